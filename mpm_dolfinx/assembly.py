@@ -1,0 +1,248 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Stock assembly of a residual and its tangent on the body mesh, and their reduction by T."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ufl
+from dolfinx import fem
+from dolfinx.fem import petsc as fem_petsc
+
+from .errors import MPMError
+from .particles import Particles
+from .quadrature import depends_on, split_by_rule
+
+__all__ = ["BackgroundForms", "BodyForms", "ReducedSpace"]
+
+
+def _test_function(form: ufl.Form, space: fem.FunctionSpace, what: str) -> Any:
+    arguments = form.arguments() if isinstance(form, ufl.Form) else None
+    if not arguments or len(arguments) != 1:
+        raise MPMError(f"{what} must be a UFL form with one test function.")
+    if arguments[0].ufl_function_space() != space:
+        raise MPMError(f"The test function of {what} must be from the space {space!r}.")
+    return arguments[0]
+
+
+def _assemble_into(vector: PETSc.Vec, forms: list[fem.Form]) -> None:
+    with vector.localForm() as local:
+        local.set(0.0)
+    for form in forms:
+        fem_petsc.assemble_vector(vector, form)
+    vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+
+
+class BodyForms:
+    """A residual on the body mesh, one compiled form per quadrature rule.
+
+    Args:
+        R: Residual in the displacement and a test function of W.
+        J: Its tangent, or ``None`` for ``ufl.derivative``.
+        particles: The body.
+        injected: Functions of R that change with the displacement.
+        **options: Passed on to ``dolfinx.fem.form``.
+
+    Raises:
+        MPMError: A form with other arguments, or rules that do not go together.
+    """
+
+    def __init__(
+        self,
+        R: ufl.Form,
+        J: ufl.Form | None,
+        particles: Particles,
+        injected: tuple[fem.Function, ...] = (),
+        **options: Any,
+    ) -> None:
+        self._options = options
+        self._test = _test_function(R, particles.W, "The residual R")
+        d = particles.displacement
+        parts = split_by_rule(R, d)
+        live = [p for p in parts if any(depends_on(p, f) for f in (d, *injected))]
+        dead = [p for p in parts if all(p is not q for q in live)]
+        if J is None:
+            tangents = [ufl.derivative(p, d) for p in live if depends_on(p, d)]
+            tangents = [t for t in tangents if not ufl.algorithms.expand_derivatives(t).empty()]
+        else:
+            tangents = split_by_rule(J, d)
+        if not tangents:
+            raise MPMError(
+                "The residual R does not depend on particles.displacement; write it in that "
+                "Function, or give its tangent as J."
+            )
+        self._parts = parts
+        self._body = particles.mesh
+        self._element = particles.W.ufl_element()
+        self._live = self._compile(live)
+        self._dead = self._compile(dead)
+        self._tangents = self._compile(tangents)
+        self.K: PETSc.Mat = fem_petsc.create_matrix(self._pattern(tangents, particles.W))
+        self.r: PETSc.Vec = fem_petsc.create_vector(particles.W)
+        self.external: PETSc.Vec = fem_petsc.create_vector(particles.W)
+
+    def _compile(self, forms: list[ufl.Form]) -> list[fem.Form]:
+        return [fem.form(form, **self._options) for form in forms]
+
+    def _pattern(self, tangents: list[ufl.Form], W: fem.FunctionSpace) -> fem.Form:
+        """Return a form whose sparsity holds all tangents."""
+        kinds = {i.integral_type() for t in tangents for i in t.integrals()}
+        if "interior_facet" not in kinds:
+            for form, compiled in zip(tangents, self._tangents, strict=True):
+                for i in form.integrals():
+                    if (i.integral_type(), i.subdomain_id()) == ("cell", "everywhere"):
+                        return compiled
+        u, v = ufl.TrialFunction(W), ufl.TestFunction(W)
+        pattern = ufl.inner(u, v) * ufl.dx
+        if "interior_facet" in kinds:
+            pattern += ufl.inner(ufl.avg(u), ufl.avg(v)) * ufl.dS
+        return fem.form(pattern, **self._options)
+
+    def assemble_external(self) -> None:
+        """Assemble the parts that do not depend on the displacement."""
+        _assemble_into(self.external, self._dead)
+
+    def assemble_residual(self) -> PETSc.Vec:
+        """Assemble the residual; the external parts are those of ``assemble_external``."""
+        _assemble_into(self.r, self._live)
+        self.r.axpy(1.0, self.external)
+        return self.r
+
+    def assemble_tangent(self) -> PETSc.Mat:
+        """Assemble the tangent."""
+        self.K.zeroEntries()
+        for form in self._tangents:
+            fem_petsc.assemble_matrix(self.K, form)
+        self.K.assemble()
+        return self.K
+
+    @cached_property
+    def _elementwise(self) -> tuple[list[fem.Form], PETSc.Vec]:
+        """The residual tested domain by domain: element vectors that are not summed."""
+        broken = fem.functionspace(
+            self._body, ("Discontinuous Lagrange", self._element.degree, self._element.block_shape)
+        )
+        swap = {self._test: ufl.TestFunction(broken)}
+        forms = self._compile([ufl.replace(part, swap) for part in self._parts])
+        return forms, fem_petsc.create_vector(broken)
+
+    def absolute_contributions(self, domain_nodes: NDArray[np.int32]) -> PETSc.Vec:
+        """Return the sum over domains of the absolute values of what each adds to the residual.
+
+        It measures the forces inside a body that is in equilibrium with itself.
+        """
+        forms, vector = self._elementwise
+        _assemble_into(vector, forms)
+        gdim = self._element.block_size
+        n, k = domain_nodes.shape
+        own = np.abs(vector.array_r[: n * k * gdim]).reshape(n, k, gdim)
+        total = self.r.duplicate()
+        with total.localForm() as local:
+            local.set(0.0)
+            np.add.at(local.array_w.reshape(-1, gdim), domain_nodes, own)
+        total.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+        return total
+
+
+class BackgroundForms:
+    """Terms on the background mesh, in the step's increment.
+
+    Args:
+        F: Form in ``particles.increment`` and a test function of V.
+        particles: The body.
+        **options: Passed on to ``dolfinx.fem.form``.
+    """
+
+    def __init__(self, F: ufl.Form, particles: Particles, **options: Any) -> None:
+        _test_function(F, particles.V, "The background form")
+        u = particles.increment
+        parts = split_by_rule(F, u)
+        tangents = [ufl.derivative(p, u) for p in parts if depends_on(p, u)]
+        if not tangents:
+            raise MPMError("The background form does not depend on particles.increment.")
+        self._residuals = [fem.form(p, **options) for p in parts]
+        self._tangents = [fem.form(t, **options) for t in tangents]
+        self._matrices = [fem_petsc.create_matrix(t) for t in self._tangents]
+        self.r: PETSc.Vec = fem_petsc.create_vector(particles.V)
+
+    def assemble_residual(self) -> PETSc.Vec:
+        """Assemble the residual on V."""
+        _assemble_into(self.r, self._residuals)
+        return self.r
+
+    def assemble_tangent(self) -> PETSc.Mat:
+        """Assemble the tangent on V."""
+        for matrix, form in zip(self._matrices, self._tangents, strict=True):
+            matrix.zeroEntries()
+            fem_petsc.assemble_matrix(matrix, form)
+            matrix.assemble()
+        total = self._matrices[0]
+        if len(self._matrices) > 1:
+            total = total.copy()
+            for matrix in self._matrices[1:]:
+                total.axpy(1.0, matrix)
+        return total
+
+    def support(self) -> NDArray[np.int32]:
+        """Return this rank's own dofs of V that the form acts on."""
+        return np.flatnonzero(self.assemble_tangent().getDiagonal().array_r).astype(np.int32)
+
+
+class ReducedSpace:
+    """The free dofs of V, and T restricted to them.
+
+    Args:
+        T: The whole transfer.
+        free: This rank's own free dofs of V, local numbers, sorted.
+
+    Attributes:
+        free: Those dofs.
+        T: The transfer's columns at the free dofs.
+    """
+
+    def __init__(self, T: PETSc.Mat, free: NDArray[np.int32]) -> None:
+        self.free = free
+        start, _ = T.getOwnershipRangeColumn()
+        first, last = T.getOwnershipRange()
+        comm = T.comm
+        rows = PETSc.IS().createStride(last - first, first, step=1, comm=comm)
+        self.columns = PETSc.IS().createGeneral((free + start).astype(PETSc.IntType), comm=comm)
+        self.T: PETSc.Mat = T.createSubMatrix(rows, self.columns)
+        self._product: PETSc.Mat | None = None
+        self._total: PETSc.Mat | None = None
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Number of free dofs of this rank and of all ranks."""
+        local, whole = self.T.getSizes()[1]
+        return int(local), int(whole)
+
+    def reduce(self, K: PETSc.Mat, background: PETSc.Mat | None = None) -> PETSc.Mat:
+        """Return ``T^T K T`` plus the background's own tangent at the free dofs.
+
+        The matrix is the same object each time, with new values.
+        """
+        self._product = K.ptap(self.T, result=self._product)
+        if background is None:
+            return self._product
+        own = background.createSubMatrix(self.columns, self.columns)
+        if self._total is None:
+            self._total = self._product.copy()
+            self._total.axpy(1.0, own, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        else:
+            subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
+            self._total.zeroEntries()
+            self._total.axpy(1.0, self._product, structure=subset)
+            self._total.axpy(1.0, own, structure=subset)
+        return self._total
+
+    def restrict(self, vector: PETSc.Vec) -> NDArray[np.float64]:
+        """Return this rank's free entries of a vector of V."""
+        return np.asarray(vector.array_r[self.free])

@@ -1,0 +1,209 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Materials at the quadrature points of particles: trial update, commit, roll back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem, mesh
+
+from .errors import MPMError, agree, name_particles
+from .materials import Material, State
+from .particles import Particles
+
+__all__ = ["ConstitutiveHistory"]
+
+type Assignment = Material | Mapping[int, Material]
+
+
+class _Group(NamedTuple):
+    """A material and the points (of all of this rank's points) that it governs."""
+
+    material: Material
+    points: NDArray[np.int64]
+
+
+class ConstitutiveHistory:
+    """The history of all points of a body, kept apart from the update being tried.
+
+    Args:
+        particles: The body.
+        assignment: One material, or one for each tag of ``cell_tags``.
+        cell_tags: Tags of the body's cells.
+
+    Attributes:
+        first_piola: First Piola stress of the last update, shape ``(n nq, dim, dim)``.
+        tangent: Its derivative by F, shape ``(n nq, dim, dim, dim, dim)``.
+
+    Raises:
+        MPMError: Materials, tags or parameters that do not go together.
+    """
+
+    def __init__(
+        self, particles: Particles, assignment: Assignment, cell_tags: mesh.MeshTags | None
+    ) -> None:
+        self._particles = particles
+        self._dim = particles.mesh.geometry.dim
+        self._points = particles.num_local * particles.num_points
+        with agree(particles.mesh.comm):
+            self._groups = self._group(assignment, cell_tags)
+        shape = (self._points, self._dim, self._dim)
+        self._gradient = np.zeros(shape)
+        self._states = [g.material.initial_state(len(g.points), self._dim) for g in self._groups]
+        self.first_piola = np.zeros(shape)
+        self.tangent = np.zeros((*shape, self._dim, self._dim))
+        self._trial: list[State] = self._states
+        self._trial_gradient = self._gradient
+        self._stress = self.first_piola.copy()
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the tangents of all materials are symmetric."""
+        return all(group.material.symmetric for group in self._groups)
+
+    def _group(self, assignment: Assignment, cell_tags: mesh.MeshTags | None) -> list[_Group]:
+        if isinstance(assignment, Material):
+            everywhere = np.arange(self._points)
+            return [_Group(self._resolve(assignment, everywhere), everywhere)]
+        if not isinstance(assignment, Mapping) or not all(
+            isinstance(m, Material) for m in assignment.values()
+        ):
+            raise MPMError(
+                "material must be a material of mpm.materials or a dictionary "
+                f"{{cell tag: material}}, not {type(assignment).__name__}."
+            )
+        body = self._particles.mesh
+        if cell_tags is None or cell_tags.dim != body.topology.dim:
+            raise MPMError("A dictionary of materials needs cell_tags=, tags of the body's cells.")
+        tags = np.full(self._particles.num_local, -1, dtype=np.int64)
+        own = cell_tags.indices < self._particles.num_local
+        tags[cell_tags.indices[own]] = cell_tags.values[own]
+        known = np.isin(tags, list(assignment))
+        without = self._particles.global_index[~known]
+        if len(without):
+            raise MPMError(
+                f"{name_particles(without)} have a cell tag without a material; give a material "
+                f"for each tag (there are {', '.join(map(str, assignment))}).".capitalize(),
+                without,
+            )
+        tags = np.repeat(tags, self._particles.num_points)
+        groups = []
+        for tag, material in assignment.items():
+            points = np.flatnonzero(tags == tag)
+            groups.append(_Group(self._resolve(material, points), points))
+        return groups
+
+    def _resolve(self, material: Material, points: NDArray[np.int64]) -> Material:
+        """Return the material with its parameters at the points."""
+        replaced: dict[str, NDArray[np.float64]] = {}
+        for name, value in material.parameters.items():
+            if not isinstance(value, fem.Function | np.ndarray):
+                continue
+            values = self._per_cell(name, value)
+            replaced[name] = np.repeat(values, self._particles.num_points)
+        return material.with_parameters(**replaced).at(points) if replaced else material
+
+    def _per_cell(self, name: str, value: Any) -> NDArray[np.float64]:
+        n = self._particles.num_local
+        if isinstance(value, np.ndarray):
+            if value.shape != (n,):
+                raise MPMError(
+                    f"The parameter {name} has {len(value)} values for {n} particles; give a "
+                    "number, a DG0 Function on the body, or one value for each owned particle."
+                )
+            return value
+        space = value.function_space
+        element = space.ufl_element()
+        if space.mesh is not self._particles.mesh or element.degree != 0 or space.value_size != 1:
+            raise MPMError(f"The parameter {name} must be a scalar DG0 Function on the body mesh.")
+        return np.asarray(value.x.array[space.dofmap.list[:n, 0]])
+
+    def update(self) -> None:
+        """Update all points for the present displacement; the history stays as it is.
+
+        Raises:
+            MPMError: An update fails; ``particles`` are global indices.
+        """
+        gradient = self._particles.displacement_gradient().reshape(-1, self._dim, self._dim)
+        trial = []
+        for group, state in zip(self._groups, self._states, strict=True):
+            everywhere = len(group.points) == self._points
+            part = gradient if everywhere else gradient[group.points]
+            try:
+                answer = group.material.update(part, state)
+            except MPMError as error:
+                raise self._named(error, group) from None
+            if everywhere:
+                self.first_piola, self.tangent = answer.first_piola, answer.tangent
+            else:
+                self.first_piola[group.points] = answer.first_piola
+                self.tangent[group.points] = answer.tangent
+            trial.append(answer.state)
+        self._trial, self._trial_gradient = trial, gradient
+
+    def _named(self, error: MPMError, group: _Group) -> MPMError:
+        points = group.points[error.particles]
+        particles = np.unique(self._particles.global_index[points // self._particles.num_points])
+        text = f"{str(error).rstrip('.')} ({name_particles(particles)})"
+        return type(error)(text, particles)
+
+    def commit(self) -> None:
+        """Make the last update the history."""
+        self._states, self._gradient = self._trial, self._trial_gradient
+        self._stress = self.first_piola.copy()
+
+    def roll_back(self) -> None:
+        """Forget the last update."""
+        self._trial, self._trial_gradient = self._states, self._gradient
+        self.first_piola = self._stress.copy()
+
+    def cauchy_stress(self) -> NDArray[np.float64]:
+        """Cauchy stress of the last converged step, shape ``(n, nq, 3, 3)``."""
+        return self._collect(
+            (3, 3),
+            lambda group, state: group.material.cauchy_stress(self._gradient[group.points], state),
+        )
+
+    def plastic_strain(self) -> NDArray[np.float64]:
+        """Accumulated plastic strain of the last converged step, shape ``(n, nq)``."""
+        return self.variable("plastic_strain")
+
+    def variable(self, name: str) -> NDArray[np.float64]:
+        """Return an internal variable of the last converged step, zero where there is none.
+
+        Args:
+            name: Key of the materials' states.
+
+        Returns:
+            Its values, shape ``(n, nq, ...)``.
+
+        Raises:
+            MPMError: No material has it.
+        """
+        shapes = {s[name].shape[1:] for s in self._states if name in s}
+        if not shapes:
+            if name == "plastic_strain":
+                shapes = {()}
+            else:
+                raise MPMError(f"No material of these particles has a variable {name!r}.")
+        return self._collect(shapes.pop(), lambda group, state: state.get(name, 0.0))
+
+    def yield_function(self) -> NDArray[np.float64]:
+        """Yield function of the last converged step, shape ``(n, nq)``; -1 where elastic."""
+
+        def value(group: _Group, state: State) -> Any:
+            rule = getattr(group.material, "yield_function", None)
+            return -1.0 if rule is None else rule(state["stress"], state["plastic_strain"])
+
+        return self._collect((), value)
+
+    def _collect(self, shape: tuple[int, ...], value: Any) -> NDArray[np.float64]:
+        result = np.zeros((self._points, *shape))
+        for group, state in zip(self._groups, self._states, strict=True):
+            result[group.points] = value(group, state)
+        return result.reshape(self._particles.num_local, -1, *shape)

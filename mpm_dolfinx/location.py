@@ -1,0 +1,240 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Points to background cells: the background basis evaluated at points of any rank."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+import basix
+import basix.ufl
+from dolfinx import fem, mesh
+
+from . import _compat
+
+__all__ = ["BackgroundBasis", "PointBasis"]
+
+#: Reference distance within which a point outside a cell counts as on its boundary.
+TOLERANCE = 1e-10
+#: Basis values below this are no weight.
+DROP = 1e-13
+
+
+class PointBasis(NamedTuple):
+    """Background basis functions at points.
+
+    Attributes:
+        nodes: Global node (block) numbers of V, shape ``(n, k)``.
+        values: Their values at the points, zero where below 1e-13, shape ``(n, k)``.
+        found: Whether a background cell holds the point, shape ``(n,)``.
+    """
+
+    nodes: NDArray[np.int64]
+    values: NDArray[np.float64]
+    found: NDArray[np.bool_]
+
+
+class _Cells:
+    """The background cells that one rank owns, and the inverse of their maps."""
+
+    def __init__(self, background: mesh.Mesh) -> None:
+        tdim = background.topology.dim
+        self.gdim = background.geometry.dim
+        count = background.topology.index_map(tdim).size_local
+        self.vertices = background.geometry.x[_compat.geometry_dofmap(background)[:count]][
+            :, :, : self.gdim
+        ]
+        name = background.basix_cell()
+        self.simplex = name in (basix.CellType.triangle, basix.CellType.tetrahedron)
+        self.map = basix.ufl.element(
+            "Lagrange", name.name, _compat.geometry_degree(background)
+        ).basix_element
+        self.middle = basix.geometry(name).mean(axis=0)
+        self.affine = self._is_affine()
+        size = np.ptp(self.vertices.reshape(-1, self.gdim), axis=0).max() if count else 1.0
+        cells = np.arange(count, dtype=np.int32)
+        self.tree = _compat.cell_tree(background, cells, 1e2 * TOLERANCE * size) if count else None
+
+    @property
+    def box(self) -> NDArray[np.float64]:
+        """Lower and upper corner of all cells, shape ``(2, gdim)``; empty: inverted."""
+        if len(self.vertices) == 0:
+            return np.array([np.full(self.gdim, np.inf), np.full(self.gdim, -np.inf)])
+        points = self.vertices.reshape(-1, self.gdim)
+        pad = 1e-8 * np.ptp(points, axis=0).max()
+        return np.stack([points.min(axis=0) - pad, points.max(axis=0) + pad])
+
+    def _is_affine(self) -> bool:
+        if len(self.vertices) == 0 or (self.simplex and self.map.degree == 1):
+            return True
+        corners = np.vstack([self.middle, self.middle + 0.37 / (1 + np.arange(self.gdim))])
+        jacobians = self._jacobians(
+            np.arange(len(self.vertices)).repeat(2), np.tile(corners, (len(self.vertices), 1))
+        ).reshape(-1, 2, self.gdim, self.gdim)
+        change = np.abs(jacobians[:, 0] - jacobians[:, 1]).max(axis=(1, 2))
+        return bool(np.all(change <= 1e-12 * np.abs(jacobians).max(axis=(1, 2, 3))))
+
+    def _jacobians(
+        self, cells: NDArray[np.int64], reference: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        table = self.map.tabulate(1, reference)[1:, :, :, 0]
+        return np.einsum("jpk,pki->pij", table, self.vertices[cells])
+
+    def pull_back(
+        self, cells: NDArray[np.int64], points: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return reference coordinates of points in cells; NaN where Newton fails.
+
+        Args:
+            cells: Local cells, shape ``(n,)``.
+            points: Points, shape ``(n, gdim)``.
+
+        Returns:
+            Reference coordinates, shape ``(n, gdim)``: one Newton step where the cells are
+            affine, at most 30 where they are not.
+        """
+        reference = np.tile(self.middle, (len(points), 1))
+        active = np.arange(len(points))
+        for _ in range(1 if self.affine else 30):
+            table = self.map.tabulate(1, reference[active])[:, :, :, 0]
+            corners = self.vertices[cells[active]]
+            gap = points[active] - np.einsum("pk,pki->pi", table[0], corners)
+            jacobian = np.einsum("jpk,pki->pij", table[1:], corners)
+            with np.errstate(all="ignore"):
+                step = _solve(jacobian, gap)
+            reference[active] += step
+            if self.affine:
+                return reference
+            size = np.abs(step).max(axis=1)
+            lost = ~(size < 1e3)
+            reference[active[lost]] = np.nan
+            active = active[~lost & (size > 1e-14)]
+            if len(active) == 0:
+                return reference
+        reference[active[size[~lost & (size > 1e-14)] > 1e-12]] = np.nan
+        return reference
+
+    def violation(self, reference: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far reference coordinates lie outside the cell (0 inside, inf for NaN)."""
+        low = -reference.min(axis=1, initial=0.0)
+        high = reference.sum(axis=1) - 1 if self.simplex else reference.max(axis=1) - 1
+        return np.where(np.isnan(low + high), np.inf, np.maximum(0.0, np.maximum(low, high)))
+
+    def clip(self, reference: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return reference coordinates moved onto the cell."""
+        if not self.simplex:
+            return np.clip(reference, 0.0, 1.0)
+        inside = np.maximum(reference, 0.0)
+        return inside / np.maximum(1.0, inside.sum(axis=1))[:, None]
+
+    def locate(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return for each point the best cell, its reference coordinates and its violation."""
+        n = len(points)
+        cell = np.zeros(n, dtype=np.int64)
+        reference = np.tile(self.middle, (n, 1))
+        violation = np.full(n, np.inf)
+        if n == 0 or self.tree is None:
+            return cell, reference, violation
+        padded = np.zeros((n, 3))
+        padded[:, : self.gdim] = points
+        offsets, candidates = _compat.candidate_cells(self.tree, padded)
+        if len(candidates) == 0:
+            return cell, reference, violation
+        owner = np.repeat(np.arange(n), np.diff(offsets))
+        coordinates = self.pull_back(candidates.astype(np.int64), points[owner])
+        outside = self.violation(coordinates)
+        order = np.lexsort((candidates, np.where(outside <= 1e-14, 0.0, outside), owner))
+        has = np.flatnonzero(np.diff(offsets))
+        best = order[offsets[has]]
+        cell[has], reference[has], violation[has] = (
+            candidates[best],
+            coordinates[best],
+            outside[best],
+        )
+        return cell, reference, violation
+
+
+def _solve(matrix: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Solve many 2 x 2 or 3 x 3 systems by Cramer's rule."""
+    if matrix.shape[-1] == 2:
+        (a, b), (c, d) = matrix[:, 0].T, matrix[:, 1].T
+        x, y = vector.T
+        return np.stack([d * x - b * y, a * y - c * x], axis=1) / (a * d - b * c)[:, None]
+    u, v, w = matrix[:, :, 0], matrix[:, :, 1], matrix[:, :, 2]
+    vw = np.cross(v, w)
+    numerators = [vw, np.cross(w, u), np.cross(u, v)]
+    determinant = np.einsum("pi,pi->p", u, vw)
+    return (
+        np.stack([np.einsum("pi,pi->p", k, vector) for k in numerators], axis=1)
+        / (determinant[:, None])
+    )
+
+
+class BackgroundBasis:
+    """Evaluates the basis of a background space at points, wherever their cells live.
+
+    Args:
+        V: Vector Lagrange space on the background mesh (collective).
+    """
+
+    def __init__(self, V: fem.FunctionSpace) -> None:
+        self._comm = V.mesh.comm
+        self._cells = _Cells(V.mesh)
+        self._basis = V.ufl_element().basix_element
+        self._dofs = V.dofmap.list
+        self._map = V.dofmap.index_map
+        self._boxes = np.asarray(self._comm.allgather(self._cells.box))
+
+    def at(self, points: NDArray[np.float64]) -> PointBasis:
+        """Evaluate the basis at points (collective).
+
+        A point on a facet belongs to one of its cells; as the basis is continuous, which one
+        does not matter. A point at most 1e-10 of a cell outside the mesh counts as on it.
+
+        Args:
+            points: This rank's points, shape ``(n, gdim)``; they may lie in cells of any rank.
+
+        Returns:
+            Nodes, values and whether a cell was found.
+        """
+        if self._comm.size == 1:
+            nodes, values, violation = self._evaluate(points)
+            return PointBasis(nodes, values, violation <= TOLERANCE)
+        inside = np.all(
+            (points[None] >= self._boxes[:, None, 0]) & (points[None] <= self._boxes[:, None, 1]),
+            axis=2,
+        )
+        asked = [np.flatnonzero(row) for row in inside]
+        questions = self._comm.alltoall([points[index] for index in asked])
+        counts = np.cumsum([len(q) for q in questions])[:-1]
+        answers = [np.split(a, counts) for a in self._evaluate(np.concatenate(questions))]
+        replies = self._comm.alltoall(list(zip(*answers, strict=True)))
+        n, k = len(points), self._dofs.shape[1]
+        nodes = np.zeros((n, k), dtype=np.int64)
+        values = np.zeros((n, k))
+        best = np.full(n, np.inf)
+        for index, (their_nodes, their_values, violation) in zip(asked, replies, strict=True):
+            better = violation < best[index]
+            take = index[better]
+            nodes[take], values[take] = their_nodes[better], their_values[better]
+            best[take] = violation[better]
+        return PointBasis(nodes, values, best <= TOLERANCE)
+
+    def _evaluate(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        cell, reference, violation = self._cells.locate(points)
+        k = self._dofs.shape[1]
+        if len(points) == 0 or self._cells.tree is None:
+            return np.zeros((len(points), k), np.int64), np.zeros((len(points), k)), violation
+        values = self._basis.tabulate(0, self._cells.clip(reference))[0, :, :, 0]
+        values = np.where((np.abs(values) < DROP) | (violation > TOLERANCE)[:, None], 0.0, values)
+        nodes = self._map.local_to_global(self._dofs[cell].ravel()).reshape(-1, k)
+        return nodes, values, np.where(violation <= 1e-14, 0.0, violation)

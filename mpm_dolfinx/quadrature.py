@@ -1,0 +1,142 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Quadrature on particle domains, and forms split into one rule each."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import basix.ufl
+import ufl
+from dolfinx import fem, mesh
+from ufl.algorithms import expand_derivatives
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.estimate_degrees import estimate_total_polynomial_degree
+from ufl.corealg.traversal import traverse_unique_terminals
+
+from . import _compat
+from .errors import MPMError
+
+__all__ = ["DomainQuadrature", "depends_on", "exact_degree", "quadrature_element", "split_by_rule"]
+
+
+def exact_degree(cell: str, degree: int) -> int:
+    """Return the degree that integrates products of two shape functions of a domain.
+
+    Args:
+        cell: Name of the cell type.
+        degree: Degree of the shape functions.
+
+    Returns:
+        Twice the degree, plus that of the Jacobian determinant where the map is not affine.
+    """
+    return 2 * degree + {"quadrilateral": 1, "hexahedron": 2}.get(cell, 0)
+
+
+def quadrature_element(cell: str, degree: int, shape: tuple[int, ...] = ()) -> Any:
+    """Return the quadrature element of the default rule."""
+    return basix.ufl.quadrature_element(cell, value_shape=shape, scheme="default", degree=degree)
+
+
+class DomainQuadrature:
+    """A rule on every domain this rank owns: weights, shape functions and their gradients.
+
+    Attributes:
+        weights: Reference volume of each point, shape ``(n, nq)``.
+        shapes: Shape functions of W at the points, shape ``(nq, k)``.
+        gradients: Their gradients in the undeformed body, shape ``(n, nq, k, gdim)``.
+    """
+
+    def __init__(self, body: mesh.Mesh, shape_functions: Any, degree: int) -> None:
+        cell = body.basix_cell()
+        gdim = body.geometry.dim
+        points, weights = basix.make_quadrature(cell, degree)
+        count = body.topology.index_map(body.topology.dim).size_local
+        nodes = body.geometry.x[_compat.geometry_dofmap(body)[:count], :gdim]
+        coordinate_map = basix.ufl.element(
+            "Lagrange", cell.name, _compat.geometry_degree(body)
+        ).basix_element
+        slopes = coordinate_map.tabulate(1, points)[1:, :, :, 0]
+        jacobian = np.einsum("jqk,nki->nqij", slopes, nodes)
+        table = shape_functions.tabulate(1, points)[:, :, :, 0]
+        self.shapes: NDArray[np.float64] = table[0]
+        self.weights: NDArray[np.float64] = weights * np.abs(np.linalg.det(jacobian))
+        self.gradients: NDArray[np.float64] = np.einsum(
+            "jqk,nqji->nqki", table[1:], np.linalg.inv(jacobian)
+        )
+
+    def displacement_gradient(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ``grad d`` at the points.
+
+        Args:
+            nodal: Displacement of the domains' nodes, shape ``(n, k, gdim)``.
+
+        Returns:
+            Gradient with respect to the undeformed body, shape ``(n, nq, gdim, gdim)``.
+        """
+        return np.asarray(np.matmul(nodal.swapaxes(1, 2)[:, None], self.gradients))
+
+
+def depends_on(form: ufl.Form, function: fem.Function) -> bool:
+    """Return whether a form contains a function."""
+    return any(c is function for c in form.coefficients())
+
+
+def _rule(integral: Any) -> tuple[int, str]:
+    """Return the degree and scheme that one integral is meant to be integrated with."""
+    metadata = integral.metadata()
+    degree = metadata.get("quadrature_degree", -1)
+    scheme = str(metadata.get("quadrature_rule", "default"))
+    for terminal in traverse_unique_terminals(integral.integrand()):
+        element = (
+            terminal.function_space.ufl_element() if isinstance(terminal, fem.Function) else None
+        )
+        if element is None or not element.has_custom_quadrature:
+            continue
+        points = element.custom_quadrature()[0]
+        if degree == -1:
+            degree = element.degree
+        rule = basix.make_quadrature(terminal.function_space.mesh.basix_cell(), degree)[0]
+        if points.shape != rule.shape or not np.allclose(points, rule):
+            raise MPMError(
+                f"The form integrates '{terminal.name}', known at {len(points)} quadrature "
+                f"point(s) of a domain, with a rule of {len(rule)} point(s); integrate it with "
+                "particles.dx."
+            )
+    if degree == -1:
+        lowered = expand_derivatives(apply_algebra_lowering(integral.integrand()))
+        estimate = estimate_total_polynomial_degree(lowered)
+        degree = max(estimate) if isinstance(estimate, tuple) else estimate
+    return int(degree), scheme
+
+
+def split_by_rule(form: ufl.Form, displacement: fem.Function) -> list[ufl.Form]:
+    """Split a form so that each part has one quadrature rule and one kind of dependence.
+
+    FFCx (0.9 to 0.11) miscompiles a form that mixes a one-point rule with another rule, so
+    each rule gets a form of its own; parts without the displacement are apart too, since they
+    are constant during a step.
+
+    Args:
+        form: Any UFL form on the body mesh.
+        displacement: The displacement of the body.
+
+    Returns:
+        The parts, whose sum is ``form``, those with the displacement first.
+
+    Raises:
+        MPMError: Where data at quadrature points meet another rule.
+    """
+    parts: dict[tuple[bool, str, int, str], list[Any]] = defaultdict(list)
+    for integral in form.integrals():
+        degree, scheme = _rule(integral)
+        metadata = dict(integral.metadata())
+        metadata.update(quadrature_degree=degree, quadrature_rule=scheme)
+        one = integral.reconstruct(metadata=metadata)
+        dead = not depends_on(ufl.Form([one]), displacement)
+        parts[dead, integral.integral_type(), degree, scheme].append(one)
+    return [ufl.Form(parts[key]) for key in sorted(parts)]

@@ -1,0 +1,293 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Newton's method on the reduced system: PETSc SNES, a shifted factor and a line search."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+
+from .errors import ConvergenceError, MPMError
+from .history import Statistics
+
+__all__ = ["NewtonSolver", "ReducedProblem"]
+
+#: Newton increment, relative to the step's, at which round-off is reached.
+ROUND_OFF = 1e-13
+#: Most halvings of a Newton step, and the drop in work that needs none.
+HALVINGS = 8
+SUFFICIENT = 0.8
+
+
+class ReducedProblem(Protocol):
+    """What the solver asks of a problem. All calls are collective."""
+
+    def residual(self, x: PETSc.Vec, F: PETSc.Vec) -> MPMError | None:
+        """Evaluate the residual at x, or say why that cannot be."""
+
+    def tangent(self) -> PETSc.Mat:
+        """Return the tangent at the x of the last residual, always the same object."""
+
+    def impose(self) -> bool:
+        """Impose the step's Dirichlet values from now on; return whether there are any."""
+
+    def lift(self) -> PETSc.Vec:
+        """Return the linearised forces of the step's Dirichlet values."""
+
+    def scale(self) -> float:
+        """Return the size of external forces and reactions at the last residual."""
+
+    def internal_scale(self) -> float:
+        """Return the size of the absolute internal contributions at the last residual."""
+
+    def motion(self, x: PETSc.Vec) -> float:
+        """Return the size of the displacement that x causes on the body."""
+
+
+class NewtonSolver:
+    """SNES with the shift and the line search that singular transfers need.
+
+    The reduced tangent K is singular whenever a combination of background dofs moves no node
+    of the body. ``K + shift |diag K|`` is factorised instead, which is K scaled to unit
+    diagonal plus ``shift`` times the identity; the residual stays the true one. The line search
+    halves a Newton step while a domain inverts, or while both the work of the residual on the
+    step stays above 0.8 of its start and the residual's norm grows.
+
+    Args:
+        comm: Communicator.
+        prefix: PETSc options prefix.
+        options: PETSc options, without prefix.
+        symmetric: Whether the tangent is symmetric.
+        shift: Relative diagonal shift in the factorisation.
+        line_search: Whether to search.
+        statistics: Where to count.
+
+    Attributes:
+        snes: The PETSc SNES.
+        residuals: Relative residuals of the last attempt.
+        iterations: Linear solves of the last attempt.
+        K: The reduced tangent.
+        x: The solution of the last attempt.
+        F: Its residual.
+    """
+
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        prefix: str,
+        options: dict[str, Any],
+        symmetric: bool,
+        shift: float,
+        line_search: bool,
+        statistics: Statistics,
+    ) -> None:
+        self._comm = comm
+        self._shift = shift
+        self._symmetric = symmetric
+        self._line_search = line_search
+        self.statistics = statistics
+        self.residuals: list[float] = []
+        self.iterations = 0
+        self.K: PETSc.Mat | None = None
+        self.x: PETSc.Vec | None = None
+        self.F: PETSc.Vec | None = None
+        self._P: PETSc.Mat | None = None
+        self._failure: MPMError | None = None
+        self._known = self._fresh = False
+        self.snes = PETSc.SNES().create(comm)
+        self.snes.setOptionsPrefix(prefix)
+        self.snes.setType("newtonls")
+        self.snes.getLineSearch().setType("basic")
+        self.snes.setTolerances(rtol=1e-9, atol=1e-50, stol=0.0, max_it=30)
+        ksp = self.snes.getKSP()
+        ksp.setType("preonly")
+        ksp.getPC().setType("cholesky" if symmetric else "lu")
+        ksp.getPC().setFactorSolverType("mumps")
+        database = PETSc.Options()
+        database.prefixPush(prefix)
+        for key, value in options.items():
+            database[key] = value
+        self.snes.setFromOptions()
+        for key in options:
+            del database[key]
+        database.prefixPop()
+
+    def solve(self, problem: ReducedProblem, sizes: tuple[int, int]) -> None:
+        """Find a root of the residual, starting from zero.
+
+        The first linear solve carries the step's Dirichlet values, as it does in finite
+        elements.
+
+        Args:
+            problem: Residual and tangent.
+            sizes: Local and global number of unknowns.
+
+        Raises:
+            MPMError: Why there is none; ``x`` and ``F`` are the last evaluated then.
+        """
+        self._problem = problem
+        self.residuals = []
+        self.iterations = 0
+        self._motion = (0.0, 0.0)
+        self._stalled = False
+        self._norm = np.inf
+        x = self._start(sizes)
+        if sizes[1] == 0:
+            problem.impose()
+        self._evaluate(x)
+        if self._failure is None and sizes[1] > 0:
+            self._iterate(x)
+        if self._failure is not None:
+            raise self._failure
+
+    def _start(self, sizes: tuple[int, int]) -> PETSc.Vec:
+        """Return the zero vector of unknowns, with vectors and SNES of its size."""
+        if self.x is not None and self.x.getSizes() == sizes:
+            self.x.set(0.0)
+            return self.x
+        self.snes.reset()
+        self.x = PETSc.Vec().createMPI(sizes, comm=self._comm)
+        self.F = self.x.duplicate()
+        self._trial = self.x.duplicate()
+        self.snes.setFunction(self._function, self.x.duplicate())
+        self.snes.setConvergenceTest(self._test)
+        self.snes.setLineSearchPreCheck(self._pre_check)
+        return self.x
+
+    def _iterate(self, x: PETSc.Vec) -> None:
+        assert self.F is not None
+        x.copy(self._trial)
+        self._known = True
+        self._set_tangent(self._problem.tangent())
+        self._fresh = True
+        if self._problem.impose():
+            forces = self._problem.lift()
+            forces.axpy(1.0, self.F)
+            with self.statistics.phase("solve"):
+                self.snes.getKSP().solve(forces, x)
+            x.scale(-1.0)
+            self.iterations += 1
+            self._known = self._fresh = False
+        with self.statistics.phase("solve"):
+            self.snes.solve(None, x)
+        reason = self.snes.getConvergedReason()
+        if self._failure is None and reason <= 0:
+            residual = self.residuals[-1] if self.residuals else np.nan
+            self._failure = ConvergenceError(
+                f"Newton's method stopped after {self.iterations} linear solves at a relative "
+                f"residual of {residual:.1e} ({_reason(reason)})"
+            )
+
+    def _function(self, snes: PETSc.SNES, x: PETSc.Vec, F: PETSc.Vec) -> None:
+        assert self.F is not None
+        if not (self._known and self._same(x, self._trial)):
+            self._evaluate(x)
+        self._known = False
+        self.F.copy(F)
+
+    def _same(self, a: PETSc.Vec, b: PETSc.Vec) -> bool:
+        same = np.array_equal(a.array_r, b.array_r)
+        return bool(self._comm.allreduce(same, MPI.LAND)) if self._comm.size > 1 else same
+
+    def _evaluate(self, x: PETSc.Vec) -> MPMError | None:
+        assert self.F is not None
+        self.statistics.count("residuals")
+        if np.isfinite(x.norm()):
+            failure = self._problem.residual(x, self.F)
+            if failure is None and not np.isfinite(self.F.norm()):
+                failure = ConvergenceError("The residual is not finite")
+        else:
+            failure = ConvergenceError("The linear solve broke down on a singular matrix")
+        self._failure = failure
+        if failure is not None:
+            self.F.set(np.nan)
+        return failure
+
+    def _test(
+        self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]
+    ) -> PETSc.SNES.ConvergedReason | None:
+        _, _, norm = norms
+        reasons = PETSc.SNES.ConvergedReason
+        if not np.isfinite(norm):
+            return reasons.DIVERGED_FNORM_NAN
+        rtol, atol, _, _ = snes.getTolerances()
+        scale = self._problem.scale()
+        if self._stalled or (iteration >= 2 and norm > max(0.25 * self._norm, rtol * scale)):
+            self._stalled = True
+            internal = self._problem.internal_scale()
+            if scale < 1e-6 * internal:
+                scale = internal
+        self._norm = norm
+        self.residuals.append(norm / scale if scale > 0 else norm)
+        if norm <= max(rtol * scale, atol):
+            return reasons.CONVERGED_FNORM_RELATIVE
+        step, whole = self._motion
+        if iteration > 0 and step <= ROUND_OFF * whole:
+            self.statistics.count("converged_at_round_off")
+            return reasons.CONVERGED_SNORM_RELATIVE
+        return None
+
+    def _set_tangent(self, K: PETSc.Mat) -> None:
+        """Factorise K with the shift."""
+        if self._shift > 0.0:
+            if self.K is not K:
+                self._P = K.copy()
+            else:
+                K.copy(self._P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+            diagonal = K.getDiagonal()
+            diagonal.abs()
+            largest = diagonal.max()[1]
+            values = diagonal.array_w
+            values[values == 0.0] = largest
+            diagonal.scale(self._shift)
+            self._P.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
+        else:
+            self._P = K
+        if self.K is not K:
+            self.K = K
+            self.snes.setJacobian(self._jacobian, K, self._P)
+            if self._symmetric:
+                self._P.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        ksp = self.snes.getKSP()
+        ksp.setOperators(K, self._P)
+        with self.statistics.phase("factorise"):
+            ksp.setUp()
+        self.statistics.count("factorisations")
+
+    def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
+        if not self._fresh:
+            self._set_tangent(self._problem.tangent())
+        self._fresh = False
+        self.iterations += 1
+
+    def _pre_check(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+        assert self.F is not None
+        self._motion = (0.0, 0.0)
+        if not np.isfinite(y.norm()):
+            return False  # the evaluation at x - y says so
+        norm, work = self.F.norm(), abs(self.F.dot(y))
+        fraction = 1.0
+        for halving in range(HALVINGS + 1):
+            self._trial.waxpy(-1.0, y, x)
+            failure = self._evaluate(self._trial)
+            if not self._line_search or halving == HALVINGS:
+                break
+            if failure is None and (
+                abs(self.F.dot(y)) <= SUFFICIENT * work * fraction or self.F.norm() <= norm
+            ):
+                break
+            y.scale(0.5)
+            fraction *= 0.5
+            self.statistics.count("halvings")
+        self._motion = (self._problem.motion(y), self._problem.motion(self._trial))
+        self._known = True
+        return fraction < 1.0
+
+
+def _reason(code: int) -> str:
+    names = {v: k for k, v in vars(PETSc.SNES.ConvergedReason).items() if isinstance(v, int)}
+    return names.get(code, str(code)).lower().replace("_", " ")

@@ -1,0 +1,51 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Load steps: equal steps, cut back where they fail, grown again where they are easy."""
+
+from __future__ import annotations
+
+__all__ = ["StepControl"]
+
+#: How often a step may be halved, and the linear solves of a step that is easy.
+MOST_HALVINGS = 10
+EASY = 8
+
+
+class StepControl:
+    """Chooses the end of the next step between 0 and 1.
+
+    Loads are whole numbers of ticks, so that a run without cutback ends its steps at k / n
+    to the last bit.
+
+    Args:
+        steps: Number of equal steps; also the largest step.
+    """
+
+    def __init__(self, steps: int) -> None:
+        self._largest = 2**MOST_HALVINGS
+        self._end = steps * self._largest
+        self._now = 0
+        self._size = self._largest
+
+    @property
+    def finished(self) -> bool:
+        """Whether the whole load is reached."""
+        return self._now == self._end
+
+    @property
+    def target(self) -> float:
+        """End of the step to try."""
+        return min(self._now + self._size, self._end) / self._end
+
+    def accept(self, iterations: int) -> None:
+        """Go to the target; double the next step if this one took few linear solves."""
+        self._now = min(self._now + self._size, self._end)
+        if iterations <= EASY:
+            self._size = min(2 * self._size, self._largest)
+
+    def cut_back(self) -> bool:
+        """Halve the step; return False where it is at its smallest."""
+        if self._size == 1:
+            return False
+        self._size //= 2
+        return True

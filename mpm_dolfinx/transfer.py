@@ -1,0 +1,158 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The transfer T from the background to the domains' nodes, and the published weights."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+import basix
+from dolfinx import fem
+
+from .location import PointBasis
+
+__all__ = ["Weights", "active_nodes", "domain_weights", "sum_by_particle", "transfer_matrix"]
+
+
+class Weights(NamedTuple):
+    """Published particle weights in the current configuration, in compressed rows.
+
+    Particle ``p`` has the entries ``offsets[p]:offsets[p + 1]``.
+
+    Attributes:
+        offsets: Shape ``(n + 1,)``.
+        nodes: Global node (block) numbers of V, shape ``(nnz,)``.
+        S: Average of the background basis over the domain, shape ``(nnz,)``.
+        grad_S: Average of its gradient, one over length, shape ``(nnz, gdim)``.
+    """
+
+    offsets: NDArray[np.int64]
+    nodes: NDArray[np.int64]
+    S: NDArray[np.float64]
+    grad_S: NDArray[np.float64]
+
+
+def transfer_matrix(basis: PointBasis, W: fem.FunctionSpace, V: fem.FunctionSpace) -> PETSc.Mat:
+    """Assemble T: the background basis at the nodes of W, for each component.
+
+    Args:
+        basis: Background basis at this rank's nodes of W, its own nodes first.
+        W: Space of the domains.
+        V: Background space.
+
+    Returns:
+        Matrix of all dofs of W by all dofs of V, global numbering (collective).
+    """
+    bs = V.dofmap.index_map_bs
+    rows = W.dofmap.index_map
+    columns = V.dofmap.index_map
+    owned = rows.size_local
+    values, nodes = basis.values[:owned], basis.nodes[:owned]
+    order = np.argsort(nodes, axis=1)
+    nodes = np.take_along_axis(nodes, order, axis=1)
+    values = np.take_along_axis(values, order, axis=1)
+    kept = values != 0.0
+    counts = np.repeat(kept.sum(axis=1), bs)
+    indptr = np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType)
+    component = np.arange(bs)[None, :, None]
+    shape = (owned, bs, nodes.shape[1])
+    keep = np.broadcast_to(kept[:, None, :], shape)
+    indices = (nodes[:, None, :] * bs + component)[keep].astype(PETSc.IntType)
+    data = np.broadcast_to(values[:, None, :], shape)[keep]
+    sizes = (
+        (owned * bs, rows.size_global * bs),
+        (columns.size_local * bs, columns.size_global * bs),
+    )
+    return PETSc.Mat().createAIJ(sizes, csr=(indptr, indices, data), comm=W.mesh.comm)
+
+
+def active_nodes(
+    basis: PointBasis, W: fem.FunctionSpace, V: fem.FunctionSpace
+) -> NDArray[np.int32]:
+    """Return this rank's own nodes of V (local numbers, sorted) that have weight in T."""
+    owned = W.dofmap.index_map.size_local
+    touched = np.unique(basis.nodes[:owned][basis.values[:owned] != 0.0])
+    columns = V.dofmap.index_map
+    if V.mesh.comm.size == 1:
+        return touched.astype(np.int32)
+    mark = PETSc.Vec().createMPI((columns.size_local, columns.size_global), comm=V.mesh.comm)
+    mark.setValues(touched.astype(PETSc.IntType), np.ones(len(touched)), addv=True)
+    mark.assemble()
+    active = np.flatnonzero(mark.array_r > 0).astype(np.int32)
+    mark.destroy()
+    return active
+
+
+def domain_weights(
+    corners: NDArray[np.float64], shape_functions: Any, cell: basix.CellType, degree: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Integrate shape functions over the domains in their current shape.
+
+    These are the integrals of Sadeghirad, Brannon & Guilkey (2013, eqs 9-14): over a
+    quadrilateral, triangle, hexahedron or tetrahedron with the corners given.
+
+    Args:
+        corners: Current positions of the domains' nodes, shape ``(n, k, gdim)``.
+        shape_functions: basix element of W.
+        cell: Cell type of the domains.
+        degree: Degree of the rule; exact for products of two shape functions.
+
+    Returns:
+        Volumes ``(n,)``; the averages ``1/V int Q dx``, shape ``(n, k)``; and
+        ``1/V int grad Q dx``, shape ``(n, k, gdim)``.
+    """
+    points, weights = basix.make_quadrature(cell, degree)
+    table = shape_functions.tabulate(1, points)[:, :, :, 0]
+    jacobian = np.einsum("jqk,nki->nqij", table[1:], corners)
+    measure = weights * np.linalg.det(jacobian)
+    volume = measure.sum(axis=1)
+    average = np.einsum("nq,qk->nk", measure, table[0]) / volume[:, None]
+    gradient = np.einsum("nq,nqji,jqk->nki", measure, np.linalg.inv(jacobian), table[1:])
+    return volume, average, gradient / volume[:, None, None]
+
+
+def sum_by_particle(
+    average: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    basis: PointBasis,
+    domain_nodes: NDArray[np.int32],
+) -> Weights:
+    """Combine domain averages with the background basis at the domains' nodes.
+
+    ``S_ip = sum_c w_c N_i(x_c)`` and ``grad S_ip = sum_c g_c N_i(x_c)`` (Sadeghirad, Brannon &
+    Guilkey 2013, eqs 15 and 16).
+
+    Args:
+        average: Weights ``w_c``, shape ``(n, k)``.
+        gradient: Gradients ``g_c``, shape ``(n, k, gdim)``.
+        basis: Background basis at the local nodes of W.
+        domain_nodes: Local nodes of each domain, shape ``(n, k)``.
+
+    Returns:
+        The weights, each particle's nodes sorted.
+    """
+    n, k = domain_nodes.shape
+    nodes = basis.nodes[domain_nodes]
+    values = basis.values[domain_nodes]
+    kept = values != 0.0
+    particle = np.broadcast_to(np.arange(n)[:, None, None], nodes.shape)[kept]
+    corner = np.broadcast_to(np.arange(k)[None, :, None], nodes.shape)[kept]
+    node, value = nodes[kept], values[kept]
+    order = np.lexsort((node, particle))
+    particle, corner, node, value = particle[order], corner[order], node[order], value[order]
+    first = np.ones(len(node), dtype=bool)
+    first[1:] = (np.diff(node) != 0) | (np.diff(particle) != 0)
+    starts = np.flatnonzero(first)
+    counts = np.bincount(particle[starts], minlength=n)
+    terms = value[:, None] * np.column_stack(
+        [average[particle, corner], gradient[particle, corner]]
+    )
+    sums = np.add.reduceat(terms, starts, axis=0) if len(starts) else terms
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return Weights(offsets, node[starts], sums[:, 0], sums[:, 1:])
