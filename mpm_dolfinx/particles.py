@@ -17,7 +17,7 @@ import ufl
 from dolfinx import fem, mesh
 
 from .errors import DomainDistortionError, MPMError, ParticleOutsideError, agree, name_particles
-from .location import BackgroundBasis
+from .location import BackgroundBasis, PointBasis
 from .quadrature import DomainQuadrature, exact_degree, quadrature_element
 from .transfer import Weights, active_nodes, domain_weights, sum_by_particle, transfer_matrix
 
@@ -112,14 +112,23 @@ class Particles:
                     f"The domains of {name_particles(flat)} have no volume; mend the body mesh.",
                     flat,
                 )
-        self._locate(self._nodes)
+        self.locate()
 
     def _measure(self, degree: int) -> ufl.Measure:
         metadata = {"quadrature_degree": degree, "quadrature_rule": "default"}
         return ufl.Measure("dx", domain=self.mesh, metadata=metadata)
 
-    def _locate(self, positions: NDArray[np.float64]) -> None:
-        """Find the background basis at the nodes; nothing changes where one is outside."""
+    def locate(self) -> None:
+        """Find the background cells of all domain nodes, unless that is done (collective).
+
+        Raises:
+            ParticleOutsideError: A domain of the last converged step is not wholly inside the
+                background.
+        """
+        self._basis  # noqa: B018
+
+    def _locate(self) -> PointBasis:
+        positions = self._nodes + self._converged
         basis = self._background.at(positions)
         with agree(self.mesh.comm):
             missing = ~basis.found
@@ -127,14 +136,17 @@ class Particles:
                 lost = np.flatnonzero(missing[self._domain_nodes].any(axis=1))
                 where = positions[missing][0]
                 raise ParticleOutsideError(
-                    f"The domains of {name_particles(self.global_index[lost])} leave the "
+                    f"The domains of {name_particles(self.global_index[lost])} are outside the "
                     f"background mesh, e.g. at {tuple(float(round(c, 6)) for c in where)}; "
                     "make the background larger or the load smaller.",
                     self.global_index[lost],
                 )
-        self._basis = basis
-        self.__dict__.pop("T", None)
-        self.__dict__.pop("_active_nodes", None)
+        return basis
+
+    @cached_property
+    def _basis(self) -> PointBasis:
+        """Background basis at the local nodes of W, at the last converged positions."""
+        return self._locate()
 
     @cached_property
     def T(self) -> PETSc.Mat:
@@ -297,14 +309,10 @@ class Particles:
         return self.global_index[~(jacobian > 0.0).all(axis=1)]
 
     def _commit(self) -> None:
-        """Make the present displacement the converged one (collective).
-
-        Raises:
-            ParticleOutsideError: A domain left the background; nothing has changed then.
-        """
-        positions = self.displacement.x.array.reshape(-1, self._gdim)
-        self._locate(self._nodes + positions)
-        self._converged = positions.copy()
+        """Make the present displacement the converged one."""
+        self._converged = self.displacement.x.array.reshape(-1, self._gdim).copy()
+        for name in ("_basis", "_active_nodes", "T"):
+            self.__dict__.pop(name, None)
 
     def _roll_back(self) -> None:
         """Restore the converged displacement."""

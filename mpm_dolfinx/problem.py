@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -222,6 +223,7 @@ class ParticleProblem:
                 continue
             control.accept(step.iterations)
             yield step
+        self._warn_of_outside()
 
     def step(self) -> Step:
         """Make one increment to the present values of loads and conditions.
@@ -281,6 +283,15 @@ class ParticleProblem:
         last = self.history.steps[-1].load if self.history.steps else 0.0
         self._series[path].write(last)
 
+    def _warn_of_outside(self) -> None:
+        """Say so where the last step, which is converged, took particles off the background."""
+        try:
+            with self.history.statistics.phase("locate"):
+                self.particles.locate()
+        except ParticleOutsideError as error:
+            if self._comm.rank == 0:
+                warnings.warn(f"The run is complete, but {str(error)}", stacklevel=3)
+
     # -- One step -------------------------------------------------------------------------
 
     def _advance(self, parameter: float, values: NDArray[np.float64]) -> Step:
@@ -289,6 +300,8 @@ class ParticleProblem:
         self._values = values
         self._change = values - self._prescribed
         self._lifted = False
+        with statistics.phase("locate"):
+            self.particles.locate()
         with statistics.phase("transfer"):
             self._reduce()
         with statistics.phase("assemble"):
@@ -296,9 +309,8 @@ class ParticleProblem:
         assert self._space is not None
         self._external = float(self._to_background(self._forms.external).norm())
         self._newton.solve(self, self._space.sizes)
-        with statistics.phase("locate"):
-            self.particles._commit()
         with statistics.phase("commit"):
+            self.particles._commit()
             self.commit()
             self._prescribed = values.copy()
             self._loaded = float(self.particles.load.value)

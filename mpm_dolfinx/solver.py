@@ -146,7 +146,9 @@ class NewtonSolver:
 
     def _start(self, sizes: tuple[int, int]) -> PETSc.Vec:
         """Return the zero vector of unknowns, with vectors and SNES of its size."""
-        if self.x is not None and self.x.getSizes() == sizes:
+        same = self.x is not None and self.x.getSizes() == sizes
+        if self._comm.allreduce(same, MPI.LAND):
+            assert self.x is not None
             self.x.set(0.0)
             return self.x
         self.snes.reset()

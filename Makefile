@@ -1,0 +1,48 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+
+# The environment: made where it is missing, used as it is where it exists.
+VENV ?= .venv
+# The interpreter to make it with (empty: look for one).
+PYTHON ?=
+# Ranks of the second run of the tests (1: leave that run out), and arguments for pytest.
+NP ?= 2
+ARGS ?=
+
+export PYTHON VENV NP
+export OMP_NUM_THREADS := 1
+
+BIN := $(VENV)/bin
+SETUP := sh scripts/setup_env.sh
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint docs clean
+
+help: ## This list
+	@echo "make TARGET [VENV=path of an environment] [PYTHON=path of an interpreter]"
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-8s %s\n", $$1, $$2 }' Makefile
+
+demo: ## Install what is needed, run the first demo, make its picture
+	@$(SETUP) wheel plot
+	@mkdir -p output
+	"$(BIN)/python" demos/demo_column_roller.py --plot output/column_roller.png
+	@echo "The picture is output/column_roller.png"
+
+test: ## Run the tests on one rank, then on NP=2 ranks (ARGS="-k name" goes to pytest)
+	@$(SETUP) wheel plot test
+	@bash scripts/run_tests.sh $(ARGS)
+
+lint: ## ruff check, ruff format --check, mypy
+	@$(SETUP) wheel plot test
+	"$(BIN)/ruff" check .
+	"$(BIN)/ruff" format --check .
+	"$(BIN)/mypy"
+
+docs: ## Build the documentation into site/
+	@$(SETUP) docs
+	NO_MKDOCS_2_WARNING=1 "$(BIN)/python" -m mkdocs build --strict
+	@echo "The documentation starts at site/index.html"
+
+clean: ## Remove what the targets made, except the environment
+	rm -rf build dist output site .mypy_cache .pytest_cache .ruff_cache
+	find $(wildcard benchmarks demos docs mpm_dolfinx tests) -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,286 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The contract between a material and the problem, and laws written in strain space."""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.errors import MPMError
+from mpm_dolfinx.materials.kinematics import KINEMATICS, Kinematics
+from mpm_dolfinx.materials.mandel import num_components, to_tensor
+
+__all__ = [
+    "Field",
+    "Integration",
+    "Material",
+    "Parameter",
+    "State",
+    "StrainMaterial",
+    "Update",
+    "check_parameter",
+    "per_row",
+]
+
+type Parameter = float | NDArray[np.float64]
+"""One value for all points, or an array ``(n,)`` with one per point."""
+
+type State = dict[str, NDArray[np.float64]]
+"""Internal state variables by name, each of shape ``(n, ...)`` and any memory order."""
+
+
+class Field(Protocol):
+    """A piecewise constant ``dolfinx.fem.Function``, whose values are ``x.array``."""
+
+    @property
+    def x(self) -> Any:
+        """The vector of values."""
+
+
+class Update(NamedTuple):
+    """What a material answers.
+
+    Attributes:
+        first_piola: First Piola stress P, shape ``(n, dim, dim)``, C order.
+        tangent: dP_iJ/dF_kL consistent with the update, shape ``(n, dim, dim, dim, dim)``, C
+            order; ``None`` if not asked for.
+        state: New state, to be kept if the step converges.
+    """
+
+    first_piola: NDArray[np.float64]
+    tangent: NDArray[np.float64] | None
+    state: State
+
+
+class Material(ABC):
+    """A constitutive law: a function of displacement gradient and state, for many points.
+
+    A new law needs ``symmetric``, :meth:`initial_state`, :meth:`update` and
+    :meth:`cauchy_stress`; laws in strain space are easier to write as a
+    :class:`StrainMaterial`. Example, the St. Venant-Kirchhoff law P = lame tr(E) F::
+
+        class VolumetricStVenantKirchhoff(Material):
+            symmetric = True
+
+            def __init__(self, lame):
+                self.parameters = {"lame": lame}
+
+            def initial_state(self, n, dim):
+                return {"stress": np.zeros((n, num_components(dim)))}
+
+            def update(self, displacement_gradient, state, tangent=True):
+                H, lame = displacement_gradient, self.parameters["lame"]
+                eye = np.eye(H.shape[1])
+                F = eye + H
+                p = lame * (np.trace(H, axis1=1, axis2=2) + 0.5 * np.sum(H * H, axis=(1, 2)))
+                P = p[:, None, None] * F
+                A = p[:, None, None, None, None] * np.einsum("ik,JL->iJkL", eye, eye)
+                A += lame * np.einsum("niJ,nkL->niJkL", F, F)
+                stress = ...  # Mandel vector of the stress to be reported
+                return Update(P, A if tangent else None, {"stress": stress})
+
+    Attributes:
+        symmetric: Whether the tangent has major symmetry, dP_iJ/dF_kL = dP_kL/dF_iJ, always.
+        parameters: Parameters by name: numbers, or arrays ``(n,)`` with one value per point.
+            A piecewise constant Function may stand here until the problem puts its values at
+            the points in its place (:meth:`with_parameters`).
+    """
+
+    symmetric: bool
+    parameters: Mapping[str, Parameter] = MappingProxyType({})
+
+    @abstractmethod
+    def initial_state(self, n: int, dim: int) -> State:
+        """Return the state of ``n`` unstrained points of a body of dimension ``dim``.
+
+        Returns:
+            Always with ``"stress"``, Mandel vectors ``(n, m)`` of the law's own stress measure.
+        """
+
+    @abstractmethod
+    def update(
+        self, displacement_gradient: NDArray[np.float64], state: State, tangent: bool = True
+    ) -> Update:
+        """Return stress, consistent tangent and new state.
+
+        It is called for each Newton iteration and each try of a line search, always with the
+        state of the last converged step.
+
+        Args:
+            displacement_gradient: H = dd/dX = F - I of the total displacement, shape
+                ``(n, dim, dim)``; plane strain in two dimensions.
+            state: State of the last converged step; never modified.
+            tangent: Whether the tangent is asked for.
+
+        Raises:
+            MPMError: The update fails; ``particles`` are the numbers of the points.
+        """
+
+    @abstractmethod
+    def cauchy_stress(
+        self, displacement_gradient: NDArray[np.float64], state: State
+    ) -> NDArray[np.float64]:
+        """Return Cauchy stresses, shape ``(n, 3, 3)``.
+
+        Args:
+            displacement_gradient: Shape ``(n, dim, dim)``.
+            state: The state that belongs to it.
+        """
+
+    def with_parameters(self, **parameters: Parameter) -> Self:
+        """Return a copy of this material with other values of some parameters."""
+        other = copy.copy(self)
+        other.parameters = {**self.parameters, **parameters}
+        return other
+
+    def at(self, points: NDArray[np.integer[Any]]) -> Self:
+        """Return this material restricted to points, given by their numbers.
+
+        Arrays among the parameters are restricted; without any it is this material itself.
+        """
+        arrays = {k: v for k, v in self.parameters.items() if isinstance(v, np.ndarray)}
+        if not arrays:
+            return self
+        return self.with_parameters(**{name: values[points] for name, values in arrays.items()})
+
+
+class Integration(NamedTuple):
+    """What a law in strain space answers.
+
+    Attributes:
+        stress: Stress, shape ``(n, m)``.
+        tangent: Its derivative by the trial strain, shape ``(n, m, m)``; ``None`` if not asked
+            for.
+        elastic_strain: Elastic strain at the end of the step, shape ``(n, m)``.
+        variables: The law's internal variables at the end of the step.
+    """
+
+    stress: NDArray[np.float64]
+    tangent: NDArray[np.float64] | None
+    elastic_strain: NDArray[np.float64]
+    variables: State
+
+
+class StrainMaterial(Material):
+    """A law written in strain space, for small and for finite strain alike.
+
+    A new law gives the attributes below and :meth:`integrate`. With logarithmic kinematics it
+    must be isotropic in the strain: the elastic left Cauchy-Green tensor is its only memory of
+    direction.
+
+    Attributes:
+        kinematics: ``"small"``: infinitesimal strain, Cauchy stress; ``"logarithmic"``: trial
+            elastic logarithmic strain, Kirchhoff stress.
+        inelastic: Whether elastic strain and strain may differ, so that history is kept.
+        internal_variables: Shape per point of each of the law's own internal variables.
+    """
+
+    kinematics: ClassVar[Literal["small", "logarithmic"]] = "logarithmic"
+    inelastic: ClassVar[bool] = False
+    internal_variables: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType({})
+
+    @abstractmethod
+    def integrate(
+        self, trial_strain: NDArray[np.float64], variables: State, tangent: bool
+    ) -> Integration:
+        """Return the stress at the end of a step.
+
+        Args:
+            trial_strain: Elastic strain if the step were elastic, Mandel vectors ``(n, m)``.
+            variables: The law's internal variables at the last converged step; not to be
+                modified.
+            tangent: Whether the tangent is asked for.
+        """
+
+    @property
+    def _kinematics(self) -> type[Kinematics]:
+        """The strain measure at work."""
+        return KINEMATICS[self.kinematics]
+
+    def initial_state(self, n: int, dim: int) -> State:
+        """See :meth:`Material.initial_state`."""
+        state: State = {"stress": np.zeros((n, num_components(dim)))}
+        if self.inelastic:
+            state |= self._kinematics.initial_history(n, dim)
+        for name, shape in self.internal_variables.items():
+            state[name] = np.zeros((n, *shape))
+        return state
+
+    def update(
+        self, displacement_gradient: NDArray[np.float64], state: State, tangent: bool = True
+    ) -> Update:
+        """See :meth:`Material.update`."""
+        frame = self._kinematics(displacement_gradient, state if self.inelastic else None)
+        variables = {name: state[name] for name in self.internal_variables}
+        stress, D, elastic_strain, variables = self.integrate(
+            frame.trial_strain, variables, tangent
+        )
+        new = {"stress": stress, **variables}
+        if self.inelastic:
+            new |= frame.history(elastic_strain)
+        A = None if D is None else frame.tangent(stress, D)
+        return Update(frame.first_piola(stress), A, new)
+
+    def cauchy_stress(
+        self, displacement_gradient: NDArray[np.float64], state: State
+    ) -> NDArray[np.float64]:
+        """See :meth:`Material.cauchy_stress`."""
+        ratio = self._kinematics.volume_ratio(displacement_gradient)
+        return to_tensor(state["stress"]) / ratio[:, None, None]
+
+
+def per_row(value: Parameter) -> Parameter:
+    """Return a number, or an array ``(n,)`` as a column ``(n, 1)``, to scale arrays ``(n, m)``."""
+    return value[:, None] if isinstance(value, np.ndarray) else value
+
+
+def check_parameter(
+    name: str,
+    value: ArrayLike | Field,
+    *,
+    above: float | None = None,
+    below: float | None = None,
+    least: float | None = None,
+) -> Parameter:
+    """Return a parameter as a number or an array ``(n,)``, if its values are allowed.
+
+    Args:
+        name: Name for the message.
+        value: Number, array ``(n,)``, or Function, which is returned as it is.
+        above: The values are greater than this.
+        below: The values are smaller than this.
+        least: The values are not smaller than this.
+
+    Raises:
+        MPMError: A value is not finite or out of range.
+    """
+    try:
+        values = np.asarray(value.x.array if hasattr(value, "x") else value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise MPMError(f"{name} must be a number or one number per point, not {value!r}") from None
+    if values.ndim > 1:
+        raise MPMError(f"{name} must be a number or one number per point, not {values.ndim}-D")
+    allowed = np.isfinite(values)
+    words = ["finite"]
+    if above is not None:
+        allowed &= values > above
+        words.append(f"greater than {above:g}")
+    if least is not None:
+        allowed &= values >= least
+        words.append(f"at least {least:g}")
+    if below is not None:
+        allowed &= values < below
+        words.append(f"less than {below:g}")
+    if not allowed.all():
+        worst = values[~allowed].flat[0]
+        raise MPMError(f"{name} is {worst:g} but must be {', '.join(words)}")
+    if hasattr(value, "x"):
+        return cast(Parameter, value)
+    return float(values) if values.ndim == 0 else values

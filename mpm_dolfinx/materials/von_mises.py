@@ -1,0 +1,153 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Plasticity of von Mises with linear isotropic hardening, returned in closed form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mpm_dolfinx.errors import MPMError
+from mpm_dolfinx.materials.base import Field, Integration, Parameter, State, check_parameter
+from mpm_dolfinx.materials.elastic import IsotropicElastic
+from mpm_dolfinx.materials.mandel import deviator, deviatoric_projector, identity, norm, trace
+
+__all__ = ["SmallStrainVonMises", "VonMises"]
+
+YIELD_TOLERANCE = 1e-13
+"""Excess over the yield strength that counts as round-off of a point on the yield surface."""
+
+
+class VonMises(IsotropicElastic):
+    """Elastoplasticity of von Mises at finite strain (Wang, Coombs, Augarde & Brown, eq. 1).
+
+    Hencky elasticity, yield function f = |dev tau| / rho(kappa) - 1 with the Kirchhoff stress
+    tau, associated flow and rho(kappa) = rho_y + sqrt(2/3) hardening kappa; kappa is the sum of
+    sqrt(2/3) |d eps_p|, the uniaxial plastic strain. Backward Euler is the radial return
+    (Wilkins 1964), with the consistent tangent of Simo & Taylor (1985, eq. 3.17).
+
+    The state holds kappa as ``"plastic_strain"``, shape ``(n,)``.
+    """
+
+    kinematics: ClassVar[Literal["small", "logarithmic"]] = "logarithmic"
+    inelastic: ClassVar[bool] = True
+    internal_variables: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType(
+        {"plastic_strain": ()}
+    )
+
+    def __init__(
+        self,
+        young: ArrayLike | Field,
+        poisson: ArrayLike | Field,
+        rho_y: ArrayLike | Field | None = None,
+        yield_stress: ArrayLike | Field | None = None,
+        hardening: ArrayLike | Field = 0.0,
+    ) -> None:
+        """Set the parameters.
+
+        Args:
+            young: Young's modulus, in units of stress.
+            poisson: Poisson's ratio.
+            rho_y: Norm of the stress deviator at first yield.
+            yield_stress: Uniaxial stress at first yield, sqrt(3/2) rho_y.
+            hardening: d(uniaxial stress)/d(plastic strain).
+
+        Raises:
+            MPMError: A value is out of range, or not exactly one of ``rho_y`` and
+                ``yield_stress`` is given.
+        """
+        super().__init__(young, poisson)
+        name, strength = ("rho_y", rho_y) if rho_y is not None else ("yield_stress", yield_stress)
+        if strength is None or (rho_y is not None and yield_stress is not None):
+            raise MPMError("give exactly one of rho_y and yield_stress, which is sqrt(3/2) rho_y")
+        self.parameters = {
+            **self.parameters,
+            name: check_parameter(name, strength, above=0.0),
+            "hardening": check_parameter("hardening", hardening, least=0.0),
+        }
+
+    @property
+    def rho_y(self) -> Parameter:
+        """Norm of the stress deviator at first yield."""
+        if "rho_y" in self.parameters:
+            return self.parameters["rho_y"]
+        return self.parameters["yield_stress"] * float(np.sqrt(2.0 / 3.0))
+
+    def strength(self, plastic_strain: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return rho(kappa), shape ``(n,)``, at plastic strains ``(n,)``."""
+        hardening = np.sqrt(2.0 / 3.0) * self.parameters["hardening"]
+        return np.asarray(self.rho_y + hardening * plastic_strain)
+
+    def yield_function(
+        self, stress: NDArray[np.float64], plastic_strain: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return f, shape ``(n,)``, of a state's stress ``(n, m)`` and plastic strain ``(n,)``."""
+        return np.asarray(norm(deviator(stress)) / self.strength(plastic_strain) - 1.0)
+
+    def integrate(
+        self, trial_strain: NDArray[np.float64], variables: State, tangent: bool
+    ) -> Integration:
+        """See :meth:`StrainMaterial.integrate`."""
+        n, m = trial_strain.shape
+        stress = self.elastic_stress(trial_strain)
+        f = self.yield_function(stress, variables["plastic_strain"])
+        D = self.elastic_tangent(n, m) if tangent else None
+        (points,) = np.nonzero(f > YIELD_TOLERANCE)
+        if len(points) == 0:
+            return Integration(stress, D, trial_strain, variables)
+
+        elastic_strain = trial_strain.copy(order="K")
+        plastic_strain = variables["plastic_strain"].copy()
+        stress.T[:, points], elastic_strain.T[:, points], plastic_strain[points], D_plastic = (
+            self.at(points)._radial_return(
+                trial_strain.T[:, points], plastic_strain[points], tangent
+            )
+        )
+        if D is not None:
+            everywhere = np.empty((m, m, n))
+            everywhere[...] = np.moveaxis(D, 0, -1)
+            everywhere[:, :, points] = D_plastic
+            D = np.moveaxis(everywhere, -1, 0)
+        return Integration(stress, D, elastic_strain, {"plastic_strain": plastic_strain})
+
+    def _radial_return(
+        self, trial_strain: NDArray[np.float64], plastic_strain: NDArray[np.float64], tangent: bool
+    ) -> tuple[
+        NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None
+    ]:
+        """Return plastic points to the yield surface; arrays have their points last."""
+        m = len(trial_strain)
+        dev, size = deviator(trial_strain.T).T, norm(deviator(trial_strain.T))
+        direction = dev / size
+        hardening, shear = 2.0 / 3.0 * self.parameters["hardening"], 2.0 * self.shear
+        rho = self.strength(plastic_strain)
+        flow = (shear * size - rho) / (shear + hardening)
+        rho = rho + hardening * flow
+        # The deviator is scaled to rho, not reduced by the flow: f = 0 to round-off.
+        stress = rho * direction
+        stress[:3] += self.bulk * trace(trial_strain.T)
+        D = None
+        if tangent:
+            # K I x I + rho/|e| (P - n x n) + 2 G h/(2 G + h) n x n, with the projector P
+            one = identity(m)[:, None, None]
+            secant = rho / size
+            along = shear * hardening / (shear + hardening) - secant
+            D = (along * direction)[:, None] * direction
+            D += secant * deviatoric_projector(m)[:, :, None]
+            D += self.bulk * (one * one.transpose(1, 0, 2))
+        return (
+            stress,
+            trial_strain - flow * direction,
+            plastic_strain + np.sqrt(2.0 / 3.0) * flow,
+            D,
+        )
+
+
+class SmallStrainVonMises(VonMises):
+    """:class:`VonMises` with infinitesimal strain and the Cauchy stress."""
+
+    kinematics: ClassVar[Literal["small", "logarithmic"]] = "small"

@@ -1,0 +1,56 @@
+#!/usr/bin/env bash
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+#
+# usage: run_tests.sh [ARGUMENT OF PYTEST...]
+#
+# Run the tests of the environment $VENV on one rank, then on $NP ranks. The first run that
+# fails ends it. The last line is pytest's summary, after launchers' messages too.
+# $TEST_TIMEOUT is the time limit of each run in seconds; $MPIRUN another launcher.
+set -uo pipefail
+
+cd "$(dirname "$0")/.." || exit 1
+venv=${VENV:-.venv}
+ranks=${NP:-2}
+limit=${TEST_TIMEOUT:-1800}
+export OMP_NUM_THREADS=1
+
+# pytest's last line, also with -q
+summary_line='^(=+ )?(no tests ran|[0-9]+ (passed|failed|skipped|deselected|xfailed|xpassed|warning|error)).* in [0-9.]+s'
+
+log=$(mktemp)
+trap 'rm -f "$log"' EXIT
+
+run() {
+    local status=0 summary
+    local -a timeout=()
+    if command -v timeout >/dev/null; then
+        timeout=(timeout --foreground --kill-after=15 "$limit")
+    fi
+    "${timeout[@]}" "$@" 2>&1 </dev/null | tee "$log" || status=$?
+    if ((status != 0)); then
+        summary=$(grep -E "$summary_line" "$log" | tail -n 1)
+        if ((status == 124 || status == 137)); then
+            echo "The run was stopped: it took more than $limit s (TEST_TIMEOUT)."
+        fi
+        if [[ -z $summary ]]; then
+            echo "pytest ended without a summary (status $status): a test crashed or hung, see above."
+        elif [[ $summary != "$(tail -n 1 "$log")" ]]; then
+            echo "$summary"
+        fi
+        exit "$status"
+    fi
+}
+
+MPM_DOLFINX_RANKS=1 run "$venv/bin/python" -m pytest "$@"
+
+if ((ranks > 1)); then
+    launcher=("$venv/bin/mpirun")
+    if [[ -n ${MPIRUN:-} ]]; then
+        read -ra launcher <<<"$MPIRUN"
+    elif [[ ! -x ${launcher[0]} ]]; then
+        launcher=(mpirun)
+    fi
+    MPM_DOLFINX_RANKS=$ranks run "${launcher[@]}" -n "$ranks" \
+        "$venv/bin/python" -m pytest -p no:cacheprovider "$@"
+fi

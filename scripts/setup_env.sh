@@ -1,0 +1,102 @@
+#!/bin/sh
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+#
+# usage: setup_env.sh EXTRA...
+#
+# Make the environment $VENV (default .venv) where it is missing, and install this package in
+# it, editable, with the extras named. What was installed for which pyproject.toml is noted in
+# $VENV/.mpm-dolfinx, after it has succeeded, so that a second call has nothing to do.
+set -eu
+
+cd "$(dirname "$0")/.."
+root=$(pwd)
+venv=${VENV:-.venv}
+state=$venv/.mpm-dolfinx
+
+fail() {
+    echo "$*" >&2
+    exit 1
+}
+
+# What was not made here is not touched.
+if [ ! -e "$venv/bin/python" ] && [ ! -e "$state/unfinished" ] && [ ! -e "$state/made-here" ] &&
+    [ -n "$(find "$venv" -mindepth 1 -maxdepth 1 ! -name .mpm-dolfinx 2>/dev/null)" ]; then
+    fail "$venv is not empty and no Python environment that works (no bin/python): remove it, or name another with VENV=."
+fi
+mkdir -p "$state"
+
+# One at a time: two calls of pip in one environment spoil it.
+if command -v flock >/dev/null 2>&1; then
+    exec 9>"$state/lock"
+    flock 9
+fi
+
+# An environment that was left half made is made again.
+if [ ! -e "$venv/bin/python" ] || [ -e "$state/unfinished" ]; then
+    if ! python=$(sh scripts/find_python.sh); then
+        [ -e "$state/unfinished" ] || rm -rf "$state"
+        rmdir "$venv" 2>/dev/null || true
+        exit 1
+    fi
+    echo "Making the environment $venv with $python"
+    : >"$state/unfinished"
+    rm -f "$state/installed"
+    (cd "$venv" && rm -rf bin include lib lib64 pyvenv.cfg)
+    "$python" -m venv "$venv"
+    : >"$state/made-here"
+    rm -f "$state/unfinished"
+fi
+
+py=$venv/bin/python
+"$py" -c 'import sys; sys.exit(sys.version_info < (3, 12))' 2>/dev/null </dev/null ||
+    fail "The Python of $venv does not run or is older than 3.12: remove $venv, or name another environment with VENV=."
+
+key="$root $(cksum <pyproject.toml)"
+installed=$state/installed
+if [ "$(sed -n 1p "$installed" 2>/dev/null)" = "$key" ]; then
+    missing=
+    for extra in "$@"; do
+        grep -qx "$extra" "$installed" || missing="$missing $extra"
+    done
+    [ -n "$missing" ] || exit 0
+    # shellcheck disable=SC2046,SC2086  # lists of words
+    set -- $(sed 1d "$installed") $missing
+fi
+
+# An environment that brings a DOLFINx of its own (conda, apt, source) does without the wheel.
+own_dolfinx() {
+    [ ! -e "$state/made-here" ] && "$py" -c '
+import sys
+from importlib.util import find_spec
+sys.exit(find_spec("dolfinx") is None or find_spec("dolfinx_solver") is not None)'
+}
+extras=
+compiler=no
+for extra in "$@"; do
+    if [ "$extra" = wheel ]; then
+        compiler=yes
+        if own_dolfinx; then
+            continue
+        fi
+    fi
+    extras="$extras${extras:+,}$extra"
+done
+
+# FFCx compiles each form when it is first used.
+if [ "$compiler" = yes ]; then
+    "$py" -c '
+import os, shlex, shutil, sys, sysconfig
+cc = os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc"
+sys.exit(shutil.which(shlex.split(cc)[0]) is None)' ||
+        fail "DOLFINx needs a C compiler at run time and there is none: install gcc."
+fi
+
+echo "Installing this package with [$extras] into $venv (the first time this takes a minute or so)"
+rm -f "$installed"
+"$py" -m pip install --quiet --disable-pip-version-check --editable ".[$extras]"
+{
+    echo "$key"
+    printf '%s\n' "$@"
+} >"$installed.new"
+mv "$installed.new" "$installed"
