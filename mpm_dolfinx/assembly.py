@@ -18,7 +18,11 @@ from dolfinx.fem import petsc as fem_petsc
 
 from .errors import MPMError
 from .particles import Particles
-from .quadrature import depends_on, split_by_rule
+from .quadrature import depends_on, follows, split_by_rule
+
+# Their types name the first of several dispatched signatures only.
+assemble_vector: Any = fem_petsc.assemble_vector
+assemble_matrix: Any = fem_petsc.assemble_matrix
 
 __all__ = ["BackgroundForms", "BodyForms", "ReducedSpace"]
 
@@ -36,7 +40,7 @@ def _assemble_into(vector: PETSc.Vec, forms: list[fem.Form]) -> None:
     with vector.localForm() as local:
         local.set(0.0)
     for form in forms:
-        fem_petsc.assemble_vector(vector, form)
+        assemble_vector(vector, form)
     vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
 
 
@@ -47,7 +51,6 @@ class BodyForms:
         R: Residual in the displacement and a test function of W.
         J: Its tangent, or ``None`` for ``ufl.derivative``.
         particles: The body.
-        injected: Functions of R that change with the displacement.
         **options: Passed on to ``dolfinx.fem.form``.
 
     Raises:
@@ -59,18 +62,16 @@ class BodyForms:
         R: ufl.Form,
         J: ufl.Form | None,
         particles: Particles,
-        injected: tuple[fem.Function, ...] = (),
         **options: Any,
     ) -> None:
         self._options = options
         self._test = _test_function(R, particles.W, "The residual R")
         d = particles.displacement
         parts = split_by_rule(R, d)
-        live = [p for p in parts if any(depends_on(p, f) for f in (d, *injected))]
-        dead = [p for p in parts if all(p is not q for q in live)]
+        live = [p for p in parts if follows(p, d)]
+        dead = [p for p in parts if not follows(p, d)]
         if J is None:
             tangents = [ufl.derivative(p, d) for p in live if depends_on(p, d)]
-            tangents = [t for t in tangents if not ufl.algorithms.expand_derivatives(t).empty()]
         else:
             tangents = split_by_rule(J, d)
         if not tangents:
@@ -103,7 +104,7 @@ class BodyForms:
         pattern = ufl.inner(u, v) * ufl.dx
         if "interior_facet" in kinds:
             pattern += ufl.inner(ufl.avg(u), ufl.avg(v)) * ufl.dS
-        return fem.form(pattern, **self._options)
+        return self._compile([pattern])[0]
 
     def assemble_external(self) -> None:
         """Assemble the parts that do not depend on the displacement."""
@@ -119,7 +120,7 @@ class BodyForms:
         """Assemble the tangent."""
         self.K.zeroEntries()
         for form in self._tangents:
-            fem_petsc.assemble_matrix(self.K, form)
+            assemble_matrix(self.K, form)
         self.K.assemble()
         return self.K
 
@@ -181,7 +182,7 @@ class BackgroundForms:
         """Assemble the tangent on V."""
         for matrix, form in zip(self._matrices, self._tangents, strict=True):
             matrix.zeroEntries()
-            fem_petsc.assemble_matrix(matrix, form)
+            assemble_matrix(matrix, form)
             matrix.assemble()
         total = self._matrices[0]
         if len(self._matrices) > 1:

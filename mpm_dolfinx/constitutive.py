@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dolfinx import fem, mesh
 
-from .errors import MPMError, agree, name_particles
+from .errors import ConvergenceError, MPMError, agree
 from .materials import Material, State
 from .particles import Particles
 
@@ -87,8 +87,8 @@ class ConstitutiveHistory:
         without = self._particles.global_index[~known]
         if len(without):
             raise MPMError(
-                f"{name_particles(without)} have a cell tag without a material; give a material "
-                f"for each tag (there are {', '.join(map(str, assignment))}).".capitalize(),
+                "The cell tags of {particles} have no material; give a material for each tag "
+                f"(there are {', '.join(map(str, assignment))}).",
                 without,
             )
         tags = np.repeat(tags, self._particles.num_points)
@@ -138,6 +138,11 @@ class ConstitutiveHistory:
                 answer = group.material.update(part, state)
             except MPMError as error:
                 raise self._named(error, group) from None
+            except np.linalg.LinAlgError as error:
+                raise ConvergenceError(
+                    f"The update of {type(group.material).__name__} broke down ({error})"
+                ) from error
+            assert answer.tangent is not None
             if everywhere:
                 self.first_piola, self.tangent = answer.first_piola, answer.tangent
             else:
@@ -149,8 +154,7 @@ class ConstitutiveHistory:
     def _named(self, error: MPMError, group: _Group) -> MPMError:
         points = group.points[error.particles]
         particles = np.unique(self._particles.global_index[points // self._particles.num_points])
-        text = f"{str(error).rstrip('.')} ({name_particles(particles)})"
-        return type(error)(text, particles)
+        return type(error)(error.message.rstrip(".") + " (at {particles})", particles)
 
     def commit(self) -> None:
         """Make the last update the history."""

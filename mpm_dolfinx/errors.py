@@ -6,10 +6,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import Any
 
-if TYPE_CHECKING:
-    from mpi4py import MPI
+from mpi4py import MPI
 
 __all__ = [
     "ConvergenceError",
@@ -17,6 +16,7 @@ __all__ = [
     "MPMError",
     "ParticleOutsideError",
     "agree",
+    "agreed",
     "name_particles",
 ]
 
@@ -24,17 +24,28 @@ __all__ = [
 class MPMError(RuntimeError):
     """A run or an input that cannot go on, told in one sentence.
 
+    Args:
+        message: The sentence; ``{particles}`` in it stands for their names.
+        particles: Global indices of the particles concerned.
+        load: Load factor of the last converged step.
+
     Attributes:
-        particles: Global indices of the particles concerned (may be empty).
+        message: The sentence as given.
+        particles: Global indices of the particles concerned, sorted (may be empty).
         load: Load factor of the last converged step, or ``None`` before a run.
     """
 
     def __init__(
         self, message: str, particles: Iterable[int] = (), load: float | None = None
     ) -> None:
-        super().__init__(message)
-        self.particles: list[int] = sorted(int(p) for p in particles)
+        self.message = message
+        self.particles: list[int] = sorted({int(p) for p in particles})
         self.load = load
+        super().__init__(message.replace("{particles}", name_particles(self.particles)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let ranks send errors to each other."""
+        return type(self), (self.message, self.particles, self.load)
 
 
 class ParticleOutsideError(MPMError):
@@ -50,20 +61,38 @@ class ConvergenceError(MPMError):
 
 
 def name_particles(particles: Sequence[int], most: int = 8) -> str:
-    """Return a short list of particle indices for a message, e.g. ``particles 3, 4``."""
-    shown = ", ".join(str(int(p)) for p in list(particles)[:most])
+    """Return a short list of particles for a message, e.g. ``particles 3, 4 and 9 more``."""
+    shown = ", ".join(str(p) for p in particles[:most])
     rest = len(particles) - most
     word = "particle" if len(particles) == 1 else "particles"
     return f"{word} {shown}" + (f" and {rest} more" if rest > 0 else "")
+
+
+def agreed(comm: MPI.Comm, error: MPMError | None) -> MPMError | None:
+    """Return one error for all ranks where any rank has one (collective).
+
+    Args:
+        comm: The ranks.
+        error: This rank's error.
+
+    Returns:
+        The lowest failing rank's error with the particles of all ranks that have one of its
+        class, or ``None``.
+    """
+    if comm.size == 1 or not comm.allreduce(error is not None, MPI.LOR):
+        return error
+    errors = [e for e in comm.allgather(error) if e is not None]
+    first: MPMError = errors[0]
+    particles = {p for e in errors if type(e) is type(first) for p in e.particles}
+    return type(first)(first.message, particles, first.load)
 
 
 @contextmanager
 def agree(comm: MPI.Comm) -> Iterator[None]:
     """Raise an error of any rank on all ranks, with one sentence and all particles.
 
-    The body must hold no collective call that an error on one rank would skip on that
-    rank alone. The first failing rank's class and sentence are raised everywhere, with the
-    particles of all ranks that raised the same class.
+    The block must hold no collective call that an error on one rank would skip on that rank
+    alone.
 
     Args:
         comm: The ranks that reach this block together (collective).
@@ -71,20 +100,11 @@ def agree(comm: MPI.Comm) -> Iterator[None]:
     Raises:
         MPMError: What any rank raised inside the block.
     """
-    mine: tuple[type[MPMError], str, list[int], float | None] | None = None
-    cause: MPMError | None = None
+    mine: MPMError | None = None
     try:
         yield
     except MPMError as error:
-        cause = error
-        mine = (type(error), str(error), error.particles, error.load)
-    if comm.size == 1:
-        if cause is not None:
-            raise cause
-        return
-    raised = [r for r in comm.allgather(mine) if r is not None]
-    if not raised:
-        return
-    kind, message, _, load = raised[0]
-    particles = {p for k, _, ps, _ in raised if k is kind for p in ps}
-    raise kind(message, particles, load) from cause
+        mine = error
+    common = agreed(comm, mine)
+    if common is not None:
+        raise common from None

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from mpi4py import MPI
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -83,7 +81,7 @@ class _Cells:
         self, cells: NDArray[np.int64], reference: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         table = self.map.tabulate(1, reference)[1:, :, :, 0]
-        return np.einsum("jpk,pki->pij", table, self.vertices[cells])
+        return np.asarray(np.einsum("jpk,pki->pij", table, self.vertices[cells]))
 
     def pull_back(
         self, cells: NDArray[np.int64], points: NDArray[np.float64]
@@ -130,7 +128,7 @@ class _Cells:
         if not self.simplex:
             return np.clip(reference, 0.0, 1.0)
         inside = np.maximum(reference, 0.0)
-        return inside / np.maximum(1.0, inside.sum(axis=1))[:, None]
+        return np.asarray(inside / np.maximum(1.0, inside.sum(axis=1))[:, None])
 
     def locate(
         self, points: NDArray[np.float64]
@@ -166,15 +164,14 @@ def _solve(matrix: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[
     if matrix.shape[-1] == 2:
         (a, b), (c, d) = matrix[:, 0].T, matrix[:, 1].T
         x, y = vector.T
-        return np.stack([d * x - b * y, a * y - c * x], axis=1) / (a * d - b * c)[:, None]
+        cofactors = np.stack([d * x - b * y, a * y - c * x], axis=1)
+        return np.asarray(cofactors / (a * d - b * c)[:, None])
     u, v, w = matrix[:, :, 0], matrix[:, :, 1], matrix[:, :, 2]
     vw = np.cross(v, w)
     numerators = [vw, np.cross(w, u), np.cross(u, v)]
     determinant = np.einsum("pi,pi->p", u, vw)
-    return (
-        np.stack([np.einsum("pi,pi->p", k, vector) for k in numerators], axis=1)
-        / (determinant[:, None])
-    )
+    cofactors = np.stack([np.einsum("pi,pi->p", k, vector) for k in numerators], axis=1)
+    return np.asarray(cofactors / determinant[:, None])
 
 
 class BackgroundBasis:

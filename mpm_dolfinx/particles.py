@@ -16,9 +16,9 @@ import basix
 import ufl
 from dolfinx import fem, mesh
 
-from .errors import DomainDistortionError, MPMError, ParticleOutsideError, agree, name_particles
+from .errors import DomainDistortionError, MPMError, ParticleOutsideError, agree
 from .location import BackgroundBasis, PointBasis
-from .quadrature import DomainQuadrature, exact_degree, quadrature_element
+from .quadrature import DomainQuadrature, exact_degree, quadrature_element, quadrature_rule
 from .transfer import Weights, active_nodes, domain_weights, sum_by_particle, transfer_matrix
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ class Particles:
             flat = self.global_index[self.quadrature.weights.min(axis=1, initial=1.0) <= 0.0]
             if len(flat):
                 raise DomainDistortionError(
-                    f"The domains of {name_particles(flat)} have no volume; mend the body mesh.",
+                    "The domains of {particles} have no volume; mend the body mesh.",
                     flat,
                 )
         self.locate()
@@ -125,7 +125,7 @@ class Particles:
             ParticleOutsideError: A domain of the last converged step is not wholly inside the
                 background.
         """
-        self._basis  # noqa: B018
+        self._basis
 
     def _locate(self) -> PointBasis:
         positions = self._nodes + self._converged
@@ -136,8 +136,8 @@ class Particles:
                 lost = np.flatnonzero(missing[self._domain_nodes].any(axis=1))
                 where = positions[missing][0]
                 raise ParticleOutsideError(
-                    f"The domains of {name_particles(self.global_index[lost])} are outside the "
-                    f"background mesh, e.g. at {tuple(float(round(c, 6)) for c in where)}; "
+                    "The domains of {particles} are outside the background mesh, e.g. at "
+                    f"{tuple(float(round(c, 6)) for c in where)}; "
                     "make the background larger or the load smaller.",
                     self.global_index[lost],
                 )
@@ -206,7 +206,8 @@ class Particles:
 
     def _nodal(self) -> NDArray[np.float64]:
         """Displacement of the domains' nodes now, shape ``(n, k, gdim)``."""
-        return self.displacement.x.array.reshape(-1, self._gdim)[self._domain_nodes]
+        nodal = self.displacement.x.array.reshape(-1, self._gdim)
+        return np.asarray(nodal[self._domain_nodes])
 
     def displacement_gradient(self) -> NDArray[np.float64]:
         """Return ``grad d`` at the history's points, shape ``(n, nq, gdim, gdim)``."""
@@ -291,7 +292,7 @@ class Particles:
         slopes = self._shape_functions.tabulate(1, points)[1:, :, :, 0]
         now = self._nodes[self._domain_nodes] + self._nodal()
         det = np.linalg.det(np.einsum("jqk,nki->nqij", slopes, now))
-        mean = self.volume / basix.make_quadrature(self.mesh.basix_cell(), 0)[1].sum()
+        mean = self.volume / quadrature_rule(self.mesh.basix_cell(), 0)[1].sum()
         return np.asarray((np.sign(self._orientation) * det).min(axis=1) / np.abs(mean))
 
     @cached_property
@@ -306,7 +307,7 @@ class Particles:
         """Return global indices of domains with ``det F <= 0`` or not finite at a point."""
         gradient = self.displacement_gradient()
         jacobian = np.linalg.det(np.eye(self._gdim) + gradient)
-        return self.global_index[~(jacobian > 0.0).all(axis=1)]
+        return np.asarray(self.global_index[~(jacobian > 0.0).all(axis=1)])
 
     def _commit(self) -> None:
         """Make the present displacement the converged one."""

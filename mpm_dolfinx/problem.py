@@ -26,7 +26,7 @@ from .errors import (
     DomainDistortionError,
     MPMError,
     ParticleOutsideError,
-    name_particles,
+    agreed,
 )
 from .history import History, Step
 from .io import TimeSeries
@@ -85,7 +85,6 @@ class ParticleProblem:
         symmetric: bool = False,
         shift: float = 1e-13,
         line_search: bool = True,
-        _injected: tuple[fem.Function, ...] = (),
     ) -> None:
         if not isinstance(particles, Particles):
             raise MPMError(f"particles must be mpm.Particles, not {type(particles).__name__}.")
@@ -102,7 +101,7 @@ class ParticleProblem:
                 )
         self.history = History()
         self._comm: MPI.Comm = particles.mesh.comm
-        self._forms = BodyForms(R, J, particles, _injected, **options)
+        self._forms = BodyForms(R, J, particles, **options)
         self._background = (
             BackgroundForms(background, particles, **options) if background is not None else None
         )
@@ -115,7 +114,7 @@ class ParticleProblem:
             line_search,
             self.history.statistics,
         )
-        self._prescribed = np.zeros_like(particles.increment.x.array)
+        self._prescribed: NDArray[np.float64] = np.zeros(len(particles.increment.x.array))
         self._loaded = float(particles.load.value)
         self._reactions: NDArray[np.float64] | None = None
         self._space: ReducedSpace | None = None
@@ -203,7 +202,7 @@ class ParticleProblem:
             t = control.target
             load = t if update is not None else start + (1.0 - start) * t
             try:
-                self.particles.load.value = load
+                np.copyto(self.particles.load.value, load)
                 if update is not None:
                     update(t)
                     values = self._dirichlet_values()
@@ -290,7 +289,7 @@ class ParticleProblem:
                 self.particles.locate()
         except ParticleOutsideError as error:
             if self._comm.rank == 0:
-                warnings.warn(f"The run is complete, but {str(error)}", stacklevel=3)
+                warnings.warn(f"The run is complete, but {error!s}", stacklevel=3)
 
     # -- One step -------------------------------------------------------------------------
 
@@ -343,7 +342,7 @@ class ParticleProblem:
 
     def _dirichlet_values(self) -> NDArray[np.float64]:
         """Return the present totals of all Dirichlet conditions, on the local dofs of V."""
-        values = np.zeros_like(self._prescribed)
+        values: NDArray[np.float64] = np.zeros_like(self._prescribed)
         for bc in self.bcs:
             bc.set(values, None, 1.0)
         return values
@@ -351,7 +350,7 @@ class ParticleProblem:
     def _restore(self, update: Callable[[float], None] | None = None) -> None:
         """Return to the last converged step."""
         self.particles._roll_back()
-        self.particles.load.value = self._loaded
+        np.copyto(self.particles.load.value, self._loaded)
         self.roll_back()
         if update is not None and self.history.steps:
             update(self.history.steps[-1].load)
@@ -363,11 +362,11 @@ class ParticleProblem:
             DomainDistortionError: "; take more steps, smaller loads or finer domains",
             ConvergenceError: "; take more steps, or look whether a limit load is reached",
         }[type(error)]
-        particles, text = error.particles, str(error).rstrip(".")
+        particles, text = error.particles, error.message.rstrip(".")
         if isinstance(error, ConvergenceError) and not particles:
             particles = self._worst_particles()
             if particles:
-                text += f"; the residual is largest at {name_particles(particles)}"
+                text += "; the residual is largest at {particles}"
         return type(error)(
             f"{text}, in the step after load {self._loaded:.6g}{advice}.",
             particles,
@@ -423,7 +422,7 @@ class ParticleProblem:
         d.array[:rows] = particles._converged.ravel()[:rows] + self._work_W.array_r
         d.scatter_forward()
         with statistics.phase("constitutive"):
-            failure = self._agree(self._inverted() or self.evaluate())
+            failure = agreed(self._comm, self._inverted() or self.evaluate())
         if failure is not None:
             return failure
         with statistics.phase("assemble"):
@@ -437,19 +436,7 @@ class ParticleProblem:
         inverted = self.particles.inverted()
         if len(inverted) == 0:
             return None
-        return DomainDistortionError(
-            f"The domains of {name_particles(inverted)} turn inside out", inverted
-        )
-
-    def _agree(self, failure: MPMError | None) -> MPMError | None:
-        """Return the failure of the lowest rank that has one, on all ranks."""
-        if self._comm.size == 1:
-            return failure
-        if not self._comm.allreduce(failure is not None, MPI.LOR):
-            return None
-        found = [f for f in self._comm.allgather(failure and _plain(failure)) if f is not None]
-        kind, message, _ = found[0]
-        return kind(message, {p for k, _, ps in found if k is kind for p in ps})
+        return DomainDistortionError("The domains of {particles} turn inside out", inverted)
 
     def _to_background(self, vector: PETSc.Vec) -> PETSc.Vec:
         """Return ``T^T`` times a vector of W, in the problem's work vector of V."""

@@ -21,7 +21,14 @@ from ufl.corealg.traversal import traverse_unique_terminals
 from . import _compat
 from .errors import MPMError
 
-__all__ = ["DomainQuadrature", "depends_on", "exact_degree", "quadrature_element", "split_by_rule"]
+__all__ = [
+    "DomainQuadrature",
+    "depends_on",
+    "exact_degree",
+    "follows",
+    "quadrature_element",
+    "split_by_rule",
+]
 
 
 def exact_degree(cell: str, degree: int) -> int:
@@ -35,6 +42,14 @@ def exact_degree(cell: str, degree: int) -> int:
         Twice the degree, plus that of the Jacobian determinant where the map is not affine.
     """
     return 2 * degree + {"quadrilateral": 1, "hexahedron": 2}.get(cell, 0)
+
+
+def quadrature_rule(
+    cell: basix.CellType, degree: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return points ``(nq, tdim)`` and weights ``(nq,)`` of the default rule."""
+    points, weights = basix.make_quadrature(cell, degree)
+    return np.asarray(points), np.asarray(weights)
 
 
 def quadrature_element(cell: str, degree: int, shape: tuple[int, ...] = ()) -> Any:
@@ -54,7 +69,7 @@ class DomainQuadrature:
     def __init__(self, body: mesh.Mesh, shape_functions: Any, degree: int) -> None:
         cell = body.basix_cell()
         gdim = body.geometry.dim
-        points, weights = basix.make_quadrature(cell, degree)
+        points, weights = quadrature_rule(cell, degree)
         count = body.topology.index_map(body.topology.dim).size_local
         nodes = body.geometry.x[_compat.geometry_dofmap(body)[:count], :gdim]
         coordinate_map = basix.ufl.element(
@@ -86,6 +101,16 @@ def depends_on(form: ufl.Form, function: fem.Function) -> bool:
     return any(c is function for c in form.coefficients())
 
 
+def follows(form: ufl.Form, displacement: fem.Function) -> bool:
+    """Return whether a form changes during a step.
+
+    It does where it has the displacement, or data injected at quadrature points.
+    """
+    return depends_on(form, displacement) or any(
+        c.ufl_element().has_custom_quadrature for c in form.coefficients()
+    )
+
+
 def _rule(integral: Any) -> tuple[int, str]:
     """Return the degree and scheme that one integral is meant to be integrated with."""
     metadata = integral.metadata()
@@ -100,7 +125,8 @@ def _rule(integral: Any) -> tuple[int, str]:
         points = element.custom_quadrature()[0]
         if degree == -1:
             degree = element.degree
-        rule = basix.make_quadrature(terminal.function_space.mesh.basix_cell(), degree)[0]
+        cell = terminal.function_space.mesh.basix_cell()
+        rule, _ = quadrature_rule(cell, degree)
         if points.shape != rule.shape or not np.allclose(points, rule):
             raise MPMError(
                 f"The form integrates '{terminal.name}', known at {len(points)} quadrature "
@@ -118,15 +144,14 @@ def split_by_rule(form: ufl.Form, displacement: fem.Function) -> list[ufl.Form]:
     """Split a form so that each part has one quadrature rule and one kind of dependence.
 
     FFCx (0.9 to 0.11) miscompiles a form that mixes a one-point rule with another rule, so
-    each rule gets a form of its own; parts without the displacement are apart too, since they
-    are constant during a step.
+    each rule gets a form of its own; parts that are constant during a step are apart too.
 
     Args:
         form: Any UFL form on the body mesh.
         displacement: The displacement of the body.
 
     Returns:
-        The parts, whose sum is ``form``, those with the displacement first.
+        The parts, whose sum is ``form``.
 
     Raises:
         MPMError: Where data at quadrature points meet another rule.
@@ -137,6 +162,6 @@ def split_by_rule(form: ufl.Form, displacement: fem.Function) -> list[ufl.Form]:
         metadata = dict(integral.metadata())
         metadata.update(quadrature_degree=degree, quadrature_rule=scheme)
         one = integral.reconstruct(metadata=metadata)
-        dead = not depends_on(ufl.Form([one]), displacement)
-        parts[dead, integral.integral_type(), degree, scheme].append(one)
+        constant = not follows(ufl.Form([one]), displacement)
+        parts[constant, integral.integral_type(), degree, scheme].append(one)
     return [ufl.Form(parts[key]) for key in sorted(parts)]

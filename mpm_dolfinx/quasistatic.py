@@ -100,7 +100,6 @@ class QuasiStaticProblem(ParticleProblem):
             symmetric=history.symmetric,
             shift=shift,
             line_search=line_search,
-            _injected=(self._first_piola,),
             **options,
         )
         particles._constitutive = history

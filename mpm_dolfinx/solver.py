@@ -95,7 +95,7 @@ class NewtonSolver:
         self.K: PETSc.Mat | None = None
         self.x: PETSc.Vec | None = None
         self.F: PETSc.Vec | None = None
-        self._P: PETSc.Mat | None = None
+        self._P: Any = None
         self._failure: MPMError | None = None
         self._known = self._fresh = False
         self.snes = PETSc.SNES().create(comm)
@@ -292,4 +292,4 @@ class NewtonSolver:
 
 def _reason(code: int) -> str:
     names = {v: k for k, v in vars(PETSc.SNES.ConvergedReason).items() if isinstance(v, int)}
-    return names.get(code, str(code)).lower().replace("_", " ")
+    return str(names.get(code, code)).lower().replace("_", " ")

@@ -22,10 +22,10 @@ class StepControl:
     """
 
     def __init__(self, steps: int) -> None:
-        self._largest = 2**MOST_HALVINGS
-        self._end = steps * self._largest
-        self._now = 0
-        self._size = self._largest
+        self._largest: int = 2**MOST_HALVINGS
+        self._end: int = steps * self._largest
+        self._now: int = 0
+        self._size: int = self._largest
 
     @property
     def finished(self) -> bool:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -16,6 +15,7 @@ import basix
 from dolfinx import fem
 
 from .location import PointBasis
+from .quadrature import quadrature_rule
 
 __all__ = ["Weights", "active_nodes", "domain_weights", "sum_by_particle", "transfer_matrix"]
 
@@ -107,7 +107,7 @@ def domain_weights(
         Volumes ``(n,)``; the averages ``1/V int Q dx``, shape ``(n, k)``; and
         ``1/V int grad Q dx``, shape ``(n, k, gdim)``.
     """
-    points, weights = basix.make_quadrature(cell, degree)
+    points, weights = quadrature_rule(cell, degree)
     table = shape_functions.tabulate(1, points)[:, :, :, 0]
     jacobian = np.einsum("jqk,nki->nqij", table[1:], corners)
     measure = weights * np.linalg.det(jacobian)
