@@ -235,8 +235,9 @@ class NewtonSolver:
 
     def _set_tangent(self, K: PETSc.Mat) -> None:
         """Factorise K with the shift."""
+        new = self.K is not K
         if self._shift > 0.0:
-            if self.K is not K:
+            if new:
                 self._P = K.copy()
             else:
                 K.copy(self._P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
@@ -249,7 +250,7 @@ class NewtonSolver:
             self._P.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
         else:
             self._P = K
-        if self.K is not K:
+        if new:
             self.K = K
             self.snes.setJacobian(self._jacobian, K, self._P)
             if self._symmetric:
