@@ -12,25 +12,39 @@ from dataclasses import dataclass, field
 __all__ = ["History", "Statistics", "Step"]
 
 PHASES = ("locate", "transfer", "constitutive", "assemble", "factorise", "solve", "commit")
+COUNTERS = (
+    "transfers",
+    "free_dofs",
+    "residuals",
+    "factorisations",
+    "halvings",
+    "converged_at_round_off",
+)
 
 
 class Statistics(dict[str, float]):
-    """Counters of a run, and its seconds per phase in ``seconds``.
+    """Counters of a run, and this rank's seconds in each phase.
 
-    Attributes:
-        seconds: Seconds of this rank in each phase: locate, transfer, constitutive, assemble,
-            factorise, solve, commit. Phases do not overlap.
+    The phases, which do not overlap, are ``locate``, ``transfer``, ``constitutive``,
+    ``assemble``, ``factorise``, ``solve`` and ``commit``. Counters are ``transfers`` (how often
+    the transfer was rebuilt), ``free_dofs`` (unknowns of the last step), ``residuals`` and
+    ``factorisations``, ``halvings`` (of Newton steps by the line search) and
+    ``converged_at_round_off`` (steps that ended at the floor of round-off).
     """
 
     def __init__(self) -> None:
-        super().__init__()
-        self.seconds: dict[str, float] = dict.fromkeys(PHASES, 0.0)
+        super().__init__(dict.fromkeys((*PHASES, *COUNTERS), 0))
         self._running: list[str] = []
         self._since = 0.0
 
-    def count(self, name: str, by: float = 1) -> None:
-        """Add to a counter."""
-        self[name] = self.get(name, 0) + by
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Seconds of each phase."""
+        return {name: self[name] for name in PHASES}
+
+    def count(self, name: str) -> None:
+        """Add one to a counter."""
+        self[name] += 1
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
@@ -46,7 +60,7 @@ class Statistics(dict[str, float]):
     def _switch(self) -> None:
         now = time.perf_counter()
         if self._running:
-            self.seconds[self._running[-1]] += now - self._since
+            self[self._running[-1]] += now - self._since
         self._since = now
 
 

@@ -283,17 +283,32 @@ class Particles:
             )
         return self._constitutive
 
+    def crossed(self) -> NDArray[np.int64]:
+        """Return global indices of quadrilaterals whose edges cross.
+
+        A quadrilateral with one corner turned inwards is concave, with two it crosses itself
+        and part of it is inverted. Other domains cannot cross without ``det F <= 0``.
+        """
+        if self.mesh.basix_cell() != basix.CellType.quadrilateral:
+            return self.global_index[:0]
+        inwards = (self._corner_jacobians() <= 0.0).sum(axis=1)
+        return np.asarray(self.global_index[inwards >= 2])
+
+    def _corner_jacobians(self) -> NDArray[np.float64]:
+        """Return det J at the corners of the present domains, positive as in the undeformed."""
+        points = basix.geometry(self.mesh.basix_cell())
+        slopes = self._shape_functions.tabulate(1, points)[1:, :, :, 0]
+        now = self._nodes[self._domain_nodes] + self._nodal()
+        det = np.linalg.det(np.einsum("jqk,nki->nqij", slopes, now))
+        return np.asarray(np.sign(self._orientation) * det)
+
     def domain_distortion(self) -> NDArray[np.float64]:
         """Return the smallest det J at a node of each domain over its mean, shape ``(n,)``.
 
         One for an undistorted domain, zero or less where a quadrilateral is concave.
         """
-        points = basix.geometry(self.mesh.basix_cell())
-        slopes = self._shape_functions.tabulate(1, points)[1:, :, :, 0]
-        now = self._nodes[self._domain_nodes] + self._nodal()
-        det = np.linalg.det(np.einsum("jqk,nki->nqij", slopes, now))
         mean = self.volume / quadrature_rule(self.mesh.basix_cell(), 0)[1].sum()
-        return np.asarray((np.sign(self._orientation) * det).min(axis=1) / np.abs(mean))
+        return np.asarray(self._corner_jacobians().min(axis=1) / np.abs(mean))
 
     @cached_property
     def _orientation(self) -> NDArray[np.float64]:

@@ -308,6 +308,9 @@ class ParticleProblem:
         assert self._space is not None
         self._external = float(self._to_background(self._forms.external).norm())
         self._newton.solve(self, self._space.sizes)
+        crossed = self.particles.crossed()
+        if (failure := agreed(self._comm, _distorted("cross themselves", crossed))) is not None:
+            raise failure
         with statistics.phase("commit"):
             self.particles._commit()
             self.commit()
@@ -422,7 +425,10 @@ class ParticleProblem:
         d.array[:rows] = particles._converged.ravel()[:rows] + self._work_W.array_r
         d.scatter_forward()
         with statistics.phase("constitutive"):
-            failure = agreed(self._comm, self._inverted() or self.evaluate())
+            failure = agreed(
+                self._comm,
+                _distorted("turn inside out", particles.inverted()) or self.evaluate(),
+            )
         if failure is not None:
             return failure
         with statistics.phase("assemble"):
@@ -431,12 +437,6 @@ class ParticleProblem:
                 total.axpy(1.0, self._background.assemble_residual())
         F.array_w[:] = self._space.restrict(total)
         return None
-
-    def _inverted(self) -> MPMError | None:
-        inverted = self.particles.inverted()
-        if len(inverted) == 0:
-            return None
-        return DomainDistortionError("The domains of {particles} turn inside out", inverted)
 
     def _to_background(self, vector: PETSc.Vec) -> PETSc.Vec:
         """Return ``T^T`` times a vector of W, in the problem's work vector of V."""
@@ -496,3 +496,9 @@ class ParticleProblem:
 
     def _size(self, values: NDArray[np.float64]) -> float:
         return float(np.sqrt(self._comm.allreduce(values @ values)))
+
+
+def _distorted(how: str, which: NDArray[np.int64]) -> DomainDistortionError | None:
+    return (
+        DomainDistortionError(f"The domains of {{particles}} {how}", which) if len(which) else None
+    )
