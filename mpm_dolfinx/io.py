@@ -21,6 +21,9 @@ __all__ = ["TimeSeries"]
 class TimeSeries:
     """A ``.pvd`` file that grows by one state at each call.
 
+    The cells are the particles' own domains at their current positions: the displaced body mesh
+    for cpdi2, domains of their own for the other methods.
+
     Args:
         path: Name of the file.
         particles: The body.
@@ -32,43 +35,52 @@ class TimeSeries:
     def __init__(self, path: Path, particles: Particles) -> None:
         if path.suffix != ".pvd":
             raise MPMError(f"A time series is written to a '.pvd' file, not to '{path}'.")
-        if particles.mesh.comm.rank == 0:
+        comm = particles.mesh.comm
+        if comm.rank == 0:
             path.parent.mkdir(parents=True, exist_ok=True)
-        particles.mesh.comm.barrier()
+        comm.barrier()
         self._particles = particles
-        self._file = io.VTKFile(particles.mesh.comm, str(path), "w")
+        self._undeformed = particles.initial_domains
+        self._mesh = particles.mesh
+        if particles.method != "cpdi2":
+            cell = particles.mesh.basix_cell()
+            self._mesh = _compat.disconnected_mesh(comm, self._undeformed, cell)
+        gdim = self._mesh.geometry.dim
+        nodal = fem.functionspace(self._mesh, ("Lagrange", 1, (gdim,)))
+        self._displacement = fem.Function(nodal, name="displacement")
         self._fields: dict[str, fem.Function] = {}
+        self._file = io.VTKFile(comm, str(path), "w")
 
     def write(self, time: float) -> None:
-        """Add the present state (collective)."""
+        """Add the last converged state (collective)."""
         particles = self._particles
-        body = particles.mesh
-        jacobian = particles.volume / particles.initial_volume
-        values = {"volume_ratio": jacobian}
+        values = {"volume_ratio": particles.volume / particles.initial_volume}
         if particles.has_material:
             stress = particles.stress
             values["stress"] = stress
             values["pressure"] = -np.trace(stress, axis1=1, axis2=2) / 3.0
             values["plastic_strain"] = particles.plastic_strain
         fields = [self._field(name, value) for name, value in values.items()]
-        reference = body.geometry.x.copy()
+        n, gdim = particles.num_local, self._mesh.geometry.dim
+        domains = particles.domains
+        moved = self._displacement.x.array.reshape(-1, gdim)
+        moved[self._displacement.function_space.dofmap.list[:n]] = domains - self._undeformed
+        self._displacement.x.scatter_forward()
+        x = self._mesh.geometry.x
+        original = x.copy()
         try:
-            nodes = _compat.geometry_dofmap(body).ravel()
-            d = particles.displacement.x.array.reshape(-1, body.geometry.dim)
-            body.geometry.x[nodes, : body.geometry.dim] = (
-                reference[nodes, : body.geometry.dim] + d[particles.W.dofmap.list.ravel()]
-            )
-            self._file.write_function([particles.displacement, *fields], time)
+            x[_compat.geometry_dofmap(self._mesh)[:n], :gdim] = domains
+            self._file.write_function([self._displacement, *fields], time)
+            self._file.close()  # writes the index so far; the series goes on
         finally:
-            body.geometry.x[:] = reference
+            x[:] = original
 
     def _field(self, name: str, values: NDArray[np.float64]) -> fem.Function:
         if name not in self._fields:
-            space = fem.functionspace(
-                self._particles.mesh, ("Discontinuous Lagrange", 0, values.shape[1:])
-            )
+            space = fem.functionspace(self._mesh, ("Discontinuous Lagrange", 0, values.shape[1:]))
             self._fields[name] = fem.Function(space, name=name)
         field = self._fields[name]
-        field.x.array[: values.size] = values.ravel()
+        cells = field.function_space.dofmap.list[: len(values), 0]
+        field.x.array.reshape(-1, *values.shape[1:])[cells] = values
         field.x.scatter_forward()
         return field

@@ -19,6 +19,8 @@ __all__ = ["BackgroundBasis", "PointBasis"]
 
 #: Reference distance within which a point outside a cell counts as on its boundary.
 TOLERANCE = 1e-10
+#: Reference distance within which a point is on a facet; the cell first in the input takes it.
+FACET = 1e-12
 #: Basis values below this are no weight.
 DROP = 1e-13
 
@@ -30,11 +32,13 @@ class PointBasis(NamedTuple):
         nodes: Global node (block) numbers of V, shape ``(n, k)``.
         values: Their values at the points, zero where below 1e-13, shape ``(n, k)``.
         found: Whether a background cell holds the point, shape ``(n,)``.
+        gradients: Their gradients, shape ``(n, k, gdim)``, where asked for.
     """
 
     nodes: NDArray[np.int64]
     values: NDArray[np.float64]
     found: NDArray[np.bool_]
+    gradients: NDArray[np.float64] | None = None
 
 
 class _Cells:
@@ -55,6 +59,7 @@ class _Cells:
         self.middle = basix.geometry(name).mean(axis=0)
         self.affine = self._is_affine()
         size = np.ptp(self.vertices.reshape(-1, self.gdim), axis=0).max() if count else 1.0
+        self.index = np.asarray(background.topology.original_cell_index[:count], np.int64)
         cells = np.arange(count, dtype=np.int32)
         self.tree = _compat.cell_tree(background, cells, 1e2 * TOLERANCE * size) if count else None
 
@@ -71,15 +76,16 @@ class _Cells:
         if len(self.vertices) == 0 or (self.simplex and self.map.degree == 1):
             return True
         corners = np.vstack([self.middle, self.middle + 0.37 / (1 + np.arange(self.gdim))])
-        jacobians = self._jacobians(
+        jacobians = self.jacobians(
             np.arange(len(self.vertices)).repeat(2), np.tile(corners, (len(self.vertices), 1))
         ).reshape(-1, 2, self.gdim, self.gdim)
         change = np.abs(jacobians[:, 0] - jacobians[:, 1]).max(axis=(1, 2))
         return bool(np.all(change <= 1e-12 * np.abs(jacobians).max(axis=(1, 2, 3))))
 
-    def _jacobians(
+    def jacobians(
         self, cells: NDArray[np.int64], reference: NDArray[np.float64]
     ) -> NDArray[np.float64]:
+        """Return ``dx/dX`` of cells at reference points, shape ``(n, gdim, gdim)``."""
         table = self.map.tabulate(1, reference)[1:, :, :, 0]
         return np.asarray(np.einsum("jpk,pki->pij", table, self.vertices[cells]))
 
@@ -121,7 +127,8 @@ class _Cells:
         """Return how far reference coordinates lie outside the cell (0 inside, inf for NaN)."""
         low = -reference.min(axis=1, initial=0.0)
         high = reference.sum(axis=1) - 1 if self.simplex else reference.max(axis=1) - 1
-        return np.where(np.isnan(low + high), np.inf, np.maximum(0.0, np.maximum(low, high)))
+        worst = np.maximum(low, high)
+        return np.where(np.isnan(worst), np.inf, np.where(worst <= FACET, 0.0, worst))
 
     def clip(self, reference: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return reference coordinates moved onto the cell."""
@@ -148,7 +155,7 @@ class _Cells:
         owner = np.repeat(np.arange(n), np.diff(offsets))
         coordinates = self.pull_back(candidates.astype(np.int64), points[owner])
         outside = self.violation(coordinates)
-        order = np.lexsort((candidates, np.where(outside <= 1e-14, 0.0, outside), owner))
+        order = np.lexsort((self.index[candidates], outside, owner))
         has = np.flatnonzero(np.diff(offsets))
         best = order[offsets[has]]
         cell[has], reference[has], violation[has] = (
@@ -189,49 +196,87 @@ class BackgroundBasis:
         self._map = V.dofmap.index_map
         self._boxes = np.asarray(self._comm.allgather(self._cells.box))
 
-    def at(self, points: NDArray[np.float64]) -> PointBasis:
+    def at(self, points: NDArray[np.float64], gradients: bool = False) -> PointBasis:
         """Evaluate the basis at points (collective).
 
-        A point on a facet belongs to one of its cells; as the basis is continuous, which one
-        does not matter. A point at most 1e-10 of a cell outside the mesh counts as on it.
+        A point on a facet belongs to that of its cells that comes first in the mesh's input,
+        on any number of ranks. A point at most 1e-10 of a cell outside the mesh counts as on it.
 
         Args:
             points: This rank's points, shape ``(n, gdim)``; they may lie in cells of any rank.
+            gradients: Whether to evaluate gradients too.
 
         Returns:
             Nodes, values and whether a cell was found.
         """
         if self._comm.size == 1:
-            nodes, values, violation = self._evaluate(points)
-            return PointBasis(nodes, values, violation <= TOLERANCE)
+            answer = self._evaluate(points, gradients)
+            return PointBasis(answer.nodes, answer.values, answer.found, answer.gradients)
         inside = np.all(
             (points[None] >= self._boxes[:, None, 0]) & (points[None] <= self._boxes[:, None, 1]),
             axis=2,
         )
         asked = [np.flatnonzero(row) for row in inside]
         questions = self._comm.alltoall([points[index] for index in asked])
-        counts = np.cumsum([len(q) for q in questions])[:-1]
-        answers = [np.split(a, counts) for a in self._evaluate(np.concatenate(questions))]
-        replies = self._comm.alltoall(list(zip(*answers, strict=True)))
+        ends = np.cumsum([len(q) for q in questions])
+        answer = self._evaluate(np.concatenate(questions), gradients)
+        replies = self._comm.alltoall(
+            [answer.part(slice(end - len(q), end)) for q, end in zip(questions, ends, strict=True)]
+        )
         n, k = len(points), self._dofs.shape[1]
-        nodes = np.zeros((n, k), dtype=np.int64)
-        values = np.zeros((n, k))
-        best = np.full(n, np.inf)
-        for index, (their_nodes, their_values, violation) in zip(asked, replies, strict=True):
-            better = violation < best[index]
-            take = index[better]
-            nodes[take], values[take] = their_nodes[better], their_values[better]
-            best[take] = violation[better]
-        return PointBasis(nodes, values, best <= TOLERANCE)
+        result = _Answer(
+            np.zeros((n, k), dtype=np.int64),
+            np.zeros((n, k)),
+            np.zeros((n, k, points.shape[1])) if gradients else None,
+            np.full(n, np.inf),
+            np.zeros(n, dtype=np.int64),
+        )
+        for index, reply in zip(asked, replies, strict=True):
+            better = (reply.violation < result.violation[index]) | (
+                (reply.violation == result.violation[index]) & (reply.cell < result.cell[index])
+            )
+            result.take(index[better], reply.part(better))
+        return PointBasis(result.nodes, result.values, result.found, result.gradients)
 
-    def _evaluate(
-        self, points: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    def _evaluate(self, points: NDArray[np.float64], gradients: bool) -> _Answer:
         cell, reference, violation = self._cells.locate(points)
-        k = self._dofs.shape[1]
-        if len(points) == 0 or self._cells.tree is None:
-            return np.zeros((len(points), k), np.int64), np.zeros((len(points), k)), violation
-        values = self._basis.tabulate(0, self._cells.clip(reference))[0, :, :, 0]
-        values = np.where((np.abs(values) < DROP) | (violation > TOLERANCE)[:, None], 0.0, values)
+        n, k = len(points), self._dofs.shape[1]
+        if n == 0 or self._cells.tree is None:
+            slopes = np.zeros((n, k, points.shape[1])) if gradients else None
+            nodes = np.zeros((n, k), np.int64)
+            return _Answer(nodes, np.zeros((n, k)), slopes, violation, cell)
+        reference = self._cells.clip(reference)
+        table = self._basis.tabulate(int(gradients), reference)[:, :, :, 0]
+        found = (violation <= TOLERANCE)[:, None]
+        values = np.where((np.abs(table[0]) >= DROP) & found, table[0], 0.0)
+        slopes = None
+        if gradients:
+            jacobian = self._cells.jacobians(cell, reference)
+            slopes = np.einsum("jpk,pji->pki", table[1:], np.linalg.inv(jacobian))
+            slopes = np.where(found[:, :, None], slopes, 0.0)
         nodes = self._map.local_to_global(self._dofs[cell].ravel()).reshape(-1, k)
-        return nodes, values, np.where(violation <= 1e-14, 0.0, violation)
+        return _Answer(nodes, values, slopes, violation, self._cells.index[cell])
+
+
+class _Answer(NamedTuple):
+    """Basis functions at points, how far outside the best cell they are, and its input index."""
+
+    nodes: NDArray[np.int64]
+    values: NDArray[np.float64]
+    gradients: NDArray[np.float64] | None
+    violation: NDArray[np.float64]
+    cell: NDArray[np.int64]
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        return np.asarray(self.violation <= TOLERANCE)
+
+    def part(self, which: slice | NDArray[np.bool_]) -> _Answer:
+        """Return the answer for some of the points."""
+        return _Answer._make(None if a is None else a[which] for a in self)
+
+    def take(self, index: NDArray[np.int64], other: _Answer) -> None:
+        """Put another answer in the place of some points' own."""
+        for mine, theirs in zip(self, other, strict=True):
+            if mine is not None and theirs is not None:
+                mine[index] = theirs

@@ -16,8 +16,10 @@ import basix
 import ufl
 from dolfinx import fem, mesh
 
+from . import _compat
 from .errors import DomainDistortionError, MPMError, ParticleOutsideError, agree
-from .location import BackgroundBasis, PointBasis
+from .location import BackgroundBasis
+from .methods import METHODS, BoxGrid, DomainState, Rows, cpdi, cpdi2, gimp, mpm
 from .quadrature import DomainQuadrature, exact_degree, quadrature_element, quadrature_rule
 from .transfer import Weights, active_nodes, domain_weights, sum_by_particle, transfer_matrix
 
@@ -26,27 +28,35 @@ if TYPE_CHECKING:
 
 __all__ = ["Particles"]
 
-METHODS = ("cpdi2",)
 DEGREES = {(1, 1)}
+BOX_CELLS = (basix.CellType.quadrilateral, basix.CellType.hexahedron)
 
 
 class Particles:
     """A body as particles with finite domains, moved by a background space.
 
-    Each cell of ``body`` is the domain of one particle (second-order convected particle domain
-    interpolation: Sadeghirad, Brannon & Guilkey 2013). The body mesh is the undeformed body and
-    never moves; where the particles are is ``displacement``. A step's increment u in V moves
-    the nodes of the domains by ``T u``.
+    Each cell of ``body`` is the domain of one particle. The body mesh is the undeformed body
+    and never moves; where the particles are is ``displacement``. A step's increment u in V
+    moves the nodes of the domains by ``T u``. The methods differ in T alone:
+
+    - ``"cpdi2"``: corners ride on the background (Sadeghirad, Brannon & Guilkey 2013);
+    - ``"cpdi"``: parallelograms that the particle's F deforms (Sadeghirad, Brannon &
+      Burghardt 2011);
+    - ``"gimp"``: axis-aligned boxes (Bardenhagen & Kober 2004), on structured backgrounds of
+      rectangles or boxes;
+    - ``"mpm"``: points (Sulsky, Chen & Schreyer 1994).
 
     Args:
         body: Undeformed body: triangles or quadrilaterals in the plane, tetrahedra or
             hexahedra in space. Its cells are the particles.
         V: Vector Lagrange space on the background mesh, on the same ranks.
-        method: ``"cpdi2"``.
+        method: ``"cpdi2"``, ``"cpdi"``, ``"gimp"`` or ``"mpm"``.
         degree: Degree of the domains' shape functions.
         quadrature_degree: Degree of the rule that carries the history; ``None`` is one point
             per domain for degree 1.
         outside: What happens when a domain leaves the background; ``"error"``.
+        domain_update: For ``"gimp"``: ``"stretch"`` (half-lengths follow the diagonal of the
+            right stretch) or ``"fixed"`` (the box only translates).
 
     Attributes:
         mesh: The body mesh, undeformed.
@@ -76,14 +86,18 @@ class Particles:
         degree: int = 1,
         quadrature_degree: int | None = None,
         outside: str = "error",
+        domain_update: str = "stretch",
     ) -> None:
         _validate(body, V, method, degree, quadrature_degree, outside)
+        if domain_update not in ("stretch", "fixed"):
+            raise MPMError(f"Unknown domain_update={domain_update!r}; choose 'stretch' or 'fixed'.")
         self.mesh = body
         self.V = V
         self.method = method
         self._gdim = body.geometry.dim
         cell = body.basix_cell()
-        self.W = fem.functionspace(body, ("Lagrange", degree, (self._gdim,)))
+        family = "Lagrange" if method == "cpdi2" else "Discontinuous Lagrange"
+        self.W = fem.functionspace(body, (family, degree, (self._gdim,)))
         self.displacement = fem.Function(self.W, name="displacement")
         self.increment = fem.Function(V, name="increment")
         self.load = fem.Constant(body, 0.0)
@@ -103,6 +117,8 @@ class Particles:
         self._domain_nodes = self.W.dofmap.list[: self.num_local]
         self._nodes = self.W.tabulate_dof_coordinates()[:, : self._gdim].copy()
         self._background = BackgroundBasis(V)
+        self._domain_update = domain_update
+        self._grid = self._box_grid() if method == "gimp" else None
         self._converged = np.zeros_like(self._nodes)
         self._constitutive: ConstitutiveHistory | None = None
         with agree(body.comm):
@@ -113,6 +129,63 @@ class Particles:
                     flat,
                 )
         self.locate()
+
+    @classmethod
+    def from_points(
+        cls,
+        points: NDArray[np.float64],
+        lengths: NDArray[np.float64] | float,
+        V: fem.FunctionSpace,
+        method: str = "gimp",
+        **options: Any,
+    ) -> Particles:
+        """Make particles of a cloud of axis-aligned boxes, without a mesh.
+
+        Args:
+            points: Centres of this rank's boxes, shape ``(n, gdim)``; each box is given by
+                one rank.
+            lengths: Side lengths, a number or shape ``(n, gdim)``.
+            V: As for :class:`Particles`.
+            method: As for :class:`Particles`. With ``"cpdi2"`` neighbours are not connected.
+            **options: As for :class:`Particles`.
+
+        Raises:
+            MPMError: Shapes that do not fit, or lengths that are not positive.
+        """
+        gdim = V.mesh.geometry.dim
+        comm = V.mesh.comm
+        with agree(comm):
+            centres = np.asarray(points, dtype=np.float64)
+            if centres.ndim != 2 or centres.shape[1] != gdim or not np.isfinite(centres).all():
+                raise MPMError(f"points must be finite and of shape (n, {gdim}).")
+            try:
+                sides = np.broadcast_to(np.asarray(lengths, np.float64), centres.shape)
+            except ValueError:
+                raise MPMError(
+                    f"lengths must be a number or of shape {centres.shape}, not "
+                    f"{np.shape(lengths)}."
+                ) from None
+            if not (np.isfinite(sides).all() and (sides > 0.0).all()):
+                raise MPMError("lengths must be positive and finite.")
+        cell = BOX_CELLS[gdim - 2]
+        unit = basix.geometry(cell) - 0.5
+        corners = centres[:, None] + unit * sides[:, None]
+        return cls(_compat.disconnected_mesh(comm, corners, cell), V, method=method, **options)
+
+    def _box_grid(self) -> BoxGrid:
+        """Return the grid lines, if body and background are made of boxes."""
+        corners = self._nodes[self._domain_nodes]
+        low, high = corners.min(axis=1, keepdims=True), corners.max(axis=1, keepdims=True)
+        off = np.minimum(corners - low, high - corners).max(axis=(1, 2), initial=0.0)
+        with agree(self.mesh.comm):
+            skew = self.global_index[off > 1e-9 * (high - low).max(axis=(1, 2), initial=0.0)]
+            if len(skew) or self.mesh.basix_cell() not in BOX_CELLS:
+                raise MPMError(
+                    "Method 'gimp' needs particle domains that are axis-aligned rectangles or "
+                    "boxes; use 'cpdi2' or 'cpdi' for this body.",
+                    skew,
+                )
+        return BoxGrid(self.V.mesh)
 
     def _measure(self, degree: int) -> ufl.Measure:
         metadata = {"quadrature_degree": degree, "quadrature_rule": "default"}
@@ -125,37 +198,50 @@ class Particles:
             ParticleOutsideError: A domain of the last converged step is not wholly inside the
                 background.
         """
-        self._basis
+        self._rows
 
-    def _locate(self) -> PointBasis:
-        positions = self._nodes + self._converged
-        basis = self._background.at(positions)
+    def _locate(self) -> Rows:
+        state = DomainState(
+            self._nodes,
+            self._converged,
+            self._domain_nodes,
+            self.initial_centroid,
+            self._mean((self._nodes + self._converged)[self._domain_nodes]),
+            np.eye(self._gdim) + self._average(self._converged_gradient()),
+        )
+        if self.method == "gimp":
+            assert self._grid is not None
+            rows = gimp(state, self._background, self._grid, self._domain_update == "stretch")
+        else:
+            rows = {"cpdi2": cpdi2, "cpdi": cpdi, "mpm": mpm}[self.method](state, self._background)
         with agree(self.mesh.comm):
-            missing = ~basis.found
-            if missing.any():
-                lost = np.flatnonzero(missing[self._domain_nodes].any(axis=1))
-                where = positions[missing][0]
+            lost = np.flatnonzero((~rows.basis.found)[self._domain_nodes].any(axis=1))
+            if len(lost):
+                where = state.centroid[lost[0]]
                 raise ParticleOutsideError(
-                    "The domains of {particles} are outside the background mesh, e.g. at "
+                    "The domains of {particles} are outside the background mesh, e.g. near "
                     f"{tuple(float(round(c, 6)) for c in where)}; "
-                    "make the background larger or the load smaller.",
+                    "make the background larger or the load smaller",
                     self.global_index[lost],
                 )
-        return basis
+        return rows
+
+    def _converged_gradient(self) -> NDArray[np.float64]:
+        return self.quadrature.displacement_gradient(self._converged[self._domain_nodes])
 
     @cached_property
-    def _basis(self) -> PointBasis:
-        """Background basis at the local nodes of W, at the last converged positions."""
+    def _rows(self) -> Rows:
+        """The rows of T at the last converged positions."""
         return self._locate()
 
     @cached_property
     def T(self) -> PETSc.Mat:
         """The transfer: all dofs of W by all dofs of V, at the last converged positions."""
-        return transfer_matrix(self._basis, self.W, self.V)
+        return transfer_matrix(self._rows.basis, self.W, self.V)
 
     @cached_property
     def _active_nodes(self) -> NDArray[np.int32]:
-        return active_nodes(self._basis, self.W, self.V)
+        return active_nodes(self._rows.basis, self.W, self.V)
 
     @property
     def active_dofs(self) -> NDArray[np.int64]:
@@ -175,14 +261,30 @@ class Particles:
             body, which is the same for triangles and undistorted quadrilaterals).
         """
         _, average, gradient = self._domain_averages()
-        return sum_by_particle(average, gradient, self._basis, self._domain_nodes)
+        return sum_by_particle(average, gradient, self._rows.basis, self._domain_nodes)
+
+    @property
+    def domains(self) -> NDArray[np.float64]:
+        """Corners of the particles' own domains, shape ``(n, k, gdim)``.
+
+        For cpdi2 they are those of the displaced body mesh, for cpdi parallelograms, for gimp
+        boxes; for mpm, whose particles are points, parallelograms of their volume.
+        """
+        return self._rows.outline
+
+    @property
+    def initial_domains(self) -> NDArray[np.float64]:
+        """Corners of the undeformed domains, shape ``(n, k, gdim)``."""
+        return np.asarray(self._nodes[self._domain_nodes])
 
     def _domain_averages(
         self,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        corners = (self._nodes + self._converged)[self._domain_nodes]
         return domain_weights(
-            corners, self._shape_functions, self.mesh.basix_cell(), self._exact_degree
+            self._rows.corners,
+            self._shape_functions,
+            self.mesh.basix_cell(),
+            self._exact_degree,
         )
 
     def quadrature_function(self, name: str, shape: tuple[int, ...] = ()) -> fem.Function:
@@ -289,7 +391,7 @@ class Particles:
         A quadrilateral with one corner turned inwards is concave, with two it crosses itself
         and part of it is inverted. Other domains cannot cross without ``det F <= 0``.
         """
-        if self.mesh.basix_cell() != basix.CellType.quadrilateral:
+        if self.mesh.basix_cell() != basix.CellType.quadrilateral or self.method != "cpdi2":
             return self.global_index[:0]
         inwards = (self._corner_jacobians() <= 0.0).sum(axis=1)
         return np.asarray(self.global_index[inwards >= 2])
@@ -327,7 +429,7 @@ class Particles:
     def _commit(self) -> None:
         """Make the present displacement the converged one."""
         self._converged = self.displacement.x.array.reshape(-1, self._gdim).copy()
-        for name in ("_basis", "_active_nodes", "T"):
+        for name in ("_rows", "_active_nodes", "T"):
             self.__dict__.pop(name, None)
 
     def _roll_back(self) -> None:
@@ -384,6 +486,11 @@ def _validate(
         raise MPMError(
             f"Domains of degree {degree!r} on a background of degree {element.degree} are not "
             "supported; use degree 1 on 1."
+        )
+    if method != "cpdi2" and (degree, quadrature_degree or 1) != (1, 1):
+        raise MPMError(
+            f"Method {method!r} has one quadrature point per domain of degree 1; use 'cpdi2' "
+            "for others."
         )
     if quadrature_degree is not None and (
         not isinstance(quadrature_degree, int) or quadrature_degree < 0
