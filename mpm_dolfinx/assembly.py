@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Stock assembly of a residual and its tangent on the body mesh, and their reduction by T."""
+"""Stock assembly of residuals and tangents, one compiled form per quadrature rule."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .quadrature import depends_on, follows, split_by_rule
 assemble_vector: Any = fem_petsc.assemble_vector
 assemble_matrix: Any = fem_petsc.assemble_matrix
 
-__all__ = ["BackgroundForms", "BodyForms", "ReducedSpace"]
+__all__ = ["BackgroundForms", "BodyForms"]
 
 
 def _test_function(form: ufl.Form, space: fem.FunctionSpace, what: str) -> Any:
@@ -194,56 +194,3 @@ class BackgroundForms:
     def support(self) -> NDArray[np.int32]:
         """Return this rank's own dofs of V that the form acts on."""
         return np.flatnonzero(self.assemble_tangent().getDiagonal().array_r).astype(np.int32)
-
-
-class ReducedSpace:
-    """The free dofs of V, and T restricted to them.
-
-    Args:
-        T: The whole transfer.
-        free: This rank's own free dofs of V, local numbers, sorted.
-
-    Attributes:
-        free: Those dofs.
-        T: The transfer's columns at the free dofs.
-    """
-
-    def __init__(self, T: PETSc.Mat, free: NDArray[np.int32]) -> None:
-        self.free = free
-        start, _ = T.getOwnershipRangeColumn()
-        first, last = T.getOwnershipRange()
-        comm = T.comm
-        rows = PETSc.IS().createStride(last - first, first, step=1, comm=comm)
-        self.columns = PETSc.IS().createGeneral((free + start).astype(PETSc.IntType), comm=comm)
-        self.T: PETSc.Mat = T.createSubMatrix(rows, self.columns)
-        self._product: PETSc.Mat | None = None
-        self._total: PETSc.Mat | None = None
-
-    @property
-    def sizes(self) -> tuple[int, int]:
-        """Number of free dofs of this rank and of all ranks."""
-        local, whole = self.T.getSizes()[1]
-        return int(local), int(whole)
-
-    def reduce(self, K: PETSc.Mat, background: PETSc.Mat | None = None) -> PETSc.Mat:
-        """Return ``T^T K T`` plus the background's own tangent at the free dofs.
-
-        The matrix is the same object each time, with new values.
-        """
-        self._product = K.ptap(self.T, result=self._product)
-        if background is None:
-            return self._product
-        own = background.createSubMatrix(self.columns, self.columns)
-        if self._total is None:
-            self._total = self._product.copy()
-            self._total.axpy(1.0, own, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        else:
-            subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
-            self._total.zeroEntries()
-            self._total.axpy(1.0, self._product, structure=subset)
-            self._total.axpy(1.0, own, structure=subset)
-        return self._total
-
-    def restrict(self, vector: PETSc.Vec) -> NDArray[np.float64]:
-        """Return this rank's free entries of a vector of V."""
-        return np.asarray(vector.array_r[self.free])

@@ -35,8 +35,12 @@ class ConstitutiveHistory:
         particles: The body.
         assignment: One material, or one for each tag of ``cell_tags``.
         cell_tags: Tags of the body's cells.
+        axisymmetric: Whether the body is one of revolution; its points are then strained in
+            three dimensions.
 
     Attributes:
+        dim: Dimension of stress and strain, 2 in plane strain.
+        axisymmetric: As given.
         first_piola: First Piola stress of the last update, shape ``(n nq, dim, dim)``.
         tangent: Its derivative by F, shape ``(n nq, dim, dim, dim, dim)``.
 
@@ -45,18 +49,25 @@ class ConstitutiveHistory:
     """
 
     def __init__(
-        self, particles: Particles, assignment: Assignment, cell_tags: mesh.MeshTags | None
+        self,
+        particles: Particles,
+        assignment: Assignment,
+        cell_tags: mesh.MeshTags | None,
+        axisymmetric: bool,
     ) -> None:
         self._particles = particles
-        self._dim = particles.mesh.geometry.dim
+        self.axisymmetric = axisymmetric
+        self.dim = 3 if axisymmetric else particles.mesh.geometry.dim
+        if axisymmetric:
+            particles.require_radius()
         self._points = particles.num_local * particles.num_points
         with agree(particles.mesh.comm):
             self._groups = self._group(assignment, cell_tags)
-        shape = (self._points, self._dim, self._dim)
+        shape = (self._points, self.dim, self.dim)
         self._gradient = np.zeros(shape)
-        self._states = [g.material.initial_state(len(g.points), self._dim) for g in self._groups]
+        self._states = [g.material.initial_state(len(g.points), self.dim) for g in self._groups]
         self.first_piola = np.zeros(shape)
-        self.tangent = np.zeros((*shape, self._dim, self._dim))
+        self.tangent = np.zeros((*shape, self.dim, self.dim))
         self._trial: list[State] = self._states
         self._trial_gradient = self._gradient
         self._stress = self.first_piola.copy()
@@ -129,7 +140,8 @@ class ConstitutiveHistory:
         Raises:
             MPMError: An update fails; ``particles`` are global indices.
         """
-        gradient = self._particles.displacement_gradient().reshape(-1, self._dim, self._dim)
+        gradient = self._particles.displacement_gradient(self.axisymmetric)
+        gradient = gradient.reshape(-1, self.dim, self.dim)
         trial = []
         for group, state in zip(self._groups, self._states, strict=True):
             everywhere = len(group.points) == self._points

@@ -19,16 +19,16 @@ from dolfinx import fem, mesh
 from . import _compat
 from .errors import DomainDistortionError, MPMError, ParticleOutsideError, agree
 from .location import BackgroundBasis
-from .methods import METHODS, BoxGrid, DomainState, Rows, cpdi, cpdi2, gimp, mpm
+from .methods import BoxGrid, DomainState, Rows, cpdi, cpdi2, gimp, mpm
 from .quadrature import DomainQuadrature, exact_degree, quadrature_element, quadrature_rule
 from .transfer import Weights, active_nodes, domain_weights, sum_by_particle, transfer_matrix
+from .validation import validate_options, validate_spaces
 
 if TYPE_CHECKING:
     from .constitutive import ConstitutiveHistory
 
 __all__ = ["Particles"]
 
-DEGREES = {(1, 1)}
 BOX_CELLS = (basix.CellType.quadrilateral, basix.CellType.hexahedron)
 
 
@@ -71,6 +71,7 @@ class Particles:
         num_global: Number of particles of all ranks.
         global_index: Input index of each owned particle, shape ``(n,)``, the same on any number
             of ranks.
+        domain_nodes: Local nodes of W of each owned domain, shape ``(n, k)``.
 
     Raises:
         MPMError: Spaces, meshes, method or degrees that do not go together.
@@ -88,9 +89,8 @@ class Particles:
         outside: str = "error",
         domain_update: str = "stretch",
     ) -> None:
-        _validate(body, V, method, degree, quadrature_degree, outside)
-        if domain_update not in ("stretch", "fixed"):
-            raise MPMError(f"Unknown domain_update={domain_update!r}; choose 'stretch' or 'fixed'.")
+        validate_spaces(body, V)
+        validate_options(body, V, method, degree, quadrature_degree, outside, domain_update)
         self.mesh = body
         self.V = V
         self.method = method
@@ -114,7 +114,7 @@ class Particles:
         )
         self._shape_functions = self.W.ufl_element().basix_element
         self.quadrature = DomainQuadrature(body, self._shape_functions, self._degree)
-        self._domain_nodes = self.W.dofmap.list[: self.num_local]
+        self.domain_nodes = self.W.dofmap.list[: self.num_local]
         self._nodes = self.W.tabulate_dof_coordinates()[:, : self._gdim].copy()
         self._background = BackgroundBasis(V)
         self._domain_update = domain_update
@@ -174,7 +174,7 @@ class Particles:
 
     def _box_grid(self) -> BoxGrid:
         """Return the grid lines, if body and background are made of boxes."""
-        corners = self._nodes[self._domain_nodes]
+        corners = self._nodes[self.domain_nodes]
         low, high = corners.min(axis=1, keepdims=True), corners.max(axis=1, keepdims=True)
         off = np.minimum(corners - low, high - corners).max(axis=(1, 2), initial=0.0)
         with agree(self.mesh.comm):
@@ -204,9 +204,9 @@ class Particles:
         state = DomainState(
             self._nodes,
             self._converged,
-            self._domain_nodes,
+            self.domain_nodes,
             self.initial_centroid,
-            self._mean((self._nodes + self._converged)[self._domain_nodes]),
+            self._mean((self._nodes + self._converged)[self.domain_nodes]),
             np.eye(self._gdim) + self._average(self._converged_gradient()),
         )
         if self.method == "gimp":
@@ -215,7 +215,7 @@ class Particles:
         else:
             rows = {"cpdi2": cpdi2, "cpdi": cpdi, "mpm": mpm}[self.method](state, self._background)
         with agree(self.mesh.comm):
-            lost = np.flatnonzero((~rows.basis.found)[self._domain_nodes].any(axis=1))
+            lost = np.flatnonzero((~rows.basis.found)[self.domain_nodes].any(axis=1))
             if len(lost):
                 where = state.centroid[lost[0]]
                 raise ParticleOutsideError(
@@ -227,7 +227,7 @@ class Particles:
         return rows
 
     def _converged_gradient(self) -> NDArray[np.float64]:
-        return self.quadrature.displacement_gradient(self._converged[self._domain_nodes])
+        return self.quadrature.displacement_gradient(self._converged[self.domain_nodes])
 
     @cached_property
     def _rows(self) -> Rows:
@@ -240,7 +240,8 @@ class Particles:
         return transfer_matrix(self._rows.basis, self.W, self.V)
 
     @cached_property
-    def _active_nodes(self) -> NDArray[np.int32]:
+    def active_nodes(self) -> NDArray[np.int32]:
+        """Nodes of V with weight that this rank owns, local numbers, sorted."""
         return active_nodes(self._rows.basis, self.W, self.V)
 
     @property
@@ -249,7 +250,7 @@ class Particles:
         bs = self.V.dofmap.index_map_bs
         start = self.V.dofmap.index_map.local_range[0]
         return np.asarray(
-            ((self._active_nodes + start)[:, None] * bs + np.arange(bs)).ravel(), dtype=np.int64
+            ((self.active_nodes + start)[:, None] * bs + np.arange(bs)).ravel(), dtype=np.int64
         )
 
     def weights(self) -> Weights:
@@ -261,7 +262,7 @@ class Particles:
             body, which is the same for triangles and undistorted quadrilaterals).
         """
         _, average, gradient = self._domain_averages()
-        return sum_by_particle(average, gradient, self._rows.basis, self._domain_nodes)
+        return sum_by_particle(average, gradient, self._rows.basis, self.domain_nodes)
 
     @property
     def domains(self) -> NDArray[np.float64]:
@@ -273,9 +274,14 @@ class Particles:
         return self._rows.outline
 
     @property
+    def converged_displacement(self) -> NDArray[np.float64]:
+        """Displacement at the last converged step, on the local dofs of W."""
+        return self._converged.ravel()
+
+    @property
     def initial_domains(self) -> NDArray[np.float64]:
         """Corners of the undeformed domains, shape ``(n, k, gdim)``."""
-        return np.asarray(self._nodes[self._domain_nodes])
+        return np.asarray(self._nodes[self.domain_nodes])
 
     def _domain_averages(
         self,
@@ -309,23 +315,69 @@ class Particles:
     def _nodal(self) -> NDArray[np.float64]:
         """Displacement of the domains' nodes now, shape ``(n, k, gdim)``."""
         nodal = self.displacement.x.array.reshape(-1, self._gdim)
-        return np.asarray(nodal[self._domain_nodes])
+        return np.asarray(nodal[self.domain_nodes])
 
-    def displacement_gradient(self) -> NDArray[np.float64]:
-        """Return ``grad d`` at the history's points, shape ``(n, nq, gdim, gdim)``."""
-        return self.quadrature.displacement_gradient(self._nodal())
+    def displacement_gradient(self, axisymmetric: bool = False) -> NDArray[np.float64]:
+        """Return ``grad d`` at the history's points.
+
+        Args:
+            axisymmetric: Whether to add the hoop stretch ``d_r / R``.
+
+        Returns:
+            Shape ``(n, nq, gdim, gdim)``, or ``(n, nq, 3, 3)`` where axisymmetric.
+        """
+        gradient = self.quadrature.displacement_gradient(self._nodal())
+        if not axisymmetric:
+            return gradient
+        whole = np.zeros((*gradient.shape[:2], 3, 3))
+        whole[:, :, :2, :2] = gradient
+        radial = np.einsum("qk,nk->nq", self.quadrature.shapes, self._nodal()[:, :, 0])
+        whole[:, :, 2, 2] = radial / self._radii
+        return whole
+
+    @property
+    def _radii(self) -> NDArray[np.float64]:
+        """Undeformed radius of the history's points, shape ``(n, nq)``."""
+        radii = self._nodes[self.domain_nodes][:, :, 0]
+        return np.asarray(np.einsum("qk,nk->nq", self.quadrature.shapes, radii))
+
+    def require_radius(self) -> None:
+        """Raise an error unless ``x[0]`` can be a radius (collective)."""
+        with agree(self.mesh.comm):
+            if self._gdim != 2:
+                raise MPMError("An axisymmetric body is a mesh in the (r, z) plane.")
+            left = self._nodes[self.domain_nodes][:, :, 0].min(axis=1) < -1e-12
+            if left.any():
+                raise MPMError(
+                    "The domains of {particles} have a negative radius; an axisymmetric body "
+                    "lies at x[0] >= 0.",
+                    self.global_index[left],
+                )
+
+    def attach(self, history: ConstitutiveHistory) -> None:
+        """Let a history answer for stress and internal variables."""
+        self._constitutive = history
 
     def _average(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return volume averages of values ``(n, nq, ...)`` over the undeformed domains."""
-        share = self.quadrature.weights / self.quadrature.weights.sum(axis=1, keepdims=True)
+        weights = self.quadrature.weights
+        if self._axisymmetric:
+            weights = weights * self._radii
+        share = weights / weights.sum(axis=1, keepdims=True)
         return np.asarray(np.einsum("nq,nq...->n...", share, values))
 
     @property
     def deformation_gradient(self) -> NDArray[np.float64]:
         """Deformation gradient, shape ``(n, 3, 3)`` (volume averages, plane strain in 2-D)."""
+        gradient = self._average(self.displacement_gradient(self._axisymmetric))
+        dim = gradient.shape[1]
         F = np.tile(np.eye(3), (self.num_local, 1, 1))
-        F[:, : self._gdim, : self._gdim] += self._average(self.displacement_gradient())
+        F[:, :dim, :dim] += gradient
         return F
+
+    @property
+    def _axisymmetric(self) -> bool:
+        return self._constitutive is not None and self._constitutive.axisymmetric
 
     @property
     def initial_volume(self) -> NDArray[np.float64]:
@@ -342,12 +394,12 @@ class Particles:
     @property
     def initial_centroid(self) -> NDArray[np.float64]:
         """Centroid of the undeformed domains, shape ``(n, gdim)``."""
-        return self._mean(self._nodes[self._domain_nodes])
+        return self._mean(self._nodes[self.domain_nodes])
 
     @property
     def centroid(self) -> NDArray[np.float64]:
         """Particle positions: mean of ``X + d`` over the domains, shape ``(n, gdim)``."""
-        return self._mean(self._nodes[self._domain_nodes] + self._nodal())
+        return self._mean(self._nodes[self.domain_nodes] + self._nodal())
 
     def _mean(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         whole = self._whole
@@ -400,7 +452,7 @@ class Particles:
         """Return det J at the corners of the present domains, positive as in the undeformed."""
         points = basix.geometry(self.mesh.basix_cell())
         slopes = self._shape_functions.tabulate(1, points)[1:, :, :, 0]
-        now = self._nodes[self._domain_nodes] + self._nodal()
+        now = self._nodes[self.domain_nodes] + self._nodal()
         det = np.linalg.det(np.einsum("jqk,nki->nqij", slopes, now))
         return np.asarray(np.sign(self._orientation) * det)
 
@@ -417,7 +469,7 @@ class Particles:
         """Sign of the reference map of each undeformed domain, shape ``(n, 1)``."""
         middle = basix.geometry(self.mesh.basix_cell()).mean(axis=0)[None]
         slopes = self._shape_functions.tabulate(1, middle)[1:, :, :, 0]
-        corners = self._nodes[self._domain_nodes]
+        corners = self._nodes[self.domain_nodes]
         return np.asarray(np.linalg.det(np.einsum("jqk,nki->nqij", slopes, corners)))
 
     def inverted(self) -> NDArray[np.int64]:
@@ -426,82 +478,13 @@ class Particles:
         jacobian = np.linalg.det(np.eye(self._gdim) + gradient)
         return np.asarray(self.global_index[~(jacobian > 0.0).all(axis=1)])
 
-    def _commit(self) -> None:
+    def commit(self) -> None:
         """Make the present displacement the converged one."""
         self._converged = self.displacement.x.array.reshape(-1, self._gdim).copy()
-        for name in ("_rows", "_active_nodes", "T"):
+        for name in ("_rows", "active_nodes", "T"):
             self.__dict__.pop(name, None)
 
-    def _roll_back(self) -> None:
+    def roll_back(self) -> None:
         """Restore the converged displacement."""
         self.displacement.x.array[:] = self._converged.ravel()
         self.increment.x.array[:] = 0.0
-
-
-def _validate(
-    body: Any, V: Any, method: str, degree: int, quadrature_degree: int | None, outside: str
-) -> None:
-    if not isinstance(body, mesh.Mesh):
-        raise MPMError(f"The body must be a dolfinx.mesh.Mesh, not {type(body).__name__}.")
-    if not isinstance(V, fem.FunctionSpace):
-        raise MPMError(
-            f"V must be a dolfinx FunctionSpace on the background, not {type(V).__name__}."
-        )
-    background = V.mesh
-    gdim = body.geometry.dim
-    if V.mesh is body:
-        raise MPMError("V lives on the body mesh; make it on the background mesh.")
-    if gdim not in (2, 3) or body.topology.dim != gdim:
-        raise MPMError(
-            f"The body must fill its space in 2-D or 3-D; it has topological dimension "
-            f"{body.topology.dim} in {gdim} dimensions."
-        )
-    if background.geometry.dim != gdim or background.topology.dim != gdim:
-        raise MPMError(
-            f"The body is {gdim}-dimensional, the background {background.geometry.dim}-"
-            "dimensional; both must have the same dimension."
-        )
-    cells = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
-    for what, domain in (("body", body), ("background", background)):
-        if domain.topology.cell_name() not in cells:
-            raise MPMError(
-                f"The {what} has {domain.topology.cell_name()} cells; use one of "
-                f"{', '.join(cells)}."
-            )
-    element = V.ufl_element()
-    if (
-        element.reference_value_shape != (gdim,)
-        or element.family_name != "P"
-        or (element.discontinuous)
-    ):
-        raise MPMError(
-            f"V must be a continuous Lagrange space of vectors with {gdim} components, e.g. "
-            f'fem.functionspace(background, ("Lagrange", 1, ({gdim},))).'
-        )
-    if V.dofmap.index_map_bs != gdim:
-        raise MPMError("V must not be a subspace; pass the whole vector space.")
-    if method not in METHODS:
-        raise MPMError(f"Unknown method {method!r}; choose one of {', '.join(map(repr, METHODS))}.")
-    if (element.degree, degree) not in DEGREES:
-        raise MPMError(
-            f"Domains of degree {degree!r} on a background of degree {element.degree} are not "
-            "supported; use degree 1 on 1."
-        )
-    if method != "cpdi2" and (degree, quadrature_degree or 1) != (1, 1):
-        raise MPMError(
-            f"Method {method!r} has one quadrature point per domain of degree 1; use 'cpdi2' "
-            "for others."
-        )
-    if quadrature_degree is not None and (
-        not isinstance(quadrature_degree, int) or quadrature_degree < 0
-    ):
-        raise MPMError(
-            f"quadrature_degree must be a whole number from 0 on, not {quadrature_degree!r}."
-        )
-    if outside != "error":
-        raise MPMError(f"Unknown policy outside={outside!r}; choose 'error'.")
-    if body.comm.size != background.comm.size:
-        raise MPMError(
-            "The body and the background live on different numbers of ranks; make both on the "
-            "same communicator."
-        )

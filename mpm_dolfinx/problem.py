@@ -20,17 +20,17 @@ import ufl
 from dolfinx import fem
 
 from . import _compat
-from .assembly import BackgroundForms, BodyForms, ReducedSpace
+from .assembly import BackgroundForms, BodyForms
 from .errors import (
     ConvergenceError,
     DomainDistortionError,
     MPMError,
     ParticleOutsideError,
-    agreed,
 )
 from .history import History, Step
 from .io import TimeSeries
 from .particles import Particles
+from .reduced import Body, ReducedSystem
 from .solver import NewtonSolver
 from .stepping import StepControl
 
@@ -45,11 +45,13 @@ class ParticleProblem:
     ``T^T J T``.
 
     Args:
-        R: Residual in ``particles.displacement`` and a test function of ``particles.W``.
-        particles: The body.
+        R: Residual in ``particles.displacement`` and a test function of ``particles.W``; for
+            several bodies one for each.
+        particles: The body, or a list of bodies on one V: they do not slip where they touch.
         J: Tangent; ``None`` is ``ufl.derivative(R, particles.displacement)``.
         bcs: Dirichlet conditions on V; their values are totals at full load.
-        background: Form in ``particles.increment`` and a test function of V, added to R.
+        background: Form in ``particles.increment`` (of the first body) and a test function of
+            V, added to R.
         petsc_options_prefix: Prefix of the PETSc options.
         petsc_options: PETSc options for SNES, KSP and PC, without prefix.
         form_compiler_options: Options of FFCx.
@@ -62,7 +64,9 @@ class ParticleProblem:
             reduce the residual.
 
     Attributes:
-        particles: The body.
+        particles: The body or bodies, as given.
+        bodies: The bodies, as a list.
+        reduced: Residual and tangent in the free dofs of V.
         history: Steps, counters and seconds; filled as a run goes on.
         bcs: The Dirichlet conditions.
 
@@ -72,9 +76,9 @@ class ParticleProblem:
 
     def __init__(
         self,
-        R: ufl.Form,
-        particles: Particles,
-        J: ufl.Form | None = None,
+        R: ufl.Form | Sequence[ufl.Form],
+        particles: Particles | Sequence[Particles],
+        J: ufl.Form | Sequence[ufl.Form] | None = None,
         bcs: Sequence[fem.DirichletBC] = (),
         background: ufl.Form | None = None,
         petsc_options_prefix: str = "mpm_",
@@ -86,25 +90,31 @@ class ParticleProblem:
         shift: float = 1e-13,
         line_search: bool = True,
     ) -> None:
-        if not isinstance(particles, Particles):
-            raise MPMError(f"particles must be mpm.Particles, not {type(particles).__name__}.")
         if not (np.isfinite(shift) and 0.0 <= shift < 1.0):
             raise MPMError(f"shift must be at least 0 and below 1, not {shift!r}.")
         options = {"form_compiler_options": form_compiler_options, "jit_options": jit_options}
         self.particles = particles
+        self.bodies = as_bodies(particles)
+        V = self.bodies[0].V
+        residuals = _one_for_each(R, self.bodies, "residual R")
+        tangents = [None] * len(self.bodies) if J is None else _one_for_each(J, self.bodies, "J")
         self.bcs = list(bcs)
-        for bc in self.bcs:
-            if not _compat.is_condition_on(bc, particles.V):
-                raise MPMError(
-                    "A Dirichlet condition is not on the background space V of the particles "
-                    "or on a component of it (V.sub(i))."
-                )
+        if not all(_compat.is_condition_on(bc, V) for bc in self.bcs):
+            raise MPMError(
+                "A Dirichlet condition is not on the background space V of the particles "
+                "or on a component of it (V.sub(i))."
+            )
         self.history = History()
-        self._comm: MPI.Comm = particles.mesh.comm
-        self._forms = BodyForms(R, J, particles, **options)
-        self._background = (
-            BackgroundForms(background, particles, **options) if background is not None else None
-        )
+        self._comm: MPI.Comm = V.mesh.comm
+        shares = [
+            Body(body, BodyForms(r, j, body, **options))
+            for body, r, j in zip(self.bodies, residuals, tangents, strict=True)
+        ]
+        terms = None
+        if background is not None:
+            terms = BackgroundForms(background, self.bodies[0], **options)
+        statistics = self.history.statistics
+        self.reduced = ReducedSystem(shares, terms, self.bcs, self.evaluate, statistics)
         self._newton = NewtonSolver(
             self._comm,
             petsc_options_prefix,
@@ -112,13 +122,12 @@ class ParticleProblem:
             symmetric,
             shift,
             line_search,
-            self.history.statistics,
+            statistics,
         )
-        self._prescribed: NDArray[np.float64] = np.zeros(len(particles.increment.x.array))
-        self._loaded = float(particles.load.value)
+        self._prescribed: NDArray[np.float64] = np.zeros(len(self.bodies[0].increment.x.array))
+        self._loaded = float(self.bodies[0].load.value)
         self._reactions: NDArray[np.float64] | None = None
-        self._space: ReducedSpace | None = None
-        self._series: dict[Path, TimeSeries] = {}
+        self._series: dict[Path, list[TimeSeries]] = {}
 
     # -- PETSc objects --------------------------------------------------------------------
 
@@ -202,7 +211,7 @@ class ParticleProblem:
             t = control.target
             load = t if update is not None else start + (1.0 - start) * t
             try:
-                np.copyto(self.particles.load.value, load)
+                self._set_load(load)
                 if update is not None:
                     update(t)
                     values = self._dirichlet_values()
@@ -234,7 +243,9 @@ class ParticleProblem:
             MPMError: It does not converge; the state is that of the last converged step.
         """
         try:
-            return self._advance(float(self.particles.load.value), self._dirichlet_values())
+            load = float(self.bodies[0].load.value)
+            self._set_load(load)
+            return self._advance(load, self._dirichlet_values())
         except MPMError as error:
             self._restore()
             self.history.failed_iterations += self._newton.iterations
@@ -256,7 +267,7 @@ class ParticleProblem:
         """
         if not any(bc is known for known in self.bcs):
             raise MPMError("reaction(bc) needs one of the Dirichlet conditions of this problem.")
-        gdim = self.particles.V.dofmap.index_map_bs
+        gdim = self.bodies[0].V.dofmap.index_map_bs
         force = np.zeros(gdim)
         if self._reactions is not None:
             dofs, first_ghost = bc.dof_indices()
@@ -271,22 +282,29 @@ class ParticleProblem:
         and, where there is a material, Cauchy stress, pressure and plastic strain.
 
         Args:
-            path: A ``.pvd`` file; the first call of a run replaces it.
+            path: A ``.pvd`` file; the first call of a run replaces it. With several bodies
+                each has its own, numbered from 0: ``name_0.pvd``.
 
         Raises:
             MPMError: The name does not end in ``.pvd``.
         """
         path = Path(path)
         if path not in self._series:
-            self._series[path] = TimeSeries(path, self.particles)
+            several = len(self.bodies) > 1
+            self._series[path] = [
+                TimeSeries(path.with_stem(f"{path.stem}_{i}") if several else path, body)
+                for i, body in enumerate(self.bodies)
+            ]
         last = self.history.steps[-1].load if self.history.steps else 0.0
-        self._series[path].write(last)
+        for series in self._series[path]:
+            series.write(last)
 
     def _warn_of_outside(self) -> None:
         """Say so where the last step, which is converged, took particles off the background."""
         try:
             with self.history.statistics.phase("locate"):
-                self.particles.locate()
+                for body in self.bodies:
+                    body.locate()
         except ParticleOutsideError as error:
             if self._comm.rank == 0:
                 warnings.warn(f"The run is complete, but {error!s}", stacklevel=3)
@@ -295,53 +313,25 @@ class ParticleProblem:
 
     def _advance(self, parameter: float, values: NDArray[np.float64]) -> Step:
         """Solve one step to Dirichlet totals, and commit it."""
-        statistics = self.history.statistics
-        self._values = values
-        self._change = values - self._prescribed
-        self._lifted = False
-        with statistics.phase("locate"):
-            self.particles.locate()
-        with statistics.phase("transfer"):
-            self._reduce()
-        with statistics.phase("assemble"):
-            self._forms.assemble_external()
-        assert self._space is not None
-        self._external = float(self._to_background(self._forms.external).norm())
-        self._newton.solve(self, self._space.sizes)
-        crossed = self.particles.crossed()
-        if (failure := agreed(self._comm, _distorted("cross themselves", crossed))) is not None:
+        self.reduced.begin(values - self._prescribed)
+        self._newton.solve(self.reduced, self.reduced.sizes)
+        if (failure := self.reduced.crossed()) is not None:
             raise failure
-        with statistics.phase("commit"):
-            self.particles._commit()
+        with self.history.statistics.phase("commit"):
+            for body in self.bodies:
+                body.commit()
             self.commit()
             self._prescribed = values.copy()
-            self._loaded = float(self.particles.load.value)
-            self._reactions = self._work_V.array_r.copy()
-            self._space = None
+            self._loaded = float(self.bodies[0].load.value)
+            self._reactions = self.reduced.force.array_r.copy()
+            self.reduced.end()
         step = Step(parameter, self._newton.iterations, list(self._newton.residuals))
         self.history.steps.append(step)
         return step
 
-    def _reduce(self) -> None:
-        """Find the free dofs and the transfer to them, unless they are those of the last try."""
-        if self._space is not None:
-            return
-        particles = self.particles
-        T = particles.T
-        bs = particles.V.dofmap.index_map_bs
-        owned = particles.V.dofmap.index_map.size_local * bs
-        free = np.zeros(owned, dtype=bool)
-        free.reshape(-1, bs)[particles._active_nodes] = True
-        if self._background is not None:
-            free[self._background.support()] = True
-        self._fixed = np.zeros(owned, dtype=bool)
-        for bc in self.bcs:
-            dofs, first_ghost = bc.dof_indices()
-            self._fixed[dofs[:first_ghost]] = True
-        self._space = ReducedSpace(T, np.flatnonzero(free & ~self._fixed).astype(np.int32))
-        self._work_V, self._work_W = T.createVecs()
-        self.history.statistics.count("transfers")
-        self.history.statistics["free_dofs"] = self._space.sizes[1]
+    def _set_load(self, load: float) -> None:
+        for body in self.bodies:
+            np.copyto(body.load.value, load)
 
     def _dirichlet_values(self) -> NDArray[np.float64]:
         """Return the present totals of all Dirichlet conditions, on the local dofs of V."""
@@ -352,8 +342,9 @@ class ParticleProblem:
 
     def _restore(self, update: Callable[[float], None] | None = None) -> None:
         """Return to the last converged step."""
-        self.particles._roll_back()
-        np.copyto(self.particles.load.value, self._loaded)
+        for body in self.bodies:
+            body.roll_back()
+        self._set_load(self._loaded)
         self.roll_back()
         if update is not None and self.history.steps:
             update(self.history.steps[-1].load)
@@ -367,7 +358,7 @@ class ParticleProblem:
         }[type(error)]
         particles, text = error.particles, error.message.rstrip(".")
         if isinstance(error, ConvergenceError) and not particles:
-            particles = self._worst_particles()
+            particles = self.reduced.worst_particles()
             if particles:
                 text += "; the residual is largest at {particles}"
         return type(error)(
@@ -375,21 +366,6 @@ class ParticleProblem:
             particles,
             self._loaded,
         )
-
-    def _worst_particles(self) -> list[int]:
-        """Return the particles at the node with the largest residual (collective)."""
-        particles = self.particles
-        particles.T.mult(self._work_V, self._work_W)
-        force = np.linalg.norm(
-            self._work_W.array_r.reshape(-1, particles.V.mesh.geometry.dim), axis=1
-        )
-        largest = float(np.nanmax(force, initial=0.0))
-        if not self._comm.allreduce(largest, MPI.MAX) == largest > 0.0:
-            mine: list[int] = []
-        else:
-            touches = (particles._domain_nodes == int(np.nanargmax(force))).any(axis=1)
-            mine = [int(p) for p in particles.global_index[touches]]
-        return sorted({p for found in self._comm.allgather(mine) for p in found})
 
     # -- What a problem with a material adds -----------------------------------------------
 
@@ -407,98 +383,31 @@ class ParticleProblem:
     def roll_back(self) -> None:
         """Return to the last converged evaluation."""
 
-    # -- The reduced problem, as the solver sees it ----------------------------------------
 
-    def residual(self, x: PETSc.Vec, F: PETSc.Vec) -> MPMError | None:
-        """Evaluate the reduced residual (for the solver)."""
-        assert self._space is not None
-        particles, statistics = self.particles, self.history.statistics
-        u = particles.increment.x
-        owned = len(self._fixed)
-        u.array[:owned] = self._lifts() if self._lifted else 0.0
-        u.array[self._space.free] = x.array_r
-        u.scatter_forward()
-        self._work_V.array_w[:] = u.array[:owned]
-        particles.T.mult(self._work_V, self._work_W)
-        d = particles.displacement.x
-        rows = self._work_W.getLocalSize()
-        d.array[:rows] = particles._converged.ravel()[:rows] + self._work_W.array_r
-        d.scatter_forward()
-        with statistics.phase("constitutive"):
-            failure = agreed(
-                self._comm,
-                _distorted("turn inside out", particles.inverted()) or self.evaluate(),
-            )
-        if failure is not None:
-            return failure
-        with statistics.phase("assemble"):
-            total = self._to_background(self._forms.assemble_residual())
-            if self._background is not None:
-                total.axpy(1.0, self._background.assemble_residual())
-        F.array_w[:] = self._space.restrict(total)
-        return None
+def as_bodies(particles: Particles | Sequence[Particles]) -> list[Particles]:
+    """Return the bodies of a problem as a list.
 
-    def _to_background(self, vector: PETSc.Vec) -> PETSc.Vec:
-        """Return ``T^T`` times a vector of W, in the problem's work vector of V."""
-        self.particles.T.multTranspose(vector, self._work_V)
-        return self._work_V
-
-    def tangent(self) -> PETSc.Mat:
-        """Return the reduced tangent (for the solver)."""
-        assert self._space is not None
-        with self.history.statistics.phase("assemble"):
-            background = (
-                self._background.assemble_tangent() if self._background is not None else None
-            )
-            return self._space.reduce(self._forms.assemble_tangent(), background)
-
-    def impose(self) -> bool:
-        """Impose the step's Dirichlet values; return whether there are any (for the solver)."""
-        self._lifted = True
-        return bool(self._comm.allreduce(bool(np.any(self._lifts())), MPI.LOR))
-
-    def _lifts(self) -> NDArray[np.float64]:
-        return np.where(self._fixed, self._change[: len(self._fixed)], 0.0)
-
-    def lift(self) -> PETSc.Vec:
-        """Return the linearised forces of the step's Dirichlet values (for the solver)."""
-        assert self._space is not None
-        self._work_V.array_w[:] = self._lifts()
-        self.particles.T.mult(self._work_V, self._work_W)
-        forces = self._forms.K.createVecLeft()
-        self._forms.K.mult(self._work_W, forces)
-        total = self._work_V.duplicate()
-        if self._background is not None:
-            self._background.assemble_tangent().mult(self._work_V, total)
-        self.particles.T.multTransposeAdd(forces, total, total)
-        reduced = self._space.T.createVecRight()
-        reduced.array_w[:] = self._space.restrict(total)
-        return reduced
-
-    def scale(self) -> float:
-        """Return the larger of external forces and reactions (for the solver)."""
-        reactions = np.where(self._fixed, self._work_V.array_r, 0.0)
-        return max(self._external, self._size(reactions))
-
-    def internal_scale(self) -> float:
-        """Return the size of the absolute internal contributions (for the solver)."""
-        with self.history.statistics.phase("assemble"):
-            total = self._forms.absolute_contributions(self.particles._domain_nodes)
-            result = self.particles.T.createVecRight()
-            self.particles.T.multTranspose(total, result)
-            return float(result.norm())
-
-    def motion(self, x: PETSc.Vec) -> float:
-        """Return the norm of ``T x`` (for the solver)."""
-        assert self._space is not None
-        self._space.T.mult(x, self._work_W)
-        return float(self._work_W.norm())
-
-    def _size(self, values: NDArray[np.float64]) -> float:
-        return float(np.sqrt(self._comm.allreduce(values @ values)))
+    Raises:
+        MPMError: Something else than particles, or particles on different backgrounds.
+    """
+    bodies = [particles] if isinstance(particles, Particles) else particles
+    if (
+        not isinstance(bodies, list | tuple)
+        or not bodies
+        or not all(isinstance(body, Particles) for body in bodies)
+    ):
+        raise MPMError(
+            f"particles must be mpm.Particles or a list of them, not {type(particles).__name__}."
+        )
+    if len({id(body) for body in bodies}) < len(bodies):
+        raise MPMError("The same particles are given twice.")
+    if any(body.V is not bodies[0].V for body in bodies):
+        raise MPMError("All particles of one problem must be made with the same space V.")
+    return list(bodies)
 
 
-def _distorted(how: str, which: NDArray[np.int64]) -> DomainDistortionError | None:
-    return (
-        DomainDistortionError(f"The domains of {{particles}} {how}", which) if len(which) else None
-    )
+def _one_for_each(forms: Any, bodies: list[Particles], what: str) -> list[Any]:
+    given = list(forms) if isinstance(forms, list | tuple) else [forms]
+    if len(given) != len(bodies):
+        raise MPMError(f"There are {len(bodies)} bodies; give one {what} for each, as a list.")
+    return given

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,22 +15,23 @@ from dolfinx import fem, mesh
 
 from .constitutive import ConstitutiveHistory
 from .errors import MPMError
-from .materials import Material
 from .particles import Particles
-from .problem import ParticleProblem
+from .problem import ParticleProblem, as_bodies
 
 __all__ = ["QuasiStaticProblem"]
 
 
 class QuasiStaticProblem(ParticleProblem):
-    """Equilibrium of a body with a material, under body force, tractions and supports.
+    """Equilibrium of bodies with materials, under body force, tractions and supports.
 
     ``int P : grad v dX - load (int density b . v dX + int t . v dS) = 0`` on the undeformed
     body; the first Piola stress P and its tangent dP/dF are Functions on a quadrature element,
-    injected into the UFL forms.
+    injected into the UFL forms. With several bodies, ``material``, ``density``,
+    ``body_force``, ``tractions``, ``pressures``, ``cell_tags`` and ``facet_tags`` are each one
+    for all, or a list with one for each body.
 
     Args:
-        particles: The body.
+        particles: The body, or a list of bodies on one V (no slip where they touch).
         material: A material, or ``{cell tag: material}`` with ``cell_tags``.
         density: Mass per undeformed volume: a number, Constant, Function or UFL expression.
         body_force: Force per mass at full load: a tuple, Constant, Function or UFL expression
@@ -38,8 +39,13 @@ class QuasiStaticProblem(ParticleProblem):
         bcs: Dirichlet conditions on V, totals at full load.
         tractions: Pairs of a dead load per undeformed area at full load (tuple or UFL) and a
             tag of ``facet_tags``.
+        pressures: Pairs of a pressure at full load (number or UFL) and a tag of
+            ``facet_tags``; it acts on the deformed facets, against their normal, per deformed
+            area (a follower load, whose tangent is not symmetric).
         cell_tags: Tags of the body's cells.
         facet_tags: Tags of the body's facets.
+        axisymmetric: Whether ``x[0]`` is the radius of a body of revolution about ``x[0] = 0``;
+            loads and reactions are then those of the whole circumference.
         background: Form on the background, as in :class:`ParticleProblem`.
         petsc_options_prefix: Prefix of the PETSc options.
         petsc_options: PETSc options, without prefix.
@@ -53,14 +59,16 @@ class QuasiStaticProblem(ParticleProblem):
 
     def __init__(
         self,
-        particles: Particles,
-        material: Material | Mapping[int, Material],
+        particles: Particles | Sequence[Particles],
+        material: Any,
         density: Any = 1.0,
         body_force: Any = None,
         bcs: Sequence[fem.DirichletBC] = (),
-        tractions: Sequence[tuple[Any, int]] = (),
-        cell_tags: mesh.MeshTags | None = None,
-        facet_tags: mesh.MeshTags | None = None,
+        tractions: Sequence[Any] = (),
+        pressures: Sequence[Any] = (),
+        cell_tags: Any = None,
+        facet_tags: Any = None,
+        axisymmetric: bool = False,
         background: ufl.Form | None = None,
         petsc_options_prefix: str = "mpm_",
         petsc_options: dict[str, Any] | None = None,
@@ -69,64 +77,178 @@ class QuasiStaticProblem(ParticleProblem):
         line_search: bool = True,
         **options: Any,
     ) -> None:
-        if not isinstance(particles, Particles):
-            raise MPMError(f"particles must be mpm.Particles, not {type(particles).__name__}.")
-        history = ConstitutiveHistory(particles, material, cell_tags)
-        dim = particles.mesh.geometry.dim
-        self._first_piola = particles.quadrature_function("first_piola", (dim, dim))
-        self._tangent = particles.quadrature_function("tangent", (dim,) * 4)
-        self._constitutive = history
-        v, du = ufl.TestFunction(particles.W), ufl.TrialFunction(particles.W)
-        i, j, k, m = ufl.indices(4)
-        R = ufl.inner(self._first_piola, ufl.grad(v)) * particles.dx
-        J = self._tangent[i, j, k, m] * ufl.grad(du)[k, m] * ufl.grad(v)[i, j] * particles.dx
-        if body_force is not None:
-            force = _expression(body_force, particles, "body_force", (dim,))
-            mass = _expression(density, particles, "density", ())
-            R -= particles.load * mass * ufl.inner(force, v) * particles.dx_exact
-        if tractions:
-            ds = _facet_measure(particles, facet_tags, [tag for _, tag in tractions])
-            for value, tag in tractions:
-                traction = _expression(value, particles, "a traction", (dim,))
-                R -= particles.load * ufl.inner(traction, v) * ds(tag)
+        bodies = as_bodies(particles)
+        count = len(bodies) if isinstance(particles, list | tuple) else 0
+        shares = zip(
+            bodies,
+            _for_each(material, count),
+            _for_each(density, count),
+            _for_each(body_force, count),
+            _for_each(tractions, count, pairs=True),
+            _for_each(pressures, count, pairs=True),
+            _for_each(cell_tags, count),
+            _for_each(facet_tags, count),
+            strict=True,
+        )
+        self._stresses: list[_InjectedStress] = []
+        residuals, tangents = [], []
+        for body, law, mass, force, dead, following, cells, facets in shares:
+            history = ConstitutiveHistory(body, law, cells, axisymmetric)
+            stress = _InjectedStress(body, history)
+            self._stresses.append(stress)
+            frame = _Frame(body, axisymmetric)
+            R, J = frame.internal(stress.first_piola, stress.tangent)
+            if force is not None:
+                R -= frame.body_force(mass, force)
+            if dead:
+                R -= frame.tractions(dead, facets)
+            if following:
+                pressure = frame.pressures(following, facets)
+                R += pressure
+                J += ufl.derivative(pressure, body.displacement)
+            residuals.append(R)
+            tangents.append(J)
+        followers = any(_for_each(pressures, count, pairs=True))
         super().__init__(
-            R,
+            residuals,
             particles,
-            J=J,
+            J=tangents,
             bcs=bcs,
             background=background,
             petsc_options_prefix=petsc_options_prefix,
             petsc_options=petsc_options,
-            symmetric=history.symmetric,
+            symmetric=not followers and all(s.history.symmetric for s in self._stresses),
             shift=shift,
             line_search=line_search,
             **options,
         )
-        particles._constitutive = history
+        for body, stress in zip(bodies, self._stresses, strict=True):
+            body.attach(stress.history)
 
     def evaluate(self) -> MPMError | None:
         """Update the stress and its tangent for the present displacement."""
         try:
-            self._constitutive.update()
+            for stress in self._stresses:
+                stress.update()
         except MPMError as error:
             return error
-        _fill(self._first_piola, self._constitutive.first_piola)
-        _fill(self._tangent, self._constitutive.tangent)
         return None
 
     def commit(self) -> None:
         """Make the last update the history."""
-        self._constitutive.commit()
+        for stress in self._stresses:
+            stress.history.commit()
 
     def roll_back(self) -> None:
         """Return to the stress of the last converged step."""
-        self._constitutive.roll_back()
-        _fill(self._first_piola, self._constitutive.first_piola)
+        for stress in self._stresses:
+            stress.roll_back()
 
     @property
     def yield_function(self) -> NDArray[np.float64]:
-        """Largest yield function of each particle's points, shape ``(n,)``; -1 where elastic."""
-        return np.asarray(self._constitutive.yield_function().max(axis=1, initial=-np.inf))
+        """Largest yield function of each particle's points, shape ``(n,)``; -1 where elastic.
+
+        With several bodies, their particles one body after the other.
+        """
+        values = [s.history.yield_function().max(axis=1, initial=-np.inf) for s in self._stresses]
+        return np.concatenate(values)
+
+
+class _InjectedStress:
+    """Stress and tangent of a body as Functions on a quadrature element."""
+
+    def __init__(self, body: Particles, history: ConstitutiveHistory) -> None:
+        self.history = history
+        dim = history.dim
+        self.first_piola = body.quadrature_function("first_piola", (dim, dim))
+        self.tangent = body.quadrature_function("tangent", (dim,) * 4)
+
+    def update(self) -> None:
+        self.history.update()
+        _fill(self.first_piola, self.history.first_piola)
+        _fill(self.tangent, self.history.tangent)
+
+    def roll_back(self) -> None:
+        self.history.roll_back()
+        _fill(self.first_piola, self.history.first_piola)
+
+
+class _Frame:
+    """The forms of a body in plane strain or space, or of a body of revolution."""
+
+    def __init__(self, body: Particles, axisymmetric: bool) -> None:
+        self._body = body
+        self._axisymmetric = axisymmetric
+        self._dim = body.mesh.geometry.dim
+        self._v = ufl.TestFunction(body.W)
+        self._radius = ufl.SpatialCoordinate(body.mesh)[0]
+        self._turn = 2.0 * np.pi * self._radius if axisymmetric else 1.0
+
+    def _gradient(self, w: Any) -> Any:
+        if not self._axisymmetric:
+            return ufl.grad(w)
+        g = ufl.grad(w)
+        hoop = w[0] / self._radius
+        return ufl.as_tensor([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, hoop]])
+
+    def internal(self, P: fem.Function, A: fem.Function) -> tuple[ufl.Form, ufl.Form]:
+        """Return the internal virtual work and its tangent."""
+        i, j, k, m = ufl.indices(4)
+        trial = self._gradient(ufl.TrialFunction(self._body.W))
+        test = self._gradient(self._v)
+        work = self._turn * ufl.inner(P, test) * self._body.dx
+        tangent = self._turn * A[i, j, k, m] * trial[k, m] * test[i, j] * self._body.dx
+        return work, tangent
+
+    def _at_load(self, terms: Sequence[ufl.Form]) -> ufl.Form:
+        """Return the sum of terms times the load factor."""
+        return ufl.Form([i for term in terms for i in (self._body.load * term).integrals()])
+
+    def body_force(self, density: Any, force: Any) -> ufl.Form:
+        """Return the virtual work of the body force."""
+        b = _expression(force, self._body, "body_force", (self._dim,))
+        mass = _expression(density, self._body, "density", ())
+        work: ufl.Form = mass * self._turn * ufl.inner(b, self._v) * self._body.dx_exact
+        return self._at_load([work])
+
+    def tractions(self, loads: Sequence[tuple[Any, int]], tags: Any) -> ufl.Form:
+        """Return the virtual work of dead tractions."""
+        ds = _facet_measure(self._body, tags, loads, "tractions")
+        terms = [
+            self._turn
+            * ufl.inner(_expression(t, self._body, "a traction", (self._dim,)), self._v)
+            * ds(tag)
+            for t, tag in loads
+        ]
+        return self._at_load(terms)
+
+    def pressures(self, loads: Sequence[tuple[Any, int]], tags: Any) -> ufl.Form:
+        """Return minus the virtual work of pressures on the deformed facets."""
+        ds = _facet_measure(self._body, tags, loads, "pressures")
+        d = self._body.displacement
+        F = ufl.Identity(self._dim) + ufl.grad(d)
+        area = ufl.det(F) * ufl.inv(F).T * ufl.FacetNormal(self._body.mesh)
+        if self._axisymmetric:
+            area *= 2.0 * np.pi * (self._radius + d[0])
+        terms = [
+            _expression(p, self._body, "a pressure", ()) * ufl.inner(area, self._v) * ds(tag)
+            for p, tag in loads
+        ]
+        return self._at_load(terms)
+
+
+def _for_each(value: Any, count: int, pairs: bool = False) -> list[Any]:
+    """Return one value for each of ``count`` bodies (0: one body that is not in a list)."""
+    if count == 0:
+        return [value]
+    listed = isinstance(value, list) and (
+        not pairs or all(isinstance(entry, list) for entry in value)
+    )
+    if not listed or not value:
+        return [value] * count
+    if len(value) != count:
+        raise MPMError(f"There are {count} bodies, but a list of {len(value)} for them.")
+    return list(value)
 
 
 def _fill(function: fem.Function, values: NDArray[np.float64]) -> None:
@@ -154,15 +276,17 @@ def _expression(value: Any, particles: Particles, name: str, shape: tuple[int, .
 
 
 def _facet_measure(
-    particles: Particles, facet_tags: mesh.MeshTags | None, tags: Sequence[int]
+    particles: Particles, facet_tags: Any, loads: Sequence[tuple[Any, int]], what: str
 ) -> ufl.Measure:
     body = particles.mesh
-    if facet_tags is None or facet_tags.dim != body.topology.dim - 1:
-        raise MPMError("tractions need facet_tags=, tags of the body's facets.")
+    if not isinstance(facet_tags, mesh.MeshTags) or facet_tags.dim != body.topology.dim - 1:
+        raise MPMError(f"{what} need facet_tags=, tags of the body's facets.")
     known = set().union(*body.comm.allgather({int(t) for t in np.unique(facet_tags.values)}))
-    for tag in tags:
-        if tag not in known:
-            raise MPMError(f"No facet has the tag {tag!r} of a traction; tags are {sorted(known)}.")
+    for load in loads:
+        if not isinstance(load, tuple) or len(load) != 2 or load[1] not in known:
+            raise MPMError(
+                f"{what} are pairs of a value and a facet tag among {sorted(known)}, not {load!r}."
+            )
     return ufl.Measure(
         "ds", domain=body, subdomain_data=facet_tags, metadata=particles.dx_exact.metadata()
     )

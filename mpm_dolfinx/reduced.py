@@ -1,0 +1,298 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The reduced system of a step: residual and tangent in the free dofs of the background."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from .assembly import BackgroundForms, BodyForms
+from .errors import DomainDistortionError, MPMError, agreed
+from .history import Statistics
+from .particles import Particles
+
+__all__ = ["Body", "ReducedSystem"]
+
+SUBSET = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
+DIFFERENT = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
+
+
+class Body:
+    """One body's share of the reduced system.
+
+    Args:
+        particles: The body.
+        forms: Its residual and tangent.
+    """
+
+    def __init__(self, particles: Particles, forms: BodyForms) -> None:
+        self.particles = particles
+        self.forms = forms
+        self._free_T: PETSc.Mat | None = None
+        self._product: PETSc.Mat | None = None
+
+    def restrict(self, columns: PETSc.IS) -> None:
+        """Take the transfer's columns at the free dofs."""
+        T = self.particles.T
+        first, last = T.getOwnershipRange()
+        rows = PETSc.IS().createStride(last - first, first, step=1, comm=T.comm)
+        self._free_T = T.createSubMatrix(rows, columns)
+        self._product = None
+        self._work = T.createVecLeft()
+
+    def move(self, u: PETSc.Vec) -> None:
+        """Set ``d = d_n + T u``."""
+        self.particles.T.mult(u, self._work)
+        d = self.particles.displacement.x
+        rows = self._work.getLocalSize()
+        d.array[:rows] = self.particles.converged_displacement[:rows] + self._work.array_r
+        d.scatter_forward()
+
+    def tangent(self) -> PETSc.Mat:
+        """Return ``T^T K T`` at the free dofs, always the same object within a step."""
+        self._product = self.forms.assemble_tangent().ptap(self._free_T, result=self._product)
+        return self._product
+
+    def stiffness_force(self, u: PETSc.Vec) -> PETSc.Vec:
+        """Return ``K T u`` on the body."""
+        self.particles.T.mult(u, self._work)
+        force = self.forms.K.createVecLeft()
+        self.forms.K.mult(self._work, force)
+        return force
+
+    def motion(self, x: PETSc.Vec) -> float:
+        """Return the norm of the displacement that free dofs cause."""
+        assert self._free_T is not None
+        self._free_T.mult(x, self._work)
+        return float(self._work.norm())
+
+    def nodal_size(self, force: PETSc.Vec) -> NDArray[np.float64]:
+        """Return the size of ``T f`` at this rank's nodes."""
+        self.particles.T.mult(force, self._work)
+        return np.asarray(
+            np.linalg.norm(self._work.array_r.reshape(-1, self.particles.mesh.geometry.dim), axis=1)
+        )
+
+
+class ReducedSystem:
+    """``sum_bodies T^T R(d_n + T u) = 0`` in the free dofs of V, as the solver sees it.
+
+    Args:
+        bodies: The bodies, all on one background space.
+        background: Terms on the background.
+        bcs: Dirichlet conditions on V.
+        evaluate: What the forms need before each assembly; may return a failure.
+        statistics: Where to count.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[Body],
+        background: BackgroundForms | None,
+        bcs: Sequence[fem.DirichletBC],
+        evaluate: Callable[[], MPMError | None],
+        statistics: Statistics,
+    ) -> None:
+        self._bodies = list(bodies)
+        self._background = background
+        self._bcs = bcs
+        self._evaluate = evaluate
+        self._statistics = statistics
+        self._V = bodies[0].particles.V
+        self._comm: MPI.Comm = self._V.mesh.comm
+        self._bs = self._V.dofmap.index_map_bs
+        self._owned = self._V.dofmap.index_map.size_local * self._bs
+        self._free: NDArray[np.int32] | None = None
+        self._total: PETSc.Mat | None = None
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Number of free dofs of this rank and of all ranks."""
+        return self._columns.getLocalSize(), self._columns.getSize()
+
+    @property
+    def force(self) -> PETSc.Vec:
+        """The residual on all dofs of V that was evaluated last: at supports, their force."""
+        return self._force
+
+    def begin(self, change: NDArray[np.float64]) -> None:
+        """Prepare a step, or another try of the same.
+
+        Args:
+            change: Change of the Dirichlet values, on the local dofs of V.
+
+        Raises:
+            ParticleOutsideError: Where the last step left a domain outside the background.
+        """
+        self._change = change[: self._owned]
+        self._imposed = False
+        with self._statistics.phase("locate"):
+            for body in self._bodies:
+                body.particles.locate()
+        if self._free is None:
+            with self._statistics.phase("transfer"):
+                self._find_free_dofs()
+        with self._statistics.phase("assemble"):
+            for body in self._bodies:
+                body.forms.assemble_external()
+            self._gather([body.forms.external for body in self._bodies])
+            self._external = float(self._force.norm())
+
+    def end(self) -> None:
+        """Forget the free dofs, since the bodies have moved."""
+        self._free = None
+
+    def _find_free_dofs(self) -> None:
+        """Free are dofs with weight or a background term, and without a condition."""
+        free = np.zeros(self._owned, dtype=bool)
+        for body in self._bodies:
+            free.reshape(-1, self._bs)[body.particles.active_nodes] = True
+        if self._background is not None:
+            free[self._background.support()] = True
+        self._fixed = np.zeros(self._owned, dtype=bool)
+        for bc in self._bcs:
+            dofs, first_ghost = bc.dof_indices()
+            self._fixed[dofs[:first_ghost]] = True
+        self._free = np.flatnonzero(free & ~self._fixed).astype(np.int32)
+        T = self._bodies[0].particles.T
+        start, _ = T.getOwnershipRangeColumn()
+        numbers = (self._free + start).astype(PETSc.IntType)
+        self._columns = PETSc.IS().createGeneral(numbers, comm=self._comm)
+        self._u = T.createVecRight()
+        self._force = T.createVecRight()
+        self._part = T.createVecRight()
+        self._total = None
+        for body in self._bodies:
+            body.restrict(self._columns)
+        self._statistics.count("transfers")
+        self._statistics["free_dofs"] = self.sizes[1]
+
+    def _gather(self, vectors: Sequence[PETSc.Vec]) -> None:
+        """Set the force to the sum of ``T^T`` times each body's vector."""
+        self._bodies[0].particles.T.multTranspose(vectors[0], self._force)
+        for body, vector in zip(self._bodies[1:], vectors[1:], strict=True):
+            body.particles.T.multTransposeAdd(vector, self._force, self._force)
+
+    def residual(self, x: PETSc.Vec, F: PETSc.Vec) -> MPMError | None:
+        """Evaluate the residual at x, or say why that cannot be."""
+        increments = [body.particles.increment.x for body in self._bodies]
+        u = increments[0]
+        u.array[: self._owned] = self._lifts() if self._imposed else 0.0
+        u.array[self._free] = x.array_r
+        u.scatter_forward()
+        for other in increments[1:]:
+            other.array[:] = u.array
+        self._u.array_w[:] = u.array[: self._owned]
+        with self._statistics.phase("constitutive"):
+            failure: MPMError | None = None
+            for body in self._bodies:
+                body.move(self._u)
+                inverted = body.particles.inverted()
+                failure = failure or distorted("turn inside out", inverted)
+            failure = agreed(self._comm, failure or self._evaluate())
+        if failure is not None:
+            return failure
+        with self._statistics.phase("assemble"):
+            self._gather([body.forms.assemble_residual() for body in self._bodies])
+            if self._background is not None:
+                self._force.axpy(1.0, self._background.assemble_residual())
+        F.array_w[:] = self._force.array_r[self._free]
+        return None
+
+    def tangent(self) -> PETSc.Mat:
+        """Return the tangent at the x of the last residual, one object within a step."""
+        with self._statistics.phase("assemble"):
+            parts = [body.tangent() for body in self._bodies]
+            if self._background is not None:
+                whole = self._background.assemble_tangent()
+                parts.append(whole.createSubMatrix(self._columns, self._columns))
+            if len(parts) == 1:
+                return parts[0]
+            if self._total is None:
+                self._total = parts[0].copy()
+                for part in parts[1:]:
+                    self._total.axpy(1.0, part, structure=DIFFERENT)
+            else:
+                self._total.zeroEntries()
+                for part in parts:
+                    self._total.axpy(1.0, part, structure=SUBSET)
+            return self._total
+
+    def impose(self) -> bool:
+        """Impose the step's Dirichlet values from now on; return whether there are any."""
+        self._imposed = True
+        return bool(self._comm.allreduce(bool(np.any(self._lifts())), MPI.LOR))
+
+    def _lifts(self) -> NDArray[np.float64]:
+        return np.where(self._fixed, self._change, 0.0)
+
+    def lift(self) -> PETSc.Vec:
+        """Return the linearised forces of the step's Dirichlet values on the free dofs."""
+        self._u.array_w[:] = self._lifts()
+        self._part.set(0.0)
+        if self._background is not None:
+            self._background.assemble_tangent().mult(self._u, self._part)
+        for body in self._bodies:
+            force = body.stiffness_force(self._u)
+            body.particles.T.multTransposeAdd(force, self._part, self._part)
+        reduced = PETSc.Vec().createMPI(self.sizes, comm=self._comm)
+        reduced.array_w[:] = self._part.array_r[self._free]
+        return reduced
+
+    def scale(self) -> float:
+        """Return the larger of external forces and reactions."""
+        reactions = np.where(self._fixed, self._force.array_r, 0.0)
+        return max(
+            self._external, float(np.sqrt(self._comm.allreduce(float(reactions @ reactions))))
+        )
+
+    def internal_scale(self) -> float:
+        """Return the size of what all domains add to the residual, in absolute values."""
+        with self._statistics.phase("assemble"):
+            self._part.set(0.0)
+            for body in self._bodies:
+                total = body.forms.absolute_contributions(body.particles.domain_nodes)
+                body.particles.T.multTransposeAdd(total, self._part, self._part)
+            return float(self._part.norm())
+
+    def motion(self, x: PETSc.Vec) -> float:
+        """Return the size of the displacement that x causes on the bodies."""
+        return float(np.linalg.norm([body.motion(x) for body in self._bodies]))
+
+    def crossed(self) -> MPMError | None:
+        """Return an error where domains cross themselves."""
+        found: MPMError | None = None
+        for body in self._bodies:
+            found = found or distorted("cross themselves", body.particles.crossed())
+        return agreed(self._comm, found)
+
+    def worst_particles(self) -> list[int]:
+        """Return the particles at the node with the largest residual."""
+        best: tuple[float, list[int]] = (0.0, [])
+        for body in self._bodies:
+            self._part.set(0.0)
+            self._part.array_w[self._free] = self._force.array_r[self._free]
+            size = np.nan_to_num(body.nodal_size(self._part), nan=0.0, posinf=0.0)
+            largest = self._comm.allreduce(float(size.max(initial=0.0)), MPI.MAX)
+            if largest <= best[0]:
+                continue
+            nodes = np.flatnonzero(size >= largest)
+            touches = np.isin(body.particles.domain_nodes, nodes).any(axis=1)
+            mine = [int(p) for p in body.particles.global_index[touches]]
+            best = largest, sorted({p for ps in self._comm.allgather(mine) for p in ps})
+        return best[1]
+
+
+def distorted(how: str, which: NDArray[np.int64]) -> DomainDistortionError | None:
+    """Return an error about domains, if there are any."""
+    return (
+        DomainDistortionError(f"The domains of {{particles}} {how}", which) if len(which) else None
+    )

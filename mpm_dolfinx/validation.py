@@ -1,0 +1,100 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What particles can be made of, and the sentences for what they cannot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dolfinx import fem, mesh
+
+from .errors import MPMError
+from .methods import METHODS
+
+__all__ = ["validate_options", "validate_spaces"]
+
+#: Pairs (degree of the background, degree of the domains) that work.
+DEGREES = {(1, 1)}
+
+
+def validate_spaces(body: Any, V: Any) -> None:
+    """Raise an error unless a body and a background space go together."""
+    if not isinstance(body, mesh.Mesh):
+        raise MPMError(f"The body must be a dolfinx.mesh.Mesh, not {type(body).__name__}.")
+    if not isinstance(V, fem.FunctionSpace):
+        raise MPMError(
+            f"V must be a dolfinx FunctionSpace on the background, not {type(V).__name__}."
+        )
+    background = V.mesh
+    gdim = body.geometry.dim
+    if V.mesh is body:
+        raise MPMError("V lives on the body mesh; make it on the background mesh.")
+    if gdim not in (2, 3) or body.topology.dim != gdim:
+        raise MPMError(
+            f"The body must fill its space in 2-D or 3-D; it has topological dimension "
+            f"{body.topology.dim} in {gdim} dimensions."
+        )
+    if background.geometry.dim != gdim or background.topology.dim != gdim:
+        raise MPMError(
+            f"The body is {gdim}-dimensional, the background {background.geometry.dim}-"
+            "dimensional; both must have the same dimension."
+        )
+    cells = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
+    for what, domain in (("body", body), ("background", background)):
+        if domain.topology.cell_name() not in cells:
+            raise MPMError(
+                f"The {what} has {domain.topology.cell_name()} cells; use one of "
+                f"{', '.join(cells)}."
+            )
+    element = V.ufl_element()
+    if (
+        element.reference_value_shape != (gdim,)
+        or element.family_name != "P"
+        or (element.discontinuous)
+    ):
+        raise MPMError(
+            f"V must be a continuous Lagrange space of vectors with {gdim} components, e.g. "
+            f'fem.functionspace(background, ("Lagrange", 1, ({gdim},))).'
+        )
+    if V.dofmap.index_map_bs != gdim:
+        raise MPMError("V must not be a subspace; pass the whole vector space.")
+    if body.comm.size != background.comm.size:
+        raise MPMError(
+            "The body and the background live on different numbers of ranks; make both on the "
+            "same communicator."
+        )
+
+
+def validate_options(
+    body: mesh.Mesh,
+    V: fem.FunctionSpace,
+    method: str,
+    degree: int,
+    quadrature_degree: int | None,
+    outside: str,
+    domain_update: str,
+) -> None:
+    """Raise an error unless method, degrees and policies go together."""
+    element = V.ufl_element()
+    if method not in METHODS:
+        raise MPMError(f"Unknown method {method!r}; choose one of {', '.join(map(repr, METHODS))}.")
+    if (element.degree, degree) not in DEGREES:
+        raise MPMError(
+            f"Domains of degree {degree!r} on a background of degree {element.degree} are not "
+            "supported; use degree 1 on 1."
+        )
+    if method != "cpdi2" and (degree, quadrature_degree or 1) != (1, 1):
+        raise MPMError(
+            f"Method {method!r} has one quadrature point per domain of degree 1; use 'cpdi2' "
+            "for others."
+        )
+    if quadrature_degree is not None and (
+        not isinstance(quadrature_degree, int) or quadrature_degree < 0
+    ):
+        raise MPMError(
+            f"quadrature_degree must be a whole number from 0 on, not {quadrature_degree!r}."
+        )
+    if outside != "error":
+        raise MPMError(f"Unknown policy outside={outside!r}; choose 'error'.")
+    if domain_update not in ("stretch", "fixed"):
+        raise MPMError(f"Unknown domain_update={domain_update!r}; choose 'stretch' or 'fixed'.")
