@@ -27,13 +27,16 @@ assemble_matrix: Any = fem_petsc.assemble_matrix
 __all__ = ["BackgroundForms", "BodyForms"]
 
 
-def _test_function(form: ufl.Form, space: fem.FunctionSpace, what: str) -> Any:
-    arguments = form.arguments() if isinstance(form, ufl.Form) else None
-    if not arguments or len(arguments) != 1:
-        raise MPMError(f"{what} must be a UFL form with one test function.")
-    if arguments[0].ufl_function_space() != space:
-        raise MPMError(f"The test function of {what} must be from the space {space!r}.")
-    return arguments[0]
+def _arguments(form: Any, rank: int, space: fem.FunctionSpace, what: str, where: str) -> Any:
+    """Return test (and trial) function of a form, if they are from a space."""
+    arguments = form.arguments() if isinstance(form, ufl.Form) else ()
+    if len(arguments) != rank:
+        kind = "one test function" if rank == 1 else "a test and a trial function"
+        raise MPMError(f"{what} must be a UFL form with {kind} of {where}.")
+    if any(argument.ufl_function_space() != space for argument in arguments):
+        kind = "test function" if rank == 1 else "test and trial functions"
+        raise MPMError(f"The {kind} of {what} must be from {where}.")
+    return arguments
 
 
 def _assemble_into(vector: PETSc.Vec, forms: list[fem.Form]) -> None:
@@ -65,7 +68,7 @@ class BodyForms:
         **options: Any,
     ) -> None:
         self._options = options
-        self._test = _test_function(R, particles.W, "The residual R")
+        (self._test,) = _arguments(R, 1, particles.W, "the residual R", "particles.W")
         d = particles.displacement
         parts = split_by_rule(R, d)
         live = [p for p in parts if follows(p, d)]
@@ -73,6 +76,7 @@ class BodyForms:
         if J is None:
             tangents = [ufl.derivative(p, d) for p in live if depends_on(p, d)]
         else:
+            _arguments(J, 2, particles.W, "the tangent J", "particles.W")
             tangents = split_by_rule(J, d)
         if not tangents:
             raise MPMError(
@@ -162,7 +166,7 @@ class BackgroundForms:
     """
 
     def __init__(self, F: ufl.Form, particles: Particles, **options: Any) -> None:
-        _test_function(F, particles.V, "The background form")
+        _arguments(F, 1, particles.V, "the background form", "the background space V")
         u = particles.increment
         parts = split_by_rule(F, u)
         tangents = [ufl.derivative(p, u) for p in parts if depends_on(p, u)]

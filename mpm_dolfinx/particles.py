@@ -122,7 +122,7 @@ class Particles:
         self._converged = np.zeros_like(self._nodes)
         self._constitutive: ConstitutiveHistory | None = None
         with agree(body.comm):
-            flat = self.global_index[self.quadrature.weights.min(axis=1, initial=1.0) <= 0.0]
+            flat = self.global_index[self.quadrature.flat]
             if len(flat):
                 raise DomainDistortionError(
                     "The domains of {particles} have no volume; mend the body mesh.",

@@ -90,7 +90,7 @@ class ParticleProblem:
         shift: float = 1e-13,
         line_search: bool = True,
     ) -> None:
-        if not (np.isfinite(shift) and 0.0 <= shift < 1.0):
+        if not isinstance(shift, float | int) or not 0.0 <= shift < 1.0:
             raise MPMError(f"shift must be at least 0 and below 1, not {shift!r}.")
         options = {"form_compiler_options": form_compiler_options, "jit_options": jit_options}
         self.particles = particles
@@ -98,6 +98,10 @@ class ParticleProblem:
         V = self.bodies[0].V
         residuals = _one_for_each(R, self.bodies, "residual R")
         tangents = [None] * len(self.bodies) if J is None else _one_for_each(J, self.bodies, "J")
+        if not isinstance(bcs, list | tuple) or not all(
+            isinstance(bc, fem.DirichletBC) for bc in bcs
+        ):
+            raise MPMError("bcs must be a list of dolfinx.fem.DirichletBC.")
         self.bcs = list(bcs)
         if not all(_compat.is_condition_on(bc, V) for bc in self.bcs):
             raise MPMError(
@@ -218,9 +222,6 @@ class ParticleProblem:
                 else:
                     values = base + (self._dirichlet_values() - base) * t
                 step = self._advance(t if update is not None else load, values)
-            except ParticleOutsideError as error:
-                self._restore(update)
-                raise self._placed(error) from None
             except (ConvergenceError, DomainDistortionError) as error:
                 self._restore()
                 self.history.failed_iterations += self._newton.iterations
@@ -229,6 +230,9 @@ class ParticleProblem:
                     raise self._placed(error) from None
                 self.history.cutbacks += 1
                 continue
+            except MPMError as error:
+                self._restore(update)
+                raise self._placed(error) from None
             control.accept(step.iterations)
             yield step
         self._warn_of_outside()
@@ -338,6 +342,8 @@ class ParticleProblem:
         values: NDArray[np.float64] = np.zeros_like(self._prescribed)
         for bc in self.bcs:
             bc.set(values, None, 1.0)
+        if not self._comm.allreduce(bool(np.isfinite(values).all()), MPI.LAND):
+            raise MPMError("A Dirichlet condition has a value that is not finite")
         return values
 
     def _restore(self, update: Callable[[float], None] | None = None) -> None:
@@ -352,10 +358,9 @@ class ParticleProblem:
     def _placed(self, error: MPMError) -> MPMError:
         """Say at what load an error happened, and what to do."""
         advice = {
-            ParticleOutsideError: "",
             DomainDistortionError: "; take more steps, smaller loads or finer domains",
             ConvergenceError: "; take more steps, or look whether a limit load is reached",
-        }[type(error)]
+        }.get(type(error), "")
         particles, text = error.particles, error.message.rstrip(".")
         if isinstance(error, ConvergenceError) and not particles:
             particles = self.reduced.worst_particles()

@@ -61,7 +61,9 @@ class DomainQuadrature:
     """A rule on every domain this rank owns: weights, shape functions and their gradients.
 
     Attributes:
-        weights: Reference volume of each point, shape ``(n, nq)``.
+        weights: Reference volume of each point, shape ``(n, nq)``; a rule may have negative
+            ones.
+        flat: Whether a domain has no volume at a point, shape ``(n,)``.
         shapes: Shape functions of W at the points, shape ``(nq, k)``.
         gradients: Their gradients in the undeformed body, shape ``(n, nq, k, gdim)``.
     """
@@ -79,7 +81,11 @@ class DomainQuadrature:
         jacobian = np.einsum("jqk,nki->nqij", slopes, nodes)
         table = shape_functions.tabulate(1, points)[:, :, :, 0]
         self.shapes: NDArray[np.float64] = table[0]
-        self.weights: NDArray[np.float64] = weights * np.abs(np.linalg.det(jacobian))
+        size = np.abs(np.linalg.det(jacobian))
+        span = np.ptp(nodes, axis=1).max(axis=1, initial=0.0) ** gdim
+        self.flat: NDArray[np.bool_] = ~(size > 1e-12 * span[:, None]).all(axis=1)
+        jacobian[self.flat] = np.eye(gdim)
+        self.weights: NDArray[np.float64] = weights * size
         self.gradients: NDArray[np.float64] = np.einsum(
             "jqk,nqji->nqki", table[1:], np.linalg.inv(jacobian)
         )

@@ -98,6 +98,7 @@ class QuasiStaticProblem(ParticleProblem):
             self._stresses.append(stress)
             frame = _Frame(body, axisymmetric)
             R, J = frame.internal(stress.first_piola, stress.tangent)
+            mass = _expression(mass, body, "density", ())
             if force is not None:
                 R -= frame.body_force(mass, force)
             if dead:
@@ -207,8 +208,7 @@ class _Frame:
     def body_force(self, density: Any, force: Any) -> ufl.Form:
         """Return the virtual work of the body force."""
         b = _expression(force, self._body, "body_force", (self._dim,))
-        mass = _expression(density, self._body, "density", ())
-        work: ufl.Form = mass * self._turn * ufl.inner(b, self._v) * self._body.dx_exact
+        work: ufl.Form = density * self._turn * ufl.inner(b, self._v) * self._body.dx_exact
         return self._at_load([work])
 
     def tractions(self, loads: Sequence[tuple[Any, int]], tags: Any) -> ufl.Form:

@@ -277,6 +277,8 @@ class ReducedSystem:
     def worst_particles(self) -> list[int]:
         """Return the particles at the node with the largest residual."""
         best: tuple[float, list[int]] = (0.0, [])
+        if self._free is None:
+            return best[1]
         for body in self._bodies:
             self._part.set(0.0)
             self._part.array_w[self._free] = self._force.array_r[self._free]

@@ -112,9 +112,9 @@ class NewtonSolver:
         for key, value in options.items():
             database[key] = value
         self.snes.setFromOptions()
-        for key in options:
-            del database[key]
         database.prefixPop()
+        for key in options:
+            database.delValue(prefix + key)
 
     def solve(self, problem: ReducedProblem, sizes: tuple[int, int]) -> None:
         """Find a root of the residual, starting from zero.
