@@ -6,7 +6,7 @@ from . import _compat
 
 _compat.require_supported()
 
-from . import materials  # noqa: E402
+from . import materials, plot  # noqa: E402
 from .errors import (  # noqa: E402
     ConvergenceError,
     DomainDistortionError,
@@ -35,4 +35,5 @@ __all__ = [
     "Weights",
     "__version__",
     "materials",
+    "plot",
 ]

@@ -19,6 +19,7 @@ COUNTERS = (
     "factorisations",
     "halvings",
     "converged_at_round_off",
+    "workspace_retries",
 )
 
 
@@ -28,8 +29,9 @@ class Statistics(dict[str, float]):
     The phases, which do not overlap, are ``locate``, ``transfer``, ``constitutive``,
     ``assemble``, ``factorise``, ``solve`` and ``commit``. Counters are ``transfers`` (how often
     the transfer was rebuilt), ``free_dofs`` (unknowns of the last step), ``residuals`` and
-    ``factorisations``, ``halvings`` (of Newton steps by the line search) and
-    ``converged_at_round_off`` (steps that ended at the floor of round-off).
+    ``factorisations``, ``halvings`` (of Newton steps by the line search),
+    ``converged_at_round_off`` (steps that ended at the floor of round-off) and
+    ``workspace_retries`` (factorisations that MUMPS repeated with more workspace).
     """
 
     def __init__(self) -> None:

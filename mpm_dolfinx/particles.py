@@ -279,6 +279,11 @@ class Particles:
         return self._converged.ravel()
 
     @property
+    def node_positions(self) -> NDArray[np.float64]:
+        """Positions of this rank's nodes of W at the last converged step, shape ``(N, gdim)``."""
+        return np.asarray(self._nodes + self._converged)
+
+    @property
     def initial_domains(self) -> NDArray[np.float64]:
         """Corners of the undeformed domains, shape ``(n, k, gdim)``."""
         return np.asarray(self._nodes[self.domain_nodes])

@@ -74,6 +74,12 @@ class Body:
         self._free_T.mult(x, self._work)
         return float(self._work.norm())
 
+    def extent(self) -> float:
+        """Return the norm of the positions of the body's nodes."""
+        rows = self._work.getLocalSize()
+        self._work.array_w[:] = self.particles.node_positions.ravel()[:rows]
+        return float(self._work.norm())
+
     def nodal_size(self, force: PETSc.Vec) -> NDArray[np.float64]:
         """Return the size of ``T f`` at this rank's nodes."""
         self.particles.T.mult(force, self._work)
@@ -266,6 +272,10 @@ class ReducedSystem:
     def motion(self, x: PETSc.Vec) -> float:
         """Return the size of the displacement that x causes on the bodies."""
         return float(np.linalg.norm([body.motion(x) for body in self._bodies]))
+
+    def extent(self) -> float:
+        """Return the size of the positions of all nodes."""
+        return float(np.linalg.norm([body.extent() for body in self._bodies]))
 
     def crossed(self) -> MPMError | None:
         """Return an error where domains cross themselves."""

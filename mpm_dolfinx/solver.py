@@ -21,6 +21,8 @@ ROUND_OFF = 1e-13
 #: Most halvings of a Newton step, and the drop in work that needs none.
 HALVINGS = 8
 SUFFICIENT = 0.8
+#: Values of MUMPS's INFOG(1) that more workspace cures.
+OUT_OF_WORKSPACE = (-8, -9)
 
 
 class ReducedProblem(Protocol):
@@ -46,6 +48,9 @@ class ReducedProblem(Protocol):
 
     def motion(self, x: PETSc.Vec) -> float:
         """Return the size of the displacement that x causes on the body."""
+
+    def extent(self) -> float:
+        """Return the size of the positions of the body, in the same norm."""
 
 
 class NewtonSolver:
@@ -228,7 +233,10 @@ class NewtonSolver:
         if norm <= max(rtol * scale, atol):
             return reasons.CONVERGED_FNORM_RELATIVE
         step, whole = self._motion
-        if iteration > 0 and step <= ROUND_OFF * whole:
+        if iteration > 0 and (
+            step <= ROUND_OFF * whole
+            or (self._stalled and step <= 4 * np.finfo(float).eps * self._problem.extent())
+        ):
             self.statistics.count("converged_at_round_off")
             return reasons.CONVERGED_SNORM_RELATIVE
         return None
@@ -259,7 +267,23 @@ class NewtonSolver:
         ksp.setOperators(K, self._P)
         with self.statistics.phase("factorise"):
             ksp.setUp()
+            self._give_workspace(ksp)
         self.statistics.count("factorisations")
+
+    def _give_workspace(self, ksp: PETSc.KSP) -> None:
+        """Factorise again with more workspace where MUMPS ran out of it."""
+        pc = ksp.getPC()
+        if pc.getType() not in ("lu", "cholesky") or pc.getFactorSolverType() != "mumps":
+            return
+        for percent in (100, 200, 400, 800):
+            if pc.getFactorMatrix().getMumpsInfog(1) not in OUT_OF_WORKSPACE:
+                return
+            pc.reset()
+            ksp.setOperators(self.K, self._P)
+            pc.setFactorSetUpSolverType()
+            pc.getFactorMatrix().setMumpsIcntl(14, percent)
+            ksp.setUp()
+            self.statistics.count("workspace_retries")
 
     def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
         if not self._fresh:

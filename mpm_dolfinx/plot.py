@@ -1,0 +1,238 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Pictures of particle domains: by matplotlib in the plane, as a pyvista grid elsewhere.
+
+Both packages are optional (``pip install 'mpm-dolfinx[plot]'``) and imported on rank 0 only,
+when a picture is asked for. All functions are collective.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import basix
+from dolfinx import fem, mesh
+
+from . import _compat
+from .errors import MPMError, agree
+from .particles import Particles
+
+__all__ = ["background", "domains", "grid"]
+
+#: VTK's cell types, and its order of the corners of DOLFINx's cells.
+VTK_CELLS = {
+    "triangle": (5, [0, 1, 2]),
+    "quadrilateral": (9, [0, 1, 3, 2]),
+    "tetrahedron": (10, [0, 1, 2, 3]),
+    "hexahedron": (12, [0, 1, 3, 2, 4, 5, 7, 6]),
+}
+#: Straight pieces that an edge is drawn with where it is curved.
+PIECES = 8
+
+
+def domains(
+    particles: Particles,
+    values: ArrayLike | None = None,
+    ax: Any = None,
+    *,
+    cmap: Any = "viridis",
+    vmin: float | None = None,
+    vmax: float | None = None,
+    facecolor: Any = "0.8",
+    edgecolor: Any = "0.25",
+    linewidth: float = 0.3,
+    warp: float = 1.0,
+    **options: Any,
+) -> Any:
+    """Draw the domains of particles in the plane at their current positions (collective).
+
+    Args:
+        particles: The body.
+        values: One value for each particle that this rank owns, shape ``(n,)``, shown by
+            colour; ``None`` is one colour for all.
+        ax: Axes to draw on, matplotlib's current ones by default; only that of rank 0 counts.
+            Its aspect is made equal.
+        cmap: Colour map of the values.
+        vmin: Value of the first colour, the smallest by default.
+        vmax: Value of the last colour, the largest by default.
+        facecolor: Colour of domains without values.
+        edgecolor: Colour of the domains' edges.
+        linewidth: Width of the edges in points.
+        warp: Factor on the displacement; 0 draws the undeformed body.
+        **options: Passed on to ``matplotlib.collections.PolyCollection``.
+
+    Returns:
+        The ``PolyCollection`` on rank 0 (ready for ``fig.colorbar``), ``None`` elsewhere.
+
+    Raises:
+        MPMError: The body is not in the plane, ``values`` has another shape, or matplotlib is
+            missing.
+    """
+    comm: MPI.Comm = particles.mesh.comm
+    _require_plane(particles.mesh)
+    shown = None if values is None else np.asarray(values, dtype=np.float64)
+    with agree(comm):
+        if shown is not None and shown.shape != (particles.num_local,):
+            raise MPMError(
+                f"values must have the shape ({particles.num_local},), one value for each particle "
+                f"of the rank, not {shown.shape}."
+            )
+    collections = _imported("matplotlib.collections", comm)
+    index = comm.gather(particles.global_index)
+    outlines = comm.gather(_outlines(particles, warp))
+    colours = comm.gather(shown)
+    if index is None or outlines is None or colours is None:
+        return None
+    order = np.argsort(np.concatenate(index))
+    if shown is not None:
+        options = {"array": np.concatenate(colours)[order], "cmap": cmap, **options}
+    else:
+        options = {"facecolors": facecolor, **options}
+    artist = collections.PolyCollection(
+        np.concatenate(outlines)[order], edgecolors=edgecolor, linewidths=linewidth, **options
+    )
+    if shown is not None:
+        artist.set_clim(vmin, vmax)
+    return _added(artist, ax)
+
+
+def background(
+    V: fem.FunctionSpace | mesh.Mesh,
+    ax: Any = None,
+    *,
+    color: Any = "0.85",
+    linewidth: float = 0.4,
+    **options: Any,
+) -> Any:
+    """Draw the cells of a background grid in the plane (collective).
+
+    Args:
+        V: The background space, or its mesh.
+        ax: Axes to draw on, matplotlib's current ones by default; only that of rank 0 counts.
+            Its aspect is made equal.
+        color: Colour of the lines.
+        linewidth: Their width in points.
+        **options: Passed on to ``matplotlib.collections.PolyCollection``.
+
+    Returns:
+        The ``PolyCollection`` on rank 0, ``None`` elsewhere.
+
+    Raises:
+        MPMError: The grid is not in the plane, or matplotlib is missing.
+    """
+    grid_mesh = V if isinstance(V, mesh.Mesh) else V.mesh
+    comm: MPI.Comm = grid_mesh.comm
+    _require_plane(grid_mesh)
+    collections = _imported("matplotlib.collections", comm)
+    own = grid_mesh.topology.index_map(grid_mesh.topology.dim).size_local
+    corners = VTK_CELLS[grid_mesh.basix_cell().name][1]
+    nodes = _compat.geometry_dofmap(grid_mesh)[:own, corners]
+    cells = comm.gather(grid_mesh.geometry.x[nodes, :2])
+    if cells is None:
+        return None
+    options = {"facecolors": "none", "zorder": 0.5, **options}
+    artist = collections.PolyCollection(
+        np.concatenate(cells), edgecolors=color, linewidths=linewidth, **options
+    )
+    return _added(artist, ax)
+
+
+def grid(particles: Particles) -> Any:
+    """Return the domains at their current positions for pyvista (collective).
+
+    Cell data are ``particle`` (the global index), ``volume_ratio`` and, where there is a
+    material, ``stress`` (Cauchy, nine components), ``pressure`` and ``plastic_strain``; point
+    data ``displacement``. Domains of higher degree are drawn by their corners.
+
+    Args:
+        particles: The body, in the plane or in space.
+
+    Returns:
+        A ``pyvista.UnstructuredGrid`` on rank 0, particles in the order of their global
+        indices; ``None`` elsewhere.
+
+    Raises:
+        MPMError: pyvista is missing.
+    """
+    comm: MPI.Comm = particles.mesh.comm
+    pyvista = _imported("pyvista", comm)
+    cell_type, corners = VTK_CELLS[particles.mesh.basix_cell().name]
+    nodes = particles.domain_nodes[:, corners]
+    data: dict[str, NDArray[Any]] = {
+        "particle": particles.global_index,
+        "volume_ratio": particles.volume / particles.initial_volume,
+    }
+    if particles.has_material:
+        stress = particles.stress
+        data["stress"] = stress.reshape(-1, 9)
+        data["pressure"] = -np.trace(stress, axis1=1, axis2=2) / 3.0
+        data["plastic_strain"] = particles.plastic_strain
+    moved = particles.displacement.x.array.reshape(particles._nodes.shape)
+    imap = particles.W.dofmap.index_map
+    names = imap.local_to_global(np.arange(imap.size_local + imap.num_ghosts, dtype=np.int32))
+    gathered = comm.gather((names[nodes], particles._nodes[nodes], moved[nodes], data))
+    if gathered is None:
+        return None
+    order = np.argsort(np.concatenate([part[3]["particle"] for part in gathered]))
+    cells, start, shift = (np.concatenate([part[k] for part in gathered])[order] for k in range(3))
+    _, first, points = np.unique(cells, return_index=True, return_inverse=True)
+    start, shift = (
+        np.pad(a.reshape(-1, a.shape[2])[first], ((0, 0), (0, 3 - a.shape[2])))
+        for a in (start, shift)
+    )
+    result = pyvista.UnstructuredGrid({cell_type: points.reshape(cells.shape)}, start + shift)
+    result.point_data["displacement"] = shift
+    for name in data:
+        result.cell_data[name] = np.concatenate([part[3][name] for part in gathered])[order]
+    return result
+
+
+def _outlines(particles: Particles, warp: float) -> NDArray[np.float64]:
+    """Return the boundaries of the owned domains as polygons, shape ``(n, m, 2)``."""
+    cell = particles.mesh.basix_cell()
+    corners = basix.geometry(cell)[VTK_CELLS[cell.name][1]]
+    pieces = 1 if particles._shape_functions.degree == 1 else PIECES
+    share = np.arange(pieces)[:, None] / pieces
+    points = np.concatenate(
+        [
+            (1.0 - share) * a + share * b
+            for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)
+        ]
+    )
+    values = particles._shape_functions.tabulate(0, points)[0, :, :, 0]
+    moved = particles.displacement.x.array.reshape(particles._nodes.shape)
+    now = particles._nodes + warp * moved
+    return np.asarray(np.einsum("mk,nki->nmi", values, now[particles.domain_nodes]))
+
+
+def _require_plane(domain: mesh.Mesh) -> None:
+    if (domain.geometry.dim, domain.topology.dim) != (2, 2):
+        raise MPMError("Only bodies in the plane are drawn by matplotlib; use plot.grid in space.")
+
+
+def _imported(module: str, comm: MPI.Comm) -> Any:
+    """Import an optional module on rank 0; ranks agree where it is missing."""
+    with agree(comm):
+        try:
+            found = import_module(module) if comm.rank == 0 else None
+        except ImportError:
+            name = module.partition(".")[0]
+            raise MPMError(
+                f"Pictures need {name}; install it with pip install 'mpm-dolfinx[plot]'."
+            ) from None
+    return found
+
+
+def _added(artist: Any, ax: Any) -> Any:
+    if ax is None:
+        ax = import_module("matplotlib.pyplot").gca()
+    ax.add_collection(artist)
+    ax.set_aspect("equal")
+    ax.autoscale_view()
+    return artist

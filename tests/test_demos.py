@@ -1,0 +1,178 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The demos: each runs, reports numbers within bounds, and makes a picture."""
+
+import json
+import os
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from scenes import WORLD
+
+DEMOS = Path(__file__).parents[1] / "demos"
+COMMON = {"completed", "load", "iterations", "cutbacks", "failure"}
+
+RUNS = {
+    "compaction-quad": ("compaction", "--elements 8", {"error": 1e-2, "error_position": 1e-3}),
+    "compaction-tri": (
+        "compaction",
+        "--elements 8 --domain tri",
+        {"error": 1.5e-2, "error_position": 2e-3},
+    ),
+    "roller-quad": (
+        "column_roller",
+        "--elements 8",
+        {"error_syy": 9e-3, "error_sxx": 7e-3, "yield_violation": 1e-8},
+    ),
+    "roller-tri": (
+        "column_roller",
+        "--elements 8 --domain tri --steps 20",
+        {"error_syy": 1.5e-2, "error_sxx": 1e-2, "yield_violation": 1e-8},
+    ),
+    "roller-small-strain": (
+        "column_roller",
+        "--elements 8 --small-strain --young 2e8 --steps 10",
+        {"error_syy": 1.05 / 32, "error_sxx": 1.05 / 32, "yield_violation": 1e-8},
+    ),
+    "free-tri": (
+        "column_free",
+        "--cell 1 --steps 20 --g0 15e3",
+        {"yield_violation": 1e-8, "cutbacks": 2},
+    ),
+    "free-quad": (
+        "column_free",
+        "--domain quad --cell 1 --steps 20 --g0 15e3",
+        {"yield_violation": 1e-8, "cutbacks": 2},
+    ),
+    "ufl": ("ufl_material", "--elements 4 --steps 12", {"difference": 1e-2}),
+}
+KEYS = {
+    "compaction": {"error", "error_position", "particles"},
+    "column_roller": {"error_syy", "error_sxx", "top", "particles", "yield_violation"},
+    "column_free": {"top", "toe", "y_mean", "yield_violation", "worst_domain"},
+    "ufl_material": {"difference"},
+}
+
+
+def run(demo, arguments, capfd):
+    """Run a demo on all ranks, in this process; return status and rank 0's standard output."""
+    path = DEMOS / f"demo_{demo}.py"
+    argv, hook, search = sys.argv, sys.excepthook, sys.path[:]
+    sys.argv = [str(path), *arguments]
+    sys.path.insert(0, str(DEMOS))
+    status = 0
+    try:
+        runpy.run_path(str(path), run_name="__main__")
+    except SystemExit as stop:
+        status = stop.code or 0
+    finally:
+        sys.argv, sys.excepthook, sys.path[:] = argv, hook, search
+    return status, WORLD.bcast(capfd.readouterr().out)
+
+
+@pytest.mark.parametrize("case", RUNS)
+def test_numbers(case, capfd):
+    demo, arguments, bounds = RUNS[case]
+    status, out = run(demo, [*arguments.split(), "--json"], capfd)
+    assert status == 0
+    numbers = json.loads(out)
+    assert COMMON | KEYS[demo] <= numbers.keys()
+    assert not any("time" in key or "seconds" in key for key in numbers)
+    assert numbers["completed"] == 1 and numbers["failure"] is None
+    assert numbers["load"] == 1.0 and numbers["iterations"] > 0
+    for key, bound in bounds.items():
+        assert numbers[key] <= bound, key
+    if "particles" in numbers and "--elements 8" in arguments:
+        assert numbers["particles"] == 32 * (2 if "tri" in arguments else 1)
+    if demo == "column_free":
+        # Volume is kept but for elasticity: the mean height times the width is that of a slab.
+        assert 8.0 < numbers["toe"] < 15.0 and 0.0 < numbers["worst_domain"] <= 1.0 + 1e-9
+        assert 1.2 < numbers["y_mean"] < 2.5
+    if case == "roller-small-strain":
+        assert numbers["error_syy"] > 0.95 / 32
+
+
+def test_plain_solver_reports_its_end(capfd):
+    # It ends in one of our errors or, by luck, completes; the status is 0 either way.
+    arguments = "--domain quad --cell 1 --g0 80e3 --steps 10 --plain-solver --json".split()
+    status, out = run("column_free", arguments, capfd)
+    assert status == 0
+    numbers = json.loads(out)
+    if numbers["completed"] == 1:
+        assert numbers["failure"] is None and numbers["load"] == 1.0
+    else:
+        assert numbers["completed"] == 0 and numbers["load"] < 1.0
+        assert numbers["failure"] in (
+            "ConvergenceError",
+            "DomainDistortionError",
+            "ParticleOutsideError",
+        )
+
+
+@pytest.mark.parametrize(
+    ("demo", "arguments"),
+    [
+        pytest.param("compaction", "--elements 4 --steps 10", marks=pytest.mark.skip_in_parallel),
+        ("column_roller", "--elements 8 --steps 10"),
+        ("column_free", "--cell 1 --steps 10 --g0 10e3"),
+        pytest.param("ufl_material", "--elements 4 --steps 4", marks=pytest.mark.skip_in_parallel),
+    ],
+)
+def test_picture(demo, arguments, mpi_tmp_path, capfd):
+    picture = mpi_tmp_path / "out" / "picture.png"
+    status, out = run(demo, [*arguments.split(), "--plot", str(picture)], capfd)
+    assert status == 0
+    assert out.strip() and not out.lstrip().startswith("{")
+    WORLD.Barrier()
+    assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert picture.stat().st_size > 5000
+
+
+@pytest.mark.parametrize("demo", KEYS)
+def test_help_and_unknown_values(demo, capfd):
+    status, out = run(demo, ["--help"], capfd)
+    assert status == 0
+    for option in ("--json", "--plot", "--steps"):
+        assert option in out
+    for wrong in (["--steps", "0"], ["--nonsense"], ["--plot", "picture.txt"]):
+        assert run(demo, wrong, capfd)[0] == 2
+    if "--domain" in out:
+        assert run(demo, ["--domain", "circle"], capfd)[0] == 2
+
+
+@pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("demo", KEYS)
+def test_text_is_a_lecture_note(demo):
+    text = (DEMOS / f"demo_{demo}.py").read_text()
+    assert "# It illustrates how to:\n" in text
+    assert r"\tag{1}" in text
+    assert "assert " in text.rsplit("# ", 1)[1] or "assert " in text[-2000:]
+
+
+def test_numbers_do_not_depend_on_the_number_of_ranks(capfd):
+    # Recorded from a run on one rank.
+    _, out = run("compaction", ["--elements", "8", "--json"], capfd)
+    numbers = json.loads(out)
+    assert abs(numbers["error"] - 0.009023004507322848) < 1e-9
+    assert numbers["iterations"] == 125
+
+
+@pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("demo", KEYS)
+def test_demo_is_a_program(demo, tmp_path):
+    # From another directory, in a process of its own, which leaves nothing behind.
+    small = {"column_free": "--cell 2 --steps 5 --g0 5e3"}.get(demo, "--elements 4 --steps 4")
+    done = subprocess.run(
+        [sys.executable, str(DEMOS / f"demo_{demo}.py"), *small.split(), "--json"],
+        capture_output=True,
+        text=True,
+        timeout=200,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
+    )
+    assert done.returncode == 0, done.stderr
+    assert COMMON <= json.loads(done.stdout).keys()
+    assert not list(tmp_path.iterdir())
