@@ -103,7 +103,8 @@ import mpm_dolfinx as mpm
 
 parser = tools.Parser("Elasto-plastic column with rollers on both sides, under its own weight.")
 parser.add_argument("--elements", type=tools.whole, default=32, help="background cells, height")
-parser.add_argument("--domain", choices=("quad", "tri"), default="quad", help="particle domains")
+parser.add_argument("--domain", choices=tuple(tools.DOMAINS), default="quad", help="domains")
+parser.add_argument("--method", choices=tools.METHODS, default="cpdi2", help="rows of T")
 parser.add_argument("--small-strain", action="store_true", help="material of small strain")
 parser.add_argument("--young", type=tools.positive, default=2e5, help="Young's modulus, Pa")
 parser.add_argument("--steps", type=tools.whole, default=40, help="load steps")
@@ -115,34 +116,36 @@ young, poisson, rho_y = args.young, 0.3, 20e3  # Pa, -, Pa
 weight = density * gravity
 width = height / args.elements
 
-# Background and body, each a DOLFINx mesh; two by two domains in a cell.
+# Background and body, each a DOLFINx mesh; two domains each way in a cell.
 
-corners = [[0.0, 0.0], [width, height]]
-background = mesh.create_rectangle(comm, corners, [1, args.elements], mesh.CellType.quadrilateral)
-V = fem.functionspace(background, ("Lagrange", 1, (2,)))
-cell = mesh.CellType.quadrilateral if args.domain == "quad" else mesh.CellType.triangle
-body = mesh.create_rectangle(
-    comm, corners, [2, 2 * args.elements], cell, diagonal=mesh.DiagonalType.left_right
+dim = 3 if args.domain in ("hex", "tet") else 2
+up = dim - 1  # the vertical axis
+upper = [width] * up + [height]
+background = tools.box(
+    upper, [1] * up + [args.elements], tools.DOMAINS["hex" if dim == 3 else "quad"]
 )
+V = fem.functionspace(background, ("Lagrange", 1, (dim,)))
+body = tools.box(upper, [2] * up + [2 * args.elements], tools.DOMAINS[args.domain])
 
-# The rollers are conditions on the background.
+# The rollers are conditions on the background: on both ends of each horizontal axis, and at the
+# base.
 
-sides = mesh.locate_entities_boundary(
-    background, 1, lambda x: np.isclose(x[0], 0.0) | np.isclose(x[0], width)
-)
-base = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[1], 0.0))
-bcs = [
-    fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(0), 1, sides), V.sub(0)),
-    fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(1), 1, base), V.sub(1)),
-]
+bcs = []
+for axis in range(dim):
+    ends = (0.0,) if axis == up else (0.0, width)
+    facets = mesh.locate_entities_boundary(
+        background, up, lambda x, i=axis, ends=ends: np.isclose(x[i][:, None], ends).any(axis=1)
+    )
+    dofs = fem.locate_dofs_topological(V.sub(axis), up, facets)
+    bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
 
-particles = mpm.Particles(body, V, method="cpdi2")
+particles = mpm.Particles(body, V, method=args.method)
 law = mpm.materials.SmallStrainVonMises if args.small_strain else mpm.materials.VonMises
 problem = mpm.QuasiStaticProblem(
     particles,
     law(young, poisson, rho_y=rho_y),
     density=density,
-    body_force=(0.0, -gravity),
+    body_force=(0.0,) * up + (-gravity,),
     bcs=bcs,
     petsc_options_prefix="roller_",
 )
@@ -200,12 +203,12 @@ heights = np.concatenate([[0.0], np.cumsum(stretch * np.diff(edges))])
 #
 # The errors (7).
 
-Y, volume = particles.initial_centroid[:, 1], particles.initial_volume
+Y, volume = particles.initial_centroid[:, up], particles.initial_volume
 stress = particles.stress
 s_yy, s_xx, _ = exact(Y)
-error_syy = tools.mean(np.abs(stress[:, 1, 1] - s_yy), volume) / (weight * height)
+error_syy = tools.mean(np.abs(stress[:, up, up] - s_yy), volume) / (weight * height)
 error_sxx = tools.mean(np.abs(stress[:, 0, 0] - s_xx), volume) / (weight * height)
-top = tools.largest(tools.nodes(particles)[:, 1])
+top = tools.largest(tools.nodes(particles)[:, up])
 
 # The yield function is zero to round-off where the material yields: it is reported to 12 digits.
 
@@ -224,7 +227,7 @@ numbers = {
 steps = problem.history.steps
 law_name = "small" if args.small_strain else "finite"
 rows = [
-    ("particles", f"{particles.num_global} ({args.domain}), {args.elements} cells high"),
+    ("particles", f"{particles.num_global} ({args.domain}, {args.method}), {args.elements} cells"),
     ("strain", f"{law_name}, E = {young:g} Pa"),
     ("load steps", f"{len(steps)}, load {numbers['load']:g}"),
     ("linear solves", f"{numbers['iterations']}, {numbers['cutbacks']} cutbacks"),
@@ -245,19 +248,21 @@ if steps:
 if args.plot:
     fig, axes = tools.figure(12.0, 6.2, [["column", "stress"]], width_ratios=[0.5, 4.0])
     plastic = particles.plastic_strain
-    mpm.plot.domains(particles, ax=axes["column"], warp=0.0, facecolor="0.93", edgecolor="0.8")
-    colours = mpm.plot.domains(
-        particles, 100.0 * plastic, ax=axes["column"], cmap="cividis", vmin=0.0
-    )
-    now = tools.gathered(particles.centroid[:, 1])
-    shown_yy = tools.gathered(stress[:, 1, 1] / 1e3)
+    if dim == 2:
+        column = axes["column"]
+        mpm.plot.domains(particles, ax=column, warp=0.0, facecolor="0.93", edgecolor="0.8")
+        colours = mpm.plot.domains(particles, 100.0 * plastic, ax=column, cmap="cividis", vmin=0.0)
+    now = tools.gathered(particles.centroid[:, up])
+    shown_yy = tools.gathered(stress[:, up, up] / 1e3)
     shown_xx = tools.gathered(stress[:, 0, 0] / 1e3)
     if comm.rank == 0:
         ax = axes["column"]
+        ax.set_visible(dim == 2)
         ax.set(xlim=(-0.4 * width, 1.4 * width), ylim=(-0.1, height + 0.1), xticks=[])
         ax.set(ylabel="vertical position, m")
         ax.spines["bottom"].set_visible(False)
-        fig.colorbar(colours, ax=ax, label="plastic strain, %", shrink=0.55, pad=0.15)
+        if dim == 2:
+            fig.colorbar(colours, ax=ax, label="plastic strain, %", shrink=0.55, pad=0.15)
 
         ax = axes["stress"]
         line_yy, line_xx, _ = exact(edges)

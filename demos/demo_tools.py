@@ -28,6 +28,8 @@ from mpi4py import MPI
 import numpy as np
 from tqdm import tqdm
 
+from dolfinx import mesh
+
 import mpm_dolfinx as mpm
 
 comm = MPI.COMM_WORLD
@@ -79,6 +81,24 @@ def positive(text: str) -> float:
     if not (math.isfinite(value) and value > 0.0):
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
     return value
+
+
+DOMAINS = {
+    "quad": mesh.CellType.quadrilateral,
+    "tri": mesh.CellType.triangle,
+    "hex": mesh.CellType.hexahedron,
+    "tet": mesh.CellType.tetrahedron,
+}
+METHODS = ("cpdi2", "cpdi", "gimp", "mpm")
+
+
+def box(upper: Sequence[float], cells: Sequence[int], kind: mesh.CellType) -> mesh.Mesh:
+    """A structured mesh from the origin to `upper`, in the plane or in space."""
+    corners = [[0.0] * len(upper), list(upper)]
+    if len(upper) == 3:
+        return mesh.create_box(comm, corners, cells, kind)
+    diagonal = mesh.DiagonalType.left_right
+    return mesh.create_rectangle(comm, corners, cells, kind, diagonal=diagonal)
 
 
 # ## Numbers of all ranks
