@@ -54,13 +54,7 @@ class TimeSeries:
     def write(self, time: float) -> None:
         """Add the last converged state (collective)."""
         particles = self._particles
-        values = {"volume_ratio": particles.volume / particles.initial_volume}
-        if particles.has_material:
-            stress = particles.stress
-            values["stress"] = stress
-            values["pressure"] = -np.trace(stress, axis1=1, axis2=2) / 3.0
-            values["plastic_strain"] = particles.plastic_strain
-        fields = [self._field(name, value) for name, value in values.items()]
+        fields = [self._field(name, value) for name, value in particles.fields().items()]
         n, gdim = particles.num_local, self._mesh.geometry.dim
         domains = particles.domains
         moved = self._displacement.x.array.reshape(-1, gdim)

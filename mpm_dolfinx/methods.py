@@ -23,8 +23,21 @@ from . import _compat
 from .errors import MPMError, agree
 from .location import BackgroundBasis, PointBasis
 
-__all__ = ["METHODS", "BoxGrid", "DomainState", "Rows", "cpdi", "cpdi2", "gimp", "mpm"]
+__all__ = [
+    "BOX_CELLS",
+    "METHODS",
+    "BoxGrid",
+    "DomainState",
+    "Rows",
+    "boxes",
+    "cpdi",
+    "cpdi2",
+    "gimp",
+    "mpm",
+    "require_boxes",
+]
 
+BOX_CELLS = (basix.CellType.quadrilateral, basix.CellType.hexahedron)
 METHODS = ("cpdi2", "cpdi", "gimp", "mpm")
 
 
@@ -58,12 +71,10 @@ class Rows(NamedTuple):
 
     Attributes:
         corners: Where the rows move the domains' nodes from, shape ``(n, k, gdim)``.
-        outline: Corners of the particles' own domains, shape ``(n, k, gdim)``.
         basis: The background basis at the local nodes of W.
     """
 
     corners: NDArray[np.float64]
-    outline: NDArray[np.float64]
     basis: PointBasis
 
 
@@ -71,7 +82,7 @@ def cpdi2(state: DomainState, background: BackgroundBasis) -> Rows:
     """Corners ride on the background (Sadeghirad, Brannon & Guilkey 2013)."""
     positions = state.nodes + state.displacement
     corners = positions[state.domains]
-    return Rows(corners, corners, background.at(positions))
+    return Rows(corners, background.at(positions))
 
 
 def cpdi(state: DomainState, background: BackgroundBasis) -> Rows:
@@ -80,7 +91,7 @@ def cpdi(state: DomainState, background: BackgroundBasis) -> Rows:
     positions = state.nodes.copy()
     positions[state.domains] = corners
     own = state.domains.size
-    return Rows(corners, corners, background.at(positions[:own]))
+    return Rows(corners, background.at(positions[:own]))
 
 
 def mpm(state: DomainState, background: BackgroundBasis) -> Rows:
@@ -88,7 +99,7 @@ def mpm(state: DomainState, background: BackgroundBasis) -> Rows:
     arms = state.arms()
     corners = state.centroid[:, None] + arms
     basis = _affine(state, arms, background.at(state.centroid, gradients=True))
-    return Rows(corners, corners, basis)
+    return Rows(corners, basis)
 
 
 def gimp(state: DomainState, background: BackgroundBasis, grid: BoxGrid, stretch: bool) -> Rows:
@@ -106,12 +117,7 @@ def gimp(state: DomainState, background: BackgroundBasis, grid: BoxGrid, stretch
         stretch: Whether half-lengths follow the diagonal of the right stretch U (Charlton,
             Coombs & Augarde 2017), or stay.
     """
-    original = state.nodes[state.domains]
-    half = 0.5 * np.ptp(original, axis=1)
-    if stretch:
-        half = half * _right_stretch(state.deformation_gradient)
-    side = np.sign(original - state.initial_centroid[:, None])
-    boxes = state.centroid[:, None] + side * half[:, None]
+    half = 0.5 * np.ptp(boxes(state, stretch), axis=1)
     middles, shares = grid.cut(state.centroid, half)
     n, pieces, gdim = middles.shape
     inside = np.clip(middles, grid.lower, grid.upper)
@@ -128,7 +134,22 @@ def gimp(state: DomainState, background: BackgroundBasis, grid: BoxGrid, stretch
         (shares[:, :, None, None] * gradients).reshape(n, -1, gdim),
     )
     arms = state.arms()
-    return Rows(state.centroid[:, None] + arms, boxes, _affine(state, arms, average))
+    return Rows(state.centroid[:, None] + arms, _affine(state, arms, average))
+
+
+def boxes(state: DomainState, stretch: bool) -> NDArray[np.float64]:
+    """Return the corners of GIMP's boxes, shape ``(n, k, gdim)``.
+
+    Args:
+        state: The domains.
+        stretch: Whether half-lengths follow the diagonal of the right stretch U, or stay.
+    """
+    original = state.nodes[state.domains]
+    half = 0.5 * np.ptp(original, axis=1)
+    if stretch:
+        half = half * _right_stretch(state.deformation_gradient)
+    side = np.sign(original - state.initial_centroid[:, None])
+    return np.asarray(state.centroid[:, None] + side * half[:, None])
 
 
 def _merged(
@@ -182,6 +203,29 @@ def _right_stretch(F: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.einsum("nia,na->ni", axes**2, np.sqrt(squares)))
 
 
+def require_boxes(body: mesh.Mesh, corners: NDArray[np.float64], index: NDArray[np.int64]) -> None:
+    """Raise an error unless all domains are axis-aligned boxes (collective).
+
+    Args:
+        body: The body mesh.
+        corners: Corners of this rank's domains, shape ``(n, k, gdim)``.
+        index: Their global indices.
+
+    Raises:
+        MPMError: Some are not; it names them.
+    """
+    low, high = corners.min(axis=1, keepdims=True), corners.max(axis=1, keepdims=True)
+    off = np.minimum(corners - low, high - corners).max(axis=(1, 2), initial=0.0)
+    skew = index[off > 1e-9 * (high - low).max(axis=(1, 2), initial=0.0)]
+    with agree(body.comm):
+        if len(skew) or body.basix_cell() not in BOX_CELLS:
+            raise MPMError(
+                "Method 'gimp' needs particle domains that are axis-aligned rectangles or "
+                "boxes; use 'cpdi2' or 'cpdi' for this body.",
+                skew,
+            )
+
+
 class BoxGrid:
     """The grid lines of a structured background of rectangles or boxes.
 
@@ -202,10 +246,9 @@ class BoxGrid:
         x = background.geometry.x[_compat.geometry_dofmap(background)[:count], :gdim]
         self._lines = [_merge(background.comm, x[:, :, i].ravel()) for i in range(gdim)]
         with agree(background.comm):
-            if background.basix_cell() not in (
-                basix.CellType.quadrilateral,
-                basix.CellType.hexahedron,
-            ) or not all(_spans_one(x[:, :, i], self._lines[i]) for i in range(gdim)):
+            if background.basix_cell() not in BOX_CELLS or not all(
+                _spans_one(x[:, :, i], self._lines[i]) for i in range(gdim)
+            ):
                 raise MPMError(
                     "Method 'gimp' needs a structured background of axis-aligned rectangles or "
                     "boxes; use 'cpdi2' or 'cpdi' on this one."

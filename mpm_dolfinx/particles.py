@@ -19,7 +19,18 @@ from dolfinx import fem, mesh
 from . import _compat
 from .errors import DomainDistortionError, MPMError, ParticleOutsideError, agree
 from .location import BackgroundBasis
-from .methods import BoxGrid, DomainState, Rows, cpdi, cpdi2, gimp, mpm
+from .methods import (
+    BOX_CELLS,
+    BoxGrid,
+    DomainState,
+    Rows,
+    boxes,
+    cpdi,
+    cpdi2,
+    gimp,
+    mpm,
+    require_boxes,
+)
 from .quadrature import DomainQuadrature, exact_degree, quadrature_element, quadrature_rule
 from .transfer import Weights, active_nodes, domain_weights, sum_by_particle, transfer_matrix
 from .validation import validate_options, validate_spaces
@@ -28,8 +39,6 @@ if TYPE_CHECKING:
     from .constitutive import ConstitutiveHistory
 
 __all__ = ["Particles"]
-
-BOX_CELLS = (basix.CellType.quadrilateral, basix.CellType.hexahedron)
 
 
 class Particles:
@@ -118,7 +127,10 @@ class Particles:
         self._nodes = self.W.tabulate_dof_coordinates()[:, : self._gdim].copy()
         self._background = BackgroundBasis(V)
         self._domain_update = domain_update
-        self._grid = self._box_grid() if method == "gimp" else None
+        self._grid = None
+        if method == "gimp":
+            require_boxes(body, self._nodes[self.domain_nodes], self.global_index)
+            self._grid = BoxGrid(V.mesh)
         self._converged = np.zeros_like(self._nodes)
         self._constitutive: ConstitutiveHistory | None = None
         with agree(body.comm):
@@ -172,21 +184,6 @@ class Particles:
         corners = centres[:, None] + unit * sides[:, None]
         return cls(_compat.disconnected_mesh(comm, corners, cell), V, method=method, **options)
 
-    def _box_grid(self) -> BoxGrid:
-        """Return the grid lines, if body and background are made of boxes."""
-        corners = self._nodes[self.domain_nodes]
-        low, high = corners.min(axis=1, keepdims=True), corners.max(axis=1, keepdims=True)
-        off = np.minimum(corners - low, high - corners).max(axis=(1, 2), initial=0.0)
-        with agree(self.mesh.comm):
-            skew = self.global_index[off > 1e-9 * (high - low).max(axis=(1, 2), initial=0.0)]
-            if len(skew) or self.mesh.basix_cell() not in BOX_CELLS:
-                raise MPMError(
-                    "Method 'gimp' needs particle domains that are axis-aligned rectangles or "
-                    "boxes; use 'cpdi2' or 'cpdi' for this body.",
-                    skew,
-                )
-        return BoxGrid(self.V.mesh)
-
     def _measure(self, degree: int) -> ufl.Measure:
         metadata = {"quadrature_degree": degree, "quadrature_rule": "default"}
         return ufl.Measure("dx", domain=self.mesh, metadata=metadata)
@@ -200,15 +197,19 @@ class Particles:
         """
         self._rows
 
-    def _locate(self) -> Rows:
-        state = DomainState(
+    def _state(self) -> DomainState:
+        """Return where the domains are at the last converged step."""
+        return DomainState(
             self._nodes,
             self._converged,
             self.domain_nodes,
             self.initial_centroid,
-            self._mean((self._nodes + self._converged)[self.domain_nodes]),
+            self._mean(self.node_positions[self.domain_nodes]),
             np.eye(self._gdim) + self._average(self._converged_gradient()),
         )
+
+    def _locate(self) -> Rows:
+        state = self._state()
         if self.method == "gimp":
             assert self._grid is not None
             rows = gimp(state, self._background, self._grid, self._domain_update == "stretch")
@@ -271,7 +272,12 @@ class Particles:
         For cpdi2 they are those of the displaced body mesh, for cpdi parallelograms, for gimp
         boxes; for mpm, whose particles are points, parallelograms of their volume.
         """
-        return self._rows.outline
+        if self.method == "cpdi2":
+            return np.asarray(self.node_positions[self.domain_nodes])
+        state = self._state()
+        if self.method == "gimp":
+            return boxes(state, self._domain_update == "stretch")
+        return np.asarray(state.centroid[:, None] + state.arms())
 
     @property
     def converged_displacement(self) -> NDArray[np.float64]:
@@ -433,6 +439,19 @@ class Particles:
     def plastic_strain(self) -> NDArray[np.float64]:
         """Accumulated plastic strain ``sqrt(2/3) |d eps_p|``, shape ``(n,)``."""
         return self._average(self._history("plastic strain").plastic_strain())
+
+    def fields(self) -> dict[str, NDArray[np.float64]]:
+        """Return what is known of each particle, for output: arrays ``(n, ...)`` by name.
+
+        ``volume_ratio`` and, where there is a material, ``stress`` (Cauchy), ``pressure``
+        (mean of the normal stresses, compression positive) and ``plastic_strain``.
+        """
+        values = {"volume_ratio": self.volume / self.initial_volume}
+        if self.has_material:
+            values["stress"] = self.stress
+            values["pressure"] = -np.trace(values["stress"], axis1=1, axis2=2) / 3.0
+            values["plastic_strain"] = self.plastic_strain
+        return values
 
     def _history(self, what: str) -> ConstitutiveHistory:
         if self._constitutive is None:

@@ -144,11 +144,11 @@ def background(
 
 
 def grid(particles: Particles) -> Any:
-    """Return the domains at their current positions for pyvista (collective).
+    """Return the particles' own domains at their current positions for pyvista (collective).
 
     Cell data are ``particle`` (the global index), ``volume_ratio`` and, where there is a
     material, ``stress`` (Cauchy, nine components), ``pressure`` and ``plastic_strain``; point
-    data ``displacement``. Domains of higher degree are drawn by their corners.
+    data ``displacement``. Domains share no points; curved ones are drawn by their corners.
 
     Args:
         particles: The body, in the plane or in space.
@@ -163,33 +163,27 @@ def grid(particles: Particles) -> Any:
     comm: MPI.Comm = particles.mesh.comm
     pyvista = _imported("pyvista", comm)
     cell_type, corners = VTK_CELLS[particles.mesh.basix_cell().name]
-    nodes = particles.domain_nodes[:, corners]
+    gdim = particles.mesh.geometry.dim
     data: dict[str, NDArray[Any]] = {
         "particle": particles.global_index,
-        "volume_ratio": particles.volume / particles.initial_volume,
+        "start": particles.initial_domains[:, corners],
+        "now": particles.domains[:, corners],
+        **particles.fields(),
     }
-    if particles.has_material:
-        stress = particles.stress
-        data["stress"] = stress.reshape(-1, 9)
-        data["pressure"] = -np.trace(stress, axis1=1, axis2=2) / 3.0
-        data["plastic_strain"] = particles.plastic_strain
-    moved = particles.displacement.x.array.reshape(particles._nodes.shape)
-    imap = particles.W.dofmap.index_map
-    names = imap.local_to_global(np.arange(imap.size_local + imap.num_ghosts, dtype=np.int32))
-    gathered = comm.gather((names[nodes], particles._nodes[nodes], moved[nodes], data))
+    gathered = comm.gather(data)
     if gathered is None:
         return None
-    order = np.argsort(np.concatenate([part[3]["particle"] for part in gathered]))
-    cells, start, shift = (np.concatenate([part[k] for part in gathered])[order] for k in range(3))
-    _, first, points = np.unique(cells, return_index=True, return_inverse=True)
-    start, shift = (
-        np.pad(a.reshape(-1, a.shape[2])[first], ((0, 0), (0, 3 - a.shape[2])))
-        for a in (start, shift)
+    order = np.argsort(np.concatenate([part["particle"] for part in gathered]))
+    whole = {name: np.concatenate([part[name] for part in gathered])[order] for name in data}
+    start, now = (
+        np.pad(whole.pop(name).reshape(-1, gdim), ((0, 0), (0, 3 - gdim)))
+        for name in ("start", "now")
     )
-    result = pyvista.UnstructuredGrid({cell_type: points.reshape(cells.shape)}, start + shift)
-    result.point_data["displacement"] = shift
-    for name in data:
-        result.cell_data[name] = np.concatenate([part[3][name] for part in gathered])[order]
+    cells = np.arange(len(now)).reshape(len(order), -1)
+    result = pyvista.UnstructuredGrid({cell_type: cells}, now)
+    result.point_data["displacement"] = now - start
+    for name, values in whole.items():
+        result.cell_data[name] = values.reshape(len(order), -1) if values.ndim > 1 else values
     return result
 
 
@@ -197,7 +191,8 @@ def _outlines(particles: Particles, warp: float) -> NDArray[np.float64]:
     """Return the boundaries of the owned domains as polygons, shape ``(n, m, 2)``."""
     cell = particles.mesh.basix_cell()
     corners = basix.geometry(cell)[VTK_CELLS[cell.name][1]]
-    pieces = 1 if particles._shape_functions.degree == 1 else PIECES
+    shape_functions = particles.W.ufl_element().basix_element
+    pieces = 1 if shape_functions.degree == 1 else PIECES
     share = np.arange(pieces)[:, None] / pieces
     points = np.concatenate(
         [
@@ -205,10 +200,10 @@ def _outlines(particles: Particles, warp: float) -> NDArray[np.float64]:
             for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)
         ]
     )
-    values = particles._shape_functions.tabulate(0, points)[0, :, :, 0]
-    moved = particles.displacement.x.array.reshape(particles._nodes.shape)
-    now = particles._nodes + warp * moved
-    return np.asarray(np.einsum("mk,nki->nmi", values, now[particles.domain_nodes]))
+    values = shape_functions.tabulate(0, points)[0, :, :, 0]
+    start = particles.initial_domains
+    now = start + warp * (particles.domains - start)
+    return np.asarray(np.einsum("mk,nki->nmi", values, now))
 
 
 def _require_plane(domain: mesh.Mesh) -> None:
