@@ -8,6 +8,7 @@ module that one of these lists holds.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,12 @@ import griffe
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 PACKAGE = "mpm_dolfinx"
 ALWAYS = ("materials",)
+# What docstrings have for Sphinx: roles, and the double colon before a block of code.
+ROLE = re.compile(r":(?:class|meth|func|mod|attr):(`|<code>)~?(?:[\w.]+\.)?(\w+)")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -31,6 +35,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, name, content=text))
     config.nav.append({"Reference": nav})
     return files
+
+
+def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    if not page.file.src_uri.startswith("api/"):
+        return content
+    return ROLE.sub(r"\1\2", content).replace("::</p>", ":</p>")
 
 
 def module_pages(module: Any, folder: str, pages: dict[str, str]) -> list[Any]:
@@ -69,4 +79,4 @@ def exports(module: Any) -> list[str]:
 def first_sentence(member: Any) -> str:
     """Return the first line of a docstring, fit for a table."""
     lines = member.docstring.value.splitlines() if member.docstring else [""]
-    return lines[0].replace("|", "\\|")
+    return ROLE.sub(r"\1\2", lines[0]).replace("|", "\\|")

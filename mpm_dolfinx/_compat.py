@@ -32,6 +32,7 @@ __all__ = [
     "disconnected_mesh",
     "geometry_degree",
     "geometry_dofmap",
+    "input_cell_index",
     "is_condition_on",
     "require_supported",
 ]
@@ -57,6 +58,16 @@ def geometry_dofmap(domain: mesh.Mesh) -> NDArray[np.int32]:
 def geometry_degree(domain: mesh.Mesh) -> int:
     """Return the degree of the coordinate element (``.cmap`` before 0.11)."""
     return int(domain.geometry.cmaps[0].degree)
+
+
+def input_cell_index(domain: mesh.Mesh) -> NDArray[np.int64]:
+    """Return the input index of each owned cell; in a submesh, which has none, the global one."""
+    cells = domain.topology.index_map(domain.topology.dim)
+    try:
+        index = domain.topology.original_cell_index[: cells.size_local]
+    except RuntimeError:
+        index = np.arange(*cells.local_range)
+    return np.asarray(index, dtype=np.int64)
 
 
 def cell_tree(domain: mesh.Mesh, cells: NDArray[np.int32], padding: float) -> Any:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,8 @@ __all__ = ["BackgroundBasis", "PointBasis"]
 TOLERANCE = 1e-10
 #: Reference distance within which a point is on a facet; the cell first in the input takes it.
 FACET = 1e-12
+#: Points looked for at once, so that what is known of them stays in the cache.
+BLOCK = 1 << 14
 #: Basis values below this are no weight.
 DROP = 1e-13
 
@@ -58,8 +61,15 @@ class _Cells:
         ).basix_element
         self.middle = basix.geometry(name).mean(axis=0)
         self.affine = self._is_affine()
+        if self.affine:
+            every = np.arange(count)
+            self._slopes = np.linalg.inv(self.jacobians(every, np.tile(self.middle, (count, 1))))
+            self._centres = np.einsum(
+                "k,nki->ni", self.map.tabulate(0, self.middle[None])[0, 0, :, 0], self.vertices
+            )
+        self.grid = None if self.simplex or not self.affine else _Grid.of(self.vertices)
         size = np.ptp(self.vertices.reshape(-1, self.gdim), axis=0).max() if count else 1.0
-        self.index = np.asarray(background.topology.original_cell_index[:count], np.int64)
+        self.index = _compat.input_cell_index(background)
         cells = np.arange(count, dtype=np.int32)
         self.tree = _compat.cell_tree(background, cells, 1e2 * TOLERANCE * size) if count else None
 
@@ -99,12 +109,15 @@ class _Cells:
             points: Points, shape ``(n, gdim)``.
 
         Returns:
-            Reference coordinates, shape ``(n, gdim)``: one Newton step where the cells are
-            affine, at most 30 where they are not.
+            Reference coordinates, shape ``(n, gdim)``, where cells are not affine by at most 30
+            Newton steps.
         """
+        if self.affine:
+            gaps = points - self._centres[cells]
+            return np.asarray(self.middle + np.einsum("nij,nj->ni", self._slopes[cells], gaps))
         reference = np.tile(self.middle, (len(points), 1))
         active = np.arange(len(points))
-        for _ in range(1 if self.affine else 30):
+        for _ in range(30):
             table = self.map.tabulate(1, reference[active])[:, :, :, 0]
             corners = self.vertices[cells[active]]
             gap = points[active] - np.einsum("pk,pki->pi", table[0], corners)
@@ -112,8 +125,6 @@ class _Cells:
             with np.errstate(all="ignore"):
                 step = _solve(jacobian, gap)
             reference[active] += step
-            if self.affine:
-                return reference
             size = np.abs(step).max(axis=1)
             lost = ~(size < 1e3)
             reference[active[lost]] = np.nan
@@ -145,25 +156,117 @@ class _Cells:
         cell = np.zeros(n, dtype=np.int64)
         reference = np.tile(self.middle, (n, 1))
         violation = np.full(n, np.inf)
-        if n == 0 or self.tree is None:
-            return cell, reference, violation
-        padded = np.zeros((n, 3))
+        for start in range(0, n if self.tree is not None else 0, BLOCK):
+            block = np.arange(start, min(start + BLOCK, n))
+            block = block[np.isfinite(points[block]).all(axis=1)]
+            if self.grid is not None:
+                inside, found = self.grid.find(points[block], self.index)
+                known = block[inside]
+                cell[known] = found
+                reference[known] = self.pull_back(found, points[known])
+                violation[known] = self.violation(reference[known])
+                block = block[violation[block] > TOLERANCE]
+            if len(block) == 0:
+                continue
+            hit, found, coordinates, outside = self._search(points[block])
+            known = block[hit]
+            cell[known], reference[known], violation[known] = found, coordinates, outside
+        return cell, reference, violation
+
+    def _search(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return which points lie in a cell's bounding box, and for them what ``locate`` does."""
+        padded = np.zeros((len(points), 3))
         padded[:, : self.gdim] = points
         offsets, candidates = _compat.candidate_cells(self.tree, padded)
-        if len(candidates) == 0:
-            return cell, reference, violation
-        owner = np.repeat(np.arange(n), np.diff(offsets))
-        coordinates = self.pull_back(candidates.astype(np.int64), points[owner])
-        outside = self.violation(coordinates)
-        order = np.lexsort((self.index[candidates], outside, owner))
-        has = np.flatnonzero(np.diff(offsets))
-        best = order[offsets[has]]
-        cell[has], reference[has], violation[has] = (
-            candidates[best],
-            coordinates[best],
-            outside[best],
-        )
-        return cell, reference, violation
+        counts = np.diff(offsets)
+        hit = np.flatnonzero(counts)
+        if len(hit) == 0:
+            return hit, hit, points[hit], np.zeros(0)
+        cells: NDArray[np.int64] = candidates.astype(np.int64)
+        reference = self.pull_back(cells, np.repeat(points, counts, axis=0))
+        outside = self.violation(reference)
+        starts, counts = offsets[hit], counts[hit]
+        least = np.repeat(np.minimum.reduceat(outside, starts), counts)
+        rank = np.where(outside == least, self.index[cells], np.iinfo(np.int64).max)
+        first = np.repeat(np.minimum.reduceat(rank, starts), counts)
+        best = np.flatnonzero(rank == first)
+        return hit, cells[best], reference[best], outside[best]
+
+
+class _Grid:
+    """Index arithmetic on cells that are the boxes of a rectilinear grid, or some of them.
+
+    Args:
+        lines: Coordinates of the grid lines in each direction.
+        table: Cell in each box, -1 where there is none.
+    """
+
+    def __init__(self, lines: list[NDArray[np.float64]], table: NDArray[np.int64]) -> None:
+        self._lines = lines
+        self._table = table
+
+    @classmethod
+    def of(cls, vertices: NDArray[np.float64]) -> _Grid | None:
+        """Return the grid of cells with these vertices ``(n, k, gdim)``, if they are one."""
+        if len(vertices) == 0:
+            return None
+        lines, places = [], []
+        for x in np.moveaxis(vertices, 2, 0):
+            line = np.unique(x)
+            line = line[np.diff(line, prepend=-np.inf) > 1e-9 * (line[-1] - line[0])]
+            middles = 0.5 * (x.min(axis=1) + x.max(axis=1))
+            place = np.searchsorted(line, middles) - 1
+            ends = line[np.clip([place, place + 1], 0, len(line) - 1)]
+            near = np.minimum(np.abs(x - ends[0][:, None]), np.abs(x - ends[1][:, None]))
+            if near.max() > 1e-9 * np.diff(line).min():
+                return None
+            lines.append(line)
+            places.append(place)
+        shape = tuple(len(line) - 1 for line in lines)
+        if np.prod(shape, dtype=float) > 16 * len(vertices):
+            return None
+        table = np.full(shape, -1, dtype=np.int64)
+        table[tuple(places)] = np.arange(len(vertices))
+        return cls(lines, table)
+
+    @staticmethod
+    def _place(line: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the interval of a line that holds each coordinate, or is next to it."""
+        size = (line[-1] - line[0]) / (len(line) - 1)
+        if np.ptp(np.diff(line)) > 1e-6 * size:
+            return np.asarray(np.clip(np.searchsorted(line, x, "right") - 1, 0, len(line) - 2))
+        place = np.clip((x - line[0]) / size, 0, len(line) - 2).astype(np.int64)
+        place -= (x < line[place]) & (place > 0)
+        place += (x >= line[place + 1]) & (place < len(line) - 2)
+        return np.asarray(place)
+
+    def find(
+        self, points: NDArray[np.float64], index: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return which points lie in boxes with a cell, and these cells.
+
+        Args:
+            points: Points, shape ``(n, gdim)``.
+            index: Input index of each cell; on a facet the first cell wins.
+        """
+        low, high = [], []
+        for line, x in zip(self._lines, points.T, strict=True):
+            place = self._place(line, x)
+            reach = FACET * (line[place + 1] - line[place])
+            low.append(np.where(x - line[place] <= reach, np.maximum(place - 1, 0), place))
+            beyond = np.minimum(place + 1, len(line) - 2)
+            high.append(np.where(line[place + 1] - x <= reach, beyond, place))
+        cell = self._table[tuple(high)]
+        between = np.flatnonzero(np.any([a != b for a, b in zip(low, high, strict=True)], axis=0))
+        for pick in product(*zip(low, high, strict=True)) if len(between) else ():
+            other = self._table[tuple(p[between] for p in pick)]
+            mine = cell[between]
+            better = (other >= 0) & ((mine < 0) | (index[other] < index[mine]))
+            cell[between[better]] = other[better]
+        inside = np.flatnonzero(cell >= 0)
+        return inside, cell[inside]
 
 
 def _solve(matrix: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -118,9 +118,7 @@ class Particles:
         cells = body.topology.index_map(body.topology.dim)
         self.num_local = int(cells.size_local)
         self.num_global = int(cells.size_global)
-        self.global_index: NDArray[np.int64] = np.asarray(
-            body.topology.original_cell_index[: self.num_local], dtype=np.int64
-        )
+        self.global_index = _compat.input_cell_index(body)
         self._shape_functions = self.W.ufl_element().basix_element
         self.quadrature = DomainQuadrature(body, self._shape_functions, self._degree)
         self.domain_nodes = self.W.dofmap.list[: self.num_local]

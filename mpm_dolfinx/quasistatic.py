@@ -147,8 +147,9 @@ class QuasiStaticProblem(ParticleProblem):
 
     @property
     def yield_function(self) -> NDArray[np.float64]:
-        """Largest yield function of each particle's points, shape ``(n,)``; -1 where elastic.
+        """Largest yield function of each particle's points, shape ``(n,)``.
 
+        In the unit of the material's own function; -1 where a material has none.
         With several bodies, their particles one body after the other.
         """
         values = [s.history.yield_function().max(axis=1, initial=-np.inf) for s in self._stresses]

@@ -23,6 +23,7 @@ HALVINGS = 8
 SUFFICIENT = 0.8
 #: Values of MUMPS's INFOG(1) that more workspace cures.
 OUT_OF_WORKSPACE = (-8, -9)
+FACTORS = ("lu", "cholesky")
 
 
 class ReducedProblem(Protocol):
@@ -110,14 +111,17 @@ class NewtonSolver:
         self.snes.setTolerances(rtol=1e-9, atol=1e-50, stol=0.0, max_it=30)
         ksp = self.snes.getKSP()
         ksp.setType("preonly")
-        ksp.getPC().setType("cholesky" if symmetric else "lu")
-        ksp.getPC().setFactorSolverType("mumps")
+        pc = ksp.getPC()
+        pc.setType("cholesky" if symmetric else "lu")
+        pc.setFactorSolverType("mumps")
         database = PETSc.Options()
         database.prefixPush(prefix)
         for key, value in options.items():
             database[key] = value
         self.snes.setFromOptions()
         database.prefixPop()
+        if pc.getType() in FACTORS and not database.hasName(f"{prefix}pc_factor_mat_solver_type"):
+            pc.setFactorSolverType("mumps")  # changing the type had dropped it
         for key in options:
             database.delValue(prefix + key)
 
@@ -184,9 +188,17 @@ class NewtonSolver:
         reason = self.snes.getConvergedReason()
         if self._failure is None and reason <= 0:
             residual = self.residuals[-1] if self.residuals else np.nan
+            if reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
+                why = "as a linear solve failed"
+                if self.snes.getKSP().getConvergedReason() == (
+                    PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
+                ):
+                    why = "as the factorisation of the tangent failed"
+            else:
+                why = _reason(reason)
             self._failure = ConvergenceError(
                 f"Newton's method stopped after {self.iterations} linear solves at a relative "
-                f"residual of {residual:.1e} ({_reason(reason)})"
+                f"residual of {residual:.1e} ({why})"
             )
 
     def _function(self, snes: PETSc.SNES, x: PETSc.Vec, F: PETSc.Vec) -> None:
@@ -273,7 +285,7 @@ class NewtonSolver:
     def _give_workspace(self, ksp: PETSc.KSP) -> None:
         """Factorise again with more workspace where MUMPS ran out of it."""
         pc = ksp.getPC()
-        if pc.getType() not in ("lu", "cholesky") or pc.getFactorSolverType() != "mumps":
+        if pc.getType() not in FACTORS or pc.getFactorSolverType() != "mumps":
             return
         for percent in (100, 200, 400, 800):
             if pc.getFactorMatrix().getMumpsInfog(1) not in OUT_OF_WORKSPACE:

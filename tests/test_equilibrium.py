@@ -349,6 +349,7 @@ def test_reduced_tangent_by_finite_differences(cell):
 
     calls = in_each_iteration(problem, check)
     problem.solve(steps=4)
+    problem.solver.cancelMonitor()
     assert len(calls) > 12 and problem.history.cutbacks == 0
     assert WORLD.allreduce(max(plastic), scenes.MPI.MAX) > 1e-3
     assert max(worst) < 1e-6
@@ -385,6 +386,7 @@ def test_residual_is_the_gradient_of_henckys_energy(cell):
 
     calls = in_each_iteration(problem, check)
     problem.solve(steps=3)
+    problem.solver.cancelMonitor()
     assert len(calls) >= 9
     assert scenes.largest(particles.displacement.x.array) > 0.02
     assert max(gaps) < 1e-7

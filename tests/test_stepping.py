@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Load steps: totals, cutback, roll-back, paths, and what a failed run leaves."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 import scenes
@@ -446,3 +449,14 @@ def test_round_off_counts_as_converged():
     assert history.cutbacks == 0
     assert history.statistics["converged_at_round_off"] >= 1
     assert max(step.residuals[-1] for step in history.steps) < 1e-12
+
+
+def test_a_problem_ends_with_its_last_reference():
+    # PETSc's callbacks must not keep it: a study of a hundred runs would use up the
+    # communicators of MPI.
+    problem = scenes.block()
+    problem.solve(steps=2)
+    alive = [weakref.ref(problem), weakref.ref(problem.particles)]
+    del problem
+    gc.collect()
+    assert [reference() for reference in alive] == [None, None]
