@@ -123,15 +123,16 @@ def gimp(state: DomainState, background: BackgroundBasis, grid: BoxGrid, stretch
     inside = np.clip(middles, grid.lower, grid.upper)
     at = background.at(inside.reshape(-1, gdim), gradients=True)
     assert at.gradients is not None
-    gradients = at.gradients.reshape(n, pieces, -1, gdim)
-    values = at.values.reshape(n, pieces, -1)
+    k = at.values.shape[1]
+    gradients = at.gradients.reshape(n, pieces, k, gdim)
+    values = at.values.reshape(n, pieces, k)
     values = values + np.einsum("npki,npi->npk", gradients, middles - inside)
     centre_inside = np.all((state.centroid >= grid.lower) & (state.centroid <= grid.upper), axis=1)
     average = _merged(
-        at.nodes.reshape(n, -1),
-        (shares[:, :, None] * values).reshape(n, -1),
+        at.nodes.reshape(n, pieces * k),
+        (shares[:, :, None] * values).reshape(n, pieces * k),
         (at.found.reshape(n, pieces) | (shares == 0.0)).all(axis=1) & centre_inside,
-        (shares[:, :, None, None] * gradients).reshape(n, -1, gdim),
+        (shares[:, :, None, None] * gradients).reshape(n, pieces * k, gdim),
     )
     arms = state.arms()
     return Rows(state.centroid[:, None] + arms, _affine(state, arms, average))

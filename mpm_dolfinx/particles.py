@@ -500,9 +500,16 @@ class Particles:
         jacobian = np.linalg.det(np.eye(self._gdim) + gradient)
         return np.asarray(self.global_index[~(jacobian > 0.0).all(axis=1)])
 
-    def commit(self) -> None:
-        """Make the present displacement the converged one."""
-        self._converged = self.displacement.x.array.reshape(-1, self._gdim).copy()
+    def commit(self) -> NDArray[np.float64]:
+        """Make the present displacement the converged one; return what that was before."""
+        before = self._converged
+        present = self.displacement.x.array.reshape(-1, self._gdim)
+        self.restore(np.array(present, dtype=np.float64))
+        return before
+
+    def restore(self, converged: NDArray[np.float64]) -> None:
+        """Set the converged displacement, shape ``(N, gdim)`` at the local nodes of W."""
+        self._converged = converged
         for name in ("_rows", "active_nodes", "T"):
             self.__dict__.pop(name, None)
 

@@ -130,6 +130,7 @@ class ParticleProblem:
         )
         self._prescribed: NDArray[np.float64] = np.zeros(len(self.bodies[0].increment.x.array))
         self._loaded = float(self.bodies[0].load.value)
+        self._parameter = self._loaded
         self._reactions: NDArray[np.float64] | None = None
         self._series: dict[Path, list[TimeSeries]] = {}
 
@@ -210,6 +211,8 @@ class ParticleProblem:
                 "(update=...)."
             )
         control = StepControl(int(steps))
+        if update is not None:
+            self._parameter = 0.0
         start, base = (self._loaded, self._prescribed.copy())
         while not control.finished:
             t = control.target
@@ -221,7 +224,8 @@ class ParticleProblem:
                     values = self._dirichlet_values()
                 else:
                     values = base + (self._dirichlet_values() - base) * t
-                step = self._advance(t if update is not None else load, values)
+                last = control.target == 1.0
+                step = self._advance(t if update is not None else load, values, last)
             except (ConvergenceError, DomainDistortionError) as error:
                 self._restore()
                 self.history.failed_iterations += self._newton.iterations
@@ -249,7 +253,7 @@ class ParticleProblem:
         try:
             load = float(self.bodies[0].load.value)
             self._set_load(load)
-            return self._advance(load, self._dirichlet_values())
+            return self._advance(load, self._dirichlet_values(), last=True)
         except MPMError as error:
             self._restore()
             self.history.failed_iterations += self._newton.iterations
@@ -315,23 +319,38 @@ class ParticleProblem:
 
     # -- One step -------------------------------------------------------------------------
 
-    def _advance(self, parameter: float, values: NDArray[np.float64]) -> Step:
-        """Solve one step to Dirichlet totals, and commit it."""
+    def _advance(self, parameter: float, values: NDArray[np.float64], last: bool) -> Step:
+        """Solve one step to Dirichlet totals, and commit it.
+
+        Unless it is the last one it must leave all particles inside the background.
+        """
         self.reduced.begin(values - self._prescribed)
         self._newton.solve(self.reduced, self.reduced.sizes)
         if (failure := self.reduced.crossed()) is not None:
             raise failure
+        self._move_bodies(inside=not last)
         with self.history.statistics.phase("commit"):
-            for body in self.bodies:
-                body.commit()
             self.commit()
             self._prescribed = values.copy()
             self._loaded = float(self.bodies[0].load.value)
+            self._parameter = parameter
             self._reactions = self.reduced.force.array_r.copy()
             self.reduced.end()
         step = Step(parameter, self._newton.iterations, list(self._newton.residuals))
         self.history.steps.append(step)
         return step
+
+    def _move_bodies(self, inside: bool) -> None:
+        """Make the present displacements the converged ones; none where one body is outside."""
+        before = [body.commit() for body in self.bodies]
+        try:
+            with self.history.statistics.phase("locate"):
+                for body in self.bodies if inside else ():
+                    body.locate()
+        except ParticleOutsideError:
+            for body, converged in zip(self.bodies, before, strict=True):
+                body.restore(converged)
+            raise
 
     def _set_load(self, load: float) -> None:
         for body in self.bodies:
@@ -352,8 +371,8 @@ class ParticleProblem:
             body.roll_back()
         self._set_load(self._loaded)
         self.roll_back()
-        if update is not None and self.history.steps:
-            update(self.history.steps[-1].load)
+        if update is not None and self._parameter > 0.0:
+            update(self._parameter)
 
     def _placed(self, error: MPMError) -> MPMError:
         """Say at what load an error happened, and what to do."""
@@ -367,9 +386,9 @@ class ParticleProblem:
             if particles:
                 text += "; the residual is largest at {particles}"
         return type(error)(
-            f"{text}, in the step after load {self._loaded:.6g}{advice}.",
+            f"{text}, in the step after load {self._parameter:.6g}{advice}.",
             particles,
-            self._loaded,
+            self._parameter,
         )
 
     # -- What a problem with a material adds -----------------------------------------------

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import weakref
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from mpi4py import MPI
@@ -164,9 +166,9 @@ class NewtonSolver:
         self.x = PETSc.Vec().createMPI(sizes, comm=self._comm)
         self.F = self.x.duplicate()
         self._trial = self.x.duplicate()
-        self.snes.setFunction(self._function, self.x.duplicate())
-        self.snes.setConvergenceTest(self._test)
-        self.snes.setLineSearchPreCheck(self._pre_check)
+        self.snes.setFunction(_weakly(self._function), self.x.duplicate())
+        self.snes.setConvergenceTest(_weakly(self._test))
+        self.snes.setLineSearchPreCheck(_weakly(self._pre_check))
         return self.x
 
     def _iterate(self, x: PETSc.Vec) -> None:
@@ -272,7 +274,7 @@ class NewtonSolver:
             self._P = K
         if new:
             self.K = K
-            self.snes.setJacobian(self._jacobian, K, self._P)
+            self.snes.setJacobian(_weakly(self._jacobian), K, self._P)
             if self._symmetric:
                 self._P.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         ksp = self.snes.getKSP()
@@ -325,6 +327,22 @@ class NewtonSolver:
         self._motion = (self._problem.motion(y), self._problem.motion(self._trial))
         self._known = True
         return fraction < 1.0
+
+
+def _weakly(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a call of a method that does not keep its object alive.
+
+    PETSc keeps its callbacks out of sight of Python's garbage collection, so a solver that held
+    itself through them would never be freed.
+    """
+    reference = weakref.WeakMethod(method)
+
+    def call(*args: Any) -> Any:
+        bound = reference()
+        assert bound is not None
+        return bound(*args)
+
+    return call
 
 
 def _reason(code: int) -> str:
