@@ -65,7 +65,7 @@ def right_side(problem):
     return d[np.isclose(X, 1.0)]
 
 
-def assert_same_run(one, two, tolerance=1e-12):
+def assert_same_run(one, two, tolerance=1e-12, size=0.0):
     """Compare arrays of two runs: bit by bit on one rank.
 
     On several, MUMPS adds contributions in the order in which messages arrive.
@@ -73,7 +73,8 @@ def assert_same_run(one, two, tolerance=1e-12):
     if WORLD.size == 1:
         assert np.array_equal(one, two)
     else:
-        np.testing.assert_allclose(one, two, atol=tolerance * scenes.largest(one))
+        size = max(size, scenes.largest(one))
+        np.testing.assert_allclose(one, two, rtol=0.0, atol=tolerance * size)
 
 
 # -- Totals ------------------------------------------------------------------------------
@@ -276,7 +277,8 @@ def test_failed_step_leaves_the_next_one_as_if_it_had_not_been():
         assert problem.history.load == [k / 10 for k in range(1, 11)]
         runs.append(scenes.state(problem))
     for key in runs[0]:
-        assert_same_run(runs[0][key], runs[1][key], 1e-9)
+        weight = 4.0 * 8.0 * 15e3 if key.startswith("reaction") else 0.0
+        assert_same_run(runs[0][key], runs[1][key], 1e-9, weight)
 
 
 def test_leaving_the_background_stops_the_run():
