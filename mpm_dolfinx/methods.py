@@ -21,7 +21,7 @@ from dolfinx import mesh
 
 from . import _compat
 from .errors import MPMError, agree
-from .location import BackgroundBasis, PointBasis
+from .location import DROP, BackgroundBasis, PointBasis
 
 __all__ = [
     "BOX_CELLS",
@@ -181,9 +181,13 @@ def _merged(
 
 
 def _affine(state: DomainState, arms: NDArray[np.float64], particle: PointBasis) -> PointBasis:
-    """Return rows ``S_ip + grad S_ip . F_p (X_c - X_p)`` for the corners of each domain."""
+    """Return rows ``S_ip + grad S_ip . F_p (X_c - X_p)`` for the corners of each domain.
+
+    What round-off leaves of weights that cancel is dropped: a column of it would be noise.
+    """
     assert particle.gradients is not None
     rows = np.einsum("nji,nki->nkj", particle.gradients, arms) + particle.values[:, None]
+    rows = np.where(np.abs(rows) < DROP, 0.0, rows)
     k = arms.shape[1]
     nodes = np.broadcast_to(particle.nodes[:, None], rows.shape)
     size = state.domains.size
