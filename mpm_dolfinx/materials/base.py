@@ -7,13 +7,14 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from contextlib import nullcontext
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.errors import MPMError
+from mpm_dolfinx.errors import MPMError, agree
 from mpm_dolfinx.materials.kinematics import KINEMATICS, Kinematics
 from mpm_dolfinx.materials.mandel import num_components, to_tensor
 
@@ -251,6 +252,8 @@ def check_parameter(
 ) -> Parameter:
     """Return a parameter as a number or an array ``(n,)``, if its values are allowed.
 
+    Ranks agree on the values of a Function (collective), as each sees its own part.
+
     Args:
         name: Name for the message.
         value: Number, array ``(n,)``, or Function, which is returned as it is.
@@ -278,9 +281,11 @@ def check_parameter(
     if below is not None:
         allowed &= values < below
         words.append(f"less than {below:g}")
-    if not allowed.all():
-        worst = values[~allowed].flat[0]
-        raise MPMError(f"{name} is {worst:g} but must be {', '.join(words)}")
+    space = getattr(value, "function_space", None)
+    with nullcontext() if space is None else agree(space.mesh.comm):
+        if not allowed.all():
+            worst = values[~allowed].flat[0]
+            raise MPMError(f"{name} is {worst:g} but must be {', '.join(words)}")
     if hasattr(value, "x"):
         return cast(Parameter, value)
     return float(values) if values.ndim == 0 else values
