@@ -222,4 +222,4 @@ class ConstitutiveHistory:
         result = np.zeros((self._points, *shape))
         for group, state in zip(self._groups, self._states, strict=True):
             result[group.points] = value(group, state)
-        return result.reshape(self._particles.num_local, -1, *shape)
+        return result.reshape(self._particles.num_local, self._particles.num_points, *shape)
