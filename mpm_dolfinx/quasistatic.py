@@ -47,6 +47,7 @@ class QuasiStaticProblem(ParticleProblem):
         axisymmetric: Whether ``x[0]`` is the radius of a body of revolution about ``x[0] = 0``;
             loads and reactions are then those of the whole circumference.
         background: Form on the background, as in :class:`ParticleProblem`.
+        f_bar: Averaging of the volume ratio against locking; ``"none"``.
         petsc_options_prefix: Prefix of the PETSc options.
         petsc_options: PETSc options, without prefix.
         shift: As in :class:`ParticleProblem`.
@@ -70,6 +71,7 @@ class QuasiStaticProblem(ParticleProblem):
         facet_tags: Any = None,
         axisymmetric: bool = False,
         background: ufl.Form | None = None,
+        f_bar: str = "none",
         petsc_options_prefix: str = "mpm_",
         petsc_options: dict[str, Any] | None = None,
         *,
@@ -77,6 +79,8 @@ class QuasiStaticProblem(ParticleProblem):
         line_search: bool = True,
         **options: Any,
     ) -> None:
+        if f_bar != "none":
+            raise MPMError(f"Unknown f_bar={f_bar!r}; choose 'none'.")
         bodies = as_bodies(particles)
         count = len(bodies) if isinstance(particles, list | tuple) else 0
         shares = zip(
