@@ -31,7 +31,7 @@ from .history import History, Step
 from .io import TimeSeries
 from .particles import Particles
 from .reduced import Body, ReducedSystem
-from .solver import NewtonSolver
+from .solver import NewtonSolver, weakly
 from .stepping import StepControl
 
 __all__ = ["ParticleProblem"]
@@ -109,6 +109,7 @@ class ParticleProblem:
                 "or on a component of it (V.sub(i))."
             )
         self.history = History()
+        self._meshes = [V.mesh, *(body.mesh for body in self.bodies)]
         self._comm: MPI.Comm = V.mesh.comm
         shares = [
             Body(body, BodyForms(r, j, body, **options))
@@ -118,7 +119,8 @@ class ParticleProblem:
         if background is not None:
             terms = BackgroundForms(background, self.bodies[0], **options)
         statistics = self.history.statistics
-        self.reduced = ReducedSystem(shares, terms, self.bcs, self.evaluate, statistics)
+        evaluate = weakly(self.evaluate)
+        self.reduced = ReducedSystem(shares, terms, self.bcs, evaluate, statistics)
         self._newton = NewtonSolver(
             self._comm,
             petsc_options_prefix,
@@ -133,6 +135,24 @@ class ParticleProblem:
         self._parameter = self._loaded
         self._reactions: NDArray[np.float64] | None = None
         self._series: dict[Path, list[TimeSeries]] = {}
+
+    def __del__(self) -> None:
+        """Free what PETSc holds, on all ranks together."""
+        if "_newton" in self.__dict__ and not PETSc.Sys.isFinalized():
+            for body in self.bodies:
+                body.__dict__.pop("T", None)
+            for part in (self.reduced, self._newton):
+                part.__dict__.clear()
+            self._clean_up()
+
+    def _clean_up(self) -> None:
+        """Free PETSc objects that are out of use (collective).
+
+        On several ranks Python leaves them to such a call, as it drops references when it likes.
+        """
+        if self._comm.size > 1:
+            for domain in self._meshes:
+                PETSc.garbage_cleanup(domain.comm)
 
     # -- PETSc objects --------------------------------------------------------------------
 
@@ -336,6 +356,7 @@ class ParticleProblem:
             self._parameter = parameter
             self._reactions = self.reduced.force.array_r.copy()
             self.reduced.end()
+            self._clean_up()
         step = Step(parameter, self._newton.iterations, list(self._newton.residuals))
         self.history.steps.append(step)
         return step

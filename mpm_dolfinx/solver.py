@@ -16,7 +16,7 @@ import numpy as np
 from .errors import ConvergenceError, MPMError
 from .history import Statistics
 
-__all__ = ["NewtonSolver", "ReducedProblem"]
+__all__ = ["NewtonSolver", "ReducedProblem", "weakly"]
 
 #: Newton increment, relative to the step's, at which round-off is reached.
 ROUND_OFF = 1e-13
@@ -166,9 +166,9 @@ class NewtonSolver:
         self.x = PETSc.Vec().createMPI(sizes, comm=self._comm)
         self.F = self.x.duplicate()
         self._trial = self.x.duplicate()
-        self.snes.setFunction(_weakly(self._function), self.x.duplicate())
-        self.snes.setConvergenceTest(_weakly(self._test))
-        self.snes.setLineSearchPreCheck(_weakly(self._pre_check))
+        self.snes.setFunction(weakly(self._function), self.x.duplicate())
+        self.snes.setConvergenceTest(weakly(self._test))
+        self.snes.setLineSearchPreCheck(weakly(self._pre_check))
         return self.x
 
     def _iterate(self, x: PETSc.Vec) -> None:
@@ -274,7 +274,7 @@ class NewtonSolver:
             self._P = K
         if new:
             self.K = K
-            self.snes.setJacobian(_weakly(self._jacobian), K, self._P)
+            self.snes.setJacobian(weakly(self._jacobian), K, self._P)
             if self._symmetric:
                 self._P.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         ksp = self.snes.getKSP()
@@ -329,7 +329,7 @@ class NewtonSolver:
         return fraction < 1.0
 
 
-def _weakly(method: Callable[..., Any]) -> Callable[..., Any]:
+def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
     """Return a call of a method that does not keep its object alive.
 
     PETSc keeps its callbacks out of sight of Python's garbage collection, so a solver that held
