@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -137,8 +138,8 @@ class ParticleProblem:
         self._series: dict[Path, list[TimeSeries]] = {}
 
     def __del__(self) -> None:
-        """Free what PETSc holds, on all ranks together."""
-        if "_newton" in self.__dict__ and not PETSc.Sys.isFinalized():
+        """Free what PETSc holds, on all ranks together; at the program's end PETSc does it."""
+        if "_newton" in self.__dict__ and not sys.is_finalizing():
             for body in self.bodies:
                 body.__dict__.pop("T", None)
             for part in (self.reduced, self._newton):

@@ -230,5 +230,6 @@ def test_demo_is_a_program(demo, tmp_path):
         env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
     )
     assert done.returncode == 0, done.stderr
+    assert "Exception ignored" not in done.stderr and "Traceback" not in done.stderr
     assert COMMON <= json.loads(done.stdout).keys()
     assert not list(tmp_path.iterdir())
