@@ -4,29 +4,40 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mpm_dolfinx._core import loops
 from mpm_dolfinx.materials.base import (
     Field,
     Integration,
     Parameter,
     State,
     StrainMaterial,
+    Update,
     check_parameter,
     per_row,
 )
+from mpm_dolfinx.materials.compiled import CompiledUpdate, update_hencky
 from mpm_dolfinx.materials.mandel import deviator, deviatoric_projector, identity, trace
 
 __all__ = ["Hencky", "IsotropicElastic", "LinearElastic"]
 
 
 class IsotropicElastic(StrainMaterial):
-    """Stress K tr(eps) I + 2 G dev(eps), the elastic part of the laws of this package."""
+    """Stress K tr(eps) I + 2 G dev(eps), the elastic part of the laws of this package.
+
+    Attributes:
+        compiled: Whether a compiled update is used where the law itself (not a law derived from
+            it) has one and the package was built with it; its answer differs from
+            :meth:`StrainMaterial.update` by round-off alone.
+    """
 
     symmetric = True
+    compiled: bool = True
+    _compiled_update: ClassVar[CompiledUpdate]
 
     def __init__(self, young: ArrayLike | Field, poisson: ArrayLike | Field) -> None:
         """Set the elastic constants.
@@ -42,6 +53,15 @@ class IsotropicElastic(StrainMaterial):
             "young": check_parameter("young", young, above=0.0),
             "poisson": check_parameter("poisson", poisson, above=-1.0, below=0.5),
         }
+
+    def update(
+        self, displacement_gradient: NDArray[np.float64], state: State, tangent: bool = True
+    ) -> Update:
+        """See :meth:`Material.update`."""
+        rule = vars(type(self)).get("_compiled_update")
+        if rule is None or loops is None or not self.compiled:
+            return super().update(displacement_gradient, state, tangent)
+        return cast(Update, rule(self, displacement_gradient, state, tangent))
 
     @property
     def bulk(self) -> Parameter:
@@ -89,3 +109,4 @@ class Hencky(IsotropicElastic):
     """
 
     kinematics: ClassVar[Literal["small", "logarithmic"]] = "logarithmic"
+    _compiled_update = update_hencky

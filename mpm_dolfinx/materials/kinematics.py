@@ -32,9 +32,27 @@ from mpm_dolfinx.materials.tensors import (
     unpack,
 )
 
-__all__ = ["KINEMATICS", "Kinematics", "LogarithmicStrain", "SmallStrain"]
+__all__ = ["KINEMATICS", "Kinematics", "LogarithmicStrain", "SmallStrain", "require_valid"]
 
 Array = NDArray[np.float64]
+
+
+def require_valid(valid: NDArray[np.bool_]) -> None:
+    """Raise an error that names the points that are not valid.
+
+    Args:
+        valid: Whether the deformation of each point is possible, shape ``(n,)``.
+
+    Raises:
+        DomainDistortionError: Some are not; its ``particles`` are the numbers of these points.
+    """
+    if not valid.all():
+        points = np.flatnonzero(~valid)
+        raise DomainDistortionError(
+            f"the deformation gradient of {len(points)} of {len(valid)} points is not finite "
+            "with a positive determinant: a domain is inverted or crushed, take smaller steps",
+            particles=points,
+        )
 
 
 class Kinematics(ABC):
@@ -157,25 +175,14 @@ class LogarithmicStrain(Kinematics):
                 h = np.einsum("ikn,kjn->ijn", H - H_n, inverse(H_n)[0])
                 right = np.einsum("ikn,kjn->ijn", h, unpack(c_n, dim)) + h
                 c = c_n + pack(2.0 * right + np.einsum("ikn,jkn->ijn", right, h))
-        self._check(np.isfinite(c).all(axis=0) & (det > 0.0))
+        require_valid(np.isfinite(c).all(axis=0) & (det > 0.0))
         self._trial_c = c
         self._principal, self._axes = eigen(unpack(c, dim))
-        self._check((self._principal > -1.0).all(axis=0))
+        require_valid((self._principal > -1.0).all(axis=0))
         strain = self._assemble(0.5 * np.log1p(self._principal), self._axes)
         if m == 4:
             strain[2] = 0.5 * np.log1p(c[2])
         self.trial_strain = strain.T
-
-    @staticmethod
-    def _check(valid: NDArray[np.bool_]) -> None:
-        """Raise an error that names the points that are not valid."""
-        if not valid.all():
-            points = np.flatnonzero(~valid)
-            raise DomainDistortionError(
-                f"the deformation gradient of {len(points)} of {len(valid)} points is not finite "
-                "with a positive determinant: a domain is inverted or crushed, take smaller steps",
-                particles=points,
-            )
 
     @staticmethod
     def _assemble(values: Array, axes: Array) -> Array:

@@ -13,13 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.errors import MPMError
 from mpm_dolfinx.materials.base import Field, Integration, Parameter, State, check_parameter
+from mpm_dolfinx.materials.compiled import update_von_mises
 from mpm_dolfinx.materials.elastic import IsotropicElastic
 from mpm_dolfinx.materials.mandel import deviator, deviatoric_projector, identity, norm, trace
 
 __all__ = ["SmallStrainVonMises", "VonMises"]
-
-YIELD_TOLERANCE = 1e-13
-"""Excess over the yield strength that counts as round-off of a point on the yield surface."""
 
 
 class VonMises(IsotropicElastic):
@@ -31,6 +29,9 @@ class VonMises(IsotropicElastic):
     (Wilkins 1964), with the consistent tangent of Simo & Taylor (1985, eq. 3.17).
 
     The state holds kappa as ``"plastic_strain"``, shape ``(n,)``.
+
+    Attributes:
+        yield_tolerance: Value of f that counts as round-off of a point on the yield surface.
     """
 
     kinematics: ClassVar[Literal["small", "logarithmic"]] = "logarithmic"
@@ -38,6 +39,8 @@ class VonMises(IsotropicElastic):
     internal_variables: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType(
         {"plastic_strain": ()}
     )
+    _compiled_update = update_von_mises
+    yield_tolerance: ClassVar[float] = 1e-13
 
     def __init__(
         self,
@@ -96,7 +99,7 @@ class VonMises(IsotropicElastic):
         stress = self.elastic_stress(trial_strain)
         f = self.yield_function(stress, variables["plastic_strain"])
         D = self.elastic_tangent(n, m) if tangent else None
-        (points,) = np.nonzero(f > YIELD_TOLERANCE)
+        (points,) = np.nonzero(f > self.yield_tolerance)
         if len(points) == 0:
             return Integration(stress, D, trial_strain, variables)
 

@@ -1,0 +1,373 @@
+// Copyright (C) 2026 the mpm-dolfinx authors
+// SPDX-License-Identifier: LGPL-3.0-or-later
+//
+// Loops over domains: gradients, forces, and T^T K T domain by domain.
+
+#include "domains.h"
+
+#include <algorithm>
+#include <numeric>
+
+namespace
+{
+using core::Domains;
+using core::Rows;
+using core::Target;
+
+// Call f with the dimension as a constant.
+template <typename F>
+void with_dimension(int dim, F&& f)
+{
+  if (dim == 2)
+    f(std::integral_constant<int, 2>());
+  else
+    f(std::integral_constant<int, 3>());
+}
+
+// The number of a node in a sorted support.
+inline std::size_t slot(const std::int32_t* begin, const std::int32_t* end, std::int32_t node)
+{
+  return static_cast<std::size_t>(std::lower_bound(begin, end, node) - begin);
+}
+
+// left[i][j][L] = factor sum_J gradient_J A_iJjL
+template <int dim>
+inline void contract(const double* A, const double* gradient, double factor, double* left)
+{
+  for (int i = 0; i < dim; ++i)
+    for (int jL = 0; jL < dim * dim; ++jL)
+    {
+      double sum = 0.0;
+      for (int J = 0; J < dim; ++J)
+        sum += gradient[J] * A[(i * dim + J) * dim * dim + jL];
+      left[i * dim * dim + jL] = factor * sum;
+    }
+}
+
+// block[i][j] += sum_L left[i][j][L] gradient_L
+template <int dim>
+inline void add_block(const double* left, const double* gradient, double* block, int stride)
+{
+  for (int i = 0; i < dim; ++i)
+    for (int j = 0; j < dim; ++j)
+    {
+      double sum = 0.0;
+      for (int L = 0; L < dim; ++L)
+        sum += left[(i * dim + j) * dim + L] * gradient[L];
+      block[i * stride + j] += sum;
+    }
+}
+
+// Add T^T K T of one domain; K is (nodes dim, nodes dim).
+template <int dim>
+void add_element(const double* K, int nodes, const double* transfer, std::size_t size,
+                 const std::int32_t* positions, double* values, std::vector<double>& work)
+{
+  constexpr int block = dim * dim;
+  const int width = nodes * dim;
+  work.assign(nodes * size * block, 0.0);
+  for (std::size_t b = 0; b < size; ++b)
+    for (int e = 0; e < nodes; ++e)
+    {
+      const double weight = transfer[b * nodes + e];
+      if (weight == 0.0)
+        continue;
+      for (int c = 0; c < nodes; ++c)
+      {
+        double* out = work.data() + (c * size + b) * block;
+        for (int i = 0; i < dim; ++i)
+          for (int j = 0; j < dim; ++j)
+            out[i * dim + j] += weight * K[(c * dim + i) * width + e * dim + j];
+      }
+    }
+  for (std::size_t a = 0; a < size; ++a)
+    for (int c = 0; c < nodes; ++c)
+    {
+      const double weight = transfer[a * nodes + c];
+      if (weight == 0.0)
+        continue;
+      const double* row = work.data() + c * size * block;
+      for (std::size_t b = 0; b < size; ++b)
+      {
+        double* out = values + static_cast<std::size_t>(positions[a * size + b]) * block;
+        for (int e = 0; e < block; ++e)
+          out[e] += weight * row[b * block + e];
+      }
+    }
+}
+
+// Go through domains with their supports.
+template <typename F>
+void for_each_support(std::size_t count, const Target& target, F&& f)
+{
+  std::size_t pairs = 0;
+  for (std::size_t p = 0; p < count; ++p)
+  {
+    const std::size_t size = target.offsets[p + 1] - target.offsets[p];
+    f(p, size, target.positions + pairs);
+    pairs += size * size;
+  }
+}
+} // namespace
+
+void core::displacement_gradient(const Domains& domains, const double* u, double* H)
+{
+  with_dimension(domains.dim, [&](auto constant) {
+    constexpr int dim = constant;
+    for (std::size_t p = 0; p < domains.count; ++p)
+    {
+      const std::int32_t* nodes = domains.dofmap + p * domains.nodes;
+      for (int q = 0; q < domains.points; ++q)
+      {
+        const double* gradients = domains.gradients + (p * domains.points + q) * domains.nodes * dim;
+        double sum[dim * dim] = {};
+        for (int c = 0; c < domains.nodes; ++c)
+          for (int i = 0; i < dim; ++i)
+            for (int j = 0; j < dim; ++j)
+              sum[i * dim + j] += u[nodes[c] * dim + i] * gradients[c * dim + j];
+        std::copy(sum, sum + dim * dim, H + (p * domains.points + q) * dim * dim);
+      }
+    }
+  });
+}
+
+void core::internal_force(const Domains& domains, const double* P, double* force)
+{
+  with_dimension(domains.dim, [&](auto constant) {
+    constexpr int dim = constant;
+    for (std::size_t p = 0; p < domains.count; ++p)
+    {
+      const std::int32_t* nodes = domains.dofmap + p * domains.nodes;
+      for (int q = 0; q < domains.points; ++q)
+      {
+        const std::size_t point = p * domains.points + q;
+        const double* gradients = domains.gradients + point * domains.nodes * dim;
+        for (int c = 0; c < domains.nodes; ++c)
+          for (int i = 0; i < dim; ++i)
+          {
+            double sum = 0.0;
+            for (int J = 0; J < dim; ++J)
+              sum += P[(point * dim + i) * dim + J] * gradients[c * dim + J];
+            force[nodes[c] * dim + i] += domains.weights[point] * sum;
+          }
+      }
+    }
+  });
+}
+
+core::Supports core::supports(const Domains& domains, const Rows& rows)
+{
+  Supports result;
+  result.offsets.reserve(domains.count + 1);
+  result.offsets.push_back(0);
+  std::vector<std::int32_t> support;
+  for (std::size_t p = 0; p < domains.count; ++p)
+  {
+    support.clear();
+    for (int c = 0; c < domains.nodes; ++c)
+    {
+      const std::int32_t row = domains.dofmap[p * domains.nodes + c];
+      support.insert(support.end(), rows.nodes + rows.offsets[row],
+                     rows.nodes + rows.offsets[row + 1]);
+    }
+    std::sort(support.begin(), support.end());
+    const auto end = std::unique(support.begin(), support.end());
+    result.nodes.insert(result.nodes.end(), support.begin(), end);
+    result.offsets.push_back(static_cast<std::int64_t>(result.nodes.size()));
+  }
+  return result;
+}
+
+void core::local_transfers(const Domains& domains, const Rows& rows, const std::int64_t* offsets,
+                           const std::int32_t* nodes, double* transfers)
+{
+  std::fill(transfers, transfers + offsets[domains.count] * domains.nodes, 0.0);
+  for (std::size_t p = 0; p < domains.count; ++p)
+  {
+    double* transfer = transfers + offsets[p] * domains.nodes;
+    for (int c = 0; c < domains.nodes; ++c)
+    {
+      const std::int32_t row = domains.dofmap[p * domains.nodes + c];
+      for (std::int64_t e = rows.offsets[row]; e < rows.offsets[row + 1]; ++e)
+        transfer[slot(nodes + offsets[p], nodes + offsets[p + 1], rows.nodes[e]) * domains.nodes
+                 + c] = rows.values[e];
+    }
+  }
+}
+
+void core::support_gradients(const Domains& domains, const Rows& rows, const std::int64_t* offsets,
+                             const std::int32_t* nodes, double* gradients)
+{
+  with_dimension(domains.dim, [&](auto constant) {
+    constexpr int dim = constant;
+    std::fill(gradients, gradients + offsets[domains.count] * dim, 0.0);
+    for (std::size_t p = 0; p < domains.count; ++p)
+      for (int c = 0; c < domains.nodes; ++c)
+      {
+        const std::int32_t row = domains.dofmap[p * domains.nodes + c];
+        const double* gradient = domains.gradients + (p * domains.nodes + c) * dim;
+        for (std::int64_t e = rows.offsets[row]; e < rows.offsets[row + 1]; ++e)
+        {
+          const std::size_t a = slot(nodes + offsets[p], nodes + offsets[p + 1], rows.nodes[e]);
+          for (int J = 0; J < dim; ++J)
+            gradients[(offsets[p] + a) * dim + J] += rows.values[e] * gradient[J];
+        }
+      }
+  });
+}
+
+core::Pattern core::pattern(const std::int64_t* offsets, const std::int32_t* nodes,
+                            std::size_t count, std::size_t num_nodes)
+{
+  // Which domains see a node, and as which of theirs.
+  std::vector<std::int64_t> first(num_nodes + 1, 0);
+  for (std::int64_t e = 0; e < offsets[count]; ++e)
+    ++first[nodes[e] + 1];
+  std::partial_sum(first.begin(), first.end(), first.begin());
+  struct Visit
+  {
+    std::int64_t domain;
+    std::size_t pairs;
+    std::int32_t slot;
+  };
+  std::vector<Visit> visits(offsets[count]);
+  std::vector<std::int64_t> next(first.begin(), first.end() - 1);
+  std::size_t pairs = 0;
+  for (std::size_t p = 0; p < count; ++p)
+  {
+    const std::size_t size = offsets[p + 1] - offsets[p];
+    for (std::size_t a = 0; a < size; ++a)
+      visits[next[nodes[offsets[p] + a]]++]
+          = {static_cast<std::int64_t>(p), pairs, static_cast<std::int32_t>(a)};
+    pairs += size * size;
+  }
+
+  Pattern result;
+  result.offsets.reserve(num_nodes + 1);
+  result.offsets.push_back(0);
+  result.positions.resize(pairs);
+  std::vector<std::int32_t> place(num_nodes, -1);
+  for (std::size_t row = 0; row < num_nodes; ++row)
+  {
+    const auto start = static_cast<std::int32_t>(result.nodes.size());
+    for (std::int64_t v = first[row]; v < first[row + 1]; ++v)
+    {
+      const std::int64_t p = visits[v].domain;
+      for (std::int64_t e = offsets[p]; e < offsets[p + 1]; ++e)
+        if (place[nodes[e]] < start)
+        {
+          place[nodes[e]] = start;
+          result.nodes.push_back(nodes[e]);
+        }
+    }
+    std::sort(result.nodes.begin() + start, result.nodes.end());
+    for (std::size_t e = start; e < result.nodes.size(); ++e)
+      place[result.nodes[e]] = static_cast<std::int32_t>(e);
+    for (std::int64_t v = first[row]; v < first[row + 1]; ++v)
+    {
+      const std::int64_t p = visits[v].domain;
+      const std::size_t size = offsets[p + 1] - offsets[p];
+      for (std::size_t b = 0; b < size; ++b)
+        result.positions[visits[v].pairs + visits[v].slot * size + b] = place[nodes[offsets[p] + b]];
+    }
+    // Every place of a row is at or after its start, so the next row finds none of them new.
+    for (std::size_t e = start; e < result.nodes.size(); ++e)
+      place[result.nodes[e]] = -1;
+    result.offsets.push_back(static_cast<std::int32_t>(result.nodes.size()));
+  }
+  return result;
+}
+
+void core::assemble_points(const Domains& domains, const double* support_gradients,
+                           const double* A, bool symmetric, const Target& target)
+{
+  with_dimension(domains.dim, [&](auto constant) {
+    constexpr int dim = constant;
+    constexpr int block = dim * dim;
+    for_each_support(
+        domains.count, target, [&](std::size_t p, std::size_t size, const std::int32_t* positions) {
+          const double* S = support_gradients + target.offsets[p] * dim;
+          double left[dim * block];
+          for (std::size_t a = 0; a < size; ++a)
+          {
+            contract<dim>(A + p * block * block, S + a * dim, domains.weights[p], left);
+            for (std::size_t b = symmetric ? a : 0; b < size; ++b)
+            {
+              double K[block] = {};
+              add_block<dim>(left, S + b * dim, K, dim);
+              double* out = target.values + static_cast<std::size_t>(positions[a * size + b]) * block;
+              for (int e = 0; e < block; ++e)
+                out[e] += K[e];
+              if (symmetric && b != a)
+              {
+                double* mirror
+                    = target.values + static_cast<std::size_t>(positions[b * size + a]) * block;
+                for (int i = 0; i < dim; ++i)
+                  for (int j = 0; j < dim; ++j)
+                    mirror[j * dim + i] += K[i * dim + j];
+              }
+            }
+          }
+        });
+  });
+}
+
+void core::assemble_domains(const Domains& domains, const double* transfers, const double* A,
+                            const Target& target)
+{
+  with_dimension(domains.dim, [&](auto constant) {
+    constexpr int dim = constant;
+    constexpr int block = dim * dim;
+    const int width = domains.nodes * dim;
+    std::vector<double> K(width * width), work;
+    for_each_support(
+        domains.count, target, [&](std::size_t p, std::size_t size, const std::int32_t* positions) {
+          std::fill(K.begin(), K.end(), 0.0);
+          for (int q = 0; q < domains.points; ++q)
+          {
+            const std::size_t point = p * domains.points + q;
+            const double* gradients = domains.gradients + point * domains.nodes * dim;
+            double left[dim * block];
+            for (int c = 0; c < domains.nodes; ++c)
+            {
+              contract<dim>(A + point * block * block, gradients + c * dim, domains.weights[point],
+                            left);
+              for (int e = 0; e < domains.nodes; ++e)
+                add_block<dim>(left, gradients + e * dim, K.data() + c * dim * width + e * dim,
+                               width);
+            }
+          }
+          add_element<dim>(K.data(), domains.nodes, transfers + target.offsets[p] * domains.nodes,
+                           size, positions, target.values, work);
+        });
+  });
+}
+
+void core::assemble_form(const Form& form, const Domains& domains, const double* transfers,
+                         const Target& target)
+{
+  with_dimension(domains.dim, [&](auto constant) {
+    constexpr int dim = constant;
+    const int width = domains.nodes * dim;
+    std::vector<double> K(width * width), x(form.geometry_nodes * 3), work;
+    // Forms may live on some cells only, so pairs cannot be counted on the way.
+    std::vector<std::size_t> pairs(domains.count);
+    for_each_support(domains.count, target,
+                     [&](std::size_t p, std::size_t, const std::int32_t* positions) {
+                       pairs[p] = static_cast<std::size_t>(positions - target.positions);
+                     });
+    for (std::size_t e = 0; e < form.count; ++e)
+    {
+      const std::int32_t cell = form.entities[form.facets ? 2 * e : e];
+      const int facet = form.facets ? form.entities[2 * e + 1] : 0;
+      for (int c = 0; c < form.geometry_nodes; ++c)
+        std::copy_n(form.x + 3 * form.geometry[cell * form.geometry_nodes + c], 3, &x[3 * c]);
+      std::fill(K.begin(), K.end(), 0.0);
+      form.kernel(K.data(), form.coefficients + e * form.stride, form.constants, x.data(), &facet,
+                  nullptr, nullptr);
+      add_element<dim>(K.data(), domains.nodes, transfers + target.offsets[cell] * domains.nodes,
+                       target.offsets[cell + 1] - target.offsets[cell],
+                       target.positions + pairs[cell], target.values, work);
+    }
+  });
+}

@@ -1,0 +1,97 @@
+// Copyright (C) 2026 the mpm-dolfinx authors
+// SPDX-License-Identifier: LGPL-3.0-or-later
+
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <vector>
+
+namespace core
+{
+// Domains with k nodes and nq points each, in dim dimensions.
+struct Domains
+{
+  std::size_t count;
+  int nodes, points, dim;
+  const std::int32_t* dofmap;  // (count, nodes)
+  const double* gradients;     // (count, points, nodes, dim)
+  const double* weights;       // (count, points)
+};
+
+// H = grad u at the points, (count, points, dim, dim), of u at the nodes.
+void displacement_gradient(const Domains& domains, const double* u, double* H);
+
+// Add int P : grad v to the force at the nodes.
+void internal_force(const Domains& domains, const double* P, double* force);
+
+// Rows of T (one for each node of W) in compressed rows of background nodes.
+struct Rows
+{
+  const std::int64_t* offsets;
+  const std::int32_t* nodes;
+  const double* values;
+};
+
+// The background nodes of each domain, sorted, in compressed rows.
+struct Supports
+{
+  std::vector<std::int64_t> offsets;
+  std::vector<std::int32_t> nodes;
+};
+Supports supports(const Domains& domains, const Rows& rows);
+
+// T of each domain: (support size, nodes) one domain after the other.
+void local_transfers(const Domains& domains, const Rows& rows, const std::int64_t* offsets,
+                     const std::int32_t* nodes, double* transfers);
+
+// The gradients of the background basis that a domain's single point sees: (support size, dim).
+void support_gradients(const Domains& domains, const Rows& rows, const std::int64_t* offsets,
+                       const std::int32_t* nodes, double* gradients);
+
+// Sparsity of the sum over domains, and where each pair of a support's nodes is in it.
+struct Pattern
+{
+  std::vector<std::int32_t> offsets, nodes, positions;
+};
+Pattern pattern(const std::int64_t* offsets, const std::int32_t* nodes, std::size_t count,
+                std::size_t num_nodes);
+
+// Where the tangents of domains go: blocks (dim, dim) of a matrix in compressed rows.
+struct Target
+{
+  const std::int64_t* offsets;    // of the supports
+  const std::int32_t* positions;  // of all pairs of a support's nodes
+  double* values;
+};
+
+// Add w S^T A S for domains of one point.
+void assemble_points(const Domains& domains, const double* support_gradients, const double* A,
+                     bool symmetric, const Target& target);
+
+// Add T^T (sum_q w_q G^T A G + low-rank terms) T.
+void assemble_domains(const Domains& domains, const double* transfers, const double* A,
+                      const Target& target);
+
+using Kernel = void (*)(double*, const double*, const double*, const double*, const int*,
+                        const std::uint8_t*, void*);
+
+// A compiled form on some cells, or facets of cells.
+struct Form
+{
+  Kernel kernel;
+  std::size_t count;
+  const std::int32_t* entities;  // cell, or cell and local facet
+  bool facets;
+  const double* coefficients;
+  std::size_t stride;
+  const double* constants;
+  const double* x;               // geometry, three columns
+  const std::int32_t* geometry;  // its dofmap
+  int geometry_nodes;
+};
+
+// Add T^T K T with the element tensors K of a compiled form.
+void assemble_form(const Form& form, const Domains& domains, const double* transfers,
+                   const Target& target);
+} // namespace core

@@ -1,0 +1,73 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The compiled updates against NumPy's."""
+
+import numpy as np
+import pytest
+from materials.test_von_mises import random_path
+
+from mpm_dolfinx import DomainDistortionError
+from mpm_dolfinx._core import loops
+from mpm_dolfinx.materials import Hencky, VonMises
+
+pytestmark = pytest.mark.skipif(loops is None, reason="the package was built without a compiler")
+
+COUNT = 50
+SPREAD = np.linspace(1.0, 2.0, COUNT)
+LAWS = {
+    "hencky": Hencky(1e3, 0.3),
+    "hencky by point": Hencky(1e3 * SPREAD, 0.2 * SPREAD),
+    "perfect": VonMises(1e3, 0.3, rho_y=2.0),
+    "hardening by point": VonMises(
+        1e3 * SPREAD, 0.49, yield_stress=2.0 * SPREAD, hardening=50.0 * SPREAD
+    ),
+}
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("size", [1e-10, 1e-3, 0.1])
+def test_compiled_update_is_that_of_numpy(law, dim, size):
+    compiled, reference = LAWS[law], LAWS[law].with_parameters()
+    reference.compiled = False
+    state = compiled.initial_state(COUNT, dim)
+    turn = 0.3 if size > 1e-6 else 0.0
+    for H in random_path(COUNT, dim, 4, size=size, turn=turn):
+        H[0] = 0.0
+        H[1] = 0.05 * np.eye(dim)
+        mine, theirs = compiled.update(H, state), reference.update(H, state)
+        assert mine.state.keys() == theirs.state.keys()
+        pairs = [(mine.first_piola, theirs.first_piola), (mine.tangent, theirs.tangent)]
+        pairs += [(mine.state[name], theirs.state[name]) for name in mine.state]
+        for a, b in pairs:
+            np.testing.assert_allclose(a, b, rtol=0.0, atol=2e-13 * np.abs(b).max())
+        assert compiled.update(H, state, tangent=False).tangent is None
+        state = theirs.state
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_derived_laws_keep_their_own_integration(dim):
+    class Doubled(Hencky):
+        def integrate(self, trial_strain, variables, tangent):
+            return super().integrate(2.0 * trial_strain, variables, tangent)
+
+    H = random_path(5, dim, 1, size=0.1)[0]
+    plain, doubled = (law(1e3, 0.3).update(H, {}).state["stress"] for law in (Hencky, Doubled))
+    np.testing.assert_allclose(doubled, 2.0 * plain, rtol=1e-12)
+
+
+@pytest.mark.parametrize("law", ["hencky", "perfect"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, -2.0])
+def test_impossible_deformations_are_named(law, bad):
+    H = np.zeros((COUNT, 2, 2))
+    H[[3, 7], 0, 0] = bad
+    with pytest.raises(DomainDistortionError) as caught:
+        LAWS[law].update(H, LAWS[law].initial_state(COUNT, 2))
+    assert list(caught.value.particles) == [3, 7]
+
+
+def test_shapes_that_do_not_fit_are_refused():
+    H = np.zeros((3, 2, 2))
+    empty = np.empty(0)
+    with pytest.raises(ValueError, match="one parameter"):
+        loops.update_hencky(H, np.ones(2), np.ones(1), H, empty, empty)
