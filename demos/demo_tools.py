@@ -172,6 +172,7 @@ def progress(steps: Iterable[mpm.Step], number: int, args: argparse.Namespace) -
 
 def outcome(history: mpm.History, failure: mpm.MPMError | None) -> dict[str, Any]:
     """What every demo reports of a run; iterations count failed attempts too."""
+    failure = failure or history.stopped
     return {
         "completed": int(failure is None),
         "load": history.load[-1] if history.load else 0.0,

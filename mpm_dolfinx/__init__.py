@@ -13,7 +13,7 @@ from .errors import (  # noqa: E402
     MPMError,
     ParticleOutsideError,
 )
-from .history import History, Statistics, Step  # noqa: E402
+from .history import History, Loss, Statistics, Step  # noqa: E402
 from .particles import Particles  # noqa: E402
 from .problem import ParticleProblem  # noqa: E402
 from .quasistatic import QuasiStaticProblem  # noqa: E402
@@ -25,6 +25,7 @@ __all__ = [
     "ConvergenceError",
     "DomainDistortionError",
     "History",
+    "Loss",
     "MPMError",
     "ParticleOutsideError",
     "ParticleProblem",

@@ -71,6 +71,8 @@ class BodyForms:
         (self._test,) = _arguments(R, 1, particles.W, "the residual R", "particles.W")
         d = particles.displacement
         parts = split_by_rule(R, d)
+        if particles.deletion is not None:
+            parts = [particles.deletion.present_only(part) for part in parts]
         live = [p for p in parts if follows(p, d)]
         dead = [p for p in parts if not follows(p, d)]
         if J is None:
@@ -78,6 +80,8 @@ class BodyForms:
         else:
             _arguments(J, 2, particles.W, "the tangent J", "particles.W")
             tangents = split_by_rule(J, d)
+            if particles.deletion is not None:
+                tangents = [particles.deletion.present_only(part) for part in tangents]
         if not tangents:
             raise MPMError(
                 "The residual R does not depend on particles.displacement; write it in that "

@@ -9,7 +9,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-__all__ = ["History", "Statistics", "Step"]
+from .errors import ParticleOutsideError
+
+__all__ = ["History", "Loss", "Statistics", "Step"]
 
 PHASES = ("locate", "transfer", "constitutive", "assemble", "factorise", "solve", "commit")
 COUNTERS = (
@@ -20,6 +22,9 @@ COUNTERS = (
     "halvings",
     "converged_at_round_off",
     "workspace_retries",
+    "lost_particles",
+    "lost_volume",
+    "lost_mass",
 )
 
 
@@ -30,8 +35,10 @@ class Statistics(dict[str, float]):
     ``assemble``, ``factorise``, ``solve`` and ``commit``. Counters are ``transfers`` (how often
     the transfer was rebuilt), ``free_dofs`` (unknowns of the last step), ``residuals`` and
     ``factorisations``, ``halvings`` (of Newton steps by the line search),
-    ``converged_at_round_off`` (steps that ended at the floor of round-off) and
-    ``workspace_retries`` (factorisations that MUMPS repeated with more workspace).
+    ``converged_at_round_off`` (steps that ended at the floor of round-off),
+    ``workspace_retries`` (factorisations that MUMPS repeated with more workspace) and
+    ``lost_particles``, ``lost_volume`` (undeformed) and ``lost_mass`` (0 where no density is
+    known), the sums over ``history.losses``.
     """
 
     def __init__(self) -> None:
@@ -81,6 +88,25 @@ class Step:
     residuals: list[float]
 
 
+@dataclass(frozen=True)
+class Loss:
+    """Particles of one body that a step took out of the background, and that are deleted.
+
+    Attributes:
+        load: Load factor (or the parameter t of a path) at the end of the step.
+        body: Number of the body, from 0.
+        particles: Their global indices, sorted; the same on all ranks.
+        volume: Their undeformed volume.
+        mass: Their mass, ``None`` in a problem without a density.
+    """
+
+    load: float
+    body: int
+    particles: list[int]
+    volume: float
+    mass: float | None
+
+
 @dataclass
 class History:
     """The steps of a run; it grows as the run goes on and stays after an error.
@@ -89,12 +115,16 @@ class History:
         steps: The converged steps.
         cutbacks: How often a step was halved.
         failed_iterations: Linear solves of attempts that did not converge.
+        losses: What ``outside="delete"`` has deleted.
+        stopped: Why a run with ``outside="stop"`` ended before its whole load, else ``None``.
         statistics: Counters and seconds per phase.
     """
 
     steps: list[Step] = field(default_factory=list)
     cutbacks: int = 0
     failed_iterations: int = 0
+    losses: list[Loss] = field(default_factory=list)
+    stopped: ParticleOutsideError | None = None
     statistics: Statistics = field(default_factory=Statistics)
 
     @property

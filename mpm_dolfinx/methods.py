@@ -21,7 +21,7 @@ from dolfinx import mesh
 
 from . import _compat
 from .errors import MPMError, agree
-from .location import DROP, BackgroundBasis, PointBasis
+from .location import DROP, TOLERANCE, BackgroundBasis, PointBasis
 
 __all__ = [
     "BOX_CELLS",
@@ -127,7 +127,10 @@ def gimp(state: DomainState, background: BackgroundBasis, grid: BoxGrid, stretch
     gradients = at.gradients.reshape(n, pieces, k, gdim)
     values = at.values.reshape(n, pieces, k)
     values = values + np.einsum("npki,npi->npk", gradients, middles - inside)
-    centre_inside = np.all((state.centroid >= grid.lower) & (state.centroid <= grid.upper), axis=1)
+    centre_inside = np.all(
+        (state.centroid >= grid.lower - grid.reach) & (state.centroid <= grid.upper + grid.reach),
+        axis=1,
+    )
     average = _merged(
         at.nodes.reshape(n, pieces * k),
         (shares[:, :, None] * values).reshape(n, pieces * k),
@@ -240,6 +243,7 @@ class BoxGrid:
     Attributes:
         lower: Lower corner of the background, shape ``(gdim,)``.
         upper: Upper corner, shape ``(gdim,)``.
+        reach: How far outside a particle counts as on the boundary, shape ``(gdim,)``.
 
     Raises:
         MPMError: The background is not such a grid.
@@ -260,6 +264,7 @@ class BoxGrid:
                 )
         self.lower = np.array([line[0] for line in self._lines])
         self.upper = np.array([line[-1] for line in self._lines])
+        self.reach = np.array([TOLERANCE * np.diff(line).min() for line in self._lines])
 
     def cut(
         self, centre: NDArray[np.float64], half: NDArray[np.float64]

@@ -17,6 +17,7 @@ import ufl
 from dolfinx import fem, mesh
 
 from . import _compat
+from .deletion import Deletion, without_deleted
 from .errors import DomainDistortionError, MPMError, ParticleOutsideError, agree
 from .location import BackgroundBasis
 from .methods import (
@@ -63,7 +64,9 @@ class Particles:
         degree: Degree of the domains' shape functions.
         quadrature_degree: Degree of the rule that carries the history; ``None`` is one point
             per domain for degree 1.
-        outside: What happens when a domain leaves the background; ``"error"``.
+        outside: What happens when a step takes a corner of a domain out of the background:
+            ``"error"`` ends the run with an error, ``"stop"`` without one (both before that
+            step), ``"delete"`` goes on without the domain and adds up what is lost.
         domain_update: For ``"gimp"``: ``"stretch"`` (half-lengths follow the diagonal of the
             right stretch) or ``"fixed"`` (the box only translates).
 
@@ -81,6 +84,8 @@ class Particles:
         global_index: Input index of each owned particle, shape ``(n,)``, the same on any number
             of ranks.
         domain_nodes: Local nodes of W of each owned domain, shape ``(n, k)``.
+        outside: The policy for domains that leave the background.
+        deletion: Which domains are deleted, with ``outside="delete"``, otherwise ``None``.
 
     Raises:
         MPMError: Spaces, meshes, method or degrees that do not go together.
@@ -123,6 +128,8 @@ class Particles:
         self.quadrature = DomainQuadrature(body, self._shape_functions, self._degree)
         self.domain_nodes = self.W.dofmap.list[: self.num_local]
         self._nodes = self.W.tabulate_dof_coordinates()[:, : self._gdim].copy()
+        self.outside = outside
+        self.deletion = Deletion(body, self.W) if outside == "delete" else None
         self._background = BackgroundBasis(V)
         self._domain_update = domain_update
         self._grid = None
@@ -202,36 +209,97 @@ class Particles:
             self._converged,
             self.domain_nodes,
             self.initial_centroid,
-            self._mean(self.node_positions[self.domain_nodes]),
+            self._mean(self._nodes[self.domain_nodes] + self._of_domains(self._converged)),
             np.eye(self._gdim) + self._average(self._converged_gradient()),
         )
 
-    def _locate(self) -> Rows:
+    def _found_rows(self) -> tuple[Rows, NDArray[np.int64]]:
+        """Return the rows of T, and the local domains that are not wholly in the background."""
         state = self._state()
         if self.method == "gimp":
             assert self._grid is not None
             rows = gimp(state, self._background, self._grid, self._domain_update == "stretch")
         else:
             rows = {"cpdi2": cpdi2, "cpdi": cpdi, "mpm": mpm}[self.method](state, self._background)
+        lost = (~rows.basis.found)[self.domain_nodes].any(axis=1)
+        return rows, np.flatnonzero(lost & ~self.deleted)
+
+    def _require_inside(self, lost: NDArray[np.int64], what: str, advice: str) -> None:
         with agree(self.mesh.comm):
-            lost = np.flatnonzero((~rows.basis.found)[self.domain_nodes].any(axis=1))
             if len(lost):
-                where = state.centroid[lost[0]]
+                where = self.centroid[lost[0]]
                 raise ParticleOutsideError(
-                    "The domains of {particles} are outside the background mesh, e.g. near "
-                    f"{tuple(float(round(c, 6)) for c in where)}; "
-                    "make the background larger or the load smaller",
+                    f"{what} outside the background mesh, e.g. near "
+                    f"{tuple(float(round(c, 6)) for c in where)}; {advice}",
                     self.global_index[lost],
                 )
-        return rows
+
+    def _of_domains(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return displacements of nodes ``(N, gdim)`` for each domain, shape ``(n, k, gdim)``."""
+        values: NDArray[np.float64] = nodal[self.domain_nodes]
+        return values if self.deletion is None else self.deletion.kept(values)
 
     def _converged_gradient(self) -> NDArray[np.float64]:
-        return self.quadrature.displacement_gradient(self._converged[self.domain_nodes])
+        return self.quadrature.displacement_gradient(self._of_domains(self._converged))
 
     @cached_property
     def _rows(self) -> Rows:
         """The rows of T at the last converged positions."""
-        return self._locate()
+        rows, lost = self._found_rows()
+        self._require_inside(
+            lost,
+            "The domains of {particles} are",
+            "make the background larger or the load smaller",
+        )
+        return self._without_dead(rows)
+
+    def _without_dead(self, rows: Rows) -> Rows:
+        """Take the weight from nodes that belong to deleted domains only."""
+        if self.deletion is not None:
+            values = rows.basis.values
+            values[self.deletion.dead[: len(values)]] = 0.0
+            rows.corners[self.deleted] = self.domains[self.deleted]
+        return rows
+
+    @property
+    def deleted(self) -> NDArray[np.bool_]:
+        """Whether each particle this rank owns is deleted, shape ``(n,)``."""
+        if self.deletion is None:
+            return np.zeros(self.num_local, dtype=bool)
+        return self.deletion.mask
+
+    def leaving(self) -> NDArray[np.int64]:
+        """Return which of this rank's particles the last step took out (collective).
+
+        Returns:
+            Their local indices, with ``outside="delete"``; without it there are none.
+
+        Raises:
+            ParticleOutsideError: Some are outside and shall not be deleted, or all would be.
+        """
+        if self.deletion is None:
+            self.locate()
+            return np.zeros(0, dtype=np.int64)
+        rows, lost = self._found_rows()
+        left = self.num_local - int(self.deleted.sum()) - len(lost)
+        if self.mesh.comm.allreduce(left) == 0:
+            self._require_inside(
+                lost,
+                "The domains of {particles}, the last that were not deleted, are",
+                "make the background larger or the load smaller",
+            )
+        self.__dict__["_rows"] = self._without_dead(rows)
+        return lost
+
+    def delete(self, domains: NDArray[np.int64]) -> None:
+        """Delete domains (collective), after :meth:`leaving`.
+
+        Args:
+            domains: Local indices of this rank's particles.
+        """
+        assert self.deletion is not None
+        self.deletion.add(domains, self._of_domains(self._converged))
+        self._without_dead(self._rows)
 
     @cached_property
     def T(self) -> PETSc.Mat:
@@ -261,7 +329,8 @@ class Particles:
             body, which is the same for triangles and undistorted quadrilaterals).
         """
         _, average, gradient = self._domain_averages()
-        return sum_by_particle(average, gradient, self._rows.basis, self.domain_nodes)
+        weights = sum_by_particle(average, gradient, self._rows.basis, self.domain_nodes)
+        return weights if self.deletion is None else without_deleted(weights, self.deleted)
 
     @property
     def domains(self) -> NDArray[np.float64]:
@@ -271,7 +340,8 @@ class Particles:
         boxes; for mpm, whose particles are points, parallelograms of their volume.
         """
         if self.method == "cpdi2":
-            return np.asarray(self.node_positions[self.domain_nodes])
+            positions = self._nodes[self.domain_nodes] + self._of_domains(self._converged)
+            return np.asarray(positions)
         state = self._state()
         if self.method == "gimp":
             return boxes(state, self._domain_update == "stretch")
@@ -324,7 +394,7 @@ class Particles:
     def _nodal(self) -> NDArray[np.float64]:
         """Displacement of the domains' nodes now, shape ``(n, k, gdim)``."""
         nodal = self.displacement.x.array.reshape(-1, self._gdim)
-        return np.asarray(nodal[self.domain_nodes])
+        return self._of_domains(np.asarray(nodal, dtype=np.float64))
 
     def displacement_gradient(self, axisymmetric: bool = False) -> NDArray[np.float64]:
         """Return ``grad d`` at the history's points.
@@ -442,13 +512,16 @@ class Particles:
         """Return what is known of each particle, for output: arrays ``(n, ...)`` by name.
 
         ``volume_ratio`` and, where there is a material, ``stress`` (Cauchy), ``pressure``
-        (mean of the normal stresses, compression positive) and ``plastic_strain``.
+        (mean of the normal stresses, compression positive) and ``plastic_strain``; with
+        ``outside="delete"`` also ``deleted`` (1 where a particle is).
         """
         values = {"volume_ratio": self.volume / self.initial_volume}
         if self.has_material:
             values["stress"] = self.stress
             values["pressure"] = -np.trace(values["stress"], axis1=1, axis2=2) / 3.0
             values["plastic_strain"] = self.plastic_strain
+        if self.deletion is not None:
+            values["deleted"] = self.deleted.astype(np.float64)
         return values
 
     def _history(self, what: str) -> ConstitutiveHistory:

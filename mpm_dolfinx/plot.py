@@ -55,7 +55,7 @@ def domains(
     Args:
         particles: The body.
         values: One value for each particle that this rank owns, shape ``(n,)``, shown by
-            colour; ``None`` is one colour for all.
+            colour; ``None`` is one colour for all. Deleted particles are not drawn.
         ax: Axes to draw on, matplotlib's current ones by default; only that of rank 0 counts.
             Its aspect is made equal.
         cmap: Colour map of the values.
@@ -84,9 +84,10 @@ def domains(
                 f"of the rank, not {shown.shape}."
             )
     collections = _imported("matplotlib.collections", comm)
-    index = comm.gather(particles.global_index)
-    outlines = comm.gather(_outlines(particles, warp))
-    colours = comm.gather(shown)
+    present = ~particles.deleted
+    index = comm.gather(particles.global_index[present])
+    outlines = comm.gather(_outlines(particles, warp)[present])
+    colours = comm.gather(None if shown is None else shown[present])
     if index is None or outlines is None or colours is None:
         return None
     order = np.argsort(np.concatenate(index))
@@ -147,8 +148,9 @@ def grid(particles: Particles) -> Any:
     """Return the particles' own domains at their current positions for pyvista (collective).
 
     Cell data are ``particle`` (the global index), ``volume_ratio`` and, where there is a
-    material, ``stress`` (Cauchy, nine components), ``pressure`` and ``plastic_strain``; point
-    data ``displacement``. Domains share no points; curved ones are drawn by their corners.
+    material, ``stress`` (Cauchy, nine components), ``pressure`` and ``plastic_strain``, and with
+    ``outside="delete"`` ``deleted`` (0 or 1); point data ``displacement``. Domains share no
+    points; curved ones are drawn by their corners.
 
     Args:
         particles: The body, in the plane or in space.

@@ -28,7 +28,7 @@ from .errors import (
     MPMError,
     ParticleOutsideError,
 )
-from .history import History, Step
+from .history import History, Loss, Step
 from .io import TimeSeries
 from .particles import Particles
 from .reduced import Body, ReducedSystem
@@ -198,7 +198,9 @@ class ParticleProblem:
             The history of the run.
 
         Raises:
-            MPMError: The run cannot go on; the state is that of the last converged step.
+            MPMError: The run cannot go on; the state is that of the last converged step. With
+                ``outside="stop"`` a particle that leaves the background is no error: the run
+                ends, ``history.stopped`` and a warning say why.
         """
         with tqdm(
             total=steps,
@@ -257,7 +259,12 @@ class ParticleProblem:
                 continue
             except MPMError as error:
                 self._restore(update)
-                raise self._placed(error) from None
+                placed = self._placed(error)
+                if self._may_stop and isinstance(placed, ParticleOutsideError):
+                    self.history.stopped = placed
+                    self._warn(f"The run stopped. {placed!s}")
+                    return
+                raise placed from None
             control.accept(step.iterations)
             yield step
         self._warn_of_outside()
@@ -335,8 +342,17 @@ class ParticleProblem:
                 for body in self.bodies:
                     body.locate()
         except ParticleOutsideError as error:
-            if self._comm.rank == 0:
-                warnings.warn(f"The run is complete, but {error!s}", stacklevel=3)
+            self._warn(f"The run is complete, but {error!s}")
+
+    @property
+    def _may_stop(self) -> bool:
+        """Whether a run that leaves the background ends without an error."""
+        policies = {body.outside for body in self.bodies}
+        return "stop" in policies and "error" not in policies
+
+    def _warn(self, sentence: str) -> None:
+        if self._comm.rank == 0:
+            warnings.warn(sentence, stacklevel=4)
 
     # -- One step -------------------------------------------------------------------------
 
@@ -349,7 +365,7 @@ class ParticleProblem:
         self._newton.solve(self.reduced, self.reduced.sizes)
         if (failure := self.reduced.crossed()) is not None:
             raise failure
-        self._move_bodies(inside=not last)
+        self._move_bodies(parameter, last)
         with self.history.statistics.phase("commit"):
             self.commit()
             self._prescribed = values.copy()
@@ -362,17 +378,41 @@ class ParticleProblem:
         self.history.steps.append(step)
         return step
 
-    def _move_bodies(self, inside: bool) -> None:
-        """Make the present displacements the converged ones; none where one body is outside."""
+    def _move_bodies(self, parameter: float, last: bool) -> None:
+        """Make the present displacements the converged ones, and delete what leaves.
+
+        None are changed where one body is outside that must not be.
+        """
         before = [body.commit() for body in self.bodies]
+        leaving: list[NDArray[np.int64]] = []
         try:
             with self.history.statistics.phase("locate"):
-                for body in self.bodies if inside else ():
-                    body.locate()
+                for body in self.bodies:
+                    if body.deletion is not None or not last:
+                        leaving.append(body.leaving())
+                    else:
+                        leaving.append(np.zeros(0, dtype=np.int64))
         except ParticleOutsideError:
             for body, converged in zip(self.bodies, before, strict=True):
                 body.restore(converged)
             raise
+        for number, which in enumerate(leaving):
+            if self._comm.allreduce(len(which)) > 0:
+                self._record_loss(parameter, number, which)
+                self.bodies[number].delete(which)
+
+    def _record_loss(self, parameter: float, number: int, which: NDArray[np.int64]) -> None:
+        """Report what is about to be deleted."""
+        body = self.bodies[number]
+        masses = self._masses(number)
+        mass = None if masses is None else float(self._comm.allreduce(masses[which].sum()))
+        indices = {p for ps in self._comm.allgather(body.global_index[which].tolist()) for p in ps}
+        volume = float(self._comm.allreduce(body.initial_volume[which].sum()))
+        self.history.losses.append(Loss(parameter, number, sorted(indices), volume, mass))
+        statistics = self.history.statistics
+        statistics["lost_particles"] += len(indices)
+        statistics["lost_volume"] += volume
+        statistics["lost_mass"] += mass or 0.0
 
     def _set_load(self, load: float) -> None:
         for body in self.bodies:
@@ -421,6 +461,10 @@ class ParticleProblem:
         Called before each assembly with ``particles.displacement`` set. Must not change the
         history. It may differ between ranks.
         """
+        return None
+
+    def _masses(self, number: int) -> NDArray[np.float64] | None:
+        """Return the mass of each particle of a body that this rank owns, if it is known."""
         return None
 
     def commit(self) -> None:

@@ -95,6 +95,7 @@ class QuasiStaticProblem(ParticleProblem):
             strict=True,
         )
         self._stresses: list[_InjectedStress] = []
+        self._density: list[ufl.Form] = []
         residuals, tangents = [], []
         for body, law, mass, force, dead, following, cells, facets in shares:
             history = ConstitutiveHistory(body, law, cells, axisymmetric)
@@ -103,6 +104,7 @@ class QuasiStaticProblem(ParticleProblem):
             frame = _Frame(body, axisymmetric)
             R, J = frame.internal(stress.first_piola, stress.tangent)
             mass = _expression(mass, body, "density", ())
+            self._density.append(frame.mass(mass))
             if force is not None:
                 R -= frame.body_force(mass, force)
             if dead:
@@ -148,6 +150,12 @@ class QuasiStaticProblem(ParticleProblem):
         """Return to the stress of the last converged step."""
         for stress in self._stresses:
             stress.roll_back()
+
+    def _masses(self, number: int) -> NDArray[np.float64]:
+        vector = fem.assemble_vector(fem.form(self._density[number]))
+        (each,) = self._density[number].arguments()
+        cells = each.ufl_function_space().dofmap.list[: self.bodies[number].num_local, 0]
+        return np.asarray(vector.array[cells])
 
     @property
     def yield_function(self) -> NDArray[np.float64]:
@@ -205,6 +213,12 @@ class _Frame:
         work = self._turn * ufl.inner(P, test) * self._body.dx
         tangent = self._turn * A[i, j, k, m] * trial[k, m] * test[i, j] * self._body.dx
         return work, tangent
+
+    def mass(self, density: Any) -> ufl.Form:
+        """Return the mass of each particle, tested by a DG0 function."""
+        each = ufl.TestFunction(fem.functionspace(self._body.mesh, ("DG", 0)))
+        form: ufl.Form = density * self._turn * each * self._body.dx_exact
+        return form
 
     def _at_load(self, terms: Sequence[ufl.Form]) -> ufl.Form:
         """Return the sum of terms times the load factor."""

@@ -94,7 +94,7 @@ def validate_options(
         raise MPMError(
             f"quadrature_degree must be a whole number from 0 on, not {quadrature_degree!r}."
         )
-    if outside != "error":
-        raise MPMError(f"Unknown policy outside={outside!r}; choose 'error'.")
+    if outside not in ("error", "stop", "delete"):
+        raise MPMError(f"Unknown policy outside={outside!r}; choose 'error', 'stop' or 'delete'.")
     if domain_update not in ("stretch", "fixed"):
         raise MPMError(f"Unknown domain_update={domain_update!r}; choose 'stretch' or 'fixed'.")
