@@ -161,8 +161,7 @@ def moved(name, method):
 
     dt = fem.Constant(V.mesh, 0.0)
     x = ufl.SpatialCoordinate(V.mesh)
-    points = V.element.interpolation_points
-    move = fem.Expression(motion(name, x, dt) - x, points)
+    move = fem.Expression(motion(name, x, dt) - x, tools.interpolation_points(V))
     increment, total = fem.Function(V), np.zeros_like(value.x.array)
     last = 0.0
 

@@ -57,7 +57,10 @@ import mpm_dolfinx as mpm
 try:
     import gmsh
 
-    from dolfinx.io import gmsh as gmshio
+    try:
+        from dolfinx.io import gmsh as gmshio
+    except ImportError:  # its name until DOLFINx 0.9
+        from dolfinx.io import gmshio
 except (ImportError, OSError):
     gmsh = None
 
@@ -82,7 +85,7 @@ PLATE, RINGS, END = 1, 2, 3
 
 
 def meshed(build, size):
-    """Return the mesh that `build` describes to gmsh, with its tags."""
+    """Return the mesh that `build` describes to gmsh, with tags of its cells and facets."""
     gmsh.initialize(interruptible=False)
     gmsh.option.setNumber("General.Terminal", 0)
     if comm.rank == 0:
@@ -91,9 +94,9 @@ def meshed(build, size):
         gmsh.option.setNumber("Mesh.MeshSizeMin", size)
         gmsh.option.setNumber("Mesh.MeshSizeMax", size)
         gmsh.model.mesh.generate(2)
-    data = gmshio.model_to_mesh(gmsh.model, comm, 0, gdim=2)
+    domain, cells, facets, *_ = gmshio.model_to_mesh(gmsh.model, comm, 0, gdim=2)
     gmsh.finalize()
-    return data
+    return domain, cells, facets
 
 
 def discs(occ, size):
@@ -122,9 +125,8 @@ def room(model):
     model.addPhysicalGroup(2, [sheet], 1, name="background")
 
 
-plate_data = meshed(plate, args.body_size)
-background = meshed(room, args.size).mesh
-body = plate_data.mesh
+body, parts, edges = meshed(plate, args.body_size)
+background, _, _ = meshed(room, args.size)
 
 # ### Problem
 #
@@ -139,9 +141,9 @@ particles = mpm.Particles(body, V, method="cpdi2")
 problem = mpm.QuasiStaticProblem(
     particles,
     {PLATE: mpm.materials.Hencky(1e6, 0.3), RINGS: mpm.materials.Hencky(10e6, 0.3)},
-    cell_tags=plate_data.cell_tags,
+    cell_tags=parts,
     tractions=[((0.0, traction), END)],
-    facet_tags=plate_data.facet_tags,
+    facet_tags=edges,
     bcs=[clamp],
     petsc_options_prefix="plate_",
 )

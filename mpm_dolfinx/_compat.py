@@ -15,7 +15,7 @@ try:
     import dolfinx
 except ImportError as error:  # pragma: no cover
     raise ImportError(
-        "mpm_dolfinx needs DOLFINx 0.11 with PETSc; install it with "
+        "mpm_dolfinx needs DOLFINx 0.9 or newer with PETSc; install it with "
         "'pip install mpm-dolfinx[wheel]', or from conda-forge, apt or source."
     ) from error
 
@@ -24,17 +24,21 @@ from petsc4py import PETSc
 import basix
 import basix.ufl
 import ufl
-from dolfinx import fem, geometry, mesh
+from dolfinx import fem, geometry, la, mesh
+from dolfinx.fem import petsc as fem_petsc
 
 __all__ = [
     "candidate_cells",
     "cell_tree",
+    "create_vector",
     "disconnected_mesh",
     "geometry_degree",
     "geometry_dofmap",
     "input_cell_index",
+    "interpolation_points",
     "is_condition_on",
     "require_supported",
+    "use_basic_line_search",
 ]
 
 _VERSION = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])
@@ -42,9 +46,9 @@ _VERSION = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])
 
 def require_supported() -> None:
     """Raise ImportError where this DOLFINx cannot run the package."""
-    if _VERSION < (0, 11):
+    if _VERSION < (0, 9):
         raise ImportError(
-            f"mpm_dolfinx needs DOLFINx 0.11 or newer, this is {dolfinx.__version__}."
+            f"mpm_dolfinx needs DOLFINx 0.9 or newer, this is {dolfinx.__version__}."
         )
     if np.issubdtype(PETSc.ScalarType, np.complexfloating):
         raise ImportError("mpm_dolfinx needs a DOLFINx and PETSc with real scalars.")
@@ -52,12 +56,14 @@ def require_supported() -> None:
 
 def geometry_dofmap(domain: mesh.Mesh) -> NDArray[np.int32]:
     """Return the geometry nodes of each local cell (``.dofmap`` before 0.11)."""
-    return np.asarray(domain.geometry.dofmaps[0])
+    geometry = domain.geometry
+    return np.asarray(geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap)
 
 
 def geometry_degree(domain: mesh.Mesh) -> int:
     """Return the degree of the coordinate element (``.cmap`` before 0.11)."""
-    return int(domain.geometry.cmaps[0].degree)
+    geometry = domain.geometry
+    return int((geometry.cmaps[0] if hasattr(geometry, "cmaps") else geometry.cmap).degree)
 
 
 def input_cell_index(domain: mesh.Mesh) -> NDArray[np.int64]:
@@ -106,22 +112,65 @@ def disconnected_mesh(
     vertices = dolfinx.cpp.common.IndexMap(comm, n * k)
     cells = dolfinx.cpp.common.IndexMap(comm, n)
     dofmap = np.arange(n * k, dtype=np.int32).reshape(n, k)
-    first_cell, first_vertex = cells.local_range[0], vertices.local_range[0]
-    topology = dolfinx.cpp.mesh.Topology(
-        cell_type=mesh.to_type(cell.name),
-        vertex_map=vertices,
-        cell_map=cells,
-        cells=dolfinx.cpp.graph.AdjacencyList_int32(dofmap),
-        original_index=np.arange(n, dtype=np.int64) + first_cell,
-    )
     element = basix.ufl.element("Lagrange", cell.name, 1, shape=(gdim,))
     coordinate_element: Any = fem.coordinate_element  # dispatched on the element
     geometry_nodes = mesh.create_geometry(
         vertices,
         dofmap,
-        coordinate_element(element.basix_element),
+        # 0.9 takes the C++ object, which is as good later
+        coordinate_element(element.basix_element)._cpp_object,
         np.ascontiguousarray(corners.reshape(-1, gdim)),
-        np.arange(n * k, dtype=np.int64) + first_vertex,
+        np.arange(n * k, dtype=np.int64) + vertices.local_range[0],
     )
+    topology = _topology(comm, cell, dofmap, vertices, cells)
     whole = dolfinx.cpp.mesh.Mesh_float64(comm, topology, geometry_nodes._cpp_object)
     return mesh.Mesh(whole, ufl.Mesh(element))
+
+
+def _topology(
+    comm: MPI.Comm, cell: basix.CellType, corners: NDArray[np.int32], vertices: Any, cells: Any
+) -> Any:
+    """Return the topology of cells that share no vertex (put together by setters before 0.10)."""
+    cell_type = mesh.to_type(cell.name)
+    connectivity = dolfinx.cpp.graph.AdjacencyList_int32(corners)
+    if not hasattr(dolfinx.cpp.mesh.Topology, "set_index_map"):
+        return dolfinx.cpp.mesh.Topology(
+            cell_type=cell_type,
+            vertex_map=vertices,
+            cell_map=cells,
+            cells=connectivity,
+            original_index=np.arange(*cells.local_range, dtype=np.int64),
+        )
+    topology = dolfinx.cpp.mesh.Topology(comm, cell_type)
+    single = dolfinx.cpp.graph.AdjacencyList_int32(np.arange(corners.size, dtype=np.int32)[:, None])
+    topology.set_index_map(0, vertices)
+    topology.set_connectivity(single, 0, 0)
+    topology.set_index_map(topology.dim, cells)
+    topology.set_connectivity(connectivity, topology.dim, 0)
+    return topology
+
+
+def create_vector(V: fem.FunctionSpace) -> PETSc.Vec:
+    """Return a vector with ghosts for a space (0.9 makes it of a form)."""
+    if hasattr(la, "create_petsc_vector"):
+        return la.create_petsc_vector(V.dofmap.index_map, V.dofmap.index_map_bs)
+    return fem_petsc.create_vector(V)
+
+
+def interpolation_points(V: fem.FunctionSpace) -> NDArray[np.float64]:
+    """Return the reference points at which a space takes its values (a method before 0.10)."""
+    points = V.element.interpolation_points
+    return np.asarray(points() if callable(points) else points)
+
+
+def use_basic_line_search(snes: PETSc.SNES) -> None:
+    """Let a solver take full steps (petsc4py has no line search objects in PETSc 3.22)."""
+    if hasattr(snes, "getLineSearch"):
+        snes.getLineSearch().setType("basic")
+        return
+    options = PETSc.Options()
+    option = f"{snes.getOptionsPrefix() or ''}snes_linesearch_type"
+    if not options.hasName(option):
+        options[option] = "basic"
+        snes.setFromOptions()
+        options.delValue(option)

@@ -16,6 +16,7 @@ import ufl
 from dolfinx import fem
 from dolfinx.fem import petsc as fem_petsc
 
+from . import _compat
 from .errors import MPMError
 from .particles import Particles
 from .quadrature import depends_on, follows, split_by_rule
@@ -94,8 +95,8 @@ class BodyForms:
         self._dead = self._compile(dead)
         self._tangents = self._compile(tangents)
         self.K: PETSc.Mat = fem_petsc.create_matrix(self._pattern(tangents, particles.W))
-        self.r: PETSc.Vec = fem_petsc.create_vector(particles.W)
-        self.external: PETSc.Vec = fem_petsc.create_vector(particles.W)
+        self.r: PETSc.Vec = _compat.create_vector(particles.W)
+        self.external: PETSc.Vec = _compat.create_vector(particles.W)
 
     def _compile(self, forms: list[ufl.Form]) -> list[fem.Form]:
         return [fem.form(form, **self._options) for form in forms]
@@ -136,11 +137,11 @@ class BodyForms:
     def _elementwise(self) -> tuple[list[fem.Form], PETSc.Vec]:
         """The residual tested domain by domain: element vectors that are not summed."""
         broken = fem.functionspace(
-            self._body, ("Discontinuous Lagrange", self._element.degree, self._element.block_shape)
+            self._body, ("Discontinuous Lagrange", self._element.degree, (self._element.block_size,))
         )
         swap = {self._test: ufl.TestFunction(broken)}
         forms = self._compile([ufl.replace(part, swap) for part in self._parts])
-        return forms, fem_petsc.create_vector(broken)
+        return forms, _compat.create_vector(broken)
 
     def absolute_contributions(self, domain_nodes: NDArray[np.int32]) -> PETSc.Vec:
         """Return the sum over domains of the absolute values of what each adds to the residual.
@@ -179,7 +180,7 @@ class BackgroundForms:
         self._residuals = [fem.form(p, **options) for p in parts]
         self._tangents = [fem.form(t, **options) for t in tangents]
         self._matrices = [fem_petsc.create_matrix(t) for t in self._tangents]
-        self.r: PETSc.Vec = fem_petsc.create_vector(particles.V)
+        self.r: PETSc.Vec = _compat.create_vector(particles.V)
 
     def assemble_residual(self) -> PETSc.Vec:
         """Assemble the residual on V."""

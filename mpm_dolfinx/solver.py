@@ -13,6 +13,7 @@ from petsc4py import PETSc
 
 import numpy as np
 
+from . import _compat
 from .errors import ConvergenceError, MPMError
 from .history import Statistics
 
@@ -109,7 +110,7 @@ class NewtonSolver:
         self.snes = PETSc.SNES().create(comm)
         self.snes.setOptionsPrefix(prefix)
         self.snes.setType("newtonls")
-        self.snes.getLineSearch().setType("basic")
+        _compat.use_basic_line_search(self.snes)
         self.snes.setTolerances(rtol=1e-9, atol=1e-50, stol=0.0, max_it=30)
         ksp = self.snes.getKSP()
         ksp.setType("preonly")

@@ -14,6 +14,7 @@ import ufl
 from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx import _compat
 from mpm_dolfinx.materials import Hencky, LinearElastic, VonMises
 
 
@@ -70,7 +71,7 @@ def surface():
     x = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 1]])
     x = x if WORLD.rank == 0 else np.zeros((0, 3))
     element = basix.ufl.element("Lagrange", "triangle", 1, shape=(3,))
-    return mesh.create_mesh(WORLD, cells, element, x)
+    return mesh.create_mesh(WORLD, cells=cells, e=element, x=x)
 
 
 def prisms():
@@ -449,7 +450,7 @@ def far_corner(scale):
 
 def touching(domain, where):
     """Return the input indices of all cells with a vertex where a marker holds."""
-    vertices = domain.geometry.x[domain.geometry.dofmaps[0]]
+    vertices = domain.geometry.x[_compat.geometry_dofmap(domain)]
     count = domain.topology.index_map(2).size_local
     mine = np.flatnonzero(where(vertices[:count]).any(axis=1))
     index = domain.topology.original_cell_index[mine]

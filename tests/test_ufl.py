@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Problems written in UFL, against stock finite elements and dense algebra."""
 
+from inspect import signature
 from itertools import pairwise
 
 import numpy as np
@@ -14,6 +15,7 @@ from dolfinx import fem
 from dolfinx.fem.petsc import NonlinearProblem, assemble_matrix
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx import _compat
 from mpm_dolfinx.assembly import BodyForms
 
 FEM_OPTIONS = {
@@ -55,11 +57,19 @@ def finite_elements(particles, residual, bcs, J=None):
     d = fem.Function(W)
     F = residual(d, ufl.TestFunction(W))
     tangent = None if J is None else J(d, ufl.TestFunction(W), ufl.TrialFunction(W))
-    problem = NonlinearProblem(
-        F, d, bcs=bcs(W), J=tangent, petsc_options_prefix="fem_", petsc_options=FEM_OPTIONS
-    )
-    problem.solve()
-    assert problem.solver.getConvergedReason() > 0
+    if "petsc_options_prefix" in signature(NonlinearProblem).parameters:
+        problem = NonlinearProblem(
+            F, d, bcs=bcs(W), J=tangent, petsc_options_prefix="fem_", petsc_options=FEM_OPTIONS
+        )
+        problem.solve()
+        assert problem.solver.getConvergedReason() > 0
+    else:  # DOLFINx 0.9
+        from dolfinx.nls.petsc import NewtonSolver
+
+        solver = NewtonSolver(W.mesh.comm, NonlinearProblem(F, d, bcs=bcs(W), J=tangent))
+        solver.convergence_criterion = "incremental"
+        solver.rtol = solver.atol = 1e-11
+        solver.solve(d)
     return d
 
 
@@ -309,7 +319,7 @@ def test_data_at_points_act_as_written(degree):
         if injected:
             values = young
             young = particles.quadrature_function("young")
-            points = young.function_space.element.interpolation_points
+            points = _compat.interpolation_points(young.function_space)
             young.interpolate(fem.Expression(values, points))
         d, v = particles.displacement, ufl.TestFunction(particles.W)
         R = young * ufl.inner(scenes.linear_stress(d, 100.0, 0.2), ufl.grad(v)) * particles.dx
