@@ -16,11 +16,11 @@ BIN := $(VENV)/bin
 SETUP := sh scripts/setup_env.sh
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint docs clean
+.PHONY: help demo test test-debian lint docs clean
 
 help: ## This list
 	@echo "make TARGET [VENV=path of an environment] [PYTHON=path of an interpreter]"
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-8s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-11s %s\n", $$1, $$2 }' Makefile
 
 demo: ## Install what is needed, run the first demo, make its picture
 	@$(SETUP) wheel plot
@@ -31,6 +31,9 @@ demo: ## Install what is needed, run the first demo, make its picture
 test: ## Run the tests on one rank, then on NP=2 ranks (ARGS="-k name" goes to pytest)
 	@$(SETUP) wheel plot test
 	@bash scripts/run_tests.sh $(ARGS)
+
+test-debian: ## As root: the tests with Debian's DOLFINx 0.9, in a root made by debootstrap
+	@bash scripts/test_debian.sh $(ARGS)
 
 lint: ## ruff check, ruff format --check, mypy
 	@$(SETUP) wheel plot test

@@ -47,9 +47,7 @@ _VERSION = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])
 def require_supported() -> None:
     """Raise ImportError where this DOLFINx cannot run the package."""
     if _VERSION < (0, 9):
-        raise ImportError(
-            f"mpm_dolfinx needs DOLFINx 0.9 or newer, this is {dolfinx.__version__}."
-        )
+        raise ImportError(f"mpm_dolfinx needs DOLFINx 0.9 or newer, this is {dolfinx.__version__}.")
     if np.issubdtype(PETSc.ScalarType, np.complexfloating):
         raise ImportError("mpm_dolfinx needs a DOLFINx and PETSc with real scalars.")
 

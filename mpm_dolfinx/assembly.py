@@ -137,7 +137,8 @@ class BodyForms:
     def _elementwise(self) -> tuple[list[fem.Form], PETSc.Vec]:
         """The residual tested domain by domain: element vectors that are not summed."""
         broken = fem.functionspace(
-            self._body, ("Discontinuous Lagrange", self._element.degree, (self._element.block_size,))
+            self._body,
+            ("Discontinuous Lagrange", self._element.degree, (self._element.block_size,)),
         )
         swap = {self._test: ufl.TestFunction(broken)}
         forms = self._compile([ufl.replace(part, swap) for part in self._parts])
