@@ -18,6 +18,7 @@ from dolfinx.fem import petsc as fem_petsc
 
 from . import _compat
 from .errors import MPMError
+from .f_bar import LowRankTangent
 from .particles import Particles
 from .quadrature import depends_on, follows, split_by_rule
 
@@ -57,6 +58,10 @@ class BodyForms:
         particles: The body.
         **options: Passed on to ``dolfinx.fem.form``.
 
+    Attributes:
+        K: The tangent on W that was assembled last.
+        low_rank: What the tangent has besides the forms, or ``None``.
+
     Raises:
         MPMError: A form with other arguments, or rules that do not go together.
     """
@@ -94,7 +99,9 @@ class BodyForms:
         self._live = self._compile(live)
         self._dead = self._compile(dead)
         self._tangents = self._compile(tangents)
-        self.K: PETSc.Mat = fem_petsc.create_matrix(self._pattern(tangents, particles.W))
+        self._sparse: PETSc.Mat = fem_petsc.create_matrix(self._pattern(tangents, particles.W))
+        self.K: PETSc.Mat = self._sparse
+        self.low_rank: LowRankTangent | None = None
         self.r: PETSc.Vec = _compat.create_vector(particles.W)
         self.external: PETSc.Vec = _compat.create_vector(particles.W)
 
@@ -126,11 +133,13 @@ class BodyForms:
         return self.r
 
     def assemble_tangent(self) -> PETSc.Mat:
-        """Assemble the tangent."""
-        self.K.zeroEntries()
+        """Assemble the tangent, always the same object."""
+        self._sparse.zeroEntries()
         for form in self._tangents:
-            assemble_matrix(self.K, form)
-        self.K.assemble()
+            assemble_matrix(self._sparse, form)
+        self._sparse.assemble()
+        if self.low_rank is not None:
+            self.K = self.low_rank.added_to(self._sparse)
         return self.K
 
     @cached_property

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dolfinx import fem, mesh
 
 from .errors import ConvergenceError, MPMError, agree
+from .f_bar import VolumeAveraging
 from .materials import Material, State
 from .particles import Particles
 
@@ -37,12 +38,18 @@ class ConstitutiveHistory:
         cell_tags: Tags of the body's cells.
         axisymmetric: Whether the body is one of revolution; its points are then strained in
             three dimensions.
+        f_bar: Kind of average of the volume ratio, or ``"none"``.
 
     Attributes:
         dim: Dimension of stress and strain, 2 in plane strain.
         axisymmetric: As given.
+        averaging: F-bar, or ``None``; the material then sees Fbar, and what follows is what
+            does work on F.
         first_piola: First Piola stress of the last update, shape ``(n nq, dim, dim)``.
-        tangent: Its derivative by F, shape ``(n nq, dim, dim, dim, dim)``.
+        tangent: Its derivative by F, shape ``(n nq, dim, dim, dim, dim)``; with F-bar the
+            pointwise part of it.
+        recovery: What the recovery of averaged stresses adds to the particles' Cauchy stress,
+            shape ``(n, 3, 3)``, or 0.
 
     Raises:
         MPMError: Materials, tags or parameters that do not go together.
@@ -54,6 +61,7 @@ class ConstitutiveHistory:
         assignment: Assignment,
         cell_tags: mesh.MeshTags | None,
         axisymmetric: bool,
+        f_bar: str = "none",
     ) -> None:
         self._particles = particles
         self.axisymmetric = axisymmetric
@@ -71,6 +79,15 @@ class ConstitutiveHistory:
         self._trial: list[State] = self._states
         self._trial_gradient = self._gradient
         self._stress = self.first_piola.copy()
+        self.recovery: NDArray[np.float64] | float = 0.0
+        self.averaging: VolumeAveraging | None = None
+        if f_bar != "none":
+            material = np.zeros(particles.num_local, dtype=np.int64)
+            for number, group in enumerate(self._groups):
+                material[group.points // particles.num_points] = number
+            self.averaging = VolumeAveraging(
+                particles, f_bar, self.dim, material, self.symmetric
+            )
 
     @property
     def symmetric(self) -> bool:
@@ -137,11 +154,29 @@ class ConstitutiveHistory:
     def update(self) -> None:
         """Update all points for the present displacement; the history stays as it is.
 
+        With F-bar this is collective, also where it fails.
+
         Raises:
             MPMError: An update fails; ``particles`` are global indices.
         """
         gradient = self._particles.displacement_gradient(self.axisymmetric)
-        gradient = gradient.reshape(-1, self.dim, self.dim)
+        if self.averaging is None:
+            self._update_materials(gradient.reshape(-1, self.dim, self.dim))
+            return
+        gradient = self.averaging.average(gradient)
+        try:
+            self._update_materials(gradient.reshape(-1, self.dim, self.dim))
+        except MPMError:
+            self.averaging.abandon()
+            raise
+        shape = gradient.shape
+        stress, tangent = self.averaging.effective(
+            self.first_piola.reshape(shape), self.tangent.reshape(*shape, self.dim, self.dim)
+        )
+        self.first_piola = stress.reshape(self.first_piola.shape)
+        self.tangent = tangent.reshape(self.tangent.shape)
+
+    def _update_materials(self, gradient: NDArray[np.float64]) -> None:
         trial = []
         for group, state in zip(self._groups, self._states, strict=True):
             everywhere = len(group.points) == self._points
@@ -169,9 +204,14 @@ class ConstitutiveHistory:
         return type(error)(error.message.rstrip(".") + " (at {particles})", particles)
 
     def commit(self) -> None:
-        """Make the last update the history."""
+        """Make the last update the history (collective with F-bar)."""
         self._states, self._gradient = self._trial, self._trial_gradient
         self._stress = self.first_piola.copy()
+        if self.averaging is not None:
+            weights = self._particles.point_volumes(self.axisymmetric)
+            share = weights / weights.sum(axis=1, keepdims=True)
+            stress = np.einsum("nq,nqij->nij", share, self.cauchy_stress())
+            self.recovery = self.averaging.recover(stress) - stress
 
     def roll_back(self) -> None:
         """Forget the last update."""

@@ -411,14 +411,23 @@ class Particles:
         whole = np.zeros((*gradient.shape[:2], 3, 3))
         whole[:, :, :2, :2] = gradient
         radial = np.einsum("qk,nk->nq", self.quadrature.shapes, self._nodal()[:, :, 0])
-        whole[:, :, 2, 2] = radial / self._radii
+        whole[:, :, 2, 2] = radial / self.radii
         return whole
 
     @property
-    def _radii(self) -> NDArray[np.float64]:
+    def radii(self) -> NDArray[np.float64]:
         """Undeformed radius of the history's points, shape ``(n, nq)``."""
         radii = self._nodes[self.domain_nodes][:, :, 0]
         return np.asarray(np.einsum("qk,nk->nq", self.quadrature.shapes, radii))
+
+    def point_volumes(self, axisymmetric: bool = False) -> NDArray[np.float64]:
+        """Return the reference volume of the history's points, shape ``(n, nq)``.
+
+        Args:
+            axisymmetric: Whether it is that of a body of revolution, all around.
+        """
+        weights = self.quadrature.weights
+        return weights * (2.0 * np.pi * self.radii) if axisymmetric else weights
 
     def require_radius(self) -> None:
         """Raise an error unless ``x[0]`` can be a radius (collective)."""
@@ -439,9 +448,7 @@ class Particles:
 
     def _average(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return volume averages of values ``(n, nq, ...)`` over the undeformed domains."""
-        weights = self.quadrature.weights
-        if self._axisymmetric:
-            weights = weights * self._radii
+        weights = self.point_volumes(self._axisymmetric)
         share = weights / weights.sum(axis=1, keepdims=True)
         return np.asarray(np.einsum("nq,nq...->n...", share, values))
 
@@ -498,10 +505,14 @@ class Particles:
     def stress(self) -> NDArray[np.float64]:
         """Cauchy stress, shape ``(n, 3, 3)`` (volume averages).
 
+        With ``f_bar="pair"`` or ``"patch"`` the part of it that is constant on a patch is
+        recovered linearly from the patches around.
+
         Raises:
             MPMError: The particles have no material (a problem written in UFL).
         """
-        return self._average(self._history("stress").cauchy_stress())
+        history = self._history("stress")
+        return self._average(history.cauchy_stress()) + history.recovery
 
     @property
     def plastic_strain(self) -> NDArray[np.float64]:

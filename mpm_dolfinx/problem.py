@@ -112,7 +112,7 @@ class ParticleProblem:
         self.history = History()
         self._meshes = [V.mesh, *(body.mesh for body in self.bodies)]
         self._comm: MPI.Comm = V.mesh.comm
-        shares = [
+        self.shares = [
             Body(body, BodyForms(r, j, body, **options))
             for body, r, j in zip(self.bodies, residuals, tangents, strict=True)
         ]
@@ -121,7 +121,7 @@ class ParticleProblem:
             terms = BackgroundForms(background, self.bodies[0], **options)
         statistics = self.history.statistics
         evaluate = weakly(self.evaluate)
-        self.reduced = ReducedSystem(shares, terms, self.bcs, evaluate, statistics)
+        self.reduced = ReducedSystem(self.shares, terms, self.bcs, evaluate, statistics)
         self._newton = NewtonSolver(
             self._comm,
             petsc_options_prefix,
@@ -142,6 +142,7 @@ class ParticleProblem:
         if "_newton" in self.__dict__ and not sys.is_finalizing():
             for body in self.bodies:
                 body.__dict__.pop("T", None)
+            self.shares.clear()
             for part in (self.reduced, self._newton):
                 part.__dict__.clear()
             self._clean_up()

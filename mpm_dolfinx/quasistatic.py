@@ -15,6 +15,7 @@ from dolfinx import fem, mesh
 
 from .constitutive import ConstitutiveHistory
 from .errors import MPMError
+from .f_bar import F_BARS, LowRankTangent
 from .particles import Particles
 from .problem import ParticleProblem, as_bodies
 
@@ -47,7 +48,10 @@ class QuasiStaticProblem(ParticleProblem):
         axisymmetric: Whether ``x[0]`` is the radius of a body of revolution about ``x[0] = 0``;
             loads and reactions are then those of the whole circumference.
         background: Form on the background, as in :class:`ParticleProblem`.
-        f_bar: Averaging of the volume ratio against locking; ``"none"``.
+        f_bar: Average of the volume ratio that the material sees, against hourglass modes and
+            locking: ``"none"``, ``"domain"`` (over a domain's points), ``"pair"`` (over the two
+            triangles of a quadrilateral) or ``"patch"`` (over the domains of about one
+            background cell).
         petsc_options_prefix: Prefix of the PETSc options.
         petsc_options: PETSc options, without prefix.
         shift: As in :class:`ParticleProblem`.
@@ -79,8 +83,8 @@ class QuasiStaticProblem(ParticleProblem):
         line_search: bool = True,
         **options: Any,
     ) -> None:
-        if f_bar != "none":
-            raise MPMError(f"Unknown f_bar={f_bar!r}; choose 'none'.")
+        if f_bar not in F_BARS:
+            raise MPMError(f"Unknown f_bar={f_bar!r}; choose one of {', '.join(map(repr, F_BARS))}.")
         bodies = as_bodies(particles)
         count = len(bodies) if isinstance(particles, list | tuple) else 0
         shares = zip(
@@ -98,7 +102,7 @@ class QuasiStaticProblem(ParticleProblem):
         self._density: list[ufl.Form] = []
         residuals, tangents = [], []
         for body, law, mass, force, dead, following, cells, facets in shares:
-            history = ConstitutiveHistory(body, law, cells, axisymmetric)
+            history = ConstitutiveHistory(body, law, cells, axisymmetric, f_bar)
             stress = _InjectedStress(body, history)
             self._stresses.append(stress)
             frame = _Frame(body, axisymmetric)
@@ -131,15 +135,20 @@ class QuasiStaticProblem(ParticleProblem):
         )
         for body, stress in zip(bodies, self._stresses, strict=True):
             body.attach(stress.history)
+        for share, stress in zip(self.shares, self._stresses, strict=True):
+            averaging = stress.history.averaging
+            if averaging is not None:
+                share.forms.low_rank = LowRankTangent(share.particles, averaging)
 
     def evaluate(self) -> MPMError | None:
         """Update the stress and its tangent for the present displacement."""
-        try:
-            for stress in self._stresses:
+        failure: MPMError | None = None
+        for stress in self._stresses:
+            try:
                 stress.update()
-        except MPMError as error:
-            return error
-        return None
+            except MPMError as error:
+                failure = failure or error
+        return failure
 
     def commit(self) -> None:
         """Make the last update the history."""

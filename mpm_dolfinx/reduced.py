@@ -203,7 +203,7 @@ class ReducedSystem:
                 body.move(self._u)
                 inverted = body.particles.inverted()
                 failure = failure or distorted("turn inside out", inverted)
-            failure = agreed(self._comm, failure or self._evaluate())
+            failure = agreed(self._comm, failure) or agreed(self._comm, self._evaluate())
         if failure is not None:
             return failure
         with self._statistics.phase("assemble"):

@@ -1,0 +1,378 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""F-bar: volume ratios averaged over domains, pairs or patches, against locking.
+
+A material sees ``Fbar = (Jbar / J)^(1/dim) F`` (de Souza Neto, Peric, Dutko & Owen 1996), in
+plane strain with the power 1/2, which leaves the third direction alone. The stress is that of the
+energy ``int psi(Fbar) dX``: residual ``P(Fbar) : delta Fbar``, so the tangent is symmetric
+wherever the material's is. With lambda_e = ln J_e of a domain's mean volume ratio and lambda_m
+that of a group of domains,
+
+    ln Jbar = lambda_m + psi(lambda_e - lambda_m),
+
+psi(d) = d where single domains are averaged, 0 for groups. In patches psi is zero for small
+deviations only (:func:`deviation`), so that no domain can drift away from its patch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import MPMError
+from .grouping import Groups, pairs, patches, singles
+from .particles import Particles
+
+__all__ = ["F_BARS", "LowRankTerm", "LowRankTangent", "VolumeAveraging", "deviation"]
+
+F_BARS = ("none", "domain", "pair", "patch")
+#: Deviation of a domain's ln J from its patch's that is free, and that from which all is felt.
+FREE, WHOLE = 0.04, 0.24
+
+SUBSET = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
+DIFFERENT = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
+
+type Array = NDArray[np.float64]
+type Deviation = Callable[[Array], tuple[Array, Array, Array]]
+
+
+def deviation(d: Array) -> tuple[Array, Array, Array]:
+    """Return how much of its deviation from the patch a domain feels, with two derivatives.
+
+    psi is odd, 0 up to 0.04, ``(|d| - 0.04)^2 / 0.4`` up to 0.24, and has slope 1 beyond.
+
+    Args:
+        d: ln of the domain's volume ratio over the patch's, shape ``(n,)``.
+
+    Returns:
+        psi, psi' and psi'', each ``(n,)``.
+    """
+    width = WHOLE - FREE
+    excess = np.maximum(np.abs(d) - FREE, 0.0)
+    inside = excess < width
+    psi = np.where(inside, excess**2 / (2.0 * width), excess - width / 2.0)
+    return (
+        np.sign(d) * psi,
+        np.minimum(excess / width, 1.0),
+        np.where(inside & (excess > 0.0), np.sign(d) / width, 0.0),
+    )
+
+
+def _wholly(d: Array) -> tuple[Array, Array, Array]:
+    return d, np.ones_like(d), np.zeros_like(d)
+
+
+def _not_at_all(d: Array) -> tuple[Array, Array, Array]:
+    return np.zeros_like(d), np.zeros_like(d), np.zeros_like(d)
+
+
+class LowRankTerm(NamedTuple):
+    """``sum_m h_m g_m g_m^T + left_m g_m^T + g_m right_m^T`` on the dofs of W, m a group.
+
+    The vectors of a group are the sums of what its domains contribute to their nodes.
+
+    Attributes:
+        groups: The groups; ``groups.number`` are those of the owned domains, shape ``(n,)``.
+        h: Factor of each owned domain's group, shape ``(n,)``.
+        g: Contributions to g, shape ``(n, k, gdim)``.
+        left: Contributions to the left vectors, shape ``(n, k, gdim)``.
+        right: The same array where the material's tangent is symmetric.
+    """
+
+    groups: Groups
+    h: Array
+    g: Array
+    left: Array
+    right: Array
+
+
+class VolumeAveraging:
+    """F-bar on the points of a body.
+
+    One evaluation is :meth:`average`, the material's update, then :meth:`effective` or, where the
+    update failed, :meth:`abandon`; each is collective.
+
+    Args:
+        particles: The body.
+        kind: ``"domain"``, ``"pair"`` or ``"patch"``.
+        dim: Dimension of the deformation gradient, 3 for a body of revolution.
+        material: Number of each owned domain's material; groups have one material.
+        symmetric: Whether the material's tangent is symmetric.
+
+    Attributes:
+        low_rank: What the pointwise tangent lacks, of the last evaluation.
+
+    Raises:
+        MPMError: Domains that the kind of average is not for.
+    """
+
+    def __init__(
+        self,
+        particles: Particles,
+        kind: str,
+        dim: int,
+        material: NDArray[np.int64],
+        symmetric: bool,
+    ) -> None:
+        self._particles = particles
+        self._dim = dim
+        self._symmetric = symmetric
+        quadrature = particles.quadrature
+        self._gradients = quadrature.gradients
+        self._weights = particles.point_volumes(dim > particles.mesh.geometry.dim)
+        self._hoop: Array | None = None
+        if dim > particles.mesh.geometry.dim:
+            self._hoop = quadrature.shapes / particles.radii[:, :, None]
+        self._volume = self._weights.sum(axis=1)
+        self.groups = self._grouped(kind, material)
+        self._feel: Deviation = {
+            "domain": _wholly,
+            "pair": _not_at_all,
+            "patch": deviation,
+        }[kind]
+        self._kind = kind
+        self._singles = singles(particles)
+        self._group_volume = self.groups.sum(self._volume)
+        self.low_rank: list[LowRankTerm] = []
+
+    def _grouped(self, kind: str, material: NDArray[np.int64]) -> Groups:
+        body = self._particles
+        if kind == "domain":
+            if body.num_points == 1:
+                raise MPMError(
+                    "f_bar='domain' averages over the points of a domain, but these have one "
+                    "each; make the particles with quadrature_degree=2, or use f_bar='patch'."
+                )
+            return singles(body)
+        if kind == "pair":
+            if body.mesh.topology.cell_name() != "triangle":
+                raise MPMError(
+                    "f_bar='pair' averages over the two triangles of a quadrilateral, but the "
+                    f"body has {body.mesh.topology.cell_name()} cells; use 'domain' or 'patch'."
+                )
+            return pairs(body, material)
+        return patches(body, material)
+
+    def average(self, gradient: Array) -> Array:
+        """Return the displacement gradient that the material sees, Fbar - I (collective).
+
+        Args:
+            gradient: Displacement gradient F - I with det F > 0, shape ``(n, nq, dim, dim)``.
+        """
+        a = 1.0 / self._dim
+        excess = _determinant_minus_one(gradient)
+        of_domain = (self._weights * excess).sum(axis=1)
+        of_group = self.groups.sum(of_domain)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ln_domain = np.log1p(of_domain / self._volume)
+            ln_group = np.log1p(of_group / self._group_volume)
+            psi, self._slope, self._curvature = self._feel(ln_domain - ln_group)
+            change = a * ((ln_group + psi)[:, None] - np.log1p(excess))
+        self._domain_size = self._volume + of_domain
+        self._group_size = self._group_volume + of_group
+        self._J = 1.0 + excess
+        self._F = np.eye(self._dim) + gradient
+        self._Z = np.linalg.inv(self._F).swapaxes(2, 3)
+        self._s = np.exp(change)
+        scale = self._s[:, :, None, None]
+        return np.asarray(np.expm1(change)[:, :, None, None] * np.eye(self._dim) + scale * gradient)
+
+    def abandon(self) -> None:
+        """Take part in the sums of an evaluation that failed on this rank (collective)."""
+        self.groups.sum(np.zeros((len(self._volume), 3)))
+
+    def effective(self, P: Array, A: Array) -> tuple[Array, Array]:
+        """Return the first Piola stress that does work on F, and its pointwise tangent.
+
+        The rest of the tangent is in :attr:`low_rank` (collective).
+
+        Args:
+            P: The material's first Piola stress at Fbar, shape ``(n, nq, dim, dim)``.
+            A: Its derivative dP_iJ/dFbar_kL, shape ``(n, nq, dim, dim, dim, dim)``.
+
+        Returns:
+            Arrays of the same shapes.
+        """
+        a, s, F, Z, J = 1.0 / self._dim, self._s, self._F, self._Z, self._J
+        s2 = s[:, :, None, None]
+        left = P + s2 * np.einsum("nqiJkL,nqkL->nqiJ", A, F)
+        right = left
+        if not self._symmetric:
+            right = P + s2 * np.einsum("nqiJ,nqiJkL->nqkL", F, A)
+        p = s * np.einsum("nqiJ,nqiJ->nq", P, F)
+        stiffness = s * np.einsum("nqiJ,nqiJ->nq", left, F)
+        in_domain = a * (self._weights * p).sum(axis=1)
+        H = a**2 * (self._weights * stiffness).sum(axis=1)
+        slope, curvature = self._slope, self._curvature
+        share = 1.0 - slope
+        C = slope * in_domain
+        sums = self.groups.sum(
+            np.stack([share * in_domain, share**2 * H + curvature * in_domain, share], axis=1)
+        )
+        B = sums[:, 0]
+        beta = (B / self._group_size + C / self._domain_size)[:, None] * J
+
+        factor = (beta - a * p)[:, :, None, None]
+        stress = s2 * P + factor * Z
+        tangent = s2[:, :, :, :, None, None] ** 2 * A
+        tangent -= _dyad((a * s2) * left, Z)
+        tangent -= _dyad(Z, (a * s2) * right)
+        tangent += _dyad((a**2 * stiffness + beta)[:, :, None, None] * Z, Z)
+        tangent -= np.einsum("nqiL,nqkJ->nqiJkL", factor * Z, Z)
+
+        g = self._nodal(J[:, :, None, None] * Z) / self._domain_size[:, None, None]
+        projected = (a * stiffness)[:, :, None, None] * Z
+        y = [self._nodal(a * (s2 * left - projected))]
+        y.append(y[0] if self._symmetric else self._nodal(a * (s2 * right - projected)))
+        self.low_rank = []
+        if self._kind != "pair":
+            h = slope**2 * H + curvature * in_domain - C
+            self.low_rank.append(
+                LowRankTerm(self._singles, h, g, *(slope[:, None, None] * v for v in y))
+            )
+        if self._kind != "domain":
+            part = (self._domain_size / self._group_size)[:, None, None]
+            cross = (slope * share * H - curvature * in_domain)[:, None, None] * g
+            self.low_rank.append(
+                LowRankTerm(
+                    self.groups,
+                    sums[:, 1] - B,
+                    part * g,
+                    *(share[:, None, None] * v + cross for v in y),
+                )
+            )
+        return stress, tangent
+
+    def _nodal(self, stress: Array) -> Array:
+        """Return the integrals of ``stress : grad N`` over each domain, ``(n, k, gdim)``."""
+        gdim = self._gradients.shape[3]
+        weighted = self._weights[:, :, None, None] * stress
+        forces = np.einsum("nqiJ,nqkJ->nki", weighted[:, :, :gdim, :gdim], self._gradients)
+        if self._hoop is not None:
+            forces[:, :, 0] += np.einsum("nq,nqk->nk", weighted[:, :, 2, 2], self._hoop)
+        return np.asarray(forces)
+
+    # -- Output ---------------------------------------------------------------------------
+
+    def recover(self, stress: Array) -> Array:
+        """Return stresses with the averaged part recovered linearly in each patch (collective).
+
+        Only the mean of the normal stresses that an average acts on (in plane strain, and apart
+        from it the third) is constant on a patch. It gets the slope of the plane fitted by least
+        squares to the patch's and its neighbours' means, about its own.
+
+        Args:
+            stress: Volume averages of the Cauchy stress, shape ``(n, 3, 3)``.
+
+        Returns:
+            The same shape.
+        """
+        if self._kind == "domain":
+            return stress
+        x = self._particles.initial_centroid
+        gdim = x.shape[1]
+        normal = np.einsum("nii->ni", stress)
+        parts = [normal[:, : self._dim].mean(axis=1)]
+        parts += [normal[:, 2]] if self._dim == 2 else []
+        own = np.stack(parts, axis=1)
+        weighted = np.column_stack([x, own, np.ones(len(x))]) * self._volume[:, None]
+        totals = self.groups.totals(weighted)
+        means = totals[:, :-1] / totals[:, -1:]
+        centre, mean = means[:, :gdim], means[:, gdim:]
+        number = self.groups.number
+        slopes = self.groups.slopes(centre, mean)[number]
+        change = mean[number] - own + np.einsum("nvi,ni->nv", slopes, x - centre[number])
+        result = stress.copy()
+        for i in range(3):
+            result[:, i, i] += change[:, i // self._dim]
+        return result
+
+
+def _determinant_minus_one(gradient: Array) -> Array:
+    """Return det(I + H) - 1 with the relative precision of a small H."""
+    dim = gradient.shape[-1]
+    minors = 0.5 * (
+        np.einsum("...ii->...", gradient) ** 2
+        - np.einsum("...ij,...ji->...", gradient, gradient)
+    )
+    change = np.einsum("...ii->...", gradient) + minors
+    return np.asarray(change if dim == 2 else change + np.linalg.det(gradient))
+
+
+def _dyad(a: Array, b: Array) -> Array:
+    return np.asarray(a[..., :, :, None, None] * b[..., None, None, :, :])
+
+
+class LowRankTangent:
+    """The low-rank part of a body's tangent by PETSc's sparse products.
+
+    With the vectors g, left and right of all groups as rows of sparse matrices G, L and R, the
+    part is ``G^T (h G / 2 + R) + (h G / 2 + L)^T G``.
+
+    Args:
+        particles: The body.
+        averaging: Its averages.
+    """
+
+    def __init__(self, particles: Particles, averaging: VolumeAveraging) -> None:
+        self._averaging = averaging
+        gdim = particles.mesh.geometry.dim
+        nodes = particles.domain_nodes
+        blocks = particles.W.dofmap.index_map.local_to_global(nodes.ravel()).reshape(nodes.shape)
+        self._dofs = (blocks[:, :, None] * gdim + np.arange(gdim)).astype(PETSc.IntType)
+        self._products: list[_Products] = []
+        self._total: PETSc.Mat | None = None
+
+    def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
+        """Return K plus the low-rank part, always the same object (collective)."""
+        terms = self._averaging.low_rank
+        if self._total is None:
+            self._products = [_Products(term.groups, self._dofs, K) for term in terms]
+        parts = [K]
+        for products, term in zip(self._products, terms, strict=True):
+            parts += products.of(term)
+        if self._total is None:
+            self._total = K.copy()
+            for part in parts[1:]:
+                self._total.axpy(1.0, part, structure=DIFFERENT)
+            return self._total
+        self._total.zeroEntries()
+        for part in parts:
+            self._total.axpy(1.0, part, structure=SUBSET)
+        return self._total
+
+
+class _Products:
+    """``G^T (h G / 2 + R)`` and ``(h G / 2 + L)^T G`` of one partition into groups."""
+
+    def __init__(self, groups: Groups, dofs: NDArray[Any], K: PETSc.Mat) -> None:
+        columns = K.getSizes()[1]
+        rows = np.repeat(groups.number, dofs[0].size if len(dofs) else 0)
+        self._factors = []
+        for _ in range(3):
+            matrix = PETSc.Mat().create(comm=K.comm)
+            matrix.setSizes(((groups.owned, groups.count), columns))
+            matrix.setType("aij")
+            # PETSc sorts the index arrays in place.
+            matrix.setPreallocationCOO(rows.astype(PETSc.IntType), dofs.flatten())
+            self._factors.append(matrix)
+        self._results: list[PETSc.Mat | None] = [None, None]
+
+    def of(self, term: LowRankTerm) -> list[PETSc.Mat]:
+        """Return both products for new values, always the same objects."""
+        half = 0.5 * term.h[:, None, None] * term.g
+        values = (term.g, half + term.right, half + term.left)
+        for matrix, part in zip(self._factors, values, strict=True):
+            matrix.setValuesCOO(np.ascontiguousarray(part).ravel())
+        G, X, Y = self._factors
+        first, second = self._results
+        self._results = [
+            G.transposeMatMult(X, result=first),
+            Y.transposeMatMult(G, result=second),
+        ]
+        return [r for r in self._results if r is not None]
