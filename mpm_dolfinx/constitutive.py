@@ -85,9 +85,7 @@ class ConstitutiveHistory:
             material = np.zeros(particles.num_local, dtype=np.int64)
             for number, group in enumerate(self._groups):
                 material[group.points // particles.num_points] = number
-            self.averaging = VolumeAveraging(
-                particles, f_bar, self.dim, material, self.symmetric
-            )
+            self.averaging = VolumeAveraging(particles, f_bar, self.dim, material, self.symmetric)
 
     @property
     def symmetric(self) -> bool:

@@ -28,7 +28,7 @@ from .errors import MPMError
 from .grouping import Groups, pairs, patches, singles
 from .particles import Particles
 
-__all__ = ["F_BARS", "LowRankTerm", "LowRankTangent", "VolumeAveraging", "deviation"]
+__all__ = ["F_BARS", "LowRankTangent", "LowRankTerm", "VolumeAveraging", "deviation"]
 
 F_BARS = ("none", "domain", "pair", "patch")
 #: Deviation of a domain's ln J from its patch's that is free, and that from which all is felt.
@@ -105,6 +105,8 @@ class VolumeAveraging:
         symmetric: Whether the material's tangent is symmetric.
 
     Attributes:
+        kind: As given.
+        groups: The groups of domains.
         low_rank: What the pointwise tangent lacks, of the last evaluation.
 
     Raises:
@@ -135,7 +137,7 @@ class VolumeAveraging:
             "pair": _not_at_all,
             "patch": deviation,
         }[kind]
-        self._kind = kind
+        self.kind = kind
         self._singles = singles(particles)
         self._group_volume = self.groups.sum(self._volume)
         self.low_rank: list[LowRankTerm] = []
@@ -230,12 +232,12 @@ class VolumeAveraging:
         y = [self._nodal(a * (s2 * left - projected))]
         y.append(y[0] if self._symmetric else self._nodal(a * (s2 * right - projected)))
         self.low_rank = []
-        if self._kind != "pair":
+        if self.kind != "pair":
             h = slope**2 * H + curvature * in_domain - C
             self.low_rank.append(
                 LowRankTerm(self._singles, h, g, *(slope[:, None, None] * v for v in y))
             )
-        if self._kind != "domain":
+        if self.kind != "domain":
             part = (self._domain_size / self._group_size)[:, None, None]
             cross = (slope * share * H - curvature * in_domain)[:, None, None] * g
             self.low_rank.append(
@@ -272,7 +274,7 @@ class VolumeAveraging:
         Returns:
             The same shape.
         """
-        if self._kind == "domain":
+        if self.kind == "domain":
             return stress
         x = self._particles.initial_centroid
         gdim = x.shape[1]
@@ -297,8 +299,7 @@ def _determinant_minus_one(gradient: Array) -> Array:
     """Return det(I + H) - 1 with the relative precision of a small H."""
     dim = gradient.shape[-1]
     minors = 0.5 * (
-        np.einsum("...ii->...", gradient) ** 2
-        - np.einsum("...ij,...ji->...", gradient, gradient)
+        np.einsum("...ii->...", gradient) ** 2 - np.einsum("...ij,...ji->...", gradient, gradient)
     )
     change = np.einsum("...ii->...", gradient) + minors
     return np.asarray(change if dim == 2 else change + np.linalg.det(gradient))

@@ -96,9 +96,7 @@ class Groups:
         self._comm.Allreduce(MPI.IN_PLACE, sums)
         return sums
 
-    def slopes(
-        self, x: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def slopes(self, x: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return slopes of the planes through groups' values, fitted to those of neighbours.
 
         Args:
@@ -118,7 +116,7 @@ class Groups:
         steps = np.zeros((self.count, most, values.shape[1]))
         gaps[a, position] = x[b] - x[a]
         steps[a, position] = values[b] - values[a]
-        return np.einsum("nij,njm->nmi", np.linalg.pinv(gaps, rcond=SLENDER), steps)
+        return np.asarray(np.einsum("nij,njm->nmi", np.linalg.pinv(gaps, rcond=SLENDER), steps))
 
 
 class _WholeBody(NamedTuple):
@@ -191,7 +189,7 @@ def _facets(body: Any, vertices: NDArray[np.int64]) -> NDArray[np.int64]:
     rows, cells = rows[order], cells[order]
     same = (rows[1:] == rows[:-1]).all(axis=1)
     found = np.stack([cells[:-1][same], cells[1:][same]], axis=1)
-    return np.asarray(found[np.lexsort(found.T[::-1])])
+    return np.asarray(found[np.lexsort(found.T[::-1])], dtype=np.int64)
 
 
 def background_cells(particles: Particles) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -281,7 +279,8 @@ def _numbered(particles: Particles, whole: _WholeBody, label: NDArray[np.int64])
     shared = np.sort(number[first != last])
     label = number[label]
     touching = np.unique(
-        np.stack([whole.vertices.ravel(), np.repeat(label, whole.vertices.shape[1])], axis=1), axis=0
+        np.stack([whole.vertices.ravel(), np.repeat(label, whole.vertices.shape[1])], axis=1),
+        axis=0,
     )
     links = [np.zeros((0, 2), dtype=np.int64)]
     for shift in range(1, len(touching)):

@@ -84,7 +84,9 @@ class QuasiStaticProblem(ParticleProblem):
         **options: Any,
     ) -> None:
         if f_bar not in F_BARS:
-            raise MPMError(f"Unknown f_bar={f_bar!r}; choose one of {', '.join(map(repr, F_BARS))}.")
+            raise MPMError(
+                f"Unknown f_bar={f_bar!r}; choose one of {', '.join(map(repr, F_BARS))}."
+            )
         bodies = as_bodies(particles)
         count = len(bodies) if isinstance(particles, list | tuple) else 0
         shares = zip(

@@ -297,6 +297,7 @@ def column(
     gravity=10.0,
     material_of=None,
     method="cpdi2",
+    quadrature_degree=None,
     **options,
 ):
     """Return a problem: a column one background cell wide, 2 x 2 particles in each.
@@ -311,7 +312,7 @@ def column(
         material, options = material_of(body)
     bcs = [fix(V, at(0, 0.0, h), component=0), fix(V, at(1, 0.0), component=1)]
     return mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, method=method),
+        mpm.Particles(body, V, method=method, quadrature_degree=quadrature_degree),
         material,
         density=case.density,
         body_force=(0.0, -gravity),
@@ -340,6 +341,7 @@ def slump(
     comm=WORLD,
     height=8.0,
     method="cpdi2",
+    quadrature_degree=None,
     **options,
 ):
     """Return the half model of a free elastoplastic column on a roller, 4 wide and 8 high."""
@@ -348,7 +350,7 @@ def slump(
     body = box([0.0, 0.0], [4.0, height], [round(8.0 / h), round(2 * height / h)], cell, comm)
     bcs = [fix(V, at(0, 0.0), component=0), fix(V, at(1, 0.0), component=1)]
     return mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, method=method),
+        mpm.Particles(body, V, method=method, quadrature_degree=quadrature_degree),
         material or mpm.materials.VonMises(1e6, 0.3, rho_y=20e3),
         density=1000.0,
         body_force=(0.0, -g0 / 1000.0),
