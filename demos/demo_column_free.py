@@ -95,6 +95,7 @@ parser.add_argument(
     "--outside", choices=("error", "stop", "delete"), default="error", help="if particles leave it"
 )
 parser.add_argument("--plain-solver", action="store_true", help="no shift, no line search")
+parser.add_f_bar()
 args = parser.parse()
 
 comm = MPI.COMM_WORLD
@@ -147,7 +148,9 @@ def collapse(g0: float):
         fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(1), 1, base), V.sub(1)),
     ]
 
-    particles = mpm.Particles(body, V, method="cpdi2", outside=args.outside)
+    particles = mpm.Particles(
+        body, V, method="cpdi2", quadrature_degree=tools.rule(args), outside=args.outside
+    )
     problem = mpm.QuasiStaticProblem(
         particles,
         mpm.materials.VonMises(young, poisson, rho_y=rho_y),
@@ -155,6 +158,7 @@ def collapse(g0: float):
         body_force=(0.0, -g0 / density),
         bcs=bcs,
         petsc_options_prefix="collapse_",
+        f_bar=args.f_bar,
         **({"shift": 0.0, "line_search": False} if args.plain_solver else {}),
     )
 

@@ -108,6 +108,10 @@ parser.add_argument("--method", choices=tools.METHODS, default="cpdi2", help="ro
 parser.add_argument("--small-strain", action="store_true", help="material of small strain")
 parser.add_argument("--young", type=tools.positive, default=2e5, help="Young's modulus, Pa")
 parser.add_argument("--steps", type=tools.whole, default=40, help="load steps")
+parser.add_argument(
+    "--particles-per-cell", type=tools.whole, default=2, help="domains, each way in a cell"
+)
+parser.add_f_bar()
 args = parser.parse()
 
 comm = MPI.COMM_WORLD
@@ -116,7 +120,7 @@ young, poisson, rho_y = args.young, 0.3, 20e3  # Pa, -, Pa
 weight = density * gravity
 width = height / args.elements
 
-# Background and body, each a DOLFINx mesh; two domains each way in a cell.
+# Background and body, each a DOLFINx mesh; two domains each way in a cell unless asked otherwise.
 
 dim = 3 if args.domain in ("hex", "tet") else 2
 up = dim - 1  # the vertical axis
@@ -125,7 +129,8 @@ background = tools.box(
     upper, [1] * up + [args.elements], tools.DOMAINS["hex" if dim == 3 else "quad"]
 )
 V = fem.functionspace(background, ("Lagrange", 1, (dim,)))
-body = tools.box(upper, [2] * up + [2 * args.elements], tools.DOMAINS[args.domain])
+each = args.particles_per_cell
+body = tools.box(upper, [each] * up + [each * args.elements], tools.DOMAINS[args.domain])
 
 # The rollers are conditions on the background: on both ends of each horizontal axis, and at the
 # base.
@@ -139,7 +144,7 @@ for axis in range(dim):
     dofs = fem.locate_dofs_topological(V.sub(axis), up, facets)
     bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
 
-particles = mpm.Particles(body, V, method=args.method)
+particles = mpm.Particles(body, V, method=args.method, quadrature_degree=tools.rule(args))
 law = mpm.materials.SmallStrainVonMises if args.small_strain else mpm.materials.VonMises
 problem = mpm.QuasiStaticProblem(
     particles,
@@ -147,6 +152,7 @@ problem = mpm.QuasiStaticProblem(
     density=density,
     body_force=(0.0,) * up + (-gravity,),
     bcs=bcs,
+    f_bar=args.f_bar,
     petsc_options_prefix="roller_",
 )
 

@@ -51,6 +51,15 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--json", action="store_true", help="print one JSON object, no more")
         self.add_argument("--plot", metavar="FILE.png", help="make a picture")
 
+    def add_f_bar(self, default: str = "none") -> None:
+        """The options of the domains' rule and of averages of the volume ratio."""
+        self.add_argument(
+            "--quadrature-degree",
+            type=whole,
+            help="of the domains' rule: one point by default, 2 with an average over them",
+        )
+        self.add_argument("--f-bar", choices=F_BARS, default=default, help="average of volume")
+
     def _print_message(self, message: str, file: Any = None) -> None:
         if comm.rank == 0:
             super()._print_message(message, file)
@@ -84,12 +93,19 @@ def positive(text: str) -> float:
     return value
 
 
+def rule(args: argparse.Namespace) -> int | None:
+    """The degree of the domains' rule; an average over a domain's points needs several."""
+    given: int | None = args.quadrature_degree
+    return 2 if given is None and args.f_bar == "domain" else given
+
+
 DOMAINS = {
     "quad": mesh.CellType.quadrilateral,
     "tri": mesh.CellType.triangle,
     "hex": mesh.CellType.hexahedron,
     "tet": mesh.CellType.tetrahedron,
 }
+F_BARS = ("none", "domain", "pair", "patch")
 METHODS = ("cpdi2", "cpdi", "gimp", "mpm")
 
 

@@ -139,7 +139,6 @@ class VolumeAveraging:
         }[kind]
         self.kind = kind
         self._singles = singles(particles)
-        self._group_volume = self.groups.sum(self._volume)
         self.low_rank: list[LowRankTerm] = []
 
     def _grouped(self, kind: str, material: NDArray[np.int64]) -> Groups:
@@ -169,14 +168,18 @@ class VolumeAveraging:
         a = 1.0 / self._dim
         excess = _determinant_minus_one(gradient)
         of_domain = (self._weights * excess).sum(axis=1)
-        of_group = self.groups.sum(of_domain)
+        present = ~self._particles.deleted
+        sums = self.groups.sum(present[:, None] * np.stack([self._volume, of_domain], axis=1))
+        group_volume = np.where(present, sums[:, 0], self._volume)
+        of_group = np.where(present, sums[:, 1], of_domain)
         with np.errstate(invalid="ignore", divide="ignore"):
             ln_domain = np.log1p(of_domain / self._volume)
-            ln_group = np.log1p(of_group / self._group_volume)
+            ln_group = np.log1p(of_group / group_volume)
             psi, self._slope, self._curvature = self._feel(ln_domain - ln_group)
             change = a * ((ln_group + psi)[:, None] - np.log1p(excess))
         self._domain_size = self._volume + of_domain
-        self._group_size = self._group_volume + of_group
+        self._group_size = group_volume + of_group
+        self._counted = self._weights * present[:, None]
         self._J = 1.0 + excess
         self._F = np.eye(self._dim) + gradient
         self._Z = np.linalg.inv(self._F).swapaxes(2, 3)
@@ -186,7 +189,7 @@ class VolumeAveraging:
 
     def abandon(self) -> None:
         """Take part in the sums of an evaluation that failed on this rank (collective)."""
-        self.groups.sum(np.zeros((len(self._volume), 3)))
+        self.groups.sum(np.zeros((len(self._volume), 2)))
 
     def effective(self, P: Array, A: Array) -> tuple[Array, Array]:
         """Return the first Piola stress that does work on F, and its pointwise tangent.
@@ -208,13 +211,13 @@ class VolumeAveraging:
             right = P + s2 * np.einsum("nqiJ,nqiJkL->nqkL", F, A)
         p = s * np.einsum("nqiJ,nqiJ->nq", P, F)
         stiffness = s * np.einsum("nqiJ,nqiJ->nq", left, F)
-        in_domain = a * (self._weights * p).sum(axis=1)
-        H = a**2 * (self._weights * stiffness).sum(axis=1)
+        in_domain = a * (self._counted * p).sum(axis=1)
+        H = a**2 * (self._counted * stiffness).sum(axis=1)
         slope, curvature = self._slope, self._curvature
         share = 1.0 - slope
         C = slope * in_domain
         sums = self.groups.sum(
-            np.stack([share * in_domain, share**2 * H + curvature * in_domain, share], axis=1)
+            np.stack([share * in_domain, share**2 * H + curvature * in_domain], axis=1)
         )
         B = sums[:, 0]
         beta = (B / self._group_size + C / self._domain_size)[:, None] * J
@@ -253,7 +256,7 @@ class VolumeAveraging:
     def _nodal(self, stress: Array) -> Array:
         """Return the integrals of ``stress : grad N`` over each domain, ``(n, k, gdim)``."""
         gdim = self._gradients.shape[3]
-        weighted = self._weights[:, :, None, None] * stress
+        weighted = self._counted[:, :, None, None] * stress
         forces = np.einsum("nqiJ,nqkJ->nki", weighted[:, :, :gdim, :gdim], self._gradients)
         if self._hoop is not None:
             forces[:, :, 0] += np.einsum("nq,nqk->nk", weighted[:, :, 2, 2], self._hoop)
@@ -282,16 +285,17 @@ class VolumeAveraging:
         parts = [normal[:, : self._dim].mean(axis=1)]
         parts += [normal[:, 2]] if self._dim == 2 else []
         own = np.stack(parts, axis=1)
-        weighted = np.column_stack([x, own, np.ones(len(x))]) * self._volume[:, None]
+        present = ~self._particles.deleted
+        weighted = np.column_stack([x, own, np.ones(len(x))]) * (self._volume * present)[:, None]
         totals = self.groups.totals(weighted)
-        means = totals[:, :-1] / totals[:, -1:]
+        means = totals[:, :-1] / np.where(totals[:, -1:] > 0.0, totals[:, -1:], 1.0)
         centre, mean = means[:, :gdim], means[:, gdim:]
         number = self.groups.number
         slopes = self.groups.slopes(centre, mean)[number]
         change = mean[number] - own + np.einsum("nvi,ni->nv", slopes, x - centre[number])
         result = stress.copy()
         for i in range(3):
-            result[:, i, i] += change[:, i // self._dim]
+            result[present, i, i] += change[present, i // self._dim]
         return result
 
 

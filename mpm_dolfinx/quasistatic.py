@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,10 +17,14 @@ from dolfinx import fem, mesh
 from .constitutive import ConstitutiveHistory
 from .errors import MPMError
 from .f_bar import F_BARS, LowRankTangent
+from .grouping import background_cells
 from .particles import Particles
 from .problem import ParticleProblem, as_bodies
 
 __all__ = ["QuasiStaticProblem"]
+
+#: Mean share of a background cell that a domain fills, from which one point is too few.
+CROWDED = 0.5
 
 
 class QuasiStaticProblem(ParticleProblem):
@@ -137,6 +142,7 @@ class QuasiStaticProblem(ParticleProblem):
         )
         for body, stress in zip(bodies, self._stresses, strict=True):
             body.attach(stress.history)
+            _warn_of_hourglass(body)
         for share, stress in zip(self.shares, self._stresses, strict=True):
             averaging = stress.history.averaging
             if averaging is not None:
@@ -279,6 +285,24 @@ def _for_each(value: Any, count: int, pairs: bool = False) -> list[Any]:
     if len(value) != count:
         raise MPMError(f"There are {count} bodies, but a list of {len(value)} for them.")
     return list(value)
+
+
+def _warn_of_hourglass(particles: Particles) -> None:
+    """Say so where one point for each domain leaves motions without strain (collective)."""
+    cell = particles.mesh.topology.cell_name()
+    if particles.num_points > 1 or cell not in ("quadrilateral", "hexahedron"):
+        return
+    _, size = background_cells(particles)
+    fill = particles.mesh.comm.allreduce(float((particles.initial_volume / size).sum()))
+    if fill > CROWDED * particles.num_global and particles.mesh.comm.rank == 0:
+        cure = "use two domains each way in a cell"
+        if particles.method == "cpdi2":
+            cure = f"use quadrature_degree=2 with f_bar='domain', or {cure[4:]}"
+        warnings.warn(
+            "The domains have one quadrature point each and are about as large as the cells of "
+            f"the background, so that motions without strain (hourglass) meet no resistance; {cure}.",
+            stacklevel=4,
+        )
 
 
 def _fill(function: fem.Function, values: NDArray[np.float64]) -> None:
