@@ -169,7 +169,8 @@ class VolumeAveraging:
         excess = _determinant_minus_one(gradient)
         of_domain = (self._weights * excess).sum(axis=1)
         present = ~self._particles.deleted
-        sums = self.groups.sum(present[:, None] * np.stack([self._volume, of_domain], axis=1))
+        sizes = np.stack([self._volume, of_domain], axis=1)
+        sums = self.groups.sum(np.where(present[:, None], sizes, 0.0))
         group_volume = np.where(present, sums[:, 0], self._volume)
         of_group = np.where(present, sums[:, 1], of_domain)
         with np.errstate(invalid="ignore", divide="ignore"):

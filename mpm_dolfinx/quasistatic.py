@@ -299,8 +299,8 @@ def _warn_of_hourglass(particles: Particles) -> None:
         if particles.method == "cpdi2":
             cure = f"use quadrature_degree=2 with f_bar='domain', or {cure[4:]}"
         warnings.warn(
-            "The domains have one quadrature point each and are about as large as the cells of "
-            f"the background, so that motions without strain (hourglass) meet no resistance; {cure}.",
+            "The domains have one quadrature point each and are about as large as the cells of the "
+            f"background, so motions without strain (hourglass) meet no resistance; {cure}.",
             stacklevel=4,
         )
 

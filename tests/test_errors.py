@@ -342,7 +342,7 @@ PROBLEMS = {
         problem(density=(1.0, 2.0), body_force=(0.0, -1.0)),
         r"density has the shape \(2,\), but must have \(\)",
     ),
-    "F-bar that does not exist": (problem(f_bar="patch"), r"Unknown f_bar=.patch."),
+    "F-bar that does not exist": (problem(f_bar="cell"), r"Unknown f_bar=.cell."),
     "negative density without a force": (problem(density=-1.0), r"density must not be"),
     "force of three numbers": (problem(body_force=(0.0, 0.0, -1.0)), r"body_force has the shape"),
     "force of a number": (problem(body_force=-9.81), r"body_force has the shape"),
