@@ -6,7 +6,7 @@ from . import _compat
 
 _compat.require_supported()
 
-from . import materials, plot  # noqa: E402
+from . import boundary, materials, plot  # noqa: E402
 from .errors import (  # noqa: E402
     ConvergenceError,
     DomainDistortionError,
@@ -35,6 +35,7 @@ __all__ = [
     "Step",
     "Weights",
     "__version__",
+    "boundary",
     "materials",
     "plot",
 ]

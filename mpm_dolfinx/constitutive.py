@@ -149,6 +149,17 @@ class ConstitutiveHistory:
             raise MPMError(f"The parameter {name} must be a scalar DG0 Function on the body mesh.")
         return np.asarray(value.x.array[space.dofmap.list[:n, 0]])
 
+    def initial_modulus(self) -> NDArray[np.float64]:
+        """Return the largest modulus of the undeformed domains in one direction, shape ``(n,)``."""
+        result = np.zeros(self._points)
+        for group in self._groups:
+            count = len(group.points)
+            state = group.material.initial_state(count, self.dim)
+            answer = group.material.update(np.zeros((count, self.dim, self.dim)), state)
+            assert answer.tangent is not None
+            result[group.points] = np.einsum("niiii->ni", answer.tangent).max(axis=1, initial=0.0)
+        return result.reshape(self._particles.num_local, -1).mean(axis=1)
+
     def update(self) -> None:
         """Update all points for the present displacement; the history stays as it is.
 

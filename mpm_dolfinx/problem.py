@@ -22,6 +22,7 @@ from dolfinx import fem
 
 from . import _compat
 from .assembly import BackgroundForms, BodyForms
+from .boundary import Support
 from .errors import (
     ConvergenceError,
     DomainDistortionError,
@@ -290,11 +291,12 @@ class ParticleProblem:
 
     # -- Results --------------------------------------------------------------------------
 
-    def reaction(self, bc: fem.DirichletBC) -> NDArray[np.float64]:
+    def reaction(self, bc: fem.DirichletBC | Support) -> NDArray[np.float64]:
         """Return the force of a support on the body at the last converged load.
 
         Args:
-            bc: One of the problem's Dirichlet conditions.
+            bc: One of the problem's Dirichlet conditions, or a support of
+                :mod:`mpm_dolfinx.boundary` on one of its bodies.
 
         Returns:
             Force, shape ``(gdim,)``, the same on all ranks.
@@ -302,6 +304,10 @@ class ParticleProblem:
         Raises:
             MPMError: The condition is not one of the problem's.
         """
+        if isinstance(bc, Support):
+            if all(bc.particles is not body for body in self.bodies):
+                raise MPMError("reaction() needs a support on one of the bodies of this problem.")
+            return bc.reaction
         if not any(bc is known for known in self.bcs):
             raise MPMError("reaction(bc) needs one of the Dirichlet conditions of this problem.")
         gdim = self.bodies[0].V.dofmap.index_map_bs

@@ -147,7 +147,7 @@ def _rule(integral: Any) -> tuple[int, str]:
 
 
 def split_by_rule(form: ufl.Form, displacement: fem.Function) -> list[ufl.Form]:
-    """Split a form so that each part has one quadrature rule and one kind of dependence.
+    """Split a form so that each part has one rule, one kind of dependence and one set of tags.
 
     FFCx (0.9 to 0.11) miscompiles a form that mixes a one-point rule with another rule, so
     each rule gets a form of its own; parts that are constant during a step are apart too.
@@ -162,12 +162,18 @@ def split_by_rule(form: ufl.Form, displacement: fem.Function) -> list[ufl.Form]:
     Raises:
         MPMError: Where data at quadrature points meet another rule.
     """
-    parts: dict[tuple[bool, str, int, str], list[Any]] = defaultdict(list)
+    parts: dict[tuple[bool, str, int, str, int], list[Any]] = defaultdict(list)
+    markers: list[Any] = []
     for integral in form.integrals():
         degree, scheme = _rule(integral)
         metadata = dict(integral.metadata())
         metadata.update(quadrature_degree=degree, quadrature_rule=scheme)
         one = integral.reconstruct(metadata=metadata)
         constant = not follows(ufl.Form([one]), displacement)
-        parts[constant, integral.integral_type(), degree, scheme].append(one)
+        tags = integral.subdomain_data()
+        seen = [i for i, known in enumerate(markers) if known is tags]
+        if not seen:
+            markers.append(tags)
+        place = seen[0] if seen else len(markers) - 1
+        parts[constant, integral.integral_type(), degree, scheme, place].append(one)
     return [ufl.Form(parts[key]) for key in sorted(parts)]

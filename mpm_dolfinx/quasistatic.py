@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ufl
-from dolfinx import fem, mesh
+from dolfinx import fem
 
+from .boundary import Support
 from .constitutive import ConstitutiveHistory
 from .errors import MPMError
+from .expressions import as_expression, facet_measure
 from .f_bar import F_BARS, LowRankTangent
 from .grouping import background_cells
 from .particles import Particles
@@ -52,6 +54,7 @@ class QuasiStaticProblem(ParticleProblem):
         facet_tags: Tags of the body's facets.
         axisymmetric: Whether ``x[0]`` is the radius of a body of revolution about ``x[0] = 0``;
             loads and reactions are then those of the whole circumference.
+        supports: Supports on the bodies' own boundaries, of :mod:`mpm_dolfinx.boundary`.
         background: Form on the background, as in :class:`ParticleProblem`.
         f_bar: Average of the volume ratio that the material sees, against hourglass modes and
             locking: ``"none"``, ``"domain"`` (over a domain's points), ``"pair"`` (over the two
@@ -79,6 +82,7 @@ class QuasiStaticProblem(ParticleProblem):
         cell_tags: Any = None,
         facet_tags: Any = None,
         axisymmetric: bool = False,
+        supports: Sequence[Support] = (),
         background: ufl.Form | None = None,
         f_bar: str = "none",
         petsc_options_prefix: str = "mpm_",
@@ -105,6 +109,7 @@ class QuasiStaticProblem(ParticleProblem):
             _for_each(facet_tags, count),
             strict=True,
         )
+        _validate_supports(supports, bodies)
         self._stresses: list[_InjectedStress] = []
         self._density: list[ufl.Form] = []
         residuals, tangents = [], []
@@ -114,12 +119,17 @@ class QuasiStaticProblem(ParticleProblem):
             self._stresses.append(stress)
             frame = _Frame(body, axisymmetric)
             R, J = frame.internal(stress.first_piola, stress.tangent)
-            mass = _expression(mass, body, "density", ())
+            mass = as_expression(mass, body, "density", ())
             self._density.append(frame.mass(mass))
             if force is not None:
                 R -= frame.body_force(mass, force)
             if dead:
                 R -= frame.tractions(dead, facets)
+            for support in supports:
+                if support.particles is body:
+                    term = frame.support(support, history)
+                    R += term
+                    J += ufl.derivative(term, body.displacement)
             if following:
                 pressure = frame.pressures(following, facets)
                 R += pressure
@@ -243,31 +253,41 @@ class _Frame:
 
     def body_force(self, density: Any, force: Any) -> ufl.Form:
         """Return the virtual work of the body force."""
-        b = _expression(force, self._body, "body_force", (self._dim,))
+        b = as_expression(force, self._body, "body_force", (self._dim,))
         work: ufl.Form = density * self._turn * ufl.inner(b, self._v) * self._body.dx_exact
         return self._at_load([work])
 
     def tractions(self, loads: Sequence[tuple[Any, int]], tags: Any) -> ufl.Form:
         """Return the virtual work of dead tractions."""
-        ds = _facet_measure(self._body, tags, loads, "tractions")
+        ds = facet_measure(self._body, tags, loads, "tractions")
         terms = [
             self._turn
-            * ufl.inner(_expression(t, self._body, "a traction", (self._dim,)), self._v)
+            * ufl.inner(as_expression(t, self._body, "a traction", (self._dim,)), self._v)
             * ds(tag)
             for t, tag in loads
         ]
         return self._at_load(terms)
 
+    def support(self, support: Support, history: ConstitutiveHistory) -> ufl.Form:
+        """Return minus the virtual work of a support."""
+        if not support.has_modulus:
+            modulus = fem.Function(fem.functionspace(self._body.mesh, ("DG", 0)))
+            cells = modulus.function_space.dofmap.list[: self._body.num_local, 0]
+            modulus.x.array[cells] = history.initial_modulus()
+            support.scale(modulus)
+        support.revolve(self._turn)
+        return support.residual
+
     def pressures(self, loads: Sequence[tuple[Any, int]], tags: Any) -> ufl.Form:
         """Return minus the virtual work of pressures on the deformed facets."""
-        ds = _facet_measure(self._body, tags, loads, "pressures")
+        ds = facet_measure(self._body, tags, loads, "pressures")
         d = self._body.displacement
         F = ufl.Identity(self._dim) + ufl.grad(d)
         area = ufl.det(F) * ufl.inv(F).T * ufl.FacetNormal(self._body.mesh)
         if self._axisymmetric:
             area *= 2.0 * np.pi * (self._radius + d[0])
         terms = [
-            _expression(p, self._body, "a pressure", ()) * ufl.inner(area, self._v) * ds(tag)
+            as_expression(p, self._body, "a pressure", ()) * ufl.inner(area, self._v) * ds(tag)
             for p, tag in loads
         ]
         return self._at_load(terms)
@@ -305,42 +325,12 @@ def _warn_of_hourglass(particles: Particles) -> None:
         )
 
 
+def _validate_supports(supports: Any, bodies: Sequence[Particles]) -> None:
+    if not isinstance(supports, list | tuple) or not all(isinstance(s, Support) for s in supports):
+        raise MPMError("supports must be a list of supports made by mpm.boundary.")
+    if any(all(s.particles is not body for body in bodies) for s in supports):
+        raise MPMError("A support was made with other particles than those of this problem.")
+
+
 def _fill(function: fem.Function, values: NDArray[np.float64]) -> None:
     function.x.array[: values.size] = values.ravel()
-
-
-def _expression(value: Any, particles: Particles, name: str, shape: tuple[int, ...]) -> Any:
-    """Return a value as a UFL expression on the body mesh."""
-    if not isinstance(value, ufl.core.expr.Expr):
-        try:
-            array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise MPMError(f"{name} must be numbers or a UFL expression, not {value!r}.") from None
-        if not np.all(np.isfinite(array)):
-            raise MPMError(f"{name} must be finite, not {value!r}.")
-        if name == "density" and array.ndim == 0 and array < 0.0:
-            raise MPMError(f"density must not be negative, not {value!r}.")
-        value = fem.Constant(particles.mesh, array)
-    if value.ufl_shape != shape:
-        raise MPMError(f"{name} has the shape {value.ufl_shape}, but must have {shape}.")
-    for domain in ufl.domain.extract_domains(value):
-        if domain != particles.mesh.ufl_domain():
-            raise MPMError(f"{name} lives on another mesh; write it on the body mesh.")
-    return value
-
-
-def _facet_measure(
-    particles: Particles, facet_tags: Any, loads: Sequence[tuple[Any, int]], what: str
-) -> ufl.Measure:
-    body = particles.mesh
-    if not isinstance(facet_tags, mesh.MeshTags) or facet_tags.dim != body.topology.dim - 1:
-        raise MPMError(f"{what} need facet_tags=, tags of the body's facets.")
-    known = set().union(*body.comm.allgather({int(t) for t in np.unique(facet_tags.values)}))
-    for load in loads:
-        if not isinstance(load, tuple) or len(load) != 2 or load[1] not in known:
-            raise MPMError(
-                f"{what} are pairs of a value and a facet tag among {sorted(known)}, not {load!r}."
-            )
-    return ufl.Measure(
-        "ds", domain=body, subdomain_data=facet_tags, metadata=particles.dx_exact.metadata()
-    )
