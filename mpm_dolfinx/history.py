@@ -18,6 +18,8 @@ COUNTERS = (
     "transfers",
     "free_dofs",
     "residuals",
+    "predictions",
+    "rejected_predictions",
     "factorisations",
     "halvings",
     "converged_at_round_off",
@@ -34,7 +36,8 @@ class Statistics(dict[str, float]):
     The phases, which do not overlap, are ``locate``, ``transfer``, ``constitutive``,
     ``assemble``, ``factorise``, ``solve`` and ``commit``. Counters are ``transfers`` (how often
     the transfer was rebuilt), ``free_dofs`` (unknowns of the last step), ``residuals`` and
-    ``factorisations``, ``halvings`` (of Newton steps by the line search),
+    ``factorisations``, ``predictions`` (steps that began at the extrapolated increment) and
+    ``rejected_predictions``, ``halvings`` (of Newton steps by the line search),
     ``converged_at_round_off`` (steps that ended at the floor of round-off),
     ``workspace_retries`` (factorisations that MUMPS repeated with more workspace) and
     ``lost_particles``, ``lost_volume`` (undeformed) and ``lost_mass`` (0 where no density is

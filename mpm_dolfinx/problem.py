@@ -32,6 +32,7 @@ from .errors import (
 from .history import History, Loss, Step
 from .io import TimeSeries
 from .particles import Particles
+from .predictor import Predictor
 from .reduced import Body, ReducedSystem
 from .solver import NewtonSolver, weakly
 from .stepping import StepControl
@@ -64,6 +65,8 @@ class ParticleProblem:
             without a shift the factor of such a matrix is noise.
         line_search: Whether Newton steps are halved where they invert domains or do not
             reduce the residual.
+        predictor: Whether Newton's method starts from the last increments extrapolated, where
+            the residual there is not above twice that of a start from zero.
 
     Attributes:
         particles: The body or bodies, as given.
@@ -91,6 +94,7 @@ class ParticleProblem:
         symmetric: bool = False,
         shift: float = 1e-13,
         line_search: bool = True,
+        predictor: bool = True,
     ) -> None:
         if not isinstance(shift, float | int) or not 0.0 <= shift < 1.0:
             raise MPMError(f"shift must be at least 0 and below 1, not {shift!r}.")
@@ -122,7 +126,8 @@ class ParticleProblem:
             terms = BackgroundForms(background, self.bodies[0], **options)
         statistics = self.history.statistics
         evaluate = weakly(self.evaluate)
-        self.reduced = ReducedSystem(self.shares, terms, self.bcs, evaluate, statistics)
+        past = Predictor() if predictor else None
+        self.reduced = ReducedSystem(self.shares, terms, self.bcs, evaluate, statistics, past)
         self._newton = NewtonSolver(
             self._comm,
             petsc_options_prefix,
@@ -238,6 +243,8 @@ class ParticleProblem:
         control = StepControl(int(steps))
         if update is not None:
             self._parameter = 0.0
+        if self.reduced.predictor is not None:
+            self.reduced.predictor.clear()
         start, base = (self._loaded, self._prescribed.copy())
         while not control.finished:
             t = control.target
@@ -368,7 +375,7 @@ class ParticleProblem:
 
         Unless it is the last one it must leave all particles inside the background.
         """
-        self.reduced.begin(values - self._prescribed)
+        self.reduced.begin(values - self._prescribed, parameter - self._parameter)
         self._newton.solve(self.reduced, self.reduced.sizes)
         if (failure := self.reduced.crossed()) is not None:
             raise failure

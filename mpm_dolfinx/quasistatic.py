@@ -64,6 +64,7 @@ class QuasiStaticProblem(ParticleProblem):
         petsc_options: PETSc options, without prefix.
         shift: As in :class:`ParticleProblem`.
         line_search: As in :class:`ParticleProblem`.
+        predictor: As in :class:`ParticleProblem`.
         **options: ``form_compiler_options`` and ``jit_options``.
 
     Raises:
@@ -90,6 +91,7 @@ class QuasiStaticProblem(ParticleProblem):
         *,
         shift: float = 1e-13,
         line_search: bool = True,
+        predictor: bool = True,
         **options: Any,
     ) -> None:
         if f_bar not in F_BARS:
@@ -148,6 +150,7 @@ class QuasiStaticProblem(ParticleProblem):
             symmetric=not followers and all(s.history.symmetric for s in self._stresses),
             shift=shift,
             line_search=line_search,
+            predictor=predictor,
             **options,
         )
         for body, stress in zip(bodies, self._stresses, strict=True):

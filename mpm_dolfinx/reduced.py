@@ -18,6 +18,7 @@ from .assembly import BackgroundForms, BodyForms
 from .errors import DomainDistortionError, MPMError, agreed
 from .history import Statistics
 from .particles import Particles
+from .predictor import Predictor, map_to_background
 
 __all__ = ["Body", "ReducedSystem"]
 
@@ -53,8 +54,15 @@ class Body:
         self.particles.T.mult(u, self._work)
         d = self.particles.displacement.x
         rows = self._work.getLocalSize()
-        d.array[:rows] = self.particles.converged_displacement[:rows] + self._work.array_r
+        self._before = self.particles.converged_displacement[:rows]
+        d.array[:rows] = self._before + self._work.array_r
         d.scatter_forward()
+
+    def increment(self) -> NDArray[np.float64]:
+        """Return the last change of displacement on this rank's own dofs of W."""
+        rows = self._work.getLocalSize()
+        d = self.particles.displacement.x.array[:rows]
+        return np.asarray(d - self._before)
 
     def tangent(self) -> PETSc.Mat:
         """Return ``T^T K T`` at the free dofs, always the same object within a step."""
@@ -97,6 +105,7 @@ class ReducedSystem:
         bcs: Dirichlet conditions on V.
         evaluate: What the forms need before each assembly; may return a failure.
         statistics: Where to count.
+        predictor: Says what increment to expect; ``None`` for none.
     """
 
     def __init__(
@@ -106,7 +115,9 @@ class ReducedSystem:
         bcs: Sequence[fem.DirichletBC],
         evaluate: Callable[[], MPMError | None],
         statistics: Statistics,
+        predictor: Predictor | None = None,
     ) -> None:
+        self.predictor = predictor
         self._bodies = list(bodies)
         self._background = background
         self._bcs = bcs
@@ -129,16 +140,18 @@ class ReducedSystem:
         """The residual on all dofs of V that was evaluated last: at supports, their force."""
         return self._force
 
-    def begin(self, change: NDArray[np.float64]) -> None:
+    def begin(self, change: NDArray[np.float64], size: float) -> None:
         """Prepare a step, or another try of the same.
 
         Args:
             change: Change of the Dirichlet values, on the local dofs of V.
+            size: Size of the step, in load factor or parameter of the path.
 
         Raises:
             ParticleOutsideError: Where the last step left a domain outside the background.
         """
         self._change = change[: self._owned]
+        self._size = size
         self._imposed = False
         with self._statistics.phase("locate"):
             for body in self._bodies:
@@ -153,8 +166,10 @@ class ReducedSystem:
             self._external = float(self._force.norm())
 
     def end(self) -> None:
-        """Forget the free dofs, since the bodies have moved."""
+        """Take note of the increments; forget the free dofs, since the bodies have moved."""
         self._free = None
+        if self.predictor is not None:
+            self.predictor.record(self._size, [body.increment() for body in self._bodies])
 
     def _find_free_dofs(self) -> None:
         """Free are dofs with weight or a background term, and without a condition."""
@@ -231,6 +246,18 @@ class ReducedSystem:
                 for part in parts:
                     self._total.axpy(1.0, part, structure=SUBSET)
             return self._total
+
+    def prediction(self) -> PETSc.Vec | None:
+        """Return the free dofs to expect at the step's end, if the past says any."""
+        if self.predictor is None:
+            return None
+        increments = self.predictor.increments(self._size)
+        if increments is None:
+            return None
+        u = map_to_background([body.particles.T for body in self._bodies], increments)
+        x = PETSc.Vec().createMPI(self.sizes, comm=self._comm)
+        x.array_w[:] = u[self._free]
+        return x
 
     def impose(self) -> bool:
         """Impose the step's Dirichlet values from now on; return whether there are any."""

@@ -24,6 +24,9 @@ ROUND_OFF = 1e-13
 #: Most halvings of a Newton step, and the drop in work that needs none.
 HALVINGS = 8
 SUFFICIENT = 0.8
+#: First residual of a prediction that is kept, over that of a start from zero; from 1 on as long
+#: as it saves linear solves.
+KEPT = 2.0
 #: Values of MUMPS's INFOG(1) that more workspace cures.
 OUT_OF_WORKSPACE = (-8, -9)
 FACTORS = ("lu", "cholesky")
@@ -37,6 +40,9 @@ class ReducedProblem(Protocol):
 
     def tangent(self) -> PETSc.Mat:
         """Return the tangent at the x of the last residual, always the same object."""
+
+    def prediction(self) -> PETSc.Vec | None:
+        """Return unknowns to expect at the step's end, if the past says any."""
 
     def impose(self) -> bool:
         """Impose the step's Dirichlet values from now on; return whether there are any."""
@@ -107,6 +113,8 @@ class NewtonSolver:
         self._P: Any = None
         self._failure: MPMError | None = None
         self._known = self._fresh = False
+        self._kept = KEPT
+        self._from_zero = 0
         self.snes = PETSc.SNES().create(comm)
         self.snes.setOptionsPrefix(prefix)
         self.snes.setType("newtonls")
@@ -129,10 +137,11 @@ class NewtonSolver:
             database.delValue(prefix + key)
 
     def solve(self, problem: ReducedProblem, sizes: tuple[int, int]) -> None:
-        """Find a root of the residual, starting from zero.
+        """Find a root of the residual, starting from zero or from the prediction.
 
-        The first linear solve carries the step's Dirichlet values, as it does in finite
-        elements.
+        The prediction is kept only where its residual is small beside that of a start from zero.
+        From zero, the first linear solve carries the step's Dirichlet values, as it does in
+        finite elements, and their linearised forces count as part of the first residual.
 
         Args:
             problem: Residual and tangent.
@@ -174,22 +183,30 @@ class NewtonSolver:
 
     def _iterate(self, x: PETSc.Vec) -> None:
         assert self.F is not None
-        x.copy(self._trial)
-        self._known = True
-        self._set_tangent(self._problem.tangent())
-        self._fresh = True
+        K: PETSc.Mat | None = None
+        forces: PETSc.Vec | None = None
         if self._problem.impose():
+            K = self._problem.tangent()
             forces = self._problem.lift()
             forces.axpy(1.0, self.F)
+        predicted = self._predict(x, self.F if forces is None else forces)
+        self._set_tangent(self._problem.tangent() if predicted or K is None else K)
+        self._fresh = forces is None or predicted
+        if forces is not None and not predicted:
             with self.statistics.phase("solve"):
                 self.snes.getKSP().solve(forces, x)
             x.scale(-1.0)
             self.iterations += 1
-            self._known = self._fresh = False
+            self._known = False
+        else:
+            x.copy(self._trial)
+            self._known = True
         with self.statistics.phase("solve"):
             self.snes.solve(None, x)
         reason = self.snes.getConvergedReason()
-        if self._failure is None and reason <= 0:
+        if self._failure is None and reason > 0:
+            self._judge(predicted)
+        elif self._failure is None:
             residual = self.residuals[-1] if self.residuals else np.nan
             if reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
                 why = "as a linear solve failed"
@@ -203,6 +220,29 @@ class NewtonSolver:
                 f"Newton's method stopped after {self.iterations} linear solves at a relative "
                 f"residual of {residual:.1e} ({why})"
             )
+
+    def _predict(self, x: PETSc.Vec, start: PETSc.Vec) -> bool:
+        """Move x from zero to the prediction unless its residual is too far above the start's."""
+        assert self.F is not None
+        guess = self._problem.prediction()
+        if guess is None:
+            return False
+        norm = start.norm()
+        if self._evaluate(guess) is None and self.F.norm() < self._kept * norm:
+            guess.copy(x)
+            self._risky = self.F.norm() >= norm
+            self.statistics.count("predictions")
+            return True
+        self.statistics.count("rejected_predictions")
+        self._evaluate(x)
+        return False
+
+    def _judge(self, predicted: bool) -> None:
+        """Keep only sure predictions from now on, if a doubtful one has saved no linear solve."""
+        if not predicted:
+            self._from_zero = self.iterations
+        elif self._risky and self.iterations >= self._from_zero:
+            self._kept = 1.0
 
     def _function(self, snes: PETSc.SNES, x: PETSc.Vec, F: PETSc.Vec) -> None:
         assert self.F is not None

@@ -160,6 +160,7 @@ def test_two_half_columns_are_one_column(case, material):
             density=case.density,
             body_force=(0.0, -10.0),
             bcs=bcs,
+            petsc_options={"snes_rtol": 1e-11},
         )
         problem.solve(steps=20)
         centres = scenes.gather(np.concatenate([b.initial_centroid for b in bodies]))
