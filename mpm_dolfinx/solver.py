@@ -319,6 +319,8 @@ class NewtonSolver:
             if self._symmetric:
                 self._P.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         ksp = self.snes.getKSP()
+        if ksp.getPC().getFailedReason():
+            ksp.getPC().reset()  # MUMPS does not factorise again where it failed
         ksp.setOperators(K, self._P)
         with self.statistics.phase("factorise"):
             ksp.setUp()

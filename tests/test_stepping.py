@@ -260,6 +260,34 @@ def test_failing_law_names_its_particles_and_the_run_can_go_on():
     assert float(value.value[0]) == 0.4
 
 
+class Overflowing(Hencky):
+    """A law whose tangent is not finite in one update."""
+
+    def __init__(self, young, poisson, when):
+        super().__init__(young, poisson)
+        self.calls, self.when = 0, when
+
+    def update(self, displacement_gradient, state, tangent=True):
+        answer = super().update(displacement_gradient, state, tangent)
+        self.calls += 1
+        if self.calls != self.when:
+            return answer
+        return answer._replace(tangent=np.full_like(answer.tangent, np.inf))
+
+
+@pytest.mark.parametrize("when", [1, 6])
+def test_a_factorisation_that_fails_is_not_the_end(when):
+    # The matrix of the next try is factorised anew, not in what is left of the failed factor.
+    problem, _ = pulled(Overflowing(1e3, 0.3, when))
+    problem.solve(steps=4)
+    assert problem.history.cutbacks == 1
+    assert problem.history.load[-1] == 1.0
+    whole, _ = pulled(Hencky(1e3, 0.3))
+    whole.solve(steps=8)
+    gap = problem.particles.displacement.x.array - whole.particles.displacement.x.array
+    assert scenes.largest(gap) < 1e-3
+
+
 def test_failed_step_leaves_the_next_one_as_if_it_had_not_been():
     # A try that fails after some iterations, then the same smaller step with and without it.
     runs = []
