@@ -31,7 +31,7 @@ from tqdm import tqdm
 from dolfinx import mesh
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx._compat import interpolation_points  # noqa: F401  (for demos)
+from mpm_dolfinx._compat import NonlinearProblem, interpolation_points  # noqa: F401 (for demos)
 
 comm = MPI.COMM_WORLD
 

@@ -76,7 +76,6 @@ import numpy as np
 
 import ufl
 from dolfinx import fem, mesh
-from dolfinx.fem.petsc import NonlinearProblem
 
 import mpm_dolfinx as mpm
 
@@ -167,7 +166,7 @@ def run(elements: int, shortening: float, steps: int):
     # Finite elements: a Function of the body's mesh.
     W = fem.functionspace(body, ("Lagrange", 1, (2,)))
     e, w = fem.Function(W), ufl.TestFunction(W)
-    fem_problem = NonlinearProblem(
+    fem_problem = tools.NonlinearProblem(
         ufl.derivative(energy(e), e, w),
         e,
         petsc_options_prefix="fem_",

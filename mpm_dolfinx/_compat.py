@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from inspect import signature
 from typing import Any
 
 from mpi4py import MPI  # (before DOLFINx: the wheel finds its MPI library by it)
@@ -28,6 +30,7 @@ from dolfinx import fem, geometry, la, mesh
 from dolfinx.fem import petsc as fem_petsc
 
 __all__ = [
+    "NonlinearProblem",
     "candidate_cells",
     "cell_tree",
     "create_vector",
@@ -172,3 +175,52 @@ def use_basic_line_search(snes: PETSc.SNES) -> None:
         options[option] = "basic"
         snes.setFromOptions()
         options.delValue(option)
+
+
+class _NonlinearProblem:
+    """``dolfinx.fem.petsc.NonlinearProblem`` as it is since 0.10, by Newton's method of 0.9.
+
+    Takes ``snes_rtol`` alone of the PETSc options, as a bound of the increment.
+    """
+
+    def __init__(
+        self,
+        F: ufl.Form,
+        u: fem.Function,
+        bcs: Sequence[fem.DirichletBC] = (),
+        J: ufl.Form | None = None,
+        petsc_options_prefix: str = "",
+        petsc_options: dict[str, Any] | None = None,
+    ) -> None:
+        from dolfinx.nls.petsc import NewtonSolver
+
+        old: Any = fem_petsc.NonlinearProblem
+        self._u = u
+        self._newton = NewtonSolver(u.function_space.mesh.comm, old(F, u, list(bcs), J))
+        self._newton.convergence_criterion = "incremental"
+        self._newton.rtol = self._newton.atol = (petsc_options or {}).get("snes_rtol", 1e-9)
+        self._newton.error_on_nonconvergence = False
+        self._reason = 0
+
+    @property
+    def solver(self) -> _NonlinearProblem:
+        """What tells whether the last solve converged."""
+        return self
+
+    def getConvergedReason(self) -> int:
+        """Return a positive number where the last solve converged."""
+        return self._reason
+
+    def solve(self) -> fem.Function:
+        """Solve from the present values on."""
+        converged = self._newton.solve(self._u)[1]
+        self._reason = 1 if converged else -1
+        return self._u
+
+
+#: DOLFINx's nonlinear problem, for comparisons with finite elements.
+NonlinearProblem: Any = (
+    fem_petsc.NonlinearProblem
+    if "petsc_options_prefix" in signature(fem_petsc.NonlinearProblem).parameters
+    else _NonlinearProblem
+)

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Problems written in UFL, against stock finite elements and dense algebra."""
 
-from inspect import signature
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +11,7 @@ from scenes import PLANE, QUADRILATERAL, TRIANGLE, WORLD
 
 import ufl
 from dolfinx import fem
-from dolfinx.fem.petsc import NonlinearProblem, assemble_matrix
+from dolfinx.fem.petsc import assemble_matrix
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import _compat
@@ -57,19 +56,11 @@ def finite_elements(particles, residual, bcs, J=None):
     d = fem.Function(W)
     F = residual(d, ufl.TestFunction(W))
     tangent = None if J is None else J(d, ufl.TestFunction(W), ufl.TrialFunction(W))
-    if "petsc_options_prefix" in signature(NonlinearProblem).parameters:
-        problem = NonlinearProblem(
-            F, d, bcs=bcs(W), J=tangent, petsc_options_prefix="fem_", petsc_options=FEM_OPTIONS
-        )
-        problem.solve()
-        assert problem.solver.getConvergedReason() > 0
-    else:  # DOLFINx 0.9
-        from dolfinx.nls.petsc import NewtonSolver
-
-        solver = NewtonSolver(W.mesh.comm, NonlinearProblem(F, d, bcs=bcs(W), J=tangent))
-        solver.convergence_criterion = "incremental"
-        solver.rtol = solver.atol = 1e-11
-        solver.solve(d)
+    problem = _compat.NonlinearProblem(
+        F, d, bcs=bcs(W), J=tangent, petsc_options_prefix="fem_", petsc_options=FEM_OPTIONS
+    )
+    problem.solve()
+    assert problem.solver.getConvergedReason() > 0
     return d
 
 
