@@ -69,6 +69,7 @@ parser.add_argument(
     "--particles-per-cell", type=tools.whole, default=3, help="quadrilaterals, each way"
 )
 parser.add_f_bar()
+parser.add_order()
 parser.add_argument("--steps", type=tools.whole, default=40, help="load steps")
 args = parser.parse()
 
@@ -83,7 +84,7 @@ density, gravity = 1000.0, 10.0  # kg/m3, m/s2
 h = args.cell
 cells = [ceil(16.0 / h), ceil(9.0 / h)]
 background = tools.box([cells[0] * h, cells[1] * h], cells, mesh.CellType.quadrilateral)
-V = fem.functionspace(background, ("Lagrange", 1, (2,)))
+V = fem.functionspace(background, ("Lagrange", args.degree, (2,)))
 along = max(1, round(size / h * args.particles_per_cell))
 body = tools.box([size, size], [along, along], tools.DOMAINS[args.domain])
 
@@ -93,7 +94,7 @@ for axis in (0, 1):
     dofs = fem.locate_dofs_topological(V.sub(axis), 1, facets)
     bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
 
-particles = mpm.Particles(body, V, quadrature_degree=tools.rule(args))
+particles = mpm.Particles(body, V, **tools.order(args))
 problem = mpm.QuasiStaticProblem(
     particles,
     mpm.materials.VonMises(young, poisson, rho_y=rho_y),
@@ -102,6 +103,7 @@ problem = mpm.QuasiStaticProblem(
     bcs=bcs,
     f_bar=args.f_bar,
     petsc_options_prefix="collapse_",
+    stabilisation=tools.stabilisation(args),
 )
 
 # What is watched is the top of the plane of symmetry and the toe, two nodes of the body.

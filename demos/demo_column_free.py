@@ -96,6 +96,7 @@ parser.add_argument(
 )
 parser.add_argument("--plain-solver", action="store_true", help="no shift, no line search")
 parser.add_f_bar()
+parser.add_order()
 args = parser.parse()
 
 comm = MPI.COMM_WORLD
@@ -132,7 +133,7 @@ def collapse(g0: float):
         cells,
         mesh.CellType.quadrilateral,
     )
-    V = fem.functionspace(background, ("Lagrange", 1, (2,)))
+    V = fem.functionspace(background, ("Lagrange", args.degree, (2,)))
     body = mesh.create_rectangle(
         comm,
         [[0.0, 0.0], [width, height]],
@@ -149,7 +150,7 @@ def collapse(g0: float):
     ]
 
     particles = mpm.Particles(
-        body, V, method="cpdi2", quadrature_degree=tools.rule(args), outside=args.outside
+        body, V, method="cpdi2", outside=args.outside, **tools.order(args)
     )
     problem = mpm.QuasiStaticProblem(
         particles,
@@ -159,6 +160,7 @@ def collapse(g0: float):
         bcs=bcs,
         petsc_options_prefix="collapse_",
         f_bar=args.f_bar,
+        stabilisation=tools.stabilisation(args),
         **({"shift": 0.0, "line_search": False} if args.plain_solver else {}),
     )
 

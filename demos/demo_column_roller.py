@@ -112,6 +112,7 @@ parser.add_argument(
     "--particles-per-cell", type=tools.whole, default=2, help="domains, each way in a cell"
 )
 parser.add_f_bar()
+parser.add_order()
 args = parser.parse()
 
 comm = MPI.COMM_WORLD
@@ -128,7 +129,7 @@ upper = [width] * up + [height]
 background = tools.box(
     upper, [1] * up + [args.elements], tools.DOMAINS["hex" if dim == 3 else "quad"]
 )
-V = fem.functionspace(background, ("Lagrange", 1, (dim,)))
+V = fem.functionspace(background, ("Lagrange", args.degree, (dim,)))
 each = args.particles_per_cell
 body = tools.box(upper, [each] * up + [each * args.elements], tools.DOMAINS[args.domain])
 
@@ -144,7 +145,7 @@ for axis in range(dim):
     dofs = fem.locate_dofs_topological(V.sub(axis), up, facets)
     bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
 
-particles = mpm.Particles(body, V, method=args.method, quadrature_degree=tools.rule(args))
+particles = mpm.Particles(body, V, method=args.method, **tools.order(args))
 law = mpm.materials.SmallStrainVonMises if args.small_strain else mpm.materials.VonMises
 problem = mpm.QuasiStaticProblem(
     particles,
@@ -154,6 +155,7 @@ problem = mpm.QuasiStaticProblem(
     bcs=bcs,
     f_bar=args.f_bar,
     petsc_options_prefix="roller_",
+    stabilisation=tools.stabilisation(args),
 )
 
 # `steps` hands out each converged step. After each, the yield function (1) is looked at: by how

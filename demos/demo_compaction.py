@@ -101,6 +101,7 @@ parser.add_argument("--domain", choices=tuple(tools.DOMAINS), default="quad", he
 parser.add_argument("--method", choices=tools.METHODS, default="cpdi2", help="rows of T")
 parser.add_argument("--young", type=tools.positive, default=1e4, help="Young's modulus")
 parser.add_argument("--steps", type=tools.whole, default=40, help="load steps")
+parser.add_order()
 args = parser.parse()
 
 comm = MPI.COMM_WORLD
@@ -121,7 +122,7 @@ def column(elements: int) -> tuple[mpm.Particles, mpm.QuasiStaticProblem]:
     upper = [width] * up + [height]
     grid = tools.DOMAINS["hex" if dim == 3 else "quad"]
     background = tools.box(upper, [1] * up + [elements], grid)
-    V = fem.functionspace(background, ("Lagrange", 1, (dim,)))
+    V = fem.functionspace(background, ("Lagrange", args.degree, (dim,)))
     body = tools.box(upper, [2] * up + [2 * elements], tools.DOMAINS[args.domain])
 
     bcs = []
@@ -133,7 +134,7 @@ def column(elements: int) -> tuple[mpm.Particles, mpm.QuasiStaticProblem]:
         dofs = fem.locate_dofs_topological(V.sub(axis), up, facets)
         bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
 
-    particles = mpm.Particles(body, V, method=args.method)
+    particles = mpm.Particles(body, V, method=args.method, **tools.order(args))
     problem = mpm.QuasiStaticProblem(
         particles,
         mpm.materials.Hencky(young, poisson),
@@ -141,6 +142,7 @@ def column(elements: int) -> tuple[mpm.Particles, mpm.QuasiStaticProblem]:
         body_force=(0.0,) * up + (-gravity,),
         bcs=bcs,
         petsc_options_prefix="compaction_",
+        stabilisation=tools.stabilisation(args),
     )
     return particles, problem
 

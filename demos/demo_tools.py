@@ -60,6 +60,26 @@ class Parser(argparse.ArgumentParser):
         )
         self.add_argument("--f-bar", choices=F_BARS, default=default, help="average of volume")
 
+    def add_order(self) -> None:
+        """The options of the degrees of background and domains."""
+        degrees = (1, 2, 3)
+        self.add_argument(
+            "--degree", type=int, choices=degrees, default=1, help="of the background"
+        )
+        self.add_argument(
+            "--domain-degree", type=int, choices=degrees, help="of the domains; the same by default"
+        )
+        if "--quadrature-degree" not in self._option_string_actions:
+            self.add_argument(
+                "--quadrature-degree", type=whole, help="of the domains' rule; by their degree"
+            )
+        self.add_argument(
+            "--stabilisation",
+            choices=("auto", "ghost", "aggregate", "none"),
+            default="auto",
+            help="of badly supported dofs",
+        )
+
     def _print_message(self, message: str, file: Any = None) -> None:
         if comm.rank == 0:
             super()._print_message(message, file)
@@ -96,7 +116,19 @@ def positive(text: str) -> float:
 def rule(args: argparse.Namespace) -> int | None:
     """The degree of the domains' rule; an average over a domain's points needs several."""
     given: int | None = args.quadrature_degree
-    return 2 if given is None and args.f_bar == "domain" else given
+    few = (args.domain_degree or args.degree) == 1
+    averaged = getattr(args, "f_bar", "none") == "domain"
+    return 2 if given is None and few and averaged else given
+
+
+def order(args: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of `mpm.Particles` for the degree of the domains and their rule."""
+    return {"degree": args.domain_degree or args.degree, "quadrature_degree": rule(args)}
+
+
+def stabilisation(args: argparse.Namespace) -> str | None:
+    """What a problem does about badly supported dofs."""
+    return None if args.stabilisation == "none" else args.stabilisation
 
 
 DOMAINS = {

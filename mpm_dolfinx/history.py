@@ -24,6 +24,8 @@ COUNTERS = (
     "halvings",
     "converged_at_round_off",
     "workspace_retries",
+    "ghost_facets",
+    "aggregated_dofs",
     "lost_particles",
     "lost_volume",
     "lost_mass",
@@ -39,7 +41,9 @@ class Statistics(dict[str, float]):
     ``factorisations``, ``predictions`` (steps that began at the extrapolated increment) and
     ``rejected_predictions``, ``halvings`` (of Newton steps by the line search),
     ``converged_at_round_off`` (steps that ended at the floor of round-off),
-    ``workspace_retries`` (factorisations that MUMPS repeated with more workspace) and
+    ``workspace_retries`` (factorisations that MUMPS repeated with more workspace),
+    ``ghost_facets`` and ``aggregated_dofs`` (facets with a ghost penalty, and dofs that follow
+    others, in the last step) and
     ``lost_particles``, ``lost_volume`` (undeformed) and ``lost_mass`` (0 where no density is
     known), the sums over ``history.losses``.
     """

@@ -36,12 +36,21 @@ class PointBasis(NamedTuple):
         values: Their values at the points, zero where below 1e-13, shape ``(n, k)``.
         found: Whether a background cell holds the point, shape ``(n,)``.
         gradients: Their gradients, shape ``(n, k, gdim)``, where asked for.
+        cell: The cell, a local number on the rank that owns it, shape ``(n,)``; ``None`` where
+            values are of several cells.
+        rank: That rank, shape ``(n,)``.
     """
 
     nodes: NDArray[np.int64]
     values: NDArray[np.float64]
     found: NDArray[np.bool_]
     gradients: NDArray[np.float64] | None = None
+    cell: NDArray[np.int64] | None = None
+    rank: NDArray[np.int64] | None = None
+
+    def part(self, count: int) -> PointBasis:
+        """Return what is known of the first points."""
+        return PointBasis._make(None if a is None else a[:count] for a in self)
 
 
 class _Cells:
@@ -313,8 +322,7 @@ class BackgroundBasis:
             Nodes, values and whether a cell was found.
         """
         if self._comm.size == 1:
-            answer = self._evaluate(points, gradients)
-            return PointBasis(answer.nodes, answer.values, answer.found, answer.gradients)
+            return self._evaluate(points, gradients).basis(np.zeros(len(points), np.int64))
         inside = np.all(
             (points[None] >= self._boxes[:, None, 0]) & (points[None] <= self._boxes[:, None, 1]),
             axis=2,
@@ -333,13 +341,16 @@ class BackgroundBasis:
             np.zeros((n, k, points.shape[1])) if gradients else None,
             np.full(n, np.inf),
             np.zeros(n, dtype=np.int64),
+            np.zeros(n, dtype=np.int64),
         )
-        for index, reply in zip(asked, replies, strict=True):
+        rank = np.zeros(n, dtype=np.int64)
+        for source, (index, reply) in enumerate(zip(asked, replies, strict=True)):
             better = (reply.violation < result.violation[index]) | (
                 (reply.violation == result.violation[index]) & (reply.cell < result.cell[index])
             )
             result.take(index[better], reply.part(better))
-        return PointBasis(result.nodes, result.values, result.found, result.gradients)
+            rank[index[better]] = source
+        return result.basis(rank)
 
     def _evaluate(self, points: NDArray[np.float64], gradients: bool) -> _Answer:
         cell, reference, violation = self._cells.locate(points)
@@ -347,7 +358,7 @@ class BackgroundBasis:
         if n == 0 or self._cells.tree is None:
             slopes = np.zeros((n, k, points.shape[1])) if gradients else None
             nodes = np.zeros((n, k), np.int64)
-            return _Answer(nodes, np.zeros((n, k)), slopes, violation, cell)
+            return _Answer(nodes, np.zeros((n, k)), slopes, violation, cell, cell)
         reference = self._cells.clip(reference)
         table = self._basis.tabulate(int(gradients), reference)[:, :, :, 0]
         found = (violation <= TOLERANCE)[:, None]
@@ -358,17 +369,25 @@ class BackgroundBasis:
             slopes = np.einsum("jpk,pji->pki", table[1:], np.linalg.inv(jacobian))
             slopes = np.where(found[:, :, None], slopes, 0.0)
         nodes = self._map.local_to_global(self._dofs[cell].ravel()).reshape(-1, k)
-        return _Answer(nodes, values, slopes, violation, self._cells.index[cell])
+        return _Answer(nodes, values, slopes, violation, self._cells.index[cell], cell)
 
 
 class _Answer(NamedTuple):
-    """Basis functions at points, how far outside the best cell they are, and its input index."""
+    """Basis functions at points, how far outside the best cell they are, and its numbers.
+
+    ``cell`` is its input index, ``home`` its local number on the rank that answers.
+    """
 
     nodes: NDArray[np.int64]
     values: NDArray[np.float64]
     gradients: NDArray[np.float64] | None
     violation: NDArray[np.float64]
     cell: NDArray[np.int64]
+    home: NDArray[np.int64]
+
+    def basis(self, rank: NDArray[np.int64]) -> PointBasis:
+        """Return what is known of the points, with the rank that each answer is of."""
+        return PointBasis(self.nodes, self.values, self.found, self.gradients, self.home, rank)
 
     @property
     def found(self) -> NDArray[np.bool_]:

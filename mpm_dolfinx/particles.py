@@ -19,7 +19,7 @@ from dolfinx import fem, mesh
 from . import _compat
 from .deletion import Deletion, without_deleted
 from .errors import DomainDistortionError, MPMError, ParticleOutsideError, agree
-from .location import BackgroundBasis
+from .location import BackgroundBasis, PointBasis
 from .methods import (
     BOX_CELLS,
     BoxGrid,
@@ -32,7 +32,13 @@ from .methods import (
     mpm,
     require_boxes,
 )
-from .quadrature import DomainQuadrature, exact_degree, quadrature_element, quadrature_rule
+from .quadrature import (
+    DomainQuadrature,
+    default_degree,
+    exact_degree,
+    quadrature_element,
+    quadrature_rule,
+)
 from .transfer import Weights, active_nodes, domain_weights, sum_by_particle, transfer_matrix
 from .validation import validate_options, validate_spaces
 
@@ -115,7 +121,9 @@ class Particles:
         self.displacement = fem.Function(self.W, name="displacement")
         self.increment = fem.Function(V, name="increment")
         self.load = fem.Constant(body, 0.0)
-        self._degree = quadrature_degree if quadrature_degree is not None else 2 * degree - 1
+        self._degree = (
+            default_degree(cell.name, degree) if quadrature_degree is None else quadrature_degree
+        )
         self._exact_degree = exact_degree(cell.name, degree)
         self.dx = self._measure(self._degree)
         self.dx_exact = self._measure(self._exact_degree)
@@ -372,6 +380,28 @@ class Particles:
             self._exact_degree,
         )
 
+    @property
+    def node_basis(self) -> PointBasis:
+        """The background basis at the local nodes of W, at the last converged positions."""
+        return self._rows.basis
+
+    @property
+    def background_basis(self) -> BackgroundBasis:
+        """What evaluates the basis of V at points."""
+        return self._background
+
+    def quadrature_points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return positions ``(n nq, gdim)`` and volumes ``(n nq,)`` of the history's points.
+
+        They are those of the last converged step, without deleted particles.
+        """
+        there = ~self.deleted
+        nodal = self._nodes[self.domain_nodes] + self._of_domains(self._converged)
+        points = np.einsum("qk,nki->nqi", self.quadrature.shapes, nodal[there])
+        jacobian = np.linalg.det(np.eye(self._gdim) + self._converged_gradient()[there])
+        volumes = self.quadrature.weights[there] * jacobian
+        return points.reshape(-1, self._gdim), volumes.ravel()
+
     def quadrature_function(self, name: str, shape: tuple[int, ...] = ()) -> fem.Function:
         """Return a Function for data at the history's points, to be injected into a form.
 
@@ -550,6 +580,8 @@ class Particles:
         and part of it is inverted. Other domains cannot cross without ``det F <= 0``.
         """
         if self.mesh.basix_cell() != basix.CellType.quadrilateral or self.method != "cpdi2":
+            return self.global_index[:0]
+        if self._shape_functions.degree > 1:
             return self.global_index[:0]
         inwards = (self._corner_jacobians() <= 0.0).sum(axis=1)
         return np.asarray(self.global_index[inwards >= 2])

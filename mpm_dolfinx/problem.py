@@ -35,6 +35,7 @@ from .particles import Particles
 from .predictor import Predictor
 from .reduced import Body, ReducedSystem
 from .solver import NewtonSolver, weakly
+from .stabilisation import stabilisation_of
 from .stepping import StepControl
 
 __all__ = ["ParticleProblem"]
@@ -67,6 +68,9 @@ class ParticleProblem:
             reduce the residual.
         predictor: Whether Newton's method starts from the last increments extrapolated, where
             the residual there is not above twice that of a start from zero.
+        stabilisation: What is done about background dofs that the body supports badly:
+            ``"ghost"`` penalty, ``"aggregate"``, ``None``, or ``"auto"``, a ghost penalty for
+            backgrounds of degree 2 or more where a cut is small.
 
     Attributes:
         particles: The body or bodies, as given.
@@ -95,6 +99,7 @@ class ParticleProblem:
         shift: float = 1e-13,
         line_search: bool = True,
         predictor: bool = True,
+        stabilisation: str | None = "auto",
     ) -> None:
         if not isinstance(shift, float | int) or not 0.0 <= shift < 1.0:
             raise MPMError(f"shift must be at least 0 and below 1, not {shift!r}.")
@@ -127,7 +132,15 @@ class ParticleProblem:
         statistics = self.history.statistics
         evaluate = weakly(self.evaluate)
         past = Predictor() if predictor else None
-        self.reduced = ReducedSystem(self.shares, terms, self.bcs, evaluate, statistics, past)
+        self.reduced = ReducedSystem(
+            self.shares,
+            terms,
+            self.bcs,
+            evaluate,
+            statistics,
+            past,
+            stabilisation_of(stabilisation, self.bodies),
+        )
         self._newton = NewtonSolver(
             self._comm,
             petsc_options_prefix,

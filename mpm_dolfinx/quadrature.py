@@ -23,6 +23,7 @@ from .errors import MPMError
 
 __all__ = [
     "DomainQuadrature",
+    "default_degree",
     "depends_on",
     "exact_degree",
     "follows",
@@ -42,6 +43,22 @@ def exact_degree(cell: str, degree: int) -> int:
         Twice the degree, plus that of the Jacobian determinant where the map is not affine.
     """
     return 2 * degree + {"quadrilateral": 1, "hexahedron": 2}.get(cell, 0)
+
+
+def default_degree(cell: str, degree: int) -> int:
+    """Return the degree of the rule that carries the history by default.
+
+    It is the smallest that sees all strains of a domain and keeps the order: degree^dim Gauss
+    points on quadrilaterals and hexahedra (one for degree 1: CPDI2 as published), and on
+    triangles 1, 3, 6, on tetrahedra 1, 4, 14 points for the degrees 1, 2, 3.
+
+    Args:
+        cell: Name of the cell type.
+        degree: Degree of the shape functions.
+    """
+    if degree == 1 or cell in ("quadrilateral", "hexahedron"):
+        return 2 * degree - 1
+    return 2 * degree - 2
 
 
 def quadrature_rule(

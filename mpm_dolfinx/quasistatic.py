@@ -65,7 +65,7 @@ class QuasiStaticProblem(ParticleProblem):
         shift: As in :class:`ParticleProblem`.
         line_search: As in :class:`ParticleProblem`.
         predictor: As in :class:`ParticleProblem`.
-        **options: ``form_compiler_options`` and ``jit_options``.
+        **options: ``stabilisation``, ``form_compiler_options`` and ``jit_options``, as there.
 
     Raises:
         MPMError: Materials, loads or conditions that do not go together.

@@ -19,6 +19,7 @@ from .errors import DomainDistortionError, MPMError, agreed
 from .history import Statistics
 from .particles import Particles
 from .predictor import Predictor, map_to_background
+from .stabilisation import Aggregation, GhostPenalty
 
 __all__ = ["Body", "ReducedSystem"]
 
@@ -40,9 +41,11 @@ class Body:
         self._free_T: PETSc.Mat | None = None
         self._product: PETSc.Mat | None = None
 
-    def restrict(self, columns: PETSc.IS) -> None:
-        """Take the transfer's columns at the free dofs."""
+    def restrict(self, columns: PETSc.IS, extension: PETSc.Mat | None = None) -> None:
+        """Take the columns at the free dofs of the transfer, or of ``T E`` with an extension."""
         T = self.particles.T
+        if extension is not None:
+            T = T.matMult(extension)
         first, last = T.getOwnershipRange()
         rows = PETSc.IS().createStride(last - first, first, step=1, comm=T.comm)
         self._free_T = T.createSubMatrix(rows, columns)
@@ -88,6 +91,24 @@ class Body:
         self._work.array_w[:] = self.particles.node_positions.ravel()[:rows]
         return float(self._work.norm())
 
+    def shear_modulus(self) -> float:
+        """Return the stiffness of the body to simple shear: its mean at the present state.
+
+        It is the smallest positive energy ``g : C : g`` over uniform gradients g with one entry,
+        for an isotropic elastic body its shear modulus, or the mean of it.
+        """
+        particles, u = self.particles, self.particles.T.createVecRight()
+        gdim = particles.mesh.geometry.dim
+        x = particles.V.tabulate_dof_coordinates()[: u.getLocalSize() // gdim, :gdim]
+        volume = particles.mesh.comm.allreduce(float(particles.initial_volume.sum()))
+        energies = []
+        for i, j in np.ndindex(gdim, gdim):
+            u.set(0.0)
+            u.array_w.reshape(-1, gdim)[:, i] = x[:, j]
+            force = self.stiffness_force(u)
+            energies.append(force.dot(self._work) / volume)
+        return min((energy for energy in energies if energy > 0.0), default=0.0)
+
     def nodal_size(self, force: PETSc.Vec) -> NDArray[np.float64]:
         """Return the size of ``T f`` at this rank's nodes."""
         self.particles.T.mult(force, self._work)
@@ -106,6 +127,11 @@ class ReducedSystem:
         evaluate: What the forms need before each assembly; may return a failure.
         statistics: Where to count.
         predictor: Says what increment to expect; ``None`` for none.
+        stabilisation: What is done about badly supported dofs.
+
+    Attributes:
+        moduli: Shear moduli of the bodies before their first step, by which a ghost penalty is
+            scaled; ``None`` where they are not known yet.
     """
 
     def __init__(
@@ -116,8 +142,13 @@ class ReducedSystem:
         evaluate: Callable[[], MPMError | None],
         statistics: Statistics,
         predictor: Predictor | None = None,
+        stabilisation: GhostPenalty | Aggregation | None = None,
     ) -> None:
         self.predictor = predictor
+        self._stabilisation = stabilisation
+        self.moduli: list[float] | None = None
+        self._extension: PETSc.Mat | None = None
+        self._ghost: tuple[PETSc.Mat, PETSc.Mat] | None = None
         self._bodies = list(bodies)
         self._background = background
         self._bcs = bcs
@@ -174,8 +205,13 @@ class ReducedSystem:
     def _find_free_dofs(self) -> None:
         """Free are dofs with weight or a background term, and without a condition."""
         free = np.zeros(self._owned, dtype=bool)
+        active = np.zeros(self._owned // self._bs, dtype=bool)
         for body in self._bodies:
-            free.reshape(-1, self._bs)[body.particles.active_nodes] = True
+            active[body.particles.active_nodes] = True
+        if self._stabilisation is not None:
+            self._stabilisation.update(self._statistics)
+            active = self._stabilisation.unknowns(active)
+        free.reshape(-1, self._bs)[active] = True
         if self._background is not None:
             free[self._background.support()] = True
         self._fixed = np.zeros(self._owned, dtype=bool)
@@ -190,9 +226,11 @@ class ReducedSystem:
         self._u = T.createVecRight()
         self._force = T.createVecRight()
         self._part = T.createVecRight()
-        self._total = None
+        self._total = self._ghost = None
+        if isinstance(self._stabilisation, Aggregation):
+            self._extension = self._stabilisation.extension(self._fixed)
         for body in self._bodies:
-            body.restrict(self._columns)
+            body.restrict(self._columns, self._extension)
         self._statistics.count("transfers")
         self._statistics["free_dofs"] = self.sizes[1]
 
@@ -208,6 +246,10 @@ class ReducedSystem:
         u = increments[0]
         u.array[: self._owned] = self._lifts() if self._imposed else 0.0
         u.array[self._free] = x.array_r
+        if self._extension is not None:
+            self._part.array_w[:] = u.array[: self._owned]
+            self._extension.mult(self._part, self._u)
+            u.array[: self._owned] = self._u.array_r
         u.scatter_forward()
         for other in increments[1:]:
             other.array[:] = u.array
@@ -225,6 +267,11 @@ class ReducedSystem:
             self._gather([body.forms.assemble_residual() for body in self._bodies])
             if self._background is not None:
                 self._force.axpy(1.0, self._background.assemble_residual())
+            if isinstance(self._stabilisation, GhostPenalty) and self._u.norm() > 0.0:
+                self._penalty(self._stabilisation)[0].multAdd(self._u, self._force, self._force)
+            if self._extension is not None:
+                self._extension.multTranspose(self._force, self._part)
+                self._part.copy(self._force)
         F.array_w[:] = self._force.array_r[self._free]
         return None
 
@@ -234,7 +281,11 @@ class ReducedSystem:
             parts = [body.tangent() for body in self._bodies]
             if self._background is not None:
                 whole = self._background.assemble_tangent()
+                if self._extension is not None:
+                    whole = whole.ptap(self._extension)
                 parts.append(whole.createSubMatrix(self._columns, self._columns))
+            if isinstance(self._stabilisation, GhostPenalty):
+                parts.append(self._penalty(self._stabilisation)[1])
             if len(parts) == 1:
                 return parts[0]
             if self._total is None:
@@ -259,6 +310,15 @@ class ReducedSystem:
         x.array_w[:] = u[self._free]
         return x
 
+    def _penalty(self, ghost: GhostPenalty) -> tuple[PETSc.Mat, PETSc.Mat]:
+        """Return the ghost penalty's matrix on all dofs and on the free ones."""
+        if self.moduli is None:
+            self.moduli = [body.shear_modulus() for body in self._bodies]
+        if self._ghost is None:
+            matrix = ghost.matrix(self.moduli)
+            self._ghost = matrix, matrix.createSubMatrix(self._columns, self._columns)
+        return self._ghost
+
     def impose(self) -> bool:
         """Impose the step's Dirichlet values from now on; return whether there are any."""
         self._imposed = True
@@ -270,12 +330,20 @@ class ReducedSystem:
     def lift(self) -> PETSc.Vec:
         """Return the linearised forces of the step's Dirichlet values on the free dofs."""
         self._u.array_w[:] = self._lifts()
+        if self._extension is not None:
+            self._extension.mult(self._u, self._part)
+            self._part.copy(self._u)
         self._part.set(0.0)
         if self._background is not None:
             self._background.assemble_tangent().mult(self._u, self._part)
         for body in self._bodies:
             force = body.stiffness_force(self._u)
             body.particles.T.multTransposeAdd(force, self._part, self._part)
+        if isinstance(self._stabilisation, GhostPenalty):
+            self._penalty(self._stabilisation)[0].multAdd(self._u, self._part, self._part)
+        if self._extension is not None:
+            self._extension.multTranspose(self._part, self._u)
+            self._u.copy(self._part)
         reduced = PETSc.Vec().createMPI(self.sizes, comm=self._comm)
         reduced.array_w[:] = self._part.array_r[self._free]
         return reduced

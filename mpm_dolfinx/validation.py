@@ -9,12 +9,12 @@ from typing import Any
 from dolfinx import fem, mesh
 
 from .errors import MPMError
-from .methods import METHODS
+from .methods import BOX_CELLS, METHODS
+from .quadrature import default_degree
 
 __all__ = ["validate_options", "validate_spaces"]
 
-#: Pairs (degree of the background, degree of the domains) that work.
-DEGREES = {(1, 1)}
+DEGREES = (1, 2, 3)
 
 
 def validate_spaces(body: Any, V: Any) -> None:
@@ -65,6 +65,28 @@ def validate_spaces(body: Any, V: Any) -> None:
         )
 
 
+def _validate_degrees(body: mesh.Mesh, background: int, domains: Any) -> None:
+    """Raise an error unless the degrees of background and domains are a good pair.
+
+    Domains of a lower degree than the background's lose its order; quadrilaterals and hexahedra
+    with one point also have modes without strain at any density (docs/high-order.md).
+    """
+    if background not in DEGREES:
+        raise MPMError(
+            f"The background has degree {background}; use "
+            f"{'1' if background < 1 else '3, the highest that is supported'}."
+        )
+    if not isinstance(domains, int) or domains not in DEGREES:
+        raise MPMError(f"The domains' degree must be 1, 2 or 3, not {domains!r}.")
+    if domains < background:
+        hourglass = domains == 1 and body.basix_cell() in BOX_CELLS
+        why = "leave modes without strain and lose its order" if hourglass else "lose its order"
+        raise MPMError(
+            f"Domains of degree {domains} on a background of degree {background} {why}; use "
+            f"degree={background}, or a background of degree {domains}."
+        )
+
+
 def validate_options(
     body: mesh.Mesh,
     V: fem.FunctionSpace,
@@ -78,21 +100,23 @@ def validate_options(
     element = V.ufl_element()
     if method not in METHODS:
         raise MPMError(f"Unknown method {method!r}; choose one of {', '.join(map(repr, METHODS))}.")
-    if (element.degree, degree) not in DEGREES:
+    _validate_degrees(body, element.degree, degree)
+    if method != "cpdi2" and (element.degree, degree, quadrature_degree or 1) != (1, 1, 1):
         raise MPMError(
-            f"Domains of degree {degree!r} on a background of degree {element.degree} are not "
-            "supported; use degree 1 on 1."
-        )
-    if method != "cpdi2" and (degree, quadrature_degree or 1) != (1, 1):
-        raise MPMError(
-            f"Method {method!r} has one quadrature point per domain of degree 1; use 'cpdi2' "
-            "for others."
+            f"Method {method!r} has one quadrature point per domain of degree 1, on a background "
+            "of degree 1; use 'cpdi2' for others."
         )
     if quadrature_degree is not None and (
         not isinstance(quadrature_degree, int) or quadrature_degree < 0
     ):
         raise MPMError(
             f"quadrature_degree must be a whole number from 0 on, not {quadrature_degree!r}."
+        )
+    if quadrature_degree is not None and degree > 1 and quadrature_degree < 2 * degree - 2:
+        raise MPMError(
+            f"A rule of degree {quadrature_degree} does not see all strains of a domain of degree "
+            f"{degree}; use quadrature_degree={default_degree(body.basix_cell().name, degree)} "
+            "or more."
         )
     if outside not in ("error", "stop", "delete"):
         raise MPMError(f"Unknown policy outside={outside!r}; choose 'error', 'stop' or 'delete'.")
