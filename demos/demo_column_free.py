@@ -149,9 +149,7 @@ def collapse(g0: float):
         fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(1), 1, base), V.sub(1)),
     ]
 
-    particles = mpm.Particles(
-        body, V, method="cpdi2", outside=args.outside, **tools.order(args)
-    )
+    particles = mpm.Particles(body, V, method="cpdi2", outside=args.outside, **tools.order(args))
     problem = mpm.QuasiStaticProblem(
         particles,
         mpm.materials.VonMises(young, poisson, rho_y=rho_y),

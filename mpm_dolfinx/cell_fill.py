@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 import basix
 import basix.ufl
-from dolfinx import fem
+from dolfinx import fem, la
 
 from . import _compat
 from .location import PointBasis
 from .particles import Particles
 
-__all__ = ["CellPairs", "CellFill"]
+__all__ = ["CellFill", "CellPairs"]
 
 
 class CellPairs:
@@ -126,11 +126,12 @@ class CellFill(NamedTuple):
     active: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, bodies: Sequence[Particles], count: int) -> Support:
+    def of(cls, bodies: Sequence[Particles], count: int) -> CellFill:
         """Look at bodies at their last converged positions (collective).
 
-        The volume is that of the history's quadrature points in the cell; a body that reaches
-        into a cell with nodes alone, a sliver, leaves the fill zero.
+        The volume is that of the history's quadrature points in the cell. A body may also
+        reach into a cell with nodes alone, a sliver: the fill is zero then, but nodes of the
+        cell have weight that belong to no filled cell.
 
         Args:
             bodies: The bodies.
@@ -139,16 +140,25 @@ class CellFill(NamedTuple):
         V = bodies[0].V
         comm: MPI.Comm = V.mesh.comm
         volume = np.zeros((count, len(bodies)))
-        active = np.zeros(count, dtype=bool)
+        used = np.zeros(count, dtype=np.uint64)
+        bit = np.uint64(1) << np.arange(V.dofmap.list.shape[1], dtype=np.uint64)
         for number, body in enumerate(bodies):
             points, volumes = body.quadrature_points()
             at = body.background_basis.at(points)
             for cells, values in _sent(comm, at, at.found, volumes):
                 np.add.at(volume[:, number], cells, values)
             rows = body.node_basis.part(body.W.dofmap.index_map.size_local)
-            for cells, _ in _sent(comm, rows, _inside(V, rows.values) & rows.found, rows.found):
-                active[cells] = True
-        active |= volume.any(axis=1)
+            bits = ((rows.values != 0.0) * bit).sum(axis=1, dtype=np.uint64)
+            for cells, values in _sent(comm, rows, rows.found, bits):
+                np.bitwise_or.at(used, cells, values)
+        filled = volume.any(axis=1)
+        own = V.dofmap.list[:count]
+        known = la.vector(V.dofmap.index_map)
+        known.array[own[filled]] = 1.0
+        known.scatter_reverse(la.InsertMode.add)
+        known.scatter_forward()
+        alone = ((known.array[own] == 0.0) * bit).sum(axis=1, dtype=np.uint64)
+        active = filled | ((used & alone) != 0)
         return cls(volume / _cell_volumes(V, count)[:, None], active)
 
 
@@ -159,16 +169,6 @@ def _sent(
     assert at.cell is not None and at.rank is not None
     chosen = [which & (at.rank == r) for r in range(comm.size)]
     return comm.alltoall([(at.cell[pick], values[pick]) for pick in chosen])
-
-
-def _inside(V: fem.FunctionSpace, values: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which points are in a cell and on none of its facets, by its basis there."""
-    element = V.ufl_element().basix_element
-    facets = element.entity_closure_dofs[V.mesh.topology.dim - 1]
-    off = np.ones((element.dim, len(facets)))
-    for number, dofs in enumerate(facets):
-        off[dofs, number] = 0.0
-    return np.asarray(((values != 0.0).astype(float) @ off > 0.0).all(axis=1))
 
 
 def _cell_volumes(V: fem.FunctionSpace, count: int) -> NDArray[np.float64]:

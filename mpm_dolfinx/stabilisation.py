@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
+from .cell_fill import CellFill, CellPairs
 from .errors import MPMError
 from .extension import CellPolynomials
 from .history import Statistics
 from .particles import Particles
-from .cell_fill import CellFill, CellPairs
 
 __all__ = ["Aggregation", "GhostPenalty", "stabilisation_of"]
 
