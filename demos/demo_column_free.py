@@ -7,7 +7,8 @@
 # - follow a body to deformations that no mesh of it would survive as an updated one,
 # - choose between triangular and quadrilateral particle domains,
 # - let the load step be cut back, and take a run that stops for what it is,
-# - see what a singular transfer does to Newton's method, and what cures it.
+# - see what a singular transfer does to Newton's method, and what cures it,
+# - save each step, and go on from there when a run was interrupted.
 #
 # The pictures are figures 4 and 5 of Wang, Coombs, Augarde and Brown, *Implicit MPM with
 # second-order convected particle domain interpolation*. There, a column of quadrilateral domains
@@ -63,6 +64,7 @@
 # ## Implementation
 
 from math import ceil
+from pathlib import Path
 
 from mpi4py import MPI
 
@@ -97,7 +99,11 @@ parser.add_argument(
 parser.add_argument("--plain-solver", action="store_true", help="no shift, no line search")
 parser.add_f_bar()
 parser.add_order()
+parser.add_argument("--checkpoint", metavar="FILE", help="save each step (a file for each load)")
+parser.add_argument("--resume", action="store_true", help="go on from the checkpoint, if any")
 args = parser.parse()
+if args.resume and not args.checkpoint:
+    parser.error("argument --resume: needs --checkpoint FILE")
 
 comm = MPI.COMM_WORLD
 width, height = 4.0, 8.0  # m
@@ -118,6 +124,16 @@ def reach(g0: float) -> float:
         if g0 <= limit:
             return size
     return 128.0 * g0 / 160e3
+
+
+# With several loads each has its checkpoint, with the load in the name.
+
+
+def checkpoint_of(g0: float) -> Path | None:
+    if args.checkpoint is None:
+        return None
+    path = Path(args.checkpoint)
+    return path if len(args.g0) == 1 else path.with_stem(f"{path.stem}_{g0 / 1e3:g}")
 
 
 # One run. A step that fails is halved and tried again; if the smallest step fails too, the package
@@ -162,13 +178,23 @@ def collapse(g0: float):
         **({"shift": 0.0, "line_search": False} if args.plain_solver else {}),
     )
 
-    yield_violation, failure = -np.inf, None
+    # What each particle's yield function has been at most is no part of the package's state, so
+    # it goes into the checkpoint as a Function of ours.
+    violation = fem.Function(fem.functionspace(body, ("DG", 0)), name="violation")
+    most = violation.x.array[: particles.num_local]
+    most[:] = -np.inf
+    checkpoint = checkpoint_of(g0)
+    failure = None
     try:
+        if args.resume and comm.bcast(checkpoint.exists()):
+            problem.restore(checkpoint, functions=[violation])
         for _ in tools.progress(problem.steps(args.steps), args.steps, args):
-            yield_violation = max(yield_violation, tools.largest(problem.yield_function))
+            np.maximum(most, problem.yield_function, out=most)
+            if checkpoint is not None:
+                problem.save(checkpoint, functions=[violation])
     except mpm.MPMError as error:
         failure = error
-    return particles, problem.history, yield_violation, failure
+    return particles, problem.history, tools.largest(most), failure
 
 
 # ## Result

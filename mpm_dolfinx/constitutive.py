@@ -227,6 +227,60 @@ class ConstitutiveHistory:
         self._trial, self._trial_gradient = self._states, self._gradient
         self.first_piola = self._stress.copy()
 
+    def converged_state(self) -> dict[str, NDArray[Any]]:
+        """Return the history of the last converged step.
+
+        Returns:
+            Arrays ``(n, nq, ...)`` by name (``recovery``: ``(n, 3, 3)``); a variable of the
+            materials has the numbers of those that have it in its name.
+        """
+        whole = {"gradient": self._gradient, "first_piola": self._stress}
+        owners: dict[tuple[str, tuple[int, ...], np.dtype[Any]], list[int]] = {}
+        for number, state in enumerate(self._states):
+            for name, values in state.items():
+                owners.setdefault((name, values.shape[1:], values.dtype), []).append(number)
+        for (name, shape, dtype), numbers in owners.items():
+            values = np.zeros((self._points, *shape), dtype)
+            for number in numbers:
+                values[self._groups[number].points] = self._states[number][name]
+            whole[f"{name}@{','.join(map(str, numbers))}"] = values
+        n, nq = self._particles.num_local, self._particles.num_points
+        arrays = {name: v.reshape(n, nq, *v.shape[1:]) for name, v in whole.items()}
+        if self.averaging is not None:
+            arrays["recovery"] = np.broadcast_to(self.recovery, (n, 3, 3))
+        return arrays
+
+    def set_converged_state(self, arrays: dict[str, NDArray[Any]]) -> None:
+        """Make what :meth:`converged_state` once returned the history of the last step."""
+        flat = {
+            name: v.reshape(self._points, *v.shape[2:])
+            for name, v in arrays.items()
+            if name != "recovery"
+        }
+        self.recovery = arrays.get("recovery", 0.0)
+        self._gradient, self._stress = flat.pop("gradient"), flat.pop("first_piola")
+        self._states = [{} for _ in self._groups]
+        for key, values in flat.items():
+            name, numbers = key.rsplit("@", 1)
+            for number in map(int, numbers.split(",")):
+                self._states[number][name] = values[self._groups[number].points]
+
+    def laws(self) -> list[tuple[str, dict[str, Any]]]:
+        """Return name and parameters of each material; arrays with the indices of their points."""
+        nq = self._particles.num_points
+        index = self._particles.global_index[:, None] * nq + np.arange(nq)
+        laws = []
+        for group in self._groups:
+            where = index.ravel()[group.points]
+            parameters: dict[str, Any] = {
+                name: (where, value) if isinstance(value, np.ndarray) else value
+                for name, value in group.material.parameters.items()
+            }
+            parameters["points"] = (where, np.ones(len(where)))
+            parameters["f_bar"] = "none" if self.averaging is None else self.averaging.kind
+            laws.append((type(group.material).__name__, parameters))
+        return laws
+
     def cauchy_stress(self) -> NDArray[np.float64]:
         """Cauchy stress of the last converged step, shape ``(n, nq, 3, 3)``."""
         return self._collect(

@@ -106,5 +106,8 @@ def agree(comm: MPI.Comm) -> Iterator[None]:
     except MPMError as error:
         mine = error
     common = agreed(comm, mine)
-    if common is not None:
-        raise common from None
+    try:
+        if common is not None:
+            raise common from None
+    finally:
+        del mine, common  # an error that its own frame holds would keep problems alive

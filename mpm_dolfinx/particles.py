@@ -573,6 +573,37 @@ class Particles:
             )
         return self._constitutive
 
+    def options(self) -> dict[str, Any]:
+        """Return method and degrees, for a checkpoint to know these particles by."""
+        return {
+            "method": self.method,
+            "degree": self.W.ufl_element().degree,
+            "quadrature_degree": self._degree,
+            "domain_update": self._domain_update,
+            "delete": self.deletion is not None,
+        }
+
+    def converged_state(self) -> dict[str, NDArray[Any]]:
+        """Return the last converged step cell by cell, for a checkpoint: arrays ``(n, ...)``."""
+        nodal = self._converged[self.domain_nodes]
+        if self.deletion is None:
+            return {"displacement": nodal}
+        return {
+            "displacement": nodal,
+            "deleted": self.deletion.mask,
+            "kept": self.deletion.kept(nodal),
+        }
+
+    def set_converged_state(self, arrays: dict[str, NDArray[Any]]) -> None:
+        """Make what :meth:`converged_state` once returned the last converged step (collective)."""
+        d = self.displacement.x
+        d.array.reshape(-1, self._gdim)[self.domain_nodes] = arrays["displacement"]
+        d.scatter_forward()
+        if self.deletion is not None:
+            self.deletion.restore(np.zeros_like(self.deletion.mask), arrays["kept"])
+            self.deletion.restore(arrays["deleted"], arrays["kept"])
+        self.commit()
+
     def crossed(self) -> NDArray[np.int64]:
         """Return global indices of quadrilaterals whose edges cross.
 

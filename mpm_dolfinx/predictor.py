@@ -27,6 +27,15 @@ class Predictor:
     def __init__(self) -> None:
         self._past: list[tuple[float, Increments]] = []
 
+    @property
+    def past(self) -> list[tuple[float, Increments]]:
+        """Size and increments of the last steps, two at most."""
+        return list(self._past)
+
+    @past.setter
+    def past(self, steps: list[tuple[float, Increments]]) -> None:
+        self._past = list(steps)
+
     def clear(self) -> None:
         """Forget the past."""
         self._past = []

@@ -20,9 +20,10 @@ from tqdm import tqdm
 import ufl
 from dolfinx import fem
 
-from . import _compat
+from . import _compat, checkpoint, state
 from .assembly import BackgroundForms, BodyForms
 from .boundary import Support
+from .cleanup import Cleaner
 from .errors import (
     ConvergenceError,
     DomainDistortionError,
@@ -33,12 +34,16 @@ from .history import History, Loss, Step
 from .io import TimeSeries
 from .particles import Particles
 from .predictor import Predictor
+from .quadrature import data_at_points
 from .reduced import Body, ReducedSystem
 from .solver import NewtonSolver, weakly
 from .stabilisation import stabilisation_of
-from .stepping import StepControl
+from .stepping import Run, StepControl
 
 __all__ = ["ParticleProblem"]
+
+type Law = tuple[str, dict[str, Any]]
+"""Name of a material, and its parameters: numbers, or indices and values of points."""
 
 
 class ParticleProblem:
@@ -120,8 +125,8 @@ class ParticleProblem:
                 "or on a component of it (V.sub(i))."
             )
         self.history = History()
-        self._meshes = [V.mesh, *(body.mesh for body in self.bodies)]
         self._comm: MPI.Comm = V.mesh.comm
+        self._clean_up = Cleaner(self._comm, [V.mesh, *(body.mesh for body in self.bodies)])
         self.shares = [
             Body(body, BodyForms(r, j, body, **options))
             for body, r, j in zip(self.bodies, residuals, tangents, strict=True)
@@ -155,25 +160,20 @@ class ParticleProblem:
         self._parameter = self._loaded
         self._reactions: NDArray[np.float64] | None = None
         self._series: dict[Path, list[TimeSeries]] = {}
+        forms = [form for form in (*residuals, *tangents) if form is not None]
+        self._data = set().union(*map(data_at_points, forms))
+        self._run: Run | None = None
+        self._resume = False
 
     def __del__(self) -> None:
-        """Free what PETSc holds, on all ranks together; at the program's end PETSc does it."""
+        """Drop what PETSc holds; at the program's end PETSc does it."""
         if "_newton" in self.__dict__ and not sys.is_finalizing():
             for body in self.bodies:
                 body.__dict__.pop("T", None)
             self.shares.clear()
             for part in (self.reduced, self._newton):
                 part.__dict__.clear()
-            self._clean_up()
-
-    def _clean_up(self) -> None:
-        """Free PETSc objects that are out of use (collective).
-
-        On several ranks Python leaves them to such a call, as it drops references when it likes.
-        """
-        if self._comm.size > 1:
-            for domain in self._meshes:
-                PETSc.garbage_cleanup(domain.comm)
+            self._clean_up.end()
 
     # -- PETSc objects --------------------------------------------------------------------
 
@@ -236,6 +236,8 @@ class ParticleProblem:
     def steps(self, steps: int, update: Callable[[float], None] | None = None) -> Iterator[Step]:
         """Apply the whole load, one converged step at a time.
 
+        After :meth:`restore` it goes on with the run that was interrupted.
+
         Args:
             steps: As in :meth:`solve`.
             update: As in :meth:`solve`.
@@ -248,17 +250,8 @@ class ParticleProblem:
         """
         if not isinstance(steps, int | np.integer) or steps < 1:
             raise MPMError(f"The number of steps must be a whole number from 1 on, not {steps!r}.")
-        if update is None and self._loaded >= 1.0:
-            raise MPMError(
-                "The whole load is applied already; go on with problem.step() or with a path "
-                "(update=...)."
-            )
-        control = StepControl(int(steps))
-        if update is not None:
-            self._parameter = 0.0
-        if self.reduced.predictor is not None:
-            self.reduced.predictor.clear()
-        start, base = (self._loaded, self._prescribed.copy())
+        run = self._begin_run(int(steps), update)
+        control, start, base = run.control, run.start, run.base
         while not control.finished:
             t = control.target
             load = t if update is not None else start + (1.0 - start) * t
@@ -289,7 +282,33 @@ class ParticleProblem:
                 raise placed from None
             control.accept(step.iterations)
             yield step
+        self._run = None
         self._warn_of_outside()
+
+    def _begin_run(self, steps: int, update: Callable[[float], None] | None) -> Run:
+        """Return a new run, or the one that a checkpoint interrupted."""
+        if self._resume and self._run is not None:
+            run = self._run
+            if (steps, update is not None) != (run.control.steps, run.path):
+                kind = "update=..." if run.path else "no path (update=None)"
+                raise MPMError(
+                    f"The checkpoint was made in a run of {run.control.steps} steps with {kind}; "
+                    "go on with these, or restore it with resume=False to begin a new run."
+                )
+            self._resume = False
+            return run
+        if update is None and self._loaded >= 1.0:
+            raise MPMError(
+                "The whole load is applied already; go on with problem.step() or with a path "
+                "(update=...)."
+            )
+        if update is not None:
+            self._parameter = 0.0
+        if self.reduced.predictor is not None:
+            self.reduced.predictor.clear()
+        start, base = self._loaded, self._prescribed.copy()
+        self._run = Run(StepControl(steps), update is not None, start, base)
+        return self._run
 
     def step(self) -> Step:
         """Make one increment to the present values of loads and conditions.
@@ -300,6 +319,7 @@ class ParticleProblem:
         Raises:
             MPMError: It does not converge; the state is that of the last converged step.
         """
+        self._run = None
         try:
             load = float(self.bodies[0].load.value)
             self._set_load(load)
@@ -380,6 +400,47 @@ class ParticleProblem:
     def _warn(self, sentence: str) -> None:
         if self._comm.rank == 0:
             warnings.warn(sentence, stacklevel=4)
+
+    def save(self, path: str | Path, functions: Sequence[fem.Function] = ()) -> None:
+        """Write a checkpoint of the last converged step (collective).
+
+        Call it wherever one likes, also between the steps of :meth:`steps`. The file replaces
+        the one before when it is whole and on the disk; whatever interrupts that leaves the one
+        before.
+
+        Args:
+            path: Name of the file.
+            functions: Functions on the bodies' meshes that are part of the state, known by
+                their names: data at quadrature points that the residual holds, and whatever
+                else the run depends on.
+
+        Raises:
+            MPMError: The file cannot be written, or functions that cannot be kept.
+        """
+        checkpoint.write(self._comm, Path(path), state.capture(self, functions))
+
+    def restore(
+        self, path: str | Path, functions: Sequence[fem.Function] = (), resume: bool = True
+    ) -> None:
+        """Return to the state of a checkpoint, on any number of ranks (collective).
+
+        The problem must be made as the one that was saved: same meshes, space, method and
+        materials. Loads and Dirichlet conditions are not compared, so that a run may go on with
+        others.
+
+        Args:
+            path: A file that :meth:`save` wrote.
+            functions: As they were given to :meth:`save`; their values are restored.
+            resume: Whether :meth:`solve` or :meth:`steps`, with the same number of steps as
+                before, goes on with the run that was interrupted; else they begin a new one
+                from the present load.
+
+        Raises:
+            MPMError: The file is missing, no checkpoint, newer than this package, truncated,
+                damaged, or that of another problem; the state is what it was.
+        """
+        snapshot = checkpoint.read(self._comm, Path(path))
+        state.adopt(self, snapshot, functions, resume, f"The checkpoint '{path}'")
 
     # -- One step -------------------------------------------------------------------------
 
@@ -499,6 +560,32 @@ class ParticleProblem:
 
     def roll_back(self) -> None:
         """Return to the last converged evaluation."""
+
+    def converged_state(self) -> list[dict[str, NDArray[Any]]]:
+        """Return the history at the last converged step, for a checkpoint.
+
+        Returns:
+            One dictionary for each body: arrays ``(n, ...)`` of its owned particles by name.
+        """
+        return [{} for _ in self.bodies]
+
+    def set_converged_state(self, states: list[dict[str, NDArray[Any]]]) -> None:
+        """Make what :meth:`converged_state` once returned the history.
+
+        :meth:`roll_back` is called after it.
+
+        Args:
+            states: As returned there.
+        """
+
+    def laws(self) -> list[list[Law]]:
+        """Return the materials of each body, for a checkpoint to know them by."""
+        return [[] for _ in self.bodies]
+
+    def data_at_points(self) -> set[fem.Function]:
+        """Return Functions at quadrature points that the forms hold and no history keeps."""
+        keeps = type(self).converged_state is not ParticleProblem.converged_state
+        return set() if keeps else self._data
 
 
 def as_bodies(particles: Particles | Sequence[Particles]) -> list[Particles]:

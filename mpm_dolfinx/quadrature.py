@@ -23,6 +23,7 @@ from .errors import MPMError
 
 __all__ = [
     "DomainQuadrature",
+    "data_at_points",
     "default_degree",
     "depends_on",
     "exact_degree",
@@ -129,9 +130,12 @@ def follows(form: ufl.Form, displacement: fem.Function) -> bool:
 
     It does where it has the displacement, or data injected at quadrature points.
     """
-    return depends_on(form, displacement) or any(
-        c.ufl_element().has_custom_quadrature for c in form.coefficients()
-    )
+    return depends_on(form, displacement) or bool(data_at_points(form))
+
+
+def data_at_points(form: ufl.Form) -> set[fem.Function]:
+    """Return the Functions at quadrature points that a form holds."""
+    return {c for c in form.coefficients() if c.ufl_element().has_custom_quadrature}
 
 
 def _rule(integral: Any) -> tuple[int, str]:

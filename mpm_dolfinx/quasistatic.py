@@ -21,7 +21,7 @@ from .expressions import as_expression, facet_measure
 from .f_bar import F_BARS, LowRankTangent
 from .grouping import background_cells
 from .particles import Particles
-from .problem import ParticleProblem, as_bodies
+from .problem import Law, ParticleProblem, as_bodies
 
 __all__ = ["QuasiStaticProblem"]
 
@@ -186,6 +186,19 @@ class QuasiStaticProblem(ParticleProblem):
         (each,) = self._density[number].arguments()
         cells = each.ufl_function_space().dofmap.list[: self.bodies[number].num_local, 0]
         return np.asarray(vector.array[cells])
+
+    def converged_state(self) -> list[dict[str, NDArray[Any]]]:
+        """See :meth:`ParticleProblem.converged_state`."""
+        return [stress.history.converged_state() for stress in self._stresses]
+
+    def set_converged_state(self, states: list[dict[str, NDArray[Any]]]) -> None:
+        """See :meth:`ParticleProblem.set_converged_state`."""
+        for stress, arrays in zip(self._stresses, states, strict=True):
+            stress.history.set_converged_state(arrays)
+
+    def laws(self) -> list[list[Law]]:
+        """See :meth:`ParticleProblem.laws`."""
+        return [stress.history.laws() for stress in self._stresses]
 
     @property
     def yield_function(self) -> NDArray[np.float64]:

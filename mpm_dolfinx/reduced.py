@@ -198,9 +198,13 @@ class ReducedSystem:
 
     def end(self) -> None:
         """Take note of the increments; forget the free dofs, since the bodies have moved."""
-        self._free = None
+        self.forget()
         if self.predictor is not None:
             self.predictor.record(self._size, [body.increment() for body in self._bodies])
+
+    def forget(self) -> None:
+        """Forget the free dofs."""
+        self._free = None
 
     def _find_free_dofs(self) -> None:
         """Free are dofs with weight or a background term, and without a condition."""

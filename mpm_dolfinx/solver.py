@@ -237,6 +237,15 @@ class NewtonSolver:
         self._evaluate(x)
         return False
 
+    @property
+    def experience(self) -> tuple[float, int]:
+        """What earlier steps have taught about predictions, for a checkpoint."""
+        return self._kept, self._from_zero
+
+    @experience.setter
+    def experience(self, values: tuple[float, int]) -> None:
+        self._kept, self._from_zero = values
+
     def _judge(self, predicted: bool) -> None:
         """Keep only sure predictions from now on, if a doubtful one has saved no linear solve."""
         if not predicted:

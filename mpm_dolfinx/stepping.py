@@ -4,7 +4,13 @@
 
 from __future__ import annotations
 
-__all__ = ["StepControl"]
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Run", "StepControl"]
 
 #: How often a step may be halved, and the linear solves of a step that is easy.
 MOST_HALVINGS = 10
@@ -19,9 +25,13 @@ class StepControl:
 
     Args:
         steps: Number of equal steps; also the largest step.
+
+    Attributes:
+        steps: As given.
     """
 
     def __init__(self, steps: int) -> None:
+        self.steps = steps
         self._largest: int = 2**MOST_HALVINGS
         self._end: int = steps * self._largest
         self._now: int = 0
@@ -49,3 +59,31 @@ class StepControl:
             return False
         self._size //= 2
         return True
+
+
+@dataclass
+class Run:
+    """A run of load steps: where it began, and how far it is.
+
+    Attributes:
+        control: The steps.
+        path: Whether it follows a path of the user's.
+        start: Load factor at its beginning.
+        base: Dirichlet values at its beginning, on the local dofs of V.
+    """
+
+    control: StepControl
+    path: bool
+    start: float
+    base: NDArray[np.float64]
+
+    def numbers(self) -> dict[str, Any]:
+        """Return all but the Dirichlet values, for a checkpoint."""
+        return {"control": dict(vars(self.control)), "path": self.path, "start": self.start}
+
+    @classmethod
+    def of(cls, numbers: dict[str, Any], base: NDArray[np.float64]) -> Self:
+        """Return the run that gave these numbers."""
+        control = StepControl(numbers["control"]["steps"])
+        vars(control).update(numbers["control"])
+        return cls(control, numbers["path"], numbers["start"], base)

@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from scenes import WORLD
 
+import mpm_dolfinx as mpm
+
 DEMOS = Path(__file__).parents[1] / "demos"
 COMMON = {"completed", "load", "iterations", "cutbacks", "failure"}
 
@@ -160,6 +162,33 @@ def test_plain_solver_reports_its_end(capfd):
             "DomainDistortionError",
             "ParticleOutsideError",
         )
+
+
+def test_column_goes_on_from_its_checkpoint(mpi_tmp_path, capfd, monkeypatch):
+    arguments = "--cell 2 --steps 6 --g0 8e3 --json".split()
+    _, whole = run("column_free", arguments, capfd)
+    arguments += ["--checkpoint", str(mpi_tmp_path / "column.ckpt"), "--resume"]
+
+    saved = []
+
+    def save(problem, *arguments, **options):
+        original(problem, *arguments, **options)
+        saved.append(problem.history.load[-1])
+        if len(saved) == 3:
+            raise KeyboardInterrupt
+
+    original = mpm.ParticleProblem.save
+    with monkeypatch.context() as patch:
+        patch.setattr(mpm.ParticleProblem, "save", save)
+        with pytest.raises(KeyboardInterrupt):
+            run("column_free", arguments, capfd)
+    capfd.readouterr()
+    status, resumed = run("column_free", arguments, capfd)
+    assert status == 0 and saved == [1 / 6, 2 / 6, 3 / 6]
+    whole, resumed = json.loads(whole), json.loads(resumed)
+    for key, value in whole.items():
+        assert resumed[key] == (pytest.approx(value, rel=1e-9) if WORLD.size > 1 else value), key
+    assert run("column_free", ["--resume"], capfd)[0] == 2
 
 
 @pytest.mark.parametrize(
