@@ -17,6 +17,10 @@ PHASES = ("locate", "transfer", "constitutive", "assemble", "factorise", "solve"
 COUNTERS = (
     "transfers",
     "free_dofs",
+    "off_rank_rows",
+    "off_rank_columns",
+    "particle_imbalance",
+    "dof_imbalance",
     "residuals",
     "predictions",
     "rejected_predictions",
@@ -37,7 +41,11 @@ class Statistics(dict[str, float]):
 
     The phases, which do not overlap, are ``locate``, ``transfer``, ``constitutive``,
     ``assemble``, ``factorise``, ``solve`` and ``commit``. Counters are ``transfers`` (how often
-    the transfer was rebuilt), ``free_dofs`` (unknowns of the last step), ``residuals`` and
+    the transfer was rebuilt), ``free_dofs`` (unknowns of the last step), ``off_rank_rows``
+    (share of the bodies' nodes that move with an unknown of another rank, in the last step) and
+    ``off_rank_columns`` (unknowns that ranks need of others for a product with T, 8 bytes each),
+    ``particle_imbalance`` and ``dof_imbalance`` (largest number on a rank over the mean),
+    ``residuals`` and
     ``factorisations``, ``predictions`` (steps that began at the extrapolated increment) and
     ``rejected_predictions``, ``halvings`` (of Newton steps by the line search),
     ``converged_at_round_off`` (steps that ended at the floor of round-off),

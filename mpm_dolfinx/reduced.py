@@ -17,6 +17,7 @@ from dolfinx import fem
 from .assembly import BackgroundForms, BodyForms
 from .errors import DomainDistortionError, MPMError, agreed
 from .history import Statistics
+from .layout import FreeDofs, imbalance
 from .particles import Particles
 from .predictor import Predictor, map_to_background
 from .stabilisation import Aggregation, GhostPenalty
@@ -164,7 +165,7 @@ class ReducedSystem:
     @property
     def sizes(self) -> tuple[int, int]:
         """Number of free dofs of this rank and of all ranks."""
-        return self._columns.getLocalSize(), self._columns.getSize()
+        return self._layout.sizes
 
     @property
     def force(self) -> PETSc.Vec:
@@ -224,9 +225,8 @@ class ReducedSystem:
             self._fixed[dofs[:first_ghost]] = True
         self._free = np.flatnonzero(free & ~self._fixed).astype(np.int32)
         T = self._bodies[0].particles.T
-        start, _ = T.getOwnershipRangeColumn()
-        numbers = (self._free + start).astype(PETSc.IntType)
-        self._columns = PETSc.IS().createGeneral(numbers, comm=self._comm)
+        self._layout = FreeDofs(self._V, self._free, [body.particles.T for body in self._bodies])
+        self._columns = self._layout.columns
         self._u = T.createVecRight()
         self._force = T.createVecRight()
         self._part = T.createVecRight()
@@ -237,6 +237,11 @@ class ReducedSystem:
             body.restrict(self._columns, self._extension)
         self._statistics.count("transfers")
         self._statistics["free_dofs"] = self.sizes[1]
+        self._statistics["off_rank_rows"] = self._layout.off_rank_rows
+        self._statistics["off_rank_columns"] = self._layout.off_rank_columns
+        self._statistics["dof_imbalance"] = imbalance(self._comm, self.sizes[0])
+        particles = sum(body.particles.num_local for body in self._bodies)
+        self._statistics["particle_imbalance"] = imbalance(self._comm, particles)
 
     def _gather(self, vectors: Sequence[PETSc.Vec]) -> None:
         """Set the force to the sum of ``T^T`` times each body's vector."""
@@ -249,7 +254,7 @@ class ReducedSystem:
         increments = [body.particles.increment.x for body in self._bodies]
         u = increments[0]
         u.array[: self._owned] = self._lifts() if self._imposed else 0.0
-        u.array[self._free] = x.array_r
+        u.array[self._free] = self._layout.spread(x)
         if self._extension is not None:
             self._part.array_w[:] = u.array[: self._owned]
             self._extension.mult(self._part, self._u)
@@ -276,7 +281,7 @@ class ReducedSystem:
             if self._extension is not None:
                 self._extension.multTranspose(self._force, self._part)
                 self._part.copy(self._force)
-        F.array_w[:] = self._force.array_r[self._free]
+        self._layout.collect(self._force.array_r[self._free], F)
         return None
 
     def tangent(self) -> PETSc.Mat:
@@ -311,7 +316,7 @@ class ReducedSystem:
             return None
         u = map_to_background([body.particles.T for body in self._bodies], increments)
         x = PETSc.Vec().createMPI(self.sizes, comm=self._comm)
-        x.array_w[:] = u[self._free]
+        self._layout.collect(u[self._free], x)
         return x
 
     def _penalty(self, ghost: GhostPenalty) -> tuple[PETSc.Mat, PETSc.Mat]:
@@ -349,7 +354,7 @@ class ReducedSystem:
             self._extension.multTranspose(self._part, self._u)
             self._u.copy(self._part)
         reduced = PETSc.Vec().createMPI(self.sizes, comm=self._comm)
-        reduced.array_w[:] = self._part.array_r[self._free]
+        self._layout.collect(self._part.array_r[self._free], reduced)
         return reduced
 
     def scale(self) -> float:

@@ -23,7 +23,7 @@ from . import _compat
 from .checkpoint import Snapshot, Table
 from .errors import MPMError, ParticleOutsideError, agree
 from .exchange import RowExchange
-from .history import Loss, Step
+from .history import Loss, Statistics, Step
 from .particles import Particles
 from .stepping import Run
 
@@ -89,7 +89,7 @@ def capture(problem: ParticleProblem, functions: Sequence[fem.Function] = ()) ->
         "failed_iterations": history.failed_iterations,
         "losses": [vars(loss) for loss in history.losses],
         "stopped": None if history.stopped is None else history.stopped.__reduce__()[1],
-        "statistics": _average(problem._comm, dict(history.statistics)),
+        "statistics": _average(problem._comm, history.statistics),
     }
     return Snapshot(numbers, tables)
 
@@ -338,10 +338,8 @@ def _same(one: Any, two: Any) -> bool:
     return bool(one == two)
 
 
-def _average(comm: MPI.Comm, statistics: dict[str, float]) -> dict[str, float]:
+def _average(comm: MPI.Comm, statistics: Statistics) -> dict[str, float]:
     """Return counters, which all ranks share, and the mean seconds of the ranks."""
-    every = comm.allgather(statistics)
-    return {
-        name: value if isinstance(value, int) else sum(s[name] for s in every) / comm.size
-        for name, value in every[0].items()
-    }
+    every = comm.allgather(statistics.seconds)
+    mean = {name: sum(s[name] for s in every) / comm.size for name in statistics.seconds}
+    return {**statistics, **mean}
