@@ -15,6 +15,7 @@ from dolfinx import fem, mesh
 from .errors import ConvergenceError, MPMError, agree
 from .f_bar import VolumeAveraging
 from .materials import Material, State
+from .materials.base import Refused
 from .particles import Particles
 
 __all__ = ["ConstitutiveHistory"]
@@ -136,6 +137,8 @@ class ConstitutiveHistory:
 
     def _per_cell(self, name: str, value: Any) -> NDArray[np.float64]:
         n = self._particles.num_local
+        if isinstance(value, Refused):
+            raise MPMError(value.message)
         if isinstance(value, np.ndarray):
             if value.shape != (n,):
                 raise MPMError(

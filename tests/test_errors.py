@@ -229,6 +229,32 @@ def values(n):
     return lambda p: Hencky(np.full(p.num_local + n, 1e3), 0.3)
 
 
+def held(kind, **options):
+    """Return a function that makes a problem with a support of the body's own boundary."""
+
+    def build():
+        p = particles()
+        make = getattr(mpm.boundary, kind)
+        more = {"facet_tags": tags_of_facets(p), "tag": 1}
+        more |= {k: f(p) if callable(f) else f for k, f in options.items()}
+        return mpm.QuasiStaticProblem(p, Hencky(1e3, 0.3), supports=[make(p, **more)])
+
+    return build
+
+
+def foreign_support():
+    p = particles()
+    support = mpm.boundary.fixed(p, tags_of_facets(p), 1)
+    return mpm.QuasiStaticProblem(particles(), Hencky(1e3, 0.3), supports=[support])
+
+
+def support_without_modulus():
+    p = particles()
+    support = mpm.boundary.fixed(p, tags_of_facets(p), 1)
+    d, v = p.displacement, ufl.TestFunction(p.W)
+    return mpm.ParticleProblem(work(p, d, v) + support.residual, p)
+
+
 def run(**options):
     return lambda: scenes.block().solve(**options)
 
@@ -378,6 +404,35 @@ PROBLEMS = {
         problem(tractions=[((np.nan, 0.0), 1)], facet_tags=tags_of_facets),
         r"a traction must be finite",
     ),
+    # supports
+    "supports in words": (problem(supports=["floor"]), r"supports must be a list of supports"),
+    "one support, no list": (
+        problem(supports=lambda p: mpm.boundary.fixed(p, tags_of_facets(p), 1)),
+        r"supports must be a list",
+    ),
+    "support of another body": (foreign_support, r"made with other particles"),
+    "support of no body": (lambda: mpm.boundary.fixed("body", None, 1), r"mpm\.Particles, not str"),
+    "roller of no body": (lambda: mpm.boundary.roller(1, None, 1, (0, 1)), r"Particles, not int"),
+    "support without modulus": (support_without_modulus, r"needs modulus="),
+    "negative modulus": (held("fixed", modulus=-1.0), r"modulus must be positive"),
+    "modulus nan": (held("fixed", modulus=np.nan), r"modulus must be finite"),
+    "no direction": (held("roller", normal=(0.0, 0.0)), r"normal must not be zero"),
+    "direction of three numbers": (held("roller", normal=(0.0, 1.0, 0.0)), r"normal has the shape"),
+    "direction nan": (held("roller", normal=(0.0, np.nan)), r"normal must be finite"),
+    "displacement of two numbers": (
+        held("roller", normal=(0.0, 1.0), value=(1.0, 2.0)),
+        r"value has the shape",
+    ),
+    "displacement of one number": (held("fixed", value=1.0), r"value has the shape"),
+    "no penalty": (held("fixed", penalty=0.0), r"penalty must be a positive number, not 0\.0"),
+    "penalty in words": (held("fixed", penalty="stiff"), r"penalty must be a positive number"),
+    "support on no facet": (held("fixed", tag=9), r"no facet tag 9; there are \[1\]"),
+    "support without tags": (held("fixed", facet_tags=None), r"Supports need facet_tags="),
+    "support on cells": (held("fixed", facet_tags=tags_of_cells), r"Supports need facet_tags="),
+    "point of a plane in words": (
+        held("plane", point="origin", normal=(0.0, 1.0)),
+        r"point must be numbers",
+    ),
     "traction is no pair": (
         problem(tractions=[(1.0, 0.0, 1)], facet_tags=tags_of_facets),
         r"traction",
@@ -429,7 +484,15 @@ MATERIALS = {
         r"exactly one of rho_y and yield_stress",
     ),
     "softening": (lambda: VonMises(1.0, 0.3, rho_y=1.0, hardening=-1.0), r"hardening is -1"),
-    "one bad value of many": (lambda: Hencky(np.array([1.0, -3.0]), 0.3), r"young is -3"),
+    "one bad value of many": (
+        lambda: Hencky(np.array([1.0, -3.0]), 0.3).initial_state(2, 2),
+        r"young is -3",
+    ),
+    "no number among many": (
+        lambda: Hencky(1.0, np.array([0.3, np.nan])).initial_state(2, 2),
+        r"poisson is nan",
+    ),
+    "a table of values": (lambda: Hencky(np.ones((2, 2)), 0.3), r"young .*not 2-D"),
 }
 
 
@@ -532,6 +595,13 @@ def test_one_parameter_out_of_range():
     mine = np.flatnonzero(p.global_index == 0)
     young.x.array[young.function_space.dofmap.list[mine, 0]] = -1.0
     raises(lambda: Hencky(young, 0.3), mpm.MPMError, r"young is -1")
+
+
+def test_one_value_out_of_range_in_arrays_of_the_ranks():
+    p = particles()
+    young = np.full(p.num_local, 1e3)
+    young[p.global_index == 0] = -1.0
+    raises(lambda: mpm.QuasiStaticProblem(p, Hencky(young, 0.3)), mpm.MPMError, r"young is -1")
 
 
 def test_errors_are_runtime_errors_with_particles_and_load():

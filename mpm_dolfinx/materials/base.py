@@ -11,6 +11,8 @@ from contextlib import nullcontext
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, cast
 
+from mpi4py import MPI
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -23,6 +25,7 @@ __all__ = [
     "Integration",
     "Material",
     "Parameter",
+    "Refused",
     "State",
     "StrainMaterial",
     "Update",
@@ -207,6 +210,9 @@ class StrainMaterial(Material):
 
     def initial_state(self, n: int, dim: int) -> State:
         """See :meth:`Material.initial_state`."""
+        for value in self.parameters.values():
+            if isinstance(value, Refused):
+                raise MPMError(value.message)
         state: State = {"stress": np.zeros((n, num_components(dim)))}
         if self.inelastic:
             state |= self._kinematics.initial_history(n, dim)
@@ -242,6 +248,18 @@ def per_row(value: Parameter) -> Parameter:
     return value[:, None] if isinstance(value, np.ndarray) else value
 
 
+class Refused(np.ndarray):
+    """An array of parameters with a value that is not allowed, on this rank.
+
+    A material does not know its body's ranks; the problem, which does, raises the error on all.
+
+    Attributes:
+        message: What is wrong with it.
+    """
+
+    message: str
+
+
 def check_parameter(
     name: str,
     value: ArrayLike | Field,
@@ -252,7 +270,8 @@ def check_parameter(
 ) -> Parameter:
     """Return a parameter as a number or an array ``(n,)``, if its values are allowed.
 
-    Ranks agree on the values of a Function (collective), as each sees its own part.
+    Ranks agree on the values of a Function (collective), as each sees its own part. An array is
+    a rank's own: where there are several ranks, the error is raised when it is used.
 
     Args:
         name: Name for the message.
@@ -285,7 +304,12 @@ def check_parameter(
     with nullcontext() if space is None else agree(space.mesh.comm):
         if not allowed.all():
             worst = values[~allowed].flat[0]
-            raise MPMError(f"{name} is {worst:g} but must be {', '.join(words)}")
+            message = f"{name} is {worst:g} but must be {', '.join(words)}"
+            if values.ndim == 1 and not hasattr(value, "x") and MPI.COMM_WORLD.size > 1:
+                refused = values.view(Refused)
+                refused.message = message
+                return refused
+            raise MPMError(message)
     if hasattr(value, "x"):
         return cast(Parameter, value)
     return float(values) if values.ndim == 0 else values

@@ -126,7 +126,8 @@ def test_a_missing_tangent_is_found():
 )
 def test_bad_parameters(arguments, message):
     with pytest.raises(MPMError, match=message):
-        VonMises(**{"young": 1.0, "poisson": 0.3, "rho_y": 1.0, **arguments})
+        law = VonMises(**{"young": 1.0, "poisson": 0.3, "rho_y": 1.0, **arguments})
+        law.initial_state(2, 2)  # an array of one rank is refused when it is used
 
 
 @pytest.mark.parametrize("law", [VonMises, SmallStrainVonMises])
