@@ -26,6 +26,7 @@ COUNTERS = (
     "rejected_predictions",
     "factorisations",
     "halvings",
+    "redirections",
     "converged_at_round_off",
     "workspace_retries",
     "ghost_facets",
@@ -47,7 +48,8 @@ class Statistics(dict[str, float]):
     ``particle_imbalance`` and ``dof_imbalance`` (largest number on a rank over the mean),
     ``residuals`` and
     ``factorisations``, ``predictions`` (steps that began at the extrapolated increment) and
-    ``rejected_predictions``, ``halvings`` (of Newton steps by the line search),
+    ``rejected_predictions``, ``halvings`` (of Newton steps by the line search), ``redirections``
+    (of Newton steps that a tangent which is not positive definite led uphill),
     ``converged_at_round_off`` (steps that ended at the floor of round-off),
     ``workspace_retries`` (factorisations that MUMPS repeated with more workspace),
     ``ghost_facets`` and ``aggregated_dofs`` (facets with a ghost penalty, and dofs that follow

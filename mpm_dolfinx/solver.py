@@ -16,17 +16,17 @@ import numpy as np
 from . import _compat
 from .errors import ConvergenceError, MPMError
 from .history import Statistics
+from .line_search import LineSearch, stalled
 
 __all__ = ["NewtonSolver", "ReducedProblem", "weakly"]
 
 #: Newton increment, relative to the step's, at which round-off is reached.
 ROUND_OFF = 1e-13
-#: Most halvings of a Newton step, and the drop in work that needs none.
-HALVINGS = 8
-SUFFICIENT = 0.8
 #: First residual of a prediction that is kept, over that of a start from zero; from 1 on as long
 #: as it saves linear solves.
 KEPT = 2.0
+#: Relative diagonal shifts tried in turn until a tangent is positive definite.
+DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 #: Values of MUMPS's INFOG(1) that more workspace cures.
 OUT_OF_WORKSPACE = (-8, -9)
 FACTORS = ("lu", "cholesky")
@@ -103,7 +103,11 @@ class NewtonSolver:
         self._comm = comm
         self._shift = shift
         self._symmetric = symmetric
-        self._line_search = line_search
+        self._search = (
+            LineSearch(weakly(self._evaluate), weakly(self._redirect), statistics)
+            if line_search
+            else None
+        )
         self.statistics = statistics
         self.residuals: list[float] = []
         self.iterations = 0
@@ -156,6 +160,7 @@ class NewtonSolver:
         self._motion = (0.0, 0.0)
         self._stalled = False
         self._norm = np.inf
+        self._norms: list[float] = []
         x = self._start(sizes)
         if sizes[1] == 0:
             problem.impose()
@@ -293,6 +298,7 @@ class NewtonSolver:
             if scale < 1e-6 * internal:
                 scale = internal
         self._norm = norm
+        self._norms.append(norm)
         self.residuals.append(norm / scale if scale > 0 else norm)
         if norm <= max(rtol * scale, atol):
             return reasons.CONVERGED_FNORM_RELATIVE
@@ -303,12 +309,20 @@ class NewtonSolver:
         ):
             self.statistics.count("converged_at_round_off")
             return reasons.CONVERGED_SNORM_RELATIVE
+        if self._search is not None and stalled(self._norms):
+            lowest = min(self.residuals)
+            self._failure = ConvergenceError(
+                f"Newton's method makes no headway: in {self.iterations} linear solves the "
+                f"relative residual did not stay below {lowest:.1e}"
+            )
+            return reasons.DIVERGED_MAX_IT
         return None
 
-    def _set_tangent(self, K: PETSc.Mat) -> None:
-        """Factorise K with the shift."""
+    def _set_tangent(self, K: PETSc.Mat, damping: float = 0.0) -> None:
+        """Factorise K with the shift, or with a larger one."""
         new = self.K is not K
-        if self._shift > 0.0:
+        shift = max(self._shift, damping)
+        if shift > 0.0:
             if new:
                 self._P = K.copy()
             else:
@@ -318,7 +332,7 @@ class NewtonSolver:
             largest = diagonal.max()[1]
             values = diagonal.array_w
             values[values == 0.0] = largest
-            diagonal.scale(self._shift)
+            diagonal.scale(shift)
             self._P.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
         else:
             self._P = K
@@ -362,23 +376,45 @@ class NewtonSolver:
         self._motion = (0.0, 0.0)
         if not np.isfinite(y.norm()):
             return False  # the evaluation at x - y says so
-        norm, work = self.F.norm(), abs(self.F.dot(y))
-        fraction = 1.0
-        for halving in range(HALVINGS + 1):
+        if self._search is not None:
+            changed = self._search(x, y, self.F, self._trial)
+        else:
+            changed = False
             self._trial.waxpy(-1.0, y, x)
-            failure = self._evaluate(self._trial)
-            if not self._line_search or halving == HALVINGS:
-                break
-            if failure is None and (
-                abs(self.F.dot(y)) <= SUFFICIENT * work * fraction or self.F.norm() <= norm
-            ):
-                break
-            y.scale(0.5)
-            fraction *= 0.5
-            self.statistics.count("halvings")
+            self._evaluate(self._trial)
         self._motion = (self._problem.motion(y), self._problem.motion(self._trial))
         self._known = True
-        return fraction < 1.0
+        return changed
+
+    def _redirect(self, F: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Solve for the step with a damped tangent, unless the tangent is positive definite.
+
+        Args:
+            F: The residual.
+            y: The step; replaced.
+
+        Returns:
+            Whether it was replaced.
+        """
+        if not self._symmetric or self._shift == 0.0 or self.K is None:
+            return False
+        if F.dot(y) > 0.0 and self._negative_pivots() == 0:
+            return False
+        for damping in DAMPINGS:
+            self._set_tangent(self.K, damping)
+            with self.statistics.phase("solve"):
+                self.snes.getKSP().solve(F, y)
+            self.iterations += 1
+            if F.dot(y) > 0.0 and self._negative_pivots() == 0:
+                break
+        return True
+
+    def _negative_pivots(self) -> int:
+        """Return how many pivots of the last factor are negative, where it says so."""
+        pc = self.snes.getKSP().getPC()
+        if pc.getType() != "cholesky" or pc.getFactorSolverType() != "mumps":
+            return 0
+        return int(pc.getFactorMatrix().getMumpsInfog(12))
 
 
 def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
