@@ -33,6 +33,7 @@ class MPMError(RuntimeError):
         message: The sentence as given.
         particles: Global indices of the particles concerned, sorted (may be empty).
         load: Load factor of the last converged step, or ``None`` before a run.
+        dofs: Global dofs of V with the largest residual, where Newton's method failed.
     """
 
     def __init__(
@@ -41,6 +42,7 @@ class MPMError(RuntimeError):
         self.message = message
         self.particles: list[int] = sorted({int(p) for p in particles})
         self.load = load
+        self.dofs: list[int] = []
         super().__init__(message.replace("{particles}", name_particles(self.particles)))
 
     def __reduce__(self) -> tuple[Any, ...]:

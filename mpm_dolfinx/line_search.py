@@ -17,7 +17,7 @@ __all__ = ["LineSearch", "stalled"]
 HALVINGS = 8
 SUFFICIENT = 0.8
 #: Iterations within which the smallest residual must fall, and to what share of itself.
-PATIENCE = 12
+PATIENCE = 15
 HEADWAY = 0.7
 
 
@@ -69,7 +69,7 @@ class LineSearch:
                 abs(F.dot(y)) <= SUFFICIENT * abs(work) * fraction or F.norm() <= norm
             ):
                 break
-            if halving == 0 and self._redirect(start, y):
+            if halving == 0 and self._redirect(start, y):  # neither, so its direction is doubted
                 self._statistics.count("redirections")
                 work, changed = start.dot(y), True
                 trial.waxpy(-1.0, y, x)

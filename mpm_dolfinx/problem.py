@@ -267,9 +267,9 @@ class ParticleProblem:
             except (ConvergenceError, DomainDistortionError) as error:
                 self._restore()
                 self.history.failed_iterations += self._newton.iterations
-                if not control.cut_back():
+                if not control.cut_back(self._newton.no_equilibrium):
                     self._restore(update)
-                    raise self._placed(error) from None
+                    raise self._placed(error, t) from None
                 self.history.cutbacks += 1
                 continue
             except MPMError as error:
@@ -524,22 +524,39 @@ class ParticleProblem:
         if update is not None and self._parameter > 0.0:
             update(self._parameter)
 
-    def _placed(self, error: MPMError) -> MPMError:
-        """Say at what load an error happened, and what to do."""
+    def _placed(self, error: MPMError, tried: float | None = None) -> MPMError:
+        """Say at what load an error happened, and what to do.
+
+        Args:
+            error: It.
+            tried: End of the smallest step tried.
+        """
         advice = {
             DomainDistortionError: "; take more steps, smaller loads or finer domains",
             ConvergenceError: "; take more steps, or look whether a limit load is reached",
         }.get(type(error), "")
+        if tried is not None and self._newton.no_equilibrium:
+            advice = (
+                f"; no equilibrium was found up to {tried:.6g}, which is a limit load unless more "
+                "steps get over it"
+            )
         particles, text = error.particles, error.message.rstrip(".")
+        dofs: list[int] = []
         if isinstance(error, ConvergenceError) and not particles:
             particles = self.reduced.worst_particles()
-            if particles:
-                text += "; the residual is largest at {particles}"
-        return type(error)(
+            dofs, where = self.reduced.worst_dof()
+            if particles and dofs:
+                text += (
+                    f"; the residual is largest at dof {dofs[0]} of V near {where}, and at "
+                    "{particles}"
+                )
+        placed = type(error)(
             f"{text}, in the step after load {self._parameter:.6g}{advice}.",
             particles,
             self._parameter,
         )
+        placed.dofs = dofs
+        return placed
 
     # -- What a problem with a material adds -----------------------------------------------
 

@@ -388,6 +388,19 @@ class ReducedSystem:
             found = found or distorted("cross themselves", body.particles.crossed())
         return agreed(self._comm, found)
 
+    def worst_dof(self) -> tuple[list[int], tuple[float, ...]]:
+        """Return the global dof with the largest residual, if any, and where it is (collective)."""
+        best: tuple[float, int, tuple[float, ...]] = (-1.0, -1, ())
+        if self._free is not None and len(self._free):
+            size = np.nan_to_num(np.abs(self._force.array_r[self._free]), nan=0.0, posinf=0.0)
+            dof = int(self._free[size.argmax()])
+            gdim = self._V.mesh.geometry.dim
+            x = self._V.tabulate_dof_coordinates()[dof // self._bs, :gdim]
+            start = self._V.dofmap.index_map.local_range[0] * self._bs
+            best = float(size.max()), start + dof, tuple(float(round(c, 6)) for c in x)
+        _, dof, where = max(self._comm.allgather(best))
+        return ([dof] if dof >= 0 else []), where
+
     def worst_particles(self) -> list[int]:
         """Return the particles at the node with the largest residual."""
         best: tuple[float, list[int]] = (0.0, [])

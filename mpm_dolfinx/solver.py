@@ -88,6 +88,7 @@ class NewtonSolver:
         K: The reduced tangent.
         x: The solution of the last attempt.
         F: Its residual.
+        no_equilibrium: Whether the last attempt's iterations came to nothing.
     """
 
     def __init__(
@@ -111,6 +112,7 @@ class NewtonSolver:
         self.statistics = statistics
         self.residuals: list[float] = []
         self.iterations = 0
+        self.no_equilibrium = False
         self.K: PETSc.Mat | None = None
         self.x: PETSc.Vec | None = None
         self.F: PETSc.Vec | None = None
@@ -161,6 +163,7 @@ class NewtonSolver:
         self._stalled = False
         self._norm = np.inf
         self._norms: list[float] = []
+        self.no_equilibrium = False
         x = self._start(sizes)
         if sizes[1] == 0:
             problem.impose()
@@ -221,6 +224,7 @@ class NewtonSolver:
                     why = "as the factorisation of the tangent failed"
             else:
                 why = _reason(reason)
+                self.no_equilibrium = True
             self._failure = ConvergenceError(
                 f"Newton's method stopped after {self.iterations} linear solves at a relative "
                 f"residual of {residual:.1e} ({why})"
@@ -310,6 +314,7 @@ class NewtonSolver:
             self.statistics.count("converged_at_round_off")
             return reasons.CONVERGED_SNORM_RELATIVE
         if self._search is not None and stalled(self._norms):
+            self.no_equilibrium = True
             lowest = min(self.residuals)
             self._failure = ConvergenceError(
                 f"Newton's method makes no headway: in {self.iterations} linear solves the "

@@ -15,6 +15,10 @@ __all__ = ["Run", "StepControl"]
 #: How often a step may be halved, and the linear solves of a step that is easy.
 MOST_HALVINGS = 10
 EASY = 8
+#: Halvings, and width of a bracket relative to the load, from which a load that no step gets
+#: over counts as a limit.
+LIMIT_HALVINGS = 6
+LIMIT_WIDTH = 1e-3
 
 
 class StepControl:
@@ -36,6 +40,8 @@ class StepControl:
         self._end: int = steps * self._largest
         self._now: int = 0
         self._size: int = self._largest
+        self._failed: int | None = None
+        self._moved = self._wary = False
 
     @property
     def finished(self) -> bool:
@@ -48,14 +54,32 @@ class StepControl:
         return min(self._now + self._size, self._end) / self._end
 
     def accept(self, iterations: int) -> None:
-        """Go to the target; double the next step if this one took few linear solves."""
+        """Go to the target; double the next step if this one took few linear solves.
+
+        Where a step failed again after it had been doubled, it is not until that load is passed.
+        """
         self._now = min(self._now + self._size, self._end)
-        if iterations <= EASY:
+        self._moved = True
+        if self._failed is not None and self._now >= self._failed:
+            self._failed, self._wary = None, False
+        if iterations <= EASY and not self._wary:
             self._size = min(2 * self._size, self._largest)
 
-    def cut_back(self) -> bool:
-        """Halve the step; return False where it is at its smallest."""
-        if self._size == 1:
+    def cut_back(self, no_equilibrium: bool = False) -> bool:
+        """Halve the step; return False where it is at its smallest, or a limit is found.
+
+        Args:
+            no_equilibrium: Whether Newton's method found none. Then a step of 1/64 of a full one
+                and of 1/1000 of the load reached is the smallest.
+        """
+        limit = self._size <= max(1, self._largest >> LIMIT_HALVINGS) and (
+            self._size <= LIMIT_WIDTH * self._now
+        )
+        self._wary = self._wary or (self._failed is not None and self._moved)
+        end = self._now + self._size
+        self._failed = end if self._failed is None else min(end, self._failed)
+        self._moved = False
+        if self._size == 1 or (no_equilibrium and limit):
             return False
         self._size //= 2
         return True

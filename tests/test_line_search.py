@@ -1,0 +1,159 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Hard steps: directions uphill, stalls, limit loads, and what a failure names."""
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+import pytest
+import scenes
+from scenes import QUADRILATERAL, WORLD
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.history import Statistics
+from mpm_dolfinx.line_search import stalled
+from mpm_dolfinx.solver import NewtonSolver
+from mpm_dolfinx.stepping import StepControl
+
+
+class DoubleWell:
+    """Gradient of the sum of ``c_i (X_i^2 - 1)^2 / 4 - g X_i`` in ``x = X - start``."""
+
+    def __init__(self, c, g, start=0.57):
+        self.c, self.g, self.start = np.asarray(c, float), g, start
+        n = len(self.c)
+        self.K = PETSc.Mat().createAIJ((n, n), nnz=1, comm=MPI.COMM_SELF)
+        self.x = np.zeros(n)
+
+    def residual(self, x, F):
+        self.x = x.array_r + self.start
+        F.array_w[:] = self.c * (self.x**3 - self.x) - self.g
+        return None
+
+    def tangent(self):
+        for i, value in enumerate(self.c * (3.0 * self.x**2 - 1.0)):
+            self.K.setValue(i, i, value)
+        self.K.assemble()
+        return self.K
+
+    def potential(self, x):
+        return float((self.c * (x * x - 1.0) ** 2 / 4.0 - self.g * x).sum())
+
+    def prediction(self):
+        return None
+
+    def impose(self):
+        return False
+
+    def scale(self):
+        return 1.0
+
+    def internal_scale(self):
+        return 1.0
+
+    def motion(self, x):
+        return x.norm()
+
+    def extent(self):
+        return 1.0
+
+
+def newton(**options):
+    given = {"symmetric": True, "shift": 1e-13, "line_search": True, **options}
+    return NewtonSolver(MPI.COMM_SELF, "hill_", {}, statistics=Statistics(), **given)
+
+
+def test_a_step_uphill_is_redirected():
+    # Near an inflection the potential's curvature is small and negative: Newton's own step is long
+    # and leads uphill, where the residual grows.
+    problem = DoubleWell([1.0, 5.0, 0.3], 0.1)
+    solver = newton()
+    solver.solve(problem, (3, 3))
+    assert solver.statistics["redirections"] >= 1
+    x = solver.x.array_r + problem.start
+    assert np.all(3.0 * x**2 > 1.0)  # a minimum of the potential, not its maximum
+    assert np.all(x > 0.0)  # the one downhill from the start
+    assert problem.potential(x) < problem.potential(np.full(3, problem.start))
+    np.testing.assert_allclose(problem.c * (x**3 - x), 0.1, atol=1e-8)
+    assert solver.statistics["factorisations"] == solver.iterations
+
+
+@pytest.mark.parametrize("options", [{"symmetric": False}, {"shift": 0.0}, {"line_search": False}])
+def test_no_redirection_without_its_conditions(options):
+    solver = newton(**options)
+    try:
+        solver.solve(DoubleWell([1.0, 5.0, 0.3], 0.1), (3, 3))
+    except mpm.ConvergenceError:
+        assert solver.no_equilibrium
+    assert solver.statistics["redirections"] == 0
+
+
+def test_stalls():
+    falling = [2.0**-i for i in range(40)]
+    assert not any(stalled(falling[:n]) for n in range(1, 41))
+    assert not stalled([1.0] * 15)
+    assert stalled([1.0] * 16)
+    cycle = [1.0, 0.3, 2.0] * 10
+    assert stalled(cycle)
+    assert not stalled([1.0] * 14 + [0.6, 0.5])
+
+
+def test_a_bracket_ends_at_a_limit():
+    control = StepControl(10)
+    for _ in range(5):
+        control.accept(20)
+    cuts = 0
+    while control.cut_back(no_equilibrium=True):
+        cuts += 1
+    assert cuts == 8  # 1/10 halved to below a thousandth of 1/2
+    other = StepControl(10)
+    while other.cut_back(no_equilibrium=True):
+        pass
+    assert other.target == pytest.approx(0.1 / 1024)  # nothing is reached yet
+
+
+def test_a_step_that_failed_after_growing_does_not_grow_at_once():
+    control = StepControl(1)
+    limit, ends, failures = 0.3, [], 0
+    while True:
+        if control.target > limit:
+            failures += 1
+            if not control.cut_back(no_equilibrium=True):
+                break
+        else:
+            ends.append(control.target)
+            control.accept(3)
+    assert limit - ends[-1] < 2e-3 * limit
+    assert failures <= 12
+
+
+def test_onset_of_a_collapse_is_passed():
+    # One-point quadrilaterals on cells that do not fit: the tangent has negative pivots on the way.
+    problem = scenes.slump(QUADRILATERAL, 160e3, h=1.06, width=106.0, height=8.0)
+    history = problem.solve(steps=20)
+    assert history.load[-1] == 1.0 and history.cutbacks <= 3
+
+
+def test_limit_load_is_told():
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 1.5], [8, 6], QUADRILATERAL))
+    body = scenes.box([0.0, 0.0], [1.1, 0.9], [8, 8], QUADRILATERAL)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(body, V),
+        mpm.materials.SmallStrainVonMises(1e4, 0.3, rho_y=10.0),
+        bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)],
+        tractions=[((2 * np.sqrt(2) * 10.0, 0.0), 1)],
+        facet_tags=scenes.facet_tags(body, scenes.at(0, 1.1)),
+    )
+    with pytest.raises(mpm.MPMError) as caught:
+        problem.solve(steps=10)
+    error = caught.value
+    assert all(text == str(error) for text in WORLD.allgather(str(error)))
+    assert 0.499 <= error.load <= 0.5001
+    assert problem.history.cutbacks <= 12
+    assert problem.history.total_iterations < 350
+    if isinstance(error, mpm.ConvergenceError):
+        assert "no equilibrium was found up to 0.50" in str(error)
+        assert len(error.dofs) == 1 and f"dof {error.dofs[0]} of V near (" in str(error)
+        assert 0 <= error.dofs[0] < problem.particles.T.getSize()[1]
+        assert error.particles
