@@ -128,6 +128,7 @@ def test_a_step_that_failed_after_growing_does_not_grow_at_once():
     assert failures <= 12
 
 
+@pytest.mark.skip_in_parallel
 def test_onset_of_a_collapse_is_passed():
     # One-point quadrilaterals on cells that do not fit: the tangent has negative pivots on the way.
     problem = scenes.slump(QUADRILATERAL, 160e3, h=1.06, width=106.0, height=8.0)
@@ -136,8 +137,8 @@ def test_onset_of_a_collapse_is_passed():
 
 
 def test_limit_load_is_told():
-    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 1.5], [8, 6], QUADRILATERAL))
-    body = scenes.box([0.0, 0.0], [1.1, 0.9], [8, 8], QUADRILATERAL)
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 1.5], [4, 3], QUADRILATERAL))
+    body = scenes.box([0.0, 0.0], [1.1, 0.9], [4, 4], QUADRILATERAL)
     problem = mpm.QuasiStaticProblem(
         mpm.Particles(body, V),
         mpm.materials.SmallStrainVonMises(1e4, 0.3, rho_y=10.0),
