@@ -26,11 +26,14 @@ from petsc4py import PETSc
 import basix
 import basix.ufl
 import ufl
-from dolfinx import fem, geometry, la, mesh
+from dolfinx import fem, geometry, graph, io, la, mesh
 from dolfinx.fem import petsc as fem_petsc
+
+from .errors import MPMError
 
 __all__ = [
     "NonlinearProblem",
+    "are_tags_of",
     "candidate_cells",
     "cell_tree",
     "create_vector",
@@ -40,7 +43,9 @@ __all__ = [
     "input_cell_index",
     "interpolation_points",
     "is_condition_on",
+    "mesh_on_ranks",
     "require_supported",
+    "tags_from_nodes",
     "use_basic_line_search",
 ]
 
@@ -96,8 +101,64 @@ def is_condition_on(bc: fem.DirichletBC, V: fem.FunctionSpace) -> bool:
     return bool(bc.function_space == own or own.contains(bc.function_space))
 
 
+def are_tags_of(tags: mesh.MeshTags, domain: mesh.Mesh) -> bool:
+    """Return whether tags are of a mesh (whose topology is wrapped since 0.10)."""
+    return bool(tags.topology == getattr(domain.topology, "_cpp_object", domain.topology))
+
+
+def tags_from_nodes(
+    domain: mesh.Mesh, dim: int, nodes: NDArray[np.int64], values: NDArray[np.int32]
+) -> mesh.MeshTags:
+    """Return tags of entities that are given by input numbers of their nodes.
+
+    Args:
+        domain: The mesh (collective).
+        dim: Dimension of the entities.
+        nodes: Input numbers, shape ``(n, k)``, each entity on one rank, any one.
+        values: Their tags, shape ``(n,)``.
+    """
+    entities, local = io.distribute_entity_data(domain, dim, nodes, values)
+    return mesh.meshtags_from_entities(
+        domain, dim, graph.adjacencylist(np.asarray(entities, dtype=np.int32)), local
+    )
+
+
+def mesh_on_ranks(
+    comm: MPI.Comm,
+    cells: NDArray[np.int64],
+    like: mesh.Mesh,
+    x: NDArray[np.float64],
+    ranks: list[list[int]],
+) -> mesh.Mesh:
+    """Return a mesh with each cell where one says (cells and points swapped before 0.10).
+
+    Args:
+        comm: Communicator (collective).
+        cells: Nodes of this rank's part of the input, shape ``(n, k)``.
+        like: A mesh with the coordinate element that is wanted.
+        x: This rank's part of the points, shape ``(m, gdim)``.
+        ranks: For each of the cells its rank, then those where it is a ghost.
+    """
+    counts = [len(targets) for targets in ranks]
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    flat = np.array([rank for targets in ranks for rank in targets], dtype=np.int32)
+
+    def partitioner(*_: Any) -> Any:
+        return dolfinx.cpp.graph.AdjacencyList_int32(flat, offsets)
+
+    domain: Any = like.ufl_domain()
+    element = domain.ufl_coordinate_element()
+    create: Any = mesh.create_mesh
+    middle = (x, element) if _VERSION < (0, 10) else (element, x)
+    whole: mesh.Mesh = create(comm, cells, *middle, partitioner)
+    return whole
+
+
 def disconnected_mesh(
-    comm: MPI.Comm, corners: NDArray[np.float64], cell: basix.CellType
+    comm: MPI.Comm,
+    corners: NDArray[np.float64],
+    cell: basix.CellType,
+    index: NDArray[np.int64] | None = None,
 ) -> mesh.Mesh:
     """Return a mesh whose cells share no vertex and stay on the rank that gives them.
 
@@ -108,6 +169,7 @@ def disconnected_mesh(
         comm: Communicator (collective).
         corners: Corners of this rank's cells in DOLFINx order, shape ``(n, k, gdim)``.
         cell: Cell type.
+        index: Input index of each cell; ``None`` numbers them from rank to rank.
     """
     n, k, gdim = corners.shape
     vertices = dolfinx.cpp.common.IndexMap(comm, n * k)
@@ -115,33 +177,42 @@ def disconnected_mesh(
     dofmap = np.arange(n * k, dtype=np.int32).reshape(n, k)
     element = basix.ufl.element("Lagrange", cell.name, 1, shape=(gdim,))
     coordinate_element: Any = fem.coordinate_element  # dispatched on the element
+    coordinates = coordinate_element(element.basix_element)
     geometry_nodes = mesh.create_geometry(
         vertices,
         dofmap,
-        # 0.9 takes the C++ object, which is as good later
-        coordinate_element(element.basix_element)._cpp_object,
+        coordinates._cpp_object if _VERSION < (0, 10) else coordinates,
         np.ascontiguousarray(corners.reshape(-1, gdim)),
         np.arange(n * k, dtype=np.int64) + vertices.local_range[0],
     )
-    topology = _topology(comm, cell, dofmap, vertices, cells)
+    topology = _topology(comm, cell, dofmap, vertices, cells, index)
     whole = dolfinx.cpp.mesh.Mesh_float64(comm, topology, geometry_nodes._cpp_object)
     return mesh.Mesh(whole, ufl.Mesh(element))
 
 
 def _topology(
-    comm: MPI.Comm, cell: basix.CellType, corners: NDArray[np.int32], vertices: Any, cells: Any
+    comm: MPI.Comm,
+    cell: basix.CellType,
+    corners: NDArray[np.int32],
+    vertices: Any,
+    cells: Any,
+    index: NDArray[np.int64] | None,
 ) -> Any:
     """Return the topology of cells that share no vertex (put together by setters before 0.10)."""
     cell_type = mesh.to_type(cell.name)
     connectivity = dolfinx.cpp.graph.AdjacencyList_int32(corners)
     if not hasattr(dolfinx.cpp.mesh.Topology, "set_index_map"):
+        if index is None:
+            index = np.arange(*cells.local_range, dtype=np.int64)
         return dolfinx.cpp.mesh.Topology(
             cell_type=cell_type,
             vertex_map=vertices,
             cell_map=cells,
             cells=connectivity,
-            original_index=np.arange(*cells.local_range, dtype=np.int64),
+            original_index=index,
         )
+    if index is not None:
+        raise MPMError("Boxes without a mesh move between ranks with DOLFINx 0.10 or newer only.")
     topology = dolfinx.cpp.mesh.Topology(comm, cell_type)
     single = dolfinx.cpp.graph.AdjacencyList_int32(np.arange(corners.size, dtype=np.int32)[:, None])
     topology.set_index_map(0, vertices)

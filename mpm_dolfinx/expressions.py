@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,16 +13,17 @@ import ufl
 from dolfinx import fem, mesh
 
 from .errors import MPMError
+from .materials import Material
 from .particles import Particles
 
-__all__ = ["as_expression", "facet_measure", "known_tags"]
+__all__ = ["as_expression", "carried", "facet_measure", "known_tags", "require_movable"]
 
 
 def as_expression(value: Any, particles: Particles, name: str, shape: tuple[int, ...]) -> Any:
     """Return a value as a UFL expression on the body mesh.
 
     Args:
-        value: Numbers or UFL.
+        value: Numbers or UFL, or a function that makes UFL from the body mesh.
         particles: The body.
         name: What it is called in a message.
         shape: The shape that it must have.
@@ -30,6 +31,8 @@ def as_expression(value: Any, particles: Particles, name: str, shape: tuple[int,
     Raises:
         MPMError: It is something else, not finite, of another shape, or on another mesh.
     """
+    if callable(value) and not isinstance(value, ufl.core.expr.Expr):
+        value = value(particles.mesh)
     if not isinstance(value, ufl.core.expr.Expr):
         try:
             array = np.asarray(value, dtype=np.float64)
@@ -46,6 +49,54 @@ def as_expression(value: Any, particles: Particles, name: str, shape: tuple[int,
         if domain != particles.mesh.ufl_domain():
             raise MPMError(f"{name} lives on another mesh; write it on the body mesh.")
     return value
+
+
+def carried(particles: Particles, assignment: Any) -> Any:
+    """Return materials with their DG0 parameters on the mesh to which the particles have moved."""
+    if isinstance(assignment, Mapping):
+        return {tag: carried(particles, material) for tag, material in assignment.items()}
+    if not isinstance(assignment, Material):
+        return assignment
+    functions = {
+        name: particles.carry(value)
+        for name, value in assignment.parameters.items()
+        if isinstance(value, fem.Function)
+    }
+    return assignment.with_parameters(**functions) if functions else assignment
+
+
+def require_movable(arguments: Mapping[str, Any]) -> None:
+    """Raise an error unless a problem can be made again on a mesh with other ranks.
+
+    Args:
+        arguments: Those of :class:`QuasiStaticProblem`.
+
+    Raises:
+        MPMError: Something among them lives on the present body mesh.
+    """
+    for name in ("density", "body_force", "tractions", "pressures"):
+        if _holds(arguments[name], ufl.core.expr.Expr):
+            raise MPMError(
+                f"{name} is written on the present body mesh, so the particles cannot move; give "
+                "a function that makes it from a mesh, e.g. lambda mesh: "
+                "ufl.SpatialCoordinate(mesh)[1]."
+            )
+    if arguments["supports"]:
+        raise MPMError("Particles with supports= on their boundary cannot move to other ranks.")
+    materials = arguments["material"]
+    for given in materials if isinstance(materials, list | tuple) else [materials]:
+        for law in given.values() if isinstance(given, Mapping) else [given]:
+            if any(isinstance(value, np.ndarray) for value in law.parameters.values()):
+                raise MPMError(
+                    "A material has arrays of parameters, one value for each particle of a rank, "
+                    "so the particles cannot move; use DG0 Functions."
+                )
+
+
+def _holds(value: Any, kind: type) -> bool:
+    if isinstance(value, list | tuple):
+        return any(_holds(entry, kind) for entry in value)
+    return isinstance(value, kind)
 
 
 def known_tags(particles: Particles, facet_tags: Any, what: str) -> set[int]:

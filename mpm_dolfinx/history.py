@@ -21,6 +21,7 @@ COUNTERS = (
     "off_rank_columns",
     "particle_imbalance",
     "dof_imbalance",
+    "repartitions",
     "residuals",
     "predictions",
     "rejected_predictions",
@@ -46,6 +47,7 @@ class Statistics(dict[str, float]):
     (share of the bodies' nodes that move with an unknown of another rank, in the last step) and
     ``off_rank_columns`` (unknowns that ranks need of others for a product with T, 8 bytes each),
     ``particle_imbalance`` and ``dof_imbalance`` (largest number on a rank over the mean),
+    ``repartitions`` (how often particles moved to other ranks),
     ``residuals`` and
     ``factorisations``, ``predictions`` (steps that began at the extrapolated increment) and
     ``rejected_predictions``, ``halvings`` (of Newton steps by the line search), ``redirections``

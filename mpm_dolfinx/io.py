@@ -40,16 +40,21 @@ class TimeSeries:
             path.parent.mkdir(parents=True, exist_ok=True)
         comm.barrier()
         self._particles = particles
+        self.follow()
+        self._file = io.VTKFile(comm, str(path), "w")
+
+    def follow(self) -> None:
+        """Take the particles as they are spread over the ranks now (collective)."""
+        particles = self._particles
         self._undeformed = particles.initial_domains
         self._mesh = particles.mesh
         if particles.method != "cpdi2":
             cell = particles.mesh.basix_cell()
-            self._mesh = _compat.disconnected_mesh(comm, self._undeformed, cell)
+            self._mesh = _compat.disconnected_mesh(self._mesh.comm, self._undeformed, cell)
         gdim = self._mesh.geometry.dim
         nodal = fem.functionspace(self._mesh, ("Lagrange", 1, (gdim,)))
         self._displacement = fem.Function(nodal, name="displacement")
         self._fields: dict[str, fem.Function] = {}
-        self._file = io.VTKFile(comm, str(path), "w")
 
     def write(self, time: float) -> None:
         """Add the last converged state (collective)."""

@@ -166,7 +166,8 @@ def even(comm: MPI.Comm, homes: NDArray[np.int64], slack: float) -> NDArray[np.i
     Args:
         comm: The ranks.
         homes: Rank where each of this rank's items is best, shape ``(n,)``. Where a home has
-            too many, the last ones (by rank, then by order) go to ranks that have room.
+            too many, the last ones (it keeps its own first; then by rank and order) go to ranks
+            that have room.
         slack: How much more than an even share, relatively, a rank may have.
 
     Returns:
@@ -176,7 +177,10 @@ def even(comm: MPI.Comm, homes: NDArray[np.int64], slack: float) -> NDArray[np.i
     counts = np.array(comm.allgather(np.bincount(homes, minlength=size)))
     total = counts.sum(axis=0)
     most = int(np.ceil((1.0 + slack) * total.sum() / size))
-    before = counts[: comm.rank].sum(axis=0)
+    # First come those that are at home already, then the others by rank.
+    stay = counts.diagonal()
+    before = counts[: comm.rank].sum(axis=0) + np.where(np.arange(size) > comm.rank, stay, 0)
+    before[comm.rank] = 0
     order = np.argsort(homes, kind="stable")
     ends = np.searchsorted(homes[order], np.arange(size + 1))
     excess = np.maximum(total - most, 0)

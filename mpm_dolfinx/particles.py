@@ -32,6 +32,7 @@ from .methods import (
     mpm,
     require_boxes,
 )
+from .partition import Redistribution, cell_centres, ranks_of_background
 from .quadrature import (
     DomainQuadrature,
     default_degree,
@@ -75,9 +76,12 @@ class Particles:
             step), ``"delete"`` goes on without the domain and adds up what is lost.
         domain_update: For ``"gimp"``: ``"stretch"`` (half-lengths follow the diagonal of the
             right stretch) or ``"fixed"`` (the box only translates).
+        partition: ``"given"`` leaves the cells of ``body`` on their ranks; ``"background"``
+            makes ``mesh`` a copy of it whose cells are on the ranks that own the background
+            where they lie, as evenly as can be.
 
     Attributes:
-        mesh: The body mesh, undeformed.
+        mesh: The body mesh, undeformed: ``body``, or its copy with ``partition="background"``.
         V: The background space.
         W: Space of the domains' displacement.
         displacement: Total displacement d in W.
@@ -108,9 +112,25 @@ class Particles:
         quadrature_degree: int | None = None,
         outside: str = "error",
         domain_update: str = "stretch",
+        partition: str = "given",
     ) -> None:
         validate_spaces(body, V)
         validate_options(body, V, method, degree, quadrature_degree, outside, domain_update)
+        if partition not in ("given", "background"):
+            raise MPMError(f"Unknown partition={partition!r}; choose 'given' or 'background'.")
+        self._options: dict[str, Any] = {
+            "method": method,
+            "degree": degree,
+            "quadrature_degree": quadrature_degree,
+            "outside": outside,
+            "domain_update": domain_update,
+        }
+        self._moves: list[Redistribution] = []
+        self._background = BackgroundBasis(V)
+        if partition == "background":
+            ranks = ranks_of_background(V, self._background, cell_centres(body))
+            self._moves.append(Redistribution(body, ranks))
+            body = self._moves[-1].mesh
         self.mesh = body
         self.V = V
         self.method = method
@@ -138,7 +158,6 @@ class Particles:
         self._nodes = self.W.tabulate_dof_coordinates()[:, : self._gdim].copy()
         self.outside = outside
         self.deletion = Deletion(body, self.W) if outside == "delete" else None
-        self._background = BackgroundBasis(V)
         self._domain_update = domain_update
         self._grid = None
         if method == "gimp":
@@ -196,6 +215,43 @@ class Particles:
         unit = basix.geometry(cell) - 0.5
         corners = centres[:, None] + unit * sides[:, None]
         return cls(_compat.disconnected_mesh(comm, corners, cell), V, method=method, **options)
+
+    def carry(self, thing: Any) -> Any:
+        """Return tags or a DG0 Function on ``mesh``, to which cells have moved (collective).
+
+        Args:
+            thing: ``MeshTags`` or a piecewise constant Function on the body mesh that was given,
+                or on any ``mesh`` since; anything else is returned as it is.
+
+        Raises:
+            MPMError: A Function that is not piecewise constant.
+        """
+        for move in self._moves:
+            thing = move.carry(thing)
+        return thing
+
+    def ranks_of_background(self) -> NDArray[np.int64]:
+        """Return the rank on which each particle would best be now, shape ``(n,)`` (collective).
+
+        That which owns the background where the particle is, or its own where that has 5 % more
+        than an even share already.
+        """
+        return ranks_of_background(self.V, self._background, self.centroid)
+
+    def move(self, ranks: NDArray[np.int64]) -> None:
+        """Move particles to other ranks, undeformed (collective).
+
+        ``mesh``, ``W``, ``displacement`` and ``load`` are new ones then. What else there is to
+        be moved is the business of :meth:`QuasiStaticProblem.repartition`.
+
+        Args:
+            ranks: New rank of each particle this rank owns, shape ``(n,)``.
+        """
+        move = Redistribution(self.mesh, ranks)
+        moves, V, increment, options = self._moves, self.V, self.increment, self._options
+        self.__dict__.clear()
+        Particles.__init__(self, move.mesh, V, **options)
+        self._moves, self.increment = [*moves, move], increment
 
     def _measure(self, degree: int) -> ufl.Measure:
         metadata = {"quadrature_degree": degree, "quadrature_rule": "default"}

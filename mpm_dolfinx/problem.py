@@ -124,7 +124,8 @@ class ParticleProblem:
                 "A Dirichlet condition is not on the background space V of the particles "
                 "or on a component of it (V.sub(i))."
             )
-        self.history = History()
+        if "history" not in self.__dict__:  # made anew by repartition
+            self.history = History()
         self._comm: MPI.Comm = V.mesh.comm
         self._clean_up = Cleaner(self._comm, [V.mesh, *(body.mesh for body in self.bodies)])
         self.shares = [
@@ -168,12 +169,15 @@ class ParticleProblem:
     def __del__(self) -> None:
         """Drop what PETSc holds; at the program's end PETSc does it."""
         if "_newton" in self.__dict__ and not sys.is_finalizing():
-            for body in self.bodies:
-                body.__dict__.pop("T", None)
-            self.shares.clear()
-            for part in (self.reduced, self._newton):
-                part.__dict__.clear()
-            self._clean_up.end()
+            self._release()
+
+    def _release(self) -> None:
+        for body in self.bodies:
+            body.__dict__.pop("T", None)
+        self.shares.clear()
+        for part in (self.reduced, self._newton):
+            part.__dict__.clear()
+        self._clean_up.end()
 
     # -- PETSc objects --------------------------------------------------------------------
 
@@ -204,6 +208,7 @@ class ParticleProblem:
         steps: int = 1,
         update: Callable[[float], None] | None = None,
         progress: bool = False,
+        repartition: float | None = None,
     ) -> History:
         """Apply the whole load.
 
@@ -213,6 +218,8 @@ class ParticleProblem:
                 Constants and Functions to their totals at t in (0, 1]. It may be called again
                 with a smaller t after a failure. The load factor is t unless it sets another.
             progress: Whether rank 0 shows a progress bar.
+            repartition: Share of the particles that makes them move to other ranks after a
+                step (:meth:`QuasiStaticProblem.repartition`); ``None`` leaves them.
 
         Returns:
             The history of the run.
@@ -228,12 +235,17 @@ class ParticleProblem:
             unit="step",
             bar_format="{l_bar}{bar}| {n:.3g}/{total} [{elapsed}<{remaining}{postfix}]",
         ) as bar:
-            for step in self.steps(steps, update):
+            for step in self.steps(steps, update, repartition):
                 bar.set_postfix_str(f"{step.iterations} solves")
                 bar.update(step.load * steps - bar.n)
         return self.history
 
-    def steps(self, steps: int, update: Callable[[float], None] | None = None) -> Iterator[Step]:
+    def steps(
+        self,
+        steps: int,
+        update: Callable[[float], None] | None = None,
+        repartition: float | None = None,
+    ) -> Iterator[Step]:
         """Apply the whole load, one converged step at a time.
 
         After :meth:`restore` it goes on with the run that was interrupted.
@@ -241,6 +253,7 @@ class ParticleProblem:
         Args:
             steps: As in :meth:`solve`.
             update: As in :meth:`solve`.
+            repartition: As in :meth:`solve`.
 
         Yields:
             Each converged step.
@@ -281,6 +294,8 @@ class ParticleProblem:
                     return
                 raise placed from None
             control.accept(step.iterations)
+            if repartition is not None:
+                self.repartition(repartition)
             yield step
         self._run = None
         self._warn_of_outside()
@@ -400,6 +415,23 @@ class ParticleProblem:
     def _warn(self, sentence: str) -> None:
         if self._comm.rank == 0:
             warnings.warn(sentence, stacklevel=4)
+
+    def repartition(self, threshold: float = 0.1) -> bool:
+        """Move particles with their history to where they are best now (collective).
+
+        Args:
+            threshold: Share of the particles that must be better elsewhere.
+
+        Returns:
+            Whether particles have moved.
+
+        Raises:
+            MPMError: The problem holds what cannot move: a residual in UFL.
+        """
+        raise MPMError(
+            "The residual is written on the present body mesh, so its particles cannot move; "
+            "place them at the start with Particles(..., partition='background')."
+        )
 
     def save(self, path: str | Path, functions: Sequence[fem.Function] = ()) -> None:
         """Write a checkpoint of the last converged step (collective).

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem
 
+from . import state
 from .boundary import Support
 from .constitutive import ConstitutiveHistory
 from .errors import MPMError
-from .expressions import as_expression, facet_measure
+from .expressions import as_expression, carried, facet_measure, require_movable
 from .f_bar import F_BARS, LowRankTangent
 from .grouping import background_cells
 from .particles import Particles
@@ -43,7 +44,7 @@ class QuasiStaticProblem(ParticleProblem):
         material: A material, or ``{cell tag: material}`` with ``cell_tags``.
         density: Mass per undeformed volume: a number, Constant, Function or UFL expression.
         body_force: Force per mass at full load: a tuple, Constant, Function or UFL expression
-            on the body mesh.
+            on the body mesh, or a function that makes one from the mesh.
         bcs: Dirichlet conditions on V, totals at full load.
         tractions: Pairs of a dead load per undeformed area at full load (tuple or UFL) and a
             tag of ``facet_tags``.
@@ -94,6 +95,7 @@ class QuasiStaticProblem(ParticleProblem):
         predictor: bool = True,
         **options: Any,
     ) -> None:
+        self._arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
         if f_bar not in F_BARS:
             raise MPMError(
                 f"Unknown f_bar={f_bar!r}; choose one of {', '.join(map(repr, F_BARS))}."
@@ -116,7 +118,8 @@ class QuasiStaticProblem(ParticleProblem):
         self._density: list[ufl.Form] = []
         residuals, tangents = [], []
         for body, law, mass, force, dead, following, cells, facets in shares:
-            history = ConstitutiveHistory(body, law, cells, axisymmetric, f_bar)
+            cells, facets = body.carry(cells), body.carry(facets)
+            history = ConstitutiveHistory(body, carried(body, law), cells, axisymmetric, f_bar)
             stress = _InjectedStress(body, history)
             self._stresses.append(stress)
             frame = _Frame(body, axisymmetric)
@@ -186,6 +189,50 @@ class QuasiStaticProblem(ParticleProblem):
         (each,) = self._density[number].arguments()
         cells = each.ufl_function_space().dofmap.list[: self.bodies[number].num_local, 0]
         return np.asarray(vector.array[cells])
+
+    def repartition(self, threshold: float = 0.1) -> bool:
+        """Move particles with their history to where they are best now (collective).
+
+        A particle is best on the rank that owns the background around it, unless that has 5 %
+        more than an even share already. Tags and DG0 parameters move too; the answer does not
+        change. Afterwards ``particles.mesh``, ``W``, ``displacement`` and ``load`` are new
+        ones, and what was made on those before is out of use: take tags over by
+        ``particles.carry``.
+
+        Args:
+            threshold: Share of the particles that must be better elsewhere.
+
+        Returns:
+            Whether particles have moved.
+
+        Raises:
+            MPMError: The problem holds what cannot move: UFL expressions, supports or arrays of
+                parameters on the present body mesh. Nothing is changed.
+        """
+        if not isinstance(threshold, float | int) or not 0.0 <= threshold <= 1.0:
+            raise MPMError(f"threshold must be a share from 0 to 1, not {threshold!r}.")
+        require_movable(self._arguments)
+        ranks = [body.ranks_of_background() for body in self.bodies]
+        leaving = sum(int(np.count_nonzero(r != self._comm.rank)) for r in ranks)
+        share = self._comm.allreduce(leaving) / sum(body.num_global for body in self.bodies)
+        if share <= threshold or share == 0.0:
+            return False
+        snapshot = state.capture(self)
+        seconds = self.history.statistics.seconds
+        run, resume, series = self._run, self._resume, self._series
+        arguments = dict(self._arguments)
+        options = arguments.pop("options")
+        self._release()
+        for body, targets in zip(self.bodies, ranks, strict=True):
+            body.move(targets)
+        QuasiStaticProblem.__init__(self, **arguments, **options)
+        state.adopt(self, snapshot, (), False, "The state before the move")
+        self._run, self._resume, self._series = run, resume, series
+        self.history.statistics.update(seconds)
+        self.history.statistics.count("repartitions")
+        for file in (file for files in series.values() for file in files):
+            file.follow()
+        return True
 
     def converged_state(self) -> list[dict[str, NDArray[Any]]]:
         """See :meth:`ParticleProblem.converged_state`."""

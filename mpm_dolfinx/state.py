@@ -304,7 +304,7 @@ def _mesh(domain: mesh.Mesh) -> list[Any]:
     index = _compat.input_cell_index(domain)
     corners = domain.geometry.x[_compat.geometry_dofmap(domain)[: len(index)]]
     size = domain.comm.allreduce(float(np.abs(corners).max(initial=0.0)), MPI.MAX)
-    places = 1.0 + corners.reshape(len(index), -1) / (size or 1.0)
+    places = 1.0 + corners.reshape(len(index), 3 * corners.shape[1]) / (size or 1.0)
     mean = _weighted(domain.comm, index, places)
     return [domain.basix_cell().name, cells.size_global, size, *mean.tolist()]
 

@@ -262,6 +262,12 @@ def test_written_by_all_ranks_read_by_one(mpi_tmp_path):
     interrupt(two_bodies, 4, mpi_tmp_path / "bodies.ckpt", 1, lambda: two_bodies(SELF))
 
 
+def test_ranks_without_particles(mpi_tmp_path):
+    path = mpi_tmp_path / "one.ckpt"
+    interrupt(lambda: scenes.block(n=1), 3, path, 1)
+    interrupt(lambda: scenes.block(n=1), 3, path, 1, lambda: scenes.block(n=1, comm=SELF))
+
+
 @pytest.mark.mpi
 def test_written_by_one_rank_read_by_all(mpi_tmp_path):
     path = mpi_tmp_path / "bodies.ckpt"

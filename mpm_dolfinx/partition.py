@@ -1,0 +1,170 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Body meshes whose cells live where the background cells are in which they lie."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem, la, mesh
+
+from . import _compat
+from .errors import MPMError
+from .exchange import RowExchange
+from .layout import even
+from .location import BackgroundBasis
+
+__all__ = ["Redistribution", "cell_centres", "ranks_of_background"]
+
+#: How many particles more than an even share a rank may have, relatively.
+SLACK = 0.05
+
+
+def ranks_of_background(
+    V: fem.FunctionSpace, background: BackgroundBasis, points: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Return for each point the rank that owns most of the background where it lies (collective).
+
+    No rank gets more than 5 % above an even share: what is too many stays where it is, as far as
+    there is room.
+
+    Args:
+        V: Background space.
+        background: Its basis.
+        points: This rank's points, shape ``(n, gdim)``.
+    """
+    comm = V.mesh.comm
+    basis = background.at(points)
+    firsts = np.array(comm.allgather(V.dofmap.index_map.local_range[0]))
+    owners = np.searchsorted(firsts, basis.nodes, side="right") - 1
+    shares = np.einsum("nk,nkj->nj", basis.values, owners[:, :, None] == owners[:, None, :])
+    best = np.take_along_axis(owners, shares.argmax(axis=1)[:, None], axis=1)[:, 0]
+    return even(comm, np.where(basis.found, best, comm.rank), SLACK)
+
+
+def cell_centres(body: mesh.Mesh) -> NDArray[np.float64]:
+    """Return the mean of the corners of each owned cell, shape ``(n, gdim)``."""
+    count = body.topology.index_map(body.topology.dim).size_local
+    corners = body.geometry.x[_compat.geometry_dofmap(body)[:count]]
+    return np.asarray(corners[:, :, : body.geometry.dim].mean(axis=1))
+
+
+class Redistribution:
+    """A mesh whose cells have moved to other ranks, and what moves with it.
+
+    Cells keep their input index. On one rank the mesh is the same one.
+
+    Args:
+        source: The mesh before.
+        ranks: New rank of each cell that this rank owns, shape ``(n,)`` (collective).
+
+    Attributes:
+        source: The mesh before.
+        mesh: The mesh after.
+    """
+
+    def __init__(self, source: mesh.Mesh, ranks: NDArray[np.int64]) -> None:
+        self.source = source
+        self.mesh = source if source.comm.size == 1 else _moved(source, ranks)
+
+    def carry(self, thing: Any) -> Any:
+        """Return tags or a piecewise constant Function on the new mesh (collective).
+
+        Args:
+            thing: ``MeshTags`` or a DG0 Function on the mesh before; anything else, also what
+                lives on the new mesh already, is returned as it is.
+        """
+        if self.mesh is self.source:
+            return thing
+        if isinstance(thing, mesh.MeshTags) and _compat.are_tags_of(thing, self.source):
+            return self._tags(thing)
+        if isinstance(thing, fem.Function) and thing.function_space.mesh is self.source:
+            return self._function(thing)
+        return thing
+
+    def _tags(self, tags: mesh.MeshTags) -> mesh.MeshTags:
+        topology, dim = self.source.topology, tags.dim
+        topology.create_connectivity(dim, topology.dim)
+        topology.create_connectivity(dim, 0)
+        own = tags.indices < topology.index_map(dim).size_local
+        nodes = mesh.entities_to_geometry(self.source, dim, tags.indices[own])
+        numbers = self.source.geometry.index_map().local_to_global(nodes.ravel())
+        self.mesh.topology.create_connectivity(dim, 0)
+        self.mesh.topology.create_connectivity(dim, self.mesh.topology.dim)
+        moved = _compat.tags_from_nodes(
+            self.mesh, dim, numbers.reshape(nodes.shape), tags.values[own].astype(np.int32)
+        )
+        moved.name = tags.name
+        return moved
+
+    def _function(self, function: fem.Function) -> fem.Function:
+        space = function.function_space
+        element = space.ufl_element()
+        if element.degree != 0:
+            raise MPMError(
+                f"The Function {function.name} moves to other ranks only if it is piecewise "
+                "constant (DG0)."
+            )
+        bs = space.dofmap.bs
+        have, want = (_compat.input_cell_index(m) for m in (self.source, self.mesh))
+        values = function.x.array.reshape(-1, bs)[space.dofmap.list[: len(have), 0]]
+        moved = fem.Function(fem.functionspace(self.mesh, element), name=function.name)
+        cells = moved.function_space.dofmap.list[: len(want), 0]
+        moved.x.array.reshape(-1, bs)[cells] = RowExchange(self.mesh.comm, have, want)(values)
+        moved.x.scatter_forward()
+        return moved
+
+
+def _moved(source: mesh.Mesh, ranks: NDArray[np.int64]) -> mesh.Mesh:
+    comm, gdim = source.comm, source.geometry.dim
+    index = _compat.input_cell_index(source)
+    nodes = _compat.geometry_dofmap(source)[: len(index)]
+    numbering = source.geometry.index_map()
+    cells = source.topology.index_map(source.topology.dim)
+    if numbering.size_global == cells.size_global * nodes.shape[1]:
+        return _moved_apart(source, ranks, index, source.geometry.x[nodes][:, :, :gdim])
+    first, last = (cells.size_global * r // comm.size for r in (comm.rank, comm.rank + 1))
+    exchange = RowExchange(comm, index, np.arange(first, last))
+    numbers = exchange(numbering.local_to_global(nodes.ravel()).reshape(nodes.shape))
+    where = exchange(np.column_stack([ranks, _neighbours(source, ranks)]))
+    targets = [[row[0], *sorted({*row[1:]} - {row[0], -1})] for row in where.tolist()]
+    x = source.geometry.x[: numbering.size_local, :gdim].copy()
+    return _compat.mesh_on_ranks(comm, numbers, source, x, targets)
+
+
+def _moved_apart(
+    source: mesh.Mesh,
+    ranks: NDArray[np.int64],
+    index: NDArray[np.int64],
+    corners: NDArray[np.float64],
+) -> mesh.Mesh:
+    """Move cells that share no vertex."""
+    comm = source.comm
+    parts = comm.alltoall([(index[ranks == r], corners[ranks == r]) for r in range(comm.size)])
+    numbers, places = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.argsort(numbers)
+    return _compat.disconnected_mesh(comm, places[order], source.basix_cell(), numbers[order])
+
+
+def _neighbours(source: mesh.Mesh, ranks: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the new rank behind each facet of each owned cell; none in a mesh without ghosts."""
+    topology, dim = source.topology, source.topology.dim
+    cells = topology.index_map(dim)
+    if source.comm.allreduce(cells.num_ghosts) == 0:
+        return np.zeros((len(ranks), 0), dtype=np.int64)
+    topology.create_connectivity(dim, dim - 1)
+    topology.create_connectivity(dim - 1, dim)
+    everywhere = la.vector(cells, 1)
+    everywhere.array[: len(ranks)] = ranks
+    everywhere.scatter_forward()
+    behind = topology.connectivity(dim - 1, dim)
+    first, last = behind.array[behind.offsets[:-1]], behind.array[behind.offsets[1:] - 1]
+    facets = topology.connectivity(dim, dim - 1).array.reshape(
+        cells.size_local + cells.num_ghosts, -1
+    )
+    facets = facets[: len(ranks)]
+    other = first[facets] + last[facets] - np.arange(len(ranks))[:, None]
+    return np.asarray(everywhere.array[other], dtype=np.int64)
