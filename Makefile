@@ -16,7 +16,7 @@ BIN := $(VENV)/bin
 SETUP := sh scripts/setup_env.sh
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-debian lint docs clean
+.PHONY: help demo test test-debian stress lint docs clean
 
 help: ## This list
 	@echo "make TARGET [VENV=path of an environment] [PYTHON=path of an interpreter]"
@@ -34,6 +34,10 @@ test: ## Run the tests on one rank, then on NP=2 ranks (ARGS="-k name" goes to p
 
 test-debian: ## As root: the tests with Debian's DOLFINx 0.9, in a root made by debootstrap
 	@bash scripts/test_debian.sh $(ARGS)
+
+stress: ## Run the stress suite and report (ARGS="--only offset flow" for some classes)
+	@$(SETUP) wheel plot test
+	@cd tests && "$(abspath $(BIN)/python)" -m stress.run $(ARGS)
 
 lint: ## ruff check, ruff format --check, mypy
 	@$(SETUP) wheel plot test

@@ -1,0 +1,252 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Problems made from scenes."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+
+from dolfinx import fem, mesh
+from stress import generator
+
+import mpm_dolfinx as mpm
+
+
+class Run(NamedTuple):
+    """A problem with what drives it.
+
+    Attributes:
+        problem: The problem.
+        bodies: Its bodies.
+        density: Mass per undeformed volume.
+        gravity: Force per mass at full load.
+        material: The law.
+        young: Young's modulus.
+        bcs: The Dirichlet conditions.
+        update: What sets the loads at t in (0, 1], or None for a ramp.
+        factor: The load factor at t.
+    """
+
+    problem: Any
+    bodies: list[Any]
+    density: float
+    gravity: Any
+    material: Any
+    young: float
+    bcs: list[Any]
+    update: Any
+    factor: Any
+
+
+def grid(comm, lower, upper, n, cell, diagonal):
+    """Return a structured mesh."""
+    kind = getattr(mesh.CellType, cell)
+    if len(n) == 3:
+        return mesh.create_box(comm, [lower, upper], n, kind)
+    return mesh.create_rectangle(
+        comm, [lower, upper], n, kind, diagonal=getattr(mesh.DiagonalType, diagonal)
+    )
+
+
+def wobble(x, amount):
+    """Return displacements that look random and depend on positions alone."""
+    dim = x.shape[1]
+    phase = x @ np.array([[127.1, 311.7], [269.5, 183.3], [74.7, 246.1]])[:dim]
+    values = np.sin(phase) * 43758.5453
+    values = 2.0 * (values - np.floor(values)) - 1.0
+    return amount * np.column_stack([values, values[:, 0] * values[:, 1]])[:, :dim]
+
+
+def shaped(x, data):
+    """Return the positions of a body's nodes, from those of the unit square or cube."""
+    shape, dim = data["shape"], x.shape[1]
+    size, origin = np.array(data["size"]), np.array(data["origin"])
+    if shape == "jitter":
+        spacing = np.array([1.0 / n for n in data["n"]])
+        inner = np.all((x > 1e-9) & (x < 1 - 1e-9), axis=1)[:, None]
+        x = x + inner * spacing * wobble(np.round(x, 9), 0.25)
+    if shape == "disc":
+        a = 2.0 * x - 1.0
+        x = 0.5 + 0.5 * np.column_stack(
+            [a[:, 0] * np.sqrt(1 - 0.45 * a[:, 1] ** 2), a[:, 1] * np.sqrt(1 - 0.45 * a[:, 0] ** 2)]
+        )
+    if shape == "ring":
+        radius, angle = 0.5 + 0.5 * x[:, 1], 0.5 * np.pi * (1.0 - x[:, 0])
+        x = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+    if shape == "trapezium":
+        x = np.column_stack([0.5 + (x[:, 0] - 0.5) * (1.0 - 0.5 * x[:, 1]), x[:, 1]])
+    if shape == "wave":
+        x = np.column_stack([x[:, 0], x[:, 1] + 0.1 * np.sin(6.0 * x[:, 0])])
+    x = x * size
+    if shape == "turned":
+        c, s = np.cos(data["angle"]), np.sin(data["angle"])
+        turn = np.eye(dim)
+        turn[:2, :2] = [[c, -s], [s, c]]
+        x = x @ turn.T
+    return x + origin
+
+
+def make_body(comm, data, unit):
+    dim = len(data["n"])
+    domain = grid(comm, [0.0] * dim, [1.0] * dim, data["n"], data["cell"], data["diagonal"])
+    domain.geometry.x[:, :dim] = unit * shaped(domain.geometry.x[:, :dim].copy(), data)
+    return domain
+
+
+def make_background(comm, data, low, high, floor):
+    """Return a background around a box, without room left of (0) and below (1) it in ``floor``."""
+    h = data["h"] * (1.0 if data.get("unit") is None else data["unit"])
+    room = max(data["room"] * h / data["h"], h)
+    shift = np.array(data["shift"]) * h / data["h"]
+    cells_below = np.full(len(low), int(np.ceil(room / h - 1e-9)))
+    for axis in floor:
+        cells_below[axis] = 0
+    lower = low - cells_below * h + shift
+    n = np.maximum(1, np.ceil((high + room - lower) / h - 1e-9).astype(int))
+    upper = lower + n * h
+    domain = grid(comm, lower, upper, [int(k) for k in n], data["cell"], data["diagonal"])
+    if data["jitter"] > 0.0:
+        dim = len(low)
+        x = domain.geometry.x[:, :dim]
+        place = (x - lower) / h
+        inner = np.all((place > 1e-6) & (place < n - 1e-6), axis=1)[:, None]
+        x += inner * h * wobble(np.round(place, 6), data["jitter"])
+    return domain, lower, upper, h
+
+
+def box_of(bodies):
+    """Return the lower and upper corner of bodies on all ranks."""
+    comm, dim = bodies[0].comm, bodies[0].geometry.dim
+    points = np.concatenate([b.geometry.x[:, :dim] for b in bodies])
+    low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
+    comm.Allreduce(MPI.IN_PLACE, low, MPI.MIN)
+    comm.Allreduce(MPI.IN_PLACE, high, MPI.MAX)
+    return low, high
+
+
+def hold(V, marker, component=None):
+    """Return a condition, and its value, on all nodes of V where a marker holds."""
+    if component is None:
+        value = fem.Constant(V.mesh, np.zeros(V.mesh.geometry.dim))
+        return fem.dirichletbc(value, fem.locate_dofs_geometrical(V, marker), V), value
+    value = fem.Constant(V.mesh, 0.0)
+    sub = V.sub(component)
+    dofs = fem.locate_dofs_geometrical((sub, sub.collapse()[0]), marker)[0]
+    return fem.dirichletbc(value, dofs, sub), value
+
+
+def supports(V, kind, low, high, lower, h):
+    """Return conditions; the last value is that of the grip that moves."""
+    near = 1e-6 * h
+    if kind == "none":
+        return []
+    if kind == "edge":
+        return [hold(V, lambda x: x[0] < lower[0] + 0.5 * h + near)]
+    if kind == "clamp":
+        return [hold(V, lambda x: x[0] < low[0] + 1.5 * h + near)]
+    if kind == "stand":
+        return [hold(V, lambda x: x[1] < low[1] + near)]
+    if kind == "sunk":
+        return [hold(V, lambda x: x[1] < low[1] + 1.5 * h + near)]
+    if kind == "roll":
+        return [
+            hold(V, lambda x: x[0] < low[0] + near, 0),
+            hold(V, lambda x: x[1] < low[1] + near, 1),
+        ]
+    assert kind == "grips"
+    return [
+        hold(V, lambda x: x[0] < low[0] + 0.6 * h + near),
+        hold(V, lambda x: x[0] > high[0] - 0.6 * h - near),
+    ]
+
+
+def make_material(data, stress):
+    """Return the law of a scene and its Young's modulus."""
+    laws = {"hencky": mpm.materials.Hencky, "linear": mpm.materials.LinearElastic}
+    if data["law"] in laws:
+        return laws[data["law"]](stress, data["poisson"]), stress
+    laws = {"von_mises": mpm.materials.VonMises, "small": mpm.materials.SmallStrainVonMises}
+    return laws[data["law"]](
+        stress,
+        data["poisson"],
+        rho_y=data["rho_y"] * stress,
+        hardening=data["hardening"] * stress,
+    ), stress
+
+
+def make(scene, comm) -> Run:
+    """Return the problem of a scene (collective).
+
+    Raises:
+        MPMError: What the package says of the input.
+    """
+    length, stress = scene["units"]
+    shapes = [scene["body"], *([scene["second"]] if "second" in scene else [])]
+    meshes = [make_body(comm, data, length) for data in shapes]
+    low, high = box_of(meshes)
+    support = scene["support"]
+    if support == "stand" and any(data["shape"] not in generator.FLAT for data in shapes):
+        support = "sunk"
+    floor = {"stand": (1,), "roll": (0, 1)}.get(support, ())
+    # The parallelograms of CPDI reach beyond the faces of the body.
+    if scene["method"] == "cpdi":
+        floor = ()
+    background, lower, _, h = make_background(
+        comm, {**scene["background"], "unit": length}, low, high, floor
+    )
+    dim = scene["dim"]
+    V = fem.functionspace(background, ("Lagrange", scene.get("degree", 1), (dim,)))
+    options = {"method": scene["method"], "quadrature_degree": scene["quadrature_degree"]}
+    options |= {k: scene[k] for k in ("outside",) if k in scene}
+    if "update" in scene and scene["method"] == "gimp":
+        options["domain_update"] = scene["update"]
+    if "domain_degree" in scene:
+        options["degree"] = scene["domain_degree"]
+    bodies = [mpm.Particles(body, V, **options) for body in meshes]
+    held = supports(V, support, low, high, lower, h)
+    bcs = [bc for bc, _ in held]
+    motion = length * np.array(scene.get("motion", [0.0] * dim))
+    if held and "motion" in scene:
+        held[-1][1].value[:] = motion
+
+    def factor(t):
+        if scene["path"] == "reverse":
+            return float(np.interp(t, [0.0, 0.25, 0.75, 1.0], [0.0, 1.0, -1.0, 0.0]))
+        if scene["path"] == "cycle":
+            return float(np.sin(4.0 * np.pi * t))
+        return t
+
+    def update(t):
+        for body in bodies:
+            body.load.value = factor(t)
+        if "motion" in scene:
+            held[-1][1].value[:] = factor(t) * motion
+
+    # A weight is a force per volume over Young's modulus and length.
+    density = stress / length
+    gravity = np.array(scene["weight"])
+    material, young = make_material(scene["material"], stress)
+    problem = mpm.QuasiStaticProblem(
+        bodies if len(bodies) > 1 else bodies[0],
+        material,
+        density=density,
+        body_force=tuple(gravity),
+        bcs=bcs,
+        petsc_options_prefix=f"stress_{scene['number']}_",
+        **scene.get("options", {}),
+    )
+    return Run(
+        problem,
+        bodies,
+        density,
+        gravity,
+        material,
+        young,
+        bcs,
+        None if scene["path"] == "ramp" else update,
+        factor,
+    )
