@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from inspect import signature
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI  # (before DOLFINx: the wheel finds its MPI library by it)
 
@@ -32,10 +32,12 @@ from dolfinx.fem import petsc as fem_petsc
 from .errors import MPMError
 
 __all__ = [
+    "CompiledIntegral",
     "NonlinearProblem",
     "are_tags_of",
     "candidate_cells",
     "cell_tree",
+    "compiled_integrals",
     "create_vector",
     "disconnected_mesh",
     "geometry_degree",
@@ -295,3 +297,32 @@ NonlinearProblem: Any = (
     if "petsc_options_prefix" in signature(fem_petsc.NonlinearProblem).parameters
     else _NonlinearProblem
 )
+
+
+class CompiledIntegral(NamedTuple):
+    """One integral of a compiled form.
+
+    Attributes:
+        key: Its key in ``fem.pack_coefficients``.
+        kernel: Address of its kernel for double precision.
+        entities: Owned cells ``(m,)``, or cells and local facets ``(m, 2)``.
+    """
+
+    key: Any
+    kernel: int
+    entities: NDArray[np.int32]
+
+
+def compiled_integrals(form: fem.Form) -> list[CompiledIntegral]:
+    """Return the integrals of a form over cells and exterior facets."""
+    ufcx, whole = form.ufcx_form, form._cpp_object
+    module: Any = form.module
+    cast = module.ffi.cast
+    result = []
+    for place, kind in enumerate((fem.IntegralType.cell, fem.IntegralType.exterior_facet)):
+        start, end = ufcx.form_integral_offsets[place], ufcx.form_integral_offsets[place + 1]
+        for i in range(end - start):
+            kernel = ufcx.form_integrals[start + i].tabulate_tensor_float64
+            entities = np.ascontiguousarray(whole.domains(kind, i))
+            result.append(CompiledIntegral((kind, i), int(cast("intptr_t", kernel)), entities))
+    return result

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from dolfinx import fem, mesh
 
 from .errors import ConvergenceError, MPMError, agree
-from .f_bar import VolumeAveraging
-from .materials import Material, State
+from .f_bar import LowRankTerm, VolumeAveraging
+from .materials import IsotropicElastic, Material, State
 from .materials.base import Refused
 from .particles import Particles
 
@@ -40,6 +40,7 @@ class ConstitutiveHistory:
         axisymmetric: Whether the body is one of revolution; its points are then strained in
             three dimensions.
         f_bar: Kind of average of the volume ratio, or ``"none"``.
+        compiled: Whether materials may use their compiled updates.
 
     Attributes:
         dim: Dimension of stress and strain, 2 in plane strain.
@@ -63,8 +64,10 @@ class ConstitutiveHistory:
         cell_tags: mesh.MeshTags | None,
         axisymmetric: bool,
         f_bar: str = "none",
+        compiled: bool = True,
     ) -> None:
         self._particles = particles
+        self._compiled = compiled
         self.axisymmetric = axisymmetric
         self.dim = 3 if axisymmetric else particles.mesh.geometry.dim
         if axisymmetric:
@@ -92,6 +95,11 @@ class ConstitutiveHistory:
     def symmetric(self) -> bool:
         """Whether the tangents of all materials are symmetric."""
         return all(group.material.symmetric for group in self._groups)
+
+    @property
+    def low_rank(self) -> list[LowRankTerm]:
+        """What the tangent has besides the pointwise one: terms of F-bar."""
+        return [] if self.averaging is None else self.averaging.low_rank
 
     def _group(self, assignment: Assignment, cell_tags: mesh.MeshTags | None) -> list[_Group]:
         if isinstance(assignment, Material):
@@ -133,7 +141,10 @@ class ConstitutiveHistory:
                 continue
             values = self._per_cell(name, value)
             replaced[name] = np.repeat(values, self._particles.num_points)
-        return material.with_parameters(**replaced).at(points) if replaced else material
+        resolved = material.with_parameters(**replaced).at(points)
+        if not self._compiled and isinstance(resolved, IsotropicElastic):
+            resolved.compiled = False
+        return resolved
 
     def _per_cell(self, name: str, value: Any) -> NDArray[np.float64]:
         n = self._particles.num_local

@@ -326,6 +326,17 @@ class Particles:
         return rows
 
     @property
+    def basis(self) -> PointBasis:
+        """The background basis in the rows of T, at this rank's nodes of W."""
+        return self._rows.basis
+
+    @property
+    def present_weights(self) -> NDArray[np.float64]:
+        """Reference volumes of the history's points, shape ``(n, nq)``; 0 where deleted."""
+        weights = self.quadrature.weights
+        return np.where(self.deleted[:, None], 0.0, weights) if self.deletion else weights
+
+    @property
     def deleted(self) -> NDArray[np.bool_]:
         """Whether each particle this rank owns is deleted, shape ``(n,)``."""
         if self.deletion is None:

@@ -21,7 +21,7 @@ import ufl
 from dolfinx import fem
 
 from . import _compat, checkpoint, state
-from .assembly import BackgroundForms, BodyForms
+from .assembly import BackgroundForms, BodyForms, PointStress, is_fast
 from .boundary import Support
 from .cleanup import Cleaner
 from .errors import (
@@ -65,6 +65,10 @@ class ParticleProblem:
         petsc_options: PETSc options for SNES, KSP and PC, without prefix.
         form_compiler_options: Options of FFCx.
         jit_options: Options of the compilation at run time.
+        assembly: ``"fast"``: the compiled loops assemble the reduced tangent domain by domain;
+            ``"reference"``: DOLFINx assembles on the body mesh and PETSc multiplies by T;
+            ``"auto"``: fast where the package was built with the loops, unless the environment
+            variable ``MPM_DOLFINX_ASSEMBLY`` says ``reference``.
         symmetric: Whether J is symmetric (an LDL^T factorisation instead of LU).
         shift: Diagonal shift in the factorisation, relative to the diagonal. Combinations of
             background dofs that move no node of the body make the reduced tangent singular;
@@ -90,9 +94,9 @@ class ParticleProblem:
 
     def __init__(
         self,
-        R: ufl.Form | Sequence[ufl.Form],
+        R: ufl.Form | Sequence[ufl.Form | None],
         particles: Particles | Sequence[Particles],
-        J: ufl.Form | Sequence[ufl.Form] | None = None,
+        J: ufl.Form | Sequence[ufl.Form | None] | None = None,
         bcs: Sequence[fem.DirichletBC] = (),
         background: ufl.Form | None = None,
         petsc_options_prefix: str = "mpm_",
@@ -100,6 +104,7 @@ class ParticleProblem:
         form_compiler_options: dict[str, Any] | None = None,
         jit_options: dict[str, Any] | None = None,
         *,
+        assembly: str = "auto",
         symmetric: bool = False,
         shift: float = 1e-13,
         line_search: bool = True,
@@ -128,9 +133,11 @@ class ParticleProblem:
             self.history = History()
         self._comm: MPI.Comm = V.mesh.comm
         self._clean_up = Cleaner(self._comm, [V.mesh, *(body.mesh for body in self.bodies)])
+        stresses = [self._internal_stress(number) for number in range(len(self.bodies))]
+        fast = is_fast(assembly)
         self.shares = [
-            Body(body, BodyForms(r, j, body, **options))
-            for body, r, j in zip(self.bodies, residuals, tangents, strict=True)
+            Body(body, BodyForms(r, j, body, stress, fast, **options))
+            for body, r, j, stress in zip(self.bodies, residuals, tangents, stresses, strict=True)
         ]
         terms = None
         if background is not None:
@@ -598,6 +605,10 @@ class ParticleProblem:
         Called before each assembly with ``particles.displacement`` set. Must not change the
         history. It may differ between ranks.
         """
+        return None
+
+    def _internal_stress(self, number: int) -> PointStress | None:
+        """Return the stress of a body whose virtual work is not in the residual form, if any."""
         return None
 
     def _masses(self, number: int) -> NDArray[np.float64] | None:

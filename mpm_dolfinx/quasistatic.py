@@ -15,6 +15,7 @@ import ufl
 from dolfinx import fem
 
 from . import state
+from .assembly import PointStress, is_fast
 from .boundary import Support
 from .constitutive import ConstitutiveHistory
 from .errors import MPMError
@@ -23,6 +24,7 @@ from .f_bar import F_BARS, LowRankTangent
 from .grouping import background_cells
 from .particles import Particles
 from .problem import Law, ParticleProblem, as_bodies
+from .quadrature import depends_on
 
 __all__ = ["QuasiStaticProblem"]
 
@@ -63,6 +65,8 @@ class QuasiStaticProblem(ParticleProblem):
             background cell).
         petsc_options_prefix: Prefix of the PETSc options.
         petsc_options: PETSc options, without prefix.
+        assembly: As in :class:`ParticleProblem`; the reference route also updates the built-in
+            materials by NumPy.
         shift: As in :class:`ParticleProblem`.
         line_search: As in :class:`ParticleProblem`.
         predictor: As in :class:`ParticleProblem`.
@@ -90,6 +94,7 @@ class QuasiStaticProblem(ParticleProblem):
         petsc_options_prefix: str = "mpm_",
         petsc_options: dict[str, Any] | None = None,
         *,
+        assembly: str = "auto",
         shift: float = 1e-13,
         line_search: bool = True,
         predictor: bool = True,
@@ -114,34 +119,43 @@ class QuasiStaticProblem(ParticleProblem):
             strict=True,
         )
         _validate_supports(supports, bodies)
-        self._stresses: list[_InjectedStress] = []
+        self._stresses: list[ConstitutiveHistory] = []
+        self._injected: list[tuple[ConstitutiveHistory, fem.Function, fem.Function]] = []
         self._density: list[ufl.Form] = []
-        residuals, tangents = [], []
+        fast = is_fast(assembly)
+        self._by_loops = fast and not axisymmetric and f_bar in ("none", "domain")
+        residuals: list[ufl.Form | None] = []
+        tangents: list[ufl.Form | None] = []
+        symmetric = True
         for body, law, mass, force, dead, following, cells, facets in shares:
             cells, facets = body.carry(cells), body.carry(facets)
-            history = ConstitutiveHistory(body, carried(body, law), cells, axisymmetric, f_bar)
-            stress = _InjectedStress(body, history)
-            self._stresses.append(stress)
+            law = carried(body, law)
+            history = ConstitutiveHistory(body, law, cells, axisymmetric, f_bar, fast)
+            self._stresses.append(history)
             frame = _Frame(body, axisymmetric)
-            R, J = frame.internal(stress.first_piola, stress.tangent)
             mass = as_expression(mass, body, "density", ())
             self._density.append(frame.mass(mass))
+            terms: list[ufl.Form] = []
             if force is not None:
-                R -= frame.body_force(mass, force)
+                terms.append(-frame.body_force(mass, force))
             if dead:
-                R -= frame.tractions(dead, facets)
-            for support in supports:
-                if support.particles is body:
-                    term = frame.support(support, history)
-                    R += term
-                    J += ufl.derivative(term, body.displacement)
+                terms.append(-frame.tractions(dead, facets))
+                symmetric = symmetric and not depends_on(terms[-1], body.displacement)
+            terms += [frame.support(s, history) for s in supports if s.particles is body]
             if following:
-                pressure = frame.pressures(following, facets)
-                R += pressure
-                J += ufl.derivative(pressure, body.displacement)
-            residuals.append(R)
-            tangents.append(J)
-        followers = any(_for_each(pressures, count, pairs=True))
+                terms.append(frame.pressures(following, facets))
+            symmetric = symmetric and history.symmetric and not following
+            slopes = [
+                ufl.derivative(term, body.displacement)
+                for term in terms
+                if depends_on(term, body.displacement)
+            ]
+            if not self._by_loops:
+                work, tangent = frame.internal(*self._inject(body, history))
+                terms.append(work)
+                slopes.append(tangent)
+            residuals.append(sum(terms[1:], terms[0]) if terms else None)
+            tangents.append(sum(slopes[1:], slopes[0]) if slopes else None)
         super().__init__(
             residuals,
             particles,
@@ -150,18 +164,20 @@ class QuasiStaticProblem(ParticleProblem):
             background=background,
             petsc_options_prefix=petsc_options_prefix,
             petsc_options=petsc_options,
-            symmetric=not followers and all(s.history.symmetric for s in self._stresses),
+            # The vectors of groups of domains are summed by PETSc.
+            assembly="reference" if f_bar in ("pair", "patch") else assembly,
+            symmetric=symmetric,
             shift=shift,
             line_search=line_search,
             predictor=predictor,
             **options,
         )
         for body, stress in zip(bodies, self._stresses, strict=True):
-            body.attach(stress.history)
+            body.attach(stress)
             _warn_of_hourglass(body)
         for share, stress in zip(self.shares, self._stresses, strict=True):
-            averaging = stress.history.averaging
-            if averaging is not None:
+            averaging = stress.averaging
+            if averaging is not None and share.forms.stock:
                 share.forms.low_rank = LowRankTangent(share.particles, averaging)
 
     def evaluate(self) -> MPMError | None:
@@ -172,17 +188,44 @@ class QuasiStaticProblem(ParticleProblem):
                 stress.update()
             except MPMError as error:
                 failure = failure or error
+        if failure is None:
+            self._fill()
         return failure
 
     def commit(self) -> None:
         """Make the last update the history."""
         for stress in self._stresses:
-            stress.history.commit()
+            stress.commit()
 
     def roll_back(self) -> None:
         """Return to the stress of the last converged step."""
         for stress in self._stresses:
             stress.roll_back()
+        self._fill()
+
+    def _inject(
+        self, body: Particles, history: ConstitutiveHistory
+    ) -> tuple[fem.Function, fem.Function]:
+        """Return stress and tangent of a body as Functions on a quadrature element."""
+        dim = history.dim
+        injected = (
+            body.quadrature_function("first_piola", (dim, dim)),
+            body.quadrature_function("tangent", (dim,) * 4),
+        )
+        self._injected.append((history, *injected))
+        return injected
+
+    def _fill(self) -> None:
+        """Set the injected Functions to the present stress and tangent."""
+        for history, first_piola, tangent in self._injected:
+            for function, values in (
+                (first_piola, history.first_piola),
+                (tangent, history.tangent),
+            ):
+                function.x.array[: values.size] = values.ravel()
+
+    def _internal_stress(self, number: int) -> PointStress | None:
+        return self._stresses[number] if self._by_loops else None
 
     def _masses(self, number: int) -> NDArray[np.float64]:
         vector = fem.assemble_vector(fem.form(self._density[number]))
@@ -236,16 +279,16 @@ class QuasiStaticProblem(ParticleProblem):
 
     def converged_state(self) -> list[dict[str, NDArray[Any]]]:
         """See :meth:`ParticleProblem.converged_state`."""
-        return [stress.history.converged_state() for stress in self._stresses]
+        return [stress.converged_state() for stress in self._stresses]
 
     def set_converged_state(self, states: list[dict[str, NDArray[Any]]]) -> None:
         """See :meth:`ParticleProblem.set_converged_state`."""
         for stress, arrays in zip(self._stresses, states, strict=True):
-            stress.history.set_converged_state(arrays)
+            stress.set_converged_state(arrays)
 
     def laws(self) -> list[list[Law]]:
         """See :meth:`ParticleProblem.laws`."""
-        return [stress.history.laws() for stress in self._stresses]
+        return [stress.laws() for stress in self._stresses]
 
     @property
     def yield_function(self) -> NDArray[np.float64]:
@@ -254,27 +297,8 @@ class QuasiStaticProblem(ParticleProblem):
         In the unit of the material's own function; -1 where a material has none.
         With several bodies, their particles one body after the other.
         """
-        values = [s.history.yield_function().max(axis=1, initial=-np.inf) for s in self._stresses]
+        values = [s.yield_function().max(axis=1, initial=-np.inf) for s in self._stresses]
         return np.concatenate(values)
-
-
-class _InjectedStress:
-    """Stress and tangent of a body as Functions on a quadrature element."""
-
-    def __init__(self, body: Particles, history: ConstitutiveHistory) -> None:
-        self.history = history
-        dim = history.dim
-        self.first_piola = body.quadrature_function("first_piola", (dim, dim))
-        self.tangent = body.quadrature_function("tangent", (dim,) * 4)
-
-    def update(self) -> None:
-        self.history.update()
-        _fill(self.first_piola, self.history.first_piola)
-        _fill(self.tangent, self.history.tangent)
-
-    def roll_back(self) -> None:
-        self.history.roll_back()
-        _fill(self.first_piola, self.history.first_piola)
 
 
 class _Frame:
@@ -393,7 +417,3 @@ def _validate_supports(supports: Any, bodies: Sequence[Particles]) -> None:
         raise MPMError("supports must be a list of supports made by mpm.boundary.")
     if any(all(s.particles is not body for body in bodies) for s in supports):
         raise MPMError("A support was made with other particles than those of this problem.")
-
-
-def _fill(function: fem.Function, values: NDArray[np.float64]) -> None:
-    function.x.array[: values.size] = values.ravel()

@@ -16,6 +16,7 @@ from dolfinx import fem
 
 from .assembly import BackgroundForms, BodyForms
 from .errors import DomainDistortionError, MPMError, agreed
+from .fused import FusedTangent
 from .history import Statistics
 from .layout import FreeDofs, imbalance
 from .particles import Particles
@@ -43,15 +44,16 @@ class Body:
         self._product: PETSc.Mat | None = None
 
     def restrict(self, columns: PETSc.IS, extension: PETSc.Mat | None = None) -> None:
-        """Take the columns at the free dofs of the transfer, or of ``T E`` with an extension."""
+        """Take over the present transfer ``T`` and free dofs, or ``T E`` with an extension."""
         T = self.particles.T
-        if extension is not None:
-            T = T.matMult(extension)
-        first, last = T.getOwnershipRange()
-        rows = PETSc.IS().createStride(last - first, first, step=1, comm=T.comm)
-        self._free_T = T.createSubMatrix(rows, columns)
-        self._product = None
         self._work = T.createVecLeft()
+        self._product = None
+        if self.forms.stock:
+            if extension is not None:
+                T = T.matMult(extension)
+            first, last = T.getOwnershipRange()
+            rows = PETSc.IS().createStride(last - first, first, step=1, comm=T.comm)
+            self._free_T = T.createSubMatrix(rows, columns)
 
     def move(self, u: PETSc.Vec) -> None:
         """Set ``d = d_n + T u``."""
@@ -69,21 +71,25 @@ class Body:
         return np.asarray(d - self._before)
 
     def tangent(self) -> PETSc.Mat:
-        """Return ``T^T K T`` at the free dofs, always the same object within a step."""
+        """Return ``T^T K T`` of the stock forms, always the same object within a step."""
         self._product = self.forms.assemble_tangent().ptap(self._free_T, result=self._product)
         return self._product
 
     def stiffness_force(self, u: PETSc.Vec) -> PETSc.Vec:
         """Return ``K T u`` on the body."""
         self.particles.T.mult(u, self._work)
+        return self.forms.stiffness_force(self._work)
+
+    def stock_force(self, u: PETSc.Vec) -> PETSc.Vec:
+        """Return ``K T u`` on the body, of the stock forms."""
+        self.particles.T.mult(u, self._work)
         force = self.forms.K.createVecLeft()
         self.forms.K.mult(self._work, force)
         return force
 
-    def motion(self, x: PETSc.Vec) -> float:
-        """Return the norm of the displacement that free dofs cause."""
-        assert self._free_T is not None
-        self._free_T.mult(x, self._work)
+    def motion(self, u: PETSc.Vec) -> float:
+        """Return the norm of the displacement that u in V causes."""
+        self.particles.T.mult(u, self._work)
         return float(self._work.norm())
 
     def extent(self) -> float:
@@ -161,6 +167,10 @@ class ReducedSystem:
         self._owned = self._V.dofmap.index_map.size_local * self._bs
         self._free: NDArray[np.int32] | None = None
         self._total: PETSc.Mat | None = None
+        fast = [b for b in bodies if b.forms.internal is not None or b.forms.fused]
+        self._fused: FusedTangent | None = None
+        if fast:
+            self._fused = FusedTangent([(b.particles, b.forms) for b in fast], statistics)
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -235,6 +245,8 @@ class ReducedSystem:
             self._extension = self._stabilisation.extension(self._fixed)
         for body in self._bodies:
             body.restrict(self._columns, self._extension)
+        if self._fused is not None:
+            self._fused.restrict(*self._numbering())
         self._statistics.count("transfers")
         self._statistics["free_dofs"] = self.sizes[1]
         self._statistics["off_rank_rows"] = self._layout.off_rank_rows
@@ -242,6 +254,35 @@ class ReducedSystem:
         self._statistics["dof_imbalance"] = imbalance(self._comm, self.sizes[0])
         particles = sum(body.particles.num_local for body in self._bodies)
         self._statistics["particle_imbalance"] = imbalance(self._comm, particles)
+
+    def _numbering(self) -> tuple[PETSc.Vec, tuple[int, int]]:
+        """Return the number of each dof of V among those of the fused tangent, -1: none.
+
+        They are the free dofs or, before an extension, all dofs of V.
+        """
+        numbers = self._u.duplicate()
+        if self._extension is not None:
+            first, last = numbers.getOwnershipRange()
+            numbers.array_w[:] = np.arange(first, last)
+            return numbers, numbers.getSizes()
+        numbers.set(-1.0)
+        numbers.array_w[self._free] = self._layout.numbers
+        return numbers, self.sizes
+
+    def _fused_tangent(self, fused: FusedTangent) -> PETSc.Mat:
+        whole = fused.assemble()
+        if self._extension is None:
+            return whole
+        return whole.ptap(self._extension).createSubMatrix(self._columns, self._columns)
+
+    def _on_background(self, x: PETSc.Vec) -> PETSc.Vec:
+        """Return the increment of V with free dofs x, and zero at the fixed ones."""
+        self._part.set(0.0)
+        self._part.array_w[self._free] = self._layout.spread(x)
+        if self._extension is None:
+            return self._part
+        self._extension.mult(self._part, self._u)
+        return self._u
 
     def _gather(self, vectors: Sequence[PETSc.Vec]) -> None:
         """Set the force to the sum of ``T^T`` times each body's vector."""
@@ -287,7 +328,8 @@ class ReducedSystem:
     def tangent(self) -> PETSc.Mat:
         """Return the tangent at the x of the last residual, one object within a step."""
         with self._statistics.phase("assemble"):
-            parts = [body.tangent() for body in self._bodies]
+            parts = [] if self._fused is None else [self._fused_tangent(self._fused)]
+            parts += [body.tangent() for body in self._bodies if body.forms.stock]
             if self._background is not None:
                 whole = self._background.assemble_tangent()
                 if self._extension is not None:
@@ -295,7 +337,7 @@ class ReducedSystem:
                 parts.append(whole.createSubMatrix(self._columns, self._columns))
             if isinstance(self._stabilisation, GhostPenalty):
                 parts.append(self._penalty(self._stabilisation)[1])
-            if len(parts) == 1:
+            if len(parts) == 1 and self._extension is None:
                 return parts[0]
             if self._total is None:
                 self._total = parts[0].copy()
@@ -345,8 +387,12 @@ class ReducedSystem:
         self._part.set(0.0)
         if self._background is not None:
             self._background.assemble_tangent().mult(self._u, self._part)
+        if self._fused is not None:
+            self._fused.multiply_add(self._u, self._part)
         for body in self._bodies:
-            force = body.stiffness_force(self._u)
+            if not body.forms.stock:
+                continue
+            force = body.stock_force(self._u)
             body.particles.T.multTransposeAdd(force, self._part, self._part)
         if isinstance(self._stabilisation, GhostPenalty):
             self._penalty(self._stabilisation)[0].multAdd(self._u, self._part, self._part)
@@ -375,7 +421,8 @@ class ReducedSystem:
 
     def motion(self, x: PETSc.Vec) -> float:
         """Return the size of the displacement that x causes on the bodies."""
-        return float(np.linalg.norm([body.motion(x) for body in self._bodies]))
+        u = self._on_background(x)
+        return float(np.linalg.norm([body.motion(u) for body in self._bodies]))
 
     def extent(self) -> float:
         """Return the size of the positions of all nodes."""

@@ -4,9 +4,11 @@
 // Loops over domains: gradients, forces, and T^T K T domain by domain.
 
 #include "domains.h"
+#include "hot_loop.h"
 
 #include <algorithm>
 #include <numeric>
+#include <type_traits>
 
 namespace
 {
@@ -58,41 +60,58 @@ inline void add_block(const double* left, const double* gradient, double* block,
     }
 }
 
-// Add T^T K T of one domain; K is (nodes dim, nodes dim).
+// Room for the products of one domain.
+struct Work
+{
+  std::vector<double> blocks, weights;
+  std::vector<int> places, ends;
+};
+
+// Add T^T K T of one domain; K is (nodes dim, nodes dim). T is sparse: zeros are passed over.
 template <int dim>
 void add_element(const double* K, int nodes, const double* transfer, std::size_t size,
-                 const std::int32_t* positions, double* values, std::vector<double>& work)
+                 const std::int32_t* positions, double* values, Work& work)
 {
   constexpr int block = dim * dim;
-  const int width = nodes * dim;
-  work.assign(nodes * size * block, 0.0);
+  const int width = nodes * dim, column = nodes * block;
+  work.blocks.resize((nodes + size) * column);
+  work.weights.resize(size * nodes + 1);
+  work.places.resize(size * nodes + 1);
+  work.ends.resize(size);
+  double* columns = work.blocks.data();    // K in blocks, column by column
+  double* right = columns + nodes * column;  // K T, the same way
+  for (int c = 0; c < nodes; ++c)
+    for (int i = 0; i < dim; ++i)
+      for (int e = 0; e < nodes; ++e)
+        for (int j = 0; j < dim; ++j)
+          columns[e * column + c * block + i * dim + j] = K[(c * dim + i) * width + e * dim + j];
+  int end = 0;
   for (std::size_t b = 0; b < size; ++b)
+  {
+    double* out = right + b * column;
+    std::fill(out, out + column, 0.0);
+    const int start = end;
     for (int e = 0; e < nodes; ++e)
     {
-      const double weight = transfer[b * nodes + e];
-      if (weight == 0.0)
-        continue;
-      for (int c = 0; c < nodes; ++c)
-      {
-        double* out = work.data() + (c * size + b) * block;
-        for (int i = 0; i < dim; ++i)
-          for (int j = 0; j < dim; ++j)
-            out[i * dim + j] += weight * K[(c * dim + i) * width + e * dim + j];
-      }
+      work.weights[end] = transfer[b * nodes + e];
+      work.places[end] = e;
+      end += transfer[b * nodes + e] != 0.0;
     }
+    work.ends[b] = end;
+    for (int n = start; n < end; ++n)
+      for (int k = 0; k < column; ++k)
+        out[k] += work.weights[n] * columns[work.places[n] * column + k];
+  }
   for (std::size_t a = 0; a < size; ++a)
-    for (int c = 0; c < nodes; ++c)
+    for (std::size_t b = 0; b < size; ++b)
     {
-      const double weight = transfer[a * nodes + c];
-      if (weight == 0.0)
-        continue;
-      const double* row = work.data() + c * size * block;
-      for (std::size_t b = 0; b < size; ++b)
-      {
-        double* out = values + static_cast<std::size_t>(positions[a * size + b]) * block;
-        for (int e = 0; e < block; ++e)
-          out[e] += weight * row[b * block + e];
-      }
+      double sum[block] = {};
+      for (int n = a == 0 ? 0 : work.ends[a - 1]; n < work.ends[a]; ++n)
+        for (int k = 0; k < block; ++k)
+          sum[k] += work.weights[n] * right[b * column + work.places[n] * block + k];
+      double* out = values + static_cast<std::size_t>(positions[a * size + b]) * block;
+      for (int k = 0; k < block; ++k)
+        out[k] += sum[k];
     }
 }
 
@@ -278,7 +297,44 @@ core::Pattern core::pattern(const std::int64_t* offsets, const std::int32_t* nod
   return result;
 }
 
-void core::assemble_points(const Domains& domains, const double* support_gradients,
+core::Reduced core::reduce(const std::int32_t* offsets, const std::int32_t* nodes,
+                           std::size_t num_nodes, int dim, const std::int32_t* numbers)
+{
+  Reduced result;
+  result.offsets.push_back(0);
+  for (std::size_t row = 0; row < num_nodes; ++row)
+    for (int i = 0; i < dim; ++i)
+    {
+      if (numbers[row * dim + i] < 0)
+        continue;
+      for (std::int32_t e = offsets[row]; e < offsets[row + 1]; ++e)
+        for (int j = 0; j < dim; ++j)
+        {
+          const std::int32_t column = numbers[static_cast<std::size_t>(nodes[e]) * dim + j];
+          if (column < 0)
+            continue;
+          result.columns.push_back(column);
+          result.sources.push_back((static_cast<std::int64_t>(e) * dim + i) * dim + j);
+        }
+      result.rows.push_back(numbers[row * dim + i]);
+      result.offsets.push_back(static_cast<std::int32_t>(result.columns.size()));
+    }
+  return result;
+}
+
+void core::multiply(const std::int32_t* offsets, const std::int32_t* nodes, std::size_t num_nodes,
+                    int dim, const double* values, const double* x, double* y)
+{
+  std::fill(y, y + num_nodes * dim, 0.0);
+  for (std::size_t row = 0; row < num_nodes; ++row)
+    for (std::int32_t e = offsets[row]; e < offsets[row + 1]; ++e)
+      for (int i = 0; i < dim; ++i)
+        for (int j = 0; j < dim; ++j)
+          y[row * dim + i] += values[(static_cast<std::size_t>(e) * dim + i) * dim + j]
+                              * x[static_cast<std::size_t>(nodes[e]) * dim + j];
+}
+
+HOT_LOOP void core::assemble_points(const Domains& domains, const double* support_gradients,
                            const double* A, bool symmetric, const Target& target)
 {
   with_dimension(domains.dim, [&](auto constant) {
@@ -312,14 +368,15 @@ void core::assemble_points(const Domains& domains, const double* support_gradien
   });
 }
 
-void core::assemble_domains(const Domains& domains, const double* transfers, const double* A,
+HOT_LOOP void core::assemble_domains(const Domains& domains, const double* transfers, const double* A, const double* vectors,
                             const Target& target)
 {
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
     constexpr int block = dim * dim;
     const int width = domains.nodes * dim;
-    std::vector<double> K(width * width), work;
+    std::vector<double> K(width * width);
+    Work work;
     for_each_support(
         domains.count, target, [&](std::size_t p, std::size_t size, const std::int32_t* positions) {
           std::fill(K.begin(), K.end(), 0.0);
@@ -337,19 +394,28 @@ void core::assemble_domains(const Domains& domains, const double* transfers, con
                                width);
             }
           }
+          if (vectors != nullptr)
+          {
+            const double* a = vectors + p * 3 * width;
+            const double *b = a + width, *g = b + width;
+            for (int r = 0; r < width; ++r)
+              for (int s = 0; s < width; ++s)
+                K[r * width + s] += a[r] * g[s] + g[r] * b[s];
+          }
           add_element<dim>(K.data(), domains.nodes, transfers + target.offsets[p] * domains.nodes,
                            size, positions, target.values, work);
         });
   });
 }
 
-void core::assemble_form(const Form& form, const Domains& domains, const double* transfers,
+HOT_LOOP void core::assemble_form(const Form& form, const Domains& domains, const double* transfers,
                          const Target& target)
 {
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
     const int width = domains.nodes * dim;
-    std::vector<double> K(width * width), x(form.geometry_nodes * 3), work;
+    std::vector<double> K(width * width), x(form.geometry_nodes * 3);
+    Work work;
     // Forms may live on some cells only, so pairs cannot be counted on the way.
     std::vector<std::size_t> pairs(domains.count);
     for_each_support(domains.count, target,
@@ -361,7 +427,8 @@ void core::assemble_form(const Form& form, const Domains& domains, const double*
       const std::int32_t cell = form.entities[form.facets ? 2 * e : e];
       const int facet = form.facets ? form.entities[2 * e + 1] : 0;
       for (int c = 0; c < form.geometry_nodes; ++c)
-        std::copy_n(form.x + 3 * form.geometry[cell * form.geometry_nodes + c], 3, &x[3 * c]);
+        for (int i = 0; i < 3; ++i)
+          x[3 * c + i] = form.x[3 * form.geometry[cell * form.geometry_nodes + c] + i];
       std::fill(K.begin(), K.end(), 0.0);
       form.kernel(K.data(), form.coefficients + e * form.stride, form.constants, x.data(), &facet,
                   nullptr, nullptr);

@@ -57,6 +57,20 @@ struct Pattern
 Pattern pattern(const std::int64_t* offsets, const std::int32_t* nodes, std::size_t count,
                 std::size_t num_nodes);
 
+// The rows and columns of a pattern of blocks (dim, dim) that have a number (not -1), in
+// compressed rows of scalars; sources are their places among the values of the blocks.
+struct Reduced
+{
+  std::vector<std::int32_t> rows, offsets, columns;
+  std::vector<std::int64_t> sources;
+};
+Reduced reduce(const std::int32_t* offsets, const std::int32_t* nodes, std::size_t num_nodes,
+               int dim, const std::int32_t* numbers);
+
+// y = K x with blocks in compressed rows.
+void multiply(const std::int32_t* offsets, const std::int32_t* nodes, std::size_t num_nodes,
+              int dim, const double* values, const double* x, double* y);
+
 // Where the tangents of domains go: blocks (dim, dim) of a matrix in compressed rows.
 struct Target
 {
@@ -69,9 +83,10 @@ struct Target
 void assemble_points(const Domains& domains, const double* support_gradients, const double* A,
                      bool symmetric, const Target& target);
 
-// Add T^T (sum_q w_q G^T A G + low-rank terms) T.
+// Add T^T (sum_q w_q G^T A G + a g^T + g b^T) T with the vectors a, b and g of each domain in
+// vectors, (count, 3, nodes, dim), or without where that is null.
 void assemble_domains(const Domains& domains, const double* transfers, const double* A,
-                      const Target& target);
+                      const double* vectors, const Target& target);
 
 using Kernel = void (*)(double*, const double*, const double*, const double*, const int*,
                         const std::uint8_t*, void*);

@@ -8,6 +8,7 @@
 // has 8 (plane) or 21 (space) entries other than zero in that frame.
 
 #include "material.h"
+#include "hot_loop.h"
 
 #include <array>
 #include <cmath>
@@ -393,7 +394,7 @@ std::vector<std::int64_t> update_all(const core::Update& u)
 }
 } // namespace
 
-std::vector<std::int64_t> core::update_logarithmic(const Update& update, int dim)
+HOT_LOOP std::vector<std::int64_t> core::update_logarithmic(const Update& update, int dim)
 {
   return dim == 2 ? update_all<2>(update) : update_all<3>(update);
 }

@@ -84,7 +84,7 @@ NB_MODULE(_loops, m)
         require(H.size() == num_points(domains) * domains.dim * domains.dim, "H (n, nq, dim, dim)");
         displacement_gradient(domains, u.data(), H.data());
       },
-      "u"_a, "dofmap"_a, "gradients"_a, "H"_a, "Set H to grad u at the points.");
+      "u"_a, "dofmap"_a, "gradients"_a, "H"_a.noconvert(), "Set H to grad u at the points.");
 
   m.def(
       "internal_force",
@@ -93,7 +93,7 @@ NB_MODULE(_loops, m)
         require(P.size() == num_points(domains) * domains.dim * domains.dim, "P (n, nq, dim, dim)");
         internal_force(domains, P.data(), force.data());
       },
-      "P"_a, "dofmap"_a, "gradients"_a, "weights"_a, "force"_a,
+      "P"_a, "dofmap"_a, "gradients"_a, "weights"_a, "force"_a.noconvert(),
       "Add the integral of P : grad v to the force at the nodes.");
 
   m.def(
@@ -116,7 +116,7 @@ NB_MODULE(_loops, m)
                         support_nodes.data(), transfers.data());
       },
       "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a, "support_offsets"_a,
-      "support_nodes"_a, "transfers"_a, "Set the values of T of each domain's nodes.");
+      "support_nodes"_a, "transfers"_a.noconvert(), "Set the values of T of each domain's nodes.");
 
   m.def(
       "support_gradients",
@@ -129,7 +129,7 @@ NB_MODULE(_loops, m)
                           support_nodes.data(), result.data());
       },
       "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a, "support_offsets"_a,
-      "support_nodes"_a, "result"_a,
+      "support_nodes"_a, "result"_a.noconvert(),
       "Set the gradients of the background basis at each domain's single point.");
 
   m.def(
@@ -145,6 +145,30 @@ NB_MODULE(_loops, m)
       "Return the sparsity of a sum over supports, and the place of each pair of their nodes.");
 
   m.def(
+      "reduce",
+      [](Indices offsets, Indices nodes, int dim, Indices numbers) {
+        require(numbers.size() == (offsets.size() - 1) * dim, "numbers of all rows");
+        Reduced result
+            = reduce(offsets.data(), nodes.data(), offsets.size() - 1, dim, numbers.data());
+        return std::make_tuple(
+            to_numpy(std::move(result.rows)), to_numpy(std::move(result.offsets)),
+            to_numpy(std::move(result.columns)), to_numpy(std::move(result.sources)));
+      },
+      "offsets"_a, "nodes"_a, "dim"_a, "numbers"_a,
+      "Return the numbered rows and columns of a pattern of blocks, and where their values are.");
+
+  m.def(
+      "multiply",
+      [](Indices offsets, Indices nodes, int dim, Reals values, Reals x, RealsOut y) {
+        const std::size_t num_nodes = offsets.size() - 1;
+        require(x.size() == num_nodes * dim && y.size() == x.size()
+                    && values.size() == nodes.size() * dim * dim,
+                "vectors and blocks of a pattern");
+        multiply(offsets.data(), nodes.data(), num_nodes, dim, values.data(), x.data(), y.data());
+      },
+      "offsets"_a, "nodes"_a, "dim"_a, "values"_a, "x"_a, "y"_a.noconvert(), "Set y to K x.");
+
+  m.def(
       "assemble_points",
       [](Indices dofmap, Reals gradients, Reals weights, Reals support_gradients, Reals A,
          bool symmetric, Offsets offsets, Indices positions, RealsOut values) {
@@ -156,21 +180,26 @@ NB_MODULE(_loops, m)
                         target_of(domains, offsets, positions, values));
       },
       "dofmap"_a, "gradients"_a, "weights"_a, "support_gradients"_a, "A"_a, "symmetric"_a,
-      "offsets"_a, "positions"_a, "values"_a, "Add the reduced tangents of domains with one point.");
+      "offsets"_a, "positions"_a, "values"_a.noconvert(),
+      "Add the reduced tangents of domains with one point.");
 
   m.def(
       "assemble_domains",
-      [](Indices dofmap, Reals gradients, Reals weights, Reals transfers, Reals A, Offsets offsets,
-         Indices positions, RealsOut values) {
+      [](Indices dofmap, Reals gradients, Reals weights, Reals transfers, Reals A, Reals vectors,
+         Offsets offsets, Indices positions, RealsOut values) {
         const Domains domains = domains_of(dofmap, gradients, &weights);
         const int square = domains.dim * domains.dim;
         require(A.size() == num_points(domains) * square * square,
                 "A (n, nq, dim, dim, dim, dim)");
+        require(vectors.size() == 0 || vectors.size() == domains.count * 3 * domains.nodes * domains.dim,
+                "vectors (n, 3, k, dim), or none");
         assemble_domains(domains, transfers.data(), A.data(),
+                         vectors.size() > 0 ? vectors.data() : nullptr,
                          target_of(domains, offsets, positions, values));
       },
-      "dofmap"_a, "gradients"_a, "weights"_a, "transfers"_a, "A"_a, "offsets"_a, "positions"_a,
-      "values"_a, "Add the reduced tangents of domains with any number of points.");
+      "dofmap"_a, "gradients"_a, "weights"_a, "transfers"_a, "A"_a, "vectors"_a,
+      "offsets"_a, "positions"_a, "values"_a.noconvert(),
+      "Add the reduced tangents of domains with any number of points.");
 
   m.def(
       "assemble_form",
@@ -179,7 +208,8 @@ NB_MODULE(_loops, m)
          Indices positions, RealsOut values) {
         const Domains domains = domains_of(dofmap, gradients, nullptr);
         require(x.ndim() == 2 && x.shape(1) == 3 && geometry.ndim() == 2, "geometry");
-        require(coefficients.ndim() == 2 && coefficients.shape(0) == entities.shape(0),
+        require(coefficients.ndim() == 2
+                    && (coefficients.size() == 0 || coefficients.shape(0) == entities.shape(0)),
                 "coefficients of each entity");
         const Form form{reinterpret_cast<Kernel>(kernel),
                         entities.shape(0),
@@ -195,7 +225,7 @@ NB_MODULE(_loops, m)
                       target_of(domains, offsets, positions, values));
       },
       "kernel"_a, "entities"_a, "coefficients"_a, "constants"_a, "x"_a, "geometry"_a, "dofmap"_a,
-      "gradients"_a, "transfers"_a, "offsets"_a, "positions"_a, "values"_a,
+      "gradients"_a, "transfers"_a, "offsets"_a, "positions"_a, "values"_a.noconvert(),
       "Add the reduced element tensors of a compiled form on cells or (cell, local facet).");
 
   m.def(
@@ -212,7 +242,8 @@ NB_MODULE(_loops, m)
         u.stress = stress.data();
         return to_numpy(update_logarithmic(u, static_cast<int>(gradient.shape(2))));
       },
-      "gradient"_a, "bulk"_a, "shear"_a, "P"_a, "A"_a, "stress"_a,
+      "gradient"_a, "bulk"_a, "shear"_a, "P"_a.noconvert(),
+      "A"_a.noconvert(), "stress"_a.noconvert(),
       "Update Hencky's law; return the points whose domains are inverted.");
 
   m.def(
@@ -243,7 +274,7 @@ NB_MODULE(_loops, m)
         return to_numpy(update_logarithmic(u, static_cast<int>(gradient.shape(2))));
       },
       "gradient"_a, "old_gradient"_a, "old_c"_a, "old_plastic_strain"_a, "bulk"_a, "shear"_a,
-      "rho_y"_a, "hardening"_a, "tolerance"_a, "P"_a, "A"_a, "stress"_a, "c"_a,
-      "plastic_strain"_a,
+      "rho_y"_a, "hardening"_a, "tolerance"_a, "P"_a.noconvert(), "A"_a.noconvert(),
+      "stress"_a.noconvert(), "c"_a.noconvert(), "plastic_strain"_a.noconvert(),
       "Update von Mises' law; return the points whose domains are inverted.");
 }

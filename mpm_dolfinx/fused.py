@@ -1,0 +1,270 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The fast route: ``T^T K T`` domain by domain, in one compiled loop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from . import _compat
+from ._core import loops
+from .assembly import BodyForms
+from .f_bar import LowRankTerm
+from .history import Statistics
+from .particles import Particles
+
+__all__ = ["FusedTangent"]
+
+
+class _Rows(NamedTuple):
+    """Rows of T, one for each local node of W, in compressed rows of touched nodes of V."""
+
+    offsets: NDArray[np.int64]
+    nodes: NDArray[np.int32]
+    values: NDArray[np.float64]
+
+
+class _Share:
+    """One body's domains, their background nodes and where their tangents go."""
+
+    def __init__(self, particles: Particles, forms: BodyForms) -> None:
+        self._particles = particles
+        self._forms = forms
+        self._domains = (particles.domain_nodes, particles.quadrature.gradients)
+        internal = forms.internal
+        self._points = internal is not None and particles.num_points == 1
+        self._whole = bool(forms.fused) or (internal is not None and not self._points)
+        self.offsets: NDArray[np.int64] = np.zeros(1, dtype=np.int64)
+        self.nodes: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
+        self.positions: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
+
+    def rows(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Return offsets, global background nodes and values of the rows of T."""
+        basis = self._particles.basis
+        kept = basis.values != 0.0
+        offsets = np.concatenate([[0], np.cumsum(np.count_nonzero(kept, axis=1))])
+        return offsets.astype(np.int64), basis.nodes[kept], basis.values[kept]
+
+    def support(self, rows: _Rows) -> bool:
+        """Find the background nodes of each domain; return whether they are the old ones."""
+        offsets, nodes = loops.supports(*self._domains, *rows)
+        same = np.array_equal(offsets, self.offsets) and np.array_equal(nodes, self.nodes)
+        self.offsets, self.nodes = offsets, nodes
+        return same
+
+    def transfer(self, rows: _Rows) -> None:
+        """Take over the values of T."""
+        given = (*self._domains, *rows, self.offsets, self.nodes)
+        if self._points:
+            self._gradients = np.empty((len(self.nodes), self._domains[1].shape[-1]))
+            loops.support_gradients(*given, self._gradients)
+        if self._whole:
+            self._transfers = np.empty((len(self.nodes), self._particles.domain_nodes.shape[1]))
+            loops.local_transfers(*given, self._transfers)
+
+    @staticmethod
+    def _low_rank(terms: Sequence[LowRankTerm]) -> NDArray[np.float64]:
+        """Return h/2 g + left, h/2 g + right and g of each domain, ``(n, 3, k, gdim)``; or none."""
+        if not terms:
+            return np.zeros((0, 3, 1, 1))
+        (term,) = terms
+        half = 0.5 * term.h[:, None, None] * term.g
+        return np.stack([half + term.left, half + term.right, term.g], axis=1)
+
+    def add(self, values: NDArray[np.float64]) -> None:
+        """Add the body's reduced tangent to the values of the pattern's blocks."""
+        target = (self.offsets, self.positions, values)
+        internal = self._forms.internal
+        weights = self._particles.present_weights
+        if internal is not None and self._points:
+            loops.assemble_points(
+                *self._domains,
+                weights,
+                self._gradients,
+                internal.tangent,
+                internal.symmetric,
+                *target,
+            )
+        elif internal is not None:
+            loops.assemble_domains(
+                *self._domains,
+                weights,
+                self._transfers,
+                internal.tangent,
+                self._low_rank(internal.low_rank),
+                *target,
+            )
+        body = self._particles.mesh
+        geometry = (body.geometry.x, _compat.geometry_dofmap(body))
+        for form in self._forms.fused:
+            constants, packed = fem.pack_constants(form), fem.pack_coefficients(form)
+            for integral in _compat.compiled_integrals(form):
+                loops.assemble_form(
+                    integral.kernel,
+                    integral.entities,
+                    packed[integral.key],
+                    constants,
+                    *geometry,
+                    *self._domains,
+                    self._transfers,
+                    *target,
+                )
+
+
+class FusedTangent:
+    """``T^T K T`` of all bodies at the free dofs of V, without ever forming K.
+
+    Each rank adds its own domains' ``T_p^T K_p T_p`` to blocks between the background nodes
+    that they touch, of whatever rank. The pattern, and with it the matrix, lasts until a node
+    of a body enters another cell. Off-rank rows travel once for each assembly.
+
+    Args:
+        bodies: Bodies with their forms, all on one V.
+        statistics: Where to count.
+    """
+
+    def __init__(
+        self, bodies: Sequence[tuple[Particles, BodyForms]], statistics: Statistics
+    ) -> None:
+        self._shares = [_Share(*body) for body in bodies]
+        self._V = bodies[0][0].V
+        self._comm: MPI.Comm = self._V.mesh.comm
+        self._bs = self._V.dofmap.index_map_bs
+        self._statistics = statistics
+        self._touched: NDArray[np.int64] | None = None
+        self._numbers: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
+        self._A: PETSc.Mat | None = None
+        self._whole: PETSc.Vec | None = None
+
+    def restrict(self, numbers: PETSc.Vec, sizes: tuple[int, int]) -> None:
+        """Take over the present transfer and free dofs (collective).
+
+        Args:
+            numbers: For each dof of V its number among the free dofs, or -1.
+            sizes: Number of free dofs of this rank and of all ranks.
+        """
+        rows = [share.rows() for share in self._shares]
+        touched = self._find_touched([nodes for _, nodes, _ in rows])
+        same = self._comm.allreduce(
+            self._touched is not None and np.array_equal(touched, self._touched), MPI.LAND
+        )
+        self._touched = touched
+        if not same:
+            self._connect(numbers)
+        local = [_Rows(o, self._local(nodes), v) for o, nodes, v in rows]
+        for share, own in zip(self._shares, local, strict=True):
+            same &= share.support(own)
+        reduced = self._at_touched(numbers).astype(np.int32)
+        same &= np.array_equal(reduced, self._numbers)
+        self._numbers = reduced
+        if not self._comm.allreduce(same, MPI.LAND) or self._A is None:
+            self._make_pattern(sizes)
+            self._statistics.count("patterns")
+        for share, own in zip(self._shares, local, strict=True):
+            share.transfer(own)
+
+    def _find_touched(self, nodes: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+        """Return the global nodes of V that this rank's domains touch, its own ones first."""
+        first, last = self._V.dofmap.index_map.local_range
+        mark = np.zeros(last - first, dtype=bool)
+        others = []
+        for some in nodes:
+            own = (some >= first) & (some < last)
+            mark[some[own] - first] = True
+            others.append(some[~own])
+        return np.concatenate([np.flatnonzero(mark) + first, np.unique(np.concatenate(others))])
+
+    def _local(self, nodes: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return the numbers of nodes among the touched ones."""
+        assert self._touched is not None
+        first, last = self._V.dofmap.index_map.local_range
+        own = np.count_nonzero((self._touched >= first) & (self._touched < last))
+        number = np.empty(last - first, dtype=np.int32)
+        number[self._touched[:own] - first] = np.arange(own)
+        mine = (nodes >= first) & (nodes < last)
+        result = np.empty(len(nodes), dtype=np.int32)
+        result[mine] = number[nodes[mine] - first]
+        result[~mine] = np.searchsorted(self._touched[own:], nodes[~mine]) + own
+        return result
+
+    def _connect(self, vector: PETSc.Vec) -> None:
+        """Prepare to read and add to vectors of V at the touched dofs."""
+        assert self._touched is not None
+        dofs = (self._touched[:, None] * self._bs + np.arange(self._bs)).ravel()
+        self._at = PETSc.Vec().createSeq(len(dofs))
+        index = PETSc.IS().createGeneral(dofs.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
+        self._scatter = PETSc.Scatter().create(vector, index, self._at, None)
+
+    def _at_touched(self, vector: PETSc.Vec) -> NDArray[np.float64]:
+        """Return a vector of V at the touched dofs (collective)."""
+        self._scatter.scatter(vector, self._at)
+        return np.asarray(self._at.array_r)
+
+    def _make_pattern(self, sizes: tuple[int, int]) -> None:
+        assert self._touched is not None
+        ends = np.cumsum([0, *(share.offsets[-1] for share in self._shares)])
+        offsets = np.concatenate(
+            [[0], *(s.offsets[1:] + end for s, end in zip(self._shares, ends, strict=False))]
+        )
+        nodes = np.concatenate([share.nodes for share in self._shares])
+        self._pattern, self._blocks, positions = self._row_lists(offsets, nodes)
+        pairs = [int((np.diff(share.offsets) ** 2).sum()) for share in self._shares]
+        split = np.split(positions, np.cumsum(pairs)[:-1])
+        for share, part in zip(self._shares, split, strict=True):
+            share.positions = part
+        self._values = np.empty(len(self._blocks) * self._bs**2)
+        rows, starts, columns, self._sources = loops.reduce(
+            self._pattern, self._blocks, self._bs, self._numbers
+        )
+        self._A = PETSc.Mat()
+        if self._comm.size == 1:
+            counts = np.zeros(sizes[0] + 1, dtype=PETSc.IntType)
+            counts[rows + 1] = np.diff(starts)
+            self._entries = np.zeros(len(columns))
+            csr = (np.cumsum(counts, dtype=PETSc.IntType), columns, self._entries)
+            self._A.createAIJWithArrays((sizes, sizes), csr, comm=self._comm)
+        else:
+            self._A.create(comm=self._comm)
+            self._A.setSizes((sizes, sizes))
+            self._A.setType("aij")
+            self._entries = np.empty(len(columns))
+            self._A.setPreallocationCOO(np.repeat(rows, np.diff(starts)), columns)
+
+    def _row_lists(
+        self, offsets: NDArray[np.int64], nodes: NDArray[np.int32]
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+        assert self._touched is not None
+        pattern: tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]
+        pattern = loops.pattern(offsets.astype(np.int64), nodes, len(self._touched))
+        return pattern
+
+    def assemble(self) -> PETSc.Mat:
+        """Return ``T^T K T``; the same object as long as the pattern lasts (collective)."""
+        assert self._A is not None
+        self._values.fill(0.0)
+        for share in self._shares:
+            share.add(self._values)
+        np.take(self._values, self._sources, out=self._entries, mode="clip")  # (raise: a copy)
+        if self._comm.size > 1:
+            self._A.setValuesCOO(self._entries, PETSc.InsertMode.INSERT_VALUES)
+        self._A.assemble()
+        return self._A
+
+    def multiply_add(self, u: PETSc.Vec, force: PETSc.Vec) -> None:
+        """Add the last ``T^T K T u`` on all active dofs of V, fixed ones too (collective)."""
+        local = np.array(self._at_touched(u))
+        result = np.empty_like(local)
+        loops.multiply(self._pattern, self._blocks, self._bs, self._values, local, result)
+        self._at.array_w[:] = result
+        self._scatter.scatter(
+            self._at, force, PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE
+        )
