@@ -61,6 +61,7 @@ def block(
         material,
         f_bar=f_bar,
         axisymmetric=axisymmetric,
+        assembly="reference",
     )
 
 
