@@ -1,0 +1,113 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""A sure lower bound of a curved domain's Jacobian, by Bernstein coefficients."""
+
+from __future__ import annotations
+
+from itertools import product
+from math import comb, factorial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import basix
+
+__all__ = ["JacobianBound"]
+
+#: Halvings of a domain after which a Jacobian that may vanish counts as vanishing.
+HALVINGS = 4
+
+
+class JacobianBound:
+    """Whether ``det dx/dxi`` of mapped cells is positive everywhere, decided for sure.
+
+    The determinant is a polynomial in the reference cell, nowhere below its smallest Bernstein
+    coefficient, and equal to those at the corners (Johnen, Remacle & Geuzaine 2013). Where the
+    corners are positive and a coefficient is not, the cell is halved.
+
+    Args:
+        cell: Cell type.
+        shape_functions: basix element of the map.
+    """
+
+    def __init__(self, cell: basix.CellType, shape_functions: Any) -> None:
+        gdim = len(basix.topology(cell)) - 1
+        degree = shape_functions.degree
+        simplex = cell in (basix.CellType.triangle, basix.CellType.tetrahedron)
+        self._degree = gdim * (degree - 1) if simplex else gdim * degree - 1
+        n = max(self._degree, 0)
+        powers = np.array(list(product(range(n + 1), repeat=gdim)))
+        self._powers = powers[powers.sum(axis=1) <= n] if simplex else powers
+        self._simplex = simplex
+        points = self._powers / max(n, 1)
+        self._slopes = shape_functions.tabulate(1, points)[1:, :, :, 0]
+        self._to_bernstein = np.linalg.inv(self._basis(points))
+        corners = basix.geometry(cell)
+        self._corners = [
+            int(np.argmin(np.abs(points - corner).sum(axis=1))) for corner in corners
+        ]
+        self._parts = [
+            self._to_bernstein @ self._basis(part(points)) for part in _halves(cell, corners)
+        ]
+
+    def _basis(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the Bernstein polynomials at points, shape ``(points, polynomials)``."""
+        n = self._degree
+        if self._simplex:
+            whole = np.column_stack([points, 1.0 - points.sum(axis=1)])
+            powers = np.column_stack([self._powers, n - self._powers.sum(axis=1)])
+            number = [factorial(n) / np.prod([factorial(k) for k in p]) for p in powers]
+            return np.asarray(number * np.prod(whole[:, None] ** powers, axis=2))
+        number = [np.prod([comb(n, k) for k in p]) for p in self._powers]
+        inner = points[:, None] ** self._powers * (1.0 - points[:, None]) ** (n - self._powers)
+        return np.asarray(number * np.prod(inner, axis=2))
+
+    def coefficients(self, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the Bernstein coefficients of the determinants of cells ``(n, k, gdim)``."""
+        jacobian = np.einsum("jqk,nki->nqij", self._slopes, nodes)
+        return np.asarray(np.linalg.det(jacobian) @ self._to_bernstein.T)
+
+    def vanishes(self, nodes: NDArray[np.float64], sign: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which cells have a determinant that is zero or of the wrong sign somewhere.
+
+        Args:
+            nodes: Nodes of the cells, shape ``(n, k, gdim)``.
+            sign: The right sign, shape ``(n,)``.
+
+        Returns:
+            Shape ``(n,)``; a positive determinant below about 1e-2 of its range may count too.
+        """
+        result = np.zeros(len(nodes), dtype=bool)
+        cell = np.arange(len(nodes))
+        open_ = self.coefficients(nodes) * sign[:, None]
+        for halving in range(HALVINGS + 1):
+            wrong = ~(open_[:, self._corners] > 0.0).all(axis=1)
+            result[cell[wrong]] = True
+            unsure = ~(open_ > 0.0).all(axis=1) & ~result[cell]
+            cell, open_ = cell[unsure], open_[unsure]
+            if halving == HALVINGS or len(cell) == 0:
+                break
+            open_ = np.concatenate([open_ @ part.T for part in self._parts])
+            cell = np.tile(cell, len(self._parts))
+        result[cell] = True
+        return result
+
+
+def _halves(cell: basix.CellType, corners: NDArray[np.float64]) -> list[Any]:
+    """Return maps from a reference cell to the parts that halving its edges makes."""
+    gdim = corners.shape[1]
+    parts = [lambda x, c=c: 0.5 * (x + c) for c in corners]
+    if cell == basix.CellType.triangle:
+        parts.append(lambda x: 0.5 * (1.0 - x))
+    elif cell == basix.CellType.tetrahedron:
+        # An octahedron is left inside: four tetrahedra around the line between two of its corners.
+        middle = {frozenset((a, b)): 0.5 * (corners[a] + corners[b]) for a in range(4) for b in range(a)}
+        ring = [(0, 1), (1, 2), (2, 3), (3, 0)]
+        ends = middle[frozenset((0, 2))], middle[frozenset((1, 3))]
+        for i in range(4):
+            a, b = middle[frozenset(ring[i])], middle[frozenset(ring[(i + 1) % 4])]
+            axes = np.stack([ends[1] - ends[0], a - ends[0], b - ends[0]])
+            parts.append(lambda x, o=ends[0], axes=axes: o + x @ axes)
+    assert all(p(corners).shape[1] == gdim for p in parts)
+    return parts
