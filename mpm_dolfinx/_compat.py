@@ -40,6 +40,7 @@ __all__ = [
     "compiled_integrals",
     "create_vector",
     "disconnected_mesh",
+    "equispaced_element",
     "geometry_degree",
     "geometry_dofmap",
     "input_cell_index",
@@ -49,6 +50,7 @@ __all__ = [
     "require_supported",
     "tags_from_nodes",
     "use_basic_line_search",
+    "vtk_order",
 ]
 
 _VERSION = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])
@@ -156,11 +158,23 @@ def mesh_on_ranks(
     return whole
 
 
+def equispaced_element(cell: basix.CellType, degree: int, gdim: int) -> Any:
+    """Return the vector Lagrange element whose nodes are equispaced, as VTK has them."""
+    variant = basix.LagrangeVariant.equispaced
+    return basix.ufl.element("Lagrange", cell.name, degree, lagrange_variant=variant, shape=(gdim,))
+
+
+def vtk_order(cell: basix.CellType, count: int) -> NDArray[np.int64]:
+    """Return which of a cell's nodes, equispaced, is each of VTK's."""
+    return np.argsort(dolfinx.cpp.io.perm_vtk(mesh.to_type(cell.name), count))
+
+
 def disconnected_mesh(
     comm: MPI.Comm,
-    corners: NDArray[np.float64],
+    nodes: NDArray[np.float64],
     cell: basix.CellType,
     index: NDArray[np.int64] | None = None,
+    degree: int = 1,
 ) -> mesh.Mesh:
     """Return a mesh whose cells share no vertex and stay on the rank that gives them.
 
@@ -169,26 +183,31 @@ def disconnected_mesh(
 
     Args:
         comm: Communicator (collective).
-        corners: Corners of this rank's cells in DOLFINx order, shape ``(n, k, gdim)``.
+        nodes: Corners of this rank's cells in DOLFINx order, or all nodes of curved ones,
+            equispaced, shape ``(n, k, gdim)``.
         cell: Cell type.
         index: Input index of each cell; ``None`` numbers them from rank to rank.
+        degree: Degree of the cells' map.
     """
-    n, k, gdim = corners.shape
-    vertices = dolfinx.cpp.common.IndexMap(comm, n * k)
+    n, k, gdim = nodes.shape
+    corners = len(basix.geometry(cell))
+    vertices = dolfinx.cpp.common.IndexMap(comm, n * corners)
+    places = vertices if degree == 1 else dolfinx.cpp.common.IndexMap(comm, n * k)
     cells = dolfinx.cpp.common.IndexMap(comm, n)
     dofmap = np.arange(n * k, dtype=np.int32).reshape(n, k)
-    element = basix.ufl.element("Lagrange", cell.name, 1, shape=(gdim,))
+    element = equispaced_element(cell, degree, gdim)
     coordinate_element: Any = fem.coordinate_element  # dispatched on the element
-    coordinates = coordinate_element(element.basix_element)
-    geometry_nodes = mesh.create_geometry(
-        vertices,
+    # (mesh.create_geometry wants another kind of element in 0.9)
+    geometry_nodes = dolfinx.cpp.mesh.Geometry_float64(
+        places,
         dofmap,
-        coordinates._cpp_object if _VERSION < (0, 10) else coordinates,
-        np.ascontiguousarray(corners.reshape(-1, gdim)),
-        np.arange(n * k, dtype=np.int64) + vertices.local_range[0],
+        coordinate_element(element.basix_element)._cpp_object,
+        np.ascontiguousarray(nodes.reshape(-1, gdim)),
+        np.arange(n * k, dtype=np.int64) + places.local_range[0],
     )
-    topology = _topology(comm, cell, dofmap, vertices, cells, index)
-    whole = dolfinx.cpp.mesh.Mesh_float64(comm, topology, geometry_nodes._cpp_object)
+    connectivity = np.arange(n * corners, dtype=np.int32).reshape(n, corners)
+    topology = _topology(comm, cell, connectivity, vertices, cells, index)
+    whole = dolfinx.cpp.mesh.Mesh_float64(comm, topology, geometry_nodes)
     return mesh.Mesh(whole, ufl.Mesh(element))
 
 

@@ -44,11 +44,10 @@ class JacobianBound:
         self._slopes = shape_functions.tabulate(1, points)[1:, :, :, 0]
         self._to_bernstein = np.linalg.inv(self._basis(points))
         corners = basix.geometry(cell)
-        self._corners = [
-            int(np.argmin(np.abs(points - corner).sum(axis=1))) for corner in corners
-        ]
+        self._corners = [int(np.argmin(np.abs(points - corner).sum(axis=1))) for corner in corners]
         self._parts = [
-            self._to_bernstein @ self._basis(part(points)) for part in _halves(cell, corners)
+            self._to_bernstein @ self._basis(origin + points @ axes)
+            for origin, axes in _halves(cell, corners)
         ]
 
     def _basis(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -67,6 +66,21 @@ class JacobianBound:
         """Return the Bernstein coefficients of the determinants of cells ``(n, k, gdim)``."""
         jacobian = np.einsum("jqk,nki->nqij", self._slopes, nodes)
         return np.asarray(np.linalg.det(jacobian) @ self._to_bernstein.T)
+
+    def lower_bound(
+        self, nodes: NDArray[np.float64], sign: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return a bound from below of the determinants, after two halvings, shape ``(n,)``.
+
+        Args:
+            nodes: Nodes of the cells, shape ``(n, k, gdim)``.
+            sign: The right sign, shape ``(n,)``.
+        """
+        values = self.coefficients(nodes)
+        halves = [values @ part.T for part in self._parts]
+        quarters = [half @ part.T for half in halves for part in self._parts]
+        least = np.min([(sign[:, None] * q).min(axis=1, initial=np.inf) for q in quarters], axis=0)
+        return np.asarray(least)
 
     def vanishes(self, nodes: NDArray[np.float64], sign: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which cells have a determinant that is zero or of the wrong sign somewhere.
@@ -94,20 +108,19 @@ class JacobianBound:
         return result
 
 
-def _halves(cell: basix.CellType, corners: NDArray[np.float64]) -> list[Any]:
-    """Return maps from a reference cell to the parts that halving its edges makes."""
-    gdim = corners.shape[1]
-    parts = [lambda x, c=c: 0.5 * (x + c) for c in corners]
+def _halves(
+    cell: basix.CellType, corners: NDArray[np.float64]
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Return the parts that halving its edges makes of a reference cell: origins and axes."""
+    half = 0.5 * np.eye(corners.shape[1])
+    parts = [(0.5 * corner, half) for corner in corners]
     if cell == basix.CellType.triangle:
-        parts.append(lambda x: 0.5 * (1.0 - x))
+        parts.append((np.full(2, 0.5), -half))
     elif cell == basix.CellType.tetrahedron:
-        # An octahedron is left inside: four tetrahedra around the line between two of its corners.
-        middle = {frozenset((a, b)): 0.5 * (corners[a] + corners[b]) for a in range(4) for b in range(a)}
-        ring = [(0, 1), (1, 2), (2, 3), (3, 0)]
-        ends = middle[frozenset((0, 2))], middle[frozenset((1, 3))]
-        for i in range(4):
-            a, b = middle[frozenset(ring[i])], middle[frozenset(ring[(i + 1) % 4])]
-            axes = np.stack([ends[1] - ends[0], a - ends[0], b - ends[0]])
-            parts.append(lambda x, o=ends[0], axes=axes: o + x @ axes)
-    assert all(p(corners).shape[1] == gdim for p in parts)
+        # An octahedron is left inside: four parts around the line between two of its corners.
+        middle = 0.5 * (corners[:, None] + corners[None])
+        ring = [middle[0, 1], middle[1, 2], middle[2, 3], middle[3, 0]]
+        one, other = middle[0, 2], middle[1, 3]
+        for a, b in zip(ring, ring[1:] + ring[:1], strict=True):
+            parts.append((one, np.stack([other - one, a - one, b - one])))
     return parts

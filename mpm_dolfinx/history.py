@@ -33,6 +33,7 @@ COUNTERS = (
     "workspace_retries",
     "ghost_facets",
     "aggregated_dofs",
+    "folded_domains",
     "lost_particles",
     "lost_volume",
     "lost_mass",
@@ -57,7 +58,7 @@ class Statistics(dict[str, float]):
     ``converged_at_round_off`` (steps that ended at the floor of round-off),
     ``workspace_retries`` (factorisations that MUMPS repeated with more workspace),
     ``ghost_facets`` and ``aggregated_dofs`` (facets with a ghost penalty, and dofs that follow
-    others, in the last step) and
+    others, in the last step), ``folded_domains`` (the most after any step; curved ones only) and
     ``lost_particles``, ``lost_volume`` (undeformed) and ``lost_mass`` (0 where no density is
     known), the sums over ``history.losses``.
     """

@@ -22,7 +22,7 @@ class TimeSeries:
     """A ``.pvd`` file that grows by one state at each call.
 
     The cells are the particles' own domains at their current positions: the displaced body mesh
-    for cpdi2, domains of their own for the other methods.
+    for cpdi2, domains of their own for the other methods and where they are curved.
 
     Args:
         path: Name of the file.
@@ -46,13 +46,15 @@ class TimeSeries:
     def follow(self) -> None:
         """Take the particles as they are spread over the ranks now (collective)."""
         particles = self._particles
-        self._undeformed = particles.initial_domains
+        self._undeformed = particles.outlined(particles.initial_domains)
         self._mesh = particles.mesh
-        if particles.method != "cpdi2":
-            cell = particles.mesh.basix_cell()
-            self._mesh = _compat.disconnected_mesh(self._mesh.comm, self._undeformed, cell)
-        gdim = self._mesh.geometry.dim
-        nodal = fem.functionspace(self._mesh, ("Lagrange", 1, (gdim,)))
+        degree, gdim = particles.W.ufl_element().degree, self._mesh.geometry.dim
+        cell = particles.mesh.basix_cell()
+        if particles.method != "cpdi2" or degree > 1:
+            self._mesh = _compat.disconnected_mesh(
+                self._mesh.comm, self._undeformed, cell, degree=degree
+            )
+        nodal = fem.functionspace(self._mesh, _compat.equispaced_element(cell, degree, gdim))
         self._displacement = fem.Function(nodal, name="displacement")
         self._fields: dict[str, fem.Function] = {}
 
@@ -61,7 +63,7 @@ class TimeSeries:
         particles = self._particles
         fields = [self._field(name, value) for name, value in particles.fields().items()]
         n, gdim = particles.num_local, self._mesh.geometry.dim
-        domains = particles.domains
+        domains = particles.outlined(particles.domains)
         moved = self._displacement.x.array.reshape(-1, gdim)
         moved[self._displacement.function_space.dofmap.list[:n]] = domains - self._undeformed
         self._displacement.x.scatter_forward()

@@ -19,6 +19,7 @@ from dolfinx import fem, mesh
 from . import _compat
 from .deletion import Deletion, without_deleted
 from .errors import DomainDistortionError, MPMError, ParticleOutsideError, agree
+from .folding import JacobianBound
 from .location import BackgroundBasis, PointBasis
 from .methods import (
     BOX_CELLS,
@@ -437,6 +438,20 @@ class Particles:
         """Corners of the undeformed domains, shape ``(n, k, gdim)``."""
         return np.asarray(self._nodes[self.domain_nodes])
 
+    def outlined(self, domains: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the equispaced nodes of domains that are given by their own nodes.
+
+        Args:
+            domains: Nodes of domains, shape ``(n, k, gdim)``.
+        """
+        degree = self._shape_functions.degree
+        if degree == 1:
+            return domains
+        cell = self.mesh.basix_cell()
+        element = _compat.equispaced_element(cell, degree, self._gdim).basix_element
+        table = self._shape_functions.tabulate(0, element.points)[0, :, :, 0]
+        return np.asarray(np.einsum("qk,nki->nqi", table, domains))
+
     def _domain_averages(
         self,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -616,6 +631,42 @@ class Particles:
         """Accumulated plastic strain ``sqrt(2/3) |d eps_p|``, shape ``(n,)``."""
         return self._average(self._history("plastic strain").plastic_strain())
 
+    @property
+    def initial_points(self) -> NDArray[np.float64]:
+        """Undeformed positions of the quadrature points, shape ``(n, nq, gdim)``."""
+        return self._at_points(self._nodes[self.domain_nodes])
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """Positions of the quadrature points, shape ``(n, nq, gdim)``."""
+        return self._at_points(self._nodes[self.domain_nodes] + self._nodal())
+
+    def _at_points(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.einsum("qk,nki->nqi", self.quadrature.shapes, nodal))
+
+    @property
+    def point_stress(self) -> NDArray[np.float64]:
+        """Cauchy stress at the quadrature points, shape ``(n, nq, 3, 3)``.
+
+        Raises:
+            MPMError: The particles have no material (a problem written in UFL).
+        """
+        return self._history("stress").cauchy_stress()
+
+    @property
+    def point_plastic_strain(self) -> NDArray[np.float64]:
+        """Accumulated plastic strain at the quadrature points, shape ``(n, nq)``."""
+        return self._history("plastic strain").plastic_strain()
+
+    @property
+    def point_deformation_gradient(self) -> NDArray[np.float64]:
+        """Deformation gradient at the quadrature points, shape ``(n, nq, 3, 3)``."""
+        gradient = self.displacement_gradient(self._axisymmetric)
+        dim = gradient.shape[2]
+        F = np.tile(np.eye(3), (*gradient.shape[:2], 1, 1))
+        F[:, :, :dim, :dim] += gradient
+        return F
+
     def fields(self) -> dict[str, NDArray[np.float64]]:
         """Return what is known of each particle, for output: arrays ``(n, ...)`` by name.
 
@@ -684,6 +735,21 @@ class Particles:
         inwards = (self._corner_jacobians() <= 0.0).sum(axis=1)
         return np.asarray(self.global_index[inwards >= 2])
 
+    @cached_property
+    def _jacobian_bound(self) -> JacobianBound:
+        return JacobianBound(self.mesh.basix_cell(), self._shape_functions)
+
+    def folded(self) -> NDArray[np.int64]:
+        """Return global indices of domains whose map is not one to one everywhere.
+
+        Decided by a bound (Bernstein coefficients of the Jacobian), not by sampling, at the
+        present displacement. Such a domain covers a part of itself twice; it goes on as long as
+        ``det F > 0`` at its quadrature points.
+        """
+        now = self._nodes[self.domain_nodes] + self._nodal()
+        sign = np.sign(self._orientation[:, 0])
+        return np.asarray(self.global_index[self._jacobian_bound.vanishes(now, sign)])
+
     def _corner_jacobians(self) -> NDArray[np.float64]:
         """Return det J at the corners of the present domains, positive as in the undeformed."""
         points = basix.geometry(self.mesh.basix_cell())
@@ -693,12 +759,15 @@ class Particles:
         return np.asarray(np.sign(self._orientation) * det)
 
     def domain_distortion(self) -> NDArray[np.float64]:
-        """Return the smallest det J at a node of each domain over its mean, shape ``(n,)``.
+        """Return the smallest det J of each domain over its mean, shape ``(n,)``.
 
-        One for an undistorted domain, zero or less where a quadrilateral is concave.
+        One for an undistorted domain, zero or less where a quadrilateral is concave. For curved
+        domains and hexahedra it is a bound from below.
         """
         mean = self.volume / quadrature_rule(self.mesh.basix_cell(), 0)[1].sum()
-        return np.asarray(self._corner_jacobians().min(axis=1) / np.abs(mean))
+        now = self._nodes[self.domain_nodes] + self._nodal()
+        least = self._jacobian_bound.lower_bound(now, np.sign(self._orientation[:, 0]))
+        return np.asarray(least / np.abs(mean))
 
     @cached_property
     def _orientation(self) -> NDArray[np.float64]:

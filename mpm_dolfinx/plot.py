@@ -32,6 +32,8 @@ VTK_CELLS = {
     "tetrahedron": (10, [0, 1, 2, 3]),
     "hexahedron": (12, [0, 1, 3, 2, 4, 5, 7, 6]),
 }
+#: VTK's Lagrange cells.
+VTK_CURVED = {"triangle": 69, "quadrilateral": 70, "tetrahedron": 71, "hexahedron": 72}
 #: Straight pieces that an edge is drawn with where it is curved.
 PIECES = 8
 
@@ -150,7 +152,7 @@ def grid(particles: Particles) -> Any:
     Cell data are ``particle`` (the global index), ``volume_ratio`` and, where there is a
     material, ``stress`` (Cauchy, nine components), ``pressure`` and ``plastic_strain``, and with
     ``outside="delete"`` ``deleted`` (0 or 1); point data ``displacement``. Domains share no
-    points; curved ones are drawn by their corners.
+    points; curved ones are VTK's Lagrange cells.
 
     Args:
         particles: The body, in the plane or in space.
@@ -164,12 +166,12 @@ def grid(particles: Particles) -> Any:
     """
     comm: MPI.Comm = particles.mesh.comm
     pyvista = _imported("pyvista", comm)
-    cell_type, corners = VTK_CELLS[particles.mesh.basix_cell().name]
+    cell_type, nodes = _vtk_cell(particles)
     gdim = particles.mesh.geometry.dim
     data: dict[str, NDArray[Any]] = {
         "particle": particles.global_index,
-        "start": particles.initial_domains[:, corners],
-        "now": particles.domains[:, corners],
+        "start": particles.outlined(particles.initial_domains)[:, nodes],
+        "now": particles.outlined(particles.domains)[:, nodes],
         **particles.fields(),
     }
     gathered = comm.gather(data)
@@ -187,6 +189,14 @@ def grid(particles: Particles) -> Any:
     for name, values in whole.items():
         result.cell_data[name] = values.reshape(len(order), -1) if values.ndim > 1 else values
     return result
+
+
+def _vtk_cell(particles: Particles) -> tuple[int, Any]:
+    """Return VTK's type of the domains, and which of their nodes it wants in turn."""
+    cell = particles.mesh.basix_cell()
+    if particles.W.ufl_element().degree == 1:
+        return VTK_CELLS[cell.name]
+    return VTK_CURVED[cell.name], _compat.vtk_order(cell, particles.domain_nodes.shape[1])
 
 
 def _outlines(particles: Particles, warp: float) -> NDArray[np.float64]:

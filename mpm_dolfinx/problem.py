@@ -500,6 +500,7 @@ class ParticleProblem:
             self._parameter = parameter
             self._reactions = self.reduced.force.array_r.copy()
             self.reduced.end()
+            self.reduced.count_folded()
             self._clean_up()
         step = Step(parameter, self._newton.iterations, list(self._newton.residuals))
         self.history.steps.append(step)

@@ -448,6 +448,13 @@ class ReducedSystem:
         _, dof, where = max(self._comm.allgather(best))
         return ([dof] if dof >= 0 else []), where
 
+    def count_folded(self) -> None:
+        """Count the curved domains that are folded."""
+        curved = [b.particles for b in self._bodies if b.particles.W.ufl_element().degree > 1]
+        if curved:
+            folded = self._comm.allreduce(sum(len(body.folded()) for body in curved))
+            self._statistics["folded_domains"] = max(self._statistics["folded_domains"], folded)
+
     def worst_particles(self) -> list[int]:
         """Return the particles at the node with the largest residual."""
         best: tuple[float, list[int]] = (0.0, [])
