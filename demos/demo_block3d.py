@@ -74,6 +74,7 @@ parser.add_argument("--domain", choices=("hex", "tet"), default="hex", help="par
 parser.add_argument("--plates", choices=("rough", "smooth"), default="rough", help="the plates")
 parser.add_argument("--elements", type=tools.whole, default=4, help="background cells, 1 m")
 parser.add_argument("--steps", type=tools.whole, default=40, help="steps")
+parser.add_order()
 args = parser.parse()
 
 comm = MPI.COMM_WORLD
@@ -93,16 +94,17 @@ background = mesh.create_box(
     [2 * args.elements, 2 * args.elements, args.elements + 1],
     mesh.CellType.hexahedron,
 )
-V = fem.functionspace(background, ("Lagrange", 1, (3,)))
+V = fem.functionspace(background, ("Lagrange", args.degree, (3,)))
 body = mesh.create_box(
     comm,
     [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]],
     [2 * args.elements] * 3,
     mesh.CellType.hexahedron if args.domain == "hex" else mesh.CellType.tetrahedron,
 )
-particles = mpm.Particles(
-    body, V, method="cpdi2", quadrature_degree=2 if args.domain == "hex" else 1
-)
+order = tools.order(args)
+if args.domain == "hex" and order["degree"] == 1:
+    order["quadrature_degree"] = args.quadrature_degree or 2
+particles = mpm.Particles(body, V, method="cpdi2", **order)
 
 # Conditions on the background's three planes. Those of the plate are one for each direction.
 
@@ -132,6 +134,7 @@ problem = mpm.QuasiStaticProblem(
     pressures=[(stiffness * above, TOP)],
     facet_tags=tags,
     petsc_options_prefix="block_",
+    stabilisation=tools.stabilisation(args),
 )
 
 

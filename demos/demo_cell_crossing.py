@@ -67,6 +67,7 @@ parser = tools.Parser("A bar pulled over the grid: the stress of its particles, 
 parser.add_argument("--steps", type=tools.whole, default=80, help="load steps")
 parser.add_argument("--cells", type=tools.whole, default=8, help="background cells, bar's length")
 parser.add_argument("--stretch", type=tools.positive, default=1.5, help="at the held end")
+parser.add_order()
 args = parser.parse()
 if args.stretch >= np.exp(1.0):
     parser.error("argument --stretch: the load has its maximum at 2.718")
@@ -94,11 +95,12 @@ def bar(options):
     background = mesh.create_rectangle(
         comm, [[0.0, 0.0], [reach * h, width]], [reach, 1], mesh.CellType.quadrilateral
     )
-    V = fem.functionspace(background, ("Lagrange", 1, (2,)))
+    high = options["method"] == "cpdi2"
+    V = fem.functionspace(background, ("Lagrange", args.degree if high else 1, (2,)))
     body = mesh.create_rectangle(
         comm, [[0.0, 0.0], [length, width]], [2 * args.cells, 2], mesh.CellType.quadrilateral
     )
-    particles = mpm.Particles(body, V, **options)
+    particles = mpm.Particles(body, V, **options, **(tools.order(args) if high else {}))
 
     held = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[0], 0.0))
     sides = mesh.locate_entities_boundary(
@@ -114,6 +116,7 @@ def bar(options):
         body_force=(g0, 0.0),  # with a density of 1
         bcs=bcs,
         petsc_options_prefix="bar_",
+        stabilisation=tools.stabilisation(args) if high else None,
     )
     return particles, problem
 

@@ -68,6 +68,7 @@ parser = tools.Parser("Plate with stiffened holes, meshed by gmsh, bent on a gri
 parser.add_argument("--size", type=tools.positive, default=0.12, help="background cells, m")
 parser.add_argument("--body-size", type=tools.positive, default=0.06, help="particle domains, m")
 parser.add_argument("--steps", type=tools.whole, default=20, help="load steps")
+parser.add_order()
 args = parser.parse()
 if gmsh is None:
     raise mpm.MPMError("This demo needs gmsh; install it with pip install gmsh.")
@@ -132,12 +133,12 @@ background, _, _ = meshed(room, args.size)
 #
 # From here on nothing tells that gmsh was there.
 
-V = fem.functionspace(background, ("Lagrange", 1, (2,)))
+V = fem.functionspace(background, ("Lagrange", args.degree, (2,)))
 wall = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[0], 0.0))
 held = fem.locate_dofs_topological(V, 1, wall)
 clamp = fem.dirichletbc(np.zeros(2), held, V)
 
-particles = mpm.Particles(body, V, method="cpdi2")
+particles = mpm.Particles(body, V, method="cpdi2", **tools.order(args))
 problem = mpm.QuasiStaticProblem(
     particles,
     {PLATE: mpm.materials.Hencky(1e6, 0.3), RINGS: mpm.materials.Hencky(10e6, 0.3)},
@@ -146,6 +147,7 @@ problem = mpm.QuasiStaticProblem(
     facet_tags=edges,
     bcs=[clamp],
     petsc_options_prefix="plate_",
+    stabilisation=tools.stabilisation(args),
 )
 
 failure = None

@@ -93,6 +93,7 @@ except ImportError:
 parser = tools.Parser("Thick tube under inner pressure: axisymmetric, and as a quarter ring.")
 parser.add_argument("--elements", type=tools.whole, default=16, help="cells over the wall")
 parser.add_argument("--steps", type=tools.whole, default=10, help="load steps")
+parser.add_order()
 args = parser.parse()
 if solve_bvp is None:
     raise mpm.MPMError("The reference of this demo needs SciPy; install it with pip install scipy.")
@@ -172,10 +173,10 @@ def strip(n):
     background = mesh.create_rectangle(
         comm, [[0.5, 0.0], [3.0, h]], [round(2.5 / h), 1], mesh.CellType.quadrilateral
     )
-    V = fem.functionspace(background, ("Lagrange", 1, (2,)))
+    V = fem.functionspace(background, ("Lagrange", args.degree, (2,)))
     body = mesh.create_rectangle(comm, [[a, 0.0], [b, h]], [2 * n, 2], mesh.CellType.quadrilateral)
     bcs = [rollers(V, 1, lambda x: np.isclose(x[1], 0.0) | np.isclose(x[1], h))]
-    return mpm.Particles(body, V), bcs, inner_facets(body, lambda x: x[0])
+    return mpm.Particles(body, V, **tools.order(args)), bcs, inner_facets(body, lambda x: x[0])
 
 
 def quarter_ring(n):
@@ -184,7 +185,7 @@ def quarter_ring(n):
     background = mesh.create_rectangle(
         comm, [[0.0, 0.0], [2.5, 2.5]], [round(2.5 / h)] * 2, mesh.CellType.quadrilateral
     )
-    V = fem.functionspace(background, ("Lagrange", 1, (2,)))
+    V = fem.functionspace(background, ("Lagrange", args.degree, (2,)))
 
     # A rectangle of radii and angles, then its geometry mapped. Rounding must not push the two
     # straight edges out of the background.
@@ -201,7 +202,11 @@ def quarter_ring(n):
         rollers(V, 1, lambda x: np.isclose(x[1], 0.0)),
     ]
     # The middle of a facet lies on a chord, its ends, which are what is looked at, on the circle.
-    return mpm.Particles(body, V), bcs, inner_facets(body, lambda x: np.hypot(x[0], x[1]))
+    return (
+        mpm.Particles(body, V, **tools.order(args)),
+        bcs,
+        inner_facets(body, lambda x: np.hypot(x[0], x[1])),
+    )
 
 
 def solve(scene, n, axisymmetric):
@@ -214,6 +219,7 @@ def solve(scene, n, axisymmetric):
         facet_tags=tags,
         axisymmetric=axisymmetric,
         petsc_options_prefix="cylinder_",
+        stabilisation=tools.stabilisation(args),
     )
     for _ in tools.progress(problem.steps(args.steps), args.steps, args):
         pass

@@ -84,6 +84,7 @@ parser.add_argument("--elements", type=tools.whole, default=8, help="background 
 parser.add_argument("--domain", choices=("quad", "tri"), default="quad", help="particle domains")
 parser.add_argument("--young", type=tools.positive, default=1e4, help="Young's modulus")
 parser.add_argument("--steps", type=tools.whole, default=40, help="load steps, half of them turn")
+parser.add_order()
 args = parser.parse()
 
 comm = MPI.COMM_WORLD
@@ -112,7 +113,7 @@ def block(elements: int) -> mpm.Particles:
     background = mesh.create_rectangle(
         comm, [[-1.5, -1.5], [1.5, 1.5]], [3 * elements] * 2, mesh.CellType.quadrilateral
     )
-    V = fem.functionspace(background, ("Lagrange", 1, (2,)))
+    V = fem.functionspace(background, ("Lagrange", args.degree, (2,)))
     corner = np.array([-1.0 + 0.11 * h, -0.5 + 0.23 * h])
     body = mesh.create_rectangle(
         comm,
@@ -120,7 +121,10 @@ def block(elements: int) -> mpm.Particles:
         [4 * elements, 2 * elements],
         mesh.CellType.quadrilateral if args.domain == "quad" else mesh.CellType.triangle,
     )
-    return mpm.Particles(body, V, quadrature_degree=3 if args.domain == "quad" else None)
+    order = tools.order(args)
+    if args.domain == "quad" and order["degree"] == 1:
+        order["quadrature_degree"] = args.quadrature_degree or 3
+    return mpm.Particles(body, V, **order)
 
 
 # A run takes the method and finite elements through the same path. The two differ in one line
@@ -160,11 +164,14 @@ def run(elements: int, shortening: float, steps: int):
     # The material point method: the unknown is the particles'.
     d, v = particles.displacement, ufl.TestFunction(particles.W)
     problem = mpm.ParticleProblem(
-        ufl.derivative(energy(d), d, v), particles, petsc_options_prefix="rubber_"
+        ufl.derivative(energy(d), d, v),
+        particles,
+        petsc_options_prefix="rubber_",
+        stabilisation=tools.stabilisation(args),
     )
 
     # Finite elements: a Function of the body's mesh.
-    W = fem.functionspace(body, ("Lagrange", 1, (2,)))
+    W = fem.functionspace(body, ("Lagrange", args.domain_degree or args.degree, (2,)))
     e, w = fem.Function(W), ufl.TestFunction(W)
     fem_problem = tools.NonlinearProblem(
         ufl.derivative(energy(e), e, w),

@@ -317,8 +317,9 @@ class ReducedSystem:
             self._gather([body.forms.assemble_residual() for body in self._bodies])
             if self._background is not None:
                 self._force.axpy(1.0, self._background.assemble_residual())
-            if isinstance(self._stabilisation, GhostPenalty) and self._u.norm() > 0.0:
-                self._penalty(self._stabilisation)[0].multAdd(self._u, self._force, self._force)
+            ghost = self._stabilisation if self.sizes[1] > 0 else None
+            if isinstance(ghost, GhostPenalty) and self._u.norm() > 0.0:
+                self._penalty(ghost)[0].multAdd(self._u, self._force, self._force)
             if self._extension is not None:
                 self._extension.multTranspose(self._force, self._part)
                 self._part.copy(self._force)

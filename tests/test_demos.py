@@ -19,6 +19,16 @@ COMMON = {"completed", "load", "iterations", "cutbacks", "failure"}
 
 RUNS = {
     "compaction-quad": ("compaction", "--elements 8", {"error": 1e-2, "error_position": 1e-3}),
+    "compaction-degree-2": (
+        "compaction",
+        "--elements 8 --degree 2 --steps 20",
+        {"error": 9.2e-4, "error_position": 2e-4},
+    ),
+    "cantilever": (
+        "cantilever",
+        "--degree 2 --offset 0.05 --steps 25",
+        {"error": 3e-4, "iterations": 140, "cutbacks": 0},
+    ),
     "compaction-tri": (
         "compaction",
         "--elements 8 --domain tri",
@@ -86,6 +96,7 @@ RUNS = {
 }
 KEYS = {
     "compaction": {"error", "error_position", "particles"},
+    "cantilever": {"shortening", "deflection", "error"},
     "column_roller": {"error_syy", "error_sxx", "top", "particles", "yield_violation"},
     "column_free": {"top", "toe", "y_mean", "yield_violation", "worst_domain"},
     "ufl_material": {"difference"},
@@ -245,6 +256,7 @@ def test_demo_is_a_program(demo, tmp_path):
     # From another directory, in a process of its own, which leaves nothing behind.
     small = {
         "column_free": "--cell 2 --steps 5 --g0 5e3",
+        "cantilever": "--cell 1 --steps 10",
         "domain_distortion": "--steps 4",
         "cell_crossing": "--cells 4 --steps 4",
         "block3d": "--elements 2 --steps 4",
