@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 from mpi4py import MPI
@@ -131,16 +132,24 @@ class NewtonSolver:
         pc = ksp.getPC()
         pc.setType("cholesky" if symmetric else "lu")
         pc.setFactorSolverType("mumps")
+        self._options = {prefix + key: value for key, value in options.items()}
+        with self._own_options() as database:
+            self.snes.setFromOptions()
+            own = database.hasName(f"{prefix}pc_factor_mat_solver_type")
+            if pc.getType() in FACTORS and not own:
+                pc.setFactorSolverType("mumps")  # changing the type had dropped it
+
+    @contextmanager
+    def _own_options(self) -> Iterator[PETSc.Options]:
+        """Put the user's options into PETSc's database, for what reads them inside the block."""
         database = PETSc.Options()
-        database.prefixPush(prefix)
-        for key, value in options.items():
+        for key, value in self._options.items():
             database[key] = value
-        self.snes.setFromOptions()
-        database.prefixPop()
-        if pc.getType() in FACTORS and not database.hasName(f"{prefix}pc_factor_mat_solver_type"):
-            pc.setFactorSolverType("mumps")  # changing the type had dropped it
-        for key in options:
-            database.delValue(prefix + key)
+        try:
+            yield database
+        finally:
+            for key in self._options:
+                database.delValue(key)
 
     def solve(self, problem: ReducedProblem, sizes: tuple[int, int]) -> None:
         """Find a root of the residual, starting from zero or from the prediction.
@@ -350,8 +359,8 @@ class NewtonSolver:
         if ksp.getPC().getFailedReason():
             ksp.getPC().reset()  # MUMPS does not factorise again where it failed
         ksp.setOperators(K, self._P)
-        with self.statistics.phase("factorise"):
-            ksp.setUp()
+        with self.statistics.phase("factorise"), self._own_options():
+            ksp.setUp()  # where the factor is made, which reads options of its own
             self._give_workspace(ksp)
         self.statistics.count("factorisations")
 

@@ -158,3 +158,12 @@ def test_limit_load_is_told():
         assert len(error.dofs) == 1 and f"dof {error.dofs[0]} of V near (" in str(error)
         assert 0 <= error.dofs[0] < problem.particles.T.getSize()[1]
         assert error.particles
+
+
+def test_options_of_the_factor_reach_it():
+    # PETSc reads them when it makes the factor, at the first solve.
+    problem = scenes.block(petsc_options={"mat_mumps_icntl_7": 0, "mat_mumps_icntl_14": 77})
+    problem.solve(steps=1)
+    factor = problem.solver.getKSP().getPC().getFactorMatrix()
+    assert factor.getMumpsIcntl(7) == 0 and factor.getMumpsIcntl(14) == 77
+    assert not PETSc.Options().hasName("mpm_mat_mumps_icntl_7")

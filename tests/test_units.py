@@ -1,0 +1,75 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The same answer in metres and pascals, in millimetres and megapascals, and 1e9 times larger."""
+
+import numpy as np
+import pytest
+import scenes
+from scenes import QUADRILATERAL
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.materials import Hencky, VonMises
+
+#: Length and stress in the units at hand, in metres and pascals.
+UNITS = {"millimetres": (1e-3, 1e6), "small": (1e-9, 1.0), "stiff": (1.0, 1e9)}
+
+
+def case(name, length=1.0, stress=1.0, **options):
+    """Return a problem in units of a length and a stress, and its number of steps."""
+    size, width, h, steps = {
+        "A": ((50.0 / 16, 50.0), 50.0 / 16, 50.0 / 16, 10),
+        "B": ((0.625, 10.0), 0.625, 0.625, 10),
+        "C": ((4.0, 8.0), 18.0, 1.0, 12),
+    }[name]
+    weight, law = {
+        "A": (800.0, lambda: Hencky(1e4 / stress, 0.0)),
+        "B": (8e3, lambda: VonMises(2e5 / stress, 0.3, rho_y=20e3 / stress)),
+        "C": (20e3, lambda: VonMises(1e6 / stress, 0.3, rho_y=20e3 / stress)),
+    }[name]
+    high = max(size[1], 10.0)
+    n = [round(width / h), round(high / h)]
+    V = scenes.vectors(scenes.box([0.0, 0.0], [n[0] * h, n[1] * h], n, QUADRILATERAL))
+    body = scenes.box([0.0, 0.0], size, [round(2 * x / h) for x in size], QUADRILATERAL)
+    for domain in (V.mesh, body):
+        domain.geometry.x[:] /= length
+    sides = (0.0,) if name == "C" else (0.0, h)
+    bcs = [fix(V, 0, [x / length for x in sides]), fix(V, 1, [0.0])]
+    force = -weight * length / stress
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(body, V), law(), density=1.0, body_force=(0.0, force), bcs=bcs, **options
+    )
+    return problem, steps
+
+
+def fix(V, component, places):
+    size = np.abs(V.mesh.geometry.x).max(initial=0.0)
+    size = scenes.largest(size)
+    return scenes.fix(
+        V,
+        lambda x: np.any(np.abs(x[component][:, None] - places) < 1e-9 * size, axis=1),
+        component=component,
+    )
+
+
+def result(problem):
+    p = problem.particles
+    reactions = [problem.reaction(bc) for bc in problem.bcs]
+    return p.centroid, p.stress, p.plastic_strain, np.array(reactions)
+
+
+@pytest.mark.parametrize("name", ["A", "B", "C"])
+def test_units(name):
+    problem, steps = case(name)
+    problem.solve(steps=steps)
+    expected = result(problem)
+    iterations = problem.history.iterations
+    for unit, (length, stress) in UNITS.items():
+        problem, _ = case(name, length, stress)
+        problem.solve(steps=steps)
+        assert problem.history.cutbacks == 0
+        assert problem.history.iterations == iterations, unit
+        answer = result(problem)
+        factors = (length, stress, 1.0, stress * length)
+        for one, two, factor in zip(expected, answer, factors, strict=True):
+            size = max(scenes.largest(one), 1e-12)
+            np.testing.assert_allclose(two * factor, one, rtol=0, atol=1e-8 * size, err_msg=unit)
