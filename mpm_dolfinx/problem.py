@@ -75,6 +75,10 @@ class ParticleProblem:
             without a shift the factor of such a matrix is noise.
         line_search: Whether Newton steps are halved where they invert domains or do not
             reduce the residual.
+        dependent_dofs: What becomes of dofs that others can stand for, as no node of the body
+            tells them apart: ``"shift"`` leaves them to the shift, ``"remove"`` looks for them in
+            each step and takes them from the unknowns (then ``shift=0.0`` is possible, and
+            ``statistics["dependent_dofs"]`` is the largest number of them).
         predictor: Whether Newton's method starts from the last increments extrapolated, where
             the residual there is not above twice that of a start from zero.
         stabilisation: What is done about background dofs that the body supports badly:
@@ -108,9 +112,14 @@ class ParticleProblem:
         symmetric: bool = False,
         shift: float = 1e-13,
         line_search: bool = True,
+        dependent_dofs: str = "shift",
         predictor: bool = True,
         stabilisation: str | None = "auto",
     ) -> None:
+        if dependent_dofs not in ("shift", "remove"):
+            raise MPMError(
+                f"Unknown dependent_dofs={dependent_dofs!r}; choose 'shift' or 'remove'."
+            )
         if not isinstance(shift, float | int) or not 0.0 <= shift < 1.0:
             raise MPMError(f"shift must be at least 0 and below 1, not {shift!r}.")
         options = {"form_compiler_options": form_compiler_options, "jit_options": jit_options}
@@ -145,6 +154,12 @@ class ParticleProblem:
         statistics = self.history.statistics
         evaluate = weakly(self.evaluate)
         past = Predictor() if predictor else None
+        cure = stabilisation_of(stabilisation, self.bodies)
+        if dependent_dofs == "remove" and (cure is not None or V.ufl_element().degree > 1):
+            raise MPMError(
+                "dependent_dofs='remove' is for a background of degree 1 without stabilisation; "
+                "use dependent_dofs='shift'."
+            )
         self.reduced = ReducedSystem(
             self.shares,
             terms,
@@ -152,7 +167,8 @@ class ParticleProblem:
             evaluate,
             statistics,
             past,
-            stabilisation_of(stabilisation, self.bodies),
+            cure,
+            dependent_dofs == "remove",
         )
         self._newton = NewtonSolver(
             self._comm,

@@ -69,6 +69,7 @@ class QuasiStaticProblem(ParticleProblem):
             materials by NumPy.
         shift: As in :class:`ParticleProblem`.
         line_search: As in :class:`ParticleProblem`.
+        dependent_dofs: As in :class:`ParticleProblem`.
         predictor: As in :class:`ParticleProblem`.
         **options: ``stabilisation``, ``form_compiler_options`` and ``jit_options``, as there.
 
@@ -97,6 +98,7 @@ class QuasiStaticProblem(ParticleProblem):
         assembly: str = "auto",
         shift: float = 1e-13,
         line_search: bool = True,
+        dependent_dofs: str = "shift",
         predictor: bool = True,
         **options: Any,
     ) -> None:
@@ -169,6 +171,7 @@ class QuasiStaticProblem(ParticleProblem):
             symmetric=symmetric,
             shift=shift,
             line_search=line_search,
+            dependent_dofs=dependent_dofs,
             predictor=predictor,
             **options,
         )

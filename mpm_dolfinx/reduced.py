@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from .assembly import BackgroundForms, BodyForms
+from .dependence import dependent_columns
 from .errors import DomainDistortionError, MPMError, agreed
 from .fused import FusedTangent
 from .history import Statistics
@@ -135,6 +136,7 @@ class ReducedSystem:
         statistics: Where to count.
         predictor: Says what increment to expect; ``None`` for none.
         stabilisation: What is done about badly supported dofs.
+        remove_dependent: Whether dofs that others can stand for are no unknowns.
 
     Attributes:
         moduli: Shear moduli of the bodies before their first step, by which a ghost penalty is
@@ -150,9 +152,11 @@ class ReducedSystem:
         statistics: Statistics,
         predictor: Predictor | None = None,
         stabilisation: GhostPenalty | Aggregation | None = None,
+        remove_dependent: bool = False,
     ) -> None:
         self.predictor = predictor
         self._stabilisation = stabilisation
+        self._remove_dependent = remove_dependent
         self.moduli: list[float] | None = None
         self._extension: PETSc.Mat | None = None
         self._ghost: tuple[PETSc.Mat, PETSc.Mat] | None = None
@@ -235,6 +239,13 @@ class ReducedSystem:
             self._fixed[dofs[:first_ghost]] = True
         self._free = np.flatnonzero(free & ~self._fixed).astype(np.int32)
         T = self._bodies[0].particles.T
+        if self._remove_dependent:
+            dependent = self._dependent_dofs(self._free)
+            start = T.getOwnershipRangeColumn()[0]
+            self._free = self._free[~np.isin(self._free + start, dependent)]
+            self._statistics["dependent_dofs"] = max(
+                self._statistics["dependent_dofs"], len(dependent)
+            )
         self._layout = FreeDofs(self._V, self._free, [body.particles.T for body in self._bodies])
         self._columns = self._layout.columns
         self._u = T.createVecRight()
@@ -283,6 +294,30 @@ class ReducedSystem:
             return self._part
         self._extension.mult(self._part, self._u)
         return self._u
+
+    def _dependent_dofs(self, free: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Return the global dofs, on all ranks, whose columns of T depend on others' (collective).
+
+        Args:
+            free: The local dofs that would be unknowns.
+        """
+        transfers = [body.particles.T for body in self._bodies]
+        mark = transfers[0].createVecRight()
+        mark.array_w[free] = 1.0
+        rows, columns, values = [], [], []
+        shift = 0
+        for T in transfers:
+            unknown = T.copy()
+            unknown.diagonalScale(R=mark)
+            indptr, indices, data = unknown.getValuesCSR()
+            row = np.repeat(np.arange(len(indptr) - 1, dtype=np.int64), np.diff(indptr))
+            kept = data != 0.0
+            rows.append(row[kept] + T.getOwnershipRange()[0] + shift)
+            columns.append(indices[kept].astype(np.int64))
+            values.append(data[kept])
+            shift += T.getSize()[0]
+        entries = (np.concatenate(part) for part in (rows, columns, values))
+        return dependent_columns(self._comm, *entries)
 
     def _gather(self, vectors: Sequence[PETSc.Vec]) -> None:
         """Set the force to the sum of ``T^T`` times each body's vector."""

@@ -326,6 +326,11 @@ PROBLEMS = {
     "shift of one": (problem(shift=1.0), r"shift must be .* not 1\.0"),
     "negative shift": (problem(shift=-1e-13), r"shift must be .* not -1e-13"),
     "shift nan": (problem(shift=np.nan), r"shift must be .* not nan"),
+    "dependent dofs of a stabilised problem": (
+        problem(dependent_dofs="remove", stabilisation="ghost"),
+        r"dependent_dofs='remove' is for a background of degree 1 without stabilisation",
+    ),
+    "dependent dofs": (problem(dependent_dofs="keep"), r"dependent_dofs='keep'"),
     "no shift": (problem(shift=None), r"shift must be .* not None"),
     "no steps": (run(steps=0), r"number of steps.*not 0"),
     "steps backwards": (run(steps=-3), r"number of steps.*not -3"),
