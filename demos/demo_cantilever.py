@@ -43,7 +43,7 @@
 #
 # $$
 # \sum_F \frac{\gamma\, G}{h^2} \int_{K_1 \cup K_2} (u_1 - u_2) \cdot (v_1 - v_2) \,\mathrm{d}x,
-# \qquad \gamma = 10^{-6}, \tag{3}
+# \qquad \gamma = 10^{-4}, \tag{3}
 # $$
 #
 # where $u_1$, $u_2$ are the polynomials of $u$ in either cell, continued over both. It vanishes for

@@ -26,7 +26,7 @@ __all__ = ["Aggregation", "GhostPenalty", "stabilisation_of"]
 #: Fill of a cell below which its dofs count as badly supported.
 FILL = 0.5
 #: Ghost penalty over shear modulus / cell size^2.
-PENALTY = 1e-6
+PENALTY = 1e-4
 #: Layers of cells over which aggregation looks for a well filled one.
 LAYERS = 8
 KINDS = ("auto", "ghost", "aggregate")
