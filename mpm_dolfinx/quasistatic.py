@@ -398,19 +398,28 @@ def _for_each(value: Any, count: int, pairs: bool = False) -> list[Any]:
 
 
 def _warn_of_hourglass(particles: Particles) -> None:
-    """Say so where one point for each domain leaves motions without strain (collective)."""
+    """Say so where the points of a domain leave motions without strain (collective).
+
+    Those are as many as Gauss points of the background's degree, in domains as large as its cells.
+    """
     cell = particles.mesh.topology.cell_name()
-    if particles.num_points > 1 or cell not in ("quadrilateral", "hexahedron"):
+    degree = particles.V.ufl_element().degree
+    points = particles.num_points
+    few = points <= degree**particles.mesh.geometry.dim
+    if not few or cell not in ("quadrilateral", "hexahedron"):
         return
     _, size = background_cells(particles)
     fill = particles.mesh.comm.allreduce(float((particles.initial_volume / size).sum()))
     if fill > CROWDED * particles.num_global and particles.mesh.comm.rank == 0:
         cure = "use two domains each way in a cell"
-        if particles.method == "cpdi2":
+        if degree > 1:
+            cure = f"use quadrature_degree={2 * degree}, or {cure[4:]}"
+        elif particles.method == "cpdi2":
             cure = f"use quadrature_degree=2 with f_bar='domain', or {cure[4:]}"
         warnings.warn(
-            "The domains have one quadrature point each and are about as large as the cells of the "
-            f"background, so motions without strain (hourglass) meet no resistance; {cure}.",
+            f"The domains have {'one' if points == 1 else points} quadrature point"
+            f"{'s'[: points > 1]} each and are about as large as the cells of the background, so "
+            f"motions without strain (hourglass) meet no resistance; {cure}.",
             stacklevel=4,
         )
 
