@@ -87,9 +87,16 @@ class ConstitutiveHistory:
         self.averaging: VolumeAveraging | None = None
         if f_bar != "none":
             material = np.zeros(particles.num_local, dtype=np.int64)
-            for number, group in enumerate(self._groups):
-                material[group.points // particles.num_points] = number
-            self.averaging = VolumeAveraging(particles, f_bar, self.dim, material, self.symmetric)
+            modulus = np.zeros(particles.num_local)  # three times that of shear
+            for number, (group, state) in enumerate(zip(self._groups, self._states, strict=True)):
+                domains = group.points // particles.num_points
+                material[domains] = number
+                answer = group.material.update(self._gradient[group.points], state)
+                assert answer.tangent is not None
+                modulus[domains] = 3.0 * answer.tangent[:, 0, 1, 0, 1]
+            self.averaging = VolumeAveraging(
+                particles, f_bar, self.dim, material, modulus, self.symmetric
+            )
 
     @property
     def symmetric(self) -> bool:

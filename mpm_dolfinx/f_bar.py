@@ -3,15 +3,13 @@
 """F-bar: volume ratios averaged over domains, pairs or patches, against locking.
 
 A material sees ``Fbar = (Jbar / J)^(1/dim) F`` (de Souza Neto, Peric, Dutko & Owen 1996), in
-plane strain with the power 1/2, which leaves the third direction alone. The stress is that of the
-energy ``int psi(Fbar) dX``: residual ``P(Fbar) : delta Fbar``, so the tangent is symmetric
-wherever the material's is. With lambda_e = ln J_e of a domain's mean volume ratio and lambda_m
-that of a group of domains,
+plane strain with the power 1/2, which leaves the third direction alone; Jbar is the mean of J over
+a group of domains. The stress is that of the energy ``int psi(Fbar) dX``: residual
+``P(Fbar) : delta Fbar``, so the tangent is symmetric wherever the material's is.
 
-    ln Jbar = lambda_m + psi(lambda_e - lambda_m),
-
-psi(d) = d where single domains are averaged, 0 for groups. In patches psi is zero for small
-deviations only (:func:`deviation`), so that no domain can drift away from its patch.
+In patches nothing but shear keeps the single domains' volumes, and they would drift as the body
+flows. Let d be ln of a domain's mean J over its patch's. To the energy is added
+``sum V modulus Phi(d)``, convex and zero for small d (:func:`deviation`).
 """
 
 from __future__ import annotations
@@ -38,37 +36,23 @@ SUBSET = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
 DIFFERENT = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
 
 type Array = NDArray[np.float64]
-type Deviation = Callable[[Array], tuple[Array, Array, Array]]
 
 
-def deviation(d: Array) -> tuple[Array, Array, Array]:
-    """Return how much of its deviation from the patch a domain feels, with two derivatives.
+def deviation(d: Array) -> tuple[Array, Array]:
+    """Return what a domain's deviation from its patch's volume costs.
 
-    psi is odd, 0 up to 0.04, ``(|d| - 0.04)^2 / 0.4`` up to 0.24, and has slope 1 beyond.
+    Phi' is odd, 0 up to 0.04, ``(|d| - 0.04)^2 / 0.4`` up to 0.24, and has slope 1 beyond.
 
     Args:
         d: ln of the domain's volume ratio over the patch's, shape ``(n,)``.
 
     Returns:
-        psi, psi' and psi'', each ``(n,)``.
+        Phi' and Phi'', each ``(n,)``.
     """
     width = WHOLE - FREE
     excess = np.maximum(np.abs(d) - FREE, 0.0)
-    inside = excess < width
-    psi = np.where(inside, excess**2 / (2.0 * width), excess - width / 2.0)
-    return (
-        np.sign(d) * psi,
-        np.minimum(excess / width, 1.0),
-        np.where(inside & (excess > 0.0), np.sign(d) / width, 0.0),
-    )
-
-
-def _wholly(d: Array) -> tuple[Array, Array, Array]:
-    return d, np.ones_like(d), np.zeros_like(d)
-
-
-def _not_at_all(d: Array) -> tuple[Array, Array, Array]:
-    return np.zeros_like(d), np.zeros_like(d), np.zeros_like(d)
+    force = np.where(excess < width, excess**2 / (2.0 * width), excess - width / 2.0)
+    return np.sign(d) * force, np.minimum(excess / width, 1.0)
 
 
 class LowRankTerm(NamedTuple):
@@ -102,6 +86,8 @@ class VolumeAveraging:
         kind: ``"domain"``, ``"pair"`` or ``"patch"``.
         dim: Dimension of the deformation gradient, 3 for a body of revolution.
         material: Number of each owned domain's material; groups have one material.
+        modulus: Modulus of each owned domain's unstrained material that resists deviations of
+            its volume from its patch's, shape ``(n,)``.
         symmetric: Whether the material's tangent is symmetric.
 
     Attributes:
@@ -119,6 +105,7 @@ class VolumeAveraging:
         kind: str,
         dim: int,
         material: NDArray[np.int64],
+        modulus: Array,
         symmetric: bool,
     ) -> None:
         self._particles = particles
@@ -131,12 +118,8 @@ class VolumeAveraging:
         if dim > particles.mesh.geometry.dim:
             self._hoop = quadrature.shapes / particles.radii[:, :, None]
         self._volume = self._weights.sum(axis=1)
+        self._modulus = modulus
         self.groups = self._grouped(kind, material)
-        self._feel: Deviation = {
-            "domain": _wholly,
-            "pair": _not_at_all,
-            "patch": deviation,
-        }[kind]
         self.kind = kind
         self._singles = singles(particles)
         self.low_rank: list[LowRankTerm] = []
@@ -176,8 +159,8 @@ class VolumeAveraging:
         with np.errstate(invalid="ignore", divide="ignore"):
             ln_domain = np.log1p(of_domain / self._volume)
             ln_group = np.log1p(of_group / group_volume)
-            psi, self._slope, self._curvature = self._feel(ln_domain - ln_group)
-            change = a * ((ln_group + psi)[:, None] - np.log1p(excess))
+            change = a * (ln_group[:, None] - np.log1p(excess))
+        self._deviation = ln_domain - ln_group
         self._domain_size = self._volume + of_domain
         self._group_size = group_volume + of_group
         self._counted = self._weights * present[:, None]
@@ -214,14 +197,13 @@ class VolumeAveraging:
         stiffness = s * np.einsum("nqiJ,nqiJ->nq", left, F)
         in_domain = a * (self._counted * p).sum(axis=1)
         H = a**2 * (self._counted * stiffness).sum(axis=1)
-        slope, curvature = self._slope, self._curvature
-        share = 1.0 - slope
-        C = slope * in_domain
-        sums = self.groups.sum(
-            np.stack([share * in_domain, share**2 * H + curvature * in_domain], axis=1)
-        )
+        force, stiffening = np.zeros_like(H), np.zeros_like(H)
+        if self.kind == "patch":
+            scale = self._counted.sum(axis=1) * self._modulus
+            force, stiffening = (scale * part for part in deviation(self._deviation))
+        sums = self.groups.sum(np.stack([in_domain - force, H + stiffening], axis=1))
         B = sums[:, 0]
-        beta = (B / self._group_size + C / self._domain_size)[:, None] * J
+        beta = (B / self._group_size + force / self._domain_size)[:, None] * J
 
         factor = (beta - a * p)[:, :, None, None]
         stress = s2 * P + factor * Z
@@ -235,23 +217,14 @@ class VolumeAveraging:
         projected = (a * stiffness)[:, :, None, None] * Z
         y = [self._nodal(a * (s2 * left - projected))]
         y.append(y[0] if self._symmetric else self._nodal(a * (s2 * right - projected)))
-        self.low_rank = []
-        if self.kind != "pair":
-            h = slope**2 * H + curvature * in_domain - C
-            self.low_rank.append(
-                LowRankTerm(self._singles, h, g, *(slope[:, None, None] * v for v in y))
-            )
-        if self.kind != "domain":
-            part = (self._domain_size / self._group_size)[:, None, None]
-            cross = (slope * share * H - curvature * in_domain)[:, None, None] * g
-            self.low_rank.append(
-                LowRankTerm(
-                    self.groups,
-                    sums[:, 1] - B,
-                    part * g,
-                    *(share[:, None, None] * v + cross for v in y),
-                )
-            )
+        part = (self._domain_size / self._group_size)[:, None, None]
+        cross = stiffening[:, None, None] * g
+        self.low_rank = [
+            LowRankTerm(self.groups, sums[:, 1] - B, part * g, *(v - cross for v in y))
+        ]
+        if self.kind == "patch":
+            none = np.zeros_like(g)
+            self.low_rank.append(LowRankTerm(self._singles, stiffening - force, g, none, none))
         return stress, tangent
 
     def _nodal(self, stress: Array) -> Array:

@@ -17,6 +17,8 @@ from scenes import (
     vectors,
 )
 
+from dolfinx import fem, mesh
+
 import mpm_dolfinx as mpm
 from mpm_dolfinx.f_bar import deviation
 from mpm_dolfinx.materials import Hencky, ReturnMapping, VonMises, mandel
@@ -148,14 +150,14 @@ def averaged_energy(problem, displacement):
     np.add.at(totals, groups, whole)
     of_group = np.log(totals[:, 1] / totals[:, 0])[history.groups.number]
     of_domain = np.log(size / volume)
-    kind = history.kind
-    own = {"domain": of_domain, "pair": of_group}.get(kind)
-    if kind == "patch":
-        d = of_domain - of_group
-        beyond = np.maximum(np.abs(d) - 0.04, 0.0)
-        own = of_group + np.sign(d) * np.where(np.abs(d) < 0.24, beyond**2 / 0.4, np.abs(d) - 0.14)
-    scale = (np.exp(own)[:, None] / J) ** (1.0 / dim)
-    return WORLD.allreduce((weights * hencky_energy(scale[:, :, None, None] * F)).sum())
+    scale = (np.exp(of_group)[:, None] / J) ** (1.0 / dim)
+    energy = (weights * hencky_energy(scale[:, :, None, None] * F)).sum()
+    if history.kind == "patch":
+        beyond = np.maximum(np.abs(of_domain - of_group) - 0.04, 0.0)
+        outer = 0.2**2 / 6.0 + (beyond - 0.2) * 0.1 + (beyond - 0.2) ** 2 / 2.0
+        cost = np.where(beyond < 0.2, beyond**3 / 1.2, outer)
+        energy += 3.0 * scenes.lame(YOUNG, POISSON)[1] * (volume * cost).sum()
+    return WORLD.allreduce(energy)
 
 
 @pytest.mark.parametrize(
@@ -172,15 +174,15 @@ def test_residual_is_the_derivative_of_the_energy(cell, f_bar, rule):
     assert abs(WORLD.allreduce(force @ direction) - expected) < 1e-8 * abs(expected)
 
 
-def test_deviation_is_smooth_and_odd():
+def test_cost_of_deviation_is_smooth_and_convex():
     d = np.linspace(-0.4, 0.4, 161) + 1e-3
-    psi, slope, curvature = deviation(d)
+    force, stiffness = deviation(d)
     eps = 1e-7
-    ahead, behind = deviation(d + eps), deviation(d - eps)
-    np.testing.assert_allclose((ahead[0] - behind[0]) / (2 * eps), slope, atol=1e-8)
-    np.testing.assert_allclose((ahead[1] - behind[1]) / (2 * eps), curvature, atol=1e-6)
-    np.testing.assert_allclose(deviation(-d)[0], -psi, atol=1e-16)
-    assert (psi[np.abs(d) < 0.039] == 0.0).all() and (slope[np.abs(d) > 0.25] == 1.0).all()
+    difference = (deviation(d + eps)[0] - deviation(d - eps)[0]) / (2 * eps)
+    np.testing.assert_allclose(difference, stiffness, atol=1e-8)
+    np.testing.assert_allclose(deviation(-d)[0], -force, atol=1e-16)
+    assert (force[np.abs(d) < 0.039] == 0.0).all() and (stiffness[np.abs(d) > 0.25] == 1.0).all()
+    assert (np.abs(np.diff(stiffness)) < 6.0 * np.diff(d)).all() and (stiffness >= 0.0).all()
 
 
 # -- Groups ------------------------------------------------------------------------------
@@ -358,3 +360,32 @@ def test_deleted_domains_leave_their_patch():
     require_exact_tangent(problem, 0.1)
     problem.commit()
     assert np.isfinite(particles.stress).all()
+
+
+def footing(f_bar):
+    """Return ratio to the limit pressure, and its last rise, of a coarse strip footing."""
+    V = vectors(box([0.0, 0.0], [3.0, 2.5], [12, 10], QUADRILATERAL))
+    body = box([0.0, 0.0], [3.0, 2.0], [24, 16], QUADRILATERAL)
+
+    def held(component, value, where):
+        V.mesh.topology.create_connectivity(1, 2)
+        facets = mesh.locate_entities(V.mesh, 1, where)
+        dofs = fem.locate_dofs_topological(V.sub(component), 1, facets)
+        return fem.dirichletbc(value, dofs, V.sub(component))
+
+    strip = held(1, -0.003, lambda x: np.isclose(x[1], 2.0) & (x[0] < 0.5001))
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(body, V, quadrature_degree=2),
+        VonMises(1e7, 0.48, rho_y=490.0 * np.sqrt(2.0)),
+        bcs=[held(0, 0.0, scenes.at(0, 0.0, 3.0)), held(1, 0.0, scenes.at(1, 0.0)), strip],
+        f_bar=f_bar,
+    )
+    pressure = [-problem.reaction(strip)[1] for _ in problem.steps(20)]
+    return 2.0 * pressure[-1] / ((2.0 + np.pi) * 490.0), pressure[-1] / pressure[-4] - 1.0
+
+
+def test_a_footing_locks_without_patches_and_reaches_its_limit_with_them():
+    ratio, rise = footing("domain")
+    assert ratio > 1.5 and rise > 0.03
+    ratio, rise = footing("patch")
+    assert 0.95 < ratio < 1.2 and abs(rise) < 0.01
