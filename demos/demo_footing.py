@@ -10,9 +10,9 @@
 #
 # ## Problem
 #
-# A smooth rigid strip of half width $b$ = 0.5 m is pushed into weightless undrained soil, 5 m by 5 m
-# of its right half, with rollers at both sides and a smooth base. The soil is von Mises', perfectly
-# plastic on Hencky elasticity,
+# A smooth rigid strip of half width $b$ = 0.5 m is pushed into weightless undrained soil, of which
+# the right half is 5 m by 5 m, with rollers at both sides and a smooth base. The soil is von
+# Mises', perfectly plastic on Hencky elasticity,
 #
 # $$
 # f = \frac{\sqrt{2 J_2}}{\rho_y} - 1 \le 0, \qquad E = 10\ \mathrm{GPa}, \quad \nu = 0.48, \quad
@@ -32,9 +32,9 @@
 #
 # At the limit load all of the motion is plastic, and plastic flow keeps the volume: $\det F$ = 1 at
 # every quadrature point (elasticity with $\nu$ = 0.48 asks for nearly the same). A background cell
-# has two unknowns to meet such conditions with. One particle of one point sets one, 2 by 2 particles
-# set four: there is then hardly any motion left that obeys them all, and the body *locks*. The
-# pressure passes the limit and goes on rising.
+# has two unknowns to meet such conditions with. One particle of one point sets one, 2 by 2
+# particles set four: there is then hardly any motion left that obeys them all, and the body
+# *locks*. The pressure passes the limit and goes on rising.
 #
 # With `f_bar="patch"` the material sees
 #
@@ -117,8 +117,8 @@ if args.quadrature_degree is None and args.domain == "quad":
     args.quadrature_degree = 2
 particles = mpm.Particles(body, V, quadrature_degree=args.quadrature_degree)
 
-# Rollers, and the strip: the nodes of the background at the ground, up to its edge, move down. Where
-# the strip is, the background is at the ground in every step, since it never moves.
+# Rollers, and the strip: the nodes of the background at the ground, up to its edge, move down in
+# every step, since the background itself never moves.
 
 
 background.topology.create_connectivity(1, 2)

@@ -7,14 +7,13 @@ plane strain with the power 1/2, which leaves the third direction alone; Jbar is
 a group of domains. The stress is that of the energy ``int psi(Fbar) dX``: residual
 ``P(Fbar) : delta Fbar``, so the tangent is symmetric wherever the material's is.
 
-In patches nothing but shear keeps the single domains' volumes, and they would drift as the body
-flows. Let d be ln of a domain's mean J over its patch's. To the energy is added
-``sum V modulus Phi(d)``, convex and zero for small d (:func:`deviation`).
+Nothing but shear would keep J at single points, and it would drift as a body flows, until domains
+fold. Let d be ln of a point's J over its average. To the energy is added
+``int 3 G Phi(d) dX``, G the shear modulus, convex and zero for small d (:func:`deviation`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from petsc4py import PETSc
@@ -29,8 +28,8 @@ from .particles import Particles
 __all__ = ["F_BARS", "LowRankTangent", "LowRankTerm", "VolumeAveraging", "deviation"]
 
 F_BARS = ("none", "domain", "pair", "patch")
-#: Deviation of a domain's ln J from its patch's that is free, and that from which all is felt.
-FREE, WHOLE = 0.04, 0.24
+#: Deviation of ln J from its average that costs nothing, and that from which all is resisted.
+FREE = {"domain": (0.2, 0.6), "pair": (0.2, 0.6), "patch": (0.1, 0.5)}
 
 SUBSET = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
 DIFFERENT = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
@@ -38,19 +37,18 @@ DIFFERENT = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
 type Array = NDArray[np.float64]
 
 
-def deviation(d: Array) -> tuple[Array, Array]:
-    """Return what a domain's deviation from its patch's volume costs.
+def deviation(d: Array, free: float, whole: float) -> tuple[Array, Array]:
+    """Return what a deviation of ln J from its average costs: Phi' and Phi''.
 
-    Phi' is odd, 0 up to 0.04, ``(|d| - 0.04)^2 / 0.4`` up to 0.24, and has slope 1 beyond.
+    Phi' is odd, 0 up to ``free``, then a parabola up to ``whole``, and has slope 1 beyond.
 
     Args:
-        d: ln of the domain's volume ratio over the patch's, shape ``(n,)``.
-
-    Returns:
-        Phi' and Phi'', each ``(n,)``.
+        d: Deviations, any shape.
+        free: Largest deviation that costs nothing.
+        whole: Deviation from which the slope is 1.
     """
-    width = WHOLE - FREE
-    excess = np.maximum(np.abs(d) - FREE, 0.0)
+    width = whole - free
+    excess = np.maximum(np.abs(d) - free, 0.0)
     force = np.where(excess < width, excess**2 / (2.0 * width), excess - width / 2.0)
     return np.sign(d) * force, np.minimum(excess / width, 1.0)
 
@@ -86,8 +84,7 @@ class VolumeAveraging:
         kind: ``"domain"``, ``"pair"`` or ``"patch"``.
         dim: Dimension of the deformation gradient, 3 for a body of revolution.
         material: Number of each owned domain's material; groups have one material.
-        modulus: Modulus of each owned domain's unstrained material that resists deviations of
-            its volume from its patch's, shape ``(n,)``.
+        modulus: Modulus that resists deviations from an average, for each owned domain, ``(n,)``.
         symmetric: Whether the material's tangent is symmetric.
 
     Attributes:
@@ -121,7 +118,6 @@ class VolumeAveraging:
         self._modulus = modulus
         self.groups = self._grouped(kind, material)
         self.kind = kind
-        self._singles = singles(particles)
         self.low_rank: list[LowRankTerm] = []
 
     def _grouped(self, kind: str, material: NDArray[np.int64]) -> Groups:
@@ -156,12 +152,9 @@ class VolumeAveraging:
         sums = self.groups.sum(np.where(present[:, None], sizes, 0.0))
         group_volume = np.where(present, sums[:, 0], self._volume)
         of_group = np.where(present, sums[:, 1], of_domain)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ln_domain = np.log1p(of_domain / self._volume)
-            ln_group = np.log1p(of_group / group_volume)
-            change = a * (ln_group[:, None] - np.log1p(excess))
-        self._deviation = ln_domain - ln_group
-        self._domain_size = self._volume + of_domain
+        ln_group = np.log1p(of_group / group_volume)[:, None]
+        self._deviation = np.log1p(excess) - ln_group
+        change = -a * self._deviation
         self._group_size = group_volume + of_group
         self._counted = self._weights * present[:, None]
         self._J = 1.0 + excess
@@ -197,35 +190,39 @@ class VolumeAveraging:
         stiffness = s * np.einsum("nqiJ,nqiJ->nq", left, F)
         in_domain = a * (self._counted * p).sum(axis=1)
         H = a**2 * (self._counted * stiffness).sum(axis=1)
-        force, stiffening = np.zeros_like(H), np.zeros_like(H)
-        if self.kind == "patch":
-            scale = self._counted.sum(axis=1) * self._modulus
-            force, stiffening = (scale * part for part in deviation(self._deviation))
-        sums = self.groups.sum(np.stack([in_domain - force, H + stiffening], axis=1))
+        force, stiffening = self._resistance()
+        sums = self.groups.sum(
+            np.stack(
+                [
+                    in_domain - (self._counted * force).sum(axis=1),
+                    H + (self._counted * stiffening).sum(axis=1),
+                ],
+                axis=1,
+            )
+        )
         B = sums[:, 0]
-        beta = (B / self._group_size + force / self._domain_size)[:, None] * J
+        beta = (B / self._group_size)[:, None] * J
 
-        factor = (beta - a * p)[:, :, None, None]
+        factor = (beta + force - a * p)[:, :, None, None]
         stress = s2 * P + factor * Z
         tangent = s2[:, :, :, :, None, None] ** 2 * A
         tangent -= _dyad((a * s2) * left, Z)
         tangent -= _dyad(Z, (a * s2) * right)
-        tangent += _dyad((a**2 * stiffness + beta)[:, :, None, None] * Z, Z)
+        tangent += _dyad((a**2 * stiffness + beta + stiffening)[:, :, None, None] * Z, Z)
         tangent -= np.einsum("nqiL,nqkJ->nqiJkL", factor * Z, Z)
 
-        g = self._nodal(J[:, :, None, None] * Z) / self._domain_size[:, None, None]
-        projected = (a * stiffness)[:, :, None, None] * Z
-        y = [self._nodal(a * (s2 * left - projected))]
-        y.append(y[0] if self._symmetric else self._nodal(a * (s2 * right - projected)))
-        part = (self._domain_size / self._group_size)[:, None, None]
-        cross = stiffening[:, None, None] * g
-        self.low_rank = [
-            LowRankTerm(self.groups, sums[:, 1] - B, part * g, *(v - cross for v in y))
-        ]
-        if self.kind == "patch":
-            none = np.zeros_like(g)
-            self.low_rank.append(LowRankTerm(self._singles, stiffening - force, g, none, none))
+        g = self._nodal((J / self._group_size[:, None])[:, :, None, None] * Z)
+        projected = (a**2 * stiffness + stiffening)[:, :, None, None] * Z
+        left = self._nodal(a * s2 * left - projected)
+        right = left if self._symmetric else self._nodal(a * s2 * right - projected)
+        self.low_rank = [LowRankTerm(self.groups, sums[:, 1] - B, g, left, right)]
         return stress, tangent
+
+    def _resistance(self) -> tuple[Array, Array]:
+        """Return force and stiffness, per volume, against deviations at the points."""
+        modulus = self._modulus[:, None]
+        force, stiffness = deviation(self._deviation, *FREE[self.kind])
+        return modulus * force, modulus * stiffness
 
     def _nodal(self, stress: Array) -> Array:
         """Return the integrals of ``stress : grad N`` over each domain, ``(n, k, gdim)``."""

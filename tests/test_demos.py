@@ -88,6 +88,19 @@ RUNS = {
         "--elements 2 --steps 20 --domain tet --plates smooth",
         {"volume_error": 1e-9},
     ),
+    "collapse": ("collapse", "--cell 2 --particles-per-cell 2 --steps 20", {"u_top": -2.69}),
+    "collapse-patch": ("collapse", "--cell 2 --f-bar patch --steps 20", {"u_top": -2.6}),
+    "footing": ("footing", "--cell 0.25 --steps 16", {"ratio": 1.1, "plateau": 0.02}),
+    "roller-patch": (
+        "column_roller",
+        "--elements 6 --steps 10 --f-bar patch --particles-per-cell 3",
+        {"error_syy": 1.2e-2, "error_sxx": 1e-2},
+    ),
+    "free-domain": (
+        "column_free",
+        "--domain quad --cell 1 --particles-per-cell 1 --f-bar domain --steps 20 --g0 15e3",
+        {"yield_violation": 1e-8, "cutbacks": 4},
+    ),
     "gmsh": (
         "gmsh_body",
         "--size 0.25 --body-size 0.2 --steps 8",
@@ -109,6 +122,8 @@ KEYS = {
     "cell_crossing": {f"scatter_{method}" for method in ("mpm", "gimp", "cpdi", "cpdi2")},
     "block3d": {"height", "barrel", "volume_error", "reaction"},
     "gmsh_body": {"error_reaction", "error_area"},
+    "collapse": {"u_top", "u_toe"},
+    "footing": {"pressure", "limit", "ratio", "plateau"},
 }
 
 
@@ -260,6 +275,8 @@ def test_demo_is_a_program(demo, tmp_path):
         "domain_distortion": "--steps 4",
         "cell_crossing": "--cells 4 --steps 4",
         "block3d": "--elements 2 --steps 4",
+        "collapse": "--cell 2 --particles-per-cell 1 --f-bar domain --steps 4",
+        "footing": "--cell 0.5 --steps 4",
         "gmsh_body": "--size 0.3 --body-size 0.3 --steps 2",
     }.get(demo, "--elements 4 --steps 4")
     done = subprocess.run(
