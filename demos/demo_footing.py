@@ -66,6 +66,7 @@ parser.add_argument(
     "--particles-per-cell", type=tools.whole, default=2, help="quadrilaterals, each way"
 )
 parser.add_f_bar("patch")
+parser.add_order()
 parser.add_argument("--steps", type=tools.whole, default=40, help="steps")
 args = parser.parse()
 
@@ -107,15 +108,15 @@ def grid(x: np.ndarray, y: np.ndarray, kind: mesh.CellType) -> mesh.Mesh:
 across, up = lines(1.75), size - lines(1.0)[::-1]
 above = np.append(up, size + h * np.arange(1, 3))
 background = grid(across, above, mesh.CellType.quadrilateral)
-V = fem.functionspace(background, ("Lagrange", 1, (2,)))
+V = fem.functionspace(background, ("Lagrange", args.degree, (2,)))
 each = args.particles_per_cell
 body = grid(divided(across, each), divided(up, each), tools.DOMAINS[args.domain])
 
-# Quadrilaterals have 2 by 2 points here.
+# Quadrilaterals of degree 1 have 2 by 2 points here.
 
-if args.quadrature_degree is None and args.domain == "quad":
+if args.quadrature_degree is None and args.domain == "quad" and args.degree == 1:
     args.quadrature_degree = 2
-particles = mpm.Particles(body, V, quadrature_degree=args.quadrature_degree)
+particles = mpm.Particles(body, V, **tools.order(args))
 
 # Rollers, and the strip: the nodes of the background at the ground, up to its edge, move down in
 # every step, since the background itself never moves.
@@ -142,6 +143,7 @@ problem = mpm.QuasiStaticProblem(
         footing,
     ],
     f_bar=args.f_bar,
+    stabilisation=tools.stabilisation(args),
     petsc_options_prefix="footing_",
 )
 
