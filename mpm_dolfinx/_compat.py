@@ -47,7 +47,10 @@ __all__ = [
     "interpolation_points",
     "is_condition_on",
     "mesh_on_ranks",
+    "packed",
     "require_supported",
+    "set_entries",
+    "set_entry_places",
     "tags_from_nodes",
     "use_basic_line_search",
     "vtk_order",
@@ -256,6 +259,33 @@ def interpolation_points(V: fem.FunctionSpace) -> NDArray[np.float64]:
     return np.asarray(points() if callable(points) else points)
 
 
+def set_entry_places(matrix: PETSc.Mat, rows: NDArray[Any], columns: NDArray[Any]) -> None:
+    """Say where the entries of :func:`set_entries` go (petsc4py 3.22 has no COO assembly).
+
+    Args:
+        matrix: A matrix with type and sizes.
+        rows: Global row of each entry, any rank's; PETSc may sort the array in place.
+        columns: Global column of each entry, likewise.
+    """
+    if hasattr(matrix, "setPreallocationCOO"):
+        matrix.setPreallocationCOO(rows, columns)
+        return
+    matrix.setUp()
+    matrix.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
+    matrix.setAttr("entry_places", (rows[:, None].copy(), columns[:, None].copy()))
+
+
+def set_entries(matrix: PETSc.Mat, values: NDArray[np.float64]) -> None:
+    """Set a matrix to entries at the places of :func:`set_entry_places`; equal places add up."""
+    if hasattr(matrix, "setValuesCOO"):
+        matrix.setValuesCOO(values, PETSc.InsertMode.INSERT_VALUES)
+        return
+    rows, columns = matrix.getAttr("entry_places")
+    matrix.zeroEntries()
+    matrix.setValuesRCV(rows, columns, values[:, None], addv=PETSc.InsertMode.ADD_VALUES)
+    matrix.assemble()
+
+
 def use_basic_line_search(snes: PETSc.SNES) -> None:
     """Let a solver take full steps (petsc4py has no line search objects in PETSc 3.22)."""
     if hasattr(snes, "getLineSearch"):
@@ -342,6 +372,16 @@ def compiled_integrals(form: fem.Form) -> list[CompiledIntegral]:
         start, end = ufcx.form_integral_offsets[place], ufcx.form_integral_offsets[place + 1]
         for i in range(end - start):
             kernel = ufcx.form_integrals[start + i].tabulate_tensor_float64
-            entities = np.ascontiguousarray(whole.domains(kind, i))
-            result.append(CompiledIntegral((kind, i), int(cast("intptr_t", kernel)), entities))
+            # the subdomain's tag names an integral until 0.9
+            name = i if hasattr(fem, "pack_constants") else ufcx.form_integral_ids[start + i]
+            entities = np.ascontiguousarray(whole.domains(kind, name))
+            result.append(CompiledIntegral((kind, name), int(cast("intptr_t", kernel)), entities))
     return result
+
+
+def packed(form: fem.Form) -> tuple[Any, Any]:
+    """Return a form's constants, and its coefficients by integral (in C++ alone until 0.9)."""
+    if hasattr(fem, "pack_constants"):
+        return fem.pack_constants(form), fem.pack_coefficients(form)
+    own = form._cpp_object
+    return dolfinx.cpp.fem.pack_constants(own), dolfinx.cpp.fem.pack_coefficients(own)

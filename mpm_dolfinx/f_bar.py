@@ -21,6 +21,7 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
+from . import _compat
 from .errors import MPMError
 from .grouping import Groups, pairs, patches, singles
 from .particles import Particles
@@ -335,7 +336,7 @@ class _Products:
             matrix.setSizes(((groups.owned, groups.count), columns))
             matrix.setType("aij")
             # PETSc sorts the index arrays in place.
-            matrix.setPreallocationCOO(rows.astype(PETSc.IntType), dofs.flatten())
+            _compat.set_entry_places(matrix, rows.astype(PETSc.IntType), dofs.flatten())
             self._factors.append(matrix)
         self._results: list[PETSc.Mat | None] = [None, None]
 
@@ -344,7 +345,7 @@ class _Products:
         half = 0.5 * term.h[:, None, None] * term.g
         values = (term.g, half + term.right, half + term.left)
         for matrix, part in zip(self._factors, values, strict=True):
-            matrix.setValuesCOO(np.ascontiguousarray(part).ravel())
+            _compat.set_entries(matrix, np.ascontiguousarray(part).ravel())
         G, X, Y = self._factors
         first, second = self._results
         self._results = [

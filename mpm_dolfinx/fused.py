@@ -13,8 +13,6 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from dolfinx import fem
-
 from . import _compat
 from ._core import loops
 from .assembly import BodyForms
@@ -106,7 +104,7 @@ class _Share:
         body = self._particles.mesh
         geometry = (body.geometry.x, _compat.geometry_dofmap(body))
         for form in self._forms.fused:
-            constants, packed = fem.pack_constants(form), fem.pack_coefficients(form)
+            constants, packed = _compat.packed(form)
             for integral in _compat.compiled_integrals(form):
                 loops.assemble_form(
                     integral.kernel,
@@ -237,7 +235,7 @@ class FusedTangent:
             self._A.setSizes((sizes, sizes))
             self._A.setType("aij")
             self._entries = np.empty(len(columns))
-            self._A.setPreallocationCOO(np.repeat(rows, np.diff(starts)), columns)
+            _compat.set_entry_places(self._A, np.repeat(rows, np.diff(starts)), columns)
 
     def _row_lists(
         self, offsets: NDArray[np.int64], nodes: NDArray[np.int32]
@@ -255,7 +253,7 @@ class FusedTangent:
             share.add(self._values)
         np.take(self._values, self._sources, out=self._entries, mode="clip")  # (raise: a copy)
         if self._comm.size > 1:
-            self._A.setValuesCOO(self._entries, PETSc.InsertMode.INSERT_VALUES)
+            _compat.set_entries(self._A, self._entries)
         self._A.assemble()
         return self._A
 

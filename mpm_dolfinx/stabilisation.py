@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
+from . import _compat
 from .cell_fill import CellFill, CellPairs
 from .errors import MPMError
 from .extension import CellPolynomials
@@ -312,8 +313,8 @@ def assembled(
     matrix = PETSc.Mat().create(comm=V.mesh.comm)
     matrix.setSizes((sizes, sizes))
     matrix.setType("aij")
-    matrix.setPreallocationCOO(rows.astype(PETSc.IntType), columns.astype(PETSc.IntType))
-    matrix.setValuesCOO(np.ascontiguousarray(values), PETSc.InsertMode.ADD_VALUES)
+    _compat.set_entry_places(matrix, rows.astype(PETSc.IntType), columns.astype(PETSc.IntType))
+    _compat.set_entries(matrix, np.ascontiguousarray(values))
     return matrix
 
 
