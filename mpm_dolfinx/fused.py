@@ -141,7 +141,6 @@ class FusedTangent:
         self._touched: NDArray[np.int64] | None = None
         self._numbers: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
         self._A: PETSc.Mat | None = None
-        self._whole: PETSc.Vec | None = None
 
     def restrict(self, numbers: PETSc.Vec, sizes: tuple[int, int]) -> None:
         """Take over the present transfer and free dofs (collective).

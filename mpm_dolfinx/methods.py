@@ -78,11 +78,17 @@ class Rows(NamedTuple):
     basis: PointBasis
 
 
-def cpdi2(state: DomainState, background: BackgroundBasis) -> Rows:
-    """Corners ride on the background (Sadeghirad, Brannon & Guilkey 2013)."""
-    positions = state.nodes + state.displacement
-    corners = positions[state.domains]
-    return Rows(corners, background.at(positions))
+def cpdi2(
+    positions: NDArray[np.float64], domains: NDArray[np.int32], background: BackgroundBasis
+) -> Rows:
+    """Corners ride on the background (Sadeghirad, Brannon & Guilkey 2013).
+
+    Args:
+        positions: Where the nodes of W are, shape ``(N, gdim)``.
+        domains: Nodes of each domain, shape ``(n, k)``.
+        background: The background's basis.
+    """
+    return Rows(positions[domains], background.at(positions))
 
 
 def cpdi(state: DomainState, background: BackgroundBasis) -> Rows:

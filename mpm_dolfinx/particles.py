@@ -40,6 +40,7 @@ from .quadrature import (
     exact_degree,
     quadrature_element,
     quadrature_rule,
+    volume_ratio,
 )
 from .transfer import Weights, active_nodes, domain_weights, sum_by_particle, transfer_matrix
 from .validation import validate_options, validate_spaces
@@ -166,6 +167,7 @@ class Particles:
             self._grid = BoxGrid(V.mesh)
         self._converged = np.zeros_like(self._nodes)
         self._constitutive: ConstitutiveHistory | None = None
+        self._gradient: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         with agree(body.comm):
             flat = self.global_index[self.quadrature.flat]
             if len(flat):
@@ -280,12 +282,14 @@ class Particles:
 
     def _found_rows(self) -> tuple[Rows, NDArray[np.int64]]:
         """Return the rows of T, and the local domains that are not wholly in the background."""
-        state = self._state()
-        if self.method == "gimp":
+        if self.method == "cpdi2":
+            rows = cpdi2(self.node_positions, self.domain_nodes, self._background)
+        elif self.method == "gimp":
             assert self._grid is not None
-            rows = gimp(state, self._background, self._grid, self._domain_update == "stretch")
+            stretch = self._domain_update == "stretch"
+            rows = gimp(self._state(), self._background, self._grid, stretch)
         else:
-            rows = {"cpdi2": cpdi2, "cpdi": cpdi, "mpm": mpm}[self.method](state, self._background)
+            rows = {"cpdi": cpdi, "mpm": mpm}[self.method](self._state(), self._background)
         lost = (~rows.basis.found)[self.domain_nodes].any(axis=1)
         return rows, np.flatnonzero(lost & ~self.deleted)
 
@@ -517,7 +521,7 @@ class Particles:
         Returns:
             Shape ``(n, nq, gdim, gdim)``, or ``(n, nq, 3, 3)`` where axisymmetric.
         """
-        gradient = self.quadrature.displacement_gradient(self._nodal())
+        gradient = self._present_gradient()
         if not axisymmetric:
             return gradient
         whole = np.zeros((*gradient.shape[:2], 3, 3))
@@ -525,6 +529,17 @@ class Particles:
         radial = np.einsum("qk,nk->nq", self.quadrature.shapes, self._nodal()[:, :, 0])
         whole[:, :, 2, 2] = radial / self.radii
         return whole
+
+    def _present_gradient(self) -> NDArray[np.float64]:
+        """Return ``grad d`` at the history's points, of the same displacement only once."""
+        d = self.displacement.x.array
+        if self.deletion is not None:
+            return self.quadrature.displacement_gradient(self._nodal())
+        if self._gradient is not None and np.array_equal(self._gradient[0], d):
+            return self._gradient[1]
+        gradient = self.quadrature.gradient_of(np.asarray(d), self.domain_nodes)
+        self._gradient = np.array(d, dtype=np.float64), gradient
+        return gradient
 
     @property
     def radii(self) -> NDArray[np.float64]:
@@ -580,14 +595,14 @@ class Particles:
     @property
     def initial_volume(self) -> NDArray[np.float64]:
         """Volume of the undeformed domains, shape ``(n,)``; an area in the plane."""
-        return self._whole.weights.sum(axis=1)
+        return self._averages[0]
 
     @property
     def volume(self) -> NDArray[np.float64]:
         """Volume of the domains now, shape ``(n,)``; an area in the plane."""
-        gradient = self._whole.displacement_gradient(self._nodal())
-        jacobian = np.linalg.det(np.eye(self._gdim) + gradient)
-        return np.asarray((self._whole.weights * jacobian).sum(axis=1))
+        exact = self._exact_quadrature()
+        ratio = volume_ratio(exact.displacement_gradient(self._nodal()))
+        return np.asarray((exact.weights * ratio).sum(axis=1))
 
     @property
     def initial_centroid(self) -> NDArray[np.float64]:
@@ -600,13 +615,18 @@ class Particles:
         return self._mean(self._nodes[self.domain_nodes] + self._nodal())
 
     def _mean(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        whole = self._whole
-        total = np.einsum("nq,qk,nki->ni", whole.weights, whole.shapes, nodal)
-        return np.asarray(total / whole.weights.sum(axis=1)[:, None])
+        return np.asarray(np.einsum("nk,nki->ni", self._averages[1], nodal))
+
+    def _exact_quadrature(self) -> DomainQuadrature:
+        """Return the rule exact for body force and mass, many times the size of a body's rest."""
+        return DomainQuadrature(self.mesh, self._shape_functions, self._exact_degree)
 
     @cached_property
-    def _whole(self) -> DomainQuadrature:
-        return DomainQuadrature(self.mesh, self._shape_functions, self._exact_degree)
+    def _averages(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Undeformed volumes ``(n,)``, and averages of the shape functions ``(n, k)``."""
+        exact = self._exact_quadrature()
+        volume = exact.weights.sum(axis=1)
+        return volume, exact.weights @ exact.shapes / volume[:, None]
 
     @property
     def has_material(self) -> bool:
@@ -780,8 +800,7 @@ class Particles:
     def inverted(self) -> NDArray[np.int64]:
         """Return global indices of domains with ``det F <= 0`` or not finite at a point."""
         gradient = self.displacement_gradient()
-        jacobian = np.linalg.det(np.eye(self._gdim) + gradient)
-        return np.asarray(self.global_index[~(jacobian > 0.0).all(axis=1)])
+        return np.asarray(self.global_index[~(volume_ratio(gradient) > 0.0).all(axis=1)])
 
     def commit(self) -> NDArray[np.float64]:
         """Make the present displacement the converged one; return what that was before."""

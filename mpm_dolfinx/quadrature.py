@@ -19,6 +19,7 @@ from ufl.algorithms.estimate_degrees import estimate_total_polynomial_degree
 from ufl.corealg.traversal import traverse_unique_terminals
 
 from . import _compat
+from ._core import loops
 from .errors import MPMError
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "follows",
     "quadrature_element",
     "split_by_rule",
+    "volume_ratio",
 ]
 
 
@@ -118,6 +120,37 @@ class DomainQuadrature:
             Gradient with respect to the undeformed body, shape ``(n, nq, gdim, gdim)``.
         """
         return np.asarray(np.matmul(nodal.swapaxes(1, 2)[:, None], self.gradients))
+
+    def gradient_of(
+        self, displacement: NDArray[np.float64], domain_nodes: NDArray[np.int32]
+    ) -> NDArray[np.float64]:
+        """Return ``grad d`` at the points, as :meth:`displacement_gradient` does.
+
+        Args:
+            displacement: Displacement at the local dofs of W.
+            domain_nodes: Local nodes of each domain, shape ``(n, k)``.
+        """
+        n, nq, _, gdim = self.gradients.shape
+        if loops is None:
+            return self.displacement_gradient(displacement.reshape(-1, gdim)[domain_nodes])
+        gradient = np.empty((n, nq, gdim, gdim))
+        loops.displacement_gradient(displacement, domain_nodes, self.gradients, gradient)
+        return gradient
+
+
+def volume_ratio(gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``det(I + H)`` of displacement gradients H, shape ``(..., dim, dim)``."""
+    F = np.moveaxis(gradient, (-2, -1), (0, 1)) + np.eye(gradient.shape[-1]).reshape(
+        (gradient.shape[-1],) * 2 + (1,) * (gradient.ndim - 2)
+    )
+    with np.errstate(invalid="ignore", over="ignore"):
+        if len(F) == 2:
+            return np.asarray(F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0])
+        return np.asarray(
+            F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1])
+            - F[0, 1] * (F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0])
+            + F[0, 2] * (F[1, 0] * F[2, 1] - F[1, 1] * F[2, 0])
+        )
 
 
 def depends_on(form: ufl.Form, function: fem.Function) -> bool:
