@@ -250,7 +250,7 @@ class FusedTangent:
         self._values.fill(0.0)
         for share in self._shares:
             share.add(self._values)
-        np.take(self._values, self._sources, out=self._entries, mode="clip")  # (raise: a copy)
+        loops.gather(self._values, self._sources, self._entries)
         if self._comm.size > 1:
             _compat.set_entries(self._A, self._entries)
         self._A.assemble()

@@ -8,6 +8,7 @@
 
 #include <algorithm>
 #include <numeric>
+#include <stdexcept>
 #include <type_traits>
 
 namespace
@@ -300,6 +301,8 @@ core::Pattern core::pattern(const std::int64_t* offsets, const std::int32_t* nod
 core::Reduced core::reduce(const std::int32_t* offsets, const std::int32_t* nodes,
                            std::size_t num_nodes, int dim, const std::int32_t* numbers)
 {
+  if (static_cast<std::uint64_t>(offsets[num_nodes]) * dim * dim > UINT32_MAX)
+    throw std::overflow_error("too many entries for one rank; use more ranks");
   Reduced result;
   result.offsets.push_back(0);
   for (std::size_t row = 0; row < num_nodes; ++row)
@@ -314,7 +317,7 @@ core::Reduced core::reduce(const std::int32_t* offsets, const std::int32_t* node
           if (column < 0)
             continue;
           result.columns.push_back(column);
-          result.sources.push_back((static_cast<std::int64_t>(e) * dim + i) * dim + j);
+          result.sources.push_back((static_cast<std::uint32_t>(e) * dim + i) * dim + j);
         }
       result.rows.push_back(numbers[row * dim + i]);
       result.offsets.push_back(static_cast<std::int32_t>(result.columns.size()));

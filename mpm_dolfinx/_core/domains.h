@@ -62,7 +62,7 @@ Pattern pattern(const std::int64_t* offsets, const std::int32_t* nodes, std::siz
 struct Reduced
 {
   std::vector<std::int32_t> rows, offsets, columns;
-  std::vector<std::int64_t> sources;
+  std::vector<std::uint32_t> sources;
 };
 Reduced reduce(const std::int32_t* offsets, const std::int32_t* nodes, std::size_t num_nodes,
                int dim, const std::int32_t* numbers);

@@ -158,6 +158,15 @@ NB_MODULE(_loops, m)
       "Return the numbered rows and columns of a pattern of blocks, and where their values are.");
 
   m.def(
+      "gather",
+      [](Reals values, Array<const std::uint32_t> sources, RealsOut entries) {
+        require(entries.size() == sources.size(), "sources and entries");
+        for (std::size_t e = 0; e < sources.size(); ++e)
+          entries.data()[e] = values.data()[sources.data()[e]];
+      },
+      "values"_a, "sources"_a, "entries"_a.noconvert(), "Set entries to values[sources].");
+
+  m.def(
       "multiply",
       [](Indices offsets, Indices nodes, int dim, Reals values, Reals x, RealsOut y) {
         const std::size_t num_nodes = offsets.size() - 1;
