@@ -236,7 +236,7 @@ class ConstitutiveHistory:
     def commit(self) -> None:
         """Make the last update the history (collective with F-bar)."""
         self._states, self._gradient = self._trial, self._trial_gradient
-        self._stress = self.first_piola.copy()
+        self._stress = self.first_piola if len(self._groups) == 1 else self.first_piola.copy()
         if self.averaging is not None:
             weights = self._particles.point_volumes(self.axisymmetric)
             share = weights / weights.sum(axis=1, keepdims=True)

@@ -47,7 +47,7 @@ class _Share:
 
     def rows(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Return offsets, global background nodes and values of the rows of T."""
-        basis = self._particles.basis
+        basis = self._particles.node_basis
         kept = basis.values != 0.0
         offsets = np.concatenate([[0], np.cumsum(np.count_nonzero(kept, axis=1))])
         return offsets.astype(np.int64), basis.nodes[kept], basis.values[kept]
@@ -218,7 +218,7 @@ class FusedTangent:
         split = np.split(positions, np.cumsum(pairs)[:-1])
         for share, part in zip(self._shares, split, strict=True):
             share.positions = part
-        self._values = np.empty(len(self._blocks) * self._bs**2)
+        self._values: NDArray[np.float64] | None = None
         rows, starts, columns, self._sources = loops.reduce(
             self._pattern, self._blocks, self._bs, self._numbers
         )
@@ -244,20 +244,26 @@ class FusedTangent:
         pattern = loops.pattern(offsets.astype(np.int64), nodes, len(self._touched))
         return pattern
 
-    def assemble(self) -> PETSc.Mat:
-        """Return ``T^T K T``; the same object as long as the pattern lasts (collective)."""
+    def assemble(self, keep: bool) -> PETSc.Mat:
+        """Return ``T^T K T``; the same object as long as the pattern lasts (collective).
+
+        Args:
+            keep: Whether :meth:`multiply_add` will be called.
+        """
         assert self._A is not None
-        self._values.fill(0.0)
+        values = np.zeros(len(self._blocks) * self._bs**2)
         for share in self._shares:
-            share.add(self._values)
-        loops.gather(self._values, self._sources, self._entries)
+            share.add(values)
+        loops.gather(values, self._sources, self._entries)
         if self._comm.size > 1:
-            _compat.set_entries(self._A, self._entries)
+            self._A.setValuesCOO(self._entries, PETSc.InsertMode.INSERT_VALUES)
         self._A.assemble()
+        self._values = values if keep else None
         return self._A
 
     def multiply_add(self, u: PETSc.Vec, force: PETSc.Vec) -> None:
         """Add the last ``T^T K T u`` on all active dofs of V, fixed ones too (collective)."""
+        assert self._values is not None
         local = np.array(self._at_touched(u))
         result = np.empty_like(local)
         loops.multiply(self._pattern, self._blocks, self._bs, self._values, local, result)

@@ -70,25 +70,23 @@ class Rows(NamedTuple):
     """What the background does to the domains' nodes.
 
     Attributes:
-        corners: Where the rows move the domains' nodes from, shape ``(n, k, gdim)``.
+        corners: Where the rows move the domains' nodes from, shape ``(n, k, gdim)``; ``None``
+            where these are the nodes' own positions.
         basis: The background basis at the local nodes of W.
     """
 
-    corners: NDArray[np.float64]
+    corners: NDArray[np.float64] | None
     basis: PointBasis
 
 
-def cpdi2(
-    positions: NDArray[np.float64], domains: NDArray[np.int32], background: BackgroundBasis
-) -> Rows:
+def cpdi2(positions: NDArray[np.float64], background: BackgroundBasis) -> Rows:
     """Corners ride on the background (Sadeghirad, Brannon & Guilkey 2013).
 
     Args:
         positions: Where the nodes of W are, shape ``(N, gdim)``.
-        domains: Nodes of each domain, shape ``(n, k)``.
         background: The background's basis.
     """
-    return Rows(positions[domains], background.at(positions))
+    return Rows(None, background.at(positions))
 
 
 def cpdi(state: DomainState, background: BackgroundBasis) -> Rows:

@@ -283,7 +283,7 @@ class Particles:
     def _found_rows(self) -> tuple[Rows, NDArray[np.int64]]:
         """Return the rows of T, and the local domains that are not wholly in the background."""
         if self.method == "cpdi2":
-            rows = cpdi2(self.node_positions, self.domain_nodes, self._background)
+            rows = cpdi2(self.node_positions, self._background)
         elif self.method == "gimp":
             assert self._grid is not None
             stretch = self._domain_update == "stretch"
@@ -327,13 +327,9 @@ class Particles:
         if self.deletion is not None:
             values = rows.basis.values
             values[self.deletion.dead[: len(values)]] = 0.0
-            rows.corners[self.deleted] = self.domains[self.deleted]
+            if rows.corners is not None:
+                rows.corners[self.deleted] = self.domains[self.deleted]
         return rows
-
-    @property
-    def basis(self) -> PointBasis:
-        """The background basis in the rows of T, at this rank's nodes of W."""
-        return self._rows.basis
 
     @property
     def present_weights(self) -> NDArray[np.float64]:
@@ -459,8 +455,9 @@ class Particles:
     def _domain_averages(
         self,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        corners = self._rows.corners
         return domain_weights(
-            self._rows.corners,
+            self.domains if corners is None else corners,
             self._shape_functions,
             self.mesh.basix_cell(),
             self._exact_degree,
@@ -595,7 +592,7 @@ class Particles:
     @property
     def initial_volume(self) -> NDArray[np.float64]:
         """Volume of the undeformed domains, shape ``(n,)``; an area in the plane."""
-        return self._averages[0]
+        return self._initial_volume.copy()
 
     @property
     def volume(self) -> NDArray[np.float64]:
@@ -615,18 +612,21 @@ class Particles:
         return self._mean(self._nodes[self.domain_nodes] + self._nodal())
 
     def _mean(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(np.einsum("nk,nki->ni", self._averages[1], nodal))
+        return np.asarray(np.einsum("nk,nki->ni", self._averages, nodal))
 
     def _exact_quadrature(self) -> DomainQuadrature:
         """Return the rule exact for body force and mass, many times the size of a body's rest."""
         return DomainQuadrature(self.mesh, self._shape_functions, self._exact_degree)
 
     @cached_property
-    def _averages(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Undeformed volumes ``(n,)``, and averages of the shape functions ``(n, k)``."""
+    def _initial_volume(self) -> NDArray[np.float64]:
+        return np.asarray(self._exact_quadrature().weights.sum(axis=1))
+
+    @cached_property
+    def _averages(self) -> NDArray[np.float64]:
+        """Averages of the shape functions over the undeformed domains, shape ``(n, k)``."""
         exact = self._exact_quadrature()
-        volume = exact.weights.sum(axis=1)
-        return volume, exact.weights @ exact.shapes / volume[:, None]
+        return np.asarray(exact.weights @ exact.shapes / exact.weights.sum(axis=1)[:, None])
 
     @property
     def has_material(self) -> bool:

@@ -199,6 +199,7 @@ class ReducedSystem:
         self._change = change[: self._owned]
         self._size = size
         self._imposed = False
+        self._prescribes = bool(self._comm.allreduce(bool(np.any(change)), MPI.LOR))
         with self._statistics.phase("locate"):
             for body in self._bodies:
                 body.particles.locate()
@@ -281,7 +282,7 @@ class ReducedSystem:
         return numbers, self.sizes
 
     def _fused_tangent(self, fused: FusedTangent) -> PETSc.Mat:
-        whole = fused.assemble()
+        whole = fused.assemble(keep=self._prescribes)
         if self._extension is None:
             return whole
         return whole.ptap(self._extension).createSubMatrix(self._columns, self._columns)
