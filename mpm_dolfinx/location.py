@@ -69,6 +69,8 @@ class _Cells:
             "Lagrange", name.name, _compat.geometry_degree(background)
         ).basix_element
         self.middle = basix.geometry(name).mean(axis=0)
+        # Of coordinates: no small part of a cell that is tiny or far from the origin.
+        self.roundoff = 8.0 * np.finfo(float).eps * np.abs(self.vertices).max(initial=0.0)
         self.affine = self._is_affine()
         if self.affine:
             every = np.arange(count)
@@ -99,7 +101,8 @@ class _Cells:
             np.arange(len(self.vertices)).repeat(2), np.tile(corners, (len(self.vertices), 1))
         ).reshape(-1, 2, self.gdim, self.gdim)
         change = np.abs(jacobians[:, 0] - jacobians[:, 1]).max(axis=(1, 2))
-        return bool(np.all(change <= 1e-12 * np.abs(jacobians).max(axis=(1, 2, 3))))
+        slack = 1e-12 * np.abs(jacobians).max(axis=(1, 2, 3))
+        return bool(np.all(change <= np.maximum(slack, self.roundoff)))
 
     def jacobians(
         self, cells: NDArray[np.int64], reference: NDArray[np.float64]
@@ -126,6 +129,8 @@ class _Cells:
             return np.asarray(self.middle + np.einsum("nij,nj->ni", self._slopes[cells], gaps))
         reference = np.tile(self.middle, (len(points), 1))
         active = np.arange(len(points))
+        smallest = np.ptp(self.vertices, axis=1).max(axis=1).min(initial=np.inf)
+        floor = self.roundoff / smallest
         for _ in range(30):
             table = self.map.tabulate(1, reference[active])[:, :, :, 0]
             corners = self.vertices[cells[active]]
@@ -137,10 +142,10 @@ class _Cells:
             size = np.abs(step).max(axis=1)
             lost = ~(size < 1e3)
             reference[active[lost]] = np.nan
-            active = active[~lost & (size > 1e-14)]
+            active = active[~lost & (size > max(1e-14, floor))]
             if len(active) == 0:
                 return reference
-        reference[active[size[~lost & (size > 1e-14)] > 1e-12]] = np.nan
+        reference[active[size[~lost & (size > max(1e-14, floor))] > 1e-12]] = np.nan
         return reference
 
     def violation(self, reference: NDArray[np.float64]) -> NDArray[np.float64]:

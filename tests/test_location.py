@@ -119,6 +119,19 @@ def shear_columns(dim):
     return np.array(unit)[:dim, :dim].T
 
 
+@pytest.mark.parametrize("kind", MESHES)
+def test_cells_far_from_the_origin(kind):
+    # Round-off of coordinates, 2e-12, is 1e-11 of a cell.
+    domain = MESHES[kind]()
+    dim = domain.topology.dim
+    domain.geometry.x[:, :dim] += 1e4
+    V = scenes.vectors(domain)
+    points, expected = points_of_cells(V)
+    basis = BackgroundBasis(V).at(points)
+    assert basis.found.all()
+    np.testing.assert_allclose(to_dense(basis, V), expected, atol=1e-10)
+
+
 @pytest.mark.parametrize("cell", PLANE, ids=scenes.name)
 def test_hole_is_outside(cell):
     # A point in a re-entrant corner is in the bounding box of the mesh, not in the mesh.
