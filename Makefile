@@ -15,8 +15,11 @@ export OMP_NUM_THREADS := 1
 BIN := $(VENV)/bin
 SETUP := sh scripts/setup_env.sh
 
+# Benchmarks that print a JSON object; work_precision.py writes its results and pictures itself.
+BENCHMARKS := $(wildcard $(patsubst %,benchmarks/%.py,assembly step skip solvers))
+
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-debian stress lint docs clean
+.PHONY: help demo test test-debian stress bench bench-smoke lint docs clean
 
 help: ## This list
 	@echo "make TARGET [VENV=path of an environment] [PYTHON=path of an interpreter]"
@@ -38,6 +41,23 @@ test-debian: ## As root: the tests with Debian's DOLFINx 0.9, in a root made by 
 stress: ## Run the stress suite and report (ARGS="--only offset flow" for some classes)
 	@$(SETUP) wheel plot test
 	@cd tests && "$(abspath $(BIN)/python)" -m stress.run $(ARGS)
+
+bench: ## Run all benchmarks: benchmarks/results/*.json and the pictures of run time against error
+	@$(SETUP) wheel plot
+	@mkdir -p benchmarks/results
+	@set -e; for script in $(BENCHMARKS); do \
+	    name=$$(basename "$$script" .py); \
+	    echo "$$script"; \
+	    "$(BIN)/python" "$$script" --json >"benchmarks/results/$$name.new"; \
+	    mv "benchmarks/results/$$name.new" "benchmarks/results/$$name.json"; \
+	done
+	"$(BIN)/python" benchmarks/work_precision.py
+
+bench-smoke: ## Run all benchmarks at tiny sizes, in less than a minute
+	@$(SETUP) wheel plot
+	@set -e; for script in $(BENCHMARKS) benchmarks/work_precision.py; do \
+	    echo "$$script --smoke"; "$(BIN)/python" "$$script" --smoke; \
+	done
 
 lint: ## ruff check, ruff format --check, mypy
 	@$(SETUP) wheel plot test

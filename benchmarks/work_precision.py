@@ -1,0 +1,486 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Run time against error: elastic and elasto-plastic columns, a cantilever, a collapse.
+
+Each point is a process of its own on one thread. Its CPU seconds (user and system) are those of
+start-up (imports, meshes, forms from FFCx's cache), of the run (load steps), and of the whole
+process; of several processes the one that took least counts. A process that compiled a form is
+run again. Other codes' points are CPU seconds of their whole processes on the same cases.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import resource
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+HERE = Path(__file__).resolve().parent
+RESULTS = HERE / "results" / "work_precision.json"
+IMAGES = HERE.parent / "docs" / "images"
+
+
+class Kind(NamedTuple):
+    """Domains and their method, and how they are drawn."""
+
+    domain: str
+    method: str
+    degree: int
+    name: str
+    colour: str
+    marker: str
+    f_bar: str = "none"
+
+
+KINDS = {
+    "quad1": Kind("quad", "cpdi2", 1, "CPDI2 quads, degree 1", "#0072B2", "o"),
+    "tri1": Kind("tri", "cpdi2", 1, "CPDI2 triangles, degree 1", "#56B4E9", "^"),
+    "fbar": Kind("quad", "cpdi2", 1, "CPDI2 quads, F-bar", "#332288", "X", "domain"),
+    "gimp": Kind("quad", "gimp", 1, "GIMP", "#009E73", "D"),
+    "mpm": Kind("quad", "mpm", 1, "point MPM", "#CC79A7", "v"),
+    "quad2": Kind("quad", "cpdi2", 2, "quads, degree 2", "#D55E00", "s"),
+    "tri2": Kind("tri", "cpdi2", 2, "triangles, degree 2", "#E69F00", ">"),
+    "quad3": Kind("quad", "cpdi2", 3, "quads, degree 3", "#882255", "P"),
+}
+
+# Background cells over the height (A, B) or size of a cell in m (C, E), coarse to fine.
+SIZES: dict[str, dict[str, list[float]]] = {
+    "A": {
+        "quad1": [16, 64, 256, 1024, 4096],
+        "tri1": [16, 64, 256, 1024],
+        "gimp": [16, 64, 256, 1024],
+        "mpm": [16, 64, 256],
+        "quad2": [4, 8, 16, 32, 64, 128],
+        "tri2": [8, 16, 32, 64],
+        "quad3": [4, 8, 16, 32],
+    },
+    "B": {
+        "quad1": [16, 64, 256, 1024],
+        "tri1": [16, 64, 256],
+        "gimp": [16, 64, 256],
+        "mpm": [16, 64],
+        "quad2": [8, 16, 32, 64, 128],
+        "tri2": [8, 16, 32],
+        "quad3": [4, 8, 16, 32],
+    },
+    "C": {
+        "quad1": [1.0, 0.5, 0.25],
+        "tri1": [1.0, 0.5, 0.25, 0.125],
+        "fbar": [1.0, 0.5, 0.25],
+        "gimp": [1.0, 0.5],
+        "quad2": [2.0, 1.0, 0.5],
+        "tri2": [2.0, 1.0],
+    },
+    "E": {
+        "quad1": [0.5, 0.25, 0.125, 0.0625],
+        "tri1": [0.5, 0.25, 0.125],
+        "gimp": [0.5, 0.25],
+        "mpm": [0.5, 0.25],
+        "quad2": [1.0, 0.5, 0.25],
+        "tri2": [1.0, 0.5, 0.25],
+        "quad3": [1.0, 0.5],
+    },
+}
+SMOKE: dict[str, dict[str, list[float]]] = {
+    "A": {"quad1": [4, 8], "quad2": [4]},
+    "B": {"quad1": [4]},
+    "C": {"quad1": [2.0]},
+    "E": {"quad1": [1.0]},
+}
+REFERENCE = {"kind": "fbar", "size": 0.125, "smoke": 1.0}  # of C
+
+# Other codes: CPU seconds of the whole process, error.
+PEERS: dict[str, dict[str, list[tuple[float, float]]]] = {
+    "A": {
+        "AMPLE, GIMP": [(13.8, 3.66e-3), (50, 4.36e-4), (263, 1.03e-4)],
+        "AMPLE, point MPM": [(18, 8.7e-2), (81, 8.3e-2)],
+        "GeoWarp, GIMP (and 105 s once)": [(4.4, 3.66e-3), (7.8, 4.36e-4), (24.6, 1.03e-4)],
+        "Kratos, point MPM": [(0.45, 7.3e-2), (0.87, 8.1e-2), (3.0, 8.1e-2)],
+    },
+    "B": {
+        "AMPLE, GIMP": [(19, 3.84e-3), (35, 1.49e-3), (75, 5.19e-4)],
+        "AMPLE, point MPM": [(18, 1.1e-1), (69, 1.0e-1)],
+    },
+    "C": {},
+    "E": {"AMPLE, GIMP, ghost penalty": [(81, 1.01e-2), (314, 4.7e-3), (1255, 1.6e-3)]},
+}
+
+
+# ## One point
+
+
+def point(case: str, kind: str, size: float, steps: int | None) -> None:
+    """Run a scene in this process and print what it took and what came out."""
+    from mpi4py import MPI  # noqa: F401
+
+    import scenes
+
+    import mpm_dolfinx as mpm
+
+    domain, method, degree = KINDS[kind][:3]
+    options: dict[str, Any] = {} if steps is None else {"steps": steps}
+    if KINDS[kind].f_bar != "none":
+        options["f_bar"] = KINDS[kind].f_bar
+    scene = scenes.CASES[case](size, domain, method, degree, **options)
+    start = time.process_time()
+    failure = None
+    try:
+        scene.problem.solve(steps=scene.steps)
+    except mpm.MPMError as error:
+        failure = type(error).__name__
+    end = time.process_time()
+    history = scene.problem.history
+    compiler = resource.getrusage(resource.RUSAGE_CHILDREN)
+    print(
+        json.dumps(
+            {
+                "startup": start,
+                "run": end - start,
+                "compiler": compiler.ru_utime + compiler.ru_stime,
+                "particles": scene.problem.bodies[0].num_global,
+                "load": history.load[-1] if history.load else 0.0,
+                "iterations": history.total_iterations,
+                "cutbacks": history.cutbacks,
+                "failure": failure,
+                **{name: float(value) for name, value in scene.measure().items()},
+            }
+        )
+    )
+
+
+def process(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Run a point in a process of its own."""
+    child = subprocess.Popen(
+        [sys.executable, str(Path(__file__).resolve()), "--point", json.dumps(arguments)],
+        stdout=subprocess.PIPE,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        text=True,
+    )
+    assert child.stdout is not None
+    out = child.stdout.read()
+    _, status, usage = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode != 0:
+        raise SystemExit(f"{arguments} ended with status {child.returncode}")
+    return {**json.loads(out), "process": usage.ru_utime + usage.ru_stime}
+
+
+def measured(case: str, kind: str, size: float, steps: int | None, repeats: int) -> dict[str, Any]:
+    """The least of several processes; one that takes long is not repeated."""
+    arguments = {"case": case, "kind": kind, "size": size, "steps": steps}
+    row = process(arguments)
+    if row["compiler"] > 0.1:
+        row = process(arguments)
+    rows = [row]
+    if row["process"] < 5.0:
+        rows += [process(arguments) for _ in range(repeats - 1)]
+    best = min(rows, key=lambda row: row["process"])
+    return {"case": case, "kind": kind, "size": size, **best}
+
+
+# ## All points
+
+
+def run(cases: list[str], smoke: bool, repeats: int, quiet: bool) -> list[dict[str, Any]]:
+    steps = 4 if smoke else None
+    rows: list[dict[str, Any]] = []
+
+    def add(case: str, kind: str, size: float, reference: float | None = None) -> dict[str, Any]:
+        row = measured(case, kind, size, steps, repeats)
+        if reference is not None:
+            row["error"] = abs(row["y_mean"] - reference) / reference
+        rows.append(row)
+        if not quiet:
+            said = row["failure"] or ", ".join(
+                f"{name} {row[name]:.3e}" for name in ("error", "y_mean") if name in row
+            )
+            print(
+                f"{case} {kind:6s} {size:8g} {row['particles']:8d} particles"
+                f" {row['startup']:7.2f} {row['run']:8.2f} {row['process']:8.2f} s"
+                f" {row['iterations']:5d} solves {row['cutbacks']:3d} cutbacks  {said}",
+                flush=True,
+            )
+        return row
+
+    if not quiet:
+        print("CPU seconds of start-up, run, whole process")
+    for case in cases:
+        reference = None
+        if case == "C":
+            size = float(REFERENCE["smoke" if smoke else "size"])
+            row = add(case, str(REFERENCE["kind"]), size)
+            row["reference"] = True
+            reference = row["y_mean"]
+        for kind, sizes in (SMOKE if smoke else SIZES)[case].items():
+            for size in sizes:
+                add(case, kind, size, reference)
+    return rows
+
+
+def curve(rows: list[dict[str, Any]], case: str, kind: str) -> list[dict[str, Any]]:
+    """The complete runs of a kind that have an error, coarse to fine."""
+    return [
+        row
+        for row in rows
+        if (row["case"], row["kind"]) == (case, kind) and not row["failure"] and "error" in row
+    ]
+
+
+def seconds_at(points: list[dict[str, Any]], error: float, key: str) -> dict[str, Any] | None:
+    """CPU seconds at an error, by log-log interpolation or from the last two points on."""
+    line = [(math.log(row["error"]), math.log(row[key])) for row in points]
+    if len(line) < 2:
+        return None
+    target = math.log(error)
+    pair = next(
+        (pair for pair in pairwise(line) if pair[0][0] >= target >= pair[1][0]),
+        None,
+    )
+    if pair is None and target >= line[0][0]:
+        return {"seconds": math.exp(line[0][1]), "at": "coarsest point"}
+    (e0, t0), (e1, t1) = pair or (line[-2], line[-1])
+    if e1 >= e0:
+        return None
+    slope = (t1 - t0) / (e1 - e0)
+    at = "interpolated" if pair else "extrapolated"
+    return {"seconds": math.exp(t1 + slope * (target - e1)), "at": at}
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """CPU seconds of run and process at an error, for each kind of a case."""
+    table: dict[str, Any] = {}
+    for case, error in (("A", 1e-4), ("A", 1e-5), ("B", 1e-4), ("C", 1e-2), ("E", 1e-3)):
+        entry: dict[str, Any] = {}
+        for kind in KINDS:
+            points = curve(rows, case, kind)
+            found = {key: seconds_at(points, error, key) for key in ("run", "process")}
+            if all(found.values()):
+                entry[kind] = found
+        if entry:
+            table[f"{case} at {error:g}"] = entry
+    return table
+
+
+# ## Pictures
+
+TITLES = {
+    "A": "Elastic column, compacted to half",
+    "B": "Elasto-plastic column between rollers",
+    "C": "Elasto-plastic column, collapsing",
+    "E": "Cantilever, large deflection",
+}
+ERRORS = {
+    "A": "mean error of stress",
+    "B": "mean error of stress",
+    "C": "relative error of mean height",
+    "E": "error of the tip, over the length",
+}
+UNSURE = {"E": 1e-4}  # errors below this are the reference's too
+GREY = "0.5"
+
+
+def draw(rows: list[dict[str, Any]], cases: list[str], key: str, path: Path) -> None:
+    """Draw error over CPU seconds, log-log, a panel for each case that was run."""
+    cases = [case for case in cases if any(curve(rows, case, kind) for kind in KINDS)]
+    import matplotlib as mpl
+
+    mpl.use("agg")
+    import matplotlib.pyplot as plt
+
+    plt.rcParams.update(
+        {
+            "font.size": 13,
+            "axes.titlesize": 14,
+            "axes.titleweight": "bold",
+            "axes.titlelocation": "left",
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+        }
+    )
+    columns = 2 if len(cases) > 1 else 1
+    lines = math.ceil(len(cases) / columns)
+    fig, axes = plt.subplots(
+        lines, columns, figsize=(7.5 * columns, 6.0 * lines), layout="constrained", squeeze=False
+    )
+    for ax in axes.flat[len(cases) :]:
+        ax.remove()
+    for ax, case in zip(axes.flat, cases, strict=False):
+        panel(ax, rows, case, key)
+    what = "whole process" if key == "process" else "run, without start-up"
+    for ax in axes[-1]:
+        ax.set_xlabel(f"CPU seconds, {what}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fig.savefig(path, dpi=100)
+    plt.close(fig)
+
+
+def panel(ax: Any, rows: list[dict[str, Any]], case: str, key: str) -> None:
+    """One case: this package in colours, other codes in grey, each curve with its name."""
+    names = []
+    if key == "process":
+        for name, points in PEERS[case].items():
+            ax.loglog(*zip(*points, strict=True), "o-", color=GREY, ms=6, lw=1.5, zorder=1)
+            names.append((name, points, GREY))
+    for name, kind in KINDS.items():
+        points = [(row[key], row["error"]) for row in curve(rows, case, name)]
+        if points:
+            x, y = zip(*points, strict=True)
+            ax.loglog(x, y, "-", marker=kind.marker, color=kind.colour, ms=8, lw=2.2, zorder=2)
+            names.append((kind.name, points, kind.colour))
+    ax.set_title(f"{TITLES[case]}\n")
+    ax.text(0.0, 1.02, ERRORS[case], transform=ax.transAxes, color="0.3")
+    ax.grid(which="major", color="0.92")
+    label(ax, names)
+    left, right = ax.get_xlim()
+    if key == "process":
+        left = 0.25
+        ax.set_xlim(left, right)
+    ticks = [b * 10.0**a for a in range(-2, 5) for b in ((1, 2, 5) if right < 50 * left else (1,))]
+    ax.set_xticks([t for t in ticks if left <= t <= right])
+    ax.set_xticklabels([f"{t:g}" for t in ticks if left <= t <= right])
+    ax.minorticks_off()
+    if case in UNSURE:
+        ax.axhspan(ax.get_ylim()[0], UNSURE[case], color="0.95", zorder=0)
+        ax.annotate(
+            "less than the reference is sure of",
+            (right, UNSURE[case]),
+            (-4, -4),
+            textcoords="offset points",
+            ha="right",
+            va="top",
+            color=GREY,
+            fontsize=11,
+        )
+    if key == "process":
+        startup = min(row["process"] - row["run"] for row in rows if row["case"] == case)
+        ax.axvspan(left, startup, color="0.95", zorder=0)
+        at = (math.sqrt(left * startup), math.sqrt(math.prod(ax.get_ylim())))
+        ax.text(*at, "start-up", rotation=90, ha="center", va="center", color=GREY, fontsize=11)
+
+
+def label(ax: Any, names: list[tuple[str, list[tuple[float, float]], str]]) -> None:
+    """Write each name beside its curve where it covers no point and no other name."""
+    import numpy as np
+
+    left, right = ax.get_xlim()
+    bottom, top = ax.get_ylim()
+    ax.set_xlim(left, right * (right / left) ** 0.1)
+    ax.set_ylim(bottom / (top / bottom) ** 0.05, top * (top / bottom) ** 0.06)
+    fig = ax.figure
+    fig.canvas.draw()
+    renderer = fig.canvas.get_renderer()
+    place = ax.transData.transform
+    fine = np.linspace(0.0, 1.0, 60)[:, None]
+    drawn = []
+    for _, points, _ in names:
+        xy = place(np.array(points))
+        drawn.append(np.vstack([a + fine * (b - a) for a, b in pairwise(xy)] or [xy]))
+    everything = np.vstack(drawn)
+    frame, taken = ax.get_window_extent(renderer), []
+    aligned = {-1: "right", 0: "center", 1: "left"}
+    vertical = {-1: "top", 0: "center", 1: "bottom"}
+    for text, points, colour in names:
+        best = None
+        for index, xy in enumerate(place(np.array(points))):
+            for reach in (1.0, 2.0, 3.0):
+                for dx, dy in (
+                    (1, 0),
+                    (1, 1),
+                    (1, -1),
+                    (0, 1),
+                    (0, -1),
+                    (-1, -1),
+                    (-1, 1),
+                    (-1, 0),
+                ):
+                    at = xy + reach * np.array([dx * 11.0, dy * 11.0])
+                    mark = ax.annotate(
+                        text,
+                        ax.transData.inverted().transform(at),
+                        ha=aligned[dx],
+                        va=vertical[dy],
+                        color=colour,
+                        fontsize=12,
+                    )
+                    box = mark.get_window_extent(renderer)
+                    inside = (
+                        (everything[:, 0] > box.x0 - 3)
+                        & (everything[:, 0] < box.x1 + 3)
+                        & (everything[:, 1] > box.y0 - 2)
+                        & (everything[:, 1] < box.y1 + 2)
+                    ).sum()
+                    crossed = sum(100 for other in taken if box.overlaps(other))
+                    beyond = box.x1 > frame.x1 + 20 or box.x0 < frame.x0 or box.y0 < frame.y0
+                    beyond |= box.y1 > frame.y1
+                    cost = inside + crossed + 500 * beyond + 2 * reach - 0.5 * index
+                    if best is None or cost < best[0]:
+                        if best is not None:
+                            best[1].remove()
+                        best = (cost, mark, box)
+                    else:
+                        mark.remove()
+        if best is not None:
+            taken.append(best[2])
+
+
+# ## Command line
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.add_argument(
+        "--json",
+        nargs="?",
+        const="-",
+        metavar="FILE",
+        help="where to write the results, - or nothing for standard output; cases of an "
+        "earlier run that are not asked for stay in it (default: "
+        f"results/{RESULTS.name}; with --smoke nowhere)",
+        default=argparse.SUPPRESS,
+    )
+    parser.add_argument("--cases", default="A,B,C,E", help="which to run, e.g. A,E")
+    parser.add_argument("--smoke", action="store_true", help="a few tiny runs, no pictures")
+    parser.add_argument("--repeats", type=int, default=2, help="processes a point, least taken")
+    parser.add_argument(
+        "--draw", action="store_true", help="run nothing, draw the pictures of an earlier run"
+    )
+    parser.add_argument("--point", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.point:
+        point(**json.loads(args.point))
+        return
+    cases = list(dict.fromkeys(args.cases.split(",")))
+    if unknown := [case for case in cases if case not in SIZES]:
+        parser.error(f"argument --cases: there is no case {unknown[0]!r}; choose from A,B,C,E")
+    if args.repeats < 1:
+        parser.error("argument --repeats: must be 1 or more")
+    target = getattr(args, "json", None) or (None if args.smoke else str(RESULTS))
+
+    rows: list[dict[str, Any]] = []
+    if target not in (None, "-") and Path(target).exists() and not args.smoke:
+        old = json.loads(Path(target).read_text())["points"]
+        rows = old if args.draw else [row for row in old if row["case"] not in cases]
+    if not args.draw:
+        rows += run(cases, args.smoke, 1 if args.smoke else args.repeats, target == "-")
+    results = {"points": rows, "summary": summary(rows), "peers": PEERS}
+    if target == "-":
+        print(json.dumps(results))
+    elif target is not None and not args.draw:
+        Path(target).parent.mkdir(parents=True, exist_ok=True)
+        Path(target).write_text(json.dumps(results, indent=1) + "\n")
+    if target is not None and not args.smoke and Path(target) == RESULTS:
+        draw(rows, ["A", "E"], "process", IMAGES / "work_precision.png")
+        draw(rows, ["A", "B", "C", "E"], "run", IMAGES / "work_precision_run.png")
+
+
+if __name__ == "__main__":
+    main()
