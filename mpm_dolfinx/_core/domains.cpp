@@ -79,8 +79,8 @@ void add_element(const double* K, int nodes, const double* transfer, std::size_t
   work.weights.resize(size * nodes + 1);
   work.places.resize(size * nodes + 1);
   work.ends.resize(size);
-  double* columns = work.blocks.data();    // K in blocks, column by column
-  double* right = columns + nodes * column;  // K T, the same way
+  double* columns = work.blocks.data();     // K in blocks, column by column
+  double* right = columns + nodes * column; // K T, the same way
   for (int c = 0; c < nodes; ++c)
     for (int i = 0; i < dim; ++i)
       for (int e = 0; e < nodes; ++e)
@@ -139,7 +139,8 @@ void core::displacement_gradient(const Domains& domains, const double* u, double
       const std::int32_t* nodes = domains.dofmap + p * domains.nodes;
       for (int q = 0; q < domains.points; ++q)
       {
-        const double* gradients = domains.gradients + (p * domains.points + q) * domains.nodes * dim;
+        const double* gradients =
+            domains.gradients + (p * domains.points + q) * domains.nodes * dim;
         double sum[dim * dim] = {};
         for (int c = 0; c < domains.nodes; ++c)
           for (int i = 0; i < dim; ++i)
@@ -257,8 +258,8 @@ core::Pattern core::pattern(const std::int64_t* offsets, const std::int32_t* nod
   {
     const std::size_t size = offsets[p + 1] - offsets[p];
     for (std::size_t a = 0; a < size; ++a)
-      visits[next[nodes[offsets[p] + a]]++]
-          = {static_cast<std::int64_t>(p), pairs, static_cast<std::int32_t>(a)};
+      visits[next[nodes[offsets[p] + a]]++] = {static_cast<std::int64_t>(p), pairs,
+                                               static_cast<std::int32_t>(a)};
     pairs += size * size;
   }
 
@@ -288,7 +289,8 @@ core::Pattern core::pattern(const std::int64_t* offsets, const std::int32_t* nod
       const std::int64_t p = visits[v].domain;
       const std::size_t size = offsets[p + 1] - offsets[p];
       for (std::size_t b = 0; b < size; ++b)
-        result.positions[visits[v].pairs + visits[v].slot * size + b] = place[nodes[offsets[p] + b]];
+        result.positions[visits[v].pairs + visits[v].slot * size + b] =
+            place[nodes[offsets[p] + b]];
     }
     // Every place of a row is at or after its start, so the next row finds none of them new.
     for (std::size_t e = start; e < result.nodes.size(); ++e)
@@ -338,41 +340,41 @@ void core::multiply(const std::int32_t* offsets, const std::int32_t* nodes, std:
 }
 
 HOT_LOOP void core::assemble_points(const Domains& domains, const double* support_gradients,
-                           const double* A, bool symmetric, const Target& target)
+                                    const double* A, bool symmetric, const Target& target)
 {
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
     constexpr int block = dim * dim;
-    for_each_support(
-        domains.count, target, [&](std::size_t p, std::size_t size, const std::int32_t* positions) {
-          const double* S = support_gradients + target.offsets[p] * dim;
-          double left[dim * block];
-          for (std::size_t a = 0; a < size; ++a)
+    for_each_support(domains.count, target,
+                     [&](std::size_t p, std::size_t size, const std::int32_t* positions) {
+      const double* S = support_gradients + target.offsets[p] * dim;
+      double left[dim * block];
+      for (std::size_t a = 0; a < size; ++a)
+      {
+        contract<dim>(A + p * block * block, S + a * dim, domains.weights[p], left);
+        for (std::size_t b = symmetric ? a : 0; b < size; ++b)
+        {
+          double K[block] = {};
+          add_block<dim>(left, S + b * dim, K, dim);
+          double* out = target.values + static_cast<std::size_t>(positions[a * size + b]) * block;
+          for (int e = 0; e < block; ++e)
+            out[e] += K[e];
+          if (symmetric && b != a)
           {
-            contract<dim>(A + p * block * block, S + a * dim, domains.weights[p], left);
-            for (std::size_t b = symmetric ? a : 0; b < size; ++b)
-            {
-              double K[block] = {};
-              add_block<dim>(left, S + b * dim, K, dim);
-              double* out = target.values + static_cast<std::size_t>(positions[a * size + b]) * block;
-              for (int e = 0; e < block; ++e)
-                out[e] += K[e];
-              if (symmetric && b != a)
-              {
-                double* mirror
-                    = target.values + static_cast<std::size_t>(positions[b * size + a]) * block;
-                for (int i = 0; i < dim; ++i)
-                  for (int j = 0; j < dim; ++j)
-                    mirror[j * dim + i] += K[i * dim + j];
-              }
-            }
+            double* mirror =
+                target.values + static_cast<std::size_t>(positions[b * size + a]) * block;
+            for (int i = 0; i < dim; ++i)
+              for (int j = 0; j < dim; ++j)
+                mirror[j * dim + i] += K[i * dim + j];
           }
-        });
+        }
+      }
+    });
   });
 }
 
-HOT_LOOP void core::assemble_domains(const Domains& domains, const double* transfers, const double* A, const double* vectors,
-                            const Target& target)
+HOT_LOOP void core::assemble_domains(const Domains& domains, const double* transfers,
+                                     const double* A, const double* vectors, const Target& target)
 {
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
@@ -380,39 +382,38 @@ HOT_LOOP void core::assemble_domains(const Domains& domains, const double* trans
     const int width = domains.nodes * dim;
     std::vector<double> K(width * width);
     Work work;
-    for_each_support(
-        domains.count, target, [&](std::size_t p, std::size_t size, const std::int32_t* positions) {
-          std::fill(K.begin(), K.end(), 0.0);
-          for (int q = 0; q < domains.points; ++q)
-          {
-            const std::size_t point = p * domains.points + q;
-            const double* gradients = domains.gradients + point * domains.nodes * dim;
-            double left[dim * block];
-            for (int c = 0; c < domains.nodes; ++c)
-            {
-              contract<dim>(A + point * block * block, gradients + c * dim, domains.weights[point],
-                            left);
-              for (int e = 0; e < domains.nodes; ++e)
-                add_block<dim>(left, gradients + e * dim, K.data() + c * dim * width + e * dim,
-                               width);
-            }
-          }
-          if (vectors != nullptr)
-          {
-            const double* a = vectors + p * 3 * width;
-            const double *b = a + width, *g = b + width;
-            for (int r = 0; r < width; ++r)
-              for (int s = 0; s < width; ++s)
-                K[r * width + s] += a[r] * g[s] + g[r] * b[s];
-          }
-          add_element<dim>(K.data(), domains.nodes, transfers + target.offsets[p] * domains.nodes,
-                           size, positions, target.values, work);
-        });
+    for_each_support(domains.count, target,
+                     [&](std::size_t p, std::size_t size, const std::int32_t* positions) {
+      std::fill(K.begin(), K.end(), 0.0);
+      for (int q = 0; q < domains.points; ++q)
+      {
+        const std::size_t point = p * domains.points + q;
+        const double* gradients = domains.gradients + point * domains.nodes * dim;
+        double left[dim * block];
+        for (int c = 0; c < domains.nodes; ++c)
+        {
+          contract<dim>(A + point * block * block, gradients + c * dim, domains.weights[point],
+                        left);
+          for (int e = 0; e < domains.nodes; ++e)
+            add_block<dim>(left, gradients + e * dim, K.data() + c * dim * width + e * dim, width);
+        }
+      }
+      if (vectors != nullptr)
+      {
+        const double* a = vectors + p * 3 * width;
+        const double *b = a + width, *g = b + width;
+        for (int r = 0; r < width; ++r)
+          for (int s = 0; s < width; ++s)
+            K[r * width + s] += a[r] * g[s] + g[r] * b[s];
+      }
+      add_element<dim>(K.data(), domains.nodes, transfers + target.offsets[p] * domains.nodes, size,
+                       positions, target.values, work);
+    });
   });
 }
 
 HOT_LOOP void core::assemble_form(const Form& form, const Domains& domains, const double* transfers,
-                         const Target& target)
+                                  const Target& target)
 {
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
@@ -423,8 +424,8 @@ HOT_LOOP void core::assemble_form(const Form& form, const Domains& domains, cons
     std::vector<std::size_t> pairs(domains.count);
     for_each_support(domains.count, target,
                      [&](std::size_t p, std::size_t, const std::int32_t* positions) {
-                       pairs[p] = static_cast<std::size_t>(positions - target.positions);
-                     });
+      pairs[p] = static_cast<std::size_t>(positions - target.positions);
+    });
     for (std::size_t e = 0; e < form.count; ++e)
     {
       const std::int32_t cell = form.entities[form.facets ? 2 * e : e];

@@ -14,9 +14,9 @@ struct Domains
 {
   std::size_t count;
   int nodes, points, dim;
-  const std::int32_t* dofmap;  // (count, nodes)
-  const double* gradients;     // (count, points, nodes, dim)
-  const double* weights;       // (count, points)
+  const std::int32_t* dofmap; // (count, nodes)
+  const double* gradients;    // (count, points, nodes, dim)
+  const double* weights;      // (count, points)
 };
 
 // H = grad u at the points, (count, points, dim, dim), of u at the nodes.
@@ -74,8 +74,8 @@ void multiply(const std::int32_t* offsets, const std::int32_t* nodes, std::size_
 // Where the tangents of domains go: blocks (dim, dim) of a matrix in compressed rows.
 struct Target
 {
-  const std::int64_t* offsets;    // of the supports
-  const std::int32_t* positions;  // of all pairs of a support's nodes
+  const std::int64_t* offsets;   // of the supports
+  const std::int32_t* positions; // of all pairs of a support's nodes
   double* values;
 };
 
@@ -96,13 +96,13 @@ struct Form
 {
   Kernel kernel;
   std::size_t count;
-  const std::int32_t* entities;  // cell, or cell and local facet
+  const std::int32_t* entities; // cell, or cell and local facet
   bool facets;
   const double* coefficients;
   std::size_t stride;
   const double* constants;
-  const double* x;               // geometry, three columns
-  const std::int32_t* geometry;  // its dofmap
+  const double* x;              // geometry, three columns
+  const std::int32_t* geometry; // its dofmap
   int geometry_nodes;
 };
 

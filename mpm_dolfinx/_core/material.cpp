@@ -240,8 +240,7 @@ void tangent(const Response& r, const std::array<double, dim>& principal, const 
     }
   for (int k = 0; k < size * size; ++k)
     A[k] = 0.0;
-  auto add = [&](double factor, const double* left, const double* right)
-  {
+  auto add = [&](double factor, const double* left, const double* right) {
     for (int i = 0; i < size; ++i)
     {
       const double scaled = factor * left[i];
@@ -264,8 +263,8 @@ void tangent(const Response& r, const std::array<double, dim>& principal, const 
 
 template <int dim>
 bool update_point(const double* gradient, const double* old_gradient, const double* old_c,
-                  double plastic_strain, const Parameters& parameters, double tolerance,
-                  double* P, double* A, double* stress, double* c, double* new_plastic_strain)
+                  double plastic_strain, const Parameters& parameters, double tolerance, double* P,
+                  double* A, double* stress, double* c, double* new_plastic_strain)
 {
   constexpr int m = dim == 2 ? 4 : 6;
   Matrix<dim> H, inverse_F;

@@ -49,7 +49,10 @@ Domains domains_of(const Indices& dofmap, const Reals& gradients, const Reals* w
   return domains;
 }
 
-std::size_t num_points(const Domains& domains) { return domains.count * domains.points; }
+std::size_t num_points(const Domains& domains)
+{
+  return domains.count * domains.points;
+}
 
 Rows rows_of(const Offsets& offsets, const Indices& nodes, const Reals& values)
 {
@@ -77,213 +80,186 @@ NB_MODULE(_loops, m)
 {
   m.doc() = "Compiled loops over particle domains.";
 
-  m.def(
-      "displacement_gradient",
-      [](Reals u, Indices dofmap, Reals gradients, RealsOut H) {
-        const Domains domains = domains_of(dofmap, gradients, nullptr);
-        require(H.size() == num_points(domains) * domains.dim * domains.dim, "H (n, nq, dim, dim)");
-        displacement_gradient(domains, u.data(), H.data());
-      },
-      "u"_a, "dofmap"_a, "gradients"_a, "H"_a.noconvert(), "Set H to grad u at the points.");
+  m.def("displacement_gradient", [](Reals u, Indices dofmap, Reals gradients, RealsOut H) {
+    const Domains domains = domains_of(dofmap, gradients, nullptr);
+    require(H.size() == num_points(domains) * domains.dim * domains.dim, "H (n, nq, dim, dim)");
+    displacement_gradient(domains, u.data(), H.data());
+  }, "u"_a, "dofmap"_a, "gradients"_a, "H"_a.noconvert(), "Set H to grad u at the points.");
 
-  m.def(
-      "internal_force",
-      [](Reals P, Indices dofmap, Reals gradients, Reals weights, RealsOut force) {
-        const Domains domains = domains_of(dofmap, gradients, &weights);
-        require(P.size() == num_points(domains) * domains.dim * domains.dim, "P (n, nq, dim, dim)");
-        internal_force(domains, P.data(), force.data());
-      },
-      "P"_a, "dofmap"_a, "gradients"_a, "weights"_a, "force"_a.noconvert(),
-      "Add the integral of P : grad v to the force at the nodes.");
+  m.def("internal_force",
+        [](Reals P, Indices dofmap, Reals gradients, Reals weights, RealsOut force) {
+    const Domains domains = domains_of(dofmap, gradients, &weights);
+    require(P.size() == num_points(domains) * domains.dim * domains.dim, "P (n, nq, dim, dim)");
+    internal_force(domains, P.data(), force.data());
+  }, "P"_a, "dofmap"_a, "gradients"_a, "weights"_a, "force"_a.noconvert(),
+        "Add the integral of P : grad v to the force at the nodes.");
 
-  m.def(
-      "supports",
-      [](Indices dofmap, Reals gradients, Offsets offsets, Indices nodes, Reals values) {
-        Supports result
-            = supports(domains_of(dofmap, gradients, nullptr), rows_of(offsets, nodes, values));
-        return std::make_pair(to_numpy(std::move(result.offsets)), to_numpy(std::move(result.nodes)));
-      },
-      "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a,
-      "Return the background nodes of each domain, sorted, in compressed rows.");
+  m.def("supports",
+        [](Indices dofmap, Reals gradients, Offsets offsets, Indices nodes, Reals values) {
+    Supports result =
+        supports(domains_of(dofmap, gradients, nullptr), rows_of(offsets, nodes, values));
+    return std::make_pair(to_numpy(std::move(result.offsets)), to_numpy(std::move(result.nodes)));
+  }, "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a,
+        "Return the background nodes of each domain, sorted, in compressed rows.");
 
-  m.def(
-      "local_transfers",
-      [](Indices dofmap, Reals gradients, Offsets offsets, Indices nodes, Reals values,
-         Offsets support_offsets, Indices support_nodes, RealsOut transfers) {
-        const Domains domains = domains_of(dofmap, gradients, nullptr);
-        require(transfers.size() == support_nodes.size() * domains.nodes, "transfers");
-        local_transfers(domains, rows_of(offsets, nodes, values), support_offsets.data(),
-                        support_nodes.data(), transfers.data());
-      },
-      "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a, "support_offsets"_a,
-      "support_nodes"_a, "transfers"_a.noconvert(), "Set the values of T of each domain's nodes.");
+  m.def("local_transfers",
+        [](Indices dofmap, Reals gradients, Offsets offsets, Indices nodes, Reals values,
+           Offsets support_offsets, Indices support_nodes, RealsOut transfers) {
+    const Domains domains = domains_of(dofmap, gradients, nullptr);
+    require(transfers.size() == support_nodes.size() * domains.nodes, "transfers");
+    local_transfers(domains, rows_of(offsets, nodes, values), support_offsets.data(),
+                    support_nodes.data(), transfers.data());
+  },
+        "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a, "support_offsets"_a,
+        "support_nodes"_a, "transfers"_a.noconvert(),
+        "Set the values of T of each domain's nodes.");
 
-  m.def(
-      "support_gradients",
-      [](Indices dofmap, Reals gradients, Offsets offsets, Indices nodes, Reals values,
-         Offsets support_offsets, Indices support_nodes, RealsOut result) {
-        const Domains domains = domains_of(dofmap, gradients, nullptr);
-        require(domains.points == 1 && result.size() == support_nodes.size() * domains.dim,
-                "gradients of domains with one point");
-        support_gradients(domains, rows_of(offsets, nodes, values), support_offsets.data(),
-                          support_nodes.data(), result.data());
-      },
-      "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a, "support_offsets"_a,
-      "support_nodes"_a, "result"_a.noconvert(),
-      "Set the gradients of the background basis at each domain's single point.");
+  m.def("support_gradients",
+        [](Indices dofmap, Reals gradients, Offsets offsets, Indices nodes, Reals values,
+           Offsets support_offsets, Indices support_nodes, RealsOut result) {
+    const Domains domains = domains_of(dofmap, gradients, nullptr);
+    require(domains.points == 1 && result.size() == support_nodes.size() * domains.dim,
+            "gradients of domains with one point");
+    support_gradients(domains, rows_of(offsets, nodes, values), support_offsets.data(),
+                      support_nodes.data(), result.data());
+  },
+        "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a, "support_offsets"_a,
+        "support_nodes"_a, "result"_a.noconvert(),
+        "Set the gradients of the background basis at each domain's single point.");
 
-  m.def(
-      "pattern",
-      [](Offsets offsets, Indices nodes, std::size_t num_nodes) {
-        require(offsets.size() > 0, "offsets of supports (n + 1)");
-        Pattern result = pattern(offsets.data(), nodes.data(), offsets.size() - 1, num_nodes);
-        return std::make_tuple(to_numpy(std::move(result.offsets)),
-                               to_numpy(std::move(result.nodes)),
-                               to_numpy(std::move(result.positions)));
-      },
-      "offsets"_a, "nodes"_a, "num_nodes"_a,
-      "Return the sparsity of a sum over supports, and the place of each pair of their nodes.");
+  m.def("pattern",
+        [](Offsets offsets, Indices nodes, std::size_t num_nodes) {
+    require(offsets.size() > 0, "offsets of supports (n + 1)");
+    Pattern result = pattern(offsets.data(), nodes.data(), offsets.size() - 1, num_nodes);
+    return std::make_tuple(to_numpy(std::move(result.offsets)), to_numpy(std::move(result.nodes)),
+                           to_numpy(std::move(result.positions)));
+  }, "offsets"_a, "nodes"_a, "num_nodes"_a,
+        "Return the sparsity of a sum over supports, and the place of each pair of their nodes.");
 
-  m.def(
-      "reduce",
-      [](Indices offsets, Indices nodes, int dim, Indices numbers) {
-        require(numbers.size() == (offsets.size() - 1) * dim, "numbers of all rows");
-        Reduced result
-            = reduce(offsets.data(), nodes.data(), offsets.size() - 1, dim, numbers.data());
-        return std::make_tuple(
-            to_numpy(std::move(result.rows)), to_numpy(std::move(result.offsets)),
-            to_numpy(std::move(result.columns)), to_numpy(std::move(result.sources)));
-      },
-      "offsets"_a, "nodes"_a, "dim"_a, "numbers"_a,
-      "Return the numbered rows and columns of a pattern of blocks, and where their values are.");
+  m.def("reduce",
+        [](Indices offsets, Indices nodes, int dim, Indices numbers) {
+    require(numbers.size() == (offsets.size() - 1) * dim, "numbers of all rows");
+    Reduced result = reduce(offsets.data(), nodes.data(), offsets.size() - 1, dim, numbers.data());
+    return std::make_tuple(to_numpy(std::move(result.rows)), to_numpy(std::move(result.offsets)),
+                           to_numpy(std::move(result.columns)),
+                           to_numpy(std::move(result.sources)));
+  }, "offsets"_a, "nodes"_a, "dim"_a, "numbers"_a,
+        "Return the numbered rows and columns of a pattern of blocks, and where their values are.");
 
-  m.def(
-      "gather",
-      [](Reals values, Array<const std::uint32_t> sources, RealsOut entries) {
-        require(entries.size() == sources.size(), "sources and entries");
-        for (std::size_t e = 0; e < sources.size(); ++e)
-          entries.data()[e] = values.data()[sources.data()[e]];
-      },
-      "values"_a, "sources"_a, "entries"_a.noconvert(), "Set entries to values[sources].");
+  m.def("gather", [](Reals values, Array<const std::uint32_t> sources, RealsOut entries) {
+    require(entries.size() == sources.size(), "sources and entries");
+    for (std::size_t e = 0; e < sources.size(); ++e)
+      entries.data()[e] = values.data()[sources.data()[e]];
+  }, "values"_a, "sources"_a, "entries"_a.noconvert(), "Set entries to values[sources].");
 
-  m.def(
-      "multiply",
-      [](Indices offsets, Indices nodes, int dim, Reals values, Reals x, RealsOut y) {
-        const std::size_t num_nodes = offsets.size() - 1;
-        require(x.size() == num_nodes * dim && y.size() == x.size()
-                    && values.size() == nodes.size() * dim * dim,
-                "vectors and blocks of a pattern");
-        multiply(offsets.data(), nodes.data(), num_nodes, dim, values.data(), x.data(), y.data());
-      },
-      "offsets"_a, "nodes"_a, "dim"_a, "values"_a, "x"_a, "y"_a.noconvert(), "Set y to K x.");
+  m.def("multiply", [](Indices offsets, Indices nodes, int dim, Reals values, Reals x, RealsOut y) {
+    const std::size_t num_nodes = offsets.size() - 1;
+    require(x.size() == num_nodes * dim && y.size() == x.size()
+                && values.size() == nodes.size() * dim * dim,
+            "vectors and blocks of a pattern");
+    multiply(offsets.data(), nodes.data(), num_nodes, dim, values.data(), x.data(), y.data());
+  }, "offsets"_a, "nodes"_a, "dim"_a, "values"_a, "x"_a, "y"_a.noconvert(), "Set y to K x.");
 
-  m.def(
-      "assemble_points",
-      [](Indices dofmap, Reals gradients, Reals weights, Reals support_gradients, Reals A,
-         bool symmetric, Offsets offsets, Indices positions, RealsOut values) {
-        const Domains domains = domains_of(dofmap, gradients, &weights);
-        const int square = domains.dim * domains.dim;
-        require(domains.points == 1 && A.size() == domains.count * square * square,
-                "A (n, dim, dim, dim, dim) of domains with one point");
-        assemble_points(domains, support_gradients.data(), A.data(), symmetric,
-                        target_of(domains, offsets, positions, values));
-      },
-      "dofmap"_a, "gradients"_a, "weights"_a, "support_gradients"_a, "A"_a, "symmetric"_a,
-      "offsets"_a, "positions"_a, "values"_a.noconvert(),
-      "Add the reduced tangents of domains with one point.");
+  m.def("assemble_points",
+        [](Indices dofmap, Reals gradients, Reals weights, Reals support_gradients, Reals A,
+           bool symmetric, Offsets offsets, Indices positions, RealsOut values) {
+    const Domains domains = domains_of(dofmap, gradients, &weights);
+    const int square = domains.dim * domains.dim;
+    require(domains.points == 1 && A.size() == domains.count * square * square,
+            "A (n, dim, dim, dim, dim) of domains with one point");
+    assemble_points(domains, support_gradients.data(), A.data(), symmetric,
+                    target_of(domains, offsets, positions, values));
+  },
+        "dofmap"_a, "gradients"_a, "weights"_a, "support_gradients"_a, "A"_a, "symmetric"_a,
+        "offsets"_a, "positions"_a, "values"_a.noconvert(),
+        "Add the reduced tangents of domains with one point.");
 
-  m.def(
-      "assemble_domains",
-      [](Indices dofmap, Reals gradients, Reals weights, Reals transfers, Reals A, Reals vectors,
-         Offsets offsets, Indices positions, RealsOut values) {
-        const Domains domains = domains_of(dofmap, gradients, &weights);
-        const int square = domains.dim * domains.dim;
-        require(A.size() == num_points(domains) * square * square,
-                "A (n, nq, dim, dim, dim, dim)");
-        require(vectors.size() == 0 || vectors.size() == domains.count * 3 * domains.nodes * domains.dim,
-                "vectors (n, 3, k, dim), or none");
-        assemble_domains(domains, transfers.data(), A.data(),
-                         vectors.size() > 0 ? vectors.data() : nullptr,
-                         target_of(domains, offsets, positions, values));
-      },
-      "dofmap"_a, "gradients"_a, "weights"_a, "transfers"_a, "A"_a, "vectors"_a,
-      "offsets"_a, "positions"_a, "values"_a.noconvert(),
-      "Add the reduced tangents of domains with any number of points.");
+  m.def("assemble_domains",
+        [](Indices dofmap, Reals gradients, Reals weights, Reals transfers, Reals A, Reals vectors,
+           Offsets offsets, Indices positions, RealsOut values) {
+    const Domains domains = domains_of(dofmap, gradients, &weights);
+    const int square = domains.dim * domains.dim;
+    require(A.size() == num_points(domains) * square * square, "A (n, nq, dim, dim, dim, dim)");
+    require(vectors.size() == 0
+                || vectors.size() == domains.count * 3 * domains.nodes * domains.dim,
+            "vectors (n, 3, k, dim), or none");
+    assemble_domains(domains, transfers.data(), A.data(),
+                     vectors.size() > 0 ? vectors.data() : nullptr,
+                     target_of(domains, offsets, positions, values));
+  },
+        "dofmap"_a, "gradients"_a, "weights"_a, "transfers"_a, "A"_a, "vectors"_a, "offsets"_a,
+        "positions"_a, "values"_a.noconvert(),
+        "Add the reduced tangents of domains with any number of points.");
 
-  m.def(
-      "assemble_form",
-      [](std::uintptr_t kernel, Indices entities, Reals coefficients, Reals constants, Reals x,
-         Indices geometry, Indices dofmap, Reals gradients, Reals transfers, Offsets offsets,
-         Indices positions, RealsOut values) {
-        const Domains domains = domains_of(dofmap, gradients, nullptr);
-        require(x.ndim() == 2 && x.shape(1) == 3 && geometry.ndim() == 2, "geometry");
-        require(coefficients.ndim() == 2
-                    && (coefficients.size() == 0 || coefficients.shape(0) == entities.shape(0)),
-                "coefficients of each entity");
-        const Form form{reinterpret_cast<Kernel>(kernel),
-                        entities.shape(0),
-                        entities.data(),
-                        entities.ndim() == 2,
-                        coefficients.data(),
-                        coefficients.shape(1),
-                        constants.data(),
-                        x.data(),
-                        geometry.data(),
-                        static_cast<int>(geometry.shape(1))};
-        assemble_form(form, domains, transfers.data(),
-                      target_of(domains, offsets, positions, values));
-      },
-      "kernel"_a, "entities"_a, "coefficients"_a, "constants"_a, "x"_a, "geometry"_a, "dofmap"_a,
-      "gradients"_a, "transfers"_a, "offsets"_a, "positions"_a, "values"_a.noconvert(),
-      "Add the reduced element tensors of a compiled form on cells or (cell, local facet).");
+  m.def("assemble_form",
+        [](std::uintptr_t kernel, Indices entities, Reals coefficients, Reals constants, Reals x,
+           Indices geometry, Indices dofmap, Reals gradients, Reals transfers, Offsets offsets,
+           Indices positions, RealsOut values) {
+    const Domains domains = domains_of(dofmap, gradients, nullptr);
+    require(x.ndim() == 2 && x.shape(1) == 3 && geometry.ndim() == 2, "geometry");
+    require(coefficients.ndim() == 2
+                && (coefficients.size() == 0 || coefficients.shape(0) == entities.shape(0)),
+            "coefficients of each entity");
+    const Form form{reinterpret_cast<Kernel>(kernel),
+                    entities.shape(0),
+                    entities.data(),
+                    entities.ndim() == 2,
+                    coefficients.data(),
+                    coefficients.shape(1),
+                    constants.data(),
+                    x.data(),
+                    geometry.data(),
+                    static_cast<int>(geometry.shape(1))};
+    assemble_form(form, domains, transfers.data(), target_of(domains, offsets, positions, values));
+  },
+        "kernel"_a, "entities"_a, "coefficients"_a, "constants"_a, "x"_a, "geometry"_a, "dofmap"_a,
+        "gradients"_a, "transfers"_a, "offsets"_a, "positions"_a, "values"_a.noconvert(),
+        "Add the reduced element tensors of a compiled form on cells or (cell, local facet).");
 
-  m.def(
-      "update_hencky",
-      [](Reals gradient, Reals bulk, Reals shear, RealsOut P, RealsOut A, RealsOut stress) {
-        require(gradient.ndim() == 3, "displacement gradients (n, dim, dim)");
-        Update u{};
-        u.count = gradient.shape(0);
-        u.gradient = gradient.data();
-        u.bulk = parameter_of(bulk, u.count);
-        u.shear = parameter_of(shear, u.count);
-        u.P = P.data();
-        u.A = A.size() > 0 ? A.data() : nullptr;
-        u.stress = stress.data();
-        return to_numpy(update_logarithmic(u, static_cast<int>(gradient.shape(2))));
-      },
-      "gradient"_a, "bulk"_a, "shear"_a, "P"_a.noconvert(),
-      "A"_a.noconvert(), "stress"_a.noconvert(),
-      "Update Hencky's law; return the points whose domains are inverted.");
+  m.def("update_hencky",
+        [](Reals gradient, Reals bulk, Reals shear, RealsOut P, RealsOut A, RealsOut stress) {
+    require(gradient.ndim() == 3, "displacement gradients (n, dim, dim)");
+    Update u{};
+    u.count = gradient.shape(0);
+    u.gradient = gradient.data();
+    u.bulk = parameter_of(bulk, u.count);
+    u.shear = parameter_of(shear, u.count);
+    u.P = P.data();
+    u.A = A.size() > 0 ? A.data() : nullptr;
+    u.stress = stress.data();
+    return to_numpy(update_logarithmic(u, static_cast<int>(gradient.shape(2))));
+  }, "gradient"_a, "bulk"_a, "shear"_a, "P"_a.noconvert(), "A"_a.noconvert(),
+        "stress"_a.noconvert(),
+        "Update Hencky's law; return the points whose domains are inverted.");
 
-  m.def(
-      "update_von_mises",
-      [](Reals gradient, Reals old_gradient, Reals old_c, Reals old_plastic_strain, Reals bulk,
-         Reals shear, Reals rho_y, Reals hardening, double tolerance, RealsOut P, RealsOut A,
-         RealsOut stress, RealsOut c, RealsOut plastic_strain) {
-        require(gradient.ndim() == 3 && old_gradient.size() == gradient.size()
-                    && old_c.shape(0) == gradient.shape(0)
-                    && old_plastic_strain.shape(0) == gradient.shape(0),
-                "displacement gradients (n, dim, dim) and states (n, ...)");
-        const std::size_t n = gradient.shape(0);
-        const Update u{n,
-                       gradient.data(),
-                       old_gradient.data(),
-                       old_c.data(),
-                       old_plastic_strain.data(),
-                       parameter_of(bulk, n),
-                       parameter_of(shear, n),
-                       parameter_of(rho_y, n),
-                       parameter_of(hardening, n),
-                       tolerance,
-                       P.data(),
-                       A.size() > 0 ? A.data() : nullptr,
-                       stress.data(),
-                       c.data(),
-                       plastic_strain.data()};
-        return to_numpy(update_logarithmic(u, static_cast<int>(gradient.shape(2))));
-      },
-      "gradient"_a, "old_gradient"_a, "old_c"_a, "old_plastic_strain"_a, "bulk"_a, "shear"_a,
-      "rho_y"_a, "hardening"_a, "tolerance"_a, "P"_a.noconvert(), "A"_a.noconvert(),
-      "stress"_a.noconvert(), "c"_a.noconvert(), "plastic_strain"_a.noconvert(),
-      "Update von Mises' law; return the points whose domains are inverted.");
+  m.def("update_von_mises",
+        [](Reals gradient, Reals old_gradient, Reals old_c, Reals old_plastic_strain, Reals bulk,
+           Reals shear, Reals rho_y, Reals hardening, double tolerance, RealsOut P, RealsOut A,
+           RealsOut stress, RealsOut c, RealsOut plastic_strain) {
+    require(gradient.ndim() == 3 && old_gradient.size() == gradient.size()
+                && old_c.shape(0) == gradient.shape(0)
+                && old_plastic_strain.shape(0) == gradient.shape(0),
+            "displacement gradients (n, dim, dim) and states (n, ...)");
+    const std::size_t n = gradient.shape(0);
+    const Update u{n,
+                   gradient.data(),
+                   old_gradient.data(),
+                   old_c.data(),
+                   old_plastic_strain.data(),
+                   parameter_of(bulk, n),
+                   parameter_of(shear, n),
+                   parameter_of(rho_y, n),
+                   parameter_of(hardening, n),
+                   tolerance,
+                   P.data(),
+                   A.size() > 0 ? A.data() : nullptr,
+                   stress.data(),
+                   c.data(),
+                   plastic_strain.data()};
+    return to_numpy(update_logarithmic(u, static_cast<int>(gradient.shape(2))));
+  },
+        "gradient"_a, "old_gradient"_a, "old_c"_a, "old_plastic_strain"_a, "bulk"_a, "shear"_a,
+        "rho_y"_a, "hardening"_a, "tolerance"_a, "P"_a.noconvert(), "A"_a.noconvert(),
+        "stress"_a.noconvert(), "c"_a.noconvert(), "plastic_strain"_a.noconvert(),
+        "Update von Mises' law; return the points whose domains are inverted.");
 }
