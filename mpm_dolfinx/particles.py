@@ -12,36 +12,15 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-import basix
-import ufl
 from dolfinx import fem, mesh
 
-from . import _compat
-from .deletion import Deletion, without_deleted
-from .errors import DomainDistortionError, MPMError, ParticleOutsideError, agree
-from .folding import JacobianBound
+from .clouds import mesh_of_boxes
+from .deletion import without_deleted
+from .domains import Domains
+from .errors import MPMError, ParticleOutsideError, agree
 from .location import BackgroundBasis, PointBasis
-from .methods import (
-    BOX_CELLS,
-    BoxGrid,
-    DomainState,
-    Rows,
-    boxes,
-    cpdi,
-    cpdi2,
-    gimp,
-    mpm,
-    require_boxes,
-)
+from .methods import BoxGrid, DomainState, Rows, boxes, cpdi, cpdi2, gimp, mpm, require_boxes
 from .partition import Redistribution, cell_centres, ranks_of_background
-from .quadrature import (
-    DomainQuadrature,
-    default_degree,
-    exact_degree,
-    quadrature_element,
-    quadrature_rule,
-    volume_ratio,
-)
 from .transfer import Weights, active_nodes, domain_weights, sum_by_particle, transfer_matrix
 from .validation import validate_options, validate_spaces
 
@@ -51,7 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["Particles"]
 
 
-class Particles:
+class Particles(Domains):
     """A body as particles with finite domains, moved by a background space.
 
     Each cell of ``body`` is the domain of one particle. The body mesh is the undeformed body
@@ -133,33 +112,13 @@ class Particles:
             ranks = ranks_of_background(V, self._background, cell_centres(body))
             self._moves.append(Redistribution(body, ranks))
             body = self._moves[-1].mesh
-        self.mesh = body
+        family = "Lagrange" if method == "cpdi2" else "Discontinuous Lagrange"
+        super().__init__(body, family, degree, quadrature_degree, outside == "delete")
         self.V = V
         self.method = method
-        self._gdim = body.geometry.dim
-        cell = body.basix_cell()
-        family = "Lagrange" if method == "cpdi2" else "Discontinuous Lagrange"
-        self.W = fem.functionspace(body, (family, degree, (self._gdim,)))
-        self.displacement = fem.Function(self.W, name="displacement")
         self.increment = fem.Function(V, name="increment")
         self.load = fem.Constant(body, 0.0)
-        self._degree = (
-            default_degree(cell.name, degree) if quadrature_degree is None else quadrature_degree
-        )
-        self._exact_degree = exact_degree(cell.name, degree)
-        self.dx = self._measure(self._degree)
-        self.dx_exact = self._measure(self._exact_degree)
-
-        cells = body.topology.index_map(body.topology.dim)
-        self.num_local = int(cells.size_local)
-        self.num_global = int(cells.size_global)
-        self.global_index = _compat.input_cell_index(body)
-        self._shape_functions = self.W.ufl_element().basix_element
-        self.quadrature = DomainQuadrature(body, self._shape_functions, self._degree)
-        self.domain_nodes = self.W.dofmap.list[: self.num_local]
-        self._nodes = self.W.tabulate_dof_coordinates()[:, : self._gdim].copy()
         self.outside = outside
-        self.deletion = Deletion(body, self.W) if outside == "delete" else None
         self._domain_update = domain_update
         self._grid = None
         if method == "gimp":
@@ -167,14 +126,7 @@ class Particles:
             self._grid = BoxGrid(V.mesh)
         self._converged = np.zeros_like(self._nodes)
         self._constitutive: ConstitutiveHistory | None = None
-        self._gradient: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-        with agree(body.comm):
-            flat = self.global_index[self.quadrature.flat]
-            if len(flat):
-                raise DomainDistortionError(
-                    "The domains of {particles} have no volume; mend the body mesh.",
-                    flat,
-                )
+        self._require_volume()
         self.locate()
 
     @classmethod
@@ -199,25 +151,8 @@ class Particles:
         Raises:
             MPMError: Shapes that do not fit, or lengths that are not positive.
         """
-        gdim = V.mesh.geometry.dim
-        comm = V.mesh.comm
-        with agree(comm):
-            centres = np.asarray(points, dtype=np.float64)
-            if centres.ndim != 2 or centres.shape[1] != gdim or not np.isfinite(centres).all():
-                raise MPMError(f"points must be finite and of shape (n, {gdim}).")
-            try:
-                sides = np.broadcast_to(np.asarray(lengths, np.float64), centres.shape)
-            except ValueError:
-                raise MPMError(
-                    f"lengths must be a number or of shape {centres.shape}, not "
-                    f"{np.shape(lengths)}."
-                ) from None
-            if not (np.isfinite(sides).all() and (sides > 0.0).all()):
-                raise MPMError("lengths must be positive and finite.")
-        cell = BOX_CELLS[gdim - 2]
-        unit = basix.geometry(cell) - 0.5
-        corners = centres[:, None] + unit * sides[:, None]
-        return cls(_compat.disconnected_mesh(comm, corners, cell), V, method=method, **options)
+        body = mesh_of_boxes(V.mesh.comm, points, lengths, V.mesh.geometry.dim)
+        return cls(body, V, method=method, **options)
 
     def carry(self, thing: Any) -> Any:
         """Return tags or a DG0 Function on ``mesh``, to which cells have moved (collective).
@@ -255,10 +190,6 @@ class Particles:
         self.__dict__.clear()
         Particles.__init__(self, move.mesh, V, **options)
         self._moves, self.increment = [*moves, move], increment
-
-    def _measure(self, degree: int) -> ufl.Measure:
-        metadata = {"quadrature_degree": degree, "quadrature_rule": "default"}
-        return ufl.Measure("dx", domain=self.mesh, metadata=metadata)
 
     def locate(self) -> None:
         """Find the background cells of all domain nodes, unless that is done (collective).
@@ -303,11 +234,6 @@ class Particles:
                     self.global_index[lost],
                 )
 
-    def _of_domains(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return displacements of nodes ``(N, gdim)`` for each domain, shape ``(n, k, gdim)``."""
-        values: NDArray[np.float64] = nodal[self.domain_nodes]
-        return values if self.deletion is None else self.deletion.kept(values)
-
     def _converged_gradient(self) -> NDArray[np.float64]:
         return self.quadrature.displacement_gradient(self._of_domains(self._converged))
 
@@ -330,19 +256,6 @@ class Particles:
             if rows.corners is not None:
                 rows.corners[self.deleted] = self.domains[self.deleted]
         return rows
-
-    @property
-    def present_weights(self) -> NDArray[np.float64]:
-        """Reference volumes of the history's points, shape ``(n, nq)``; 0 where deleted."""
-        weights = self.quadrature.weights
-        return np.where(self.deleted[:, None], 0.0, weights) if self.deletion else weights
-
-    @property
-    def deleted(self) -> NDArray[np.bool_]:
-        """Whether each particle this rank owns is deleted, shape ``(n,)``."""
-        if self.deletion is None:
-            return np.zeros(self.num_local, dtype=bool)
-        return self.deletion.mask
 
     def leaving(self) -> NDArray[np.int64]:
         """Return which of this rank's particles the last step took out (collective).
@@ -433,25 +346,6 @@ class Particles:
         """Positions of this rank's nodes of W at the last converged step, shape ``(N, gdim)``."""
         return np.asarray(self._nodes + self._converged)
 
-    @property
-    def initial_domains(self) -> NDArray[np.float64]:
-        """Corners of the undeformed domains, shape ``(n, k, gdim)``."""
-        return np.asarray(self._nodes[self.domain_nodes])
-
-    def outlined(self, domains: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the equispaced nodes of domains that are given by their own nodes.
-
-        Args:
-            domains: Nodes of domains, shape ``(n, k, gdim)``.
-        """
-        degree = self._shape_functions.degree
-        if degree == 1:
-            return domains
-        cell = self.mesh.basix_cell()
-        element = _compat.equispaced_element(cell, degree, self._gdim).basix_element
-        table = self._shape_functions.tabulate(0, element.points)[0, :, :, 0]
-        return np.asarray(np.einsum("qk,nki->nqi", table, domains))
-
     def _domain_averages(
         self,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -485,87 +379,6 @@ class Particles:
         volumes = self.quadrature.weights[there] * jacobian
         return points.reshape(-1, self._gdim), volumes.ravel()
 
-    def quadrature_function(self, name: str, shape: tuple[int, ...] = ()) -> fem.Function:
-        """Return a Function for data at the history's points, to be injected into a form.
-
-        Args:
-            name: Its name.
-            shape: Shape of a value.
-
-        Returns:
-            Function on a quadrature element, integrated with ``particles.dx``. Its values
-            cell by cell are ``f.x.array.reshape(-1, nq, *shape)``.
-        """
-        element = quadrature_element(self.mesh.basix_cell().name, self._degree, tuple(shape))
-        return fem.Function(fem.functionspace(self.mesh, element), name=name)
-
-    @property
-    def num_points(self) -> int:
-        """Number of quadrature points of each domain."""
-        return int(self.quadrature.weights.shape[1])
-
-    def _nodal(self) -> NDArray[np.float64]:
-        """Displacement of the domains' nodes now, shape ``(n, k, gdim)``."""
-        nodal = self.displacement.x.array.reshape(-1, self._gdim)
-        return self._of_domains(np.asarray(nodal, dtype=np.float64))
-
-    def displacement_gradient(self, axisymmetric: bool = False) -> NDArray[np.float64]:
-        """Return ``grad d`` at the history's points.
-
-        Args:
-            axisymmetric: Whether to add the hoop stretch ``d_r / R``.
-
-        Returns:
-            Shape ``(n, nq, gdim, gdim)``, or ``(n, nq, 3, 3)`` where axisymmetric.
-        """
-        gradient = self._present_gradient()
-        if not axisymmetric:
-            return gradient
-        whole = np.zeros((*gradient.shape[:2], 3, 3))
-        whole[:, :, :2, :2] = gradient
-        radial = np.einsum("qk,nk->nq", self.quadrature.shapes, self._nodal()[:, :, 0])
-        whole[:, :, 2, 2] = radial / self.radii
-        return whole
-
-    def _present_gradient(self) -> NDArray[np.float64]:
-        """Return ``grad d`` at the history's points, of the same displacement only once."""
-        d = self.displacement.x.array
-        if self.deletion is not None:
-            return self.quadrature.displacement_gradient(self._nodal())
-        if self._gradient is not None and np.array_equal(self._gradient[0], d):
-            return self._gradient[1]
-        gradient = self.quadrature.gradient_of(np.asarray(d), self.domain_nodes)
-        self._gradient = np.array(d, dtype=np.float64), gradient
-        return gradient
-
-    @property
-    def radii(self) -> NDArray[np.float64]:
-        """Undeformed radius of the history's points, shape ``(n, nq)``."""
-        radii = self._nodes[self.domain_nodes][:, :, 0]
-        return np.asarray(np.einsum("qk,nk->nq", self.quadrature.shapes, radii))
-
-    def point_volumes(self, axisymmetric: bool = False) -> NDArray[np.float64]:
-        """Return the reference volume of the history's points, shape ``(n, nq)``.
-
-        Args:
-            axisymmetric: Whether it is that of a body of revolution, all around.
-        """
-        weights = self.quadrature.weights
-        return weights * (2.0 * np.pi * self.radii) if axisymmetric else weights
-
-    def require_radius(self) -> None:
-        """Raise an error unless ``x[0]`` can be a radius (collective)."""
-        with agree(self.mesh.comm):
-            if self._gdim != 2:
-                raise MPMError("An axisymmetric body is a mesh in the (r, z) plane.")
-            left = self._nodes[self.domain_nodes][:, :, 0].min(axis=1) < -1e-12
-            if left.any():
-                raise MPMError(
-                    "The domains of {particles} have a negative radius; an axisymmetric body "
-                    "lies at x[0] >= 0.",
-                    self.global_index[left],
-                )
-
     def attach(self, history: ConstitutiveHistory) -> None:
         """Let a history answer for stress and internal variables."""
         self._constitutive = history
@@ -579,54 +392,11 @@ class Particles:
     @property
     def deformation_gradient(self) -> NDArray[np.float64]:
         """Deformation gradient, shape ``(n, 3, 3)`` (volume averages, plane strain in 2-D)."""
-        gradient = self._average(self.displacement_gradient(self._axisymmetric))
-        dim = gradient.shape[1]
-        F = np.tile(np.eye(3), (self.num_local, 1, 1))
-        F[:, :dim, :dim] += gradient
-        return F
+        return _in_space(self._average(self.displacement_gradient(self._axisymmetric)))
 
     @property
     def _axisymmetric(self) -> bool:
         return self._constitutive is not None and self._constitutive.axisymmetric
-
-    @property
-    def initial_volume(self) -> NDArray[np.float64]:
-        """Volume of the undeformed domains, shape ``(n,)``; an area in the plane."""
-        return self._initial_volume.copy()
-
-    @property
-    def volume(self) -> NDArray[np.float64]:
-        """Volume of the domains now, shape ``(n,)``; an area in the plane."""
-        exact = self._exact_quadrature()
-        ratio = volume_ratio(exact.displacement_gradient(self._nodal()))
-        return np.asarray((exact.weights * ratio).sum(axis=1))
-
-    @property
-    def initial_centroid(self) -> NDArray[np.float64]:
-        """Centroid of the undeformed domains, shape ``(n, gdim)``."""
-        return self._mean(self._nodes[self.domain_nodes])
-
-    @property
-    def centroid(self) -> NDArray[np.float64]:
-        """Particle positions: mean of ``X + d`` over the domains, shape ``(n, gdim)``."""
-        return self._mean(self._nodes[self.domain_nodes] + self._nodal())
-
-    def _mean(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(np.einsum("nk,nki->ni", self._averages, nodal))
-
-    def _exact_quadrature(self) -> DomainQuadrature:
-        """Return the rule exact for body force and mass, many times the size of a body's rest."""
-        return DomainQuadrature(self.mesh, self._shape_functions, self._exact_degree)
-
-    @cached_property
-    def _initial_volume(self) -> NDArray[np.float64]:
-        return np.asarray(self._exact_quadrature().weights.sum(axis=1))
-
-    @cached_property
-    def _averages(self) -> NDArray[np.float64]:
-        """Averages of the shape functions over the undeformed domains, shape ``(n, k)``."""
-        exact = self._exact_quadrature()
-        return np.asarray(exact.weights @ exact.shapes / exact.weights.sum(axis=1)[:, None])
 
     @property
     def has_material(self) -> bool:
@@ -652,19 +422,6 @@ class Particles:
         return self._average(self._history("plastic strain").plastic_strain())
 
     @property
-    def initial_points(self) -> NDArray[np.float64]:
-        """Undeformed positions of the quadrature points, shape ``(n, nq, gdim)``."""
-        return self._at_points(self._nodes[self.domain_nodes])
-
-    @property
-    def points(self) -> NDArray[np.float64]:
-        """Positions of the quadrature points, shape ``(n, nq, gdim)``."""
-        return self._at_points(self._nodes[self.domain_nodes] + self._nodal())
-
-    def _at_points(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(np.einsum("qk,nki->nqi", self.quadrature.shapes, nodal))
-
-    @property
     def point_stress(self) -> NDArray[np.float64]:
         """Cauchy stress at the quadrature points, shape ``(n, nq, 3, 3)``.
 
@@ -681,11 +438,7 @@ class Particles:
     @property
     def point_deformation_gradient(self) -> NDArray[np.float64]:
         """Deformation gradient at the quadrature points, shape ``(n, nq, 3, 3)``."""
-        gradient = self.displacement_gradient(self._axisymmetric)
-        dim = gradient.shape[2]
-        F = np.tile(np.eye(3), (*gradient.shape[:2], 1, 1))
-        F[:, :, :dim, :dim] += gradient
-        return F
+        return _in_space(self.displacement_gradient(self._axisymmetric))
 
     def fields(self) -> dict[str, NDArray[np.float64]]:
         """Return what is known of each particle, for output: arrays ``(n, ...)`` by name.
@@ -742,66 +495,6 @@ class Particles:
             self.deletion.restore(arrays["deleted"], arrays["kept"])
         self.commit()
 
-    def crossed(self) -> NDArray[np.int64]:
-        """Return global indices of quadrilaterals whose edges cross.
-
-        A quadrilateral with one corner turned inwards is concave, with two it crosses itself
-        and part of it is inverted. Other domains cannot cross without ``det F <= 0``.
-        """
-        if self.mesh.basix_cell() != basix.CellType.quadrilateral or self.method != "cpdi2":
-            return self.global_index[:0]
-        if self._shape_functions.degree > 1:
-            return self.global_index[:0]
-        inwards = (self._corner_jacobians() <= 0.0).sum(axis=1)
-        return np.asarray(self.global_index[inwards >= 2])
-
-    @cached_property
-    def _jacobian_bound(self) -> JacobianBound:
-        return JacobianBound(self.mesh.basix_cell(), self._shape_functions)
-
-    def folded(self) -> NDArray[np.int64]:
-        """Return global indices of domains whose map is not one to one everywhere.
-
-        Decided by a bound (Bernstein coefficients of the Jacobian), not by sampling, at the
-        present displacement. Such a domain covers a part of itself twice; it goes on as long as
-        ``det F > 0`` at its quadrature points.
-        """
-        now = self._nodes[self.domain_nodes] + self._nodal()
-        sign = np.sign(self._orientation[:, 0])
-        return np.asarray(self.global_index[self._jacobian_bound.vanishes(now, sign)])
-
-    def _corner_jacobians(self) -> NDArray[np.float64]:
-        """Return det J at the corners of the present domains, positive as in the undeformed."""
-        points = basix.geometry(self.mesh.basix_cell())
-        slopes = self._shape_functions.tabulate(1, points)[1:, :, :, 0]
-        now = self._nodes[self.domain_nodes] + self._nodal()
-        det = np.linalg.det(np.einsum("jqk,nki->nqij", slopes, now))
-        return np.asarray(np.sign(self._orientation) * det)
-
-    def domain_distortion(self) -> NDArray[np.float64]:
-        """Return the smallest det J of each domain over its mean, shape ``(n,)``.
-
-        One for an undistorted domain, zero or less where a quadrilateral is concave. For curved
-        domains and hexahedra it is a bound from below.
-        """
-        mean = self.volume / quadrature_rule(self.mesh.basix_cell(), 0)[1].sum()
-        now = self._nodes[self.domain_nodes] + self._nodal()
-        least = self._jacobian_bound.lower_bound(now, np.sign(self._orientation[:, 0]))
-        return np.asarray(least / np.abs(mean))
-
-    @cached_property
-    def _orientation(self) -> NDArray[np.float64]:
-        """Sign of the reference map of each undeformed domain, shape ``(n, 1)``."""
-        middle = basix.geometry(self.mesh.basix_cell()).mean(axis=0)[None]
-        slopes = self._shape_functions.tabulate(1, middle)[1:, :, :, 0]
-        corners = self._nodes[self.domain_nodes]
-        return np.asarray(np.linalg.det(np.einsum("jqk,nki->nqij", slopes, corners)))
-
-    def inverted(self) -> NDArray[np.int64]:
-        """Return global indices of domains with ``det F <= 0`` or not finite at a point."""
-        gradient = self.displacement_gradient()
-        return np.asarray(self.global_index[~(volume_ratio(gradient) > 0.0).all(axis=1)])
-
     def commit(self) -> NDArray[np.float64]:
         """Make the present displacement the converged one; return what that was before."""
         before = self._converged
@@ -819,3 +512,11 @@ class Particles:
         """Restore the converged displacement."""
         self.displacement.x.array[:] = self._converged.ravel()
         self.increment.x.array[:] = 0.0
+
+
+def _in_space(gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``I + H`` of gradients ``(..., dim, dim)``, shape ``(..., 3, 3)``."""
+    dim = gradient.shape[-1]
+    F = np.tile(np.eye(3), (*gradient.shape[:-2], 1, 1))
+    F[..., :dim, :dim] += gradient
+    return F

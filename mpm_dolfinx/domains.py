@@ -1,0 +1,332 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Domains of particles: a body mesh, the displacement of its cells, and their measures."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+import basix
+import ufl
+from dolfinx import fem, mesh
+
+from . import _compat
+from .deletion import Deletion
+from .errors import DomainDistortionError, MPMError, agree
+from .folding import JacobianBound
+from .quadrature import (
+    DomainQuadrature,
+    default_degree,
+    exact_degree,
+    quadrature_element,
+    quadrature_rule,
+    volume_ratio,
+)
+
+__all__ = ["Domains"]
+
+
+class Domains:
+    """The cells of a body mesh as domains that a displacement deforms.
+
+    Here is all that follows from the body mesh, the rule that carries the history, and the
+    displacement; what moves the domains is not known here.
+
+    Args:
+        body: Undeformed body.
+        family: Family of the displacement's element: Lagrange where neighbours share their
+            nodes, discontinuous Lagrange where they do not.
+        degree: Degree of the domains' shape functions.
+        quadrature_degree: Degree of the rule that carries the history, or ``None``.
+        deletable: Whether domains may be deleted.
+
+    Attributes:
+        mesh: The body mesh, undeformed.
+        W: Space of the domains' displacement.
+        displacement: Total displacement d in W.
+        dx: Measure with the rule that carries the history.
+        dx_exact: Measure exact for body force and mass.
+        num_local: Number of domains this rank owns.
+        num_global: Number of domains of all ranks.
+        global_index: Input index of each owned domain, shape ``(n,)``.
+        domain_nodes: Local nodes of W of each owned domain, shape ``(n, k)``.
+        quadrature: The rule that carries the history, on each owned domain.
+        deletion: Which domains are deleted, or ``None`` where none may be.
+    """
+
+    def __init__(
+        self,
+        body: mesh.Mesh,
+        family: str,
+        degree: int,
+        quadrature_degree: int | None,
+        deletable: bool,
+    ) -> None:
+        self.mesh = body
+        self._gdim = body.geometry.dim
+        cell = body.basix_cell()
+        self.W = fem.functionspace(body, (family, degree, (self._gdim,)))
+        self.displacement = fem.Function(self.W, name="displacement")
+        self._degree = (
+            default_degree(cell.name, degree) if quadrature_degree is None else quadrature_degree
+        )
+        self._exact_degree = exact_degree(cell.name, degree)
+        self.dx = self._measure(self._degree)
+        self.dx_exact = self._measure(self._exact_degree)
+
+        cells = body.topology.index_map(body.topology.dim)
+        self.num_local = int(cells.size_local)
+        self.num_global = int(cells.size_global)
+        self.global_index = _compat.input_cell_index(body)
+        self._shape_functions = self.W.ufl_element().basix_element
+        self.quadrature = DomainQuadrature(body, self._shape_functions, self._degree)
+        self.domain_nodes = self.W.dofmap.list[: self.num_local]
+        self._nodes = self.W.tabulate_dof_coordinates()[:, : self._gdim].copy()
+        self.deletion = Deletion(body, self.W) if deletable else None
+        self._gradient: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+
+    def _require_volume(self) -> None:
+        with agree(self.mesh.comm):
+            flat = self.global_index[self.quadrature.flat]
+            if len(flat):
+                raise DomainDistortionError(
+                    "The domains of {particles} have no volume; mend the body mesh.",
+                    flat,
+                )
+
+    def _measure(self, degree: int) -> ufl.Measure:
+        metadata = {"quadrature_degree": degree, "quadrature_rule": "default"}
+        return ufl.Measure("dx", domain=self.mesh, metadata=metadata)
+
+    def quadrature_function(self, name: str, shape: tuple[int, ...] = ()) -> fem.Function:
+        """Return a Function for data at the history's points, to be injected into a form.
+
+        Args:
+            name: Its name.
+            shape: Shape of a value.
+
+        Returns:
+            Function on a quadrature element, integrated with ``particles.dx``. Its values
+            cell by cell are ``f.x.array.reshape(-1, nq, *shape)``.
+        """
+        element = quadrature_element(self.mesh.basix_cell().name, self._degree, tuple(shape))
+        return fem.Function(fem.functionspace(self.mesh, element), name=name)
+
+    @property
+    def num_points(self) -> int:
+        """Number of quadrature points of each domain."""
+        return int(self.quadrature.weights.shape[1])
+
+    def _of_domains(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return displacements of nodes ``(N, gdim)`` for each domain, shape ``(n, k, gdim)``."""
+        values: NDArray[np.float64] = nodal[self.domain_nodes]
+        return values if self.deletion is None else self.deletion.kept(values)
+
+    def _nodal(self) -> NDArray[np.float64]:
+        """Displacement of the domains' nodes now, shape ``(n, k, gdim)``."""
+        nodal = self.displacement.x.array.reshape(-1, self._gdim)
+        return self._of_domains(np.asarray(nodal, dtype=np.float64))
+
+    def displacement_gradient(self, axisymmetric: bool = False) -> NDArray[np.float64]:
+        """Return ``grad d`` at the history's points.
+
+        Args:
+            axisymmetric: Whether to add the hoop stretch ``d_r / R``.
+
+        Returns:
+            Shape ``(n, nq, gdim, gdim)``, or ``(n, nq, 3, 3)`` where axisymmetric.
+        """
+        gradient = self._present_gradient()
+        if not axisymmetric:
+            return gradient
+        whole = np.zeros((*gradient.shape[:2], 3, 3))
+        whole[:, :, :2, :2] = gradient
+        radial = np.einsum("qk,nk->nq", self.quadrature.shapes, self._nodal()[:, :, 0])
+        whole[:, :, 2, 2] = radial / self.radii
+        return whole
+
+    def _present_gradient(self) -> NDArray[np.float64]:
+        """Return ``grad d`` at the history's points, of the same displacement only once."""
+        d = self.displacement.x.array
+        if self.deletion is not None:
+            return self.quadrature.displacement_gradient(self._nodal())
+        if self._gradient is not None and np.array_equal(self._gradient[0], d):
+            return self._gradient[1]
+        gradient = self.quadrature.gradient_of(np.asarray(d), self.domain_nodes)
+        self._gradient = np.array(d, dtype=np.float64), gradient
+        return gradient
+
+    @property
+    def radii(self) -> NDArray[np.float64]:
+        """Undeformed radius of the history's points, shape ``(n, nq)``."""
+        radii = self._nodes[self.domain_nodes][:, :, 0]
+        return np.asarray(np.einsum("qk,nk->nq", self.quadrature.shapes, radii))
+
+    def point_volumes(self, axisymmetric: bool = False) -> NDArray[np.float64]:
+        """Return the reference volume of the history's points, shape ``(n, nq)``.
+
+        Args:
+            axisymmetric: Whether it is that of a body of revolution, all around.
+        """
+        weights = self.quadrature.weights
+        return weights * (2.0 * np.pi * self.radii) if axisymmetric else weights
+
+    def require_radius(self) -> None:
+        """Raise an error unless ``x[0]`` can be a radius (collective)."""
+        with agree(self.mesh.comm):
+            if self._gdim != 2:
+                raise MPMError("An axisymmetric body is a mesh in the (r, z) plane.")
+            left = self._nodes[self.domain_nodes][:, :, 0].min(axis=1) < -1e-12
+            if left.any():
+                raise MPMError(
+                    "The domains of {particles} have a negative radius; an axisymmetric body "
+                    "lies at x[0] >= 0.",
+                    self.global_index[left],
+                )
+
+    @property
+    def present_weights(self) -> NDArray[np.float64]:
+        """Reference volumes of the history's points, shape ``(n, nq)``; 0 where deleted."""
+        weights = self.quadrature.weights
+        return np.where(self.deleted[:, None], 0.0, weights) if self.deletion else weights
+
+    @property
+    def deleted(self) -> NDArray[np.bool_]:
+        """Whether each particle this rank owns is deleted, shape ``(n,)``."""
+        if self.deletion is None:
+            return np.zeros(self.num_local, dtype=bool)
+        return self.deletion.mask
+
+    @property
+    def initial_domains(self) -> NDArray[np.float64]:
+        """Corners of the undeformed domains, shape ``(n, k, gdim)``."""
+        return np.asarray(self._nodes[self.domain_nodes])
+
+    @property
+    def initial_volume(self) -> NDArray[np.float64]:
+        """Volume of the undeformed domains, shape ``(n,)``; an area in the plane."""
+        return self._initial_volume.copy()
+
+    @property
+    def volume(self) -> NDArray[np.float64]:
+        """Volume of the domains now, shape ``(n,)``; an area in the plane."""
+        exact = self._exact_quadrature()
+        ratio = volume_ratio(exact.displacement_gradient(self._nodal()))
+        return np.asarray((exact.weights * ratio).sum(axis=1))
+
+    @property
+    def initial_centroid(self) -> NDArray[np.float64]:
+        """Centroid of the undeformed domains, shape ``(n, gdim)``."""
+        return self._mean(self._nodes[self.domain_nodes])
+
+    @property
+    def centroid(self) -> NDArray[np.float64]:
+        """Particle positions: mean of ``X + d`` over the domains, shape ``(n, gdim)``."""
+        return self._mean(self._nodes[self.domain_nodes] + self._nodal())
+
+    @property
+    def initial_points(self) -> NDArray[np.float64]:
+        """Undeformed positions of the quadrature points, shape ``(n, nq, gdim)``."""
+        return self._at_points(self._nodes[self.domain_nodes])
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """Positions of the quadrature points, shape ``(n, nq, gdim)``."""
+        return self._at_points(self._nodes[self.domain_nodes] + self._nodal())
+
+    def _mean(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.einsum("nk,nki->ni", self._averages, nodal))
+
+    def _at_points(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.einsum("qk,nki->nqi", self.quadrature.shapes, nodal))
+
+    def _exact_quadrature(self) -> DomainQuadrature:
+        """Return the rule exact for body force and mass, many times the size of a body's rest."""
+        return DomainQuadrature(self.mesh, self._shape_functions, self._exact_degree)
+
+    @cached_property
+    def _initial_volume(self) -> NDArray[np.float64]:
+        return np.asarray(self._exact_quadrature().weights.sum(axis=1))
+
+    @cached_property
+    def _averages(self) -> NDArray[np.float64]:
+        """Averages of the shape functions over the undeformed domains, shape ``(n, k)``."""
+        exact = self._exact_quadrature()
+        return np.asarray(exact.weights @ exact.shapes / exact.weights.sum(axis=1)[:, None])
+
+    def outlined(self, domains: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the equispaced nodes of domains that are given by their own nodes.
+
+        Args:
+            domains: Nodes of domains, shape ``(n, k, gdim)``.
+        """
+        degree = self._shape_functions.degree
+        if degree == 1:
+            return domains
+        cell = self.mesh.basix_cell()
+        element = _compat.equispaced_element(cell, degree, self._gdim).basix_element
+        table = self._shape_functions.tabulate(0, element.points)[0, :, :, 0]
+        return np.asarray(np.einsum("qk,nki->nqi", table, domains))
+
+    def inverted(self) -> NDArray[np.int64]:
+        """Return global indices of domains with ``det F <= 0`` or not finite at a point."""
+        gradient = self.displacement_gradient()
+        return np.asarray(self.global_index[~(volume_ratio(gradient) > 0.0).all(axis=1)])
+
+    def crossed(self) -> NDArray[np.int64]:
+        """Return global indices of quadrilaterals whose edges cross.
+
+        A quadrilateral with one corner turned inwards is concave, with two it crosses itself
+        and part of it is inverted. Other domains cannot cross without ``det F <= 0``.
+        """
+        shapes = self._shape_functions
+        quadrilateral = self.mesh.basix_cell() == basix.CellType.quadrilateral
+        if not quadrilateral or shapes.discontinuous or shapes.degree > 1:
+            return self.global_index[:0]
+        inwards = (self._corner_jacobians() <= 0.0).sum(axis=1)
+        return np.asarray(self.global_index[inwards >= 2])
+
+    def folded(self) -> NDArray[np.int64]:
+        """Return global indices of domains whose map is not one to one everywhere.
+
+        Decided by a bound (Bernstein coefficients of the Jacobian), not by sampling, at the
+        present displacement. Such a domain covers a part of itself twice; it goes on as long as
+        ``det F > 0`` at its quadrature points.
+        """
+        now = self._nodes[self.domain_nodes] + self._nodal()
+        sign = np.sign(self._orientation[:, 0])
+        return np.asarray(self.global_index[self._jacobian_bound.vanishes(now, sign)])
+
+    def domain_distortion(self) -> NDArray[np.float64]:
+        """Return the smallest det J of each domain over its mean, shape ``(n,)``.
+
+        One for an undistorted domain, zero or less where a quadrilateral is concave. For curved
+        domains and hexahedra it is a bound from below.
+        """
+        mean = self.volume / quadrature_rule(self.mesh.basix_cell(), 0)[1].sum()
+        now = self._nodes[self.domain_nodes] + self._nodal()
+        least = self._jacobian_bound.lower_bound(now, np.sign(self._orientation[:, 0]))
+        return np.asarray(least / np.abs(mean))
+
+    @cached_property
+    def _jacobian_bound(self) -> JacobianBound:
+        return JacobianBound(self.mesh.basix_cell(), self._shape_functions)
+
+    def _corner_jacobians(self) -> NDArray[np.float64]:
+        """Return det J at the corners of the present domains, positive as in the undeformed."""
+        points = basix.geometry(self.mesh.basix_cell())
+        slopes = self._shape_functions.tabulate(1, points)[1:, :, :, 0]
+        now = self._nodes[self.domain_nodes] + self._nodal()
+        det = np.linalg.det(np.einsum("jqk,nki->nqij", slopes, now))
+        return np.asarray(np.sign(self._orientation) * det)
+
+    @cached_property
+    def _orientation(self) -> NDArray[np.float64]:
+        """Sign of the reference map of each undeformed domain, shape ``(n, 1)``."""
+        middle = basix.geometry(self.mesh.basix_cell()).mean(axis=0)[None]
+        slopes = self._shape_functions.tabulate(1, middle)[1:, :, :, 0]
+        corners = self._nodes[self.domain_nodes]
+        return np.asarray(np.linalg.det(np.einsum("jqk,nki->nqij", slopes, corners)))
