@@ -3,7 +3,8 @@
 """MkDocs hook: one page per public name, from the package's source without importing it.
 
 Public are the names in ``__all__`` of ``mpm_dolfinx``, of ``mpm_dolfinx.materials``, and of each
-module that one of these lists holds.
+module that one of these lists holds. A page also has what its class inherits from bases that are
+not public.
 """
 
 from __future__ import annotations
@@ -61,12 +62,19 @@ def module_pages(module: Any, folder: str, pages: dict[str, str]) -> list[Any]:
             nav.append({name: module_pages(member, f"{folder}/{name}", pages)})
         else:
             target = f"{name}.md"
-            pages[f"{folder}/{target}"] = f"::: {module.path}.{name}\n"
+            pages[f"{folder}/{target}"] = f"::: {module.path}.{name}\n" + inherited(member, names)
             nav.append({name: f"{folder}/{target}"})
         rows.append(f"| [`{name}`]({target}) | {summary} |")
     title = f"# `{module.path}`\n\n{first_sentence(module)}\n\n"
     pages[f"{folder}/index.md"] = title + "\n".join(["| name | |", "| --- | --- |", *rows]) + "\n"
     return nav
+
+
+def inherited(member: Any, names: list[str]) -> str:
+    """Return the option that adds what a class has from bases without a page of their own."""
+    bases = [base for base in member.mro() if base.name not in names] if member.is_class else []
+    described = [n for b in bases for n, m in b.members.items() if n[0] != "_" and m.docstring]
+    return f"    options:\n      inherited_members: {described}\n" if described else ""
 
 
 def exports(module: Any) -> list[str]:

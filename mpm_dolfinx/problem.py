@@ -20,17 +20,14 @@ from tqdm import tqdm
 import ufl
 from dolfinx import fem
 
-from . import _compat, checkpoint, state
+from . import checkpoint, state
 from .assembly import BackgroundForms, BodyForms, PointStress, is_fast
+from .bodies import as_bodies, as_conditions, may_stop, move_bodies, one_for_each
 from .boundary import Support
 from .cleanup import Cleaner
-from .errors import (
-    ConvergenceError,
-    DomainDistortionError,
-    MPMError,
-    ParticleOutsideError,
-)
-from .history import History, Loss, Step
+from .diagnosis import placed
+from .errors import ConvergenceError, DomainDistortionError, MPMError, ParticleOutsideError
+from .history import History, Step
 from .io import TimeSeries
 from .particles import Particles
 from .predictor import Predictor
@@ -126,18 +123,9 @@ class ParticleProblem:
         self.particles = particles
         self.bodies = as_bodies(particles)
         V = self.bodies[0].V
-        residuals = _one_for_each(R, self.bodies, "residual R")
-        tangents = [None] * len(self.bodies) if J is None else _one_for_each(J, self.bodies, "J")
-        if not isinstance(bcs, list | tuple) or not all(
-            isinstance(bc, fem.DirichletBC) for bc in bcs
-        ):
-            raise MPMError("bcs must be a list of dolfinx.fem.DirichletBC.")
-        self.bcs = list(bcs)
-        if not all(_compat.is_condition_on(bc, V) for bc in self.bcs):
-            raise MPMError(
-                "A Dirichlet condition is not on the background space V of the particles "
-                "or on a component of it (V.sub(i))."
-            )
+        residuals = one_for_each(R, self.bodies, "residual R")
+        tangents = [None] * len(self.bodies) if J is None else one_for_each(J, self.bodies, "J")
+        self.bcs = as_conditions(bcs, V)
         if "history" not in self.__dict__:  # made anew by repartition
             self.history = History()
         self._comm: MPI.Comm = V.mesh.comm
@@ -287,35 +275,33 @@ class ParticleProblem:
         if not isinstance(steps, int | np.integer) or steps < 1:
             raise MPMError(f"The number of steps must be a whole number from 1 on, not {steps!r}.")
         run = self._begin_run(int(steps), update)
-        control, start, base = run.control, run.start, run.base
+        control = run.control
         while not control.finished:
-            t = control.target
-            load = t if update is not None else start + (1.0 - start) * t
+            t, load = control.target, run.load
             try:
                 self._set_load(load)
                 if update is not None:
                     update(t)
-                    values = self._dirichlet_values()
-                else:
-                    values = base + (self._dirichlet_values() - base) * t
-                last = control.target == 1.0
-                step = self._advance(t if update is not None else load, values, last)
+                values = run.dirichlet_values(self._dirichlet_values())
+                step = self._advance(load, values, last=t == 1.0)
             except (ConvergenceError, DomainDistortionError) as error:
                 self._restore()
                 self.history.failed_iterations += self._newton.iterations
-                if not control.cut_back(self._newton.no_equilibrium):
+                no_equilibrium = self._newton.no_equilibrium
+                if not control.cut_back(no_equilibrium):
                     self._restore(update)
-                    raise self._placed(error, t) from None
+                    limit = t if no_equilibrium else None
+                    raise placed(error, self.reduced, self._parameter, limit) from None
                 self.history.cutbacks += 1
                 continue
             except MPMError as error:
                 self._restore(update)
-                placed = self._placed(error)
-                if self._may_stop and isinstance(placed, ParticleOutsideError):
-                    self.history.stopped = placed
-                    self._warn(f"The run stopped. {placed!s}")
+                told = placed(error, self.reduced, self._parameter)
+                if may_stop(self.bodies) and isinstance(told, ParticleOutsideError):
+                    self.history.stopped = told
+                    self._warn(f"The run stopped. {told!s}")
                     return
-                raise placed from None
+                raise told from None
             control.accept(step.iterations)
             if repartition is not None:
                 self.repartition(repartition)
@@ -326,15 +312,9 @@ class ParticleProblem:
     def _begin_run(self, steps: int, update: Callable[[float], None] | None) -> Run:
         """Return a new run, or the one that a checkpoint interrupted."""
         if self._resume and self._run is not None:
-            run = self._run
-            if (steps, update is not None) != (run.control.steps, run.path):
-                kind = "update=..." if run.path else "no path (update=None)"
-                raise MPMError(
-                    f"The checkpoint was made in a run of {run.control.steps} steps with {kind}; "
-                    "go on with these, or restore it with resume=False to begin a new run."
-                )
+            self._run.require(steps, update is not None)
             self._resume = False
-            return run
+            return self._run
         if update is None and self._loaded >= 1.0:
             raise MPMError(
                 "The whole load is applied already; go on with problem.step() or with a path "
@@ -365,7 +345,7 @@ class ParticleProblem:
         except MPMError as error:
             self._restore()
             self.history.failed_iterations += self._newton.iterations
-            raise self._placed(error) from None
+            raise placed(error, self.reduced, self._parameter) from None
 
     # -- Results --------------------------------------------------------------------------
 
@@ -428,12 +408,6 @@ class ParticleProblem:
                     body.locate()
         except ParticleOutsideError as error:
             self._warn(f"The run is complete, but {error!s}")
-
-    @property
-    def _may_stop(self) -> bool:
-        """Whether a run that leaves the background ends without an error."""
-        policies = {body.outside for body in self.bodies}
-        return "stop" in policies and "error" not in policies
 
     def _warn(self, sentence: str) -> None:
         if self._comm.rank == 0:
@@ -508,7 +482,7 @@ class ParticleProblem:
         self._newton.solve(self.reduced, self.reduced.sizes)
         if (failure := self.reduced.crossed()) is not None:
             raise failure
-        self._move_bodies(parameter, last)
+        move_bodies(self.bodies, self.history, self._masses, parameter, last)
         with self.history.statistics.phase("commit"):
             self.commit()
             self._prescribed = values.copy()
@@ -521,42 +495,6 @@ class ParticleProblem:
         step = Step(parameter, self._newton.iterations, list(self._newton.residuals))
         self.history.steps.append(step)
         return step
-
-    def _move_bodies(self, parameter: float, last: bool) -> None:
-        """Make the present displacements the converged ones, and delete what leaves.
-
-        None are changed where one body is outside that must not be.
-        """
-        before = [body.commit() for body in self.bodies]
-        leaving: list[NDArray[np.int64]] = []
-        try:
-            with self.history.statistics.phase("locate"):
-                for body in self.bodies:
-                    if body.deletion is not None or not last:
-                        leaving.append(body.leaving())
-                    else:
-                        leaving.append(np.zeros(0, dtype=np.int64))
-        except ParticleOutsideError:
-            for body, converged in zip(self.bodies, before, strict=True):
-                body.restore(converged)
-            raise
-        for number, which in enumerate(leaving):
-            if self._comm.allreduce(len(which)) > 0:
-                self._record_loss(parameter, number, which)
-                self.bodies[number].delete(which)
-
-    def _record_loss(self, parameter: float, number: int, which: NDArray[np.int64]) -> None:
-        """Report what is about to be deleted."""
-        body = self.bodies[number]
-        masses = self._masses(number)
-        mass = None if masses is None else float(self._comm.allreduce(masses[which].sum()))
-        indices = {p for ps in self._comm.allgather(body.global_index[which].tolist()) for p in ps}
-        volume = float(self._comm.allreduce(body.initial_volume[which].sum()))
-        self.history.losses.append(Loss(parameter, number, sorted(indices), volume, mass))
-        statistics = self.history.statistics
-        statistics["lost_particles"] += len(indices)
-        statistics["lost_volume"] += volume
-        statistics["lost_mass"] += mass or 0.0
 
     def _set_load(self, load: float) -> None:
         for body in self.bodies:
@@ -579,40 +517,6 @@ class ParticleProblem:
         self.roll_back()
         if update is not None and self._parameter > 0.0:
             update(self._parameter)
-
-    def _placed(self, error: MPMError, tried: float | None = None) -> MPMError:
-        """Say at what load an error happened, and what to do.
-
-        Args:
-            error: It.
-            tried: End of the smallest step tried.
-        """
-        advice = {
-            DomainDistortionError: "; take more steps, smaller loads or finer domains",
-            ConvergenceError: "; take more steps, or look whether a limit load is reached",
-        }.get(type(error), "")
-        if tried is not None and self._newton.no_equilibrium:
-            advice = (
-                f"; no equilibrium was found up to {tried:.6g}, which is a limit load unless more "
-                "steps get over it"
-            )
-        particles, text = error.particles, error.message.rstrip(".")
-        dofs: list[int] = []
-        if isinstance(error, ConvergenceError) and not particles:
-            particles = self.reduced.worst_particles()
-            dofs, where = self.reduced.worst_dof()
-            if particles and dofs:
-                text += (
-                    f"; the residual is largest at dof {dofs[0]} of V near {where}, and at "
-                    "{particles}"
-                )
-        placed = type(error)(
-            f"{text}, in the step after load {self._parameter:.6g}{advice}.",
-            particles,
-            self._parameter,
-        )
-        placed.dofs = dofs
-        return placed
 
     # -- What a problem with a material adds -----------------------------------------------
 
@@ -663,32 +567,3 @@ class ParticleProblem:
         """Return Functions at quadrature points that the forms hold and no history keeps."""
         keeps = type(self).converged_state is not ParticleProblem.converged_state
         return set() if keeps else self._data
-
-
-def as_bodies(particles: Particles | Sequence[Particles]) -> list[Particles]:
-    """Return the bodies of a problem as a list.
-
-    Raises:
-        MPMError: Something else than particles, or particles on different backgrounds.
-    """
-    bodies = [particles] if isinstance(particles, Particles) else particles
-    if (
-        not isinstance(bodies, list | tuple)
-        or not bodies
-        or not all(isinstance(body, Particles) for body in bodies)
-    ):
-        raise MPMError(
-            f"particles must be mpm.Particles or a list of them, not {type(particles).__name__}."
-        )
-    if len({id(body) for body in bodies}) < len(bodies):
-        raise MPMError("The same particles are given twice.")
-    if any(body.V is not bodies[0].V for body in bodies):
-        raise MPMError("All particles of one problem must be made with the same space V.")
-    return list(bodies)
-
-
-def _one_for_each(forms: Any, bodies: list[Particles], what: str) -> list[Any]:
-    given = list(forms) if isinstance(forms, list | tuple) else [forms]
-    if len(given) != len(bodies):
-        raise MPMError(f"There are {len(bodies)} bodies; give one {what} for each, as a list.")
-    return given

@@ -16,6 +16,7 @@ from dolfinx import fem
 
 from . import state
 from .assembly import PointStress, is_fast
+from .bodies import as_bodies
 from .boundary import Support
 from .constitutive import ConstitutiveHistory
 from .errors import MPMError
@@ -23,7 +24,7 @@ from .expressions import as_expression, carried, facet_measure, require_movable
 from .f_bar import F_BARS, LowRankTangent
 from .grouping import background_cells
 from .particles import Particles
-from .problem import Law, ParticleProblem, as_bodies
+from .problem import Law, ParticleProblem
 from .quadrature import depends_on
 
 __all__ = ["QuasiStaticProblem"]

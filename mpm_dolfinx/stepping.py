@@ -10,6 +10,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from .errors import MPMError
+
 __all__ = ["Run", "StepControl"]
 
 #: How often a step may be halved, and the linear solves of a step that is easy.
@@ -100,6 +102,31 @@ class Run:
     path: bool
     start: float
     base: NDArray[np.float64]
+
+    @property
+    def load(self) -> float:
+        """Load factor, or parameter of the path, at the end of the step to try."""
+        t = self.control.target
+        return t if self.path else self.start + (1.0 - self.start) * t
+
+    def dirichlet_values(self, totals: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the Dirichlet values at the end of the step to try.
+
+        Args:
+            totals: Those at full load, or on a path those that it has set for this step.
+        """
+        if self.path:
+            return totals
+        return self.base + (totals - self.base) * self.control.target
+
+    def require(self, steps: int, path: bool) -> None:
+        """Raise an error unless this run has so many steps, and a path of the user's or none."""
+        if (steps, path) != (self.control.steps, self.path):
+            kind = "update=..." if self.path else "no path (update=None)"
+            raise MPMError(
+                f"The checkpoint was made in a run of {self.control.steps} steps with {kind}; "
+                "go on with these, or restore it with resume=False to begin a new run."
+            )
 
     def numbers(self) -> dict[str, Any]:
         """Return all but the Dirichlet values, for a checkpoint."""
