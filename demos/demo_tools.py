@@ -26,12 +26,12 @@ from typing import Any
 from mpi4py import MPI
 
 import numpy as np
-from tqdm import tqdm
 
 from dolfinx import mesh
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx._compat import NonlinearProblem, interpolation_points  # noqa: F401 (for demos)
+from mpm_dolfinx.progress import with_bar
 
 comm = MPI.COMM_WORLD
 
@@ -207,16 +207,7 @@ def lambert_w(x: Any) -> np.ndarray:
 
 def progress(steps: Iterable[mpm.Step], number: int, args: argparse.Namespace) -> Iterator:
     """Go through load steps with the bar that `solve(progress=True)` shows."""
-    with tqdm(
-        total=number,
-        disable=args.json or comm.rank > 0,
-        unit="step",
-        bar_format="{l_bar}{bar}| {n:.3g}/{total} [{elapsed}<{remaining}{postfix}]",
-    ) as bar:
-        for step in steps:
-            bar.set_postfix_str(f"{step.iterations} solves")
-            bar.update(step.load * number - bar.n)
-            yield step
+    yield from steps if args.json or comm.rank > 0 else with_bar(steps, number)
 
 
 def outcome(history: mpm.History, failure: mpm.MPMError | None) -> dict[str, Any]:

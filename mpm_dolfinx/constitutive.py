@@ -148,10 +148,12 @@ class ConstitutiveHistory:
                 continue
             values = self._per_cell(name, value)
             replaced[name] = np.repeat(values, self._particles.num_points)
-        resolved = material.with_parameters(**replaced).at(points)
-        if not self._compiled and isinstance(resolved, IsotropicElastic):
-            resolved.compiled = False
-        return resolved
+        if replaced:
+            material = material.with_parameters(**replaced).at(points)
+        if not self._compiled and isinstance(material, IsotropicElastic):
+            material = material.with_parameters()
+            material.compiled = False
+        return material
 
     def _per_cell(self, name: str, value: Any) -> NDArray[np.float64]:
         n = self._particles.num_local

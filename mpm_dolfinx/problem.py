@@ -15,7 +15,6 @@ from petsc4py import PETSc
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 import ufl
 from dolfinx import fem
@@ -31,6 +30,7 @@ from .history import History, Step
 from .io import TimeSeries
 from .particles import Particles
 from .predictor import Predictor
+from .progress import with_bar
 from .quadrature import data_at_points
 from .reduced import Body, ReducedSystem
 from .solver import NewtonSolver, weakly
@@ -240,15 +240,9 @@ class ParticleProblem:
                 ``outside="stop"`` a particle that leaves the background is no error: the run
                 ends, ``history.stopped`` and a warning say why.
         """
-        with tqdm(
-            total=steps,
-            disable=not progress or self._comm.rank > 0,
-            unit="step",
-            bar_format="{l_bar}{bar}| {n:.3g}/{total} [{elapsed}<{remaining}{postfix}]",
-        ) as bar:
-            for step in self.steps(steps, update, repartition):
-                bar.set_postfix_str(f"{step.iterations} solves")
-                bar.update(step.load * steps - bar.n)
+        path = self.steps(steps, update, repartition)
+        for _ in with_bar(path, steps) if progress and self._comm.rank == 0 else path:
+            pass
         return self.history
 
     def steps(

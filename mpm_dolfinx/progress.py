@@ -1,0 +1,34 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""A progress bar for load steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from .history import Step
+
+__all__ = ["with_bar"]
+
+
+def with_bar(steps: Iterable[Step], number: int) -> Iterator[Step]:
+    """Go through load steps with a bar on the terminal.
+
+    Args:
+        steps: Converged steps.
+        number: How many equal steps the whole load is.
+
+    Yields:
+        Each of the steps.
+    """
+    from tqdm import tqdm  # (a tenth of the start-up, for those who want it)
+
+    with tqdm(
+        total=number,
+        unit="step",
+        bar_format="{l_bar}{bar}| {n:.3g}/{total} [{elapsed}<{remaining}{postfix}]",
+    ) as bar:
+        for step in steps:
+            bar.set_postfix_str(f"{step.iterations} solves")
+            bar.update(step.load * number - bar.n)
+            yield step
