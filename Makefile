@@ -16,7 +16,7 @@ BIN := $(VENV)/bin
 SETUP := sh scripts/setup_env.sh
 
 # Benchmarks that print a JSON object; work_precision.py writes its results and pictures itself.
-BENCHMARKS := $(wildcard $(patsubst %,benchmarks/%.py,assembly step skip solvers))
+BENCHMARKS := $(wildcard $(patsubst %,benchmarks/%.py,assembly step skip solvers scaling))
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test test-debian stress bench bench-smoke lint docs clean
