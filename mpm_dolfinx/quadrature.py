@@ -140,16 +140,16 @@ class DomainQuadrature:
 
 def volume_ratio(gradient: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return ``det(I + H)`` of displacement gradients H, shape ``(..., dim, dim)``."""
-    F = np.moveaxis(gradient, (-2, -1), (0, 1)) + np.eye(gradient.shape[-1]).reshape(
-        (gradient.shape[-1],) * 2 + (1,) * (gradient.ndim - 2)
-    )
+    H, dim = gradient, gradient.shape[-1]
+    diagonal = [1.0 + H[..., i, i] for i in range(dim)]
     with np.errstate(invalid="ignore", over="ignore"):
-        if len(F) == 2:
-            return np.asarray(F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0])
+        if dim == 2:
+            return np.asarray(diagonal[0] * diagonal[1] - H[..., 0, 1] * H[..., 1, 0])
+        x, y, z = diagonal
         return np.asarray(
-            F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1])
-            - F[0, 1] * (F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0])
-            + F[0, 2] * (F[1, 0] * F[2, 1] - F[1, 1] * F[2, 0])
+            x * (y * z - H[..., 1, 2] * H[..., 2, 1])
+            - H[..., 0, 1] * (H[..., 1, 0] * z - H[..., 1, 2] * H[..., 2, 0])
+            + H[..., 0, 2] * (H[..., 1, 0] * H[..., 2, 1] - y * H[..., 2, 0])
         )
 
 
