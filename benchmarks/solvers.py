@@ -161,7 +161,7 @@ def main() -> None:
         parser.error("--size needs --scene")
     if args.steps < 1 or any(size <= 0 for size in args.size or ()):
         parser.error("--steps and --size must be positive")
-    history_module.time = SimpleNamespace(perf_counter=time.process_time)  # type: ignore[assignment]
+    history_module.time = SimpleNamespace(perf_counter=time.process_time)
     results: dict[str, Any] = {"scenes": []}
     root = MPI.COMM_WORLD.rank == 0
     for scene in SCENES if args.scene == "all" else [args.scene]:

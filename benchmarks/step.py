@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from typing import Any
 
 from solvers import flow
 
@@ -17,7 +18,7 @@ SIZES = "0.5,0.25,0.125,0.04"
 SOLVER = ("factorise", "solve")
 
 
-def measure(size: float, steps: int) -> dict[str, object]:
+def measure(size: float, steps: int) -> dict[str, Any]:
     """Run the first steps in cells of one size."""
     problem = flow(size, {})
     path = problem.steps(40)
@@ -48,14 +49,14 @@ def main() -> None:
     args = parser.parse_args()
     sizes = [1.0, 0.5] if args.smoke else [float(size) for size in args.sizes.split(",")]
     rows = [measure(size, args.steps) for size in sizes]
-    cost = [float(row["us_per_particle_and_solve"]) for row in rows]  # type: ignore[arg-type]
+    cost = [row["us_per_particle_and_solve"] for row in rows]
     if args.json:
         print(json.dumps({"sizes": rows, "growth": cost[-1] / cost[0]}))
         return
-    phases = list(rows[0]["seconds"])  # type: ignore[call-overload]
+    phases = list(rows[0]["seconds"])
     print("seconds per step".ljust(18) + "".join(f"{name:>13s}" for name in phases))
     for row in rows:
-        values = "".join(f"{row['seconds'][name]:13.4f}" for name in phases)  # type: ignore[index]
+        values = "".join(f"{row['seconds'][name]:13.4f}" for name in phases)
         print(f"{row['particles']:>10} triangles{values}")
     print("microseconds per particle and solve, without the linear solver:")
     print(", ".join(f"{value:.2f}" for value in cost))
