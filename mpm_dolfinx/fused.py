@@ -213,7 +213,9 @@ class FusedTangent:
             [[0], *(s.offsets[1:] + end for s, end in zip(self._shares, ends, strict=False))]
         )
         nodes = np.concatenate([share.nodes for share in self._shares])
-        self._pattern, self._blocks, positions = self._row_lists(offsets, nodes)
+        self._pattern, self._blocks, positions = loops.pattern(
+            offsets.astype(np.int64), nodes, len(self._touched)
+        )
         pairs = [int((np.diff(share.offsets) ** 2).sum()) for share in self._shares]
         split = np.split(positions, np.cumsum(pairs)[:-1])
         for share, part in zip(self._shares, split, strict=True):
@@ -236,14 +238,6 @@ class FusedTangent:
             self._entries = np.empty(len(columns))
             _compat.set_entry_places(self._A, np.repeat(rows, np.diff(starts)), columns)
 
-    def _row_lists(
-        self, offsets: NDArray[np.int64], nodes: NDArray[np.int32]
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-        assert self._touched is not None
-        pattern: tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]
-        pattern = loops.pattern(offsets.astype(np.int64), nodes, len(self._touched))
-        return pattern
-
     def assemble(self, keep: bool) -> PETSc.Mat:
         """Return ``T^T K T``; the same object as long as the pattern lasts (collective).
 
@@ -256,7 +250,7 @@ class FusedTangent:
             share.add(values)
         loops.gather(values, self._sources, self._entries)
         if self._comm.size > 1:
-            self._A.setValuesCOO(self._entries, PETSc.InsertMode.INSERT_VALUES)
+            _compat.set_entries(self._A, self._entries)
         self._A.assemble()
         self._values = values if keep else None
         return self._A
