@@ -63,7 +63,10 @@ class CellPolynomials:
         self._degree = V.ufl_element().degree
         order = _compat.geometry_degree(V.mesh)
         shape = basix.ufl.element("Lagrange", cell.name, order).basix_element
-        points, self._weights = basix.make_quadrature(cell, 2 * self._degree + self._gdim * order)
+        # Gauss and Jacobi's weights are positive, which not all rules on simplices have.
+        points, self._weights = basix.make_quadrature(
+            cell, 2 * self._degree + self._gdim * order, rule=basix.QuadratureType.gauss_jacobi
+        )
         self._values = V.ufl_element().basix_element.tabulate(0, points)[0, :, :, 0]
         self._map = shape.tabulate(1, points)[:, :, :, 0]
         self._middle = shape.tabulate(1, basix.geometry(cell).mean(axis=0)[None])[:, 0, :, 0]
@@ -91,7 +94,8 @@ class CellPolynomials:
         points = np.einsum("qm,nmi->nqi", self._map[0], vertices)
         jacobian = np.einsum("jqm,nmi->nqij", self._map[1:], vertices)
         measure = self._weights * np.abs(np.linalg.det(jacobian))
-        table = self.at(points, frame)
-        weighted = (table * measure[:, :, None]).swapaxes(1, 2)
-        mass = weighted @ table
-        return Moments(mass, np.linalg.solve(mass, weighted @ self._values), measure.sum(axis=1))
+        root = np.sqrt(measure)[:, :, None]
+        # The mass matrix squares the condition of its factor, from which one does as well.
+        Q, R = np.linalg.qr(root * self.at(points, frame))
+        coefficients = np.linalg.solve(R, Q.swapaxes(1, 2) @ (root * self._values))
+        return Moments(R.swapaxes(1, 2) @ R, coefficients, measure.sum(axis=1))

@@ -184,7 +184,9 @@ def grid(particles: Particles) -> Any:
         for name in ("start", "now")
     )
     cells = np.arange(len(now)).reshape(len(order), -1)
-    result = pyvista.UnstructuredGrid({cell_type: cells}, now)
+    sizes = np.full((len(order), 1), cells.shape[1])
+    types = np.full(len(order), cell_type, dtype=np.uint8)
+    result = pyvista.UnstructuredGrid(np.hstack([sizes, cells]).ravel(), types, now)
     result.point_data["displacement"] = now - start
     for name, values in whole.items():
         result.cell_data[name] = values.reshape(len(order), -1) if values.ndim > 1 else values
