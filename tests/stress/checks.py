@@ -416,7 +416,8 @@ class Observer:
         found, figures = [], {}
         self._check_numbers(found)
         self._check_mass(found, figures)
-        if self.steps and not found:
+        # Of what follows much is collective, and one rank may have found what others have not.
+        if self.steps and not any(self.comm.allgather(bool(found))):
             if self.exact:
                 self._check_balance(found, figures)
             elif self.whole:
