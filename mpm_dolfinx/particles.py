@@ -59,7 +59,7 @@ class Particles(Domains):
             right stretch) or ``"fixed"`` (the box only translates).
         partition: ``"given"`` leaves the cells of ``body`` on their ranks; ``"background"``
             makes ``mesh`` a copy of it whose cells are on the ranks that own the background
-            where they lie, as evenly as can be.
+            where they lie, or in even compact parts where a rank would get too many.
 
     Attributes:
         mesh: The body mesh, undeformed: ``body``, or its copy with ``partition="background"``.
@@ -171,8 +171,8 @@ class Particles(Domains):
     def ranks_of_background(self) -> NDArray[np.int64]:
         """Return the rank on which each particle would best be now, shape ``(n,)`` (collective).
 
-        That which owns the background where the particle is, or its own where that has 5 % more
-        than an even share already.
+        That which owns the background where the particle is; where a rank would get more than
+        5 % above an even share, that of the compact part that the particle is in.
         """
         return ranks_of_background(self.V, self._background, self.centroid)
 

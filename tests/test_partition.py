@@ -168,6 +168,21 @@ def test_particles_are_where_their_background_is():
 
 
 @pytest.mark.mpi
+def test_particles_of_a_rank_are_together():
+    # A column in a corner of the background, which flows until it is a flat heap.
+    problem = scenes.slump(TRIANGLE, 40e3, h=0.5, width=30.0)
+    problem.solve(steps=10)
+    before = problem.history.statistics["off_rank_rows"]
+    assert problem.repartition(0.1)
+    for _ in range(2):  # each part stays with the rank that has it
+        assert not problem.repartition(0.01)
+    problem.particles.load.value = 0.99
+    problem.step()
+    assert problem.history.statistics["off_rank_rows"] < 0.7 * before
+    assert problem.history.statistics["particle_imbalance"] <= 1.05
+
+
+@pytest.mark.mpi
 def test_idle_ranks_get_particles():
     # All in one corner, and all on one rank: nobody has more than its share afterwards.
     problem = scenes.block()
