@@ -7,6 +7,7 @@ from . import _compat
 _compat.require_supported()
 
 from . import boundary, materials, plot  # noqa: E402
+from .displacement_control import DisplacementControl  # noqa: E402
 from .errors import (  # noqa: E402
     ConvergenceError,
     DomainDistortionError,
@@ -23,6 +24,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "ConvergenceError",
+    "DisplacementControl",
     "DomainDistortionError",
     "History",
     "Loss",

@@ -122,6 +122,7 @@ class BodyForms:
         internal: As given.
         fused: Parts of the tangent that the compiled loops assemble.
         stock: Parts of the tangent in :attr:`K`.
+        follows_load: Whether what the load factor does depends on the displacement.
         K: The stock parts of the tangent, on W, as assembled last.
         low_rank: What the tangent has besides the forms, or ``None``.
 
@@ -168,6 +169,13 @@ class BodyForms:
         self._element = particles.W.ufl_element()
         self._live = self._compile(live)
         self._dead = self._compile(dead)
+        load = particles.load
+        self._loaded = [
+            form
+            for part, form in zip([*live, *dead], [*self._live, *self._dead], strict=True)
+            if any(constant is load for constant in part.constants())
+        ]
+        self.follows_load = any(any(c is load for c in part.constants()) for part in live)
         together = [fast and not _couples_cells(form) for form in tangents]
         compiled = self._compile(tangents)
         self.fused = [form for form, fuse in zip(compiled, together, strict=True) if fuse]
@@ -203,6 +211,28 @@ class BodyForms:
     def assemble_external(self) -> None:
         """Assemble the parts that do not depend on the displacement."""
         _assemble_into(self.external, self._dead)
+
+    def load_derivative(self, order: int = 1) -> tuple[PETSc.Vec, float]:
+        """Return a difference quotient of the residual by the load factor (collective).
+
+        Args:
+            order: 1, which is the derivative where the residual is affine in the load factor,
+                or 2, which is zero there.
+
+        Returns:
+            The quotient, and the size of what it is the difference of.
+        """
+        load, coefficients = self._particles.load, {1: (-1.0, 1.0), 2: (1.0, -2.0, 1.0)}[order]
+        present, size = load.value.copy(), 0.0
+        total, at = self.r.duplicate(), self.r.duplicate()
+        total.set(0.0)
+        for factor, coefficient in enumerate(coefficients):
+            load.value[...] = factor
+            _assemble_into(at, self._loaded)
+            total.axpy(coefficient, at)
+            size += float(at.norm())
+        load.value[...] = present
+        return total, size
 
     def assemble_residual(self) -> PETSc.Vec:
         """Assemble the residual; the external parts are those of ``assemble_external``."""

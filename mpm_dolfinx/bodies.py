@@ -7,6 +7,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +19,15 @@ from .errors import MPMError, ParticleOutsideError
 from .history import History, Loss
 from .particles import Particles
 
-__all__ = ["as_bodies", "as_conditions", "may_stop", "move_bodies", "one_for_each"]
+__all__ = [
+    "as_bodies",
+    "as_conditions",
+    "dirichlet_values",
+    "force_at",
+    "may_stop",
+    "move_bodies",
+    "one_for_each",
+]
 
 type Masses = Callable[[int], NDArray[np.float64] | None]
 """Masses of the owned particles of a body, by its number; ``None`` where they are not known."""
@@ -71,6 +81,39 @@ def as_conditions(bcs: Any, V: fem.FunctionSpace) -> list[fem.DirichletBC]:
             "or on a component of it (V.sub(i))."
         )
     return list(bcs)
+
+
+def dirichlet_values(bcs: Sequence[fem.DirichletBC], V: fem.FunctionSpace) -> NDArray[np.float64]:
+    """Return the present totals of Dirichlet conditions, on the local dofs of V (collective).
+
+    Raises:
+        MPMError: Some are not finite.
+    """
+    values: NDArray[np.float64] = np.array(fem.Function(V).x.array)
+    for bc in bcs:
+        bc.set(values, None, 1.0)
+    if not V.mesh.comm.allreduce(bool(np.isfinite(values).all()), MPI.LAND):
+        raise MPMError("A Dirichlet condition has a value that is not finite")
+    return values
+
+
+def force_at(
+    bc: fem.DirichletBC, forces: NDArray[np.float64] | None, V: fem.FunctionSpace
+) -> NDArray[np.float64]:
+    """Return the sum of forces on the dofs of a condition, ``(gdim,)`` (collective).
+
+    Args:
+        bc: The condition.
+        forces: Forces on this rank's own dofs of V; ``None`` are none.
+        V: The background space.
+    """
+    gdim = V.dofmap.index_map_bs
+    force = np.zeros(gdim)
+    if forces is not None:
+        dofs, first_ghost = bc.dof_indices()
+        own = dofs[:first_ghost]
+        np.add.at(force, own % gdim, forces[own])
+    return np.asarray(V.mesh.comm.allreduce(force))
 
 
 def may_stop(bodies: Sequence[Particles]) -> bool:

@@ -11,7 +11,7 @@ __all__ = ["placed"]
 
 
 def placed(
-    error: MPMError, reduced: ReducedSystem, load: float, limit: float | None = None
+    error: MPMError, reduced: ReducedSystem, load: float, limit: str | None = None
 ) -> MPMError:
     """Return an error that says at what load it happened, and what to do (collective).
 
@@ -19,17 +19,14 @@ def placed(
         error: It.
         reduced: The system whose residual did not vanish.
         load: Load, or parameter of the path, at the last converged step.
-        limit: End of the smallest step tried, where no equilibrium was found up to it.
+        limit: Up to what no equilibrium was found, if that may be a limit, and what to do.
     """
     advice = {
         DomainDistortionError: "; take more steps, smaller loads or finer domains",
         ConvergenceError: "; take more steps, or look whether a limit load is reached",
     }.get(type(error), "")
     if limit is not None:
-        advice = (
-            f"; no equilibrium was found up to {limit:.6g}, which is a limit load unless more "
-            "steps get over it"
-        )
+        advice = f"; {limit}"
     particles, text = error.particles, error.message.rstrip(".")
     dofs: list[int] = []
     if isinstance(error, ConvergenceError) and not particles:

@@ -105,11 +105,13 @@ class Step:
         load: Load factor (or the parameter t of a path) at its end.
         iterations: Linear solves it took.
         residuals: Relative residual before each of Newton's iterations and at the end.
+        displacement: The controlled displacement at its end, under displacement control.
     """
 
     load: float
     iterations: int
     residuals: list[float]
+    displacement: float | None = None
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,14 @@ class History:
     def load(self) -> list[float]:
         """Load factor at the end of each converged step."""
         return [step.load for step in self.steps]
+
+    @property
+    def time(self) -> float:
+        """What orders the states of a run: the last load, or the number of a controlled step."""
+        if not self.steps:
+            return 0.0
+        last = self.steps[-1]
+        return last.load if last.displacement is None else float(len(self.steps))
 
     @property
     def total_iterations(self) -> int:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from . import _compat
 from .errors import MPMError
 from .particles import Particles
 
-__all__ = ["TimeSeries"]
+__all__ = ["TimeSeries", "time_series"]
 
 
 class TimeSeries:
@@ -85,3 +86,12 @@ class TimeSeries:
         field.x.array.reshape(-1, *values.shape[1:])[cells] = values
         field.x.scatter_forward()
         return field
+
+
+def time_series(path: Path, bodies: Sequence[Particles]) -> list[TimeSeries]:
+    """Return a time series for each body; those of several have their number in the name."""
+    several = len(bodies) > 1
+    return [
+        TimeSeries(path.with_stem(f"{path.stem}_{i}") if several else path, body)
+        for i, body in enumerate(bodies)
+    ]

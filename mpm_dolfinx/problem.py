@@ -21,19 +21,28 @@ from dolfinx import fem
 
 from . import checkpoint, state
 from .assembly import BackgroundForms, BodyForms, PointStress, is_fast
-from .bodies import as_bodies, as_conditions, may_stop, move_bodies, one_for_each
+from .bodies import (
+    as_bodies,
+    as_conditions,
+    dirichlet_values,
+    force_at,
+    may_stop,
+    move_bodies,
+    one_for_each,
+)
 from .boundary import Support
 from .cleanup import Cleaner
 from .diagnosis import placed
+from .displacement_control import ControlledSystem, DisplacementControl
 from .errors import ConvergenceError, DomainDistortionError, MPMError, ParticleOutsideError
 from .history import History, Step
-from .io import TimeSeries
+from .io import TimeSeries, time_series
 from .particles import Particles
 from .predictor import Predictor
 from .progress import with_bar
 from .quadrature import data_at_points
 from .reduced import Body, ReducedSystem
-from .solver import NewtonSolver, weakly
+from .solver import NewtonSolver, ReducedProblem, weakly
 from .stabilisation import stabilisation_of
 from .stepping import Run, StepControl
 
@@ -220,6 +229,7 @@ class ParticleProblem:
         update: Callable[[float], None] | None = None,
         progress: bool = False,
         repartition: float | None = None,
+        control: DisplacementControl | None = None,
     ) -> History:
         """Apply the whole load.
 
@@ -231,6 +241,8 @@ class ParticleProblem:
             progress: Whether rank 0 shows a progress bar.
             repartition: Share of the particles that makes them move to other ranks after a
                 step (:meth:`QuasiStaticProblem.repartition`); ``None`` leaves them.
+            control: A displacement of a body that goes to a value in equal steps; the load
+                factor is found for each, which may fall again. Dirichlet values stay.
 
         Returns:
             The history of the run.
@@ -240,8 +252,8 @@ class ParticleProblem:
                 ``outside="stop"`` a particle that leaves the background is no error: the run
                 ends, ``history.stopped`` and a warning say why.
         """
-        path = self.steps(steps, update, repartition)
-        for _ in with_bar(path, steps) if progress and self._comm.rank == 0 else path:
+        path = self.steps(steps, update, repartition, control)
+        for _ in with_bar(path, steps, self._share) if progress and self._comm.rank == 0 else path:
             pass
         return self.history
 
@@ -250,6 +262,7 @@ class ParticleProblem:
         steps: int,
         update: Callable[[float], None] | None = None,
         repartition: float | None = None,
+        control: DisplacementControl | None = None,
     ) -> Iterator[Step]:
         """Apply the whole load, one converged step at a time.
 
@@ -259,6 +272,7 @@ class ParticleProblem:
             steps: As in :meth:`solve`.
             update: As in :meth:`solve`.
             repartition: As in :meth:`solve`.
+            control: As in :meth:`solve`.
 
         Yields:
             Each converged step.
@@ -268,23 +282,25 @@ class ParticleProblem:
         """
         if not isinstance(steps, int | np.integer) or steps < 1:
             raise MPMError(f"The number of steps must be a whole number from 1 on, not {steps!r}.")
-        run = self._begin_run(int(steps), update)
-        control = run.control
-        while not control.finished:
-            t, load = control.target, run.load
+        run = self._begin_run(int(steps), update, control)
+        if control is not None and repartition is not None:
+            control.require_movable()
+        while not run.control.finished:
+            t, end = run.control.target, run.parameter
             try:
-                self._set_load(load)
+                if control is None:
+                    self._set_load(end)
                 if update is not None:
                     update(t)
-                values = run.dirichlet_values(self._dirichlet_values())
-                step = self._advance(load, values, last=t == 1.0)
+                values = run.dirichlet_values(dirichlet_values(self.bcs, self.bodies[0].V))
+                step = self._advance(end, values, t == 1.0, control)
             except (ConvergenceError, DomainDistortionError) as error:
                 self._restore()
                 self.history.failed_iterations += self._newton.iterations
                 no_equilibrium = self._newton.no_equilibrium
-                if not control.cut_back(no_equilibrium):
+                if not run.control.cut_back(no_equilibrium):
                     self._restore(update)
-                    limit = t if no_equilibrium else None
+                    limit = run.limit if no_equilibrium else None
                     raise placed(error, self.reduced, self._parameter, limit) from None
                 self.history.cutbacks += 1
                 continue
@@ -296,31 +312,47 @@ class ParticleProblem:
                     self._warn(f"The run stopped. {told!s}")
                     return
                 raise told from None
-            control.accept(step.iterations)
+            run.control.accept(step.iterations)
             if repartition is not None:
                 self.repartition(repartition)
             yield step
         self._run = None
         self._warn_of_outside()
 
-    def _begin_run(self, steps: int, update: Callable[[float], None] | None) -> Run:
+    def _begin_run(
+        self,
+        steps: int,
+        update: Callable[[float], None] | None,
+        control: DisplacementControl | None,
+    ) -> Run:
         """Return a new run, or the one that a checkpoint interrupted."""
+        goal = None
+        if control is not None:
+            control.require_for(self.bodies, update is not None)
+            goal = control.value
         if self._resume and self._run is not None:
-            self._run.require(steps, update is not None)
+            self._run.require(steps, update is not None, goal)
             self._resume = False
             return self._run
-        if update is None and self._loaded >= 1.0:
+        start = self._loaded if control is None else control.present()
+        if control is None and update is None and self._loaded >= 1.0:
             raise MPMError(
                 "The whole load is applied already; go on with problem.step() or with a path "
                 "(update=...)."
             )
+        if start == goal:
+            raise MPMError("The controlled displacement has its value already.")
         if update is not None:
             self._parameter = 0.0
         if self.reduced.predictor is not None:
             self.reduced.predictor.clear()
-        start, base = self._loaded, self._prescribed.copy()
-        self._run = Run(StepControl(steps), update is not None, start, base)
+        base = self._prescribed.copy()
+        self._run = Run(StepControl(steps), update is not None, start, base, goal)
         return self._run
+
+    def _share(self) -> float:
+        """Return how much of the run is done."""
+        return 1.0 if self._run is None else self._run.control.share
 
     def step(self) -> Step:
         """Make one increment to the present values of loads and conditions.
@@ -335,7 +367,7 @@ class ParticleProblem:
         try:
             load = float(self.bodies[0].load.value)
             self._set_load(load)
-            return self._advance(load, self._dirichlet_values(), last=True)
+            return self._advance(load, dirichlet_values(self.bcs, self.bodies[0].V), last=True)
         except MPMError as error:
             self._restore()
             self.history.failed_iterations += self._newton.iterations
@@ -362,13 +394,7 @@ class ParticleProblem:
             return bc.reaction
         if not any(bc is known for known in self.bcs):
             raise MPMError("reaction(bc) needs one of the Dirichlet conditions of this problem.")
-        gdim = self.bodies[0].V.dofmap.index_map_bs
-        force = np.zeros(gdim)
-        if self._reactions is not None:
-            dofs, first_ghost = bc.dof_indices()
-            own = dofs[:first_ghost]
-            np.add.at(force, own % gdim, self._reactions[own])
-        return np.asarray(self._comm.allreduce(force))
+        return force_at(bc, self._reactions, self.bodies[0].V)
 
     def write(self, path: str | Path) -> None:
         """Add the present state to a time series for ParaView.
@@ -385,14 +411,9 @@ class ParticleProblem:
         """
         path = Path(path)
         if path not in self._series:
-            several = len(self.bodies) > 1
-            self._series[path] = [
-                TimeSeries(path.with_stem(f"{path.stem}_{i}") if several else path, body)
-                for i, body in enumerate(self.bodies)
-            ]
-        last = self.history.steps[-1].load if self.history.steps else 0.0
+            self._series[path] = time_series(path, self.bodies)
         for series in self._series[path]:
-            series.write(last)
+            series.write(self.history.time)
 
     def _warn_of_outside(self) -> None:
         """Say so where the last step, which is converged, took particles off the background."""
@@ -467,15 +488,32 @@ class ParticleProblem:
 
     # -- One step -------------------------------------------------------------------------
 
-    def _advance(self, parameter: float, values: NDArray[np.float64], last: bool) -> Step:
+    def _advance(
+        self,
+        parameter: float,
+        values: NDArray[np.float64],
+        last: bool,
+        control: DisplacementControl | None = None,
+    ) -> Step:
         """Solve one step to Dirichlet totals, and commit it.
 
-        Unless it is the last one it must leave all particles inside the background.
+        Unless it is the last one it must leave all particles inside the background. Under
+        displacement control the parameter is the displacement.
         """
-        self.reduced.begin(values - self._prescribed, parameter - self._parameter)
-        self._newton.solve(self.reduced, self.reduced.sizes)
+        size = parameter - self._parameter
+        if control is not None:
+            size = abs(parameter - control.present())
+        self.reduced.begin(values - self._prescribed, size)
+        system: ReducedProblem = self.reduced
+        displacement = None
+        if control is not None:
+            system = ControlledSystem(self.reduced, control, parameter, self.bodies)
+            displacement = parameter
+        self._newton.solve(system, self.reduced.sizes)
         if (failure := self.reduced.crossed()) is not None:
             raise failure
+        if control is not None:
+            parameter = float(self.bodies[0].load.value)
         move_bodies(self.bodies, self.history, self._masses, parameter, last)
         with self.history.statistics.phase("commit"):
             self.commit()
@@ -486,22 +524,14 @@ class ParticleProblem:
             self.reduced.end()
             self.reduced.count_folded()
             self._clean_up()
-        step = Step(parameter, self._newton.iterations, list(self._newton.residuals))
+        newton = self._newton
+        step = Step(parameter, newton.iterations, list(newton.residuals), displacement)
         self.history.steps.append(step)
         return step
 
     def _set_load(self, load: float) -> None:
         for body in self.bodies:
             np.copyto(body.load.value, load)
-
-    def _dirichlet_values(self) -> NDArray[np.float64]:
-        """Return the present totals of all Dirichlet conditions, on the local dofs of V."""
-        values: NDArray[np.float64] = np.zeros_like(self._prescribed)
-        for bc in self.bcs:
-            bc.set(values, None, 1.0)
-        if not self._comm.allreduce(bool(np.isfinite(values).all()), MPI.LAND):
-            raise MPMError("A Dirichlet condition has a value that is not finite")
-        return values
 
     def _restore(self, update: Callable[[float], None] | None = None) -> None:
         """Return to the last converged step."""

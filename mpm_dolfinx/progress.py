@@ -4,19 +4,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from .history import Step
 
 __all__ = ["with_bar"]
 
 
-def with_bar(steps: Iterable[Step], number: int) -> Iterator[Step]:
+def with_bar(steps: Iterable[Step], number: int, done: Callable[[], float]) -> Iterator[Step]:
     """Go through load steps with a bar on the terminal.
 
     Args:
         steps: Converged steps.
-        number: How many equal steps the whole load is.
+        number: How many equal steps the run is.
+        done: Returns which share of it is done.
 
     Yields:
         Each of the steps.
@@ -30,5 +31,5 @@ def with_bar(steps: Iterable[Step], number: int) -> Iterator[Step]:
     ) as bar:
         for step in steps:
             bar.set_postfix_str(f"{step.iterations} solves")
-            bar.update(step.load * number - bar.n)
+            bar.update(done() * number - bar.n)
             yield step

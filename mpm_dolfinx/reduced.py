@@ -139,6 +139,7 @@ class ReducedSystem:
         remove_dependent: Whether dofs that others can stand for are no unknowns.
 
     Attributes:
+        prescribes: Whether Dirichlet values change in the step that has begun.
         moduli: Shear moduli of the bodies before their first step, by which a ghost penalty is
             scaled; ``None`` where they are not known yet.
     """
@@ -186,6 +187,11 @@ class ReducedSystem:
         """The residual on all dofs of V that was evaluated last: at supports, their force."""
         return self._force
 
+    @property
+    def follows_load(self) -> bool:
+        """Whether what the load factor does depends on the displacement."""
+        return any(body.forms.follows_load for body in self._bodies)
+
     def begin(self, change: NDArray[np.float64], size: float) -> None:
         """Prepare a step, or another try of the same.
 
@@ -199,7 +205,7 @@ class ReducedSystem:
         self._change = change[: self._owned]
         self._size = size
         self._imposed = False
-        self._prescribes = bool(self._comm.allreduce(bool(np.any(change)), MPI.LOR))
+        self.prescribes = bool(self._comm.allreduce(bool(np.any(change)), MPI.LOR))
         with self._statistics.phase("locate"):
             for body in self._bodies:
                 body.particles.locate()
@@ -282,7 +288,7 @@ class ReducedSystem:
         return numbers, self.sizes
 
     def _fused_tangent(self, fused: FusedTangent) -> PETSc.Mat:
-        whole = fused.assemble(keep=self._prescribes)
+        whole = fused.assemble(keep=self.prescribes)
         if self._extension is None:
             return whole
         return whole.ptap(self._extension).createSubMatrix(self._columns, self._columns)
@@ -356,11 +362,45 @@ class ReducedSystem:
             ghost = self._stabilisation if self.sizes[1] > 0 else None
             if isinstance(ghost, GhostPenalty) and self._u.norm() > 0.0:
                 self._penalty(ghost)[0].multAdd(self._u, self._force, self._force)
-            if self._extension is not None:
-                self._extension.multTranspose(self._force, self._part)
-                self._part.copy(self._force)
+            self._extend(self._force)
         self._layout.collect(self._force.array_r[self._free], F)
         return None
+
+    def _extend(self, force: PETSc.Vec) -> None:
+        """Move what aggregated dofs feel to those that they follow."""
+        if self._extension is not None:
+            self._extension.multTranspose(force, self._part)
+            self._part.copy(force)
+
+    def load_derivative(self, order: int = 1) -> tuple[PETSc.Vec, float]:
+        """Return :meth:`BodyForms.load_derivative` on all dofs of V (collective)."""
+        with self._statistics.phase("assemble"):
+            parts = [body.forms.load_derivative(order) for body in self._bodies]
+            total = self._force.duplicate()
+            total.set(0.0)
+            for body, (part, _) in zip(self._bodies, parts, strict=True):
+                body.particles.T.multTransposeAdd(part, total, total)
+            self._extend(total)
+            return total, sum(size for _, size in parts)
+
+    def functional(self, particles: Particles, row: PETSc.Vec) -> PETSc.Vec:
+        """Return the coefficients on the free dofs of a functional on a body's W (collective)."""
+        total = self._force.duplicate()
+        particles.T.multTranspose(row, total)
+        self._extend(total)
+        return self.restricted(total)
+
+    def restricted(self, force: PETSc.Vec) -> PETSc.Vec:
+        """Return a vector on all dofs of V at the free ones (collective)."""
+        reduced = PETSc.Vec().createMPI(self.sizes, comm=self._comm)
+        self._layout.collect(force.array_r[self._free], reduced)
+        return reduced
+
+    def constrain(
+        self, y: PETSc.Vec, x: PETSc.Vec | None, solve: Callable[[PETSc.Vec, PETSc.Vec], None]
+    ) -> int:
+        """Leave a Newton step as it is: all steps are permitted."""
+        return 0
 
     def tangent(self) -> PETSc.Mat:
         """Return the tangent at the x of the last residual, one object within a step."""
@@ -436,9 +476,7 @@ class ReducedSystem:
         if self._extension is not None:
             self._extension.multTranspose(self._part, self._u)
             self._u.copy(self._part)
-        reduced = PETSc.Vec().createMPI(self.sizes, comm=self._comm)
-        self._layout.collect(self._part.array_r[self._free], reduced)
-        return reduced
+        return self.restricted(self._part)
 
     def scale(self) -> float:
         """Return the larger of external forces and reactions."""

@@ -42,6 +42,15 @@ class ReducedProblem(Protocol):
     def tangent(self) -> PETSc.Mat:
         """Return the tangent at the x of the last residual, always the same object."""
 
+    def constrain(
+        self, y: PETSc.Vec, x: PETSc.Vec | None, solve: Callable[[PETSc.Vec, PETSc.Vec], None]
+    ) -> int:
+        """Amend a Newton step y from x (``None``: zero) so that ``x - y`` is permitted.
+
+        ``solve`` solves with the factor that gave y. Returns how many negative eigenvalues the
+        tangent has where it is positive definite in all directions that are permitted.
+        """
+
     def prediction(self) -> PETSc.Vec | None:
         """Return unknowns to expect at the step's end, if the past says any."""
 
@@ -210,8 +219,8 @@ class NewtonSolver:
         self._set_tangent(self._problem.tangent() if predicted or K is None else K)
         self._fresh = forces is None or predicted
         if forces is not None and not predicted:
-            with self.statistics.phase("solve"):
-                self.snes.getKSP().solve(forces, x)
+            self._solve_linear(forces, x)
+            self._negative = self._problem.constrain(x, None, self._solve_linear)
             x.scale(-1.0)
             self.iterations += 1
             self._known = False
@@ -238,6 +247,10 @@ class NewtonSolver:
                 f"Newton's method stopped after {self.iterations} linear solves at a relative "
                 f"residual of {residual:.1e} ({why})"
             )
+
+    def _solve_linear(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        with self.statistics.phase("solve"):
+            self.snes.getKSP().solve(b, x)
 
     def _predict(self, x: PETSc.Vec, start: PETSc.Vec) -> bool:
         """Move x from zero to the prediction unless its residual is too far above the start's."""
@@ -388,6 +401,8 @@ class NewtonSolver:
     def _pre_check(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         assert self.F is not None
         self._motion = (0.0, 0.0)
+        self._origin = x
+        self._negative = self._problem.constrain(y, x, self._solve_linear)
         if not np.isfinite(y.norm()):
             return False  # the evaluation at x - y says so
         if self._search is not None:
@@ -412,14 +427,14 @@ class NewtonSolver:
         """
         if not self._symmetric or self._shift == 0.0 or self.K is None:
             return False
-        if F.dot(y) > 0.0 and self._negative_pivots() == 0:
+        if F.dot(y) > 0.0 and self._negative_pivots() <= self._negative:
             return False
         for damping in DAMPINGS:
             self._set_tangent(self.K, damping)
-            with self.statistics.phase("solve"):
-                self.snes.getKSP().solve(F, y)
+            self._solve_linear(F, y)
+            self._negative = self._problem.constrain(y, self._origin, self._solve_linear)
             self.iterations += 1
-            if F.dot(y) > 0.0 and self._negative_pivots() == 0:
+            if F.dot(y) > 0.0 and self._negative_pivots() <= self._negative:
                 break
         return True
 

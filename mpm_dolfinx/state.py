@@ -84,7 +84,7 @@ def capture(problem: ParticleProblem, functions: Sequence[fem.Function] = ()) ->
         "past": [size for size, _ in past],
         "experience": problem._newton.experience,
         "moduli": problem.reduced.moduli,
-        "steps": [[s.load, s.iterations, s.residuals] for s in history.steps],
+        "steps": [[s.load, s.iterations, s.residuals, s.displacement] for s in history.steps],
         "cutbacks": history.cutbacks,
         "failed_iterations": history.failed_iterations,
         "losses": [vars(loss) for loss in history.losses],

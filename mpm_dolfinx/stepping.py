@@ -51,6 +51,11 @@ class StepControl:
         return self._now == self._end
 
     @property
+    def share(self) -> float:
+        """How much is done."""
+        return self._now / self._end
+
+    @property
     def target(self) -> float:
         """End of the step to try."""
         return min(self._now + self._size, self._end) / self._end
@@ -94,20 +99,37 @@ class Run:
     Attributes:
         control: The steps.
         path: Whether it follows a path of the user's.
-        start: Load factor at its beginning.
+        start: Load factor, or the displacement that is controlled, at its beginning.
         base: Dirichlet values at its beginning, on the local dofs of V.
+        goal: The controlled displacement at its end, ``None`` where the load is given.
     """
 
     control: StepControl
     path: bool
     start: float
     base: NDArray[np.float64]
+    goal: float | None = None
 
     @property
-    def load(self) -> float:
-        """Load factor, or parameter of the path, at the end of the step to try."""
+    def parameter(self) -> float:
+        """Load factor, parameter of the path or displacement at the end of the step to try."""
         t = self.control.target
-        return t if self.path else self.start + (1.0 - self.start) * t
+        goal = 1.0 if self.goal is None else self.goal
+        return t if self.path else self.start + (goal - self.start) * t
+
+    @property
+    def limit(self) -> str:
+        """What it means, and what to do, if there is no equilibrium up to the end of this step."""
+        found = "no equilibrium was found up to"
+        if self.goal is not None:
+            return (
+                f"{found} a controlled displacement of {self.parameter:.6g}, where it may turn "
+                "back; control another one, or take more steps"
+            )
+        return (
+            f"{found} {self.control.target:.6g}, which is a limit load unless more steps get over "
+            "it; displacement control (control=...) goes on beyond it"
+        )
 
     def dirichlet_values(self, totals: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the Dirichlet values at the end of the step to try.
@@ -119,10 +141,12 @@ class Run:
             return totals
         return self.base + (totals - self.base) * self.control.target
 
-    def require(self, steps: int, path: bool) -> None:
-        """Raise an error unless this run has so many steps, and a path of the user's or none."""
-        if (steps, path) != (self.control.steps, self.path):
+    def require(self, steps: int, path: bool, goal: float | None) -> None:
+        """Raise an error unless this run has so many steps, and such a path or control."""
+        if (steps, path, goal) != (self.control.steps, self.path, self.goal):
             kind = "update=..." if self.path else "no path (update=None)"
+            if self.goal is not None:
+                kind = f"displacement control to {self.goal:g}"
             raise MPMError(
                 f"The checkpoint was made in a run of {self.control.steps} steps with {kind}; "
                 "go on with these, or restore it with resume=False to begin a new run."
@@ -130,11 +154,16 @@ class Run:
 
     def numbers(self) -> dict[str, Any]:
         """Return all but the Dirichlet values, for a checkpoint."""
-        return {"control": dict(vars(self.control)), "path": self.path, "start": self.start}
+        return {
+            "control": dict(vars(self.control)),
+            "path": self.path,
+            "start": self.start,
+            "goal": self.goal,
+        }
 
     @classmethod
     def of(cls, numbers: dict[str, Any], base: NDArray[np.float64]) -> Self:
         """Return the run that gave these numbers."""
         control = StepControl(numbers["control"]["steps"])
         vars(control).update(numbers["control"])
-        return cls(control, numbers["path"], numbers["start"], base)
+        return cls(control, numbers["path"], numbers["start"], base, numbers.get("goal"))
