@@ -205,9 +205,11 @@ def lambert_w(x: Any) -> np.ndarray:
 # ## A run and its report
 
 
-def progress(steps: Iterable[mpm.Step], number: int, args: argparse.Namespace) -> Iterator:
+def progress(
+    steps: Iterable[mpm.Step], number: int, args: argparse.Namespace, done: Any = None
+) -> Iterator:
     """Go through load steps with the bar that `solve(progress=True)` shows."""
-    yield from steps if args.json or comm.rank > 0 else with_bar(steps, number)
+    yield from steps if args.json or comm.rank > 0 else with_bar(steps, number, done)
 
 
 def outcome(history: mpm.History, failure: mpm.MPMError | None) -> dict[str, Any]:

@@ -15,6 +15,7 @@ PICTURES = {
     "column_roller": ("column_roller",),
     "column_free": ("column_free", "--g0", "all"),
     "column_stop": ("column_free", "--domain", "quad", "--g0", 80e3, "--plain-solver"),
+    "snap_through": ("snap_through",),
     "column_whole": ("column_free", "--domain", "quad", "--g0", 80e3),
 }
 

@@ -350,7 +350,7 @@ class ParticleProblem:
         self._run = Run(StepControl(steps), update is not None, start, base, goal)
         return self._run
 
-    def _share(self) -> float:
+    def _share(self, _: Step) -> float:
         """Return how much of the run is done."""
         return 1.0 if self._run is None else self._run.control.share
 

@@ -12,14 +12,14 @@ __all__ = ["with_bar"]
 
 
 def with_bar(
-    steps: Iterable[Step], number: int, done: Callable[[], float] | None = None
+    steps: Iterable[Step], number: int, done: Callable[[Step], float] | None = None
 ) -> Iterator[Step]:
     """Go through load steps with a bar on the terminal.
 
     Args:
         steps: Converged steps.
         number: How many equal steps the run is.
-        done: Returns which share of it is done; ``None``: the load.
+        done: Returns which share of it is done after a step; ``None``: the load.
 
     Yields:
         Each of the steps.
@@ -33,5 +33,5 @@ def with_bar(
     ) as bar:
         for step in steps:
             bar.set_postfix_str(f"{step.iterations} solves")
-            bar.update((step.load if done is None else done()) * number - bar.n)
+            bar.update((step.load if done is None else done(step)) * number - bar.n)
             yield step
