@@ -28,6 +28,9 @@ from .quadrature import (
 
 __all__ = ["Domains"]
 
+#: Corners of a quadrilateral one after the other.
+RING = (0, 1, 3, 2)
+
 
 class Domains:
     """The cells of a body mesh as domains that a displacement deforms.
@@ -87,6 +90,41 @@ class Domains:
         self._nodes = self.W.tabulate_dof_coordinates()[:, : self._gdim].copy()
         self.deletion = Deletion(body, self.W) if deletable else None
         self._gradient: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        self._earlier: NDArray[np.float64] | None = None
+
+    def refer(self, earlier: NDArray[np.float64]) -> None:
+        """Say what deformation the mesh does not show: ``F = (I + grad d) (I + earlier)``.
+
+        The history's rule then has the volumes and gradients of the undeformed body, not those of
+        the mesh. Its arrays stay the same ones.
+
+        Args:
+            earlier: Displacement gradients at the history's points, shape ``(n, nq, gdim, gdim)``.
+        """
+        plain = DomainQuadrature(self.mesh, self._shape_functions, self._degree)
+        before = np.eye(self._gdim) + earlier
+        np.matmul(plain.gradients, before, out=self.quadrature.gradients)
+        np.divide(plain.weights, np.linalg.det(before), out=self.quadrature.weights)
+        self._earlier, self._gradient = earlier, None
+        exact = self._exact_quadrature().weights.sum(axis=1)
+        share = self.quadrature.weights.sum(axis=1) / plain.weights.sum(axis=1)
+        self.__dict__["_initial_volume"] = exact * share
+
+    @property
+    def earlier(self) -> NDArray[np.float64]:
+        """What was given to :meth:`refer`, or zero."""
+        if self._earlier is not None:
+            return self._earlier
+        return np.zeros((*self.quadrature.weights.shape, self._gdim, self._gdim))
+
+    def mesh_gradient(self) -> NDArray[np.float64]:
+        """Return ``grad d`` on the mesh at the history's points, shape ``(n, nq, gdim, gdim)``."""
+        plain = DomainQuadrature(self.mesh, self._shape_functions, self._degree)
+        return plain.displacement_gradient(self._nodal())
+
+    def _whole_gradient(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gradient since the undeformed body."""
+        return gradient if self._earlier is None else gradient + self._earlier
 
     def _require_volume(self) -> None:
         with agree(self.mesh.comm):
@@ -152,10 +190,11 @@ class Domains:
         """Return ``grad d`` at the history's points, of the same displacement only once."""
         d = self.displacement.x.array
         if self.deletion is not None:
-            return self.quadrature.displacement_gradient(self._nodal())
+            return self._whole_gradient(self.quadrature.displacement_gradient(self._nodal()))
         if self._gradient is not None and np.array_equal(self._gradient[0], d):
             return self._gradient[1]
         gradient = self.quadrature.gradient_of(np.asarray(d), self.domain_nodes)
+        gradient = self._whole_gradient(gradient)
         self._gradient = np.array(d, dtype=np.float64), gradient
         return gradient
 
@@ -286,8 +325,8 @@ class Domains:
         quadrilateral = self.mesh.basix_cell() == basix.CellType.quadrilateral
         if not quadrilateral or shapes.discontinuous or shapes.degree > 1:
             return self.global_index[:0]
-        inwards = (self._corner_jacobians() <= 0.0).sum(axis=1)
-        return np.asarray(self.global_index[inwards >= 2])
+        inwards = (self.corner_jacobians() <= 0.0).sum(axis=1)
+        return np.asarray(self.global_index[(inwards >= 2) & ~self.triangular])
 
     def folded(self) -> NDArray[np.int64]:
         """Return global indices of domains whose map is not one to one everywhere.
@@ -298,25 +337,40 @@ class Domains:
         """
         now = self._nodes[self.domain_nodes] + self._nodal()
         sign = np.sign(self._orientation[:, 0])
-        return np.asarray(self.global_index[self._jacobian_bound.vanishes(now, sign)])
+        folded = self._jacobian_bound.vanishes(now, sign) & ~self.triangular
+        return np.asarray(self.global_index[folded])
 
     def domain_distortion(self) -> NDArray[np.float64]:
         """Return the smallest det J of each domain over its mean, shape ``(n,)``.
 
-        One for an undistorted domain, zero or less where a quadrilateral is concave. For curved
-        domains and hexahedra it is a bound from below.
+        One for an undistorted domain and for a triangle, also one that is half a quadrilateral;
+        zero or less where a quadrilateral is concave. For curved domains and hexahedra it is a
+        bound from below.
         """
         mean = self.volume / quadrature_rule(self.mesh.basix_cell(), 0)[1].sum()
         now = self._nodes[self.domain_nodes] + self._nodal()
         least = self._jacobian_bound.lower_bound(now, np.sign(self._orientation[:, 0]))
-        return np.asarray(least / np.abs(mean))
+        return np.where(self.triangular, 1.0, least / np.abs(mean))
 
     @cached_property
     def _jacobian_bound(self) -> JacobianBound:
         return JacobianBound(self.mesh.basix_cell(), self._shape_functions)
 
-    def _corner_jacobians(self) -> NDArray[np.float64]:
-        """Return det J at the corners of the present domains, positive as in the undeformed."""
+    @cached_property
+    def triangular(self) -> NDArray[np.bool_]:
+        """Whether each domain is a quadrilateral with two corners in one place, shape ``(n,)``."""
+        if self.mesh.basix_cell() != basix.CellType.quadrilateral:
+            return np.zeros(self.num_local, dtype=bool)
+        ring = self._nodes[self.domain_nodes][:, list(RING)]
+        edges = np.linalg.norm(ring - np.roll(ring, 1, axis=1), axis=2)
+        return np.asarray(edges.min(axis=1) <= 1e-12 * edges.max(axis=1))
+
+    def corner_jacobians(self) -> NDArray[np.float64]:
+        """Return det J at the corners of the present domains, positive as in the undeformed.
+
+        Returns:
+            Shape ``(n, corners)``.
+        """
         points = basix.geometry(self.mesh.basix_cell())
         slopes = self._shape_functions.tabulate(1, points)[1:, :, :, 0]
         now = self._nodes[self.domain_nodes] + self._nodal()

@@ -65,11 +65,14 @@ def carried(particles: Particles, assignment: Any) -> Any:
     return assignment.with_parameters(**functions) if functions else assignment
 
 
-def require_movable(arguments: Mapping[str, Any]) -> None:
-    """Raise an error unless a problem can be made again on a mesh with other ranks.
+def require_movable(
+    arguments: Mapping[str, Any], consequence: str = "the particles cannot move"
+) -> None:
+    """Raise an error unless a problem can be made again on another mesh of its body.
 
     Args:
         arguments: Those of :class:`QuasiStaticProblem`.
+        consequence: What else cannot be.
 
     Raises:
         MPMError: Something among them lives on the present body mesh.
@@ -77,19 +80,18 @@ def require_movable(arguments: Mapping[str, Any]) -> None:
     for name in ("density", "body_force", "tractions", "pressures"):
         if _holds(arguments[name], ufl.core.expr.Expr):
             raise MPMError(
-                f"{name} is written on the present body mesh, so the particles cannot move; give "
-                "a function that makes it from a mesh, e.g. lambda mesh: "
-                "ufl.SpatialCoordinate(mesh)[1]."
+                f"{name} is written on the present body mesh, so {consequence}; give a function "
+                "that makes it from a mesh, e.g. lambda mesh: ufl.SpatialCoordinate(mesh)[1]."
             )
     if arguments["supports"]:
-        raise MPMError("Particles with supports= on their boundary cannot move to other ranks.")
+        raise MPMError(f"supports= lie on the present body mesh, so {consequence}.")
     materials = arguments["material"]
     for given in materials if isinstance(materials, list | tuple) else [materials]:
         for law in given.values() if isinstance(given, Mapping) else [given]:
             if any(isinstance(value, np.ndarray) for value in law.parameters.values()):
                 raise MPMError(
                     "A material has arrays of parameters, one value for each particle of a rank, "
-                    "so the particles cannot move; use DG0 Functions."
+                    f"so {consequence}; use DG0 Functions."
                 )
 
 

@@ -35,6 +35,7 @@ COUNTERS = (
     "ghost_facets",
     "aggregated_dofs",
     "folded_domains",
+    "split_domains",
     "lost_particles",
     "lost_volume",
     "lost_mass",
@@ -60,8 +61,8 @@ class Statistics(dict[str, float]):
     ``converged_at_round_off`` (steps that ended at the floor of round-off),
     ``workspace_retries`` (factorisations that MUMPS repeated with more workspace),
     ``ghost_facets`` and ``aggregated_dofs`` (facets with a ghost penalty, and dofs that follow
-    others, in the last step), ``folded_domains`` (the most after any step; curved ones only) and
-    ``lost_particles``, ``lost_volume`` (undeformed) and ``lost_mass`` (0 where no density is
+    others, in the last step), ``folded_domains`` (the most after any step; curved ones only),
+    ``split_domains`` (quadrilaterals cut in two) and ``lost_particles``, ``lost_volume`` (undeformed) and ``lost_mass`` (0 where no density is
     known), the sums over ``history.losses``.
     """
 

@@ -21,8 +21,9 @@ from .errors import MPMError, ParticleOutsideError, agree
 from .location import BackgroundBasis, PointBasis
 from .methods import BoxGrid, DomainState, Rows, boxes, cpdi, cpdi2, gimp, mpm, require_boxes
 from .partition import Redistribution, cell_centres, ranks_of_background
+from .rebase import Cuts, Rebase
 from .transfer import Weights, active_nodes, domain_weights, sum_by_particle, transfer_matrix
-from .validation import validate_options, validate_spaces
+from .validation import validate_distortion, validate_options, validate_spaces
 
 if TYPE_CHECKING:
     from .constitutive import ConstitutiveHistory
@@ -60,6 +61,9 @@ class Particles(Domains):
         partition: ``"given"`` leaves the cells of ``body`` on their ranks; ``"background"``
             makes ``mesh`` a copy of it whose cells are on the ranks that own the background
             where they lie, or in even compact parts where a rank would get too many.
+        on_distortion: What a problem with a material does about quadrilaterals that a step has
+            made concave: ``"error"`` nothing, until one crosses itself; ``"split"`` cuts them into
+            two triangles each.
 
     Attributes:
         mesh: The body mesh, undeformed: ``body``, or its copy with ``partition="background"``.
@@ -77,6 +81,9 @@ class Particles(Domains):
         domain_nodes: Local nodes of W of each owned domain, shape ``(n, k)``.
         outside: The policy for domains that leave the background.
         deletion: Which domains are deleted, with ``outside="delete"``, otherwise ``None``.
+        on_distortion: As given.
+        mass_share: Factor of the density that keeps the mass at each node where domains were
+            split, otherwise ``None``.
 
     Raises:
         MPMError: Spaces, meshes, method or degrees that do not go together.
@@ -94,9 +101,11 @@ class Particles(Domains):
         outside: str = "error",
         domain_update: str = "stretch",
         partition: str = "given",
+        on_distortion: str = "error",
     ) -> None:
         validate_spaces(body, V)
         validate_options(body, V, method, degree, quadrature_degree, outside, domain_update)
+        validate_distortion(body, method, degree, quadrature_degree, on_distortion)
         if partition not in ("given", "background"):
             raise MPMError(f"Unknown partition={partition!r}; choose 'given' or 'background'.")
         self._options: dict[str, Any] = {
@@ -105,8 +114,11 @@ class Particles(Domains):
             "quadrature_degree": quadrature_degree,
             "outside": outside,
             "domain_update": domain_update,
+            "on_distortion": on_distortion,
         }
         self._moves: list[Redistribution] = []
+        self.cuts: Cuts = np.zeros((0, 2), dtype=np.int64)
+        self.mass_share: fem.Function | None = None
         self._background = BackgroundBasis(V)
         if partition == "background":
             ranks = ranks_of_background(V, self._background, cell_centres(body))
@@ -119,6 +131,7 @@ class Particles(Domains):
         self.increment = fem.Function(V, name="increment")
         self.load = fem.Constant(body, 0.0)
         self.outside = outside
+        self.on_distortion = on_distortion
         self._domain_update = domain_update
         self._grid = None
         if method == "gimp":
@@ -185,11 +198,39 @@ class Particles(Domains):
         Args:
             ranks: New rank of each particle this rank owns, shape ``(n,)``.
         """
-        move = Redistribution(self.mesh, ranks)
+        self._take(Redistribution(self.mesh, ranks), self.cuts)
+
+    def split(self, cuts: Cuts) -> Rebase:
+        """Cut quadrilaterals in two, undeformed (collective).
+
+        As in :meth:`move`, the rest is the business of :meth:`QuasiStaticProblem.split`.
+
+        Args:
+            cuts: Which, sorted, the same on all ranks.
+        """
+        move = Rebase(self.mesh, cuts)
+        self._take(move, np.concatenate([self.cuts, cuts]))
+        return move
+
+    def _take(self, move: Redistribution, cuts: Cuts) -> None:
+        """Live on another mesh (collective)."""
         moves, V, increment, options = self._moves, self.V, self.increment, self._options
         self.__dict__.clear()
         Particles.__init__(self, move.mesh, V, **options)
         self._moves, self.increment = [*moves, move], increment
+        self.cuts = cuts
+        if len(cuts):
+            space = fem.functionspace(self.mesh, ("Discontinuous Lagrange", 1))
+            self.mass_share = fem.Function(space, name="mass_share")
+            self.mass_share.x.array[:] = 1.0
+
+    @property
+    def origin_index(self) -> NDArray[np.int64]:
+        """Input index of the domain that each particle is, or is half of, shape ``(n,)``."""
+        first = self.num_global - len(self.cuts)
+        index = self.global_index.copy()
+        index[index >= first] = self.cuts[index[index >= first] - first, 0]
+        return index
 
     def locate(self) -> None:
         """Find the background cells of all domain nodes, unless that is done (collective).
@@ -208,7 +249,7 @@ class Particles(Domains):
             self.domain_nodes,
             self.initial_centroid,
             self._mean(self._nodes[self.domain_nodes] + self._of_domains(self._converged)),
-            np.eye(self._gdim) + self._average(self._converged_gradient()),
+            np.eye(self._gdim) + self._average(self.converged_gradient()),
         )
 
     def _found_rows(self) -> tuple[Rows, NDArray[np.int64]]:
@@ -234,8 +275,10 @@ class Particles(Domains):
                     self.global_index[lost],
                 )
 
-    def _converged_gradient(self) -> NDArray[np.float64]:
-        return self.quadrature.displacement_gradient(self._of_domains(self._converged))
+    def converged_gradient(self) -> NDArray[np.float64]:
+        """Return ``F - I`` at the history's points, last converged, ``(n, nq, gdim, gdim)``."""
+        gradient = self.quadrature.displacement_gradient(self._of_domains(self._converged))
+        return self._whole_gradient(gradient)
 
     @cached_property
     def _rows(self) -> Rows:
@@ -375,7 +418,7 @@ class Particles(Domains):
         there = ~self.deleted
         nodal = self._nodes[self.domain_nodes] + self._of_domains(self._converged)
         points = np.einsum("qk,nki->nqi", self.quadrature.shapes, nodal[there])
-        jacobian = np.linalg.det(np.eye(self._gdim) + self._converged_gradient()[there])
+        jacobian = np.linalg.det(np.eye(self._gdim) + self.converged_gradient()[there])
         volumes = self.quadrature.weights[there] * jacobian
         return points.reshape(-1, self._gdim), volumes.ravel()
 
@@ -464,6 +507,11 @@ class Particles(Domains):
             )
         return self._constitutive
 
+    @property
+    def quadrature_degree(self) -> int:
+        """Degree of the rule that carries the history."""
+        return self._degree
+
     def options(self) -> dict[str, Any]:
         """Return method and degrees, for a checkpoint to know these particles by."""
         return {
@@ -477,13 +525,25 @@ class Particles(Domains):
     def converged_state(self) -> dict[str, NDArray[Any]]:
         """Return the last converged step cell by cell, for a checkpoint: arrays ``(n, ...)``."""
         nodal = self._converged[self.domain_nodes]
-        if self.deletion is None:
-            return {"displacement": nodal}
-        return {
-            "displacement": nodal,
-            "deleted": self.deletion.mask,
-            "kept": self.deletion.kept(nodal),
-        }
+        arrays: dict[str, NDArray[Any]] = {"displacement": nodal}
+        if self.deletion is not None:
+            arrays |= {"deleted": self.deletion.mask, "kept": self.deletion.kept(nodal)}
+        if self.mass_share is not None:
+            arrays |= {"earlier": self.earlier, "mass share": self.mass_shares()}
+        return arrays
+
+    def mass_shares(self) -> NDArray[np.float64]:
+        """Return the factors of the density at the corners of the owned domains, ``(n, k)``."""
+        assert self.mass_share is not None
+        dofs = self.mass_share.function_space.dofmap.list[: self.num_local]
+        return np.array(self.mass_share.x.array[dofs], dtype=np.float64)
+
+    def set_mass_shares(self, shares: NDArray[np.float64]) -> None:
+        """Set the factors of the density at the corners of the owned domains, shape ``(n, k)``."""
+        assert self.mass_share is not None
+        dofs = self.mass_share.function_space.dofmap.list[: self.num_local]
+        self.mass_share.x.array[dofs] = shares
+        self.mass_share.x.scatter_forward()
 
     def set_converged_state(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Make what :meth:`converged_state` once returned the last converged step (collective)."""
@@ -493,6 +553,9 @@ class Particles(Domains):
         if self.deletion is not None:
             self.deletion.restore(np.zeros_like(self.deletion.mask), arrays["kept"])
             self.deletion.restore(arrays["deleted"], arrays["kept"])
+        if self.mass_share is not None:
+            self.refer(arrays["earlier"])
+            self.set_mass_shares(arrays["mass share"])
         self.commit()
 
     def commit(self) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from .errors import MPMError
 from .exchange import RowExchange
 from .location import BackgroundBasis
 
-__all__ = ["Redistribution", "cell_centres", "ranks_of_background"]
+__all__ = ["Redistribution", "cell_centres", "neighbour_ranks", "ranks_of_background"]
 
 #: How many particles more than an even share a rank may have, relatively.
 SLACK = 0.05
@@ -117,14 +117,23 @@ class Redistribution:
         topology.create_connectivity(dim, 0)
         own = tags.indices < topology.index_map(dim).size_local
         nodes = mesh.entities_to_geometry(self.source, dim, tags.indices[own])
-        numbers = self.source.geometry.index_map().local_to_global(nodes.ravel())
         self.mesh.topology.create_connectivity(dim, 0)
         self.mesh.topology.create_connectivity(dim, self.mesh.topology.dim)
         moved = _compat.tags_from_nodes(
-            self.mesh, dim, numbers.reshape(nodes.shape), tags.values[own].astype(np.int32)
+            self.mesh, dim, self._node_numbers(nodes), tags.values[own].astype(np.int32)
         )
         moved.name = tags.name
         return moved
+
+    def _node_numbers(self, nodes: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Return the input numbers in the new mesh of the old one's nodes, of the same shape."""
+        numbers = self.source.geometry.index_map().local_to_global(nodes.ravel())
+        return np.asarray(numbers.reshape(nodes.shape))
+
+    def of_cells(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return values of the owned cells on the new mesh, shape ``(n, ...)`` (collective)."""
+        have, want = (_compat.input_cell_index(m) for m in (self.source, self.mesh))
+        return RowExchange(self.mesh.comm, have, want)(values)
 
     def _function(self, function: fem.Function) -> fem.Function:
         space = function.function_space
@@ -135,11 +144,12 @@ class Redistribution:
                 "constant (DG0)."
             )
         bs = space.dofmap.bs
-        have, want = (_compat.input_cell_index(m) for m in (self.source, self.mesh))
-        values = function.x.array.reshape(-1, bs)[space.dofmap.list[: len(have), 0]]
+        count = self.source.topology.index_map(self.source.topology.dim).size_local
+        values = function.x.array.reshape(-1, bs)[space.dofmap.list[:count, 0]]
         moved = fem.Function(fem.functionspace(self.mesh, element), name=function.name)
-        cells = moved.function_space.dofmap.list[: len(want), 0]
-        moved.x.array.reshape(-1, bs)[cells] = RowExchange(self.mesh.comm, have, want)(values)
+        values = self.of_cells(values)
+        cells = moved.function_space.dofmap.list[: len(values), 0]
+        moved.x.array.reshape(-1, bs)[cells] = values
         moved.x.scatter_forward()
         return moved
 
@@ -155,7 +165,7 @@ def _moved(source: mesh.Mesh, ranks: NDArray[np.int64]) -> mesh.Mesh:
     first, last = (cells.size_global * r // comm.size for r in (comm.rank, comm.rank + 1))
     exchange = RowExchange(comm, index, np.arange(first, last))
     numbers = exchange(numbering.local_to_global(nodes.ravel()).reshape(nodes.shape))
-    where = exchange(np.column_stack([ranks, _neighbours(source, ranks)]))
+    where = exchange(np.column_stack([ranks, neighbour_ranks(source, ranks)]))
     targets = [[row[0], *sorted({*row[1:]} - {row[0], -1})] for row in where.tolist()]
     x = source.geometry.x[: numbering.size_local, :gdim].copy()
     return _compat.mesh_on_ranks(comm, numbers, source, x, targets)
@@ -175,7 +185,7 @@ def _moved_apart(
     return _compat.disconnected_mesh(comm, places[order], source.basix_cell(), numbers[order])
 
 
-def _neighbours(source: mesh.Mesh, ranks: NDArray[np.int64]) -> NDArray[np.int64]:
+def neighbour_ranks(source: mesh.Mesh, ranks: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the new rank behind each facet of each owned cell; none in a mesh without ghosts."""
     topology, dim = source.topology, source.topology.dim
     cells = topology.index_map(dim)

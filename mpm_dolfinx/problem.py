@@ -135,8 +135,9 @@ class ParticleProblem:
         residuals = one_for_each(R, self.bodies, "residual R")
         tangents = [None] * len(self.bodies) if J is None else one_for_each(J, self.bodies, "J")
         self.bcs = as_conditions(bcs, V)
-        if "history" not in self.__dict__:  # made anew by repartition
+        if "history" not in self.__dict__:  # made anew on another mesh
             self.history = History()
+            self.identity: dict[str, Any] | None = None
         self._comm: MPI.Comm = V.mesh.comm
         self._clean_up = Cleaner(self._comm, [V.mesh, *(body.mesh for body in self.bodies)])
         stresses = [self._internal_stress(number) for number in range(len(self.bodies))]
@@ -313,6 +314,7 @@ class ParticleProblem:
                     return
                 raise told from None
             run.control.accept(step.iterations)
+            self.end_step()
             if repartition is not None:
                 self.repartition(repartition)
             yield step
@@ -367,11 +369,13 @@ class ParticleProblem:
         try:
             load = float(self.bodies[0].load.value)
             self._set_load(load)
-            return self._advance(load, dirichlet_values(self.bcs, self.bodies[0].V), last=True)
+            step = self._advance(load, dirichlet_values(self.bcs, self.bodies[0].V), last=True)
         except MPMError as error:
             self._restore()
             self.history.failed_iterations += self._newton.iterations
             raise placed(error, self.reduced, self._parameter) from None
+        self.end_step()
+        return step
 
     # -- Results --------------------------------------------------------------------------
 
@@ -414,6 +418,10 @@ class ParticleProblem:
             self._series[path] = time_series(path, self.bodies)
         for series in self._series[path]:
             series.write(self.history.time)
+
+    def keep_identity(self) -> None:
+        """Note what this problem is known by, before its body meshes change (collective)."""
+        self.identity = state.identity(self)
 
     def _warn_of_outside(self) -> None:
         """Say so where the last step, which is converged, took particles off the background."""
@@ -562,6 +570,9 @@ class ParticleProblem:
 
     def commit(self) -> None:
         """Make the last evaluation the converged one."""
+
+    def end_step(self) -> None:
+        """Do what is to be done between two steps."""
 
     def roll_back(self) -> None:
         """Return to the last converged evaluation."""

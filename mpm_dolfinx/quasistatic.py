@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem
 
-from . import state
+from . import splitting, state
 from .assembly import PointStress, is_fast
 from .bodies import as_bodies
 from .boundary import Support
+from .checkpoint import Snapshot
 from .constitutive import ConstitutiveHistory
 from .errors import MPMError
 from .expressions import as_expression, carried, facet_measure, require_movable
@@ -103,7 +104,7 @@ class QuasiStaticProblem(ParticleProblem):
         predictor: bool = True,
         **options: Any,
     ) -> None:
-        self._arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
+        self.arguments = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
         if f_bar not in F_BARS:
             raise MPMError(
                 f"Unknown f_bar={f_bar!r}; choose one of {', '.join(map(repr, F_BARS))}."
@@ -124,7 +125,7 @@ class QuasiStaticProblem(ParticleProblem):
         _validate_supports(supports, bodies)
         self._stresses: list[ConstitutiveHistory] = []
         self._injected: list[tuple[ConstitutiveHistory, fem.Function, fem.Function]] = []
-        self._density: list[ufl.Form] = []
+        self._density: list[tuple[_Frame, Any]] = []
         fast = is_fast(assembly)
         self._by_loops = fast and not axisymmetric and f_bar in ("none", "domain")
         residuals: list[ufl.Form | None] = []
@@ -137,7 +138,9 @@ class QuasiStaticProblem(ParticleProblem):
             self._stresses.append(history)
             frame = _Frame(body, axisymmetric)
             mass = as_expression(mass, body, "density", ())
-            self._density.append(frame.mass(mass))
+            self._density.append((frame, mass))
+            if body.mass_share is not None:
+                mass = mass * body.mass_share
             terms: list[ufl.Form] = []
             if force is not None:
                 terms.append(-frame.body_force(mass, force))
@@ -232,10 +235,7 @@ class QuasiStaticProblem(ParticleProblem):
         return self._stresses[number] if self._by_loops else None
 
     def _masses(self, number: int) -> NDArray[np.float64]:
-        vector = fem.assemble_vector(fem.form(self._density[number]))
-        (each,) = self._density[number].arguments()
-        cells = each.ufl_function_space().dofmap.list[: self.bodies[number].num_local, 0]
-        return np.asarray(vector.array[cells])
+        return self.nodal_masses(number).sum(axis=1)
 
     def repartition(self, threshold: float = 0.1) -> bool:
         """Move particles with their history to where they are best now (collective).
@@ -258,28 +258,88 @@ class QuasiStaticProblem(ParticleProblem):
         """
         if not isinstance(threshold, float | int) or not 0.0 <= threshold <= 1.0:
             raise MPMError(f"threshold must be a share from 0 to 1, not {threshold!r}.")
-        require_movable(self._arguments)
+        require_movable(self.arguments)
         ranks = [body.ranks_of_background() for body in self.bodies]
         leaving = sum(int(np.count_nonzero(r != self._comm.rank)) for r in ranks)
         share = self._comm.allreduce(leaving) / sum(body.num_global for body in self.bodies)
         if share <= threshold or share == 0.0:
             return False
+        def move() -> None:
+            for body, targets in zip(self.bodies, ranks, strict=True):
+                body.move(targets)
+
+        self.make_anew(move, lambda snapshot: snapshot)
+        self.history.statistics.count("repartitions")
+        return True
+
+    def split(self, particles: Sequence[int], body: int = 0) -> None:
+        """Cut quadrilaterals with one point in two, as they are now (collective).
+
+        Each is cut along the diagonal that makes the better triangles; the halves have its
+        deformation gradient, stress and history. Mass at each node, and with it momentum, does
+        not change, nor do the forces: what was in equilibrium still is. The first half keeps the
+        global index, the second ones follow after all others (``particles.origin_index``). As
+        after :meth:`repartition`, ``particles.mesh``, ``W``, ``displacement`` and ``load`` are
+        new ones then; ``particles.carry`` takes tags and DG0 Functions over.
+
+        Args:
+            particles: Global indices; each on one rank or on several.
+            body: Number of the body, where there are several.
+
+        Raises:
+            MPMError: Domains or a problem that cannot be split. Nothing is changed.
+        """
+        if body not in range(len(self.bodies)):
+            raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
+        chosen = [np.zeros(0, dtype=np.int64) for _ in self.bodies]
+        chosen[body] = np.asarray(particles, dtype=np.int64).ravel()
+        splitting.split(self, chosen)
+
+    def make_anew(
+        self, change: Callable[[], None], carry: Callable[[Snapshot], Snapshot]
+    ) -> None:
+        """Make the problem on other meshes of the same bodies, in the same state (collective).
+
+        Args:
+            change: Gives the particles their meshes.
+            carry: Makes of the state before the one on these meshes.
+        """
         snapshot = state.capture(self)
         seconds = self.history.statistics.seconds
         run, resume, series = self._run, self._resume, self._series
-        arguments = dict(self._arguments)
+        arguments = dict(self.arguments)
         options = arguments.pop("options")
         self._release()
-        for body, targets in zip(self.bodies, ranks, strict=True):
-            body.move(targets)
+        change()
         QuasiStaticProblem.__init__(self, **arguments, **options)
-        state.adopt(self, snapshot, (), False, "The state before the move")
+        state.adopt(self, carry(snapshot), (), False, "The state before")
         self._run, self._resume, self._series = run, resume, series
         self.history.statistics.update(seconds)
-        self.history.statistics.count("repartitions")
         for file in (file for files in series.values() for file in files):
             file.follow()
-        return True
+
+    def nodal_masses(self, number: int) -> NDArray[np.float64]:
+        """Return ``int density Q_c dX`` of each owned domain of a body, ``(n, k)`` (collective)."""
+        body, (frame, density) = self.bodies[number], self._density[number]
+        space = fem.functionspace(body.mesh, ("Discontinuous Lagrange", 1))
+        test: Any = ufl.TestFunction(space)
+        if body.mass_share is not None:
+            test = body.mass_share * test
+        vector = fem.assemble_vector(fem.form(frame.mass(density, test)))
+        return np.asarray(vector.array[space.dofmap.list[: body.num_local]])
+
+    def mass_matrices(self, number: int) -> NDArray[np.float64]:
+        """Return ``int density Q_c Q_d dX`` of each owned domain, ``(n, k, k)`` (collective)."""
+        body, (frame, density) = self.bodies[number], self._density[number]
+        space = fem.functionspace(body.mesh, ("Discontinuous Lagrange", 1))
+        product = ufl.TrialFunction(space) * ufl.TestFunction(space)
+        matrix = fem.assemble_matrix(fem.form(frame.mass(density, product)))
+        n, k = body.num_local, space.dofmap.list.shape[1]
+        return matrix.data[: n * k * k].reshape(n, k, k)
+
+    def end_step(self) -> None:
+        """See :meth:`ParticleProblem.end_step`."""
+        splitting.split_concave(self)
 
     def converged_state(self) -> list[dict[str, NDArray[Any]]]:
         """See :meth:`ParticleProblem.converged_state`."""
@@ -332,10 +392,9 @@ class _Frame:
         tangent = self._turn * A[i, j, k, m] * trial[k, m] * test[i, j] * self._body.dx
         return work, tangent
 
-    def mass(self, density: Any) -> ufl.Form:
-        """Return the mass of each particle, tested by a DG0 function."""
-        each = ufl.TestFunction(fem.functionspace(self._body.mesh, ("DG", 0)))
-        form: ufl.Form = density * self._turn * each * self._body.dx_exact
+    def mass(self, density: Any, test: Any) -> ufl.Form:
+        """Return the integral of the density times a test function."""
+        form: ufl.Form = density * self._turn * test * self._body.dx_exact
         return form
 
     def _at_load(self, terms: Sequence[ufl.Form]) -> ufl.Form:

@@ -30,7 +30,7 @@ from .stepping import Run
 if TYPE_CHECKING:
     from .problem import ParticleProblem
 
-__all__ = ["adopt", "capture"]
+__all__ = ["adopt", "capture", "identity", "require_same"]
 
 #: Relative difference up to which numbers of two problems count as the same.
 SAME = 1e-12
@@ -76,7 +76,8 @@ def capture(problem: ParticleProblem, functions: Sequence[fem.Function] = ()) ->
     )
     history = problem.history
     numbers = {
-        "identity": _identity(problem),
+        "identity": identity(problem),
+        "cuts": [body.cuts.tolist() for body in problem.bodies],
         "load": problem._loaded,
         "parameter": problem._parameter,
         "reactions": problem._reactions is not None,
@@ -115,11 +116,7 @@ def adopt(
     """
     shares = _by_body(problem, functions)
     numbers, comm = snapshot.numbers, problem._comm
-    identity = _identity(problem)
-    with agree(comm):
-        for name, present in identity.items():
-            if not _same(numbers["identity"].get(name), present):
-                raise MPMError(f"{source} is of another problem: {name} is not the same.")
+    require_same(problem, snapshot, source)
     taken = []
     for body, table in zip(problem.bodies, snapshot.tables, strict=False):
         exchange = RowExchange(comm, table.rows, body.global_index)
@@ -180,6 +177,15 @@ def adopt(
     history.statistics.update(numbers["statistics"])
     problem.reduced.forget()
     problem._restore()
+
+
+def require_same(problem: ParticleProblem, snapshot: Snapshot, source: str) -> None:
+    """Raise an error unless a state is one of this problem (collective)."""
+    known = snapshot.numbers["identity"]
+    with agree(problem._comm):
+        for name, present in identity(problem).items():
+            if not _same(known.get(name), present):
+                raise MPMError(f"{source} is of another problem: {name} is not the same.")
 
 
 # -- Values cell by cell -----------------------------------------------------------------
@@ -278,24 +284,29 @@ def _require_columns(
 # -- What tells problems apart -----------------------------------------------------------
 
 
-def _identity(problem: ParticleProblem) -> dict[str, Any]:
-    """Return what two problems must share for a state of one to be one of the other."""
+def identity(problem: ParticleProblem) -> dict[str, Any]:
+    """Return what two problems must share for a state of one to be one of the other.
+
+    It is that of the problem before domains were split (collective).
+    """
+    if problem.identity is not None:
+        return problem.identity
     V = problem.bodies[0].V
     element = V.ufl_element()
-    identity: dict[str, Any] = {
+    found: dict[str, Any] = {
         "the number of bodies": len(problem.bodies),
         "the background mesh": _mesh(V.mesh),
         "the background space": [element.family_name, element.degree],
     }
     for i, (body, law) in enumerate(zip(problem.bodies, problem.laws(), strict=True)):
         of = f" of body {i}" if len(problem.bodies) > 1 else ""
-        identity[f"the body mesh{of}"] = _mesh(body.mesh)
-        identity[f"the particles' method{of}"] = body.options()
-        identity[f"the material{of}"] = [
+        found[f"the body mesh{of}"] = _mesh(body.mesh)
+        found[f"the particles' method{of}"] = body.options()
+        found[f"the material{of}"] = [
             [name, {key: _parameter(body, value) for key, value in parameters.items()}]
             for name, parameters in law
         ]
-    return identity
+    return found
 
 
 def _mesh(domain: mesh.Mesh) -> list[Any]:

@@ -8,11 +8,12 @@ from typing import Any
 
 from dolfinx import fem, mesh
 
+from . import _compat
 from .errors import MPMError
 from .methods import BOX_CELLS, METHODS
 from .quadrature import default_degree
 
-__all__ = ["validate_options", "validate_spaces"]
+__all__ = ["validate_distortion", "validate_options", "validate_spaces"]
 
 DEGREES = (1, 2, 3)
 
@@ -122,3 +123,18 @@ def validate_options(
         raise MPMError(f"Unknown policy outside={outside!r}; choose 'error', 'stop' or 'delete'.")
     if domain_update not in ("stretch", "fixed"):
         raise MPMError(f"Unknown domain_update={domain_update!r}; choose 'stretch' or 'fixed'.")
+
+
+def validate_distortion(
+    body: mesh.Mesh, method: str, degree: int, quadrature_degree: int | None, policy: str
+) -> None:
+    """Raise an error unless the policy for distorted domains is one for these domains."""
+    if policy not in ("error", "split"):
+        raise MPMError(f"Unknown policy on_distortion={policy!r}; choose 'error' or 'split'.")
+    plain = (body.basix_cell(), _compat.geometry_degree(body)) == (BOX_CELLS[0], 1)
+    one_point = plain and (method, degree) == ("cpdi2", 1) and quadrature_degree in (None, 0, 1)
+    if policy == "split" and not one_point:
+        raise MPMError(
+            "Only quadrilaterals with one quadrature point and method 'cpdi2' can be split "
+            "(on_distortion='split'); others fold less with quadrature_degree=2 and f_bar='domain'."
+        )

@@ -1,0 +1,177 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Quadrilaterals that fold, cut into triangles in the middle of a run.
+
+The halves of a quadrilateral go on with its deformation gradient and history. Let F be its own,
+``F_t`` that of the half as a part of the body mesh: from then on the material sees
+``F_t(now) F_t^-1 F``, and the half's undeformed volume is that of the material in it, its present
+area over det F. As the mean gradient over the quadrilateral is that of its outline, on which the
+triangles have the same edges, the internal forces on the nodes do not change. Masses at nodes are
+kept by a factor of the density, linear in each half.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .checkpoint import Snapshot, Table
+from .errors import MPMError
+from .expressions import require_movable
+from .particles import Particles
+from .rebase import Cuts, Rebase, diagonals
+from .validation import validate_distortion
+
+if TYPE_CHECKING:
+    from .quasistatic import QuasiStaticProblem
+
+__all__ = ["require_divisible", "split", "split_concave"]
+
+#: Columns of a state that hold values at the nodes of domains.
+NODAL = ("displacement", "kept", "past ")
+
+
+def require_divisible(arguments: dict[str, Any]) -> None:
+    """Raise an error unless domains of a problem may be split.
+
+    Args:
+        arguments: Those of :class:`QuasiStaticProblem`.
+
+    Raises:
+        MPMError: They may not.
+    """
+    require_movable(arguments, "domains cannot be split")
+    if arguments["f_bar"] != "none":
+        raise MPMError(
+            f"Domains cannot be split with f_bar={arguments['f_bar']!r}, whose averages they would "
+            "change; it keeps most domains from folding by itself."
+        )
+    if arguments["axisymmetric"]:
+        raise MPMError(
+            "Domains of a body of revolution cannot be split, since the halves have other radii; "
+            "use quadrature_degree=2 with f_bar='domain'."
+        )
+
+
+def split_concave(problem: QuasiStaticProblem) -> None:
+    """Split the quadrilaterals that the last step has made concave, where bodies want it so."""
+    chosen = []
+    for body in problem.bodies:
+        concave = np.zeros(0, dtype=np.int64)
+        if body.on_distortion == "split":
+            concave = body.global_index[(body.domain_distortion() <= 0.0) & ~body.deleted]
+        chosen.append(concave)
+    split(problem, chosen)
+
+
+def split(problem: QuasiStaticProblem, chosen: Sequence[NDArray[np.int64]]) -> None:
+    """Split domains (collective).
+
+    Args:
+        problem: The problem.
+        chosen: For each body global indices, which ranks may name apart or together.
+
+    Raises:
+        MPMError: They, or the problem, cannot be split.
+    """
+    comm = problem.bodies[0].V.mesh.comm
+    every = comm.allgather([part.tolist() for part in chosen])
+    wanted = [sorted({p for parts in every for p in parts[i]}) for i in range(len(chosen))]
+    if not any(wanted):
+        return
+    require_divisible(problem.arguments)
+    cuts = [_cuts(body, which) for body, which in zip(problem.bodies, wanted, strict=True)]
+    gradients = [body.converged_gradient() for body in problem.bodies]
+    masses = [problem.nodal_masses(number) for number in range(len(chosen))]
+    problem.keep_identity()
+    moves = make_cuts(problem, cuts)
+    for number, (body, move, gradient, mass) in enumerate(
+        zip(problem.bodies, moves, gradients, masses, strict=True)
+    ):
+        nodal, matrices = move.masses(mass), problem.mass_matrices(number)
+        gradient = move.of_cells(gradient)
+        if body.mass_share is not None:
+            halves = move.halves
+            earlier, shares = body.earlier.copy(), body.mass_shares()
+            earlier[halves] = _earlier(gradient[halves], body.mesh_gradient()[halves])
+            shares[halves] = _shares(matrices[halves], nodal[halves])
+            body.refer(earlier)
+            body.set_mass_shares(shares)
+    problem.history.statistics["split_domains"] += sum(map(len, cuts))
+
+
+def make_cuts(problem: QuasiStaticProblem, cuts: Sequence[Cuts]) -> list[Rebase]:
+    """Make a problem anew on meshes with cuts, one array for each body (collective)."""
+    moves: list[Rebase] = []
+
+    def change() -> None:
+        moves.extend(body.split(some) for body, some in zip(problem.bodies, cuts, strict=True))
+
+    def carry(snapshot: Snapshot) -> Snapshot:
+        tables = [
+            _carried(table, move, body)
+            for table, move, body in zip(snapshot.tables, moves, problem.bodies, strict=False)
+        ]
+        snapshot.numbers["cuts"] = [body.cuts.tolist() for body in problem.bodies]
+        return Snapshot(snapshot.numbers, [*tables, snapshot.tables[-1]])
+
+    problem.make_anew(change, carry)
+    return moves
+
+
+def _carried(table: Table, move: Rebase, body: Particles) -> Table:
+    """Return the state of a body's domains for those on its new mesh."""
+    columns = {
+        name: move.rows(values, nodal=name.startswith(NODAL))
+        for name, values in table.columns.items()
+    }
+    if body.mass_share is not None and "earlier" not in columns:
+        n, (nq, gdim) = len(move.index), body.earlier.shape[1:3]
+        columns["earlier"] = np.zeros((n, nq, gdim, gdim))
+        columns["mass share"] = np.ones((n, body.domain_nodes.shape[1]))
+    return Table(move.index, columns)
+
+
+def _cuts(body: Particles, which: list[int]) -> Cuts:
+    """Return how domains of a body are to be cut (collective)."""
+    if not which:
+        return np.zeros((0, 2), dtype=np.int64)
+    comm = body.mesh.comm
+    validate_distortion(
+        body.mesh, body.method, body.W.ufl_element().degree, body.quadrature_degree, "split"
+    )
+    diagonal, least = diagonals(body.corner_jacobians())
+    good = (least > 0.0) & ~body.triangular & ~body.deleted
+    mine = np.isin(body.global_index, which) & good
+    told = comm.allgather(np.column_stack([body.global_index, diagonal])[mine])
+    cuts = np.concatenate(told)
+    cuts = cuts[np.argsort(cuts[:, 0])]
+    refused = np.setdiff1d(which, cuts[:, 0])
+    if len(refused):
+        raise MPMError(
+            "{particles} cannot be split: there are no such particles, they are triangles or "
+            "deleted, or cross themselves.",
+            refused,
+        )
+    return np.asarray(cuts, dtype=np.int64)
+
+
+def _earlier(gradient: NDArray[np.float64], h: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return E of ``(I + h) (I + E) = I + gradient``, arrays ``(n, nq, gdim, gdim)``."""
+    return np.asarray(np.linalg.solve(np.eye(h.shape[-1]) + h, gradient - h))
+
+
+def _shares(matrices: NDArray[np.float64], masses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the factors of the density at the corners that make given masses there, ``(n, k)``.
+
+    Args:
+        matrices: ``int density Q_c Q_d dX``, shape ``(n, k, k)``.
+        masses: Shape ``(n, k)``.
+    """
+    shares = np.ones_like(masses)
+    heavy = matrices.sum(axis=(1, 2)) > 0.0
+    shares[heavy] = np.linalg.solve(matrices[heavy], masses[heavy][:, :, None])[:, :, 0]
+    return shares
