@@ -208,6 +208,21 @@ class ConstitutiveHistory:
         self.first_piola = stress.reshape(self.first_piola.shape)
         self.tangent = tangent.reshape(self.tangent.shape)
 
+    def on_mesh(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return first Piola stress and tangent with respect to the body mesh, as it is.
+
+        They differ from :attr:`first_piola` and :attr:`tangent` where the mesh is not the
+        undeformed body: ``P G^T / det G`` where it has G behind it.
+        """
+        if not self._particles.rebased:
+            return self.first_piola, self.tangent
+        gdim = self._particles.mesh.geometry.dim
+        G = (np.eye(gdim) + self._particles.earlier).reshape(-1, gdim, gdim)
+        volume = np.linalg.det(G)[:, None, None]
+        stress = np.einsum("niJ,nMJ->niM", self.first_piola, G) / volume
+        tangent = np.einsum("niJkL,nMJ,nNL->niMkN", self.tangent, G, G, optimize=True)
+        return stress, tangent / volume[:, :, :, None, None]
+
     def _update_materials(self, gradient: NDArray[np.float64]) -> None:
         trial = []
         for group, state in zip(self._groups, self._states, strict=True):

@@ -111,6 +111,11 @@ class Domains:
         self.__dict__["_initial_volume"] = exact * share
 
     @property
+    def rebased(self) -> bool:
+        """Whether the mesh is not the undeformed body."""
+        return self._earlier is not None
+
+    @property
     def earlier(self) -> NDArray[np.float64]:
         """What was given to :meth:`refer`, or zero."""
         if self._earlier is not None:

@@ -62,8 +62,8 @@ class Statistics(dict[str, float]):
     ``workspace_retries`` (factorisations that MUMPS repeated with more workspace),
     ``ghost_facets`` and ``aggregated_dofs`` (facets with a ghost penalty, and dofs that follow
     others, in the last step), ``folded_domains`` (the most after any step; curved ones only),
-    ``split_domains`` (quadrilaterals cut in two) and ``lost_particles``, ``lost_volume`` (undeformed) and ``lost_mass`` (0 where no density is
-    known), the sums over ``history.losses``.
+    ``split_domains`` (quadrilaterals cut in two) and ``lost_particles``, ``lost_volume``
+    (undeformed) and ``lost_mass`` (0 where no density is known), the sums over ``history.losses``.
     """
 
     def __init__(self) -> None:

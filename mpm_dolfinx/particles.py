@@ -206,7 +206,7 @@ class Particles(Domains):
         As in :meth:`move`, the rest is the business of :meth:`QuasiStaticProblem.split`.
 
         Args:
-            cuts: Which, sorted, the same on all ranks.
+            cuts: Which, the same on all ranks.
         """
         move = Rebase(self.mesh, cuts)
         self._take(move, np.concatenate([self.cuts, cuts]))

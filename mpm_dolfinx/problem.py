@@ -135,6 +135,13 @@ class ParticleProblem:
         residuals = one_for_each(R, self.bodies, "residual R")
         tangents = [None] * len(self.bodies) if J is None else one_for_each(J, self.bodies, "J")
         self.bcs = as_conditions(bcs, V)
+        if type(self).mend is ParticleProblem.mend and any(
+            body.on_distortion == "split" for body in self.bodies
+        ):
+            raise MPMError(
+                "The residual is written on the present body mesh, so domains cannot be split; "
+                "on_distortion='split' is for mpm.QuasiStaticProblem."
+            )
         if "history" not in self.__dict__:  # made anew on another mesh
             self.history = History()
             self.identity: dict[str, Any] | None = None
@@ -300,9 +307,13 @@ class ParticleProblem:
                 self.history.failed_iterations += self._newton.iterations
                 no_equilibrium = self._newton.no_equilibrium
                 if not run.control.cut_back(no_equilibrium):
-                    self._restore(update)
                     limit = run.limit if no_equilibrium else None
-                    raise placed(error, self.reduced, self._parameter, limit) from None
+                    told = placed(error, self.reduced, self._parameter, limit)
+                    if self.mend(told):
+                        run.control.begin_anew()
+                        continue
+                    self._restore(update)
+                    raise told from None
                 self.history.cutbacks += 1
                 continue
             except MPMError as error:
@@ -310,7 +321,7 @@ class ParticleProblem:
                 told = placed(error, self.reduced, self._parameter)
                 if may_stop(self.bodies) and isinstance(told, ParticleOutsideError):
                     self.history.stopped = told
-                    self._warn(f"The run stopped. {told!s}")
+                    self.warn(f"The run stopped. {told!s}")
                     return
                 raise told from None
             run.control.accept(step.iterations)
@@ -430,9 +441,10 @@ class ParticleProblem:
                 for body in self.bodies:
                     body.locate()
         except ParticleOutsideError as error:
-            self._warn(f"The run is complete, but {error!s}")
+            self.warn(f"The run is complete, but {error!s}")
 
-    def _warn(self, sentence: str) -> None:
+    def warn(self, sentence: str) -> None:
+        """Warn the user, on one rank."""
         if self._comm.rank == 0:
             warnings.warn(sentence, stacklevel=4)
 
@@ -491,8 +503,22 @@ class ParticleProblem:
             MPMError: The file is missing, no checkpoint, newer than this package, truncated,
                 damaged, or that of another problem; the state is what it was.
         """
-        snapshot = checkpoint.read(self._comm, Path(path))
-        state.adopt(self, snapshot, functions, resume, f"The checkpoint '{path}'")
+        snapshot, source = checkpoint.read(self._comm, Path(path)), f"The checkpoint '{path}'"
+        state.require_same(self, snapshot, source)
+        self.cut_as(snapshot, bool(functions), source)
+        state.adopt(self, snapshot, functions, resume, source)
+
+    def cut_as(self, snapshot: checkpoint.Snapshot, functions: bool, source: str) -> None:
+        """Split the domains that were split in a state (collective).
+
+        Args:
+            snapshot: The state, one of this problem.
+            functions: Whether it is to be restored with Functions on the present mesh.
+            source: What to call it in an error.
+
+        Raises:
+            MPMError: Domains were split that are not, or the other way round.
+        """
 
     # -- One step -------------------------------------------------------------------------
 
@@ -573,6 +599,10 @@ class ParticleProblem:
 
     def end_step(self) -> None:
         """Do what is to be done between two steps."""
+
+    def mend(self, error: MPMError) -> bool:
+        """Change what made the smallest step fail; return whether to go on (collective)."""
+        return False
 
     def roll_back(self) -> None:
         """Return to the last converged evaluation."""

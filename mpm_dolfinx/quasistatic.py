@@ -110,6 +110,9 @@ class QuasiStaticProblem(ParticleProblem):
                 f"Unknown f_bar={f_bar!r}; choose one of {', '.join(map(repr, F_BARS))}."
             )
         bodies = as_bodies(particles)
+        if any(body.on_distortion == "split" for body in bodies):
+            splitting.require_divisible(self.arguments)
+        self.__dict__.setdefault("splits_of_step", (0, 0))  # kept where it is made anew
         count = len(bodies) if isinstance(particles, list | tuple) else 0
         shares = zip(
             bodies,
@@ -123,6 +126,7 @@ class QuasiStaticProblem(ParticleProblem):
             strict=True,
         )
         _validate_supports(supports, bodies)
+        self.splits_of_step: tuple[int, int]
         self._stresses: list[ConstitutiveHistory] = []
         self._injected: list[tuple[ConstitutiveHistory, fem.Function, fem.Function]] = []
         self._density: list[tuple[_Frame, Any]] = []
@@ -225,10 +229,7 @@ class QuasiStaticProblem(ParticleProblem):
     def _fill(self) -> None:
         """Set the injected Functions to the present stress and tangent."""
         for history, first_piola, tangent in self._injected:
-            for function, values in (
-                (first_piola, history.first_piola),
-                (tangent, history.tangent),
-            ):
+            for function, values in zip((first_piola, tangent), history.on_mesh(), strict=True):
                 function.x.array[: values.size] = values.ravel()
 
     def _internal_stress(self, number: int) -> PointStress | None:
@@ -264,6 +265,7 @@ class QuasiStaticProblem(ParticleProblem):
         share = self._comm.allreduce(leaving) / sum(body.num_global for body in self.bodies)
         if share <= threshold or share == 0.0:
             return False
+
         def move() -> None:
             for body, targets in zip(self.bodies, ranks, strict=True):
                 body.move(targets)
@@ -295,9 +297,7 @@ class QuasiStaticProblem(ParticleProblem):
         chosen[body] = np.asarray(particles, dtype=np.int64).ravel()
         splitting.split(self, chosen)
 
-    def make_anew(
-        self, change: Callable[[], None], carry: Callable[[Snapshot], Snapshot]
-    ) -> None:
+    def make_anew(self, change: Callable[[], None], carry: Callable[[Snapshot], Snapshot]) -> None:
         """Make the problem on other meshes of the same bodies, in the same state (collective).
 
         Args:
@@ -340,6 +340,14 @@ class QuasiStaticProblem(ParticleProblem):
     def end_step(self) -> None:
         """See :meth:`ParticleProblem.end_step`."""
         splitting.split_concave(self)
+
+    def mend(self, error: MPMError) -> bool:
+        """See :meth:`ParticleProblem.mend`."""
+        return splitting.split_failing(self, error)
+
+    def cut_as(self, snapshot: Snapshot, functions: bool, source: str) -> None:
+        """See :meth:`ParticleProblem.cut_as`."""
+        splitting.repeat(self, snapshot, functions, source)
 
     def converged_state(self) -> list[dict[str, NDArray[Any]]]:
         """See :meth:`ParticleProblem.converged_state`."""

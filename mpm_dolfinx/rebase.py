@@ -35,6 +35,8 @@ Diagonal 0 is that of the corners 0 and 3, diagonal 1 that of 1 and 2.
 #: new vertex in the place of its last one.
 HALVES = np.array([[[0, 1, 3, 3], [0, 3, 2, 3]], [[1, 3, 2, 2], [1, 2, 0, 2]]])
 DOUBLED = (2, 1)
+#: Difference of areas, relative to the largest, that does not decide between diagonals.
+EQUAL = 1e-6
 #: What share of the mass at its corners each half gets.
 HALVES_OF_MASS = np.array([[0.5, 1.0, 0.25, 0.25], [0.5, 0.25, 1.0, 0.25]])
 
@@ -56,7 +58,8 @@ def diagonals(
     areas = np.stack(
         [corner_jacobians[:, [1, 2]].min(axis=1), corner_jacobians[:, [0, 3]].min(axis=1)], axis=1
     )
-    return areas.argmax(axis=1).astype(np.int64), areas.max(axis=1)
+    second = areas[:, 1] > areas[:, 0] + EQUAL * np.abs(corner_jacobians).max(axis=1)
+    return second.astype(np.int64), np.where(second, areas[:, 1], areas[:, 0])
 
 
 class Rebase(Redistribution):
@@ -67,7 +70,7 @@ class Rebase(Redistribution):
 
     Args:
         source: The mesh before (collective).
-        cuts: Quadrilaterals of degree 1 to be cut, sorted.
+        cuts: Quadrilaterals of degree 1 to be cut.
         positions: Where the owned cells' nodes are to be, shape ``(n, k, gdim)``; ``None`` leaves
             them.
 
@@ -148,11 +151,11 @@ class Rebase(Redistribution):
             values: Shape ``(n, ...)``, nodal ones ``(n, k, ...)``.
             nodal: Whether halves have a part of the nodes only.
         """
-        taken = values[self._origin]
+        taken: NDArray[Any] = values[self._origin]
         if not nodal:
             return taken
         corners = self._corners.reshape(*self._corners.shape, *[1] * (values.ndim - 2))
-        return np.take_along_axis(taken, corners, axis=1)
+        return np.asarray(np.take_along_axis(taken, corners, axis=1))
 
     def masses(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the shares in masses at nodes ``(n, k)`` of each cell of the new mesh, ``(n, k)``.
@@ -161,7 +164,7 @@ class Rebase(Redistribution):
         """
         want = _compat.input_cell_index(self.mesh)
         exchange = RowExchange(self.mesh.comm, self.index, want)
-        return exchange(self.rows(nodal, nodal=True) * self._parts)
+        return np.asarray(exchange(self.rows(nodal, nodal=True) * self._parts))
 
     def _node_numbers(self, nodes: NDArray[np.int32]) -> NDArray[np.int64]:
         return np.asarray(self._numbers[nodes])

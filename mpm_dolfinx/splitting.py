@@ -28,8 +28,12 @@ from .validation import validate_distortion
 if TYPE_CHECKING:
     from .quasistatic import QuasiStaticProblem
 
-__all__ = ["require_divisible", "split", "split_concave"]
+__all__ = ["repeat", "require_divisible", "split", "split_concave", "split_failing"]
 
+#: How often a failing step may be mended, and the share of all quadrilaterals that is
+#: split where none is named.
+TRIES = 5
+FEW = 0.02
 #: Columns of a state that hold values at the nodes of domains.
 NODAL = ("displacement", "kept", "past ")
 
@@ -64,11 +68,78 @@ def split_concave(problem: QuasiStaticProblem) -> None:
         if body.on_distortion == "split":
             concave = body.global_index[(body.domain_distortion() <= 0.0) & ~body.deleted]
         chosen.append(concave)
-    split(problem, chosen)
+    _split_and_say_so(problem, chosen)
 
 
-def split(problem: QuasiStaticProblem, chosen: Sequence[NDArray[np.int64]]) -> None:
-    """Split domains (collective).
+def split_failing(problem: QuasiStaticProblem, error: MPMError) -> bool:
+    """Split the quadrilaterals that keep a step from converging; return whether there are any.
+
+    They are those that the error names or, of several bodies or where it names none, the most
+    distorted ones (collective).
+    """
+    steps, tries = len(problem.history.steps), 1
+    if problem.splits_of_step[0] == steps:
+        tries += problem.splits_of_step[1]
+    problem.splits_of_step = steps, tries
+    if tries > TRIES or all(body.on_distortion == "error" for body in problem.bodies):
+        return False
+    comm = problem.bodies[0].V.mesh.comm
+    chosen = []
+    for body in problem.bodies:
+        whole = (body.on_distortion == "split") & ~body.triangular & ~body.deleted
+        named = whole & np.isin(body.global_index, error.particles)
+        if len(problem.bodies) > 1 or not comm.allreduce(int(named.sum())):
+            shape = np.where(whole, body.domain_distortion(), np.inf)
+            every = np.sort(np.concatenate(comm.allgather(shape[whole])))
+            few = int(np.ceil(FEW * len(every)))
+            named = whole & (shape <= (every[few - 1] if few else -np.inf))
+        chosen.append(body.global_index[named])
+    return _split_and_say_so(problem, chosen)
+
+
+def _split_and_say_so(problem: QuasiStaticProblem, chosen: Sequence[NDArray[np.int64]]) -> bool:
+    first = problem.history.statistics["split_domains"] == 0
+    count = split(problem, chosen)
+    if first and count:
+        problem.warn(
+            f"{count} quadrilaterals fold and are split into triangles, and others may be later; "
+            "with quadrature_degree=2 and f_bar='domain' they would not."
+        )
+    return count > 0
+
+
+def repeat(problem: QuasiStaticProblem, snapshot: Snapshot, functions: bool, source: str) -> None:
+    """Make the cuts with which a state was made (collective).
+
+    Raises:
+        MPMError: The problem has others.
+    """
+    present = [body.cuts for body in problem.bodies]
+    wanted = [
+        np.array(cuts, dtype=np.int64).reshape(-1, 2)
+        for cuts in snapshot.numbers.get("cuts", [[]] * len(present))
+    ]
+    for mine, theirs in zip(present, wanted, strict=True):
+        if not np.array_equal(mine, theirs[: len(mine)]):
+            raise MPMError(
+                f"{source} was made when other domains were split than now; restore it into a "
+                "problem that is made as at first."
+            )
+    missing = [theirs[len(mine) :] for mine, theirs in zip(present, wanted, strict=True)]
+    if not any(map(len, missing)):
+        return
+    if functions:
+        raise MPMError(
+            f"{source} was made after domains were split, so functions= on the mesh of before "
+            "cannot be restored; restore it without them."
+        )
+    require_divisible(problem.arguments)
+    problem.keep_identity()
+    make_cuts(problem, missing)
+
+
+def split(problem: QuasiStaticProblem, chosen: Sequence[NDArray[np.int64]]) -> int:
+    """Split domains; return how many (collective).
 
     Args:
         problem: The problem.
@@ -81,7 +152,7 @@ def split(problem: QuasiStaticProblem, chosen: Sequence[NDArray[np.int64]]) -> N
     every = comm.allgather([part.tolist() for part in chosen])
     wanted = [sorted({p for parts in every for p in parts[i]}) for i in range(len(chosen))]
     if not any(wanted):
-        return
+        return 0
     require_divisible(problem.arguments)
     cuts = [_cuts(body, which) for body, which in zip(problem.bodies, wanted, strict=True)]
     gradients = [body.converged_gradient() for body in problem.bodies]
@@ -100,7 +171,9 @@ def split(problem: QuasiStaticProblem, chosen: Sequence[NDArray[np.int64]]) -> N
             shares[halves] = _shares(matrices[halves], nodal[halves])
             body.refer(earlier)
             body.set_mass_shares(shares)
-    problem.history.statistics["split_domains"] += sum(map(len, cuts))
+    count = sum(map(len, cuts))
+    problem.history.statistics["split_domains"] += count
+    return count
 
 
 def make_cuts(problem: QuasiStaticProblem, cuts: Sequence[Cuts]) -> list[Rebase]:

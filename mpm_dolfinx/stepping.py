@@ -72,6 +72,11 @@ class StepControl:
         if iterations <= EASY and not self._wary:
             self._size = min(2 * self._size, self._largest)
 
+    def begin_anew(self) -> None:
+        """Try whole steps again, after what made them fail has changed."""
+        self._size, self._failed = self._largest, None
+        self._moved = self._wary = False
+
     def cut_back(self, no_equilibrium: bool = False) -> bool:
         """Halve the step; return False where it is at its smallest, or a limit is found.
 

@@ -5,75 +5,269 @@
 import numpy as np
 import pytest
 import scenes
-from scenes import QUADRILATERAL, WORLD
+from scenes import QUADRILATERAL, TRIANGLE, WORLD
 
 import ufl
-from dolfinx import fem
+from dolfinx import fem, la
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.materials import Hencky, VonMises
+from mpm_dolfinx.materials import Hencky, LinearElastic, VonMises
+from mpm_dolfinx.rebase import diagonals
 
 
-def column(on_distortion="error", comm=WORLD, density=1000.0, **options):
-    """Return a column of quadrilaterals that slumps, bent at first."""
+def column(comm=WORLD, policy="error", outside="error", **options):
+    """Return a column of quadrilaterals that slumps, of two materials, under a pressure."""
     V = scenes.vectors(scenes.box([0.0, 0.0], [10.0, 10.0], [10, 10], QUADRILATERAL, comm))
     body = scenes.box([0.0, 0.0], [4.0, 8.0], [6, 12], QUADRILATERAL, comm)
-    bcs = [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)]
-    options.setdefault("body_force", (0.0, -15.0))
-    return mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, on_distortion=on_distortion),
-        options.pop("material", VonMises(1e6, 0.3, rho_y=20e3, hardening=5e4)),
-        density=density,
-        bcs=bcs,
-        **options,
-    )
+    young = fem.Function(fem.functionspace(body, ("DG", 0)))
+    young.interpolate(lambda x: 1e6 * (1.0 + 0.05 * x[1]))
+    defaults = {
+        "material": {1: VonMises(young, 0.3, rho_y=20e3, hardening=5e4), 2: Hencky(2e6, 0.3)},
+        "cell_tags": scenes.cell_tags(body, lambda x: 1 + (x[:, 1] > 6.0)),
+        "facet_tags": scenes.facet_tags(body, scenes.at(1, 8.0), scenes.at(0, 4.0)),
+        "pressures": [(5e3, 1)],
+        "tractions": [((2e3, -1e3), 2)],
+        "density": lambda domain: 1000.0 + 50.0 * ufl.SpatialCoordinate(domain)[0],
+        "body_force": (0.0, -12.0),
+        "bcs": [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)],
+    }
+    particles = mpm.Particles(body, V, on_distortion=policy, outside=outside)
+    return mpm.QuasiStaticProblem(particles, **{**defaults, **options})
 
 
 def some(particles, seed=3, share=0.3):
-    """Return global indices of some particles, the same on all ranks."""
-    count = particles.num_global
-    chosen = np.random.default_rng(seed).random(count) < share
-    return np.flatnonzero(chosen)
+    """Return global indices of some particles, the same on any number of ranks."""
+    return np.flatnonzero(np.random.default_rng(seed).random(particles.num_global) < share)
+
+
+def half_way(problem, steps=8):
+    """Take a problem to half of its load."""
+    for step in problem.steps(steps):
+        if step.load == 0.5:
+            return problem
+    raise AssertionError
+
+
+def on_background(particles, vector):
+    """Return T^T times a vector of W, by global dof of V."""
+    result = particles.T.createVecRight()
+    particles.T.multTranspose(vector, result)
+    return scenes.gather(result.array_r.copy(), particles.mesh.comm)
 
 
 def sums(problem):
-    """Return what a split must leave as it was: sums over the body, and at background nodes."""
+    """Return what a split must leave as it is: sums over the body, and at background nodes."""
     p = problem.particles
-    volume = p.initial_volume
-    masses = problem.nodal_masses(0)
+    volume, masses = p.initial_volume, problem.nodal_masses(0)
     at_nodes = fem.Function(fem.functionspace(p.mesh, ("Lagrange", 1)))
     np.add.at(at_nodes.x.array, at_nodes.function_space.dofmap.list[: p.num_local], masses)
-    at_nodes.x.scatter_reverse(mpm.deletion.la.InsertMode.add)
+    at_nodes.x.scatter_reverse(la.InsertMode.add)
     work = p.T.createVecLeft()
     work.array_w.reshape(-1, 2)[:] = scenes.own(at_nodes)[:, None]
-    on_background = p.T.createVecRight()
-    p.T.multTranspose(work, on_background)
-    stress = problem._stresses[0]
+    forms = problem.shares[0].forms
+    forms.assemble_external()
+    (stress,) = problem._stresses
     strain = stress.variable("elastic_b_minus_identity")[:, 0]
     return {
         "volume": scenes.total(p, volume),
         "present volume": scenes.total(p, p.volume),
         "mass": scenes.total(p, masses.sum(axis=1)),
         "moment of mass": scenes.total(p, np.einsum("nk,nki->ni", masses, p.domains)),
-        "mass at nodes of the background": scenes.gather(on_background.array_r.copy()),
+        "mass at nodes of the background": on_background(p, work),
+        "external forces": on_background(p, forms.external),
+        "forces": on_background(p, forms.assemble_residual()),
         "elastic strain": scenes.total(p, volume[:, None] * strain),
         "plastic strain": scenes.total(p, volume * p.plastic_strain),
         "stress": scenes.total(p, p.volume[:, None, None] * p.stress),
         "F": scenes.total(p, volume[:, None, None] * p.deformation_gradient),
+        "reactions": np.array([problem.reaction(bc) for bc in problem.bcs]),
     }
 
 
-def test_split_keeps_everything():
-    problem = column()
-    for step in problem.steps(8):
-        if step.load == 0.5:
-            break
-    before = sums(problem)
+@pytest.mark.parametrize("assembly", ["auto", "reference"])
+def test_split_keeps_everything(assembly):
+    problem = half_way(column(assembly=assembly))
     p = problem.particles
-    kept = [scenes.in_order(p, a) for a in (p.stress, p.plastic_strain, p.deformation_gradient)]
-    problem.split(some(p))
+    before, which = sums(problem), some(p)
+    per_particle = ("stress", "plastic_strain", "deformation_gradient", "point_stress")
+    kept = {name: scenes.in_order(p, getattr(p, name)) for name in per_particle}
+    total = p.num_global
+    problem.split(which)
     after = sums(problem)
     for name, value in before.items():
         size = np.abs(value).max()
-        print(name, np.abs(value-after[name]).max()/size)
         np.testing.assert_allclose(after[name], value, rtol=0.0, atol=1e-12 * size, err_msg=name)
+    assert p.num_global == total + len(which)
+    assert problem.history.statistics["split_domains"] == len(which)
+    origin = scenes.in_order(p, p.origin_index)
+    assert np.array_equal(origin, [*range(total), *which])
+    triangular = scenes.in_order(p, p.triangular)
+    assert np.array_equal(np.flatnonzero(triangular), [*which, *range(total, p.num_global)])
+    assert scenes.largest(p.domain_distortion()[p.triangular] - 1.0) == 0.0
+    assert len(p.crossed()) == len(p.inverted()) == len(p.folded()) == 0
+    for name, values in kept.items():
+        size = np.abs(values).max()
+        now = scenes.in_order(p, getattr(p, name))
+        np.testing.assert_allclose(now, values[origin], rtol=0.0, atol=1e-12 * size, err_msg=name)
+
+
+def result(problem):
+    p = problem.particles
+    names = ("centroid", "volume", "stress", "plastic_strain", "initial_volume")
+    values = {name: scenes.in_order(p, getattr(p, name)) for name in names}
+    values["reaction"] = np.array([problem.reaction(bc) for bc in problem.bcs])
+    return values
+
+
+def assert_same(one, two, tolerance=1e-9):
+    for name, values in one.items():
+        size = np.abs(two[name]).max()
+        np.testing.assert_allclose(values, two[name], rtol=0, atol=tolerance * size, err_msg=name)
+
+
+def split_half_way(**options):
+    problem = half_way(column(**options))
+    problem.split(some(problem.particles))
+    while problem.particles.load.value < 0.9:
+        problem.particles.load.value += 0.125
+        problem.step()
+    return problem
+
+
+def test_after_a_split_routes_and_ranks_agree():
+    results = [result(split_half_way(assembly=route)) for route in ("auto", "reference")]
+    if WORLD.size > 1:
+        results.append(result(split_half_way(comm=scenes.MPI.COMM_SELF)))
+    for other in results[1:]:
+        assert_same(other, results[0])
+
+
+def test_split_at_first_is_a_body_of_triangles():
+    # Undeformed, halves are triangles as any others: the answer is that of a mesh of them.
+    def bar(body):
+        V = scenes.vectors(scenes.box([0.0, -0.5], [3.0, 1.0], [12, 6], QUADRILATERAL))
+        return mpm.QuasiStaticProblem(
+            mpm.Particles(body, V),
+            Hencky(20.0, 0.3),
+            density=1.0,
+            body_force=(1.0, -0.2),
+            bcs=[scenes.fix(V, scenes.at(0, 0.0))],
+        )
+
+    corners = ([0.0, 0.0], [2.0, 0.5], [9, 3])
+    split = bar(scenes.box(*corners, QUADRILATERAL))
+    p = split.particles
+    split.split(range(p.num_global))
+    split.particles.mass_share.x.array[:] = 1.0  # masses of triangles, not of quadrilaterals
+    # Split where undeformed, all are cut along the diagonal from the first corner to the last.
+    triangles = bar(scenes.box(*corners, TRIANGLE, diagonal="right"))
+    histories = [problem.solve(4) for problem in (split, triangles)]
+    rows = []
+    for problem in (split, triangles):
+        q = problem.particles
+        middle = np.column_stack([q.initial_centroid, q.centroid, q.stress.reshape(-1, 9)])
+        rows.append(scenes.gather(middle))
+    one, two = (r[np.lexsort(np.round(r[:, :2], 9).T)] for r in rows)
+    np.testing.assert_allclose(one, two, rtol=0, atol=1e-9)
+    assert histories[0].iterations == histories[1].iterations
+
+
+def test_diagonals_make_triangles_of_positive_area():
+    # The reflex corner of a concave quadrilateral is an end of the diagonal.
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    slopes = np.array([[-1.0, 1, 0, 0], [-1, 1, 0, 0], [0, 0, -1, 1], [0, 0, -1, 1]])
+    across = np.array([[-1.0, 0, 1, 0], [0, -1, 0, 1], [-1, 0, 1, 0], [0, -1, 0, 1]])
+    for reflex in range(4):
+        x = corners.copy()
+        x[reflex] += 0.7 * (0.5 - x[reflex]) * 2.0
+        det = np.linalg.det(np.stack([slopes @ x, across @ x], axis=1))
+        diagonal, least = diagonals(det[None])
+        assert diagonal[0] == (0 if reflex in (0, 3) else 1) and least[0] > 0.0
+
+
+def test_loss_after_a_split_adds_up():
+    loads = {"body_force": (0.0, -25.0), "pressures": (), "tractions": ()}
+    problem = column(outside="delete", density=1000.0, **loads)
+    p = problem.particles
+    half_way(problem)
+    problem.split(some(p))
+    p.load.value = 0.6
+    while not problem.history.losses or p.load.value < 1.0:
+        p.load.value += 0.1
+        problem.step()
+    statistics = problem.history.statistics
+    here = scenes.total(p, problem._masses(0)[~p.deleted])
+    assert abs(here + statistics["lost_mass"] - 32e3) < 1e-12 * 32e3
+    here = scenes.total(p, p.initial_volume[~p.deleted])
+    assert abs(here + statistics["lost_volume"] - 32.0) < 1e-12 * 32.0
+
+
+def test_repartition_after_a_split():
+    problem = split_half_way()
+    before = result(problem)
+    problem.repartition(0.0)
+    assert_same(result(problem), before, 1e-13)
+    one, two = problem, split_half_way()
+    for each in (one, two):
+        each.particles.load.value = 1.0
+        each.step()
+    assert_same(result(one), result(two))
+
+
+def test_checkpoint_after_a_split(tmp_path):
+    path = scenes.WORLD.bcast(tmp_path) / "state"
+    whole = column()
+    for step in whole.steps(8):
+        if step.load == 0.5:
+            whole.split(some(whole.particles))
+        if step.load == 0.75:
+            whole.save(path)
+    other = column()
+    other.restore(path)
+    assert np.array_equal(other.particles.cuts, whole.particles.cuts)
+    assert other.history.statistics["split_domains"] == len(some(column().particles))
+    other.solve(8)
+    assert_same(result(other), result(whole))
+    # It can be restored again, but not where other domains are split.
+    other.restore(path, resume=False)
+    assert other.particles.load.value == 0.75
+    third = half_way(column())
+    third.split([5])
+    with pytest.raises(mpm.MPMError, match="when other domains were split"):
+        third.restore(path)
+    flag = fem.Function(fem.functionspace(column().particles.mesh, ("DG", 0)), name="flag")
+    with pytest.raises(mpm.MPMError, match="cannot be restored; restore it without"):
+        column().restore(path, functions=[flag])
+
+
+def test_refused():
+    problem = half_way(column(), steps=2)
+    before = scenes.state(problem)
+    with pytest.raises(mpm.MPMError, match="particle 1000 cannot be split: there are no such"):
+        problem.split([3, 1000])
+    with pytest.raises(mpm.MPMError, match="There is no body 1"):
+        problem.split([3], body=1)
+    scenes.assert_same_state(before, scenes.state(problem))
+    problem.split([3])
+    with pytest.raises(mpm.MPMError, match="particle 3 cannot be split"):
+        problem.split([3])
+    problem = scenes.block()
+    with pytest.raises(mpm.MPMError, match="Only quadrilaterals with one quadrature point"):
+        problem.split([0])
+    V, body = problem.particles.V, scenes.unit(4, QUADRILATERAL)
+    particles = mpm.Particles(body, V, on_distortion="split")
+    for options, reason in (
+        ({"f_bar": "patch"}, "with f_bar='patch'"),
+        ({"axisymmetric": True}, "body of revolution"),
+        ({"body_force": ufl.SpatialCoordinate(body)}, "so domains cannot be split"),
+    ):
+        with pytest.raises(mpm.MPMError, match=reason):
+            mpm.QuasiStaticProblem(particles, LinearElastic(1.0, 0.3), **options)
+    d, v = particles.displacement, ufl.TestFunction(particles.W)
+    R = ufl.derivative(scenes.neo_hookean(d) * particles.dx, d, v)
+    with pytest.raises(mpm.MPMError, match=r"is for mpm\.QuasiStaticProblem"):
+        mpm.ParticleProblem(R, particles)
+    with pytest.raises(mpm.MPMError, match="Unknown policy on_distortion='mend'"):
+        mpm.Particles(body, V, on_distortion="mend")
+    with pytest.raises(mpm.MPMError, match="Only quadrilaterals"):
+        mpm.Particles(body, V, on_distortion="split", quadrature_degree=2)
