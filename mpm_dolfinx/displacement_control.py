@@ -92,11 +92,11 @@ class DisplacementControl:
             raise MPMError("Give either control= or a path (update=...), not both.")
 
     def require_movable(self) -> None:
-        """Raise an error where it cannot follow particles to other ranks."""
+        """Raise an error where it cannot follow particles to another mesh."""
         if self.functional is not None:
             raise MPMError(
-                "functional is written on the present body mesh, so the particles cannot move; "
-                "control a point, or leave repartition=None."
+                "functional is written on the present body mesh, so the particles cannot "
+                "move or be split; control a point, or leave repartition and on_distortion alone."
             )
 
     def row(self) -> PETSc.Vec:

@@ -291,7 +291,8 @@ class ParticleProblem:
         if not isinstance(steps, int | np.integer) or steps < 1:
             raise MPMError(f"The number of steps must be a whole number from 1 on, not {steps!r}.")
         run = self._begin_run(int(steps), update, control)
-        if control is not None and repartition is not None:
+        may_split = any(body.on_distortion == "split" for body in self.bodies)
+        if control is not None and (repartition is not None or may_split):
             control.require_movable()
         while not run.control.finished:
             t, end = run.control.target, run.parameter
