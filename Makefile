@@ -5,8 +5,8 @@
 VENV ?= .venv
 # The interpreter to make it with (empty: look for one).
 PYTHON ?=
-# Ranks of the second run of the tests (1: leave that run out), and arguments for pytest.
-NP ?= 2
+# Numbers of ranks of the further runs of the tests (1: no further run), and arguments for pytest.
+NP ?= 2 3
 ARGS ?=
 
 export PYTHON VENV NP
@@ -16,7 +16,7 @@ BIN := $(VENV)/bin
 SETUP := sh scripts/setup_env.sh
 
 # Benchmarks that print a JSON object; work_precision.py writes its results and pictures itself.
-BENCHMARKS := $(wildcard $(patsubst %,benchmarks/%.py,assembly step skip solvers scaling))
+BENCHMARKS := $(wildcard $(patsubst %,benchmarks/%.py,assembly step skip solvers scaling ranks))
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test test-debian stress bench bench-smoke lint docs clean
@@ -31,7 +31,7 @@ demo: ## Install what is needed, run the first demo, make its picture
 	"$(BIN)/python" demos/demo_column_roller.py --plot output/column_roller.png
 	@echo "The picture is output/column_roller.png"
 
-test: ## Run the tests on one rank, then on NP=2 ranks (ARGS="-k name" goes to pytest)
+test: ## Run the tests on one rank, then on NP="2 3" ranks (ARGS="-k name" goes to pytest)
 	@$(SETUP) wheel plot test
 	@bash scripts/run_tests.sh $(ARGS)
 

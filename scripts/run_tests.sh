@@ -4,16 +4,24 @@
 #
 # usage: run_tests.sh [ARGUMENT OF PYTEST...]
 #
-# Run the tests of the environment $VENV on one rank, then on $NP ranks. The first run that
-# fails ends it. The last line is pytest's summary, after launchers' messages too.
-# $TEST_TIMEOUT is the time limit of each run in seconds; $MPIRUN another launcher.
+# Run the tests of the environment $VENV on one rank, then on each number of ranks of the list
+# $NP (default: 2 3; 1 is no more than the first run). The first run that fails ends it. The last
+# line is pytest's summary, after launchers' messages too. $TEST_TIMEOUT is the time limit of each
+# run in seconds; $MPIRUN another launcher.
 set -uo pipefail
 
 cd "$(dirname "$0")/.." || exit 1
 venv=${VENV:-.venv}
-ranks=${NP:-2}
 limit=${TEST_TIMEOUT:-1800}
 export OMP_NUM_THREADS=1
+
+read -ra numbers <<<"${NP:-2 3}"
+for ranks in "${numbers[@]}"; do
+    if [[ ! $ranks =~ ^[1-9][0-9]*$ ]]; then
+        echo "NP=\"${NP}\" is no list of numbers of ranks, such as \"2 3\"." >&2
+        exit 1
+    fi
+done
 
 # pytest's last line, also with -q
 summary_line='^(=+ )?(no tests ran|[0-9]+ (passed|failed|skipped|deselected|xfailed|xpassed|warning|error)).* in [0-9.]+s'
@@ -44,13 +52,23 @@ run() {
 
 MPM_DOLFINX_RANKS=1 run "$venv/bin/python" -m pytest "$@"
 
-if ((ranks > 1)); then
-    launcher=("$venv/bin/mpirun")
-    if [[ -n ${MPIRUN:-} ]]; then
-        read -ra launcher <<<"$MPIRUN"
-    elif [[ ! -x ${launcher[0]} ]]; then
-        launcher=(mpirun)
-    fi
-    MPM_DOLFINX_RANKS=$ranks run "${launcher[@]}" -n "$ranks" \
-        "$venv/bin/python" -m pytest -p no:cacheprovider "$@"
+# Open MPI refuses more ranks than cores unless it is told so.
+export PRTE_MCA_rmaps_default_mapping_policy=:oversubscribe
+
+launcher=("$venv/bin/mpirun")
+if [[ -n ${MPIRUN:-} ]]; then
+    read -ra launcher <<<"$MPIRUN"
+elif [[ ! -x ${launcher[0]} ]]; then
+    launcher=(mpirun)
 fi
+for ranks in "${numbers[@]}"; do
+    ((ranks > 1)) || continue
+    waiting=()
+    if ((ranks >= $(nproc))); then
+        # Where no core is left over, ranks that wait sleep (MPICH) or yield (Open MPI).
+        waiting=(env MPIR_CVAR_ENABLE_HEAVY_YIELD=1 MPIR_CVAR_CH4_PROGRESS_THROTTLE=1
+            MPIR_CVAR_CH4_PROGRESS_THROTTLE_NO_PROGRESS_COUNT=20 OMPI_MCA_mpi_yield_when_idle=1)
+    fi
+    MPM_DOLFINX_RANKS=$ranks run "${waiting[@]}" "${launcher[@]}" -n "$ranks" \
+        "$venv/bin/python" -m pytest -p no:cacheprovider "$@"
+done
