@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from .errors import MPMError, agree
 
-__all__ = ["VERSION", "Snapshot", "Table", "read", "write"]
+__all__ = ["VERSION", "Snapshot", "Table", "complaint", "read", "write"]
 
 MAGIC = b"mpm_dolfinx checkpoint\n"
 VERSION = 1
@@ -133,7 +133,7 @@ def write(comm: MPI.Comm, path: Path, snapshot: Snapshot) -> None:
     draft = path.with_name(f".{path.name}.part")
     try:
         _write_draft(comm, draft, start, data, layout)
-        with _complaint(comm, path):
+        with complaint(comm, path):
             if comm.rank == 0:
                 _flush(draft)
                 draft.replace(path)
@@ -157,28 +157,28 @@ def _write_draft(
     for columns in data:
         counts = comm.allgather(len(columns[""]))
         firsts.append(sum(counts[: comm.rank]))
-    with _complaint(comm, draft):
+    with complaint(comm, draft):
         if comm.rank == 0:
             draft.parent.mkdir(parents=True, exist_ok=True)
             draft.unlink(missing_ok=True)
             draft.touch()
-    with _complaint(comm, draft):
+    with complaint(comm, draft):
         file = MPI.File.Open(cast(MPI.Intracomm, comm), str(draft), MPI.MODE_WRONLY)
     try:
-        with _complaint(comm, draft):
+        with complaint(comm, draft):
             if comm.rank == 0:
                 _put(file, 0, start)
             for columns, places, first in zip(data, layout, firsts, strict=True):
                 for place, values in zip(places, columns.values(), strict=True):
                     _put(file, place.part(first), _bytes(values))
-        with _complaint(comm, draft):
+        with complaint(comm, draft):
             file.Sync()
     finally:
         file.Close()
 
 
 @contextmanager
-def _complaint(comm: MPI.Comm, path: Path) -> Iterator[None]:
+def complaint(comm: MPI.Comm, path: Path) -> Iterator[None]:
     """Turn a failure of any rank to write into one error of all."""
     with agree(comm):
         try:

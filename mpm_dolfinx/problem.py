@@ -36,7 +36,7 @@ from .diagnosis import placed
 from .displacement_control import ControlledSystem, DisplacementControl
 from .errors import ConvergenceError, DomainDistortionError, MPMError, ParticleOutsideError
 from .history import History, Step
-from .io import TimeSeries, time_series
+from .io import Output, read_series
 from .particles import Particles
 from .predictor import Predictor
 from .progress import with_bar
@@ -188,7 +188,7 @@ class ParticleProblem:
         self._loaded = float(self.bodies[0].load.value)
         self._parameter = self._loaded
         self._reactions: NDArray[np.float64] | None = None
-        self._series: dict[Path, list[TimeSeries]] = {}
+        self._output = Output()
         forms = [form for form in (*residuals, *tangents) if form is not None]
         self._data = set().union(*map(data_at_points, forms))
         self._run: Run | None = None
@@ -419,17 +419,15 @@ class ParticleProblem:
         and, where there is a material, Cauchy stress, pressure and plastic strain.
 
         Args:
-            path: A ``.pvd`` file; the first call of a run replaces it. With several bodies
-                each has its own, numbered from 0: ``name_0.pvd``.
+            path: A ``.pvd`` file; the first call replaces it, unless the problem was restored
+                from a checkpoint of the run that wrote it: then the series goes on, without
+                what is later than the checkpoint. With several bodies each has its own, numbered
+                from 0: ``name_0.pvd``.
 
         Raises:
-            MPMError: The name does not end in ``.pvd``.
+            MPMError: The name does not end in ``.pvd``, or the file cannot be written.
         """
-        path = Path(path)
-        if path not in self._series:
-            self._series[path] = time_series(path, self.bodies)
-        for series in self._series[path]:
-            series.write(self.history.time)
+        self._output.write(Path(path), self.bodies, self.history.time)
 
     def keep_identity(self) -> None:
         """Note what this problem is known by, before its body meshes change (collective)."""
@@ -502,12 +500,16 @@ class ParticleProblem:
 
         Raises:
             MPMError: The file is missing, no checkpoint, newer than this package, truncated,
-                damaged, or that of another problem; the state is what it was.
+                damaged, or that of another problem, or a time series that it was writing cannot
+                be read; the state is what it was.
         """
         snapshot, source = checkpoint.read(self._comm, Path(path)), f"The checkpoint '{path}'"
         state.require_same(self, snapshot, source)
+        written = snapshot.numbers.get("series", {})
+        series = read_series(self._comm, written)
         self.cut_as(snapshot, bool(functions), source)
         state.adopt(self, snapshot, functions, resume, source)
+        self._output.go_back(series, written, self.history.time)
 
     def cut_as(self, snapshot: checkpoint.Snapshot, functions: bool, source: str) -> None:
         """Split the domains that were split in a state (collective).

@@ -306,17 +306,16 @@ class QuasiStaticProblem(ParticleProblem):
         """
         snapshot = state.capture(self)
         seconds = self.history.statistics.seconds
-        run, resume, series = self._run, self._resume, self._series
+        run, resume, output = self._run, self._resume, self._output
         arguments = dict(self.arguments)
         options = arguments.pop("options")
         self._release()
         change()
         QuasiStaticProblem.__init__(self, **arguments, **options)
         state.adopt(self, carry(snapshot), (), False, "The state before")
-        self._run, self._resume, self._series = run, resume, series
+        self._run, self._resume, self._output = run, resume, output
         self.history.statistics.update(seconds)
-        for file in (file for files in series.values() for file in files):
-            file.follow()
+        output.follow()
 
     def nodal_masses(self, number: int) -> NDArray[np.float64]:
         """Return ``int density Q_c dX`` of each owned domain of a body, ``(n, k)`` (collective)."""

@@ -91,6 +91,7 @@ def capture(problem: ParticleProblem, functions: Sequence[fem.Function] = ()) ->
         "losses": [vars(loss) for loss in history.losses],
         "stopped": None if history.stopped is None else history.stopped.__reduce__()[1],
         "statistics": _average(problem._comm, history.statistics),
+        "series": problem._output.written(),
     }
     return Snapshot(numbers, tables)
 

@@ -120,6 +120,75 @@ def test_another_run_replaces_the_series(mpi_tmp_path):
     WORLD.Barrier()
 
 
+def started(path, tmp, save_first=False):
+    """Return a problem that wrote four states of eight steps and was saved at the second."""
+    problem = scenes.slump(TRIANGLE, 10e3, h=2.0)
+    for step in problem.steps(8):
+        if save_first and step.load == 0.5:
+            problem.save(tmp / "run.ckpt")
+        if step.load in (0.25, 0.5, 0.75, 0.875):
+            problem.write(path)
+        if not save_first and step.load == 0.5:
+            problem.save(tmp / "run.ckpt")
+        if step.load == 0.875:
+            return problem
+    raise AssertionError
+
+
+@pytest.mark.parametrize("save_first", [False, True])
+@pytest.mark.parametrize("again", [False, True])
+def test_series_goes_on_after_a_checkpoint(save_first, again, mpi_tmp_path):
+    path = mpi_tmp_path / "column.pvd"
+    problem = started(path, mpi_tmp_path, save_first)
+    if not again:
+        problem = scenes.slump(TRIANGLE, 10e3, h=2.0)
+    problem.restore(mpi_tmp_path / "run.ckpt")
+    # Saved and restored once more before anything is written.
+    problem.save(mpi_tmp_path / "later.ckpt")
+    problem.restore(mpi_tmp_path / "later.ckpt")
+    for step in problem.steps(8):
+        if step.load in (0.625, 1.0):
+            problem.write(path)
+    state = expected(problem.particles)
+    WORLD.Barrier()
+    if WORLD.rank == 0:
+        times, grids = read(path)
+        assert times == [0.25, 0.5, 0.625, 1.0]
+        compare(grids[-1], *state)
+        heights = [grid.bounds[3] for grid in grids]
+        assert sorted(heights, reverse=True) == heights and len(set(heights)) == 4
+    WORLD.Barrier()
+
+
+def test_series_that_the_checkpoint_does_not_know(mpi_tmp_path):
+    path = mpi_tmp_path / "column.pvd"
+    problem = started(path, mpi_tmp_path)
+    problem.restore(mpi_tmp_path / "run.ckpt")
+    other = mpi_tmp_path / "other.pvd"
+    problem.write(other)
+    WORLD.Barrier()
+    if WORLD.rank == 0:
+        assert read(other)[0] == [0.5]
+        assert read(path)[0] == [0.25, 0.5, 0.75, 0.875]
+        path.unlink()
+    WORLD.Barrier()
+    # A file that is gone begins again, one that is damaged is no reason to go on.
+    problem.restore(mpi_tmp_path / "run.ckpt")
+    problem.write(path)
+    WORLD.Barrier()
+    if WORLD.rank == 0:
+        assert read(path)[0] == [0.5]
+        path.write_text("<VTKFile>")
+    WORLD.Barrier()
+    before = problem.particles.displacement.x.array.copy()
+    problem.solve(8)
+    after = problem.particles.displacement.x.array.copy()
+    with pytest.raises(mpm.MPMError, match=r"column\.pvd' should be the time series so far"):
+        problem.restore(mpi_tmp_path / "run.ckpt")
+    assert np.array_equal(problem.particles.displacement.x.array, after)
+    assert not np.array_equal(before, after)
+
+
 @pytest.mark.parametrize("name", ["run", "run.vtk", "run.xdmf", "run.pvd.txt"])
 def test_wrong_name(name, mpi_tmp_path):
     problem = scenes.block()
