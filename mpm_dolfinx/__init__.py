@@ -19,10 +19,12 @@ from .particles import Particles  # noqa: E402
 from .problem import ParticleProblem  # noqa: E402
 from .quasistatic import QuasiStaticProblem  # noqa: E402
 from .transfer import Weights  # noqa: E402
+from .volume_average import AveragedVolumeRatio  # noqa: E402
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "AveragedVolumeRatio",
     "ConvergenceError",
     "DisplacementControl",
     "DomainDistortionError",

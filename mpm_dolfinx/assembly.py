@@ -24,6 +24,7 @@ from .errors import MPMError
 from .f_bar import LowRankTangent, LowRankTerm
 from .particles import Particles
 from .quadrature import depends_on, follows, split_by_rule
+from .volume_average import average_in
 
 # Their types name the first of several dispatched signatures only.
 assemble_vector: Any = fem_petsc.assemble_vector
@@ -144,6 +145,8 @@ class BodyForms:
         self.internal = internal
         d = particles.displacement
         parts: list[ufl.Form] = []
+        self._average = average_in(R)
+        fast = fast and self._average is None
         if R is not None:
             (self._test,) = _arguments(R, 1, particles.W, "the residual R", "particles.W")
             parts = split_by_rule(R, d)
@@ -182,6 +185,8 @@ class BodyForms:
         self.stock = [form for form, fuse in zip(compiled, together, strict=True) if not fuse]
         self._stock_ufl = [form for form, fuse in zip(tangents, together, strict=True) if not fuse]
         self.low_rank: LowRankTangent | None = None
+        if self._average is not None:
+            self.low_rank = self._average.tangent()
         self.r: PETSc.Vec = _compat.create_vector(particles.W)
         self.external: PETSc.Vec = _compat.create_vector(particles.W)
 
@@ -207,6 +212,11 @@ class BodyForms:
         if "interior_facet" in kinds:
             pattern += ufl.inner(ufl.avg(u), ufl.avg(v)) * ufl.dS
         return self._compile([pattern])[0]
+
+    def update_average(self) -> None:
+        """Set the averaged volume ratio that the residual may hold (collective)."""
+        if self._average is not None:
+            self._average.update()
 
     def assemble_external(self) -> None:
         """Assemble the parts that do not depend on the displacement."""
@@ -236,6 +246,7 @@ class BodyForms:
 
     def assemble_residual(self) -> PETSc.Vec:
         """Assemble the residual; the external parts are those of ``assemble_external``."""
+        self.update_average()
         start = None if self.internal is None else self._force_of(self.internal.first_piola)
         _assemble_into(self.r, self._live, start)
         self.r.axpy(1.0, self.external)

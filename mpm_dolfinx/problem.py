@@ -574,6 +574,8 @@ class ParticleProblem:
         """Return to the last converged step."""
         for body in self.bodies:
             body.roll_back()
+        for share in self.shares:
+            share.forms.update_average()
         self._set_load(self._loaded)
         self.roll_back()
         if update is not None and self._parameter > 0.0:
