@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -12,7 +13,25 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["RowExchange"]
+__all__ = ["RowExchange", "swap"]
+
+
+def swap(comm: MPI.Comm, parts: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
+    """Return what each rank has sent to this one (collective).
+
+    Args:
+        comm: The ranks.
+        parts: What goes to each rank, shapes ``(n, ...)``: all of one type, and of one shape but
+            for n, on all ranks.
+    """
+    counts = np.array([len(part) for part in parts])
+    received = np.empty_like(counts)
+    comm.Alltoall(counts, received)
+    sent = np.concatenate(parts)
+    result = np.empty((received.sum(), *sent.shape[1:]), dtype=sent.dtype)
+    width = int(np.prod(sent.shape[1:]))
+    comm.Alltoallv((sent, (counts * width).tolist()), (result, (received * width).tolist()))
+    return np.split(result, np.cumsum(received)[:-1])
 
 
 class RowExchange:

@@ -4,8 +4,11 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +18,7 @@ import basix.ufl
 from dolfinx import fem, mesh
 
 from . import _compat
+from .exchange import swap
 
 __all__ = ["BackgroundBasis", "PointBasis"]
 
@@ -26,6 +30,8 @@ FACET = 1e-12
 BLOCK = 1 << 14
 #: Basis values below this are no weight.
 DROP = 1e-13
+#: Background cells that a tile, of which a rank learns at once, holds in the mean.
+TILE = 256
 
 
 class PointBasis(NamedTuple):
@@ -53,22 +59,67 @@ class PointBasis(NamedTuple):
         return PointBasis._make(None if a is None else a[:count] for a in self)
 
 
-class _Cells:
-    """The background cells that one rank owns, and the inverse of their maps."""
+class _Table(NamedTuple):
+    """Background cells, of any rank.
 
-    def __init__(self, background: mesh.Mesh) -> None:
-        tdim = background.topology.dim
+    Attributes:
+        vertices: Their geometry nodes, shape ``(n, k, gdim)``.
+        nodes: Global nodes of V, shape ``(n, K)``.
+        number: Input indices, shape ``(n,)``.
+        home: Local numbers on the ranks that own them, shape ``(n,)``.
+        rank: These ranks, shape ``(n,)``.
+    """
+
+    vertices: NDArray[np.float64]
+    nodes: NDArray[np.int64]
+    number: NDArray[np.int64]
+    home: NDArray[np.int64]
+    rank: NDArray[np.int64]
+
+    @classmethod
+    def owned(cls, V: fem.FunctionSpace) -> _Table:
+        """Return the cells that this rank owns."""
+        background = V.mesh
+        count = background.topology.index_map(background.topology.dim).size_local
+        corners = _compat.geometry_dofmap(background)[:count]
+        dofs = V.dofmap.list[:count]
+        return cls(
+            background.geometry.x[corners][:, :, : background.geometry.dim],
+            V.dofmap.index_map.local_to_global(dofs.ravel()).reshape(dofs.shape),
+            _compat.input_cell_index(background),
+            np.arange(count),
+            np.full(count, background.comm.rank),
+        )
+
+    def part(self, which: slice | NDArray[np.int64]) -> _Table:
+        """Return some of the cells."""
+        return _Table._make(a[which] for a in self)
+
+    def joined(self, other: _Table) -> _Table:
+        """Return the cells of both tables, each once."""
+        both = _Table._make(np.concatenate(pair) for pair in zip(self, other, strict=True))
+        return both.part(np.unique(both.number, return_index=True)[1])
+
+
+class _Cells:
+    """Background cells, and the inverse of their maps.
+
+    Args:
+        background: The mesh.
+        table: All of its cells, or some.
+    """
+
+    def __init__(self, background: mesh.Mesh, table: _Table) -> None:
+        self.vertices, self.nodes, self.index, self.home, self.rank = table
         self.gdim = background.geometry.dim
-        count = background.topology.index_map(tdim).size_local
-        self.vertices = background.geometry.x[_compat.geometry_dofmap(background)[:count]][
-            :, :, : self.gdim
-        ]
-        name = background.basix_cell()
-        self.simplex = name in (basix.CellType.triangle, basix.CellType.tetrahedron)
+        count = len(self.vertices)
+        self._background = background
+        self._name = background.basix_cell()
+        self.simplex = self._name in (basix.CellType.triangle, basix.CellType.tetrahedron)
         self.map = basix.ufl.element(
-            "Lagrange", name.name, _compat.geometry_degree(background)
+            "Lagrange", self._name.name, _compat.geometry_degree(background)
         ).basix_element
-        self.middle = basix.geometry(name).mean(axis=0)
+        self.middle = basix.geometry(self._name).mean(axis=0)
         # Of coordinates: no small part of a cell that is tiny or far from the origin.
         self.roundoff = 8.0 * np.finfo(float).eps * np.abs(self.vertices).max(initial=0.0)
         self.affine = self._is_affine()
@@ -79,19 +130,19 @@ class _Cells:
                 "k,nki->ni", self.map.tabulate(0, self.middle[None])[0, 0, :, 0], self.vertices
             )
         self.grid = None if self.simplex or not self.affine else _Grid.of(self.vertices)
-        size = np.ptp(self.vertices.reshape(-1, self.gdim), axis=0).max() if count else 1.0
-        self.index = _compat.input_cell_index(background)
-        cells = np.arange(count, dtype=np.int32)
-        self.tree = _compat.cell_tree(background, cells, 1e2 * TOLERANCE * size) if count else None
 
-    @property
-    def box(self) -> NDArray[np.float64]:
-        """Lower and upper corner of all cells, shape ``(2, gdim)``; empty: inverted."""
-        if len(self.vertices) == 0:
-            return np.array([np.full(self.gdim, np.inf), np.full(self.gdim, -np.inf)])
-        points = self.vertices.reshape(-1, self.gdim)
-        pad = 1e-8 * np.ptp(points, axis=0).max()
-        return np.stack([points.min(axis=0) - pad, points.max(axis=0) + pad])
+    @cached_property
+    def tree(self) -> Any:
+        """A tree of the cells' bounding boxes."""
+        size = np.ptp(self.vertices.reshape(-1, self.gdim), axis=0).max()
+        domain = self._background
+        if domain.comm.size > 1:
+            degree = self.map.degree
+            domain = _compat.disconnected_mesh(
+                MPI.COMM_SELF, self.vertices, self._name, degree=degree
+            )
+        cells = np.arange(len(self.vertices), dtype=np.int32)
+        return _compat.cell_tree(domain, cells, 1e2 * TOLERANCE * size)
 
     def _is_affine(self) -> bool:
         if len(self.vertices) == 0 or (self.simplex and self.map.degree == 1):
@@ -170,7 +221,7 @@ class _Cells:
         cell = np.zeros(n, dtype=np.int64)
         reference = np.tile(self.middle, (n, 1))
         violation = np.full(n, np.inf)
-        for start in range(0, n if self.tree is not None else 0, BLOCK):
+        for start in range(0, n if len(self.vertices) else 0, BLOCK):
             block = np.arange(start, min(start + BLOCK, n))
             block = block[np.isfinite(points[block]).all(axis=1)]
             if self.grid is not None:
@@ -298,20 +349,95 @@ def _solve(matrix: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[
     return np.asarray(cofactors / determinant[:, None])
 
 
+class _Tiles:
+    """Boxes of a coarse grid over the background, in which ranks tell each other their cells.
+
+    Args:
+        comm: The ranks (collective).
+        own: The cells that this rank owns.
+    """
+
+    def __init__(self, comm: MPI.Comm, own: _Table) -> None:
+        self._comm = comm
+        self._own = own
+        gdim = own.vertices.shape[2]
+        low, high = own.vertices.min(axis=1), own.vertices.max(axis=1)
+        empty = np.full((1, gdim), np.inf)
+        corner = np.append(low, empty, axis=0).min(axis=0)
+        opposite = np.append(high, -empty, axis=0).max(axis=0)
+        boxes = np.array(comm.allgather([corner, opposite]))
+        self._low = boxes[:, 0].min(axis=0)
+        size = boxes[:, 1].max(axis=0) - self._low
+        count = comm.allreduce(len(own.number))
+        edge = (size.prod() * TILE / count) ** (1.0 / gdim)
+        self._shape = np.maximum(size / edge, 1.0).astype(np.int64)
+        self._edges = size / self._shape
+        pad = 1e2 * TOLERANCE * size.max()
+        self._ranks = self._place(boxes + np.array([[-pad], [pad]]))
+        self._ranges = self._place(low - pad), self._place(high + pad)
+        self._known = np.zeros(self._shape.prod(), dtype=bool)
+        self.cells = own.part(slice(0))
+
+    def _place(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the places of points in the coarse grid; those outside it are at its border."""
+        place = np.clip((points - self._low) / self._edges, 0, self._shape - 1)
+        return np.asarray(place.astype(np.int64))
+
+    def _tile(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.asarray(np.ravel_multi_index(tuple(places.T), tuple(self._shape)))
+
+    def know(self, points: NDArray[np.float64]) -> bool:
+        """Learn of all cells around points; return whether there are new ones (collective)."""
+        tiles = self._tile(self._place(points[np.isfinite(points).all(axis=1)]))
+        new = np.unique(tiles[~self._known[tiles]])
+        if self._comm.allreduce(len(new)) == 0:
+            return False
+        near = np.stack(np.unravel_index(new, self._shape), axis=1)
+        steps = np.array(list(product((-1, 0, 1), repeat=len(self._shape))))
+        places = np.clip(near[:, None] + steps, 0, self._shape - 1).reshape(-1, len(self._shape))
+        asked = np.unique(self._tile(places))
+        asked = asked[~self._known[asked]]
+        self._known[asked] = True
+        place = np.stack(np.unravel_index(asked, self._shape), axis=1)
+        low, high = self._ranks[:, 0, None], self._ranks[:, 1, None]
+        of_rank = ((place >= low) & (place <= high)).all(axis=2)
+        told = [self._inside(q) for q in swap(self._comm, [asked[has] for has in of_rank])]
+        whole = [np.column_stack([t.number, t.home, t.rank, t.nodes]) for t in told]
+        numbers = np.concatenate(swap(self._comm, whole))
+        vertices = np.concatenate(swap(self._comm, [t.vertices for t in told]))
+        number, home, rank, nodes = np.split(numbers, [1, 2, 3], axis=1)
+        self.cells = self.cells.joined(
+            _Table(vertices, nodes, number[:, 0], home[:, 0], rank[:, 0])
+        )
+        return True
+
+    def _inside(self, tiles: NDArray[np.int64]) -> _Table:
+        """Return this rank's own cells in some tiles."""
+        wanted = np.zeros(len(self._known), dtype=bool)
+        wanted[tiles] = True
+        low, high = self._ranges
+        found = np.zeros(len(low), dtype=bool)
+        for step in product(*(range(n + 1) for n in (high - low).max(axis=0, initial=0))):
+            found |= wanted[self._tile(np.minimum(low + step, high))]
+        return self._own.part(np.flatnonzero(found))
+
+
 class BackgroundBasis:
     """Evaluates the basis of a background space at points, wherever their cells live.
+
+    On several ranks each learns of the cells around its points from the ranks that own them, and
+    remembers them: where points stay among known cells, nothing is sent.
 
     Args:
         V: Vector Lagrange space on the background mesh (collective).
     """
 
     def __init__(self, V: fem.FunctionSpace) -> None:
-        self._comm = V.mesh.comm
-        self._cells = _Cells(V.mesh)
+        self._mesh = V.mesh
         self._basis = V.ufl_element().basix_element
-        self._dofs = V.dofmap.list
-        self._map = V.dofmap.index_map
-        self._boxes = np.asarray(self._comm.allgather(self._cells.box))
+        own = _Table.owned(V)
+        self._tiles = _Tiles(V.mesh.comm, own) if V.mesh.comm.size > 1 else None
+        self._cells = _Cells(V.mesh, own if self._tiles is None else self._tiles.cells)
 
     def at(self, points: NDArray[np.float64], gradients: bool = False) -> PointBasis:
         """Evaluate the basis at points (collective).
@@ -326,84 +452,25 @@ class BackgroundBasis:
         Returns:
             Nodes, values and whether a cell was found.
         """
-        if self._comm.size == 1:
-            return self._evaluate(points, gradients).basis(np.zeros(len(points), np.int64))
-        inside = np.all(
-            (points[None] >= self._boxes[:, None, 0]) & (points[None] <= self._boxes[:, None, 1]),
-            axis=2,
-        )
-        asked = [np.flatnonzero(row) for row in inside]
-        questions = self._comm.alltoall([points[index] for index in asked])
-        ends = np.cumsum([len(q) for q in questions])
-        answer = self._evaluate(np.concatenate(questions), gradients)
-        replies = self._comm.alltoall(
-            [answer.part(slice(end - len(q), end)) for q, end in zip(questions, ends, strict=True)]
-        )
-        n, k = len(points), self._dofs.shape[1]
-        result = _Answer(
-            np.zeros((n, k), dtype=np.int64),
-            np.zeros((n, k)),
-            np.zeros((n, k, points.shape[1])) if gradients else None,
-            np.full(n, np.inf),
-            np.zeros(n, dtype=np.int64),
-            np.zeros(n, dtype=np.int64),
-        )
-        rank = np.zeros(n, dtype=np.int64)
-        for source, (index, reply) in enumerate(zip(asked, replies, strict=True)):
-            better = (reply.violation < result.violation[index]) | (
-                (reply.violation == result.violation[index]) & (reply.cell < result.cell[index])
-            )
-            result.take(index[better], reply.part(better))
-            rank[index[better]] = source
-        return result.basis(rank)
-
-    def _evaluate(self, points: NDArray[np.float64], gradients: bool) -> _Answer:
-        cell, reference, violation = self._cells.locate(points)
-        n, k = len(points), self._dofs.shape[1]
-        if n == 0 or self._cells.tree is None:
+        if self._tiles is not None and self._tiles.know(points):
+            self._cells = _Cells(self._mesh, self._tiles.cells)
+        cells = self._cells
+        n, k = len(points), cells.nodes.shape[1]
+        if n == 0 or len(cells.index) == 0:
             slopes = np.zeros((n, k, points.shape[1])) if gradients else None
-            nodes = np.zeros((n, k), np.int64)
-            return _Answer(nodes, np.zeros((n, k)), slopes, violation, cell, cell)
-        reference = self._cells.clip(reference)
+            none = np.zeros(n, dtype=np.int64)
+            nodes = np.zeros((n, k), dtype=np.int64)
+            return PointBasis(nodes, np.zeros((n, k)), none > 0, slopes, none, none)
+        cell, reference, violation = cells.locate(points)
+        reference = cells.clip(reference)
         table = self._basis.tabulate(int(gradients), reference)[:, :, :, 0]
-        found = (violation <= TOLERANCE)[:, None]
-        values = np.where((np.abs(table[0]) >= DROP) & found, table[0], 0.0)
+        found = violation <= TOLERANCE
+        inside = found[:, None]
+        values = np.where((np.abs(table[0]) >= DROP) & inside, table[0], 0.0)
         slopes = None
         if gradients:
-            jacobian = self._cells.jacobians(cell, reference)
+            jacobian = cells.jacobians(cell, reference)
             slopes = np.einsum("jpk,pji->pki", table[1:], np.linalg.inv(jacobian))
-            slopes = np.where(found[:, :, None], slopes, 0.0)
-        nodes = self._map.local_to_global(self._dofs[cell].ravel()).reshape(-1, k)
-        return _Answer(nodes, values, slopes, violation, self._cells.index[cell], cell)
-
-
-class _Answer(NamedTuple):
-    """Basis functions at points, how far outside the best cell they are, and its numbers.
-
-    ``cell`` is its input index, ``home`` its local number on the rank that answers.
-    """
-
-    nodes: NDArray[np.int64]
-    values: NDArray[np.float64]
-    gradients: NDArray[np.float64] | None
-    violation: NDArray[np.float64]
-    cell: NDArray[np.int64]
-    home: NDArray[np.int64]
-
-    def basis(self, rank: NDArray[np.int64]) -> PointBasis:
-        """Return what is known of the points, with the rank that each answer is of."""
-        return PointBasis(self.nodes, self.values, self.found, self.gradients, self.home, rank)
-
-    @property
-    def found(self) -> NDArray[np.bool_]:
-        return np.asarray(self.violation <= TOLERANCE)
-
-    def part(self, which: slice | NDArray[np.bool_]) -> _Answer:
-        """Return the answer for some of the points."""
-        return _Answer._make(None if a is None else a[which] for a in self)
-
-    def take(self, index: NDArray[np.int64], other: _Answer) -> None:
-        """Put another answer in the place of some points' own."""
-        for mine, theirs in zip(self, other, strict=True):
-            if mine is not None and theirs is not None:
-                mine[index] = theirs
+            slopes = np.where(inside[:, :, None], slopes, 0.0)
+        nodes = cells.nodes[cell]
+        return PointBasis(nodes, values, found, slopes, cells.home[cell], cells.rank[cell])

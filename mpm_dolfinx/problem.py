@@ -183,6 +183,7 @@ class ParticleProblem:
             shift,
             line_search,
             statistics,
+            V.mesh.geometry.dim,
         )
         self._prescribed: NDArray[np.float64] = np.zeros(len(self.bodies[0].increment.x.array))
         self._loaded = float(self.bodies[0].load.value)

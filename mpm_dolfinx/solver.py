@@ -31,6 +31,10 @@ DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 #: Values of MUMPS's INFOG(1) that more workspace cures.
 OUT_OF_WORKSPACE = (-8, -9)
 FACTORS = ("lu", "cholesky")
+#: Options of MUMPS unless others are given: K scaled by its diagonal, as the shift is; PORD orders
+#: a plane graph twice as fast as METIS and no worse, one in space worse.
+MUMPS = {"mat_mumps_icntl_8": 1}
+PLANE = {"mat_mumps_icntl_7": 4}
 
 
 class ReducedProblem(Protocol):
@@ -90,6 +94,7 @@ class NewtonSolver:
         shift: Relative diagonal shift in the factorisation.
         line_search: Whether to search.
         statistics: Where to count.
+        dim: Dimension of space.
 
     Attributes:
         snes: The PETSc SNES.
@@ -110,6 +115,7 @@ class NewtonSolver:
         shift: float,
         line_search: bool,
         statistics: Statistics,
+        dim: int,
     ) -> None:
         self._comm = comm
         self._shift = shift
@@ -142,6 +148,8 @@ class NewtonSolver:
         pc.setType("cholesky" if symmetric else "lu")
         pc.setFactorSolverType("mumps")
         self._options = {prefix + key: value for key, value in options.items()}
+        defaults = MUMPS | (PLANE if dim == 2 else {})
+        self._defaults = {prefix + key: value for key, value in defaults.items()}
         with self._own_options() as database:
             self.snes.setFromOptions()
             own = database.hasName(f"{prefix}pc_factor_mat_solver_type")
@@ -150,14 +158,16 @@ class NewtonSolver:
 
     @contextmanager
     def _own_options(self) -> Iterator[PETSc.Options]:
-        """Put the user's options into PETSc's database, for what reads them inside the block."""
+        """Put the options into PETSc's database, for what reads them inside the block."""
         database = PETSc.Options()
-        for key, value in self._options.items():
+        defaults = {k: v for k, v in self._defaults.items() if not database.hasName(k)}
+        options = defaults | self._options
+        for key, value in options.items():
             database[key] = value
         try:
             yield database
         finally:
-            for key in self._options:
+            for key in options:
                 database.delValue(key)
 
     def solve(self, problem: ReducedProblem, sizes: tuple[int, int]) -> None:

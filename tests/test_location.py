@@ -87,6 +87,25 @@ def test_structured_grid_has_hat_functions(dim):
     np.testing.assert_allclose(to_dense(BackgroundBasis(V).at(points), V), hats, atol=1e-12)
 
 
+@pytest.mark.parametrize("cell", PLANE, ids=scenes.name)
+@pytest.mark.parametrize("bent", [False, True])
+def test_points_that_wander_through_a_large_background(cell, bent):
+    # Ranks learn of the cells around their points step by step; who owns them plays no part.
+    domain = scenes.unit(40, cell)
+    V = scenes.vectors(scenes.bend(domain, 0.005) if bent else domain)
+    background = BackgroundBasis(V)
+    corners = scenes.coordinates(V)
+    for x in (0.0, 0.3, 0.9, 0.4):
+        points = np.random.default_rng(WORLD.rank).random((60, 2)) * [0.1, 1.0] + [x, 0.0]
+        basis = background.at(points)
+        assert basis.found.all()
+        near = np.abs(corners[basis.nodes] - points[:, None]).max(axis=2)
+        assert near.max() < 0.04
+        np.testing.assert_allclose(basis.values.sum(axis=1), 1.0, atol=1e-12)
+        moved = np.einsum("nk,nki->ni", basis.values, corners[basis.nodes])
+        np.testing.assert_allclose(moved, points, atol=1e-13)
+
+
 @pytest.mark.parametrize("kind", MESHES)
 def test_points_just_outside(kind):
     V = scenes.vectors(MESHES[kind]())
