@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from . import _compat
 from ._core import loops
 from .assembly import BodyForms
+from .exchange import swap
 from .f_bar import LowRankTerm
 from .history import Statistics
 from .particles import Particles
@@ -170,7 +171,7 @@ class FusedTangent:
             share.transfer(own)
 
     def _find_touched(self, nodes: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-        """Return the global nodes of V that this rank's domains touch, its own ones first."""
+        """Return the global nodes of V that this rank's domains touch, sorted."""
         first, last = self._V.dofmap.index_map.local_range
         mark = np.zeros(last - first, dtype=bool)
         others = []
@@ -178,20 +179,14 @@ class FusedTangent:
             own = (some >= first) & (some < last)
             mark[some[own] - first] = True
             others.append(some[~own])
-        return np.concatenate([np.flatnonzero(mark) + first, np.unique(np.concatenate(others))])
+        rest = np.unique(np.concatenate(others))
+        before = np.searchsorted(rest, first)
+        return np.concatenate([rest[:before], np.flatnonzero(mark) + first, rest[before:]])
 
     def _local(self, nodes: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the numbers of nodes among the touched ones."""
         assert self._touched is not None
-        first, last = self._V.dofmap.index_map.local_range
-        own = np.count_nonzero((self._touched >= first) & (self._touched < last))
-        number = np.empty(last - first, dtype=np.int32)
-        number[self._touched[:own] - first] = np.arange(own)
-        mine = (nodes >= first) & (nodes < last)
-        result = np.empty(len(nodes), dtype=np.int32)
-        result[mine] = number[nodes[mine] - first]
-        result[~mine] = np.searchsorted(self._touched[own:], nodes[~mine]) + own
-        return result
+        return np.searchsorted(self._touched, nodes).astype(np.int32)
 
     def _connect(self, vector: PETSc.Vec) -> None:
         """Prepare to read and add to vectors of V at the touched dofs."""
@@ -221,22 +216,40 @@ class FusedTangent:
         for share, part in zip(self._shares, split, strict=True):
             share.positions = part
         self._values: NDArray[np.float64] | None = None
-        rows, starts, columns, self._sources = loops.reduce(
-            self._pattern, self._blocks, self._bs, self._numbers
+        blocks = (self._pattern, self._blocks, self._bs, self._numbers)
+        lasts = np.cumsum(self._comm.allgather(sizes[0]))
+        own = (int(lasts[self._comm.rank]) - sizes[0], int(lasts[self._comm.rank]))
+        starts, columns = self._exchange_rows(blocks, own, lasts)
+        inside, outside, self._places = loops.reduce(*blocks, own, starts, columns)
+        self._sources = np.concatenate([inside[2], outside[2]])
+        self._entries = np.zeros(len(self._sources))
+        values = np.split(self._entries, [len(inside[2])])
+        csr = [
+            (start.astype(PETSc.IntType), column.astype(PETSc.IntType), value)
+            for (start, column, _), value in zip((inside, outside), values, strict=True)
+        ]
+        self._A = PETSc.Mat().createAIJWithArrays(
+            (sizes, sizes), csr[0] if self._comm.size == 1 else tuple(csr), comm=self._comm
         )
-        self._A = PETSc.Mat()
-        if self._comm.size == 1:
-            counts = np.zeros(sizes[0] + 1, dtype=PETSc.IntType)
-            counts[rows + 1] = np.diff(starts)
-            self._entries = np.zeros(len(columns))
-            csr = (np.cumsum(counts, dtype=PETSc.IntType), columns, self._entries)
-            self._A.createAIJWithArrays((sizes, sizes), csr, comm=self._comm)
-        else:
-            self._A.create(comm=self._comm)
-            self._A.setSizes((sizes, sizes))
-            self._A.setType("aij")
-            self._entries = np.empty(len(columns))
-            _compat.set_entry_places(self._A, np.repeat(rows, np.diff(starts)), columns)
+
+    def _exchange_rows(
+        self, blocks: tuple[Any, ...], own: tuple[int, int], lasts: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Tell other ranks the places of their entries; return what they tell, by own row."""
+        rows, (starts, columns, sources) = loops.foreign_rows(*blocks, own)
+        row = np.repeat(rows, np.diff(starts))
+        owner = np.searchsorted(lasts, row, side="right")
+        order = np.argsort(owner, kind="stable")
+        self._sent = np.split(
+            sources[order], np.searchsorted(owner[order], np.arange(1, self._comm.size))
+        )
+        ends = np.cumsum([len(part) for part in self._sent])[:-1]
+        pairs = np.column_stack([row, columns])[order]
+        received = np.concatenate(swap(self._comm, np.split(pairs, ends)))
+        self._order = np.argsort(received[:, 0], kind="stable")
+        counts = np.bincount(received[:, 0] - own[0], minlength=own[1] - own[0])
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+        return offsets, np.ascontiguousarray(received[self._order, 1])
 
     def assemble(self, keep: bool) -> PETSc.Mat:
         """Return ``T^T K T``; the same object as long as the pattern lasts (collective).
@@ -245,14 +258,15 @@ class FusedTangent:
             keep: Whether :meth:`multiply_add` will be called.
         """
         assert self._A is not None
-        values = np.zeros(len(self._blocks) * self._bs**2)
+        values = np.zeros(len(self._blocks) * self._bs**2 + 1)
         for share in self._shares:
             share.add(values)
         loops.gather(values, self._sources, self._entries)
         if self._comm.size > 1:
-            _compat.set_entries(self._A, self._entries)
+            received = np.concatenate(swap(self._comm, [values[part] for part in self._sent]))
+            np.add.at(self._entries, self._places, received[self._order])
         self._A.assemble()
-        self._values = values if keep else None
+        self._values = values[:-1] if keep else None
         return self._A
 
     def multiply_add(self, u: PETSc.Vec, force: PETSc.Vec) -> None:

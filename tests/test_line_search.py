@@ -64,7 +64,7 @@ class DoubleWell:
 
 def newton(**options):
     given = {"symmetric": True, "shift": 1e-13, "line_search": True, **options}
-    return NewtonSolver(MPI.COMM_SELF, "hill_", {}, statistics=Statistics(), **given)
+    return NewtonSolver(MPI.COMM_SELF, "hill_", {}, statistics=Statistics(), dim=1, **given)
 
 
 def test_a_step_uphill_is_redirected():

@@ -300,30 +300,108 @@ core::Pattern core::pattern(const std::int64_t* offsets, const std::int32_t* nod
   return result;
 }
 
-core::Reduced core::reduce(const std::int32_t* offsets, const std::int32_t* nodes,
-                           std::size_t num_nodes, int dim, const std::int32_t* numbers)
+namespace
 {
-  if (static_cast<std::uint64_t>(offsets[num_nodes]) * dim * dim > UINT32_MAX)
-    throw std::overflow_error("too many entries for one rank; use more ranks");
-  Reduced result;
-  result.offsets.push_back(0);
-  for (std::size_t row = 0; row < num_nodes; ++row)
-    for (int i = 0; i < dim; ++i)
+// Call f(column, source) for the entries of a row of scalars.
+template <typename F>
+void for_each_entry(const core::Numbered& pattern, std::size_t row, F&& f)
+{
+  const std::size_t dim = pattern.dim, node = row / dim, i = row % dim;
+  for (std::int32_t e = pattern.offsets[node]; e < pattern.offsets[node + 1]; ++e)
+    for (std::size_t j = 0; j < dim; ++j)
     {
-      if (numbers[row * dim + i] < 0)
-        continue;
-      for (std::int32_t e = offsets[row]; e < offsets[row + 1]; ++e)
-        for (int j = 0; j < dim; ++j)
-        {
-          const std::int32_t column = numbers[static_cast<std::size_t>(nodes[e]) * dim + j];
-          if (column < 0)
-            continue;
-          result.columns.push_back(column);
-          result.sources.push_back((static_cast<std::uint32_t>(e) * dim + i) * dim + j);
-        }
-      result.rows.push_back(numbers[row * dim + i]);
-      result.offsets.push_back(static_cast<std::int32_t>(result.columns.size()));
+      const std::int32_t column = pattern.numbers[pattern.nodes[e] * dim + j];
+      if (column >= 0)
+        f(column, static_cast<std::uint32_t>((e * dim + i) * dim + j));
     }
+}
+
+std::size_t num_values(const core::Numbered& pattern)
+{
+  const std::size_t count =
+      static_cast<std::size_t>(pattern.offsets[pattern.num_nodes]) * pattern.dim * pattern.dim;
+  if (count >= UINT32_MAX)
+    throw std::overflow_error("too many entries for one rank; use more ranks");
+  return count;
+}
+} // namespace
+
+core::Reduced core::reduce(const Numbered& pattern, Range range,
+                           const std::int32_t* further_offsets,
+                           const std::int32_t* further_columns)
+{
+  const auto none = static_cast<std::uint32_t>(num_values(pattern));
+  const std::int32_t count = range.last - range.first;
+  std::vector<std::int64_t> row_of(count, -1);
+  for (std::size_t row = 0; row < pattern.num_nodes * pattern.dim; ++row)
+    if (pattern.numbers[row] >= range.first && pattern.numbers[row] < range.last)
+      row_of[pattern.numbers[row] - range.first] = static_cast<std::int64_t>(row);
+
+  Reduced result;
+  result.places.reserve(further_offsets[count]);
+  std::vector<std::pair<std::int32_t, std::uint32_t>> line;
+  for (std::int32_t r = 0; r < count; ++r)
+  {
+    line.clear();
+    if (row_of[r] >= 0)
+      for_each_entry(pattern, row_of[r], [&](std::int32_t column, std::uint32_t source) {
+        line.emplace_back(column, source);
+      });
+    for (std::int32_t e = further_offsets[r]; e < further_offsets[r + 1]; ++e)
+      line.emplace_back(further_columns[e], none);
+    if (!std::is_sorted(line.begin(), line.end()))
+      std::sort(line.begin(), line.end());
+    const std::size_t start[] = {result.inside.columns.size(), result.outside.columns.size()};
+    std::int32_t last = -1;
+    for (const auto& [column, source] : line)
+    {
+      if (column == last)
+        continue;
+      last = column;
+      const bool inside = column >= range.first && column < range.last;
+      Entries& part = inside ? result.inside : result.outside;
+      part.columns.push_back(inside ? column - range.first : column);
+      part.sources.push_back(source);
+    }
+    // Places outside are counted below zero until the number of those inside is known.
+    for (std::int32_t e = further_offsets[r]; e < further_offsets[r + 1]; ++e)
+    {
+      const std::int32_t column = further_columns[e];
+      const bool inside = column >= range.first && column < range.last;
+      const auto& columns = inside ? result.inside.columns : result.outside.columns;
+      const auto place = std::lower_bound(columns.begin() + start[inside ? 0 : 1], columns.end(),
+                                          inside ? column - range.first : column)
+                         - columns.begin();
+      result.places.push_back(inside ? place : -1 - place);
+    }
+    result.inside.offsets.push_back(static_cast<std::int32_t>(result.inside.columns.size()));
+    result.outside.offsets.push_back(static_cast<std::int32_t>(result.outside.columns.size()));
+  }
+  const auto shift = static_cast<std::int64_t>(result.inside.columns.size());
+  for (std::int64_t& place : result.places)
+    if (place < 0)
+      place = shift - 1 - place;
+  return result;
+}
+
+std::pair<std::vector<std::int32_t>, core::Entries> core::foreign_rows(const Numbered& pattern,
+                                                                       Range range)
+{
+  num_values(pattern);
+  std::pair<std::vector<std::int32_t>, Entries> result;
+  auto& [rows, entries] = result;
+  for (std::size_t row = 0; row < pattern.num_nodes * pattern.dim; ++row)
+  {
+    const std::int32_t number = pattern.numbers[row];
+    if (number < 0 || (number >= range.first && number < range.last))
+      continue;
+    for_each_entry(pattern, row, [&](std::int32_t column, std::uint32_t source) {
+      entries.columns.push_back(column);
+      entries.sources.push_back(source);
+    });
+    rows.push_back(number);
+    entries.offsets.push_back(static_cast<std::int32_t>(entries.columns.size()));
+  }
   return result;
 }
 

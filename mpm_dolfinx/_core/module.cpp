@@ -27,6 +27,18 @@ auto to_numpy(std::vector<T>&& values)
   return nb::ndarray<nb::numpy, T, nb::ndim<1>>(kept->data(), {kept->size()}, owner);
 }
 
+auto to_numpy(Entries&& entries)
+{
+  return std::make_tuple(to_numpy(std::move(entries.offsets)), to_numpy(std::move(entries.columns)),
+                         to_numpy(std::move(entries.sources)));
+}
+
+Numbered numbered(const Indices& offsets, const Indices& nodes, int dim, const Indices& numbers)
+{
+  require(numbers.size() == (offsets.size() - 1) * dim, "numbers of all rows");
+  return {offsets.data(), nodes.data(), offsets.size() - 1, dim, numbers.data()};
+}
+
 Domains domains_of(const Indices& dofmap, const Reals& gradients, const Reals* weights)
 {
   require(dofmap.ndim() == 2 && gradients.ndim() == 4, "dofmap (n, k), gradients (n, nq, k, dim)");
@@ -137,14 +149,27 @@ NB_MODULE(_loops, m)
         "Return the sparsity of a sum over supports, and the place of each pair of their nodes.");
 
   m.def("reduce",
-        [](Indices offsets, Indices nodes, int dim, Indices numbers) {
-    require(numbers.size() == (offsets.size() - 1) * dim, "numbers of all rows");
-    Reduced result = reduce(offsets.data(), nodes.data(), offsets.size() - 1, dim, numbers.data());
-    return std::make_tuple(to_numpy(std::move(result.rows)), to_numpy(std::move(result.offsets)),
-                           to_numpy(std::move(result.columns)),
-                           to_numpy(std::move(result.sources)));
-  }, "offsets"_a, "nodes"_a, "dim"_a, "numbers"_a,
-        "Return the numbered rows and columns of a pattern of blocks, and where their values are.");
+        [](Indices offsets, Indices nodes, int dim, Indices numbers, std::pair<int, int> range,
+           Indices further_offsets, Indices further_columns) {
+    require(further_offsets.size() == static_cast<std::size_t>(range.second - range.first) + 1,
+            "offsets of further entries, one for each row of the range");
+    Reduced result = reduce(numbered(offsets, nodes, dim, numbers), {range.first, range.second},
+                            further_offsets.data(), further_columns.data());
+    return std::make_tuple(to_numpy(std::move(result.inside)), to_numpy(std::move(result.outside)),
+                           to_numpy(std::move(result.places)));
+  },
+        "offsets"_a, "nodes"_a, "dim"_a, "numbers"_a, "range"_a, "further_offsets"_a,
+        "further_columns"_a,
+        "Return the rows of a pattern of blocks that are numbered in a range: their columns in "
+        "the range, the other columns, and the places of further entries among both.");
+
+  m.def("foreign_rows",
+        [](Indices offsets, Indices nodes, int dim, Indices numbers, std::pair<int, int> range) {
+    auto [rows, entries] =
+        foreign_rows(numbered(offsets, nodes, dim, numbers), {range.first, range.second});
+    return std::make_tuple(to_numpy(std::move(rows)), to_numpy(std::move(entries)));
+  }, "offsets"_a, "nodes"_a, "dim"_a, "numbers"_a, "range"_a,
+        "Return the numbered rows of a pattern of blocks that are not in a range.");
 
   m.def("gather", [](Reals values, Array<const std::uint32_t> sources, RealsOut entries) {
     require(entries.size() == sources.size(), "sources and entries");
