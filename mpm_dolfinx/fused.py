@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -19,17 +19,10 @@ from .assembly import BodyForms
 from .exchange import swap
 from .f_bar import LowRankTerm
 from .history import Statistics
+from .layout import Rows, TouchedNodes
 from .particles import Particles
 
 __all__ = ["FusedTangent"]
-
-
-class _Rows(NamedTuple):
-    """Rows of T, one for each local node of W, in compressed rows of touched nodes of V."""
-
-    offsets: NDArray[np.int64]
-    nodes: NDArray[np.int32]
-    values: NDArray[np.float64]
 
 
 class _Share:
@@ -46,21 +39,14 @@ class _Share:
         self.nodes: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
         self.positions: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
 
-    def rows(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Return offsets, global background nodes and values of the rows of T."""
-        basis = self._particles.node_basis
-        kept = basis.values != 0.0
-        offsets = np.concatenate([[0], np.cumsum(np.count_nonzero(kept, axis=1))])
-        return offsets.astype(np.int64), basis.nodes[kept], basis.values[kept]
-
-    def support(self, rows: _Rows) -> bool:
+    def support(self, rows: Rows) -> bool:
         """Find the background nodes of each domain; return whether they are the old ones."""
         offsets, nodes = loops.supports(*self._domains, *rows)
         same = np.array_equal(offsets, self.offsets) and np.array_equal(nodes, self.nodes)
         self.offsets, self.nodes = offsets, nodes
         return same
 
-    def transfer(self, rows: _Rows) -> None:
+    def transfer(self, rows: Rows) -> None:
         """Take over the values of T."""
         given = (*self._domains, *rows, self.offsets, self.nodes)
         if self._points:
@@ -139,67 +125,37 @@ class FusedTangent:
         self._comm: MPI.Comm = self._V.mesh.comm
         self._bs = self._V.dofmap.index_map_bs
         self._statistics = statistics
-        self._touched: NDArray[np.int64] | None = None
+        self._touched: TouchedNodes | None = None
         self._numbers: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
         self._A: PETSc.Mat | None = None
 
-    def restrict(self, numbers: PETSc.Vec, sizes: tuple[int, int]) -> None:
+    def restrict(
+        self,
+        touched: TouchedNodes,
+        rows: Sequence[Rows],
+        numbers: NDArray[np.int32],
+        sizes: tuple[int, int],
+    ) -> None:
         """Take over the present transfer and free dofs (collective).
 
         Args:
-            numbers: For each dof of V its number among the free dofs, or -1.
+            touched: The nodes that the bodies touch.
+            rows: Their rows of T, of each body.
+            numbers: For each own dof of V its number among the free dofs, or -1.
             sizes: Number of free dofs of this rank and of all ranks.
         """
-        rows = [share.rows() for share in self._shares]
-        touched = self._find_touched([nodes for _, nodes, _ in rows])
-        same = self._comm.allreduce(
-            self._touched is not None and np.array_equal(touched, self._touched), MPI.LAND
-        )
         self._touched = touched
-        if not same:
-            self._connect(numbers)
-        local = [_Rows(o, self._local(nodes), v) for o, nodes, v in rows]
-        for share, own in zip(self._shares, local, strict=True):
+        numbers = touched.spread(numbers.reshape(-1, self._bs)).ravel()
+        same = self._A is not None and self._A.getSizes()[0] == sizes
+        same &= np.array_equal(numbers, self._numbers)
+        self._numbers = numbers
+        for share, own in zip(self._shares, rows, strict=True):
             same &= share.support(own)
-        reduced = self._at_touched(numbers).astype(np.int32)
-        same &= np.array_equal(reduced, self._numbers)
-        self._numbers = reduced
-        if not self._comm.allreduce(same, MPI.LAND) or self._A is None:
+        if not self._comm.allreduce(same, MPI.LAND):
             self._make_pattern(sizes)
             self._statistics.count("patterns")
-        for share, own in zip(self._shares, local, strict=True):
+        for share, own in zip(self._shares, rows, strict=True):
             share.transfer(own)
-
-    def _find_touched(self, nodes: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-        """Return the global nodes of V that this rank's domains touch, sorted."""
-        first, last = self._V.dofmap.index_map.local_range
-        mark = np.zeros(last - first, dtype=bool)
-        others = []
-        for some in nodes:
-            own = (some >= first) & (some < last)
-            mark[some[own] - first] = True
-            others.append(some[~own])
-        rest = np.unique(np.concatenate(others))
-        before = np.searchsorted(rest, first)
-        return np.concatenate([rest[:before], np.flatnonzero(mark) + first, rest[before:]])
-
-    def _local(self, nodes: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Return the numbers of nodes among the touched ones."""
-        assert self._touched is not None
-        return np.searchsorted(self._touched, nodes).astype(np.int32)
-
-    def _connect(self, vector: PETSc.Vec) -> None:
-        """Prepare to read and add to vectors of V at the touched dofs."""
-        assert self._touched is not None
-        dofs = (self._touched[:, None] * self._bs + np.arange(self._bs)).ravel()
-        self._at = PETSc.Vec().createSeq(len(dofs))
-        index = PETSc.IS().createGeneral(dofs.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
-        self._scatter = PETSc.Scatter().create(vector, index, self._at, None)
-
-    def _at_touched(self, vector: PETSc.Vec) -> NDArray[np.float64]:
-        """Return a vector of V at the touched dofs (collective)."""
-        self._scatter.scatter(vector, self._at)
-        return np.asarray(self._at.array_r)
 
     def _make_pattern(self, sizes: tuple[int, int]) -> None:
         assert self._touched is not None
@@ -209,7 +165,7 @@ class FusedTangent:
         )
         nodes = np.concatenate([share.nodes for share in self._shares])
         self._pattern, self._blocks, positions = loops.pattern(
-            offsets.astype(np.int64), nodes, len(self._touched)
+            offsets.astype(np.int64), nodes, len(self._touched.nodes)
         )
         pairs = [int((np.diff(share.offsets) ** 2).sum()) for share in self._shares]
         split = np.split(positions, np.cumsum(pairs)[:-1])
@@ -271,11 +227,8 @@ class FusedTangent:
 
     def multiply_add(self, u: PETSc.Vec, force: PETSc.Vec) -> None:
         """Add the last ``T^T K T u`` on all active dofs of V, fixed ones too (collective)."""
-        assert self._values is not None
-        local = np.array(self._at_touched(u))
+        assert self._values is not None and self._touched is not None
+        local = self._touched.spread(u.array_r.reshape(-1, self._bs))
         result = np.empty_like(local)
         loops.multiply(self._pattern, self._blocks, self._bs, self._values, local, result)
-        self._at.array_w[:] = result
-        self._scatter.scatter(
-            self._at, force, PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE
-        )
+        force.array_w[:] += self._touched.collect(result).ravel()

@@ -11,7 +11,7 @@ rows of T in its column, as far as no rank gets more than its share.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -21,10 +21,121 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
-__all__ = ["FreeDofs", "even", "imbalance"]
+from .exchange import swap
+from .location import PointBasis
+
+__all__ = ["FreeDofs", "TouchedNodes", "even", "imbalance"]
 
 #: How much more than an even share a rank may have for the sake of locality.
 SLACK = 0.05
+
+
+class Rows(NamedTuple):
+    """Rows of T, one for each local node of W, in compressed rows of touched nodes of V."""
+
+    offsets: NDArray[np.int64]
+    nodes: NDArray[np.int32]
+    values: NDArray[np.float64]
+
+
+class TouchedNodes:
+    """The nodes of V that the bodies' nodes on this rank touch, and the ranks that own them.
+
+    Args:
+        V: Background space (collective).
+        bases: Background basis at the local nodes of W of each body.
+        owned: How many of these are the rank's own, which come first.
+
+    Attributes:
+        nodes: The touched nodes, global numbers, sorted.
+        rows: The rows of T of each body, in numbers of the touched nodes.
+        active: This rank's own nodes of V that any rank touches, local numbers, sorted.
+        homes: For each of these the rank that touches it most often.
+    """
+
+    def __init__(
+        self, V: fem.FunctionSpace, bases: Sequence[PointBasis], owned: Sequence[int]
+    ) -> None:
+        self._comm: MPI.Comm = V.mesh.comm
+        self._owned = owned
+        first, last = V.dofmap.index_map.local_range
+        self._size = last - first
+        kept = [basis.values != 0.0 for basis in bases]
+        every = np.concatenate([basis.nodes[keep] for basis, keep in zip(bases, kept, strict=True)])
+        self.nodes, numbers, counts = _distinct(every)
+        self.rows = []
+        for basis, keep in zip(bases, kept, strict=True):
+            ends = np.cumsum(np.count_nonzero(keep, axis=1))
+            mine, numbers = np.split(numbers, [int(ends[-1]) if len(ends) else 0])
+            offsets = np.concatenate([[0], ends]).astype(np.int64)
+            self.rows.append(Rows(offsets, mine, basis.values[keep]))
+        firsts = self._comm.allgather(first)
+        self._ends = np.searchsorted(self.nodes, firsts[1:])
+        told = swap(self._comm, self._by_owner(np.column_stack([self.nodes, counts])))
+        self._own = [part[:, 0] - first for part in told]
+        most = np.zeros(self._size, dtype=np.int64)
+        homes = np.zeros(self._size, dtype=np.int64)
+        for rank, (own, part) in enumerate(zip(self._own, told, strict=True)):
+            better = part[:, 1] > most[own]
+            homes[own[better]] = rank
+            most[own[better]] = part[better, 1]
+        self.active: NDArray[np.int32] = np.flatnonzero(most).astype(np.int32)
+        self.homes: NDArray[np.int64] = homes[self.active]
+
+    def _by_owner(self, values: NDArray[Any]) -> list[NDArray[Any]]:
+        return np.split(values, self._ends)
+
+    def spread(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return at the touched nodes what their owners have (collective).
+
+        Args:
+            values: One row for each own node of V, shape ``(n, ...)``.
+        """
+        return np.concatenate(swap(self._comm, [values[own] for own in self._own]))
+
+    def collect(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the sums of all ranks' values at this rank's own nodes of V (collective).
+
+        Args:
+            values: One row for each touched node, shape ``(n, ...)``.
+        """
+        result = np.zeros((self._size, *values.shape[1:]), dtype=values.dtype)
+        for own, part in zip(self._own, swap(self._comm, self._by_owner(values)), strict=True):
+            result[own] += part
+        return result
+
+    def off_rank(self, owner: NDArray[np.int64]) -> tuple[float, int]:
+        """Return the share of rows with a node on another rank, and how many nodes that are.
+
+        Args:
+            owner: Rank of each own node of V as an unknown, -1 where it is none (collective).
+        """
+        comm = self._comm
+        ranks = self.spread(owner)
+        off = (ranks >= 0) & (ranks != comm.rank)
+        rows = 0
+        for row, owned in zip(self.rows, self._owned, strict=True):
+            before = np.concatenate([[0], np.cumsum(off[row.nodes])])[row.offsets[: owned + 1]]
+            rows += int(np.count_nonzero(np.diff(before)))
+        counts = np.array([rows, sum(self._owned), off.sum()])
+        off_rank, total, columns = comm.allreduce(counts)
+        return float(off_rank / max(total, 1)), int(columns)
+
+
+def _distinct(
+    nodes: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
+    """Return the distinct nodes, sorted; the number of each among them; how often they occur."""
+    low = int(nodes.min(initial=np.iinfo(np.int64).max))
+    span = int(nodes.max(initial=low - 1)) - low + 1
+    if span > 8 * len(nodes):
+        found, number, counts = np.unique(nodes, return_inverse=True, return_counts=True)
+        return found, number.astype(np.int32), counts
+    counts = np.bincount(nodes - low, minlength=span)
+    found = np.flatnonzero(counts)
+    table = np.empty(span, dtype=np.int32)
+    table[found] = np.arange(len(found))
+    return found + low, table[nodes - low], counts[found]
 
 
 class FreeDofs:
@@ -33,7 +144,7 @@ class FreeDofs:
     Args:
         V: Background space.
         free: This rank's own dofs of V that are free, local numbers, sorted.
-        transfers: T of each body (collective).
+        touched: The nodes that bodies touch (collective).
 
     Attributes:
         columns: The free dofs, global numbers of V, in the order of the new numbers.
@@ -44,7 +155,7 @@ class FreeDofs:
     """
 
     def __init__(
-        self, V: fem.FunctionSpace, free: NDArray[np.int32], transfers: Sequence[PETSc.Mat]
+        self, V: fem.FunctionSpace, free: NDArray[np.int32], touched: TouchedNodes
     ) -> None:
         self._comm: MPI.Comm = V.mesh.comm
         comm, bs = self._comm, V.dofmap.index_map_bs
@@ -54,20 +165,20 @@ class FreeDofs:
         if comm.size == 1:
             self._place(index, np.arange(len(free)))
             return
-        seen = _Columns(V, transfers)
-        ranks = even(comm, seen.homes[free // bs], SLACK)
+        homes = np.full(V.dofmap.index_map.size_local, comm.rank, dtype=np.int64)
+        homes[touched.active] = touched.homes
+        ranks = even(comm, homes[free // bs], SLACK)
         owner = np.full(V.dofmap.index_map.size_local, -1, dtype=np.int64)
         owner[free // bs] = ranks
-        self.off_rank_rows, off = seen.off_rank(owner)
+        self.off_rank_rows, off = touched.off_rank(owner)
         self.off_rank_columns = bs * off
         order = np.argsort(ranks, kind="stable")
-        ends = np.searchsorted(ranks[order], np.arange(comm.size + 1))
-        received = comm.alltoall([index[order[a:b]] for a, b in pairwise(ends)])
-        firsts = comm.alltoall(_starts(comm, [len(part) for part in received]))
+        ends = np.searchsorted(ranks[order], np.arange(1, comm.size))
+        received = swap(comm, np.split(index[order], ends))
+        firsts = _starts(comm, [len(part) for part in received])
+        told = [first + np.arange(len(part)) for first, part in zip(firsts, received, strict=True)]
         numbers = np.empty(len(free), dtype=np.int64)
-        for rank, first in enumerate(firsts):
-            which = order[ends[rank] : ends[rank + 1]]
-            numbers[which] = first + np.arange(len(which))
+        numbers[order] = np.concatenate(swap(comm, told))
         self._place(np.concatenate(received), numbers)
 
     def _place(self, columns: NDArray[np.int64], numbers: NDArray[np.int64]) -> None:
@@ -107,53 +218,6 @@ def _starts(comm: MPI.Comm, counts: list[int]) -> list[int]:
     return [first + sum(counts[:i]) for i in range(len(counts))]
 
 
-class _Columns:
-    """Which nodes of V the rows of T on this rank touch, and how often.
-
-    Attributes:
-        homes: For each own node of V the rank with most rows in its column; where no body
-            touches it, this one.
-    """
-
-    def __init__(self, V: fem.FunctionSpace, transfers: Sequence[PETSc.Mat]) -> None:
-        comm, bs, nodes = V.mesh.comm, V.dofmap.index_map_bs, V.dofmap.index_map
-        self._comm = comm
-        self._rows = []
-        for T in transfers:
-            starts, columns, _ = T.getValuesCSR()
-            self._rows.append((starts, columns // bs))
-        firsts = np.array(comm.allgather(nodes.local_range[0]))
-        every = np.concatenate([columns for _, columns in self._rows])
-        self._touched, counts = np.unique(every, return_counts=True)
-        ends = np.append(np.searchsorted(self._touched, firsts), len(self._touched))
-        told = comm.alltoall([(self._touched[a:b], counts[a:b]) for a, b in pairwise(ends)])
-        self._asked = [where - firsts[comm.rank] for where, _ in told]
-        self.homes: NDArray[np.int64] = np.full(nodes.size_local, comm.rank, dtype=np.int64)
-        most = np.zeros(nodes.size_local, dtype=np.int64)
-        for rank, (local, (_, count)) in enumerate(zip(self._asked, told, strict=True)):
-            better = count > most[local]
-            self.homes[local[better]] = rank
-            most[local[better]] = count[better]
-
-    def off_rank(self, owner: NDArray[np.int64]) -> tuple[float, int]:
-        """Return the share of rows with a node on another rank, and how many nodes that are.
-
-        Args:
-            owner: New rank of each own node of V, -1 where it is not free.
-        """
-        comm = self._comm
-        ranks = np.concatenate(comm.alltoall([owner[local] for local in self._asked]))
-        off = (ranks >= 0) & (ranks != comm.rank)
-        rows = total = 0
-        for starts, columns in self._rows:
-            flags = off[np.searchsorted(self._touched, columns)]
-            sums = np.concatenate([[0], np.cumsum(flags)])[starts]
-            rows += int(np.count_nonzero(np.diff(sums)))
-            total += len(starts) - 1
-        share = comm.allreduce(rows) / max(comm.allreduce(total), 1)
-        return share, comm.allreduce(int(off.sum()))
-
-
 def imbalance(comm: MPI.Comm, count: int) -> float:
     """Return the largest count of a rank over the mean of all (collective)."""
     counts = comm.allgather(count)
@@ -174,7 +238,8 @@ def even(comm: MPI.Comm, homes: NDArray[np.int64], slack: float) -> NDArray[np.i
         Ranks, shape ``(n,)``.
     """
     size = comm.size
-    counts = np.array(comm.allgather(np.bincount(homes, minlength=size)))
+    counts = np.empty((size, size), dtype=np.int64)
+    comm.Allgather(np.bincount(homes, minlength=size), counts)
     total = counts.sum(axis=0)
     most = int(np.ceil((1.0 + slack) * total.sum() / size))
     # First come those that are at home already, then the others by rank.

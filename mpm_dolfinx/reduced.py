@@ -19,7 +19,7 @@ from .dependence import dependent_columns
 from .errors import DomainDistortionError, MPMError, agreed
 from .fused import FusedTangent
 from .history import Statistics
-from .layout import FreeDofs, imbalance
+from .layout import FreeDofs, TouchedNodes, imbalance
 from .particles import Particles
 from .predictor import Predictor, map_to_background
 from .stabilisation import Aggregation, GhostPenalty
@@ -172,10 +172,15 @@ class ReducedSystem:
         self._owned = self._V.dofmap.index_map.size_local * self._bs
         self._free: NDArray[np.int32] | None = None
         self._total: PETSc.Mat | None = None
-        fast = [b for b in bodies if b.forms.internal is not None or b.forms.fused]
+        self._fast = [
+            number
+            for number, body in enumerate(bodies)
+            if body.forms.internal is not None or body.forms.fused
+        ]
         self._fused: FusedTangent | None = None
-        if fast:
-            self._fused = FusedTangent([(b.particles, b.forms) for b in fast], statistics)
+        if self._fast:
+            fast = [(bodies[number].particles, bodies[number].forms) for number in self._fast]
+            self._fused = FusedTangent(fast, statistics)
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -232,8 +237,10 @@ class ReducedSystem:
         """Free are dofs with weight or a background term, and without a condition."""
         free = np.zeros(self._owned, dtype=bool)
         active = np.zeros(self._owned // self._bs, dtype=bool)
-        for body in self._bodies:
-            active[body.particles.active_nodes] = True
+        bodies = [body.particles for body in self._bodies]
+        owned = [body.W.dofmap.index_map.size_local for body in bodies]
+        touched = TouchedNodes(self._V, [body.node_basis for body in bodies], owned)
+        active[touched.active] = True
         if self._stabilisation is not None:
             self._stabilisation.update(self._statistics)
             active = self._stabilisation.unknowns(active)
@@ -253,7 +260,7 @@ class ReducedSystem:
             self._statistics["dependent_dofs"] = max(
                 self._statistics["dependent_dofs"], len(dependent)
             )
-        self._layout = FreeDofs(self._V, self._free, [body.particles.T for body in self._bodies])
+        self._layout = FreeDofs(self._V, self._free, touched)
         self._columns = self._layout.columns
         self._u = T.createVecRight()
         self._force = T.createVecRight()
@@ -264,7 +271,8 @@ class ReducedSystem:
         for body in self._bodies:
             body.restrict(self._columns, self._extension)
         if self._fused is not None:
-            self._fused.restrict(*self._numbering())
+            rows = [touched.rows[number] for number in self._fast]
+            self._fused.restrict(touched, rows, *self._numbering())
         self._statistics.count("transfers")
         self._statistics["free_dofs"] = self.sizes[1]
         self._statistics["off_rank_rows"] = self._layout.off_rank_rows
@@ -273,18 +281,17 @@ class ReducedSystem:
         particles = sum(body.particles.num_local for body in self._bodies)
         self._statistics["particle_imbalance"] = imbalance(self._comm, particles)
 
-    def _numbering(self) -> tuple[PETSc.Vec, tuple[int, int]]:
-        """Return the number of each dof of V among those of the fused tangent, -1: none.
+    def _numbering(self) -> tuple[NDArray[np.int32], tuple[int, int]]:
+        """Return the number of each own dof of V among those of the fused tangent, -1: none.
 
         They are the free dofs or, before an extension, all dofs of V.
         """
-        numbers = self._u.duplicate()
         if self._extension is not None:
-            first, last = numbers.getOwnershipRange()
-            numbers.array_w[:] = np.arange(first, last)
-            return numbers, numbers.getSizes()
-        numbers.set(-1.0)
-        numbers.array_w[self._free] = self._layout.numbers
+            first, last = self._u.getOwnershipRange()
+            return np.arange(first, last, dtype=np.int32), self._u.getSizes()
+        numbers = np.full(self._owned, -1, dtype=np.int32)
+        assert self._free is not None
+        numbers[self._free] = self._layout.numbers
         return numbers, self.sizes
 
     def _fused_tangent(self, fused: FusedTangent) -> PETSc.Mat:

@@ -31,10 +31,11 @@ DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 #: Values of MUMPS's INFOG(1) that more workspace cures.
 OUT_OF_WORKSPACE = (-8, -9)
 FACTORS = ("lu", "cholesky")
-#: Options of MUMPS unless others are given: K scaled by its diagonal, as the shift is; PORD orders
-#: a plane graph twice as fast as METIS and no worse, one in space worse.
+#: Options of MUMPS unless others are given: K scaled by its diagonal, as the shift is.
 MUMPS = {"mat_mumps_icntl_8": 1}
-PLANE = {"mat_mumps_icntl_7": 4}
+#: PORD orders plane graphs three times as fast as METIS and no worse, in space worse; from that
+#: many unknowns on, as it ends the process where all unknowns are neighbours of each other.
+PORD, PORD_FROM = {"mat_mumps_icntl_7": 4}, 2000
 
 
 class ReducedProblem(Protocol):
@@ -148,8 +149,7 @@ class NewtonSolver:
         pc.setType("cholesky" if symmetric else "lu")
         pc.setFactorSolverType("mumps")
         self._options = {prefix + key: value for key, value in options.items()}
-        defaults = MUMPS | (PLANE if dim == 2 else {})
-        self._defaults = {prefix + key: value for key, value in defaults.items()}
+        self._prefix, self._dim = prefix, dim
         with self._own_options() as database:
             self.snes.setFromOptions()
             own = database.hasName(f"{prefix}pc_factor_mat_solver_type")
@@ -160,8 +160,9 @@ class NewtonSolver:
     def _own_options(self) -> Iterator[PETSc.Options]:
         """Put the options into PETSc's database, for what reads them inside the block."""
         database = PETSc.Options()
-        defaults = {k: v for k, v in self._defaults.items() if not database.hasName(k)}
-        options = defaults | self._options
+        plane = self._dim == 2 and self.x is not None and self.x.getSize() >= PORD_FROM
+        defaults = {self._prefix + k: v for k, v in (MUMPS | (PORD if plane else {})).items()}
+        options = {k: v for k, v in defaults.items() if not database.hasName(k)} | self._options
         for key, value in options.items():
             database[key] = value
         try:

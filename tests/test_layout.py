@@ -10,7 +10,7 @@ import scenes
 from scenes import QUADRILATERAL, TRIANGLE, WORLD
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.layout import FreeDofs, even, imbalance
+from mpm_dolfinx.layout import FreeDofs, TouchedNodes, even, imbalance
 from mpm_dolfinx.materials import Hencky
 
 
@@ -47,7 +47,9 @@ def test_numbers_and_values():
     V = particles.V
     bs = V.dofmap.index_map_bs
     free = np.flatnonzero(np.isin(np.arange(bs * V.dofmap.index_map.size_local) % 7, [0, 2, 3]))
-    layout = FreeDofs(V, free.astype(np.int32), [particles.T])
+    owned = particles.W.dofmap.index_map.size_local
+    touched = TouchedNodes(V, [particles.node_basis], [owned])
+    layout = FreeDofs(V, free.astype(np.int32), touched)
     start = V.dofmap.index_map.local_range[0] * bs
     local, size = layout.sizes
     assert size == WORLD.allreduce(len(free)) and WORLD.allreduce(local) == size
