@@ -33,12 +33,15 @@ def mesh_of_boxes(comm: MPI.Comm, points: Any, lengths: Any, gdim: int) -> mesh.
         MPMError: Shapes that do not fit, or lengths that are not positive.
     """
     with agree(comm):
-        centres = np.asarray(points, dtype=np.float64)
+        try:
+            centres = np.asarray(points, dtype=np.float64)
+        except (TypeError, ValueError):
+            centres = np.array(np.nan)
         if centres.ndim != 2 or centres.shape[1] != gdim or not np.isfinite(centres).all():
             raise MPMError(f"points must be finite and of shape (n, {gdim}).")
         try:
             sides = np.broadcast_to(np.asarray(lengths, np.float64), centres.shape)
-        except ValueError:
+        except (TypeError, ValueError):
             raise MPMError(
                 f"lengths must be a number or of shape {centres.shape}, not {np.shape(lengths)}."
             ) from None

@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import pickle
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -18,6 +19,7 @@ __all__ = [
     "agree",
     "agreed",
     "name_particles",
+    "on_all_ranks",
 ]
 
 
@@ -113,3 +115,40 @@ def agree(comm: MPI.Comm) -> Iterator[None]:
             raise common from None
     finally:
         del mine, common  # an error that its own frame holds would keep problems alive
+
+
+def on_all_ranks(comm: MPI.Comm, function: Callable[[float], None]) -> Callable[[float], None]:
+    """Return a user's function that fails on all ranks, with one error, where it fails on any.
+
+    Args:
+        comm: The ranks, which call the function together (collective).
+        function: The function.
+    """
+
+    def call(value: float) -> None:
+        mine: Exception | None = None
+        try:
+            function(value)
+        except Exception as error:
+            mine = error
+        try:
+            if comm.size > 1 and comm.allreduce(mine is not None, MPI.LOR):
+                failures = comm.allgather(None if mine is None else _sendable(mine))
+                rank = next(r for r, failure in enumerate(failures) if failure is not None)
+                if rank != comm.rank:
+                    mine = failures[rank]
+            if mine is not None:
+                raise mine
+        finally:
+            del mine  # an error that its own frame holds would keep problems alive
+
+    return call
+
+
+def _sendable(error: Exception) -> Exception:
+    """Return an error that can be sent to other ranks, this one if it can be."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error

@@ -12,7 +12,7 @@ import numpy as np
 import ufl
 from dolfinx import fem, mesh
 
-from .errors import MPMError
+from .errors import MPMError, agree
 from .materials import Material
 from .particles import Particles
 
@@ -43,6 +43,11 @@ def as_expression(value: Any, particles: Particles, name: str, shape: tuple[int,
         if name == "density" and array.ndim == 0 and array < 0.0:
             raise MPMError(f"density must not be negative, not {value!r}.")
         value = fem.Constant(particles.mesh, array)
+    elif name == "density" and isinstance(value, fem.Function):
+        with agree(particles.mesh.comm):
+            wrong = value.x.array[~(value.x.array >= 0.0)]
+            if len(wrong):
+                raise MPMError(f"density must not be negative, not {wrong[0]:g}.")
     if value.ufl_shape != shape:
         raise MPMError(f"{name} has the shape {value.ufl_shape}, but must have {shape}.")
     for domain in ufl.domain.extract_domains(value):

@@ -34,7 +34,13 @@ from .boundary import Support
 from .cleanup import Cleaner
 from .diagnosis import placed
 from .displacement_control import ControlledSystem, DisplacementControl
-from .errors import ConvergenceError, DomainDistortionError, MPMError, ParticleOutsideError
+from .errors import (
+    ConvergenceError,
+    DomainDistortionError,
+    MPMError,
+    ParticleOutsideError,
+    on_all_ranks,
+)
 from .history import History, Step
 from .io import Output, read_series
 from .particles import Particles
@@ -291,6 +297,8 @@ class ParticleProblem:
         """
         if not isinstance(steps, int | np.integer) or steps < 1:
             raise MPMError(f"The number of steps must be a whole number from 1 on, not {steps!r}.")
+        if update is not None:
+            update = on_all_ranks(self._comm, update)
         run = self._begin_run(int(steps), update, control)
         may_split = any(body.on_distortion == "split" for body in self.bodies)
         if control is not None and (repartition is not None or may_split):
@@ -301,7 +309,7 @@ class ParticleProblem:
                 if control is None:
                     self._set_load(end)
                 if update is not None:
-                    update(t)
+                    self._follow(update, t)
                 values = run.dirichlet_values(dirichlet_values(self.bcs, self.bodies[0].V))
                 step = self._advance(end, values, t == 1.0, control)
             except (ConvergenceError, DomainDistortionError) as error:
@@ -570,6 +578,15 @@ class ParticleProblem:
     def _set_load(self, load: float) -> None:
         for body in self.bodies:
             np.copyto(body.load.value, load)
+
+    def _follow(self, update: Callable[[float], None], t: float) -> None:
+        """Set the values of a path; where that fails the load is that before the step."""
+        try:
+            update(t)
+        except Exception as error:
+            if not isinstance(error, MPMError):
+                self._restore()
+            raise
 
     def _restore(self, update: Callable[[float], None] | None = None) -> None:
         """Return to the last converged step."""

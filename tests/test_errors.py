@@ -602,11 +602,85 @@ def test_one_parameter_out_of_range():
     raises(lambda: Hencky(young, 0.3), mpm.MPMError, r"young is -1")
 
 
-def test_one_value_out_of_range_in_arrays_of_the_ranks():
+@pytest.mark.parametrize(
+    ("name", "value", "match"),
+    [
+        ("young", -1.0, "young is -1 but"),
+        ("yield_stress", np.nan, "yield_stress is nan but"),
+        ("hardening", -2.0, "hardening is -2 but"),
+    ],
+)
+def test_one_value_out_of_range_in_arrays_of_the_ranks(name, value, match):
     p = particles()
-    young = np.full(p.num_local, 1e3)
-    young[p.global_index == 0] = -1.0
-    raises(lambda: mpm.QuasiStaticProblem(p, Hencky(young, 0.3)), mpm.MPMError, r"young is -1")
+    values = np.full(p.num_local, 1e3)
+    values[p.global_index == 0] = value
+    parameters = {"young": 1e3, "yield_stress": 1.0, name: values}
+    raises(
+        lambda: mpm.QuasiStaticProblem(p, VonMises(poisson=0.3, **parameters)), mpm.MPMError, match
+    )
+
+
+def test_one_array_of_another_length():
+    p = particles()
+    young = np.full(p.num_local + (WORLD.rank == WORLD.size - 1), 1e3)
+    raises(lambda: mpm.QuasiStaticProblem(p, Hencky(young, 0.3)), mpm.MPMError, "young has")
+
+
+def test_one_negative_density():
+    p = particles()
+    density = fem.Function(fem.functionspace(p.mesh, ("DG", 0)))
+    density.x.array[:] = 1.0
+    mine = np.flatnonzero(p.global_index == 0)
+    density.x.array[density.function_space.dofmap.list[mine, 0]] = -3.0
+    raises(
+        lambda: mpm.QuasiStaticProblem(p, Hencky(1e3, 0.3), density=density),
+        mpm.MPMError,
+        "density must not be negative, not -3",
+    )
+
+
+@pytest.mark.parametrize("wrong", [np.nan, 99.0, "shape", "text"])
+def test_one_box_that_is_wrong(wrong):
+    V = scenes.vectors(scenes.box([0.0, 0.0], [4.0, 4.0], [8, 8], QUADRILATERAL))
+    x = np.array([[0.5 + 0.25 * WORLD.rank, 0.5], [0.5 + 0.25 * WORLD.rank, 0.75]])
+    if WORLD.rank == WORLD.size - 1:
+        if isinstance(wrong, float):
+            x[1, 0] = wrong
+        else:
+            x = x[:, :1] if wrong == "shape" else "text"
+    kind, match = mpm.MPMError, "points must be finite and of shape"
+    if wrong == 99.0:
+        kind, match = mpm.ParticleOutsideError, f"particle {2 * WORLD.size - 1} "
+    raises(lambda: mpm.Particles.from_points(x, 0.25, V), kind, match)
+
+
+class Unsendable(Exception):
+    """An error that cannot be made again from its arguments."""
+
+    def __init__(self, table, place):
+        super().__init__(f"There is no {table} in {place}.")
+
+
+@pytest.mark.parametrize(
+    "error", [mpm.MPMError("No table."), ValueError("No table."), Unsendable("table", "here")]
+)
+def test_path_that_fails_on_one_rank(error):
+    problem = scenes.block()
+    last = WORLD.rank == WORLD.size - 1
+
+    def path(t):
+        if t > 0.5 and last:
+            raise error
+
+    kind = RuntimeError if isinstance(error, Unsendable) and not last else type(error)
+    with pytest.raises(kind, match=r"[Nn]o table") as caught:
+        problem.solve(2, update=path)
+    if not isinstance(error, Unsendable):
+        assert len(set(WORLD.allgather(str(caught.value)))) == 1
+    # The state is that of the last converged step.
+    assert problem.history.load == [0.5] and problem.particles.load.value == 0.5
+    problem.solve(2)
+    assert problem.history.load[-1] == 1.0
 
 
 def test_errors_are_runtime_errors_with_particles_and_load():
