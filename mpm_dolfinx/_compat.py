@@ -47,6 +47,7 @@ __all__ = [
     "interpolation_points",
     "is_condition_on",
     "mesh_on_ranks",
+    "own_dofs",
     "packed",
     "require_supported",
     "set_entries",
@@ -385,3 +386,12 @@ def packed(form: fem.Form) -> tuple[Any, Any]:
         return fem.pack_constants(form), fem.pack_coefficients(form)
     own = form._cpp_object
     return dolfinx.cpp.fem.pack_constants(own), dolfinx.cpp.fem.pack_coefficients(own)
+
+
+def own_dofs(bc: fem.DirichletBC, V: fem.FunctionSpace) -> NDArray[np.int32]:
+    """Return the dofs of V, local numbers, that a condition on V or a part of it has on this rank.
+
+    DOLFINx says where ghosts begin too, but 0.9 takes dofs for blocks there.
+    """
+    dofs = np.asarray(bc.dof_indices()[0])
+    return np.asarray(dofs[dofs < V.dofmap.index_map.size_local * V.dofmap.index_map_bs])

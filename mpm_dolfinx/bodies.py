@@ -110,8 +110,7 @@ def force_at(
     gdim = V.dofmap.index_map_bs
     force = np.zeros(gdim)
     if forces is not None:
-        dofs, first_ghost = bc.dof_indices()
-        own = dofs[:first_ghost]
+        own = _compat.own_dofs(bc, V)
         np.add.at(force, own % gdim, forces[own])
     return np.asarray(V.mesh.comm.allreduce(force))
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
+from . import _compat
 from .assembly import BackgroundForms, BodyForms
 from .dependence import dependent_columns
 from .errors import DomainDistortionError, MPMError, agreed
@@ -249,8 +250,7 @@ class ReducedSystem:
             free[self._background.support()] = True
         self._fixed = np.zeros(self._owned, dtype=bool)
         for bc in self._bcs:
-            dofs, first_ghost = bc.dof_indices()
-            self._fixed[dofs[:first_ghost]] = True
+            self._fixed[_compat.own_dofs(bc, self._V)] = True
         self._free = np.flatnonzero(free & ~self._fixed).astype(np.int32)
         T = self._bodies[0].particles.T
         if self._remove_dependent:

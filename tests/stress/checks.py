@@ -493,9 +493,9 @@ class Observer:
         internal, outer, floor, absolute = totals
         fixed = np.zeros((self.background.size, dim), dtype=bool)
         for bc in self.run.bcs:
-            dofs, first_ghost = bc.dof_indices()
-            start = self.run.bodies[0].V.dofmap.index_map.local_range[0] * dim
-            for own in self.comm.allgather(dofs[:first_ghost] + start):
+            V = self.run.bodies[0].V
+            start = V.dofmap.index_map.local_range[0] * dim
+            for own in self.comm.allgather(_compat.own_dofs(bc, V) + start):
                 fixed.ravel()[own] = True
         residual = internal - outer
         free = ~fixed & (active > 1e-12)[:, None]
