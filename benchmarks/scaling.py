@@ -3,10 +3,11 @@
 """Seconds of each phase on several ranks, and what a step sends.
 
 The slumping column of case C (triangles, 20 kN/m3): one size on all numbers of ranks (strong), and
-a size that grows with them (weak). Seconds are wall time, the most of all ranks, the least of
-several runs in turn; on more ranks than there are cores only the counters mean something. From the
-counters follows a model of the traffic: the unknowns that ranks need of each other for a product
-with T are c sqrt(unknowns x ranks), the length of the borders between them.
+a size that grows with them (weak). Seconds are wall time of a load step after the first one, the
+most of all ranks, medians of several runs in turn; on more ranks than there are cores only the
+counters mean something. From the counters follows a model of the traffic: the unknowns that ranks
+need of each other for a product with T are c sqrt(unknowns x ranks), the length of the borders
+between them.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from mpi4py import MPI
@@ -28,35 +30,43 @@ import mpm_dolfinx as mpm
 
 COUNTERS = ("free_dofs", "off_rank_rows", "off_rank_columns", "dof_imbalance")
 BYTES = 8
+ITERATIVE = {"ksp_type": "cg", "ksp_rtol": 1e-8, "pc_type": "gamg"}
 
 
-def run(cell: float, steps: int) -> dict[str, Any]:
-    """Run the first load steps of 40 on the ranks there are (collective)."""
+def run(cell: float, steps: int, iterative: bool) -> dict[str, Any]:
+    """Run load steps of 40, after a first one, on the ranks there are (collective)."""
     comm = MPI.COMM_WORLD
-    problem = flow(cell, {})
+    problem = flow(cell, {"petsc_options": ITERATIVE} if iterative else {})
+    path = problem.steps(40)
+    next(path)
+    statistics = problem.history.statistics
+    before = dict(statistics)
+    iterations = []
     comm.barrier()
     start = MPI.Wtime()
-    path = problem.steps(40)
     for _ in range(steps):
-        next(path)
+        step = next(path)
+        iterations.append(problem.solver.getLinearSolveIterations() / step.iterations)
     wall = comm.allreduce(MPI.Wtime() - start, MPI.MAX)
-    statistics = problem.history.statistics
     seconds = {
-        name: comm.allreduce(value, MPI.MAX) / steps for name, value in statistics.seconds.items()
+        name: comm.allreduce(value - before[name], MPI.MAX) / steps
+        for name, value in statistics.seconds.items()
     }
-    products = 2 * statistics["residuals"] / steps + 2  # T u and T^T r, and once for each step
+    residuals = (statistics["residuals"] - before["residuals"]) / steps
+    products = 2 * residuals + 2  # T u and T^T r, and once for each step
     return {
         "ranks": comm.size,
         "cell": cell,
         "particles": problem.particles.num_global,
         "step": wall / steps,
         "seconds": seconds,
+        "iterations_per_solve": sum(iterations) / steps,
         **{name: statistics[name] for name in COUNTERS},
         "bytes_per_step": BYTES * statistics["off_rank_columns"] * products,
     }
 
 
-def launched(ranks: int, cell: float, steps: int) -> dict[str, Any]:
+def launched(ranks: int, cell: float, steps: int, iterative: bool) -> dict[str, Any]:
     """Run in processes of their own."""
     beside = Path(sys.executable).with_name("mpirun")
     launcher = str(beside) if beside.exists() else shutil.which("mpirun")
@@ -64,14 +74,16 @@ def launched(ranks: int, cell: float, steps: int) -> dict[str, Any]:
         raise SystemExit("There is no mpirun, neither beside this Python nor on PATH.")
     command = [launcher, "-n", str(ranks), sys.executable, __file__, "--task", "run"]
     command += ["--cell", str(cell), "--steps", str(steps)]
+    command += ["--iterative"] if iterative else []
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
     return dict(json.loads(done.stdout))
 
 
-def least(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """The run with the shortest step."""
-    return min(runs, key=lambda one: float(one["step"]))
+def middle(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """The medians of the seconds of several runs."""
+    seconds = {name: median(one["seconds"][name] for one in runs) for name in runs[0]["seconds"]}
+    return {**runs[0], "seconds": seconds, "step": median(one["step"] for one in runs)}
 
 
 def model(rows: list[dict[str, Any]]) -> dict[str, float]:
@@ -94,12 +106,16 @@ def model(rows: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def table(rows: list[dict[str, Any]]) -> None:
+    """Print seconds, and how many times faster than the first row the others are."""
     phases = list(rows[0]["seconds"])
     print(f"{'ranks':>5s} {'particles':>9s}" + "".join(f"{p:>13s}" for p in (*phases, "step")))
-    for row in rows:
-        values = [*(row["seconds"][p] for p in phases), row["step"]]
+    times = [[*(row["seconds"][p] for p in phases), row["step"]] for row in rows]
+    for row, values in zip(rows, times, strict=True):
         line = "".join(f"{value:13.4f}" for value in values)
         print(f"{row['ranks']:5d} {row['particles']:9d}{line}")
+    for row, values in zip(rows[1:], times[1:], strict=True):
+        ratios = (a / b if b > 0 else 1.0 for a, b in zip(times[0], values, strict=True))
+        print(f"{row['ranks']:5d} {'faster':>9s}" + "".join(f"{ratio:13.2f}" for ratio in ratios))
 
 
 def main() -> None:
@@ -107,33 +123,35 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object, no more")
-    parser.add_argument("--ranks", default="1,2,4", help="numbers of ranks")
-    parser.add_argument("--cell", type=float, default=0.0625, help="background cell, m")
-    parser.add_argument("--steps", type=int, default=2, help="load steps of 40 to run")
-    parser.add_argument("--repeats", type=int, default=3, help="runs of each")
+    parser.add_argument("--ranks", default="1,2", help="numbers of ranks")
+    parser.add_argument("--cell", type=float, default=0.04, help="background cell, m")
+    parser.add_argument("--steps", type=int, default=3, help="load steps to time")
+    parser.add_argument("--repeats", type=int, default=5, help="runs of each")
+    parser.add_argument("--only", choices=["strong", "weak"], help="one of the two alone")
+    parser.add_argument(
+        "--iterative", action="store_true", help="conjugate gradients with GAMG instead of MUMPS"
+    )
     parser.add_argument("--smoke", action="store_true", help="tiny sizes: does it run?")
     parser.add_argument("--task", choices=["run"], help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.task:
-        result = run(args.cell, args.steps)
+        result = run(args.cell, args.steps, args.iterative)
         if MPI.COMM_WORLD.rank == 0:
             print(json.dumps(result))
         return
     if args.smoke:
         args.ranks, args.cell, args.repeats, args.steps = "1,2", 0.5, 1, 1
     counts = [int(n) for n in args.ranks.split(",")]
-    strong: dict[int, list[dict[str, Any]]] = {n: [] for n in counts}
-    weak: dict[int, list[dict[str, Any]]] = {n: [] for n in counts}
+    kinds = [args.only] if args.only else ["strong", "weak"]
+    runs: dict[str, dict[int, list[dict[str, Any]]]] = {k: {n: [] for n in counts} for k in kinds}
     for _ in range(args.repeats):
         for n in counts:
-            strong[n].append(launched(n, args.cell, args.steps))
-            cells = round(8.0 / args.cell / 2 * n**0.5) * 2
-            weak[n].append(launched(n, 8.0 / cells, args.steps))
-    rows = {
-        "strong": [least(r) for r in strong.values()],
-        "weak": [least(r) for r in weak.values()],
-    }
-    fitted = model([*rows["strong"], *rows["weak"]])
+            for kind in kinds:
+                cells = round(8.0 / args.cell / 2 * n**0.5) * 2
+                cell = args.cell if kind == "strong" else 8.0 / cells
+                runs[kind][n].append(launched(n, cell, args.steps, args.iterative))
+    rows = {kind: [middle(part) for part in runs[kind].values()] for kind in kinds}
+    fitted = model([row for part in rows.values() for row in part]) if max(counts) > 1 else {}
     if args.json:
         print(json.dumps({**rows, "model": fitted, "version": mpm.__version__}))
         return

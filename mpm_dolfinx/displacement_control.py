@@ -307,6 +307,10 @@ class ControlledSystem:
         """Return the size of the displacement that x causes on the bodies."""
         return self._reduced.motion(x)
 
+    def rigid_motions(self) -> PETSc.NullSpace:
+        """Return the rigid motions in the unknowns."""
+        return self._reduced.rigid_motions()
+
     def extent(self) -> float:
         """Return the size of the positions of all nodes."""
         return self._reduced.extent()

@@ -11,6 +11,7 @@ rows of T in its column, as far as no rank gets more than its share.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -158,6 +159,7 @@ class FreeDofs:
         self, V: fem.FunctionSpace, free: NDArray[np.int32], touched: TouchedNodes
     ) -> None:
         self._comm: MPI.Comm = V.mesh.comm
+        self._V, self._free = V, free
         comm, bs = self._comm, V.dofmap.index_map_bs
         start = V.dofmap.index_map.local_range[0] * bs
         index = free.astype(np.int64) + start
@@ -209,6 +211,26 @@ class FreeDofs:
             x, self._own, addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.REVERSE
         )
         return np.asarray(self._own.array_r)
+
+    def rigid_motions(self) -> PETSc.NullSpace:
+        """Return the rigid motions of the background in the unknowns (collective)."""
+        gdim = self._V.mesh.geometry.dim
+        x = self._V.tabulate_dof_coordinates()[: self._V.dofmap.index_map.size_local, :gdim]
+        motions = [np.broadcast_to(e, x.shape) for e in np.eye(gdim)]
+        for i, j in combinations(range(gdim), 2):
+            turn = np.zeros_like(x)
+            turn[:, i], turn[:, j] = -x[:, j], x[:, i]
+            motions.append(turn)
+        found: list[PETSc.Vec] = []
+        for motion in motions:
+            vector = PETSc.Vec().createMPI(self.sizes, comm=self._comm)
+            self.collect(motion.ravel()[self._free], vector)
+            before = vector.norm()
+            for other in found * 2:  # twice is enough for orthogonality (Parlett 1980, section 6-9)
+                vector.axpy(-vector.dot(other), other)
+            if vector.normalize() > 1e-12 * before:
+                found.append(vector)
+        return PETSc.NullSpace().create(vectors=found, comm=self._comm)
 
 
 def _starts(comm: MPI.Comm, counts: list[int]) -> list[int]:

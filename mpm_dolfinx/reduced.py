@@ -445,6 +445,10 @@ class ReducedSystem:
         self._layout.collect(u[self._free], x)
         return x
 
+    def rigid_motions(self) -> PETSc.NullSpace:
+        """Return the rigid motions of the background in the free dofs (collective)."""
+        return self._layout.rigid_motions()
+
     def _penalty(self, ghost: GhostPenalty) -> tuple[PETSc.Mat, PETSc.Mat]:
         """Return the ghost penalty's matrix on all dofs and on the free ones."""
         if self.moduli is None:

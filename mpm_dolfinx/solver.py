@@ -59,6 +59,9 @@ class ReducedProblem(Protocol):
     def prediction(self) -> PETSc.Vec | None:
         """Return unknowns to expect at the step's end, if the past says any."""
 
+    def rigid_motions(self) -> PETSc.NullSpace:
+        """Return the rigid motions in the unknowns, which multigrid must know."""
+
     def impose(self) -> bool:
         """Impose the step's Dirichlet values from now on; return whether there are any."""
 
@@ -379,6 +382,8 @@ class NewtonSolver:
             self.snes.setJacobian(weakly(self._jacobian), K, self._P)
             if self._symmetric:
                 self._P.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            if self.snes.getKSP().getPC().getType() not in FACTORS:
+                self._P.setNearNullSpace(self._problem.rigid_motions())
         ksp = self.snes.getKSP()
         if ksp.getPC().getFailedReason():
             ksp.getPC().reset()  # MUMPS does not factorise again where it failed

@@ -91,3 +91,41 @@ def test_imbalance():
     assert imbalance(WORLD, 3) == 1.0
     assert imbalance(WORLD, 4 if WORLD.rank == 0 else 0) == WORLD.size
     assert imbalance(WORLD, 0) == 0.0
+
+
+def test_multigrid_knows_the_rigid_motions():
+    # Without conditions these are what the tangent of a body at rest gives no force to.
+    V = scenes.vectors(scenes.box([0.0, 0.0], [4.0, 3.0], [20, 15], QUADRILATERAL))
+    body = scenes.box([0.5, 0.3], [3.5, 2.7], [30, 24], TRIANGLE)
+    options = {"ksp_type": "cg", "pc_type": "gamg", "ksp_rtol": 1e-10}
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(body, V),
+        Hencky(1e4, 0.3),
+        density=1.0,
+        body_force=(0.0, -1.0),
+        bcs=[scenes.fix(V, scenes.at(1, 0.6))],
+        petsc_options=options,
+    )
+    problem.reduced._bcs = []
+    problem.reduced.begin(np.zeros_like(problem.particles.increment.x.array), 1.0)
+    x = PETSc.Vec().createMPI(problem.reduced.sizes, comm=WORLD)
+    problem.reduced.residual(x, x.duplicate())
+    K = problem.reduced.tangent()
+    motions = problem.reduced.rigid_motions().getVecs()
+    assert len(motions) == 3
+    for number, motion in enumerate(motions):
+        assert abs(motion.norm() - 1.0) < 1e-14
+        assert all(abs(motion.dot(other)) < 1e-14 for other in motions[:number])
+        assert (K * motion).norm() < 1e-12 * K.norm()
+
+
+def test_iterative_solver():
+    options = {"ksp_type": "cg", "pc_type": "gamg", "ksp_rtol": 1e-10, "ksp_max_it": 40}
+    moved = []
+    for given in ({}, options):
+        problem = scenes.slump(TRIANGLE, 5e3, h=0.25, petsc_options=given)
+        problem.solve(steps=2)
+        moved.append(problem.particles.displacement.x.array.copy())
+    assert problem.solver.getKSP().getPC().getType() == "gamg"
+    assert scenes.largest(moved[0]) > 1e-3
+    assert scenes.largest(moved[0] - moved[1]) < 1e-8
