@@ -164,8 +164,10 @@ class FreeDofs:
         start = V.dofmap.index_map.local_range[0] * bs
         index = free.astype(np.int64) + start
         self.off_rank_rows, self.off_rank_columns = 0.0, 0
+        self._order: NDArray[np.int64] | None = None
         if comm.size == 1:
-            self._place(index, np.arange(len(free)))
+            self.numbers = np.arange(len(free))
+            self._set_columns(index)
             return
         homes = np.full(V.dofmap.index_map.size_local, comm.rank, dtype=np.int64)
         homes[touched.active] = touched.homes
@@ -174,43 +176,36 @@ class FreeDofs:
         owner[free // bs] = ranks
         self.off_rank_rows, off = touched.off_rank(owner)
         self.off_rank_columns = bs * off
-        order = np.argsort(ranks, kind="stable")
-        ends = np.searchsorted(ranks[order], np.arange(1, comm.size))
-        received = swap(comm, np.split(index[order], ends))
-        firsts = _starts(comm, [len(part) for part in received])
-        told = [first + np.arange(len(part)) for first, part in zip(firsts, received, strict=True)]
-        numbers = np.empty(len(free), dtype=np.int64)
-        numbers[order] = np.concatenate(swap(comm, told))
-        self._place(np.concatenate(received), numbers)
+        self._order = np.argsort(ranks, kind="stable")
+        self._sent = np.searchsorted(ranks[self._order], np.arange(1, comm.size))
+        received = swap(comm, np.split(index[self._order], self._sent))
+        self._received = np.cumsum([len(part) for part in received])[:-1]
+        columns = np.concatenate(received)
+        last = sum(comm.allgather(len(columns))[: comm.rank + 1])
+        self.numbers = self._returned(np.arange(last - len(columns), last))
+        self._set_columns(columns)
 
-    def _place(self, columns: NDArray[np.int64], numbers: NDArray[np.int64]) -> None:
-        comm = self._comm
-        self.columns = PETSc.IS().createGeneral(columns.astype(PETSc.IntType), comm=comm)
-        self.numbers = numbers
+    def _set_columns(self, columns: NDArray[np.int64]) -> None:
+        self.columns = PETSc.IS().createGeneral(columns.astype(PETSc.IntType), comm=self._comm)
         self.sizes: tuple[int, int] = self.columns.getLocalSize(), self.columns.getSize()
-        self._scatter: PETSc.Scatter | None = None
-        if comm.size > 1:
-            self._own = PETSc.Vec().createMPI((len(numbers), self.sizes[1]), comm=comm)
-            targets = PETSc.IS().createGeneral(numbers.astype(PETSc.IntType), comm=comm)
-            x = PETSc.Vec().createMPI(self.sizes, comm=comm)
-            self._scatter = PETSc.Scatter().create(self._own, None, x, targets)
+
+    def _returned(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return at ``free`` what the ranks of the unknowns have."""
+        result = np.empty(len(self._free), dtype=values.dtype)
+        result[self._order] = np.concatenate(swap(self._comm, np.split(values, self._received)))
+        return result
 
     def collect(self, values: NDArray[np.float64], x: PETSc.Vec) -> None:
         """Set the unknowns to values at ``free``, the dofs on the ranks that own them in V."""
-        if self._scatter is None:
-            x.array_w[:] = values
-            return
-        self._own.array_w[:] = values
-        self._scatter.scatter(self._own, x, addv=PETSc.InsertMode.INSERT)
+        if self._order is not None:
+            parts = swap(self._comm, np.split(values[self._order], self._sent))
+            values = np.concatenate(parts)
+        x.array_w[:] = values
 
     def spread(self, x: PETSc.Vec) -> NDArray[np.float64]:
         """Return the unknowns at ``free``, the dofs on the ranks that own them in V."""
-        if self._scatter is None:
-            return np.asarray(x.array_r)
-        self._scatter.scatter(
-            x, self._own, addv=PETSc.InsertMode.INSERT, mode=PETSc.ScatterMode.REVERSE
-        )
-        return np.asarray(self._own.array_r)
+        values = np.asarray(x.array_r)
+        return values if self._order is None else self._returned(values)
 
     def rigid_motions(self) -> PETSc.NullSpace:
         """Return the rigid motions of the background in the unknowns (collective)."""
@@ -231,13 +226,6 @@ class FreeDofs:
             if vector.normalize() > 1e-12 * before:
                 found.append(vector)
         return PETSc.NullSpace().create(vectors=found, comm=self._comm)
-
-
-def _starts(comm: MPI.Comm, counts: list[int]) -> list[int]:
-    """Return where each part begins in the concatenation of all ranks' parts."""
-    before = comm.allgather(sum(counts))
-    first = sum(before[: comm.rank])
-    return [first + sum(counts[:i]) for i in range(len(counts))]
 
 
 def imbalance(comm: MPI.Comm, count: int) -> float:

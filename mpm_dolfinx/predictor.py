@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -89,10 +90,12 @@ def map_to_background(
     total = transfers[0].createVecRight()
     weight = total.duplicate()
     for T, increment in zip(transfers, increments, strict=True):
-        size = T.copy()
         indptr, columns, values = T.getValuesCSR()
-        size.setValuesCSR(indptr, columns, np.abs(values))
-        size.assemble()
+        size = T
+        if T.comm.tompi4py().allreduce(bool(values.min(initial=0.0) < 0.0), MPI.LOR):
+            size = T.copy()
+            size.setValuesCSR(indptr, columns, np.abs(values))
+            size.assemble()
         rows = size.createVecLeft()
         rows.array_w[:] = increment
         size.multTransposeAdd(rows, total, total)

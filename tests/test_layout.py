@@ -120,7 +120,7 @@ def test_multigrid_knows_the_rigid_motions():
 
 
 def test_iterative_solver():
-    options = {"ksp_type": "cg", "pc_type": "gamg", "ksp_rtol": 1e-10, "ksp_max_it": 40}
+    options = {"ksp_type": "cg", "pc_type": "gamg", "ksp_rtol": 1e-10, "ksp_max_it": 200}
     moved = []
     for given in ({}, options):
         problem = scenes.slump(TRIANGLE, 5e3, h=0.25, petsc_options=given)
