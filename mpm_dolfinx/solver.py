@@ -35,7 +35,7 @@ FACTORS = ("lu", "cholesky")
 MUMPS = {"mat_mumps_icntl_8": 1}
 #: PORD orders plane graphs three times as fast as METIS and no worse, in space worse; from that
 #: many unknowns on, as it ends the process where all unknowns are neighbours of each other.
-PORD, PORD_FROM = {"mat_mumps_icntl_7": 4}, 2000
+PORD, PORD_FROM = {"mat_mumps_icntl_7": 4}, 10000
 
 
 class ReducedProblem(Protocol):
