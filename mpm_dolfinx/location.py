@@ -159,7 +159,7 @@ class _Cells:
         self, cells: NDArray[np.int64], reference: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return ``dx/dX`` of cells at reference points, shape ``(n, gdim, gdim)``."""
-        table = self.map.tabulate(1, reference)[1:, :, :, 0]
+        table = _compat.tabulated(self.map, 1, reference)[1:]
         return np.asarray(np.einsum("jpk,pki->pij", table, self.vertices[cells]))
 
     def pull_back(
@@ -183,7 +183,7 @@ class _Cells:
         smallest = np.ptp(self.vertices, axis=1).max(axis=1).min(initial=np.inf)
         floor = self.roundoff / smallest
         for _ in range(30):
-            table = self.map.tabulate(1, reference[active])[:, :, :, 0]
+            table = _compat.tabulated(self.map, 1, reference[active])
             corners = self.vertices[cells[active]]
             gap = points[active] - np.einsum("pk,pki->pi", table[0], corners)
             jacobian = np.einsum("jpk,pki->pij", table[1:], corners)
@@ -463,7 +463,7 @@ class BackgroundBasis:
             return PointBasis(nodes, np.zeros((n, k)), none > 0, slopes, none, none)
         cell, reference, violation = cells.locate(points)
         reference = cells.clip(reference)
-        table = self._basis.tabulate(int(gradients), reference)[:, :, :, 0]
+        table = _compat.tabulated(self._basis, int(gradients), reference)
         found = violation <= TOLERANCE
         inside = found[:, None]
         values = np.where((np.abs(table[0]) >= DROP) & inside, table[0], 0.0)
