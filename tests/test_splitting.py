@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Quadrilaterals split into triangles in the middle of a run: what is kept, and what follows."""
 
+import warnings
+
 import numpy as np
 import pytest
 import scenes
@@ -183,6 +185,92 @@ def test_diagonals_make_triangles_of_positive_area():
         det = np.linalg.det(np.stack([slopes @ x, across @ x], axis=1))
         diagonal, least = diagonals(det[None])
         assert diagonal[0] == (0 if reflex in (0, 3) else 1) and least[0] > 0.0
+
+
+def dented(policy="split", comm=WORLD):
+    """Return four quadrilaterals, the middle of which is pushed into the first one."""
+    V = scenes.vectors(scenes.box([0.0, 0.0], [1.0, 1.0], [4, 4], QUADRILATERAL, comm))
+    bc, u = scenes.everywhere(V)
+    x = V.tabulate_dof_coordinates()
+    inside = ((x[:, :2] > 0.1) & (x[:, :2] < 0.9)).all(axis=1)
+    u.x.array.reshape(-1, 2)[inside] = -0.35
+    body = scenes.box([0.0, 0.0], [1.0, 1.0], [2, 2], QUADRILATERAL, comm)
+    particles = mpm.Particles(body, V, on_distortion=policy)
+    return mpm.QuasiStaticProblem(particles, Hencky(1e4, 0.3), density=2.0, bcs=[bc])
+
+
+def test_concave_domains_are_split():
+    problem = dented()
+    p = problem.particles
+    gradients = []
+    for _ in problem.steps(10):
+        corners = scenes.in_order(p, p.domains)
+        gradients.append((corners, scenes.in_order(p, p.deformation_gradient)[:, :2, :2]))
+    assert problem.history.statistics["split_domains"] == 1 and p.num_global == 5
+    assert list(scenes.in_order(p, p.origin_index)) == [0, 1, 2, 3, 0]
+    assert np.all(p.domain_distortion() > 0.0)
+    plain = dented("error")
+    plain.solve(10)
+    q = plain.particles
+    assert (scenes.in_order(q, q.domain_distortion()) < 0.0).sum() == 1
+    # All nodes move as before, and each other domain has its stress.
+    middle = [scenes.in_order(each, each.domains)[1:4] for each in (p, q)]
+    np.testing.assert_allclose(*middle, rtol=0, atol=1e-13)
+    stress = [scenes.in_order(each, each.stress)[1:4] for each in (p, q)]
+    np.testing.assert_allclose(*stress, rtol=0, atol=1e-8)
+    # The halves move as triangles from the moment of their split on.
+    first = next(i for i, (corners, _) in enumerate(gradients) if len(corners) == 5)
+    (then, F_then), (now, F_now) = gradients[first], gradients[-1]
+    for half, last in ((0, 1), (4, 2)):
+        edges = [
+            np.stack([x[half, last] - x[half, 0], x[half, 3] - x[half, 0]]) for x in (then, now)
+        ]
+        motion = np.linalg.solve(edges[0], edges[1]).T
+        np.testing.assert_allclose(F_now[half], motion @ F_then[half], rtol=1e-12)
+    np.testing.assert_allclose(F_then[0], F_then[4], rtol=1e-12)
+    # A Hencky body knows no history: its stress is that of F.
+    state = problem.arguments["material"].initial_state(2, 2)
+    H = F_now[[0, 4]] - np.eye(2)
+    expected = problem.arguments["material"].update(H, state)
+    expected = problem.arguments["material"].cauchy_stress(H, expected.state)
+    stress = scenes.in_order(p, p.stress)[[0, 4]]
+    np.testing.assert_allclose(stress, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_a_warning_tells_once():
+    problem = dented()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        problem.solve(10)
+        problem.split([1])
+    told = [w for w in caught if "fold and are split" in str(w.message)]
+    assert len(told) == (WORLD.rank == 0)
+
+
+def test_what_keeps_a_step_from_converging_is_split():
+    # One particle in a cell: hourglass stops the run, and splitting takes it on.
+    ends = []
+    for policy in ("error", "split"):
+        V = scenes.vectors(scenes.box([0.0, 0.0], [20.0, 10.0], [20, 10], QUADRILATERAL))
+        body = scenes.box([0.0, 0.0], [4.0, 8.0], [4, 8], QUADRILATERAL)
+        bcs = [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)]
+        problem = mpm.QuasiStaticProblem(
+            mpm.Particles(body, V, on_distortion=policy),
+            VonMises(1e6, 0.3, rho_y=20e3),
+            density=1000.0,
+            body_force=(0.0, -20.0),
+            bcs=bcs,
+        )
+        try:
+            problem.solve(10)
+        except mpm.MPMError as error:
+            assert not isinstance(error, mpm.ParticleOutsideError)
+        ends.append(problem.history.load[-1])
+        p = problem.particles
+        assert np.all(problem.yield_function < 1e-8)
+        np.testing.assert_allclose(scenes.total(p, p.initial_volume), 32.0, rtol=1e-12)
+    assert ends[0] < 0.6 and ends[1] > ends[0]
+    assert problem.history.statistics["split_domains"] > 0
 
 
 def test_loss_after_a_split_adds_up():
