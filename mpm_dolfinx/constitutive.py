@@ -217,7 +217,7 @@ class ConstitutiveHistory:
         if not self._particles.rebased:
             return self.first_piola, self.tangent
         gdim = self._particles.mesh.geometry.dim
-        G = (np.eye(gdim) + self._particles.earlier).reshape(-1, gdim, gdim)
+        G = (np.eye(gdim) + self._particles.reference.gradient).reshape(-1, gdim, gdim)
         volume = np.linalg.det(G)[:, None, None]
         stress = np.einsum("niJ,nMJ->niM", self.first_piola, G) / volume
         tangent = np.einsum("niJkL,nMJ,nNL->niMkN", self.tangent, G, G, optimize=True)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +27,27 @@ from .quadrature import (
     volume_ratio,
 )
 
-__all__ = ["Domains"]
+__all__ = ["Domains", "Reference"]
 
 #: Corners of a quadrilateral one after the other.
 RING = (0, 1, 3, 2)
+
+
+class Reference(NamedTuple):
+    """The undeformed body, as far as a body mesh that was made anew does not show it.
+
+    Attributes:
+        gradient: ``F - I`` of the mesh where it is not displaced, at the history's points, shape
+            ``(n, nq, gdim, gdim)``.
+        volume: Undeformed volume of each domain, shape ``(n,)``.
+        averages: Averages of the shape functions over the undeformed domains, shape ``(n, k)``.
+        domains: Undeformed corners of each domain, shape ``(n, k, gdim)``.
+    """
+
+    gradient: NDArray[np.float64]
+    volume: NDArray[np.float64]
+    averages: NDArray[np.float64]
+    domains: NDArray[np.float64]
 
 
 class Domains:
@@ -90,46 +108,45 @@ class Domains:
         self._nodes = self.W.tabulate_dof_coordinates()[:, : self._gdim].copy()
         self.deletion = Deletion(body, self.W) if deletable else None
         self._gradient: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-        self._earlier: NDArray[np.float64] | None = None
+        self._reference: Reference | None = None
 
-    def refer(self, earlier: NDArray[np.float64]) -> None:
-        """Say what deformation the mesh does not show: ``F = (I + grad d) (I + earlier)``.
+    def refer(self, reference: Reference) -> None:
+        """Say what the undeformed body is where the mesh does not show it.
 
-        The history's rule then has the volumes and gradients of the undeformed body, not those of
-        the mesh. Its arrays stay the same ones.
-
-        Args:
-            earlier: Displacement gradients at the history's points, shape ``(n, nq, gdim, gdim)``.
+        The history's rule then has the volumes and gradients of the undeformed body. Its arrays
+        stay the same ones.
         """
-        plain = DomainQuadrature(self.mesh, self._shape_functions, self._degree)
-        before = np.eye(self._gdim) + earlier
+        plain = self.mesh_rule()
+        before = np.eye(self._gdim) + reference.gradient
         np.matmul(plain.gradients, before, out=self.quadrature.gradients)
         np.divide(plain.weights, np.linalg.det(before), out=self.quadrature.weights)
-        self._earlier, self._gradient = earlier, None
-        exact = self._exact_quadrature().weights.sum(axis=1)
-        share = self.quadrature.weights.sum(axis=1) / plain.weights.sum(axis=1)
-        self.__dict__["_initial_volume"] = exact * share
+        self._reference, self._gradient = reference, None
 
     @property
     def rebased(self) -> bool:
         """Whether the mesh is not the undeformed body."""
-        return self._earlier is not None
+        return self._reference is not None
 
     @property
-    def earlier(self) -> NDArray[np.float64]:
-        """What was given to :meth:`refer`, or zero."""
-        if self._earlier is not None:
-            return self._earlier
-        return np.zeros((*self.quadrature.weights.shape, self._gdim, self._gdim))
+    def reference(self) -> Reference:
+        """The undeformed body."""
+        if self._reference is not None:
+            return self._reference
+        gradient = np.zeros((*self.quadrature.weights.shape, self._gdim, self._gdim))
+        domains = self._nodes[self.domain_nodes]
+        return Reference(gradient, self._mesh_volume, self.mesh_averages, domains)
+
+    def mesh_rule(self) -> DomainQuadrature:
+        """Return the history's rule with the volumes and gradients of the mesh."""
+        return DomainQuadrature(self.mesh, self._shape_functions, self._degree)
 
     def mesh_gradient(self) -> NDArray[np.float64]:
         """Return ``grad d`` on the mesh at the history's points, shape ``(n, nq, gdim, gdim)``."""
-        plain = DomainQuadrature(self.mesh, self._shape_functions, self._degree)
-        return plain.displacement_gradient(self._nodal())
+        return self.mesh_rule().displacement_gradient(self._nodal())
 
     def _whole_gradient(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradient since the undeformed body."""
-        return gradient if self._earlier is None else gradient + self._earlier
+        return gradient if self._reference is None else gradient + self._reference.gradient
 
     def _require_volume(self) -> None:
         with agree(self.mesh.comm):
@@ -247,12 +264,12 @@ class Domains:
     @property
     def initial_domains(self) -> NDArray[np.float64]:
         """Corners of the undeformed domains, shape ``(n, k, gdim)``."""
-        return np.asarray(self._nodes[self.domain_nodes])
+        return self.reference.domains.copy()
 
     @property
     def initial_volume(self) -> NDArray[np.float64]:
         """Volume of the undeformed domains, shape ``(n,)``; an area in the plane."""
-        return self._initial_volume.copy()
+        return self.reference.volume.copy()
 
     @property
     def volume(self) -> NDArray[np.float64]:
@@ -264,25 +281,27 @@ class Domains:
     @property
     def initial_centroid(self) -> NDArray[np.float64]:
         """Centroid of the undeformed domains, shape ``(n, gdim)``."""
-        return self._mean(self._nodes[self.domain_nodes])
+        return self.mean(self.reference.domains)
 
     @property
     def centroid(self) -> NDArray[np.float64]:
         """Particle positions: mean of ``X + d`` over the domains, shape ``(n, gdim)``."""
-        return self._mean(self._nodes[self.domain_nodes] + self._nodal())
+        return self.mean(self._nodes[self.domain_nodes] + self._nodal())
 
     @property
     def initial_points(self) -> NDArray[np.float64]:
         """Undeformed positions of the quadrature points, shape ``(n, nq, gdim)``."""
-        return self._at_points(self._nodes[self.domain_nodes])
+        return self._at_points(self.reference.domains)
 
     @property
     def points(self) -> NDArray[np.float64]:
         """Positions of the quadrature points, shape ``(n, nq, gdim)``."""
         return self._at_points(self._nodes[self.domain_nodes] + self._nodal())
 
-    def _mean(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(np.einsum("nk,nki->ni", self._averages, nodal))
+    def mean(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return averages over the undeformed domains of values at nodes ``(n, k, gdim)``."""
+        averages = self.mesh_averages if self._reference is None else self._reference.averages
+        return np.asarray(np.einsum("nk,nki->ni", averages, nodal))
 
     def _at_points(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(np.einsum("qk,nki->nqi", self.quadrature.shapes, nodal))
@@ -292,12 +311,12 @@ class Domains:
         return DomainQuadrature(self.mesh, self._shape_functions, self._exact_degree)
 
     @cached_property
-    def _initial_volume(self) -> NDArray[np.float64]:
+    def _mesh_volume(self) -> NDArray[np.float64]:
         return np.asarray(self._exact_quadrature().weights.sum(axis=1))
 
     @cached_property
-    def _averages(self) -> NDArray[np.float64]:
-        """Averages of the shape functions over the undeformed domains, shape ``(n, k)``."""
+    def mesh_averages(self) -> NDArray[np.float64]:
+        """Averages of the shape functions over the domains of the mesh, shape ``(n, k)``."""
         exact = self._exact_quadrature()
         return np.asarray(exact.weights @ exact.shapes / exact.weights.sum(axis=1)[:, None])
 
@@ -344,6 +363,12 @@ class Domains:
         sign = np.sign(self._orientation[:, 0])
         folded = self._jacobian_bound.vanishes(now, sign) & ~self.triangular
         return np.asarray(self.global_index[folded])
+
+    def proper(self) -> NDArray[np.bool_]:
+        """Return whether det J is positive wherever mass is integrated, shape ``(n,)``."""
+        exact = self._exact_quadrature()
+        ratio = volume_ratio(exact.displacement_gradient(self._nodal()))
+        return np.asarray((ratio > 0.0).all(axis=1))
 
     def domain_distortion(self) -> NDArray[np.float64]:
         """Return the smallest det J of each domain over its mean, shape ``(n,)``.

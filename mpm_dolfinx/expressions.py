@@ -16,7 +16,7 @@ from .errors import MPMError, agree
 from .materials import Material
 from .particles import Particles
 
-__all__ = ["as_expression", "carried", "facet_measure", "known_tags", "require_movable"]
+__all__ = ["as_expression", "carried", "facet_measure", "holds", "known_tags", "require_movable"]
 
 
 def as_expression(value: Any, particles: Particles, name: str, shape: tuple[int, ...]) -> Any:
@@ -83,7 +83,7 @@ def require_movable(
         MPMError: Something among them lives on the present body mesh.
     """
     for name in ("density", "body_force", "tractions", "pressures"):
-        if _holds(arguments[name], ufl.core.expr.Expr):
+        if holds(arguments[name], ufl.core.expr.Expr):
             raise MPMError(
                 f"{name} is written on the present body mesh, so {consequence}; give a function "
                 "that makes it from a mesh, e.g. lambda mesh: ufl.SpatialCoordinate(mesh)[1]."
@@ -100,9 +100,10 @@ def require_movable(
                 )
 
 
-def _holds(value: Any, kind: type) -> bool:
+def holds(value: Any, kind: Any) -> bool:
+    """Return whether a value, or one in lists and tuples, is of a kind."""
     if isinstance(value, list | tuple):
-        return any(_holds(entry, kind) for entry in value)
+        return any(holds(entry, kind) for entry in value)
     return isinstance(value, kind)
 
 

@@ -12,11 +12,12 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
+import ufl
 from dolfinx import fem, mesh
 
 from .clouds import mesh_of_boxes
 from .deletion import without_deleted
-from .domains import Domains
+from .domains import Domains, Reference
 from .errors import MPMError, ParticleOutsideError, agree
 from .location import BackgroundBasis, PointBasis
 from .methods import BoxGrid, DomainState, Rows, boxes, cpdi, cpdi2, gimp, mpm, require_boxes
@@ -83,7 +84,9 @@ class Particles(Domains):
         deletion: Which domains are deleted, with ``outside="delete"``, otherwise ``None``.
         on_distortion: As given.
         mass_share: Factor of the density that keeps the mass at each node where domains were
-            split, otherwise ``None``.
+            split or the body rebased, otherwise ``None``.
+        origin: Undeformed positions of the nodes of W where the body was rebased, otherwise
+            ``None``.
 
     Raises:
         MPMError: Spaces, meshes, method or degrees that do not go together.
@@ -119,6 +122,7 @@ class Particles(Domains):
         self._moves: list[Redistribution] = []
         self.cuts: Cuts = np.zeros((0, 2), dtype=np.int64)
         self.mass_share: fem.Function | None = None
+        self.origin: fem.Function | None = None
         self._background = BackgroundBasis(V)
         if partition == "background":
             ranks = ranks_of_background(V, self._background, cell_centres(body))
@@ -198,28 +202,33 @@ class Particles(Domains):
         Args:
             ranks: New rank of each particle this rank owns, shape ``(n,)``.
         """
-        self._take(Redistribution(self.mesh, ranks), self.cuts)
+        self._take(Redistribution(self.mesh, ranks), self.cuts, self.origin is not None)
 
-    def split(self, cuts: Cuts) -> Rebase:
-        """Cut quadrilaterals in two, undeformed (collective).
+    def rebase(self, cuts: Cuts, positions: NDArray[np.float64] | None = None) -> Rebase:
+        """Cut quadrilaterals of the mesh in two, or move its nodes (collective).
 
-        As in :meth:`move`, the rest is the business of :meth:`QuasiStaticProblem.split`.
+        As in :meth:`move`, the rest is the business of :meth:`QuasiStaticProblem.split` and
+        :meth:`QuasiStaticProblem.rebase`.
 
         Args:
-            cuts: Which, the same on all ranks.
+            cuts: Which are cut, the same on all ranks.
+            positions: Where the domains' corners are to be, shape ``(n, k, gdim)``, if elsewhere.
         """
-        move = Rebase(self.mesh, cuts)
-        self._take(move, np.concatenate([self.cuts, cuts]))
+        move = Rebase(self.mesh, cuts, positions)
+        moved = positions is not None or self.origin is not None
+        self._take(move, np.concatenate([self.cuts, cuts]), moved)
         return move
 
-    def _take(self, move: Redistribution, cuts: Cuts) -> None:
+    def _take(self, move: Redistribution, cuts: Cuts, moved: bool) -> None:
         """Live on another mesh (collective)."""
         moves, V, increment, options = self._moves, self.V, self.increment, self._options
         self.__dict__.clear()
         Particles.__init__(self, move.mesh, V, **options)
         self._moves, self.increment = [*moves, move], increment
         self.cuts = cuts
-        if len(cuts):
+        if moved:
+            self.origin = fem.Function(self.W, name="origin")
+        if moved or len(cuts):
             space = fem.functionspace(self.mesh, ("Discontinuous Lagrange", 1))
             self.mass_share = fem.Function(space, name="mass_share")
             self.mass_share.x.array[:] = 1.0
@@ -248,7 +257,7 @@ class Particles(Domains):
             self._converged,
             self.domain_nodes,
             self.initial_centroid,
-            self._mean(self._nodes[self.domain_nodes] + self._of_domains(self._converged)),
+            self.mean(self._nodes[self.domain_nodes] + self._of_domains(self._converged)),
             np.eye(self._gdim) + self._average(self.converged_gradient()),
         )
 
@@ -529,7 +538,10 @@ class Particles(Domains):
         if self.deletion is not None:
             arrays |= {"deleted": self.deletion.mask, "kept": self.deletion.kept(nodal)}
         if self.mass_share is not None:
-            arrays |= {"earlier": self.earlier, "mass share": self.mass_shares()}
+            arrays |= {f"reference {k}": v for k, v in self.reference._asdict().items()}
+            arrays["mass share"] = self.mass_shares()
+        if self.origin is not None:
+            arrays["mesh nodes"] = self._nodes[self.domain_nodes]
         return arrays
 
     def mass_shares(self) -> NDArray[np.float64]:
@@ -537,6 +549,22 @@ class Particles(Domains):
         assert self.mass_share is not None
         dofs = self.mass_share.function_space.dofmap.list[: self.num_local]
         return np.array(self.mass_share.x.array[dofs], dtype=np.float64)
+
+    def refer(self, reference: Reference) -> None:
+        """See :meth:`Domains.refer` (collective)."""
+        super().refer(reference)
+        if self.origin is not None:
+            self.origin.x.array.reshape(-1, self._gdim)[self.domain_nodes] = reference.domains
+            self.origin.x.scatter_forward()
+
+    @property
+    def area_ratio(self) -> Any:
+        """UFL: undeformed area of the body mesh's facets over their own, by Nanson's formula."""
+        if self.origin is None:
+            return 1.0
+        F = ufl.grad(self.origin)
+        area = ufl.det(F) * ufl.inv(F).T * ufl.FacetNormal(self.mesh)
+        return ufl.sqrt(ufl.inner(area, area))
 
     def set_mass_shares(self, shares: NDArray[np.float64]) -> None:
         """Set the factors of the density at the corners of the owned domains, shape ``(n, k)``."""
@@ -554,7 +582,7 @@ class Particles(Domains):
             self.deletion.restore(np.zeros_like(self.deletion.mask), arrays["kept"])
             self.deletion.restore(arrays["deleted"], arrays["kept"])
         if self.mass_share is not None:
-            self.refer(arrays["earlier"])
+            self.refer(Reference(*(arrays[f"reference {name}"] for name in Reference._fields)))
             self.set_mass_shares(arrays["mass share"])
         self.commit()
 

@@ -112,7 +112,9 @@ class QuasiStaticProblem(ParticleProblem):
         bodies = as_bodies(particles)
         if any(body.on_distortion == "split" for body in bodies):
             splitting.require_divisible(self.arguments)
-        self.__dict__.setdefault("splits_of_step", (0, 0))  # kept where it is made anew
+        first = "history" not in self.__dict__  # not made anew on other meshes
+        if first:
+            self.splits_of_step = 0, 0
         count = len(bodies) if isinstance(particles, list | tuple) else 0
         shares = zip(
             bodies,
@@ -126,7 +128,6 @@ class QuasiStaticProblem(ParticleProblem):
             strict=True,
         )
         _validate_supports(supports, bodies)
-        self.splits_of_step: tuple[int, int]
         self._stresses: list[ConstitutiveHistory] = []
         self._injected: list[tuple[ConstitutiveHistory, fem.Function, fem.Function]] = []
         self._density: list[tuple[_Frame, Any]] = []
@@ -185,7 +186,8 @@ class QuasiStaticProblem(ParticleProblem):
         )
         for body, stress in zip(bodies, self._stresses, strict=True):
             body.attach(stress)
-            _warn_of_hourglass(body)
+            if first:
+                _warn_of_hourglass(body)
         for share, stress in zip(self.shares, self._stresses, strict=True):
             averaging = stress.averaging
             if averaging is not None and share.forms.stock:
@@ -296,6 +298,19 @@ class QuasiStaticProblem(ParticleProblem):
         chosen = [np.zeros(0, dtype=np.int64) for _ in self.bodies]
         chosen[body] = np.asarray(particles, dtype=np.int64).ravel()
         splitting.split(self, chosen)
+
+    def rebase(self) -> None:
+        """Take the body as it is now for the mesh that displacements are counted from (collective).
+
+        ``particles.displacement`` starts from zero. All else goes on: deformation gradient, stress
+        and history, mass at each node, ``initial_volume`` and ``initial_centroid``, dead loads per
+        undeformed area, and the undeformed shape in pictures and series. The objects on the body
+        mesh are new ones as after :meth:`split`.
+
+        Raises:
+            MPMError: Domains or a problem that cannot be rebased. Nothing is changed.
+        """
+        splitting.rebase(self)
 
     def make_anew(self, change: Callable[[], None], carry: Callable[[Snapshot], Snapshot]) -> None:
         """Make the problem on other meshes of the same bodies, in the same state (collective).
@@ -419,6 +434,7 @@ class _Frame:
         ds = facet_measure(self._body, tags, loads, "tractions")
         terms = [
             self._turn
+            * self._body.area_ratio
             * ufl.inner(as_expression(t, self._body, "a traction", (self._dim,)), self._v)
             * ds(tag)
             for t, tag in loads

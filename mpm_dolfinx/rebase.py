@@ -102,11 +102,11 @@ class Rebase(Redistribution):
             [index[whole], index[cut], count + np.flatnonzero(here).astype(np.int64)]
         )
         nodes = _compat.geometry_dofmap(source)[: len(index)]
-        own = np.arange(nodes.shape[1])
+        own, both = np.arange(nodes.shape[1]), (0, 1) if len(cut) else ()
         corners = np.broadcast_to(own, (len(index), len(own)))[whole]
-        self._corners = np.concatenate([corners, *(HALVES[diagonal, half] for half in (0, 1))])
+        self._corners = np.concatenate([corners, *(HALVES[diagonal, half] for half in both)])
         self._parts = np.concatenate(
-            [np.ones(corners.shape), *(HALVES_OF_MASS[[half] * len(cut)] for half in (0, 1))]
+            [np.ones(corners.shape), *(HALVES_OF_MASS[[half] * len(cut)] for half in both)]
         )
 
         x = source.geometry.x[:, : source.geometry.dim].copy()

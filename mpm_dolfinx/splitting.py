@@ -12,15 +12,18 @@ kept by a factor of the density, linear in each half.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from . import _compat
 from .checkpoint import Snapshot, Table
-from .errors import MPMError
-from .expressions import require_movable
+from .domains import Reference
+from .errors import MPMError, agree
+from .exchange import RowExchange
+from .expressions import holds, require_movable
 from .particles import Particles
 from .rebase import Cuts, Rebase, diagonals
 from .validation import validate_distortion
@@ -28,14 +31,14 @@ from .validation import validate_distortion
 if TYPE_CHECKING:
     from .quasistatic import QuasiStaticProblem
 
-__all__ = ["repeat", "require_divisible", "split", "split_concave", "split_failing"]
+__all__ = ["rebase", "repeat", "require_divisible", "split", "split_concave", "split_failing"]
 
 #: How often a failing step may be mended, and the share of all quadrilaterals that is
 #: split where none is named.
 TRIES = 5
 FEW = 0.02
 #: Columns of a state that hold values at the nodes of domains.
-NODAL = ("displacement", "kept", "past ")
+NODAL = ("displacement", "kept", "past ", "mass share", "reference domains", "mesh nodes")
 
 
 def require_divisible(arguments: dict[str, Any]) -> None:
@@ -125,17 +128,33 @@ def repeat(problem: QuasiStaticProblem, snapshot: Snapshot, functions: bool, sou
                 f"{source} was made when other domains were split than now; restore it into a "
                 "problem that is made as at first."
             )
+    moved = ["mesh nodes" in table.columns for table in snapshot.tables[:-1]]
+    if any(
+        body.origin is not None and not new for body, new in zip(problem.bodies, moved, strict=True)
+    ):
+        raise MPMError(
+            f"{source} was made before the body was rebased; restore it into a problem that is "
+            "made as at first."
+        )
     missing = [theirs[len(mine) :] for mine, theirs in zip(present, wanted, strict=True)]
-    if not any(map(len, missing)):
+    if not any(map(len, missing)) and not any(moved):
         return
     if functions:
         raise MPMError(
-            f"{source} was made after domains were split, so functions= on the mesh of before "
-            "cannot be restored; restore it without them."
+            f"{source} was made after domains were split or the body rebased, so functions= on "
+            "the mesh of before cannot be restored; restore it without them."
         )
-    require_divisible(problem.arguments)
-    problem.keep_identity()
-    make_cuts(problem, missing)
+    require_movable(problem.arguments, "this checkpoint cannot be restored")
+    remesh(problem, missing)
+    if any(moved):
+        comm = problem.bodies[0].V.mesh.comm
+        positions = [
+            RowExchange(comm, table.rows, body.global_index)(table.columns["mesh nodes"])
+            if new
+            else None
+            for body, table, new in zip(problem.bodies, snapshot.tables, moved, strict=False)
+        ]
+        remesh(problem, [cuts[:0] for cuts in missing], positions)
 
 
 def split(problem: QuasiStaticProblem, chosen: Sequence[NDArray[np.int64]]) -> int:
@@ -157,55 +176,114 @@ def split(problem: QuasiStaticProblem, chosen: Sequence[NDArray[np.int64]]) -> i
     cuts = [_cuts(body, which) for body, which in zip(problem.bodies, wanted, strict=True)]
     gradients = [body.converged_gradient() for body in problem.bodies]
     masses = [problem.nodal_masses(number) for number in range(len(chosen))]
-    problem.keep_identity()
-    moves = make_cuts(problem, cuts)
+    moves = remesh(problem, cuts)
     for number, (body, move, gradient, mass) in enumerate(
         zip(problem.bodies, moves, gradients, masses, strict=True)
     ):
         nodal, matrices = move.masses(mass), problem.mass_matrices(number)
         gradient = move.of_cells(gradient)
-        if body.mass_share is not None:
-            halves = move.halves
-            earlier, shares = body.earlier.copy(), body.mass_shares()
-            earlier[halves] = _earlier(gradient[halves], body.mesh_gradient()[halves])
-            shares[halves] = _shares(matrices[halves], nodal[halves])
-            body.refer(earlier)
-            body.set_mass_shares(shares)
+        if body.mass_share is None:
+            continue
+        halves, reference, shares = move.halves, body.reference, body.mass_shares()
+        earlier = reference.gradient.copy()
+        earlier[halves] = _earlier(gradient[halves], body.mesh_gradient()[halves])
+        volume = body.mesh_rule().weights / np.linalg.det(np.eye(earlier.shape[-1]) + earlier)
+        volume = np.where(halves, volume.sum(axis=1), reference.volume)
+        averages = np.where(halves[:, None], body.mesh_averages, reference.averages)
+        body.refer(Reference(earlier, volume, averages, reference.domains))
+        shares[halves] = _shares(matrices[halves], nodal[halves])
+        body.set_mass_shares(shares)
     count = sum(map(len, cuts))
     problem.history.statistics["split_domains"] += count
     return count
 
 
-def make_cuts(problem: QuasiStaticProblem, cuts: Sequence[Cuts]) -> list[Rebase]:
-    """Make a problem anew on meshes with cuts, one array for each body (collective)."""
+def rebase(problem: QuasiStaticProblem) -> None:
+    """Take the present positions of all bodies for those of their meshes (collective).
+
+    Raises:
+        MPMError: They, or the problem, cannot be rebased.
+    """
+    _require_movable_nodes(problem)
+    gradients = [body.converged_gradient() for body in problem.bodies]
+    masses = [problem.nodal_masses(number) for number in range(len(problem.bodies))]
+    none = np.zeros((0, 2), dtype=np.int64)
+    positions = [body.domains for body in problem.bodies]
+    moves = remesh(problem, [none] * len(positions), positions)
+    for number, (body, move, gradient, mass) in enumerate(
+        zip(problem.bodies, moves, gradients, masses, strict=True)
+    ):
+        body.refer(body.reference._replace(gradient=move.of_cells(gradient)))
+        body.set_mass_shares(_shares(problem.mass_matrices(number), move.masses(mass)))
+
+
+def _require_movable_nodes(problem: QuasiStaticProblem) -> None:
+    arguments, consequence = problem.arguments, "the body cannot be rebased"
+    require_movable(arguments, consequence)
+    for name in ("density", "body_force", "tractions", "pressures"):
+        if holds(arguments[name], Callable):
+            raise MPMError(f"{name} is a function of the mesh, whose nodes move, so {consequence}.")
+    if arguments["f_bar"] != "none" or arguments["axisymmetric"]:
+        raise MPMError(f"With f_bar or axisymmetric=True {consequence}.")
+    for body in problem.bodies:
+        linear = body.W.ufl_element().degree == _compat.geometry_degree(body.mesh) == 1
+        if body.method != "cpdi2" or not linear:
+            raise MPMError("Only a body of degree 1 that moves by 'cpdi2' can be rebased.")
+        with agree(body.mesh.comm):
+            if (bad := body.global_index[~body.proper() | body.deleted]).size:
+                raise MPMError(
+                    "{particles} are concave or deleted, so the body cannot be rebased; split "
+                    "concave quadrilaterals first.",
+                    bad,
+                )
+        body.locate()
+
+
+def remesh(
+    problem: QuasiStaticProblem,
+    cuts: Sequence[Cuts],
+    positions: Sequence[NDArray[np.float64] | None] | None = None,
+) -> list[Rebase]:
+    """Make a problem anew on meshes with cuts or with moved nodes (collective).
+
+    Args:
+        problem: The problem.
+        cuts: For each body.
+        positions: For each body, of its domains' corners; displacements are zero then.
+    """
+    problem.keep_identity()
+    places = [None] * len(cuts) if positions is None else list(positions)
     moves: list[Rebase] = []
+    references = [body.reference for body in problem.bodies]
+    shares = [
+        np.ones(body.domain_nodes.shape) if body.mass_share is None else body.mass_shares()
+        for body in problem.bodies
+    ]
 
     def change() -> None:
-        moves.extend(body.split(some) for body, some in zip(problem.bodies, cuts, strict=True))
+        for body, some, x in zip(problem.bodies, cuts, places, strict=True):
+            moves.append(body.rebase(some, x))
 
     def carry(snapshot: Snapshot) -> Snapshot:
-        tables = [
-            _carried(table, move, body)
-            for table, move, body in zip(snapshot.tables, moves, problem.bodies, strict=False)
-        ]
+        tables = []
+        for move, table, reference, share, x in zip(
+            moves, snapshot.tables, references, shares, places, strict=False
+        ):
+            columns = {
+                name: move.rows(values, nodal=name.startswith(NODAL))
+                for name, values in table.columns.items()
+            }
+            if x is not None:
+                columns["displacement"] = np.zeros_like(columns["displacement"])
+            for name, values in reference._asdict().items():
+                columns[f"reference {name}"] = move.rows(values, nodal=name == "domains")
+            columns["mass share"] = move.rows(share, nodal=True)
+            tables.append(Table(move.index, columns))
         snapshot.numbers["cuts"] = [body.cuts.tolist() for body in problem.bodies]
         return Snapshot(snapshot.numbers, [*tables, snapshot.tables[-1]])
 
     problem.make_anew(change, carry)
     return moves
-
-
-def _carried(table: Table, move: Rebase, body: Particles) -> Table:
-    """Return the state of a body's domains for those on its new mesh."""
-    columns = {
-        name: move.rows(values, nodal=name.startswith(NODAL))
-        for name, values in table.columns.items()
-    }
-    if body.mass_share is not None and "earlier" not in columns:
-        n, (nq, gdim) = len(move.index), body.earlier.shape[1:3]
-        columns["earlier"] = np.zeros((n, nq, gdim, gdim))
-        columns["mass share"] = np.ones((n, body.domain_nodes.shape[1]))
-    return Table(move.index, columns)
 
 
 def _cuts(body: Particles, which: list[int]) -> Cuts:

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 import scenes
-from scenes import QUADRILATERAL, TRIANGLE, WORLD
+from scenes import ALL, HEXAHEDRON, PLANE, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 
 import ufl
 from dolfinx import fem, la
@@ -65,7 +65,7 @@ def sums(problem):
     np.add.at(at_nodes.x.array, at_nodes.function_space.dofmap.list[: p.num_local], masses)
     at_nodes.x.scatter_reverse(la.InsertMode.add)
     work = p.T.createVecLeft()
-    work.array_w.reshape(-1, 2)[:] = scenes.own(at_nodes)[:, None]
+    work.array_w.reshape(-1, p.mesh.geometry.dim)[:] = scenes.own(at_nodes)[:, None]
     forms = problem.shares[0].forms
     forms.assemble_external()
     (stress,) = problem._stresses
@@ -247,30 +247,27 @@ def test_a_warning_tells_once():
     assert len(told) == (WORLD.rank == 0)
 
 
+@pytest.mark.skip_in_parallel  # many failing steps
 def test_what_keeps_a_step_from_converging_is_split():
-    # One particle in a cell: hourglass stops the run, and splitting takes it on.
-    ends = []
-    for policy in ("error", "split"):
-        V = scenes.vectors(scenes.box([0.0, 0.0], [20.0, 10.0], [20, 10], QUADRILATERAL))
-        body = scenes.box([0.0, 0.0], [4.0, 8.0], [4, 8], QUADRILATERAL)
-        bcs = [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)]
-        problem = mpm.QuasiStaticProblem(
-            mpm.Particles(body, V, on_distortion=policy),
-            VonMises(1e6, 0.3, rho_y=20e3),
-            density=1000.0,
-            body_force=(0.0, -20.0),
-            bcs=bcs,
-        )
-        try:
-            problem.solve(10)
-        except mpm.MPMError as error:
-            assert not isinstance(error, mpm.ParticleOutsideError)
-        ends.append(problem.history.load[-1])
-        p = problem.particles
-        assert np.all(problem.yield_function < 1e-8)
-        np.testing.assert_allclose(scenes.total(p, p.initial_volume), 32.0, rtol=1e-12)
-    assert ends[0] < 0.6 and ends[1] > ends[0]
-    assert problem.history.statistics["split_domains"] > 0
+    # One particle in a cell: hourglass stops the run at 48 %, and splitting takes it on.
+    V = scenes.vectors(scenes.box([0.0, 0.0], [12.0, 9.0], [12, 9], QUADRILATERAL))
+    body = scenes.box([0.0, 0.0], [4.0, 8.0], [4, 8], QUADRILATERAL)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(body, V, on_distortion="split"),
+        VonMises(1e6, 0.3, rho_y=20e3),
+        density=1000.0,
+        body_force=(0.0, -20.0),
+        bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)],
+    )
+    p, failing = problem.particles, 0.0
+    for step in problem.steps(10):
+        if p.triangular.any() and not failing:
+            failing = step.load
+        if failing and step.load > failing + 0.01:
+            break
+    assert 0.4 < failing < 0.6 and problem.history.cutbacks > 5
+    assert np.all(problem.yield_function < 1e-8)
+    np.testing.assert_allclose(scenes.total(p, p.initial_volume), 32.0, rtol=1e-12)
 
 
 def test_loss_after_a_split_adds_up():
@@ -326,6 +323,104 @@ def test_checkpoint_after_a_split(tmp_path):
     flag = fem.Function(fem.functionspace(column().particles.mesh, ("DG", 0)), name="flag")
     with pytest.raises(mpm.MPMError, match="cannot be restored; restore it without"):
         column().restore(path, functions=[flag])
+
+
+def block_of(cell, **options):
+    """Return a bent block of plastic material on a roller, pulled at its side and pushed on top."""
+    dim = 2 if cell in PLANE else 3
+    grid = QUADRILATERAL if dim == 2 else HEXAHEDRON
+    V = scenes.vectors(scenes.box([0.0] * dim, [2.0] * dim, [4] * dim, grid))
+    body = scenes.bend(
+        scenes.box([0.0] * dim, [1.0] * dim, [2 if cell == TETRAHEDRON else 4] * dim, cell), 0.03
+    )
+    force, pull = np.zeros(dim), np.zeros(dim)
+    force[:2], pull[0] = (2.0, -10.0), 4.0
+    return mpm.QuasiStaticProblem(
+        mpm.Particles(body, V),
+        VonMises(1e3, 0.3, yield_stress=12.0, hardening=200.0),
+        density=2.0,
+        body_force=tuple(force),
+        facet_tags=scenes.facet_tags(body, scenes.at(0, 1.0), scenes.at(1, 1.0)),
+        tractions=[(tuple(pull), 1)],
+        pressures=[(6.0, 2)],
+        bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in range(dim)],
+        **options,
+    )
+
+
+@pytest.mark.parametrize("cell", ALL, ids=scenes.name)
+def test_rebase_keeps_everything_and_changes_no_step(cell):
+    problem, plain = block_of(cell), block_of(cell)
+    for each in (problem, plain):
+        half_way(each, 4)
+    p, dim = problem.particles, plain.particles.mesh.geometry.dim
+    before, state = sums(problem), result(problem)
+    undeformed = [scenes.in_order(p, a) for a in (p.initial_domains, p.initial_centroid)]
+    now = scenes.in_order(p, p.domains)
+    problem.rebase()
+    after = sums(problem)
+    for name, value in before.items():
+        size = np.abs(value).max()
+        np.testing.assert_allclose(after[name], value, rtol=0.0, atol=1e-12 * size, err_msg=name)
+    assert_same(result(problem), state, 1e-12)
+    assert scenes.largest(p.displacement.x.array) == 0.0
+    for one, two in zip(undeformed, (p.initial_domains, p.initial_centroid), strict=True):
+        np.testing.assert_allclose(scenes.in_order(p, two), one, rtol=0, atol=1e-15)
+    x = p.W.tabulate_dof_coordinates()[p.domain_nodes][:, :, :dim]
+    np.testing.assert_allclose(scenes.in_order(p, x), now, rtol=0, atol=1e-15)
+    for each in (problem, plain):
+        for load in (0.75, 1.0):
+            each.particles.load.value = load
+            each.step()
+    assert scenes.largest(plain.particles.plastic_strain) > 1e-3
+    assert problem.history.iterations == plain.history.iterations
+    assert_same(result(problem), result(plain))
+
+
+def test_rebased_and_split_state_is_restored(tmp_path):
+    path = WORLD.bcast(tmp_path) / "state"
+    whole = half_way(block_of(QUADRILATERAL), 4)
+    whole.split([1, 4])
+    whole.rebase()
+    whole.particles.load.value = 0.75
+    whole.step()
+    whole.split([7])
+    whole.save(path)
+    other = block_of(QUADRILATERAL)
+    other.restore(path)
+    assert_same(result(other), result(whole), 1e-13)
+    for each in (whole, other):
+        each.particles.load.value = 1.0
+        each.step()
+    assert_same(result(other), result(whole))
+    before = sums(whole)
+    whole.repartition(0.0)
+    for name, value in sums(whole).items():
+        size = np.abs(value).max()
+        np.testing.assert_allclose(value, before[name], rtol=0, atol=1e-12 * size, err_msg=name)
+    block_of(QUADRILATERAL).save(path)
+    with pytest.raises(mpm.MPMError, match="when other domains were split"):
+        whole.restore(path)
+    rebased = half_way(block_of(QUADRILATERAL), 4)
+    rebased.rebase()
+    with pytest.raises(mpm.MPMError, match="before the body was rebased"):
+        rebased.restore(path)
+
+
+def test_rebase_refused():
+    concave = dented("error")
+    concave.solve(10)
+    with pytest.raises(mpm.MPMError, match="particle 0 are concave or deleted"):
+        concave.rebase()
+    concave.split([0])
+    concave.rebase()
+    with pytest.raises(mpm.MPMError, match="density is a function of the mesh"):
+        column().rebase()
+    tall = scenes.column(scenes.A, 2, QUADRILATERAL, LinearElastic(1.0, 0.0), method="cpdi")
+    with pytest.raises(mpm.MPMError, match="that moves by 'cpdi2'"):
+        tall.rebase()
+    with pytest.raises(mpm.MPMError, match="With f_bar"):
+        block_of(TRIANGLE, f_bar="patch").rebase()
 
 
 def test_refused():
