@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 __all__ = ["rebase", "repeat", "require_divisible", "split", "split_concave", "split_failing"]
 
-#: How often a failing step may be mended, and the share of all quadrilaterals that is
-#: split where none is named.
+#: How often a failing step may be mended, and the share of all quadrilaterals that is split at
+#: first where none is named.
 TRIES = 5
 FEW = 0.02
 #: Columns of a state that hold values at the nodes of domains.
@@ -77,8 +77,8 @@ def split_concave(problem: QuasiStaticProblem) -> None:
 def split_failing(problem: QuasiStaticProblem, error: MPMError) -> bool:
     """Split the quadrilaterals that keep a step from converging; return whether there are any.
 
-    They are those that the error names or, of several bodies or where it names none, the most
-    distorted ones (collective).
+    They are those that the error names. Of several bodies, where it names none, and where that
+    was not enough, they are the most distorted ones too, twice as many each time (collective).
     """
     steps, tries = len(problem.history.steps), 1
     if problem.splits_of_step[0] == steps:
@@ -90,13 +90,15 @@ def split_failing(problem: QuasiStaticProblem, error: MPMError) -> bool:
     chosen = []
     for body in problem.bodies:
         whole = (body.on_distortion == "split") & ~body.triangular & ~body.deleted
-        named = whole & np.isin(body.global_index, error.particles)
-        if len(problem.bodies) > 1 or not comm.allreduce(int(named.sum())):
-            shape = np.where(whole, body.domain_distortion(), np.inf)
+        which = whole & np.isin(body.global_index, error.particles)
+        several = len(problem.bodies) > 1
+        if several or tries > 1 or not comm.allreduce(int(which.sum())):
+            shape = body.domain_distortion()
             every = np.sort(np.concatenate(comm.allgather(shape[whole])))
-            few = int(np.ceil(FEW * len(every)))
-            named = whole & (shape <= (every[few - 1] if few else -np.inf))
-        chosen.append(body.global_index[named])
+            few = int(np.ceil(FEW * 2 ** (tries - 1) * len(every)))
+            worst = whole & (shape <= (every[few - 1] if few else -np.inf))
+            which = worst if several else which | worst
+        chosen.append(body.global_index[which])
     return _split_and_say_so(problem, chosen)
 
 
