@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +76,10 @@ class Domains:
         domain_nodes: Local nodes of W of each owned domain, shape ``(n, k)``.
         quadrature: The rule that carries the history, on each owned domain.
         deletion: Which domains are deleted, or ``None`` where none may be.
+        mass_share: Factor of the density that keeps the mass at each node where domains were
+            split or the body rebased, otherwise ``None``.
+        origin: Undeformed positions of the nodes of W where the body was rebased, otherwise
+            ``None``.
     """
 
     def __init__(
@@ -109,9 +113,23 @@ class Domains:
         self.deletion = Deletion(body, self.W) if deletable else None
         self._gradient: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self._reference: Reference | None = None
+        self.mass_share: fem.Function | None = None
+        self.origin: fem.Function | None = None
+
+    def expect_reference(self, moved: bool) -> None:
+        """Prepare for a mesh that is not the undeformed body (collective).
+
+        Args:
+            moved: Whether its nodes are elsewhere.
+        """
+        space = fem.functionspace(self.mesh, ("Discontinuous Lagrange", 1))
+        self.mass_share = fem.Function(space, name="mass_share")
+        self.mass_share.x.array[:] = 1.0
+        if moved:
+            self.origin = fem.Function(self.W, name="origin")
 
     def refer(self, reference: Reference) -> None:
-        """Say what the undeformed body is where the mesh does not show it.
+        """Say what the undeformed body is where the mesh does not show it (collective).
 
         The history's rule then has the volumes and gradients of the undeformed body. Its arrays
         stay the same ones.
@@ -121,6 +139,31 @@ class Domains:
         np.matmul(plain.gradients, before, out=self.quadrature.gradients)
         np.divide(plain.weights, np.linalg.det(before), out=self.quadrature.weights)
         self._reference, self._gradient = reference, None
+        if self.origin is not None:
+            self.origin.x.array.reshape(-1, self._gdim)[self.domain_nodes] = reference.domains
+            self.origin.x.scatter_forward()
+
+    def mass_shares(self) -> NDArray[np.float64]:
+        """Return the factors of the density at the corners of the owned domains, ``(n, k)``."""
+        assert self.mass_share is not None
+        dofs = self.mass_share.function_space.dofmap.list[: self.num_local]
+        return np.array(self.mass_share.x.array[dofs], dtype=np.float64)
+
+    @property
+    def area_ratio(self) -> Any:
+        """UFL: undeformed area of the body mesh's facets over their own, by Nanson's formula."""
+        if self.origin is None:
+            return 1.0
+        F = ufl.grad(self.origin)
+        area = ufl.det(F) * ufl.inv(F).T * ufl.FacetNormal(self.mesh)
+        return ufl.sqrt(ufl.inner(area, area))
+
+    def set_mass_shares(self, shares: NDArray[np.float64]) -> None:
+        """Set the factors of the density at the corners of the owned domains, shape ``(n, k)``."""
+        assert self.mass_share is not None
+        dofs = self.mass_share.function_space.dofmap.list[: self.num_local]
+        self.mass_share.x.array[dofs] = shares
+        self.mass_share.x.scatter_forward()
 
     @property
     def rebased(self) -> bool:

@@ -12,7 +12,6 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-import ufl
 from dolfinx import fem, mesh
 
 from .clouds import mesh_of_boxes
@@ -121,8 +120,6 @@ class Particles(Domains):
         }
         self._moves: list[Redistribution] = []
         self.cuts: Cuts = np.zeros((0, 2), dtype=np.int64)
-        self.mass_share: fem.Function | None = None
-        self.origin: fem.Function | None = None
         self._background = BackgroundBasis(V)
         if partition == "background":
             ranks = ranks_of_background(V, self._background, cell_centres(body))
@@ -226,12 +223,8 @@ class Particles(Domains):
         Particles.__init__(self, move.mesh, V, **options)
         self._moves, self.increment = [*moves, move], increment
         self.cuts = cuts
-        if moved:
-            self.origin = fem.Function(self.W, name="origin")
         if moved or len(cuts):
-            space = fem.functionspace(self.mesh, ("Discontinuous Lagrange", 1))
-            self.mass_share = fem.Function(space, name="mass_share")
-            self.mass_share.x.array[:] = 1.0
+            self.expect_reference(moved)
 
     @property
     def origin_index(self) -> NDArray[np.int64]:
@@ -543,35 +536,6 @@ class Particles(Domains):
         if self.origin is not None:
             arrays["mesh nodes"] = self._nodes[self.domain_nodes]
         return arrays
-
-    def mass_shares(self) -> NDArray[np.float64]:
-        """Return the factors of the density at the corners of the owned domains, ``(n, k)``."""
-        assert self.mass_share is not None
-        dofs = self.mass_share.function_space.dofmap.list[: self.num_local]
-        return np.array(self.mass_share.x.array[dofs], dtype=np.float64)
-
-    def refer(self, reference: Reference) -> None:
-        """See :meth:`Domains.refer` (collective)."""
-        super().refer(reference)
-        if self.origin is not None:
-            self.origin.x.array.reshape(-1, self._gdim)[self.domain_nodes] = reference.domains
-            self.origin.x.scatter_forward()
-
-    @property
-    def area_ratio(self) -> Any:
-        """UFL: undeformed area of the body mesh's facets over their own, by Nanson's formula."""
-        if self.origin is None:
-            return 1.0
-        F = ufl.grad(self.origin)
-        area = ufl.det(F) * ufl.inv(F).T * ufl.FacetNormal(self.mesh)
-        return ufl.sqrt(ufl.inner(area, area))
-
-    def set_mass_shares(self, shares: NDArray[np.float64]) -> None:
-        """Set the factors of the density at the corners of the owned domains, shape ``(n, k)``."""
-        assert self.mass_share is not None
-        dofs = self.mass_share.function_space.dofmap.list[: self.num_local]
-        self.mass_share.x.array[dofs] = shares
-        self.mass_share.x.scatter_forward()
 
     def set_converged_state(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Make what :meth:`converged_state` once returned the last converged step (collective)."""
