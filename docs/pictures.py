@@ -17,6 +17,10 @@ PICTURES = {
     "column_stop": ("column_free", "--domain", "quad", "--g0", 80e3, "--plain-solver"),
     "snap_through": ("snap_through",),
     "column_whole": ("column_free", "--domain", "quad", "--g0", 80e3),
+    "column_split": (
+        *("column_free", "--domain", "quad", "--particles-per-cell", 1),
+        *("--on-distortion", "split"),
+    ),
 }
 
 
