@@ -68,8 +68,9 @@ def difference(key: str, one: Any, other: Any) -> float:
     """Return how far two values of a key are apart: 0 where they are the same."""
     if one == other:
         return 0.0
-    whole = isinstance(one, int | str | None) or isinstance(other, int | str | None)
-    if whole:
+    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        return max(difference(key, a, b) for a, b in zip(one, other, strict=True))
+    if not (isinstance(one, float) and isinstance(other, float)):
         return float("inf")
     gap = abs(one - other)
     return float(gap if "error" in key else gap / max(abs(one), abs(other)))
