@@ -423,6 +423,36 @@ def test_rebase_refused():
         block_of(TRIANGLE, f_bar="patch").rebase()
 
 
+def test_one_of_two_bodies():
+    def blocks():
+        V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
+        halves = [
+            mpm.Particles(scenes.box([0.0, y], [1.0, y + 0.5], [4, 2], cell), V)
+            for y, cell in ((0.0, TRIANGLE), (0.5, QUADRILATERAL))
+        ]
+        bcs = [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in range(2)]
+        law = Hencky(1e3, 0.3)
+        return mpm.QuasiStaticProblem(halves, law, density=[2.0, 3.0], body_force=(3, -9), bcs=bcs)
+
+    problem = half_way(blocks(), 4)
+    whole = np.array([problem.reaction(bc) for bc in problem.bcs])
+    lower, upper = problem.bodies
+    before = [scenes.in_order(lower, lower.centroid), scenes.in_order(lower, lower.stress)]
+    with pytest.raises(mpm.MPMError, match="Only quadrilaterals"):
+        problem.split([0], body=0)
+    problem.split([2, 5], body=1)
+    assert (lower.num_global, upper.num_global) == (16, 10)
+    after = [scenes.in_order(lower, lower.centroid), scenes.in_order(lower, lower.stress)]
+    assert all(map(np.array_equal, before, after))
+    assert np.array_equal(whole, [problem.reaction(bc) for bc in problem.bcs])
+    for body in problem.bodies:
+        body.load.value = 1.0
+    problem.step()
+    # The supports carry the weight of both, and the force to the side.
+    forces = sum(problem.reaction(bc) for bc in problem.bcs)
+    np.testing.assert_allclose(forces, [-3 * 2.5, 9 * 2.5], rtol=1e-7)
+
+
 def test_refused():
     problem = half_way(column(), steps=2)
     before = scenes.state(problem)
