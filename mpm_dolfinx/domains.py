@@ -307,12 +307,15 @@ class Domains:
     @property
     def initial_domains(self) -> NDArray[np.float64]:
         """Corners of the undeformed domains, shape ``(n, k, gdim)``."""
-        return self.reference.domains.copy()
+        if self._reference is None:
+            return np.asarray(self._nodes[self.domain_nodes])
+        return self._reference.domains.copy()
 
     @property
     def initial_volume(self) -> NDArray[np.float64]:
         """Volume of the undeformed domains, shape ``(n,)``; an area in the plane."""
-        return self.reference.volume.copy()
+        volume = self._mesh_volume if self._reference is None else self._reference.volume
+        return volume.copy()
 
     @property
     def volume(self) -> NDArray[np.float64]:
@@ -324,7 +327,7 @@ class Domains:
     @property
     def initial_centroid(self) -> NDArray[np.float64]:
         """Centroid of the undeformed domains, shape ``(n, gdim)``."""
-        return self.mean(self.reference.domains)
+        return self.mean(self.initial_domains)
 
     @property
     def centroid(self) -> NDArray[np.float64]:
@@ -334,7 +337,7 @@ class Domains:
     @property
     def initial_points(self) -> NDArray[np.float64]:
         """Undeformed positions of the quadrature points, shape ``(n, nq, gdim)``."""
-        return self._at_points(self.reference.domains)
+        return self._at_points(self.initial_domains)
 
     @property
     def points(self) -> NDArray[np.float64]:
