@@ -4,67 +4,252 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["dependent_columns"]
+from .particles import Particles
+
+__all__ = ["Dependence", "dependent_columns", "dependent_dofs"]
 
 #: Most rows of a column that is looked at, and what is left of a column of length one that
-#: depends on others.
+#: depends on others. A shift of 1e-13 would freeze by half what is left of 3e-7.
 FEW_ROWS = 6
-DEPENDENT = 1e-7
+DEPENDENT = 1e-6
+#: Share of a column's length in a row where it is alone that makes it independent.
+CLEAR = 1e-2
+#: Most columns that are orthogonalised together.
+LARGEST = 300
+
+
+class Dependence(NamedTuple):
+    """Columns that are combinations of others: ``T[:, columns[d]] = sum_k c T[:, stand_in]``.
+
+    The same on all ranks.
+
+    Attributes:
+        columns: The columns that depend on others, sorted, shape ``(n,)``.
+        which: Number among them of the dependent column of each term, shape ``(m,)``.
+        stand_ins: The column of each term, none of which depends on others, shape ``(m,)``.
+        coefficients: Its coefficient c, shape ``(m,)``.
+    """
+
+    columns: NDArray[np.int64]
+    which: NDArray[np.int64]
+    stand_ins: NDArray[np.int64]
+    coefficients: NDArray[np.float64]
+
+    def fold(self, comm: MPI.Comm, start: int, u: NDArray[np.float64]) -> None:
+        """Let the others stand in for the dependent dofs, so that T u stays (collective).
+
+        Args:
+            comm: The ranks.
+            start: Global number of this rank's first dof.
+            u: Values of this rank's dofs; changed at the stand-ins.
+        """
+        values = np.zeros(len(self.columns))
+        own = (self.columns >= start) & (self.columns < start + len(u))
+        values[own] = u[self.columns[own] - start]
+        values = comm.allreduce(values) if comm.size > 1 else values
+        own = (self.stand_ins >= start) & (self.stand_ins < start + len(u))
+        np.add.at(u, self.stand_ins[own] - start, (self.coefficients * values[self.which])[own])
+
+
+def dependent_dofs(bodies: Sequence[Particles], free: NDArray[np.bool_]) -> Dependence:
+    """Find free dofs of V whose columns of T depend on those of others (collective).
+
+    Only columns with few rows can, in a transfer of degree one: those of background nodes that few
+    nodes of the body see.
+
+    Args:
+        bodies: Bodies on one background space.
+        free: Whether each dof of V that this rank owns can be an unknown.
+
+    Returns:
+        Global dofs.
+    """
+    V = bodies[0].V
+    comm, bs = V.mesh.comm, V.dofmap.index_map_bs
+    first, last = V.dofmap.index_map.local_range
+    seen = [_Seen(body, first, last) for body in bodies]
+    few = np.unique(np.concatenate([some.few() for some in seen]))
+    counts = sum(some.counts_at(few) for some in seen)
+    if comm.size > 1:
+        few = np.unique(np.concatenate(comm.allgather(few)))
+        counts = comm.allreduce(sum(some.counts_at(few) for some in seen))
+    few = few[counts <= FEW_ROWS]
+    own = (few >= first) & (few < last)
+    unknown = np.zeros((len(few), bs), dtype=np.int32)
+    unknown[own] = free.reshape(-1, bs)[few[own] - first]
+    starts = np.cumsum([0, *(body.W.dofmap.index_map.size_global for body in bodies)])
+    entries = [some.entries(few, int(start)) for some, start in zip(seen, starts, strict=False)]
+    parts = [tuple(np.concatenate(column) for column in zip(*entries, strict=True))]
+    if comm.size > 1:
+        unknown = comm.allreduce(unknown)
+        parts = comm.allgather(parts[0])
+    rows, columns, values = (np.concatenate(column) for column in zip(*parts, strict=True))
+    found: dict[bytes, Dependence] = {}
+    results = []
+    for component in range(bs):
+        mask = unknown[:, component] > 0
+        if mask.tobytes() not in found:
+            kept = mask[columns]
+            found[mask.tobytes()] = dependent_columns(rows[kept], columns[kept], values[kept])
+        columns_, which, stand_ins, coefficients = found[mask.tobytes()]
+        dofs = [few[some] * bs + component for some in (columns_, stand_ins)]
+        results.append(Dependence(dofs[0], which, dofs[1], coefficients))
+    return _joined(results)
+
+
+class _Seen:
+    """Which background nodes the nodes of a body see, and how many see each."""
+
+    def __init__(self, body: Particles, first: int, last: int) -> None:
+        own_rows = body.W.dofmap.index_map
+        self._rows = own_rows.local_range[0]
+        basis = body.node_basis.part(own_rows.size_local)
+        self._nodes, self._values = basis.nodes, basis.values
+        there = self._values != 0.0
+        self._first = first
+        self._own = there & (self._nodes >= first) & (self._nodes < last)
+        self._counts = np.bincount(self._nodes[self._own] - first, minlength=last - first)
+        self._others = there & ~self._own
+        self._ghosts, self._ghost_counts = np.unique(self._nodes[self._others], return_counts=True)
+
+    def few(self) -> NDArray[np.int64]:
+        """Return the global nodes that few of this rank's rows see."""
+        own = np.flatnonzero((self._counts > 0) & (self._counts <= FEW_ROWS)) + self._first
+        return np.concatenate([own, self._ghosts[self._ghost_counts <= FEW_ROWS]])
+
+    def counts_at(self, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return how many of this rank's rows see each of some sorted global nodes."""
+        counts = np.zeros(len(nodes), dtype=np.int64)
+        own = (nodes >= self._first) & (nodes < self._first + len(self._counts))
+        counts[own] = self._counts[nodes[own] - self._first]
+        _, place, ghost = np.intersect1d(
+            nodes, self._ghosts, assume_unique=True, return_indices=True
+        )
+        counts[place] += self._ghost_counts[ghost]
+        return counts
+
+    def entries(
+        self, nodes: NDArray[np.int64], start: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Return the entries of T at some sorted global nodes.
+
+        Args:
+            nodes: They.
+            start: Number of the body's first row, of all ranks.
+
+        Returns:
+            Rows of all bodies, places among ``nodes``, and values.
+        """
+        wanted = np.zeros(len(self._counts), dtype=bool)
+        wanted[
+            nodes[(nodes >= self._first) & (nodes < self._first + len(wanted))] - self._first
+        ] = 1
+        picked = np.zeros(self._nodes.shape, dtype=bool)
+        picked[self._own] = wanted[self._nodes[self._own] - self._first]
+        picked[self._others] = np.isin(self._nodes[self._others], nodes)
+        rows = np.nonzero(picked)[0] + self._rows + start
+        return rows, np.searchsorted(nodes, self._nodes[picked]), self._values[picked]
+
+
+def _joined(parts: Sequence[Dependence]) -> Dependence:
+    """Return what is known of different columns as one."""
+    columns, which, stand_ins, coefficients = (
+        np.concatenate(each) for each in zip(*parts, strict=True)
+    )
+    ends = np.cumsum([0, *(len(part.columns) for part in parts[:-1])])
+    which = which + np.repeat(ends, [len(part.which) for part in parts])
+    order = np.argsort(columns)
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    return Dependence(columns[order], place[which], stand_ins, coefficients)
 
 
 def dependent_columns(
-    comm: MPI.Comm,
-    rows: NDArray[np.int64],
-    columns: NDArray[np.int64],
-    values: NDArray[np.float64],
-) -> NDArray[np.int64]:
-    """Find columns of a distributed matrix that are combinations of other columns (collective).
+    rows: NDArray[np.int64], columns: NDArray[np.int64], values: NDArray[np.float64]
+) -> Dependence:
+    """Find columns of a sparse matrix that are combinations of other columns.
 
-    Only columns with few rows can be, in a transfer: those of background nodes that few nodes
-    of the body see. They fall into small groups that share no row, and in each group columns are
-    orthogonalised in the order of what is left of them, the largest first (Businger & Golub
-    1965); those of which nothing is left depend on the others.
+    A column that is alone in a row depends on none. The others fall into groups that share no
+    row, and in each group columns are orthogonalised in the order of what is left of them, the
+    largest first (Businger & Golub 1965); those of which nothing is left depend on the others.
+    Of a group too large for that, the columns with most rows are taken to be independent.
 
     Args:
-        comm: The ranks.
-        rows: Global row of each entry this rank owns.
-        columns: Its global column.
+        rows: Row of each entry.
+        columns: Its column.
         values: Its value, not zero.
-
-    Returns:
-        Global columns that depend on others, sorted, the same on all ranks.
     """
-    mine, counts = np.unique(columns, return_counts=True)
-    everywhere = comm.allgather((mine, counts)) if comm.size > 1 else [(mine, counts)]
-    known, place = np.unique(np.concatenate([m for m, _ in everywhere]), return_inverse=True)
-    total = np.bincount(place, weights=np.concatenate([c for _, c in everywhere]))
-    few = known[total <= FEW_ROWS]
-    picked = np.isin(columns, few)
-    part = rows[picked], columns[picked], values[picked]
-    parts = comm.allgather(part) if comm.size > 1 else [part]
-    i, j, v = (np.concatenate(each) for each in zip(*parts, strict=True))
-    if len(i) == 0:
-        return few[:0]
-    _, i = np.unique(i, return_inverse=True)
-    names, j = np.unique(j, return_inverse=True)
-    label = _groups(i, j, len(names))
-    found: list[int] = []
-    order = np.argsort(label[j], kind="stable")
-    cuts = np.flatnonzero(np.diff(label[j][order])) + 1
-    for entries in np.split(order, cuts):
-        some, column = np.unique(j[entries], return_inverse=True)
-        _, row = np.unique(i[entries], return_inverse=True)
-        if len(some) == 1:
-            continue
-        block = np.zeros((row.max() + 1, len(some)))
-        block[row, column] = v[entries]
-        found.extend(names[some[_dependent(block)]].tolist())
-    return np.sort(np.asarray(found, dtype=np.int64))
+    known, j = np.unique(columns, return_inverse=True)
+    _, i = np.unique(rows, return_inverse=True)
+    total = np.bincount(j)
+    terms: list[tuple[int, int, float]] = []
+    left = np.arange(len(j))
+    for few in range(int(total.max(initial=0)), 0, -1):
+        left = left[total[j[left]] <= few]
+        left = left[_entangled(i[left], j[left], values[left])]
+        if len(left) == 0:
+            break
+        label = _groups(i[left], j[left], len(known))[j[left]]
+        _, first = np.unique(j[left], return_index=True)
+        large = np.bincount(label[first], minlength=len(known))[label] > LARGEST
+        small = np.flatnonzero(~large)[np.argsort(label[~large], kind="stable")]
+        cuts = np.flatnonzero(np.diff(label[small])) + 1
+        for entries in np.split(left[small], cuts) if len(small) else ():
+            terms += _terms(i[entries], j[entries], values[entries])
+        left = left[large]
+    dependent, stand_in, coefficients = zip(*terms, strict=True) if terms else ((), (), ())
+    found, which = np.unique(np.array(dependent, dtype=np.int64), return_inverse=True)
+    stand_ins = known[np.array(stand_in, dtype=np.int64)]
+    return Dependence(known[found], which, stand_ins, np.array(coefficients, dtype=np.float64))
+
+
+def _terms(
+    i: NDArray[np.int64], j: NDArray[np.int64], values: NDArray[np.float64]
+) -> list[tuple[int, int, float]]:
+    """Return dependent column, stand-in and coefficient of each term in a group of columns."""
+    names, column = np.unique(j, return_inverse=True)
+    _, row = np.unique(i, return_inverse=True)
+    block = np.zeros((row.max() + 1, len(names)))
+    block[row, column] = values
+    dependent = _dependent(block)
+    if len(dependent) == 0:
+        return []
+    others = np.setdiff1d(np.arange(len(names)), dependent)
+    solution = np.linalg.lstsq(block[:, others], block[:, dependent])[0]
+    return [
+        (int(names[d]), int(names[other]), float(solution[k, n]))
+        for n, d in enumerate(dependent)
+        for k, other in enumerate(others)
+    ]
+
+
+def _entangled(
+    i: NDArray[np.int64], j: NDArray[np.int64], values: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Return the entries of columns that may depend on each other.
+
+    A column that is alone in a row is part of no combination that vanishes; without it another
+    may be alone.
+    """
+    length = np.sqrt(np.bincount(j, weights=values**2))
+    clear = np.abs(values) > CLEAR * length[j]
+    kept = np.arange(len(values))
+    while len(kept):
+        alone = (np.bincount(i[kept])[i[kept]] == 1) & clear[kept]
+        free = np.zeros(len(length), dtype=bool)
+        free[j[kept[alone]]] = True
+        if not free.any():
+            break
+        kept = kept[~free[j[kept]]]
+    return kept
 
 
 def _groups(i: NDArray[np.int64], j: NDArray[np.int64], count: int) -> NDArray[np.int64]:
@@ -82,14 +267,18 @@ def _groups(i: NDArray[np.int64], j: NDArray[np.int64], count: int) -> NDArray[n
 
 def _dependent(block: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the columns of a dense matrix that depend on others."""
-    left = block / np.linalg.norm(block, axis=0)
-    rest = np.arange(left.shape[1])
-    while len(rest):
-        size = np.linalg.norm(left[:, rest], axis=0)
-        best = int(size.argmax())
-        if size[best] < DEPENDENT:
-            return rest
-        pivot = left[:, rest[best]] / size[best]
-        rest = np.delete(rest, best)
-        left[:, rest] -= np.outer(pivot, pivot @ left[:, rest])
-    return rest
+    left = np.ascontiguousarray((block / np.linalg.norm(block, axis=0)).T)
+    order = np.arange(len(left))
+    size = np.ones(len(left))
+    for k in range(len(left)):
+        best = k + int(size[k:].argmax())
+        for values in (left, order, size):
+            values[[k, best]] = values[[best, k]]
+        length = np.linalg.norm(left[k])
+        if length < DEPENDENT:
+            return order[k:]
+        pivot = left[k] / length
+        along = left[k + 1 :] @ pivot
+        left[k + 1 :] -= along[:, None] * pivot
+        size[k + 1 :] -= along**2
+    return order[:0]

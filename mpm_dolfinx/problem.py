@@ -94,8 +94,10 @@ class ParticleProblem:
         predictor: Whether Newton's method starts from the last increments extrapolated, where
             the residual there is not above twice that of a start from zero.
         stabilisation: What is done about background dofs that the body supports badly:
-            ``"ghost"`` penalty, ``"aggregate"``, ``None``, or ``"auto"``, a ghost penalty for
-            backgrounds of degree 2 or more where a cut is small.
+            ``"ghost"`` penalty, ``"aggregate"``, ``None``, or ``"auto"``, a ghost penalty where a
+            cut is small, on backgrounds of degree 2 or more and, on those of degree 1, while
+            the bodies have hardly more nodes than the background (not beside ``background=``
+            or ``dependent_dofs="remove"``).
 
     Attributes:
         particles: The body or bodies, as given.
@@ -165,8 +167,10 @@ class ParticleProblem:
         statistics = self.history.statistics
         evaluate = weakly(self.evaluate)
         past = Predictor() if predictor else None
-        cure = stabilisation_of(stabilisation, self.bodies)
-        if dependent_dofs == "remove" and (cure is not None or V.ufl_element().degree > 1):
+        remove, simple = dependent_dofs == "remove", V.ufl_element().degree == 1
+        left_alone = simple and stabilisation == "auto" and (remove or background is not None)
+        cure = stabilisation_of(None if left_alone else stabilisation, self.bodies)
+        if remove and (cure is not None or not simple):
             raise MPMError(
                 "dependent_dofs='remove' is for a background of degree 1 without stabilisation; "
                 "use dependent_dofs='shift'."
@@ -179,7 +183,7 @@ class ParticleProblem:
             statistics,
             past,
             cure,
-            dependent_dofs == "remove",
+            remove,
         )
         self._newton = NewtonSolver(
             self._comm,

@@ -16,7 +16,7 @@ from dolfinx import fem
 
 from . import _compat
 from .assembly import BackgroundForms, BodyForms
-from .dependence import dependent_columns
+from .dependence import Dependence, dependent_dofs
 from .errors import DomainDistortionError, MPMError, agreed
 from .fused import FusedTangent
 from .history import Statistics
@@ -137,7 +137,7 @@ class ReducedSystem:
         statistics: Where to count.
         predictor: Says what increment to expect; ``None`` for none.
         stabilisation: What is done about badly supported dofs.
-        remove_dependent: Whether dofs that others can stand for are no unknowns.
+        remove_dependent: Whether dofs of T that others can stand for are no unknowns.
 
     Attributes:
         prescribes: Whether Dirichlet values change in the step that has begun.
@@ -159,6 +159,7 @@ class ReducedSystem:
         self.predictor = predictor
         self._stabilisation = stabilisation
         self._remove_dependent = remove_dependent
+        self._dependence: Dependence | None = None
         self.moduli: list[float] | None = None
         self._extension: PETSc.Mat | None = None
         self._ghost: tuple[PETSc.Mat, PETSc.Mat] | None = None
@@ -243,23 +244,26 @@ class ReducedSystem:
         touched = TouchedNodes(self._V, [body.node_basis for body in bodies], owned)
         active[touched.active] = True
         if self._stabilisation is not None:
-            self._stabilisation.update(self._statistics)
-            active = self._stabilisation.unknowns(active)
+            active = self._stabilisation.unknowns(active, self._statistics)
         free.reshape(-1, self._bs)[active] = True
+        supported = np.zeros(self._owned, dtype=bool)
         if self._background is not None:
-            free[self._background.support()] = True
+            supported[self._background.support()] = True
+        free |= supported
         self._fixed = np.zeros(self._owned, dtype=bool)
         for bc in self._bcs:
             self._fixed[_compat.own_dofs(bc, self._V)] = True
-        self._free = np.flatnonzero(free & ~self._fixed).astype(np.int32)
+        free &= ~self._fixed
         T = self._bodies[0].particles.T
         if self._remove_dependent:
-            dependent = self._dependent_dofs(self._free)
-            start = T.getOwnershipRangeColumn()[0]
-            self._free = self._free[~np.isin(self._free + start, dependent)]
+            self._dependence = dependent_dofs(bodies, free & ~supported)
+            start, end = T.getOwnershipRangeColumn()
+            dependent = self._dependence.columns
+            free[dependent[(dependent >= start) & (dependent < end)] - start] = False
             self._statistics["dependent_dofs"] = max(
                 self._statistics["dependent_dofs"], len(dependent)
             )
+        self._free = np.flatnonzero(free).astype(np.int32)
         self._layout = FreeDofs(self._V, self._free, touched)
         self._columns = self._layout.columns
         self._u = T.createVecRight()
@@ -309,30 +313,6 @@ class ReducedSystem:
         self._extension.mult(self._part, self._u)
         return self._u
 
-    def _dependent_dofs(self, free: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Return the global dofs, on all ranks, whose columns of T depend on others' (collective).
-
-        Args:
-            free: The local dofs that would be unknowns.
-        """
-        transfers = [body.particles.T for body in self._bodies]
-        mark = transfers[0].createVecRight()
-        mark.array_w[free] = 1.0
-        rows, columns, values = [], [], []
-        shift = 0
-        for T in transfers:
-            unknown = T.copy()
-            unknown.diagonalScale(R=mark)
-            indptr, indices, data = unknown.getValuesCSR()
-            row = np.repeat(np.arange(len(indptr) - 1, dtype=np.int64), np.diff(indptr))
-            kept = data != 0.0
-            rows.append(row[kept] + T.getOwnershipRange()[0] + shift)
-            columns.append(indices[kept].astype(np.int64))
-            values.append(data[kept])
-            shift += T.getSize()[0]
-        entries = (np.concatenate(part) for part in (rows, columns, values))
-        return dependent_columns(self._comm, *entries)
-
     def _gather(self, vectors: Sequence[PETSc.Vec]) -> None:
         """Set the force to the sum of ``T^T`` times each body's vector."""
         self._bodies[0].particles.T.multTranspose(vectors[0], self._force)
@@ -366,9 +346,8 @@ class ReducedSystem:
             self._gather([body.forms.assemble_residual() for body in self._bodies])
             if self._background is not None:
                 self._force.axpy(1.0, self._background.assemble_residual())
-            ghost = self._stabilisation if self.sizes[1] > 0 else None
-            if isinstance(ghost, GhostPenalty) and self._u.norm() > 0.0:
-                self._penalty(ghost)[0].multAdd(self._u, self._force, self._force)
+            if self._penalised and self.sizes[1] > 0 and self._u.norm() > 0.0:
+                self._penalty()[0].multAdd(self._u, self._force, self._force)
             self._extend(self._force)
         self._layout.collect(self._force.array_r[self._free], F)
         return None
@@ -419,8 +398,8 @@ class ReducedSystem:
                 if self._extension is not None:
                     whole = whole.ptap(self._extension)
                 parts.append(whole.createSubMatrix(self._columns, self._columns))
-            if isinstance(self._stabilisation, GhostPenalty):
-                parts.append(self._penalty(self._stabilisation)[1])
+            if self._penalised:
+                parts.append(self._penalty()[1])
             if len(parts) == 1 and self._extension is None:
                 return parts[0]
             if self._total is None:
@@ -441,6 +420,10 @@ class ReducedSystem:
         if increments is None:
             return None
         u = map_to_background([body.particles.T for body in self._bodies], increments)
+        if self._dependence is not None:
+            self._dependence.fold(
+                self._comm, self._bodies[0].particles.T.getOwnershipRangeColumn()[0], u
+            )
         x = PETSc.Vec().createMPI(self.sizes, comm=self._comm)
         self._layout.collect(u[self._free], x)
         return x
@@ -449,12 +432,18 @@ class ReducedSystem:
         """Return the rigid motions of the background in the free dofs (collective)."""
         return self._layout.rigid_motions()
 
-    def _penalty(self, ghost: GhostPenalty) -> tuple[PETSc.Mat, PETSc.Mat]:
+    @property
+    def _penalised(self) -> bool:
+        """Whether there is a ghost penalty now."""
+        return isinstance(self._stabilisation, GhostPenalty) and self._stabilisation.acts
+
+    def _penalty(self) -> tuple[PETSc.Mat, PETSc.Mat]:
         """Return the ghost penalty's matrix on all dofs and on the free ones."""
+        assert isinstance(self._stabilisation, GhostPenalty)
         if self.moduli is None:
             self.moduli = [body.shear_modulus() for body in self._bodies]
         if self._ghost is None:
-            matrix = ghost.matrix(self.moduli)
+            matrix = self._stabilisation.matrix(self.moduli)
             self._ghost = matrix, matrix.createSubMatrix(self._columns, self._columns)
         return self._ghost
 
@@ -482,8 +471,8 @@ class ReducedSystem:
                 continue
             force = body.stock_force(self._u)
             body.particles.T.multTransposeAdd(force, self._part, self._part)
-        if isinstance(self._stabilisation, GhostPenalty):
-            self._penalty(self._stabilisation)[0].multAdd(self._u, self._part, self._part)
+        if self._penalised:
+            self._penalty()[0].multAdd(self._u, self._part, self._part)
         if self._extension is not None:
             self._extension.multTranspose(self._part, self._u)
             self._u.copy(self._part)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 from mpi4py import MPI
@@ -28,6 +29,9 @@ __all__ = ["Aggregation", "GhostPenalty", "stabilisation_of"]
 FILL = 0.5
 #: Ghost penalty over shear modulus / cell size^2.
 PENALTY = 1e-4
+#: Background nodes with weight over nodes of the bodies, from which on a background of degree 1
+#: needs a penalty.
+CROWDED = 0.9
 #: Layers of cells over which aggregation looks for a well filled one.
 LAYERS = 8
 KINDS = ("auto", "ghost", "aggregate")
@@ -42,7 +46,8 @@ def stabilisation_of(
 
     Args:
         kind: ``"ghost"``, ``"aggregate"``, ``None`` (nothing) or ``"auto"``: a ghost penalty
-            for a background of degree 2 or more, nothing for degree 1, which needs none.
+            for a background of degree 2 or more; for degree 1 only while the bodies have hardly
+            more nodes than the background, for methods that move particles at their nodes.
         bodies: The bodies of a problem.
 
     Raises:
@@ -52,15 +57,18 @@ def stabilisation_of(
         raise MPMError(
             f"Unknown stabilisation={kind!r}; choose {', '.join(map(repr, KINDS))} or None."
         )
-    if kind is None or (kind == "auto" and bodies[0].V.ufl_element().degree == 1):
+    if kind is None:
         return None
+    least = CROWDED if kind == "auto" and bodies[0].V.ufl_element().degree == 1 else 0.0
     for body in bodies:
         if body.method not in NODAL:
+            if least > 0.0:
+                return None
             raise MPMError(
                 f"stabilisation={kind!r} is for the methods 'cpdi2' and 'cpdi', not for "
                 f"{body.method!r}; use stabilisation=None."
             )
-    return Aggregation(bodies) if kind == "aggregate" else GhostPenalty(bodies)
+    return Aggregation(bodies) if kind == "aggregate" else GhostPenalty(bodies, least)
 
 
 class GhostPenalty:
@@ -74,16 +82,46 @@ class GhostPenalty:
 
     Args:
         bodies: The bodies (collective).
+        least: Number of background nodes with weight over that of the bodies' nodes, below which
+            there is no penalty.
+
+    Attributes:
+        acts: Whether there is any penalty now.
     """
 
-    def __init__(self, bodies: Sequence[Particles]) -> None:
+    def __init__(self, bodies: Sequence[Particles], least: float = 0.0) -> None:
         self._bodies = list(bodies)
         self._V = bodies[0].V
-        self._cells = CellPairs(self._V)
-        self._polynomials = CellPolynomials(self._V)
+        self._least = least * sum(_num_nodes(body) for body in bodies)
+        self.acts = False
 
-    def update(self, statistics: Statistics) -> None:
-        """Look at the bodies where they are at the last converged step (collective)."""
+    @cached_property
+    def _cells(self) -> CellPairs:
+        return CellPairs(self._V)
+
+    @cached_property
+    def _polynomials(self) -> CellPolynomials:
+        return CellPolynomials(self._V)
+
+    def unknowns(self, active: NDArray[np.bool_], statistics: Statistics) -> NDArray[np.bool_]:
+        """Look at the bodies where they are at the last converged step (collective).
+
+        Args:
+            active: Whether each own node of V has weight.
+            statistics: Where to count.
+
+        Returns:
+            Which own nodes are unknowns.
+        """
+        self.acts = self._V.mesh.comm.allreduce(int(active.sum())) >= self._least
+        if not self.acts:
+            statistics["ghost_facets"] = 0
+            return active
+        self._choose(statistics)
+        return active | self._marked
+
+    def _choose(self, statistics: Statistics) -> None:
+        """Find the pairs of cells that are tied together."""
         cells = self._cells
         support = CellFill.of(self._bodies, cells.num_own)
         fill, active = cells.with_others(support.fill), cells.with_others(support.active)
@@ -94,10 +132,6 @@ class GhostPenalty:
         self._shares = fill[chosen].sum(axis=1)
         self._marked = marked(self._V, cells.nodes[chosen])
         statistics["ghost_facets"] = self._V.mesh.comm.allreduce(len(chosen))
-
-    def unknowns(self, active: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return which own nodes are unknowns, from those with weight."""
-        return active | self._marked
 
     def matrix(self, moduli: Sequence[float]) -> PETSc.Mat:
         """Return the penalty's matrix on all dofs of V (collective).
@@ -139,6 +173,13 @@ class GhostPenalty:
         return np.asarray(0.5 * (values + values.swapaxes(1, 2)))
 
 
+def _num_nodes(body: Particles) -> int:
+    """Return the number of nodes of a body, each counted once where domains may part."""
+    nodes: int = body.W.dofmap.index_map.size_global
+    corners: int = body.mesh.topology.index_map(0).size_global
+    return min(nodes, corners) if body.W.ufl_element().degree == 1 else nodes
+
+
 class Aggregation:
     """Badly supported dofs follow the polynomial of a well filled cell near by.
 
@@ -160,8 +201,16 @@ class Aggregation:
         dofs = self._V.dofmap.list[:own]
         self._positions = coordinates[dofs][:, :, : self._V.mesh.geometry.dim]
 
-    def update(self, statistics: Statistics) -> None:
-        """Look at the bodies where they are at the last converged step (collective)."""
+    def unknowns(self, active: NDArray[np.bool_], statistics: Statistics) -> NDArray[np.bool_]:
+        """Look at the bodies where they are at the last converged step (collective).
+
+        Args:
+            active: Whether each own node of V has weight.
+            statistics: Where to count.
+
+        Returns:
+            Which own nodes are unknowns.
+        """
         cells, V = self._cells, self._V
         support = CellFill.of(self._bodies, cells.num_own)
         good = support.active & (support.fill.sum(axis=1) >= FILL)
@@ -176,6 +225,9 @@ class Aggregation:
         self._take(cells.nodes[lost], values, root.nodes[lost], distance, cells.index[lost])
         count = V.mesh.comm.allreduce(len(self._node)) * V.dofmap.index_map_bs
         statistics["aggregated_dofs"] = count
+        result = active | self._good
+        result[self._node] = False
+        return result
 
     def _root_polynomials(self, vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], Any]:
         frame = self._polynomials.frame(vertices)
@@ -238,12 +290,6 @@ class Aggregation:
         order = order[~self._good[node[order]]]
         self._node, first = np.unique(node[order], return_index=True)
         self._value, self._root = value[order][first], root[order][first]
-
-    def unknowns(self, active: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return which own nodes are unknowns, from those with weight."""
-        result = active | self._good
-        result[self._node] = False
-        return result
 
     def extension(self, fixed: NDArray[np.bool_]) -> PETSc.Mat:
         """Return E, which gives all dofs of V from the unknowns and the fixed ones (collective).

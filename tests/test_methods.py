@@ -205,6 +205,7 @@ def test_cpdi_is_cpdi2_on_tetrahedra():
             Hencky(1e3, 0.3),
             body_force=(0.0, 0.0, -300.0),
             bcs=bcs,
+            stabilisation=None,
         )
         problem.solve(steps=4)
         runs.append(scenes.in_order(problem.particles, problem.particles.domains))

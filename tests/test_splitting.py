@@ -154,6 +154,7 @@ def test_split_at_first_is_a_body_of_triangles():
             density=1.0,
             body_force=(1.0, -0.2),
             bcs=[scenes.fix(V, scenes.at(0, 0.0))],
+            stabilisation=None,
         )
 
     corners = ([0.0, 0.0], [2.0, 0.5], [9, 3])
@@ -258,6 +259,7 @@ def test_what_keeps_a_step_from_converging_is_split():
         density=1000.0,
         body_force=(0.0, -20.0),
         bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)],
+        stabilisation=None,
     )
     p, failing = problem.particles, 0.0
     for step in problem.steps(10):
