@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem, la
 
+from .domains import RING
 from .errors import MPMError
-from .location import BackgroundBasis
+from .location import TOLERANCE, BackgroundBasis
 from .particles import Particles
 from .quadrature import depends_on, split_by_rule
 from .reduced import ReducedSystem
@@ -38,7 +39,7 @@ class DisplacementControl:
     Args:
         particles: The body.
         value: The displacement at the end of the run.
-        point: A point of the undeformed body whose displacement it is, shape ``(gdim,)``.
+        point: A point of the body mesh whose displacement it is, shape ``(gdim,)``.
         direction: Direction of that displacement, made a unit vector, shape ``(gdim,)``.
         functional: Instead of point and direction: a UFL form, linear in
             ``particles.displacement`` and without test function, such as the mean over facets
@@ -50,8 +51,8 @@ class DisplacementControl:
         functional: As given.
 
     Raises:
-        MPMError: A point outside the undeformed body, a form that is no linear functional, or
-            values that make no sense.
+        MPMError: A point outside the body mesh, a form that is no linear functional, or values
+            that make no sense.
     """
 
     def __init__(
@@ -82,6 +83,7 @@ class DisplacementControl:
                 raise MPMError("direction must not be zero.")
             self._direction /= length
         self._space: fem.FunctionSpace | None = None
+        self._rebases = particles.rebases
         self.row()
 
     def require_for(self, bodies: Sequence[Particles], path: bool) -> None:
@@ -100,7 +102,16 @@ class DisplacementControl:
             )
 
     def row(self) -> PETSc.Vec:
-        """Return the functional's coefficients of this rank's own dofs of W (collective)."""
+        """Return the functional's coefficients of this rank's own dofs of W (collective).
+
+        Raises:
+            MPMError: The body was rebased meanwhile.
+        """
+        if self._rebases != self.particles.rebases:
+            raise MPMError(
+                "The body was rebased since this displacement control was made; make a new one, "
+                "with a point of the rebased body and a displacement that is counted from there."
+            )
         if self._space is not self.particles.W:
             self._space = self.particles.W
             self._row = self.particles.T.createVecLeft()
@@ -117,17 +128,43 @@ class DisplacementControl:
 
     def _of_point(self) -> NDArray[np.float64]:
         W, comm = self.particles.W, self.particles.mesh.comm
-        asked = self._point[None][: int(comm.rank == 0)]
-        basis = BackgroundBasis(W).at(asked)
-        nodes, values, found = comm.bcast((basis.nodes, basis.values, basis.found))
-        if not found.all():
+        found = False
+        if len(self.particles.cuts):
+            nodes, values, found = self._in_triangles()
+        if not found:
+            asked = self._point[None][: int(comm.rank == 0)]
+            basis = BackgroundBasis(W).at(asked)
+            every = comm.bcast((basis.nodes, basis.values, basis.found))
+            nodes, values, found = (array[0] for array in every)
+        if not found:
             where = tuple(float(x) for x in self._point)
             raise MPMError(f"The point {where} of the displacement control is not in the body.")
         first, last = W.dofmap.index_map.local_range
         row = np.zeros((last - first, W.dofmap.index_map_bs))
-        own = (nodes[0] >= first) & (nodes[0] < last)
-        row[nodes[0][own] - first] = values[0][own, None] * self._direction
+        own = (nodes >= first) & (nodes < last)
+        row[nodes[own] - first] = values[own, None] * self._direction
         return row.ravel()
+
+    def _in_triangles(self) -> tuple[NDArray[np.int64], NDArray[np.float64], bool]:
+        """Return nodes and weights of the point in half a quadrilateral, and whether it is in one.
+
+        The map of such a half is singular at the corner that is there twice.
+        """
+        particles = self.particles
+        ring = particles.domain_nodes[particles.triangular][:, RING]
+        x = particles.W.tabulate_dof_coordinates()[:, : len(self._point)]
+        edges = np.linalg.norm(x[ring] - x[np.roll(ring, 1, axis=1)], axis=2)
+        kept = (edges.argmin(axis=1)[:, None] + np.arange(1, 4)) % 4
+        nodes = np.take_along_axis(ring, kept, axis=1)
+        start, sides = x[nodes[:, 0]], x[nodes[:, 1:]] - x[nodes[:, :1]]
+        along = np.linalg.solve(sides.transpose(0, 2, 1), (self._point - start)[:, :, None])
+        weights = np.column_stack([1.0 - along.sum(axis=1), along[:, :, 0]])
+        inside = weights.min(axis=1)
+        best = np.argsort(-inside)[:1]
+        numbers = particles.W.dofmap.index_map.local_to_global(nodes[best].ravel())
+        mine = inside[best].max(initial=-np.inf), numbers, weights[best].ravel()
+        most, numbers, values = max(particles.mesh.comm.allgather(mine), key=lambda one: one[0])
+        return numbers, values, bool(most >= -TOLERANCE)
 
     def _of_form(self, functional: Any) -> NDArray[np.float64]:
         particles = self.particles

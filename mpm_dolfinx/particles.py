@@ -227,6 +227,11 @@ class Particles(Domains):
             self.expect_reference(moved)
 
     @property
+    def rebases(self) -> int:
+        """How often the nodes of the mesh were moved."""
+        return sum(isinstance(move, Rebase) and move.moved for move in self._moves)
+
+    @property
     def origin_index(self) -> NDArray[np.int64]:
         """Input index of the domain that each particle is, or is half of, shape ``(n,)``."""
         first = self.num_global - len(self.cuts)

@@ -77,13 +77,14 @@ class Rebase(Redistribution):
     Attributes:
         source: The mesh before.
         mesh: The mesh after.
+        moved: Whether its nodes are elsewhere.
         index: Input indices on the new mesh of the owned cells of the old one and of their halves.
     """
 
     def __init__(
         self, source: mesh.Mesh, cuts: Cuts, positions: NDArray[np.float64] | None = None
     ) -> None:
-        self.source = source
+        self.source, self.moved = source, positions is not None
         comm = source.comm
         index = _compat.input_cell_index(source)
         count = source.topology.index_map(source.topology.dim).size_global
