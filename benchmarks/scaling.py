@@ -14,16 +14,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 from mpi4py import MPI
 
+from launcher import launched
 from solvers import flow
 
 import mpm_dolfinx as mpm
@@ -64,20 +61,6 @@ def run(cell: float, steps: int, iterative: bool) -> dict[str, Any]:
         **{name: statistics[name] for name in COUNTERS},
         "bytes_per_step": BYTES * statistics["off_rank_columns"] * products,
     }
-
-
-def launched(ranks: int, cell: float, steps: int, iterative: bool) -> dict[str, Any]:
-    """Run in processes of their own."""
-    beside = Path(sys.executable).with_name("mpirun")
-    launcher = str(beside) if beside.exists() else shutil.which("mpirun")
-    if launcher is None:
-        raise SystemExit("There is no mpirun, neither beside this Python nor on PATH.")
-    command = [launcher, "-n", str(ranks), sys.executable, __file__, "--task", "run"]
-    command += ["--cell", str(cell), "--steps", str(steps)]
-    command += ["--iterative"] if iterative else []
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
-    return dict(json.loads(done.stdout))
 
 
 def middle(runs: list[dict[str, Any]]) -> dict[str, Any]:
@@ -143,13 +126,16 @@ def main() -> None:
         args.ranks, args.cell, args.repeats, args.steps = "1,2", 0.5, 1, 1
     counts = [int(n) for n in args.ranks.split(",")]
     kinds = [args.only] if args.only else ["strong", "weak"]
+    options = ["--task", "run", "--steps", str(args.steps)]
+    options += ["--iterative"] if args.iterative else []
     runs: dict[str, dict[int, list[dict[str, Any]]]] = {k: {n: [] for n in counts} for k in kinds}
     for _ in range(args.repeats):
         for n in counts:
             for kind in kinds:
                 cells = round(8.0 / args.cell / 2 * n**0.5) * 2
                 cell = args.cell if kind == "strong" else 8.0 / cells
-                runs[kind][n].append(launched(n, cell, args.steps, args.iterative))
+                one = launched(n, Path(__file__), *options, "--cell", str(cell))
+                runs[kind][n].append(one)
     rows = {kind: [middle(part) for part in runs[kind].values()] for kind in kinds}
     fitted = model([row for part in rows.values() for row in part]) if max(counts) > 1 else {}
     if args.json:

@@ -47,7 +47,8 @@ from .particles import Particles
 from .predictor import Predictor
 from .progress import with_bar
 from .quadrature import data_at_points
-from .reduced import Body, ReducedSystem
+from .reduced import ReducedSystem
+from .share import Body
 from .solver import NewtonSolver, ReducedProblem, weakly
 from .stabilisation import stabilisation_of
 from .stepping import Run, StepControl

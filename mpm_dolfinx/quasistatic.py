@@ -21,12 +21,13 @@ from .boundary import Support
 from .checkpoint import Snapshot
 from .constitutive import ConstitutiveHistory
 from .errors import MPMError
-from .expressions import as_expression, carried, facet_measure, require_movable
+from .expressions import as_expression, carried, require_movable
 from .f_bar import F_BARS, LowRankTangent
 from .grouping import background_cells
 from .particles import Particles
 from .problem import Law, ParticleProblem
 from .quadrature import depends_on
+from .virtual_work import VirtualWork
 
 __all__ = ["QuasiStaticProblem"]
 
@@ -130,7 +131,7 @@ class QuasiStaticProblem(ParticleProblem):
         _validate_supports(supports, bodies)
         self._stresses: list[ConstitutiveHistory] = []
         self._injected: list[tuple[ConstitutiveHistory, fem.Function, fem.Function]] = []
-        self._density: list[tuple[_Frame, Any]] = []
+        self._density: list[tuple[VirtualWork, Any]] = []
         fast = is_fast(assembly)
         self._by_loops = fast and not axisymmetric and f_bar in ("none", "domain")
         residuals: list[ufl.Form | None] = []
@@ -141,20 +142,20 @@ class QuasiStaticProblem(ParticleProblem):
             law = carried(body, law)
             history = ConstitutiveHistory(body, law, cells, axisymmetric, f_bar, fast)
             self._stresses.append(history)
-            frame = _Frame(body, axisymmetric)
+            work = VirtualWork(body, axisymmetric)
             mass = as_expression(mass, body, "density", ())
-            self._density.append((frame, mass))
+            self._density.append((work, mass))
             if body.mass_share is not None:
                 mass = mass * body.mass_share
             terms: list[ufl.Form] = []
             if force is not None:
-                terms.append(-frame.body_force(mass, force))
+                terms.append(-work.body_force(mass, force))
             if dead:
-                terms.append(-frame.tractions(dead, facets))
+                terms.append(-work.tractions(dead, facets))
                 symmetric = symmetric and not depends_on(terms[-1], body.displacement)
-            terms += [frame.support(s, history) for s in supports if s.particles is body]
+            terms += [work.support(s, history) for s in supports if s.particles is body]
             if following:
-                terms.append(frame.pressures(following, facets))
+                terms.append(work.pressures(following, facets))
             symmetric = symmetric and history.symmetric and not following
             slopes = [
                 ufl.derivative(term, body.displacement)
@@ -162,8 +163,8 @@ class QuasiStaticProblem(ParticleProblem):
                 if depends_on(term, body.displacement)
             ]
             if not self._by_loops:
-                work, tangent = frame.internal(*self._inject(body, history))
-                terms.append(work)
+                internal, tangent = work.internal(*self._inject(body, history))
+                terms.append(internal)
                 slopes.append(tangent)
             residuals.append(sum(terms[1:], terms[0]) if terms else None)
             tangents.append(sum(slopes[1:], slopes[0]) if slopes else None)
@@ -334,20 +335,20 @@ class QuasiStaticProblem(ParticleProblem):
 
     def nodal_masses(self, number: int) -> NDArray[np.float64]:
         """Return ``int density Q_c dX`` of each owned domain of a body, ``(n, k)`` (collective)."""
-        body, (frame, density) = self.bodies[number], self._density[number]
+        body, (work, density) = self.bodies[number], self._density[number]
         space = fem.functionspace(body.mesh, ("Discontinuous Lagrange", 1))
         test: Any = ufl.TestFunction(space)
         if body.mass_share is not None:
             test = body.mass_share * test
-        vector = fem.assemble_vector(fem.form(frame.mass(density, test)))
+        vector = fem.assemble_vector(fem.form(work.mass(density, test)))
         return np.asarray(vector.array[space.dofmap.list[: body.num_local]])
 
     def mass_matrices(self, number: int) -> NDArray[np.float64]:
         """Return ``int density Q_c Q_d dX`` of each owned domain, ``(n, k, k)`` (collective)."""
-        body, (frame, density) = self.bodies[number], self._density[number]
+        body, (work, density) = self.bodies[number], self._density[number]
         space = fem.functionspace(body.mesh, ("Discontinuous Lagrange", 1))
         product = ufl.TrialFunction(space) * ufl.TestFunction(space)
-        matrix = fem.assemble_matrix(fem.form(frame.mass(density, product)))
+        matrix = fem.assemble_matrix(fem.form(work.mass(density, product)))
         n, k = body.num_local, space.dofmap.list.shape[1]
         return matrix.data[: n * k * k].reshape(n, k, k)
 
@@ -385,85 +386,6 @@ class QuasiStaticProblem(ParticleProblem):
         """
         values = [s.yield_function().max(axis=1, initial=-np.inf) for s in self._stresses]
         return np.concatenate(values)
-
-
-class _Frame:
-    """The forms of a body in plane strain or space, or of a body of revolution."""
-
-    def __init__(self, body: Particles, axisymmetric: bool) -> None:
-        self._body = body
-        self._axisymmetric = axisymmetric
-        self._dim = body.mesh.geometry.dim
-        self._v = ufl.TestFunction(body.W)
-        self._radius = ufl.SpatialCoordinate(body.mesh)[0]
-        self._turn = 2.0 * np.pi * self._radius if axisymmetric else 1.0
-
-    def _gradient(self, w: Any) -> Any:
-        if not self._axisymmetric:
-            return ufl.grad(w)
-        g = ufl.grad(w)
-        hoop = w[0] / self._radius
-        return ufl.as_tensor([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, hoop]])
-
-    def internal(self, P: fem.Function, A: fem.Function) -> tuple[ufl.Form, ufl.Form]:
-        """Return the internal virtual work and its tangent."""
-        i, j, k, m = ufl.indices(4)
-        trial = self._gradient(ufl.TrialFunction(self._body.W))
-        test = self._gradient(self._v)
-        work = self._turn * ufl.inner(P, test) * self._body.dx
-        tangent = self._turn * A[i, j, k, m] * trial[k, m] * test[i, j] * self._body.dx
-        return work, tangent
-
-    def mass(self, density: Any, test: Any) -> ufl.Form:
-        """Return the integral of the density times a test function."""
-        form: ufl.Form = density * self._turn * test * self._body.dx_exact
-        return form
-
-    def _at_load(self, terms: Sequence[ufl.Form]) -> ufl.Form:
-        """Return the sum of terms times the load factor."""
-        return ufl.Form([i for term in terms for i in (self._body.load * term).integrals()])
-
-    def body_force(self, density: Any, force: Any) -> ufl.Form:
-        """Return the virtual work of the body force."""
-        b = as_expression(force, self._body, "body_force", (self._dim,))
-        work: ufl.Form = density * self._turn * ufl.inner(b, self._v) * self._body.dx_exact
-        return self._at_load([work])
-
-    def tractions(self, loads: Sequence[tuple[Any, int]], tags: Any) -> ufl.Form:
-        """Return the virtual work of dead tractions."""
-        ds = facet_measure(self._body, tags, loads, "tractions")
-        terms = [
-            self._turn
-            * self._body.area_ratio
-            * ufl.inner(as_expression(t, self._body, "a traction", (self._dim,)), self._v)
-            * ds(tag)
-            for t, tag in loads
-        ]
-        return self._at_load(terms)
-
-    def support(self, support: Support, history: ConstitutiveHistory) -> ufl.Form:
-        """Return minus the virtual work of a support."""
-        if not support.has_modulus:
-            modulus = fem.Function(fem.functionspace(self._body.mesh, ("DG", 0)))
-            cells = modulus.function_space.dofmap.list[: self._body.num_local, 0]
-            modulus.x.array[cells] = history.initial_modulus()
-            support.scale(modulus)
-        support.revolve(self._turn)
-        return support.residual
-
-    def pressures(self, loads: Sequence[tuple[Any, int]], tags: Any) -> ufl.Form:
-        """Return minus the virtual work of pressures on the deformed facets."""
-        ds = facet_measure(self._body, tags, loads, "pressures")
-        d = self._body.displacement
-        F = ufl.Identity(self._dim) + ufl.grad(d)
-        area = ufl.det(F) * ufl.inv(F).T * ufl.FacetNormal(self._body.mesh)
-        if self._axisymmetric:
-            area *= 2.0 * np.pi * (self._radius + d[0])
-        terms = [
-            as_expression(p, self._body, "a pressure", ()) * ufl.inner(area, self._v) * ds(tag)
-            for p, tag in loads
-        ]
-        return self._at_load(terms)
 
 
 def _for_each(value: Any, count: int, pairs: bool = False) -> list[Any]:
