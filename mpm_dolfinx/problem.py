@@ -24,34 +24,27 @@ from .assembly import BackgroundForms, BodyForms, PointStress, is_fast
 from .bodies import (
     as_bodies,
     as_conditions,
-    dirichlet_values,
     force_at,
-    may_stop,
-    move_bodies,
     one_for_each,
 )
 from .boundary import Support
 from .cleanup import Cleaner
-from .diagnosis import placed
-from .displacement_control import ControlledSystem, DisplacementControl
+from .displacement_control import DisplacementControl
 from .errors import (
-    ConvergenceError,
-    DomainDistortionError,
     MPMError,
-    ParticleOutsideError,
-    on_all_ranks,
 )
 from .history import History, Step
 from .io import Output, read_series
+from .loading import Converged, load_steps, single_step
 from .particles import Particles
 from .predictor import Predictor
 from .progress import with_bar
 from .quadrature import data_at_points
 from .reduced import ReducedSystem
 from .share import Body
-from .solver import NewtonSolver, ReducedProblem, weakly
+from .solver import NewtonSolver, weakly
 from .stabilisation import stabilisation_of
-from .stepping import Run, StepControl
+from .stepping import Run
 
 __all__ = ["ParticleProblem"]
 
@@ -196,10 +189,8 @@ class ParticleProblem:
             statistics,
             V.mesh.geometry.dim,
         )
-        self._prescribed: NDArray[np.float64] = np.zeros(len(self.bodies[0].increment.x.array))
-        self._loaded = float(self.bodies[0].load.value)
-        self._parameter = self._loaded
-        self._reactions: NDArray[np.float64] | None = None
+        load = float(self.bodies[0].load.value)
+        self._converged = Converged(load, load, np.zeros(len(self.bodies[0].increment.x.array)))
         self._output = Output()
         forms = [form for form in (*residuals, *tangents) if form is not None]
         self._data = set().union(*map(data_at_points, forms))
@@ -300,83 +291,7 @@ class ParticleProblem:
         Raises:
             MPMError: As in :meth:`solve`.
         """
-        if not isinstance(steps, int | np.integer) or steps < 1:
-            raise MPMError(f"The number of steps must be a whole number from 1 on, not {steps!r}.")
-        if update is not None:
-            update = on_all_ranks(self._comm, update)
-        run = self._begin_run(int(steps), update, control)
-        may_split = any(body.on_distortion == "split" for body in self.bodies)
-        if control is not None and (repartition is not None or may_split):
-            control.require_movable()
-        while not run.control.finished:
-            t, end = run.control.target, run.parameter
-            try:
-                if control is None:
-                    self._set_load(end)
-                if update is not None:
-                    self._follow(update, t)
-                values = run.dirichlet_values(dirichlet_values(self.bcs, self.bodies[0].V))
-                step = self._advance(end, values, t == 1.0, control)
-            except (ConvergenceError, DomainDistortionError) as error:
-                self._restore()
-                self.history.failed_iterations += self._newton.iterations
-                no_equilibrium = self._newton.no_equilibrium
-                if not run.control.cut_back(no_equilibrium):
-                    limit = run.limit if no_equilibrium else None
-                    told = placed(error, self.reduced, self._parameter, limit)
-                    if self.mend(told):
-                        run.control.begin_anew()
-                        continue
-                    self._restore(update)
-                    raise told from None
-                self.history.cutbacks += 1
-                continue
-            except MPMError as error:
-                self._restore(update)
-                told = placed(error, self.reduced, self._parameter)
-                if may_stop(self.bodies) and isinstance(told, ParticleOutsideError):
-                    self.history.stopped = told
-                    self.warn(f"The run stopped. {told!s}")
-                    return
-                raise told from None
-            run.control.accept(step.iterations)
-            self.end_step()
-            if repartition is not None:
-                self.repartition(repartition)
-            yield step
-        self._run = None
-        self._warn_of_outside()
-
-    def _begin_run(
-        self,
-        steps: int,
-        update: Callable[[float], None] | None,
-        control: DisplacementControl | None,
-    ) -> Run:
-        """Return a new run, or the one that a checkpoint interrupted."""
-        goal = None
-        if control is not None:
-            control.require_for(self.bodies, update is not None)
-            goal = control.value
-        if self._resume and self._run is not None:
-            self._run.require(steps, update is not None, goal)
-            self._resume = False
-            return self._run
-        start = self._loaded if control is None else control.present()
-        if control is None and update is None and self._loaded >= 1.0:
-            raise MPMError(
-                "The whole load is applied already; go on with problem.step() or with a path "
-                "(update=...)."
-            )
-        if start == goal:
-            raise MPMError("The controlled displacement has its value already.")
-        if update is not None:
-            self._parameter = 0.0
-        if self.reduced.predictor is not None:
-            self.reduced.predictor.clear()
-        base = self._prescribed.copy()
-        self._run = Run(StepControl(steps), update is not None, start, base, goal)
-        return self._run
+        return load_steps(self, steps, update, repartition, control)
 
     def _share(self, _: Step) -> float:
         """Return how much of the run is done."""
@@ -391,17 +306,7 @@ class ParticleProblem:
         Raises:
             MPMError: It does not converge; the state is that of the last converged step.
         """
-        self._run = None
-        try:
-            load = float(self.bodies[0].load.value)
-            self._set_load(load)
-            step = self._advance(load, dirichlet_values(self.bcs, self.bodies[0].V), last=True)
-        except MPMError as error:
-            self._restore()
-            self.history.failed_iterations += self._newton.iterations
-            raise placed(error, self.reduced, self._parameter) from None
-        self.end_step()
-        return step
+        return single_step(self)
 
     # -- Results --------------------------------------------------------------------------
 
@@ -424,7 +329,7 @@ class ParticleProblem:
             return bc.reaction
         if not any(bc is known for known in self.bcs):
             raise MPMError("reaction(bc) needs one of the Dirichlet conditions of this problem.")
-        return force_at(bc, self._reactions, self.bodies[0].V)
+        return force_at(bc, self._converged.reactions, self.bodies[0].V)
 
     def write(self, path: str | Path) -> None:
         """Add the present state to a time series for ParaView.
@@ -446,15 +351,6 @@ class ParticleProblem:
     def keep_identity(self) -> None:
         """Note what this problem is known by, before its body meshes change (collective)."""
         self.identity = state.identity(self)
-
-    def _warn_of_outside(self) -> None:
-        """Say so where the last step, which is converged, took particles off the background."""
-        try:
-            with self.history.statistics.phase("locate"):
-                for body in self.bodies:
-                    body.locate()
-        except ParticleOutsideError as error:
-            self.warn(f"The run is complete, but {error!s}")
 
     def warn(self, sentence: str) -> None:
         """Warn the user, on one rank."""
@@ -536,73 +432,6 @@ class ParticleProblem:
         Raises:
             MPMError: Domains were split that are not, or the other way round.
         """
-
-    # -- One step -------------------------------------------------------------------------
-
-    def _advance(
-        self,
-        parameter: float,
-        values: NDArray[np.float64],
-        last: bool,
-        control: DisplacementControl | None = None,
-    ) -> Step:
-        """Solve one step to Dirichlet totals, and commit it.
-
-        Unless it is the last one it must leave all particles inside the background. Under
-        displacement control the parameter is the displacement.
-        """
-        size = parameter - self._parameter
-        if control is not None:
-            size = abs(parameter - control.present())
-        self.reduced.begin(values - self._prescribed, size)
-        system: ReducedProblem = self.reduced
-        displacement = None
-        if control is not None:
-            system = ControlledSystem(self.reduced, control, parameter, self.bodies)
-            displacement = parameter
-        self._newton.solve(system, self.reduced.sizes)
-        if (failure := self.reduced.crossed()) is not None:
-            raise failure
-        if control is not None:
-            parameter = float(self.bodies[0].load.value)
-        move_bodies(self.bodies, self.history, self._masses, parameter, last)
-        with self.history.statistics.phase("commit"):
-            self.commit()
-            self._prescribed = values.copy()
-            self._loaded = float(self.bodies[0].load.value)
-            self._parameter = parameter
-            self._reactions = self.reduced.force.array_r.copy()
-            self.reduced.end()
-            self.reduced.count_folded()
-            self._clean_up()
-        newton = self._newton
-        step = Step(parameter, newton.iterations, list(newton.residuals), displacement)
-        self.history.steps.append(step)
-        return step
-
-    def _set_load(self, load: float) -> None:
-        for body in self.bodies:
-            np.copyto(body.load.value, load)
-
-    def _follow(self, update: Callable[[float], None], t: float) -> None:
-        """Set the values of a path; where that fails the load is that before the step."""
-        try:
-            update(t)
-        except Exception as error:
-            if not isinstance(error, MPMError):
-                self._restore()
-            raise
-
-    def _restore(self, update: Callable[[float], None] | None = None) -> None:
-        """Return to the last converged step."""
-        for body in self.bodies:
-            body.roll_back()
-        for share in self.shares:
-            share.forms.update_average()
-        self._set_load(self._loaded)
-        self.roll_back()
-        if update is not None and self._parameter > 0.0:
-            update(self._parameter)
 
     # -- What a problem with a material adds -----------------------------------------------
 

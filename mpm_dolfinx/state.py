@@ -24,6 +24,7 @@ from .checkpoint import Snapshot, Table
 from .errors import MPMError, ParticleOutsideError, agree
 from .exchange import RowExchange
 from .history import Loss, Statistics, Step
+from .loading import Converged, go_back
 from .particles import Particles
 from .stepping import Run
 
@@ -59,11 +60,11 @@ def capture(problem: ParticleProblem, functions: Sequence[fem.Function] = ()) ->
         for i, (_, increments) in enumerate(past):
             columns[f"past {i}"] = _of_cells(body.W, _with_ghosts(body.W, increments[number]))
         tables.append(Table(body.global_index, columns))
-    run = problem._run
+    run, converged = problem._run, problem._converged
     V = problem.bodies[0].V
     totals = {
-        "prescribed": problem._prescribed,
-        "reactions": problem._reactions,
+        "prescribed": converged.prescribed,
+        "reactions": converged.reactions,
         "base": None if run is None else run.base,
     }
     columns = {name: _of_cells(V, _with_ghosts(V, values)) for name, values in totals.items()}
@@ -78,9 +79,9 @@ def capture(problem: ParticleProblem, functions: Sequence[fem.Function] = ()) ->
     numbers = {
         "identity": identity(problem),
         "cuts": [body.cuts.tolist() for body in problem.bodies],
-        "load": problem._loaded,
-        "parameter": problem._parameter,
-        "reactions": problem._reactions is not None,
+        "load": converged.load,
+        "parameter": converged.parameter,
+        "reactions": converged.reactions is not None,
         "run": None if run is None else run.numbers(),
         "past": [size for size, _ in past],
         "experience": problem._newton.experience,
@@ -145,10 +146,10 @@ def adopt(
         for function in own:
             _fill(function, columns[f"function {function.name}"])
     problem.set_converged_state(histories)
-    problem._prescribed = totals["prescribed"]
-    problem._reactions = None
-    if numbers["reactions"]:
-        problem._reactions = totals["reactions"][: _owned(V)].copy()
+    reactions = totals["reactions"][: _owned(V)].copy() if numbers["reactions"] else None
+    problem._converged = Converged(
+        numbers["load"], numbers["parameter"], totals["prescribed"], reactions
+    )
     if problem.reduced.predictor is not None:
         problem.reduced.predictor.past = [
             (
@@ -162,7 +163,6 @@ def adopt(
         ]
     problem.reduced.moduli = numbers["moduli"]
     problem._newton.experience = tuple(numbers["experience"])
-    problem._loaded, problem._parameter = numbers["load"], numbers["parameter"]
     problem._run = None
     problem._resume = False
     if numbers["run"] is not None and resume:
@@ -177,7 +177,7 @@ def adopt(
     history.stopped = None if stopped is None else ParticleOutsideError(*stopped)
     history.statistics.update(numbers["statistics"])
     problem.reduced.forget()
-    problem._restore()
+    go_back(problem)
 
 
 def require_same(problem: ParticleProblem, snapshot: Snapshot, source: str) -> None:
