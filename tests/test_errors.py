@@ -592,13 +592,18 @@ def test_law_that_fails_at_one_particle(quadrature_degree):
     assert f"particle {expected[0]}" in str(error)
 
 
+def with_one_value(p, all_others, first):
+    """Return a DG0 Function that is ``first`` in particle 0 and ``all_others`` elsewhere."""
+    function = fem.Function(fem.functionspace(p.mesh, ("DG", 0)))
+    function.x.array[:] = all_others
+    mine = np.flatnonzero(p.global_index == 0)
+    function.x.array[function.function_space.dofmap.list[mine, 0]] = first
+    return function
+
+
 def test_one_parameter_out_of_range():
     # Only the rank that owns the particle sees that its modulus is negative.
-    p = particles()
-    young = fem.Function(fem.functionspace(p.mesh, ("DG", 0)))
-    young.x.array[:] = 1e3
-    mine = np.flatnonzero(p.global_index == 0)
-    young.x.array[young.function_space.dofmap.list[mine, 0]] = -1.0
+    young = with_one_value(particles(), 1e3, -1.0)
     raises(lambda: Hencky(young, 0.3), mpm.MPMError, r"young is -1")
 
 
@@ -628,10 +633,7 @@ def test_one_array_of_another_length():
 
 def test_one_negative_density():
     p = particles()
-    density = fem.Function(fem.functionspace(p.mesh, ("DG", 0)))
-    density.x.array[:] = 1.0
-    mine = np.flatnonzero(p.global_index == 0)
-    density.x.array[density.function_space.dofmap.list[mine, 0]] = -3.0
+    density = with_one_value(p, 1.0, -3.0)
     raises(
         lambda: mpm.QuasiStaticProblem(p, Hencky(1e3, 0.3), density=density),
         mpm.MPMError,
