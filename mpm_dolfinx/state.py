@@ -48,6 +48,11 @@ def capture(problem: ParticleProblem, functions: Sequence[fem.Function] = ()) ->
         MPMError: Functions that cannot be kept, or that are missing.
     """
     shares = _by_body(problem, functions)
+    if functions and problem.identity is not None:
+        raise MPMError(
+            "Domains were split or the body rebased, so functions= on its new mesh could not be "
+            "restored; save the state without them."
+        )
     predictor = problem.reduced.predictor
     past = [] if predictor is None else predictor.past
     tables = []

@@ -322,6 +322,11 @@ def test_checkpoint_after_a_split(tmp_path):
     flag = fem.Function(fem.functionspace(column().particles.mesh, ("DG", 0)), name="flag")
     with pytest.raises(mpm.MPMError, match="cannot be restored; restore it without"):
         column().restore(path, functions=[flag])
+    # What could not be restored is not saved.
+    flag = fem.Function(fem.functionspace(whole.particles.mesh, ("DG", 0)), name="flag")
+    with pytest.raises(mpm.MPMError, match="save the state without them"):
+        whole.save(path, functions=[flag])
+    other.restore(path)
 
 
 def block_of(cell, **options):
