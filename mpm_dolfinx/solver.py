@@ -332,8 +332,9 @@ class NewtonSolver:
             return reasons.DIVERGED_FNORM_NAN
         rtol, atol, _, _ = snes.getTolerances()
         scale = self._problem.scale()
-        if self._stalled or (iteration >= 2 and norm > max(0.25 * self._norm, rtol * scale)):
+        if iteration >= 2 and norm > max(0.25 * self._norm, rtol * scale):
             self._stalled = True
+        if self._stalled or scale == 0.0:
             internal = self._problem.internal_scale()
             if scale < 1e-6 * internal:
                 scale = internal
