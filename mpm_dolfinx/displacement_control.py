@@ -16,7 +16,7 @@ import ufl
 from dolfinx import fem, la
 
 from .domains import RING
-from .errors import MPMError
+from .errors import MPMError, agree
 from .location import TOLERANCE, BackgroundBasis
 from .particles import Particles
 from .quadrature import depends_on, split_by_rule
@@ -68,20 +68,23 @@ class DisplacementControl:
             raise MPMError(
                 f"A displacement control needs mpm.Particles, not {type(particles).__name__}."
             )
-        if not isinstance(value, float | int | np.number) or not np.isfinite(value):
-            raise MPMError(f"The controlled displacement must be a finite number, not {value!r}.")
-        if (functional is None) != (point is not None and direction is not None):
-            raise MPMError("Give either point= and direction=, or functional=.")
+        with agree(particles.mesh.comm):
+            if not _is_number(value):
+                raise MPMError(
+                    f"The controlled displacement must be a finite number, not {value!r}."
+                )
+            if (functional is None) != (point is not None and direction is not None):
+                raise MPMError("Give either point= and direction=, or functional=.")
+            if functional is None:
+                self._point = _vector(point, particles, "point")
+                self._direction = _vector(direction, particles, "direction")
+                length = float(np.linalg.norm(self._direction))
+                if length == 0.0:
+                    raise MPMError("direction must not be zero.")
+                self._direction /= length
         self.particles = particles
         self.value = float(value)
         self.functional = functional
-        if functional is None:
-            self._point = _vector(point, particles, "point")
-            self._direction = _vector(direction, particles, "direction")
-            length = float(np.linalg.norm(self._direction))
-            if length == 0.0:
-                raise MPMError("direction must not be zero.")
-            self._direction /= length
         self._space: fem.FunctionSpace | None = None
         self._rebases = particles.rebases
         self.row()
@@ -351,6 +354,11 @@ class ControlledSystem:
     def extent(self) -> float:
         """Return the size of the positions of all nodes."""
         return self._reduced.extent()
+
+
+def _is_number(value: Any) -> bool:
+    number = isinstance(value, float | int | np.number) and not isinstance(value, bool)
+    return number and bool(np.isfinite(value))
 
 
 def _vector(value: Any, particles: Particles, name: str) -> NDArray[np.float64]:

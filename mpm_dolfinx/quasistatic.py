@@ -20,7 +20,7 @@ from .bodies import as_bodies
 from .boundary import Support
 from .checkpoint import Snapshot
 from .constitutive import ConstitutiveHistory
-from .errors import MPMError
+from .errors import MPMError, agree
 from .expressions import as_expression, carried, require_movable
 from .f_bar import F_BARS, LowRankTangent
 from .grouping import background_cells
@@ -297,7 +297,8 @@ class QuasiStaticProblem(ParticleProblem):
         if body not in range(len(self.bodies)):
             raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
         chosen = [np.zeros(0, dtype=np.int64) for _ in self.bodies]
-        chosen[body] = np.asarray(particles, dtype=np.int64).ravel()
+        with agree(self._comm):
+            chosen[body] = splitting.as_indices(particles)
         splitting.split(self, chosen)
 
     def rebase(self) -> None:

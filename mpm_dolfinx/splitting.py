@@ -31,7 +31,15 @@ from .validation import validate_distortion
 if TYPE_CHECKING:
     from .quasistatic import QuasiStaticProblem
 
-__all__ = ["rebase", "repeat", "require_divisible", "split", "split_concave", "split_failing"]
+__all__ = [
+    "as_indices",
+    "rebase",
+    "repeat",
+    "require_divisible",
+    "split",
+    "split_concave",
+    "split_failing",
+]
 
 #: How often a failing step may be mended, and the share of all quadrilaterals that is split at
 #: first where none is named.
@@ -39,6 +47,23 @@ TRIES = 5
 FEW = 0.02
 #: Columns of a state that hold values at the nodes of domains.
 NODAL = ("displacement", "kept", "past ", "mass share", "reference domains", "mesh nodes")
+
+
+def as_indices(particles: Any) -> NDArray[np.int64]:
+    """Return global indices as an array.
+
+    Raises:
+        MPMError: They are no whole numbers.
+    """
+    try:
+        array = np.asarray(particles)
+    except ValueError:
+        array = np.array(None)
+    if array.size and not np.issubdtype(array.dtype, np.integer):
+        raise MPMError(
+            f"Particles to be split are global indices, whole numbers, not {particles!r}."
+        )
+    return array.astype(np.int64).ravel()
 
 
 def require_divisible(arguments: dict[str, Any]) -> None:

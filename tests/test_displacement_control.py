@@ -422,6 +422,7 @@ def test_control_of_before_a_rebase():
         ({"direction": None}, "either point= and direction=, or functional="),
         ({"functional": 1.0}, "either point= and direction=, or functional="),
         ({"particles": None}, "needs mpm.Particles"),
+        ({"value": True}, "finite number"),
     ],
 )
 def test_bad_control(options, sentence):
@@ -429,6 +430,13 @@ def test_bad_control(options, sentence):
     given = {"particles": problem.particles, "value": 0.1, "point": (1.0, 1.0)}
     with pytest.raises(mpm.MPMError, match=sentence):
         mpm.DisplacementControl(**{**given, "direction": (0.0, 1.0), **options})
+
+
+def test_direction_that_is_bad_on_one_rank():
+    problem, _ = cantilever()
+    direction = (0.0, 0.0 if WORLD.rank == WORLD.size - 1 else 1.0)
+    with pytest.raises(mpm.MPMError, match="direction must not be zero"):
+        mpm.DisplacementControl(problem.particles, 0.1, (1.0, 1.0), direction)
 
 
 def test_bad_functional():

@@ -461,6 +461,10 @@ def test_refused():
         problem.split([3, 1000])
     with pytest.raises(mpm.MPMError, match="There is no body 1"):
         problem.split([3], body=1)
+    on_one = [3] if WORLD.rank else [3.0]
+    for wrong in ([1.7], [True], "3", [[1, 2], [3]], None, on_one):
+        with pytest.raises(mpm.MPMError, match="global indices, whole numbers, not"):
+            problem.split(wrong)
     scenes.assert_same_state(before, scenes.state(problem))
     problem.split([3])
     with pytest.raises(mpm.MPMError, match="particle 3 cannot be split"):
