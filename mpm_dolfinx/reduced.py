@@ -47,8 +47,8 @@ class ReducedSystem:
 
     Attributes:
         prescribes: Whether Dirichlet values change in the step that has begun.
-        moduli: Shear moduli of the bodies before their first step, by which a ghost penalty is
-            scaled; ``None`` where they are not known yet.
+        moduli: Shear moduli of the bodies at the first step with a ghost penalty, which is scaled
+            by them; ``None`` before.
     """
 
     def __init__(
