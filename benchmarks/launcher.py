@@ -14,7 +14,6 @@ from typing import Any
 
 #: With more ranks than cores, ranks that wait leave them the cores (MPICH, Open MPI).
 WAITING = {
-    "MPIR_CVAR_ENABLE_HEAVY_YIELD": "1",
     "MPIR_CVAR_CH4_PROGRESS_THROTTLE": "1",
     "MPIR_CVAR_CH4_PROGRESS_THROTTLE_NO_PROGRESS_COUNT": "20",
     "OMPI_MCA_mpi_yield_when_idle": "1",
