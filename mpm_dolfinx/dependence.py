@@ -12,6 +12,7 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
+from .layout import TouchedNodes
 from .particles import Particles
 
 __all__ = ["Dependence", "dependent_columns", "dependent_dofs"]
@@ -59,7 +60,9 @@ class Dependence(NamedTuple):
         np.add.at(u, self.stand_ins[own] - start, (self.coefficients * values[self.which])[own])
 
 
-def dependent_dofs(bodies: Sequence[Particles], free: NDArray[np.bool_]) -> Dependence:
+def dependent_dofs(
+    bodies: Sequence[Particles], touched: TouchedNodes, free: NDArray[np.bool_]
+) -> Dependence:
     """Find free dofs of V whose columns of T depend on those of others (collective).
 
     Only columns with few rows can, in a transfer of degree one: those of background nodes that few
@@ -67,6 +70,7 @@ def dependent_dofs(bodies: Sequence[Particles], free: NDArray[np.bool_]) -> Depe
 
     Args:
         bodies: Bodies on one background space.
+        touched: The nodes of V that they touch.
         free: Whether each dof of V that this rank owns can be an unknown.
 
     Returns:
@@ -74,89 +78,38 @@ def dependent_dofs(bodies: Sequence[Particles], free: NDArray[np.bool_]) -> Depe
     """
     V = bodies[0].V
     comm, bs = V.mesh.comm, V.dofmap.index_map_bs
-    first, last = V.dofmap.index_map.local_range
-    seen = [_Seen(body, first, last) for body in bodies]
-    few = np.unique(np.concatenate([some.few() for some in seen]))
-    counts = sum(some.counts_at(few) for some in seen)
+    counts = np.zeros(len(touched.nodes), dtype=np.int64)
+    own, start = [], 0
+    for body, rows in zip(bodies, touched.rows, strict=True):
+        index = body.W.dofmap.index_map
+        offsets = rows.offsets[: index.size_local + 1]
+        row = np.repeat(np.arange(index.size_local), np.diff(offsets))
+        own.append((row + index.local_range[0] + start, rows.nodes[: offsets[-1]], rows.values))
+        counts += np.bincount(own[-1][1], minlength=len(counts))
+        start += index.size_global
+    few = touched.spread(touched.collect(counts) <= FEW_ROWS)
+    unknown = touched.spread(free.reshape(-1, bs))
+    parts = []
+    for row, node, values in own:
+        picked = few[node]
+        node = node[picked]
+        parts.append(
+            (row[picked], touched.nodes[node], values[: len(picked)][picked], unknown[node])
+        )
+    every = [tuple(np.concatenate(column) for column in zip(*parts, strict=True))]
     if comm.size > 1:
-        few = np.unique(np.concatenate(comm.allgather(few)))
-        counts = comm.allreduce(sum(some.counts_at(few) for some in seen))
-    few = few[counts <= FEW_ROWS]
-    own = (few >= first) & (few < last)
-    unknown = np.zeros((len(few), bs), dtype=np.int32)
-    unknown[own] = free.reshape(-1, bs)[few[own] - first]
-    starts = np.cumsum([0, *(body.W.dofmap.index_map.size_global for body in bodies)])
-    entries = [some.entries(few, int(start)) for some, start in zip(seen, starts, strict=False)]
-    parts = [tuple(np.concatenate(column) for column in zip(*entries, strict=True))]
-    if comm.size > 1:
-        unknown = comm.allreduce(unknown)
-        parts = comm.allgather(parts[0])
-    rows, columns, values = (np.concatenate(column) for column in zip(*parts, strict=True))
+        every = comm.allgather(every[0])
+    row, node, values, mask = (np.concatenate(column) for column in zip(*every, strict=True))
     found: dict[bytes, Dependence] = {}
     results = []
-    for component in range(bs):
-        mask = unknown[:, component] > 0
-        if mask.tobytes() not in found:
-            kept = mask[columns]
-            found[mask.tobytes()] = dependent_columns(rows[kept], columns[kept], values[kept])
-        columns_, which, stand_ins, coefficients = found[mask.tobytes()]
-        dofs = [few[some] * bs + component for some in (columns_, stand_ins)]
+    for component, kept in enumerate(mask.T):
+        key = kept.tobytes()
+        if key not in found:
+            found[key] = dependent_columns(row[kept], node[kept], values[kept])
+        columns, which, stand_ins, coefficients = found[key]
+        dofs = [nodes * bs + component for nodes in (columns, stand_ins)]
         results.append(Dependence(dofs[0], which, dofs[1], coefficients))
     return _joined(results)
-
-
-class _Seen:
-    """Which background nodes the nodes of a body see, and how many see each."""
-
-    def __init__(self, body: Particles, first: int, last: int) -> None:
-        own_rows = body.W.dofmap.index_map
-        self._rows = own_rows.local_range[0]
-        basis = body.node_basis.part(own_rows.size_local)
-        self._nodes, self._values = basis.nodes, basis.values
-        there = self._values != 0.0
-        self._first = first
-        self._own = there & (self._nodes >= first) & (self._nodes < last)
-        self._counts = np.bincount(self._nodes[self._own] - first, minlength=last - first)
-        self._others = there & ~self._own
-        self._ghosts, self._ghost_counts = np.unique(self._nodes[self._others], return_counts=True)
-
-    def few(self) -> NDArray[np.int64]:
-        """Return the global nodes that few of this rank's rows see."""
-        own = np.flatnonzero((self._counts > 0) & (self._counts <= FEW_ROWS)) + self._first
-        return np.concatenate([own, self._ghosts[self._ghost_counts <= FEW_ROWS]])
-
-    def counts_at(self, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return how many of this rank's rows see each of some sorted global nodes."""
-        counts = np.zeros(len(nodes), dtype=np.int64)
-        own = (nodes >= self._first) & (nodes < self._first + len(self._counts))
-        counts[own] = self._counts[nodes[own] - self._first]
-        _, place, ghost = np.intersect1d(
-            nodes, self._ghosts, assume_unique=True, return_indices=True
-        )
-        counts[place] += self._ghost_counts[ghost]
-        return counts
-
-    def entries(
-        self, nodes: NDArray[np.int64], start: int
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Return the entries of T at some sorted global nodes.
-
-        Args:
-            nodes: They.
-            start: Number of the body's first row, of all ranks.
-
-        Returns:
-            Rows of all bodies, places among ``nodes``, and values.
-        """
-        wanted = np.zeros(len(self._counts), dtype=bool)
-        wanted[
-            nodes[(nodes >= self._first) & (nodes < self._first + len(wanted))] - self._first
-        ] = 1
-        picked = np.zeros(self._nodes.shape, dtype=bool)
-        picked[self._own] = wanted[self._nodes[self._own] - self._first]
-        picked[self._others] = np.isin(self._nodes[self._others], nodes)
-        rows = np.nonzero(picked)[0] + self._rows + start
-        return rows, np.searchsorted(nodes, self._nodes[picked]), self._values[picked]
 
 
 def _joined(parts: Sequence[Dependence]) -> Dependence:

@@ -18,12 +18,13 @@ from .clouds import mesh_of_boxes
 from .deletion import without_deleted
 from .domains import Reference
 from .errors import MPMError, ParticleOutsideError, agree
+from .layout import TouchedNodes
 from .location import BackgroundBasis, PointBasis
 from .material_domains import MaterialDomains
 from .methods import BoxGrid, DomainState, Rows, boxes, cpdi, cpdi2, gimp, mpm, require_boxes
 from .partition import Redistribution, cell_centres, ranks_of_background
 from .rebase import Cuts, Rebase
-from .transfer import Weights, active_nodes, domain_weights, sum_by_particle, transfer_matrix
+from .transfer import Weights, domain_weights, sum_by_particle, transfer_matrix
 from .validation import validate_distortion, validate_options, validate_spaces
 
 __all__ = ["Particles"]
@@ -345,7 +346,8 @@ class Particles(MaterialDomains):
     @cached_property
     def active_nodes(self) -> NDArray[np.int32]:
         """Nodes of V with weight that this rank owns, local numbers, sorted."""
-        return active_nodes(self._rows.basis, self.W, self.V)
+        owned = self.W.dofmap.index_map.size_local
+        return TouchedNodes(self.V, [self._rows.basis], [owned]).active
 
     @property
     def active_dofs(self) -> NDArray[np.int64]:

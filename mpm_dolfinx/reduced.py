@@ -162,7 +162,7 @@ class ReducedSystem:
         free &= ~self._fixed
         T = self._bodies[0].particles.T
         if self._remove_dependent:
-            self._dependence = dependent_dofs(bodies, free & ~supported)
+            self._dependence = dependent_dofs(bodies, touched, free & ~supported)
             start, end = T.getOwnershipRangeColumn()
             dependent = self._dependence.columns
             free[dependent[(dependent >= start) & (dependent < end)] - start] = False

@@ -17,7 +17,7 @@ from dolfinx import fem
 from .location import PointBasis
 from .quadrature import quadrature_rule
 
-__all__ = ["Weights", "active_nodes", "domain_weights", "sum_by_particle", "transfer_matrix"]
+__all__ = ["Weights", "domain_weights", "sum_by_particle", "transfer_matrix"]
 
 
 class Weights(NamedTuple):
@@ -70,23 +70,6 @@ def transfer_matrix(basis: PointBasis, W: fem.FunctionSpace, V: fem.FunctionSpac
         (columns.size_local * bs, columns.size_global * bs),
     )
     return PETSc.Mat().createAIJ(sizes, csr=(indptr, indices, data), comm=W.mesh.comm)
-
-
-def active_nodes(
-    basis: PointBasis, W: fem.FunctionSpace, V: fem.FunctionSpace
-) -> NDArray[np.int32]:
-    """Return this rank's own nodes of V (local numbers, sorted) that have weight in T."""
-    owned = W.dofmap.index_map.size_local
-    touched = np.unique(basis.nodes[:owned][basis.values[:owned] != 0.0])
-    columns = V.dofmap.index_map
-    if V.mesh.comm.size == 1:
-        return touched.astype(np.int32)
-    mark = PETSc.Vec().createMPI((columns.size_local, columns.size_global), comm=V.mesh.comm)
-    mark.setValues(touched.astype(PETSc.IntType), np.ones(len(touched)), addv=True)
-    mark.assemble()
-    active = np.flatnonzero(mark.array_r > 0).astype(np.int32)
-    mark.destroy()
-    return active
 
 
 def domain_weights(
