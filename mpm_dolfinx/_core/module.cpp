@@ -12,6 +12,7 @@
 #include "arrays.h"
 #include "domains.h"
 #include "material.h"
+#include "sparsity.h"
 
 namespace
 {
