@@ -40,6 +40,7 @@ __all__ = [
     "compiled_integrals",
     "create_vector",
     "disconnected_mesh",
+    "entity_nodes",
     "equispaced_element",
     "geometry_degree",
     "geometry_dofmap",
@@ -113,6 +114,14 @@ def is_condition_on(bc: fem.DirichletBC, V: fem.FunctionSpace) -> bool:
 def are_tags_of(tags: mesh.MeshTags, domain: mesh.Mesh) -> bool:
     """Return whether tags are of a mesh (whose topology is wrapped since 0.10)."""
     return bool(tags.topology == getattr(domain.topology, "_cpp_object", domain.topology))
+
+
+def entity_nodes(domain: mesh.Mesh, dim: int, entities: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the geometry nodes of entities' vertices ``(n, k)`` (0.9 crashes where n is zero)."""
+    if len(entities) == 0:
+        corners = len(basix.topology(domain.basix_cell())[dim][0])
+        return np.zeros((0, corners), dtype=np.int32)
+    return mesh.entities_to_geometry(domain, dim, entities)
 
 
 def tags_from_nodes(

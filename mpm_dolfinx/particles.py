@@ -22,7 +22,7 @@ from .layout import TouchedNodes
 from .location import BackgroundBasis, PointBasis
 from .material_domains import MaterialDomains
 from .methods import BoxGrid, DomainState, Rows, boxes, cpdi, cpdi2, gimp, mpm, require_boxes
-from .partition import Redistribution, cell_centres, ranks_of_background
+from .partition import Carrier, Redistribution, cell_centres, ranks_of_background
 from .rebase import Cuts, Rebase
 from .transfer import Weights, domain_weights, sum_by_particle, transfer_matrix
 from .validation import validate_distortion, validate_options, validate_spaces
@@ -83,6 +83,7 @@ class Particles(MaterialDomains):
         on_distortion: As given.
         mass_share: Factor of the density that keeps the mass at each node where domains were
             split or the body rebased, otherwise ``None``.
+        rebases: How often the nodes of the mesh were moved.
         origin: Undeformed positions of the nodes of W where the body was rebased, otherwise
             ``None``.
 
@@ -117,13 +118,14 @@ class Particles(MaterialDomains):
             "domain_update": domain_update,
             "on_distortion": on_distortion,
         }
-        self._moves: list[Redistribution] = []
+        self._carriers: list[Carrier] = []
+        self.rebases = 0
         self.cuts: Cuts = np.zeros((0, 2), dtype=np.int64)
         self._background = BackgroundBasis(V)
         if partition == "background":
             ranks = ranks_of_background(V, self._background, cell_centres(body))
-            self._moves.append(Redistribution(body, ranks))
-            body = self._moves[-1].mesh
+            self._carriers.append(Redistribution(body, ranks))
+            body = self._carriers[-1].mesh
         family = "Lagrange" if method == "cpdi2" else "Discontinuous Lagrange"
         super().__init__(body, family, degree, quadrature_degree, outside == "delete")
         self.V = V
@@ -171,13 +173,13 @@ class Particles(MaterialDomains):
 
         Args:
             thing: ``MeshTags`` or a piecewise constant Function on the body mesh that was given,
-                or on any ``mesh`` since; anything else is returned as it is.
+                or on the ``mesh`` before the last move; anything else is returned as it is.
 
         Raises:
             MPMError: A Function that is not piecewise constant.
         """
-        for move in self._moves:
-            thing = move.carry(thing)
+        for carrier in self._carriers:
+            thing = carrier.carry(thing)
         return thing
 
     def ranks_of_background(self) -> NDArray[np.int64]:
@@ -212,22 +214,21 @@ class Particles(MaterialDomains):
         move = Rebase(self.mesh, cuts, positions)
         moved = positions is not None or self.origin is not None
         self._take(move, np.concatenate([self.cuts, cuts]), moved)
+        self.rebases += positions is not None
         return move
 
-    def _take(self, move: Redistribution, cuts: Cuts, moved: bool) -> None:
+    def _take(self, move: Carrier, cuts: Cuts, moved: bool) -> None:
         """Live on another mesh (collective)."""
-        moves, V, increment, options = self._moves, self.V, self.increment, self._options
+        kept = {name: self.__dict__[name] for name in ("V", "increment", "rebases", "_options")}
+        carriers = [carrier.then(move) for carrier in self._carriers[:1]]
         self.__dict__.clear()
-        Particles.__init__(self, move.mesh, V, **options)
-        self._moves, self.increment = [*moves, move], increment
+        Particles.__init__(self, move.mesh, kept["V"], **kept["_options"])
+        self.__dict__ |= kept
+        # From the mesh that was given and from the last one: those between are forgotten.
+        self._carriers = [*carriers, move]
         self.cuts = cuts
         if moved or len(cuts):
             self.expect_reference(moved)
-
-    @property
-    def rebases(self) -> int:
-        """How often the nodes of the mesh were moved."""
-        return sum(isinstance(move, Rebase) and move.moved for move in self._moves)
 
     @property
     def origin_index(self) -> NDArray[np.int64]:

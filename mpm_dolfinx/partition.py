@@ -19,7 +19,7 @@ from .errors import MPMError
 from .exchange import RowExchange
 from .location import BackgroundBasis
 
-__all__ = ["Redistribution", "cell_centres", "neighbour_ranks", "ranks_of_background"]
+__all__ = ["Carrier", "Redistribution", "cell_centres", "neighbour_ranks", "ranks_of_background"]
 
 #: How many particles more than an even share a rank may have, relatively.
 SLACK = 0.05
@@ -78,62 +78,97 @@ def cell_centres(body: mesh.Mesh) -> NDArray[np.float64]:
     return np.asarray(corners[:, :, : body.geometry.dim].mean(axis=1))
 
 
-class Redistribution:
-    """A mesh whose cells have moved to other ranks, and what moves with it.
-
-    Cells keep their input index. On one rank the mesh is the same one.
+class Carrier:
+    """Takes tags and piecewise constants of a mesh to another mesh of the same body.
 
     Args:
         source: The mesh before.
-        ranks: New rank of each cell that this rank owns, shape ``(n,)`` (collective).
+        mesh: The mesh after, of which each cell is one of those before, or a part of one.
+        origin: Input index of the one before, for each owned cell after, shape ``(n,)``.
+        numbers: Input number after, for each local node before, shape ``(m,)``.
 
     Attributes:
         source: The mesh before.
         mesh: The mesh after.
     """
 
-    def __init__(self, source: mesh.Mesh, ranks: NDArray[np.int64]) -> None:
-        self.source = source
-        self.mesh = source if source.comm.size == 1 else _moved(source, ranks)
+    def __init__(
+        self,
+        source: mesh.Mesh,
+        mesh: mesh.Mesh,
+        origin: NDArray[np.int64],
+        numbers: NDArray[np.int64],
+    ) -> None:
+        self.source, self.mesh = source, mesh
+        self._origin, self._numbers = origin, numbers
+
+    def then(self, move: Carrier) -> Carrier:
+        """Return what takes things of this source to where another carrier goes on (collective).
+
+        Args:
+            move: Its source is the mesh of this one.
+        """
+        if move.mesh is self.mesh:
+            return self
+        comm = self.mesh.comm
+        cells = RowExchange(comm, _compat.input_cell_index(self.mesh), move._origin)
+        nodes = self.mesh.geometry
+        owned = nodes.index_map().size_local
+        have = np.asarray(nodes.input_global_indices[:owned], dtype=np.int64)
+        return Carrier(
+            self.source,
+            move.mesh,
+            cells(self._origin),
+            RowExchange(comm, have, self._numbers)(move._numbers[:owned]),
+        )
 
     def carry(self, thing: Any) -> Any:
-        """Return tags or a piecewise constant Function on the new mesh (collective).
+        """Return tags or a piecewise constant Function on the mesh after (collective).
 
         Args:
             thing: ``MeshTags`` or a DG0 Function on the mesh before; anything else, also what
-                lives on the new mesh already, is returned as it is.
+                lives on the mesh after already, is returned as it is.
+
+        Raises:
+            MPMError: A Function that is not piecewise constant.
         """
         if self.mesh is self.source:
             return thing
         if isinstance(thing, mesh.MeshTags) and _compat.are_tags_of(thing, self.source):
-            return self._tags(thing)
+            return self._cell_tags(thing) if thing.dim == thing.topology.dim else self._tags(thing)
         if isinstance(thing, fem.Function) and thing.function_space.mesh is self.source:
             return self._function(thing)
         return thing
+
+    def of_cells(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return values of the owned cells on the mesh after, shape ``(n, ...)`` (collective)."""
+        have = _compat.input_cell_index(self.source)
+        return RowExchange(self.mesh.comm, have, self._origin)(values)
+
+    def _cell_tags(self, tags: mesh.MeshTags) -> mesh.MeshTags:
+        count = self.source.topology.index_map(tags.dim).size_local
+        own = tags.indices < count
+        values = np.zeros((count, 2), dtype=np.int32)
+        values[tags.indices[own]] = np.column_stack([tags.values[own], np.ones(own.sum())])
+        values = self.of_cells(values)
+        tagged = np.flatnonzero(values[:, 1]).astype(np.int32)
+        moved = mesh.meshtags(self.mesh, tags.dim, tagged, values[tagged, 0])
+        moved.name = tags.name
+        return moved
 
     def _tags(self, tags: mesh.MeshTags) -> mesh.MeshTags:
         topology, dim = self.source.topology, tags.dim
         topology.create_connectivity(dim, topology.dim)
         topology.create_connectivity(dim, 0)
         own = tags.indices < topology.index_map(dim).size_local
-        nodes = mesh.entities_to_geometry(self.source, dim, tags.indices[own])
+        nodes = _compat.entity_nodes(self.source, dim, tags.indices[own])
         self.mesh.topology.create_connectivity(dim, 0)
         self.mesh.topology.create_connectivity(dim, self.mesh.topology.dim)
         moved = _compat.tags_from_nodes(
-            self.mesh, dim, self._node_numbers(nodes), tags.values[own].astype(np.int32)
+            self.mesh, dim, self._numbers[nodes], tags.values[own].astype(np.int32)
         )
         moved.name = tags.name
         return moved
-
-    def _node_numbers(self, nodes: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Return the input numbers in the new mesh of the old one's nodes, of the same shape."""
-        numbers = self.source.geometry.index_map().local_to_global(nodes.ravel())
-        return np.asarray(numbers.reshape(nodes.shape))
-
-    def of_cells(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return values of the owned cells on the new mesh, shape ``(n, ...)`` (collective)."""
-        have, want = (_compat.input_cell_index(m) for m in (self.source, self.mesh))
-        return RowExchange(self.mesh.comm, have, want)(values)
 
     def _function(self, function: fem.Function) -> fem.Function:
         space = function.function_space
@@ -154,21 +189,47 @@ class Redistribution:
         return moved
 
 
-def _moved(source: mesh.Mesh, ranks: NDArray[np.int64]) -> mesh.Mesh:
+class Redistribution(Carrier):
+    """A mesh whose cells have moved to other ranks, and what moves with it.
+
+    Cells keep their input index. On one rank the mesh is the same one.
+
+    Args:
+        source: The mesh before.
+        ranks: New rank of each cell that this rank owns, shape ``(n,)`` (collective).
+    """
+
+    def __init__(self, source: mesh.Mesh, ranks: NDArray[np.int64]) -> None:
+        moved, numbers = (source, None) if source.comm.size == 1 else _moved(source, ranks)
+        if numbers is None:
+            numbers = np.asarray(source.geometry.input_global_indices, dtype=np.int64)
+        super().__init__(source, moved, _compat.input_cell_index(moved), numbers)
+
+
+def _moved(source: mesh.Mesh, ranks: NDArray[np.int64]) -> tuple[mesh.Mesh, NDArray[np.int64]]:
+    """Return a mesh with cells on other ranks, and its input numbers of the local nodes."""
     comm, gdim = source.comm, source.geometry.dim
     index = _compat.input_cell_index(source)
     nodes = _compat.geometry_dofmap(source)[: len(index)]
     numbering = source.geometry.index_map()
     cells = source.topology.index_map(source.topology.dim)
     if numbering.size_global == cells.size_global * nodes.shape[1]:
-        return _moved_apart(source, ranks, index, source.geometry.x[nodes][:, :, :gdim])
+        moved = _moved_apart(source, ranks, index, source.geometry.x[nodes][:, :, :gdim])
+        exchange = RowExchange(comm, _compat.input_cell_index(moved), index)
+        places = _compat.geometry_dofmap(moved)
+        told = exchange(moved.geometry.input_global_indices[places].astype(np.int64))
+        numbers = np.zeros(len(source.geometry.x), dtype=np.int64)
+        numbers[nodes] = told
+        return moved, numbers
     first, last = (cells.size_global * r // comm.size for r in (comm.rank, comm.rank + 1))
     exchange = RowExchange(comm, index, np.arange(first, last))
-    numbers = exchange(numbering.local_to_global(nodes.ravel()).reshape(nodes.shape))
+    local = np.arange(len(source.geometry.x), dtype=np.int32)
+    numbers = numbering.local_to_global(local)
+    corners = exchange(numbers[nodes])
     where = exchange(np.column_stack([ranks, neighbour_ranks(source, ranks)]))
     targets = [[row[0], *sorted({*row[1:]} - {row[0], -1})] for row in where.tolist()]
     x = source.geometry.x[: numbering.size_local, :gdim].copy()
-    return _compat.mesh_on_ranks(comm, numbers, source, x, targets)
+    return _compat.mesh_on_ranks(comm, corners, source, x, targets), numbers
 
 
 def _moved_apart(

@@ -117,15 +117,24 @@ class QuasiStaticProblem(ParticleProblem):
         if first:
             self.splits_of_step = 0, 0
         count = len(bodies) if isinstance(particles, list | tuple) else 0
+        # Where they have moved to: what is on the mesh of before is not known for ever.
+        for name, move in (
+            ("material", carried),
+            ("cell_tags", Particles.carry),
+            ("facet_tags", Particles.carry),
+        ):
+            values = _for_each(self.arguments[name], count)
+            moved = [move(body, value) for body, value in zip(bodies, values, strict=True)]
+            self.arguments[name] = moved if count else moved[0]
         shares = zip(
             bodies,
-            _for_each(material, count),
+            _for_each(self.arguments["material"], count),
             _for_each(density, count),
             _for_each(body_force, count),
             _for_each(tractions, count, pairs=True),
             _for_each(pressures, count, pairs=True),
-            _for_each(cell_tags, count),
-            _for_each(facet_tags, count),
+            _for_each(self.arguments["cell_tags"], count),
+            _for_each(self.arguments["facet_tags"], count),
             strict=True,
         )
         _validate_supports(supports, bodies)
@@ -138,8 +147,6 @@ class QuasiStaticProblem(ParticleProblem):
         tangents: list[ufl.Form | None] = []
         symmetric = True
         for body, law, mass, force, dead, following, cells, facets in shares:
-            cells, facets = body.carry(cells), body.carry(facets)
-            law = carried(body, law)
             history = ConstitutiveHistory(body, law, cells, axisymmetric, f_bar, fast)
             self._stresses.append(history)
             work = VirtualWork(body, axisymmetric)

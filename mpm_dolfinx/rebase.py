@@ -21,7 +21,7 @@ from dolfinx import mesh
 
 from . import _compat
 from .exchange import RowExchange
-from .partition import Redistribution, neighbour_ranks
+from .partition import Carrier, neighbour_ranks
 
 __all__ = ["HALVES", "HALVES_OF_MASS", "Cuts", "Rebase", "diagonals"]
 
@@ -62,7 +62,7 @@ def diagonals(
     return second.astype(np.int64), np.where(second, areas[:, 1], areas[:, 0])
 
 
-class Rebase(Redistribution):
+class Rebase(Carrier):
     """A mesh on the same ranks with some quadrilaterals cut in two, or with moved nodes.
 
     The first half of a quadrilateral keeps its input index; the second ones follow after all
@@ -77,14 +77,12 @@ class Rebase(Redistribution):
     Attributes:
         source: The mesh before.
         mesh: The mesh after.
-        moved: Whether its nodes are elsewhere.
         index: Input indices on the new mesh of the owned cells of the old one and of their halves.
     """
 
     def __init__(
         self, source: mesh.Mesh, cuts: Cuts, positions: NDArray[np.float64] | None = None
     ) -> None:
-        self.source, self.moved = source, positions is not None
         comm = source.comm
         index = _compat.input_cell_index(source)
         count = source.topology.index_map(source.topology.dim).size_global
@@ -98,7 +96,7 @@ class Rebase(Redistribution):
         cut, diagonal = order[place[here]], cuts[here, 1]
         whole = np.ones(len(index), dtype=bool)
         whole[cut] = False
-        self._origin = np.concatenate([np.flatnonzero(whole), cut, cut])
+        self._parents = np.concatenate([np.flatnonzero(whole), cut, cut])
         self.index = np.concatenate(
             [index[whole], index[cut], count + np.flatnonzero(here).astype(np.int64)]
         )
@@ -117,9 +115,9 @@ class Rebase(Redistribution):
         added = np.cumsum([0, *comm.allgather(2 * len(cut))])
         firsts = np.array(comm.allgather(numbering.local_range[0]))
         old = numbering.local_to_global(np.arange(len(x), dtype=np.int32))
-        self._numbers = old + added[np.searchsorted(firsts, old, side="right") - 1]
-        corners = np.take_along_axis(nodes[self._origin], self._corners, axis=1)
-        cells = self._numbers[corners]
+        numbers = old + added[np.searchsorted(firsts, old, side="right") - 1]
+        corners = np.take_along_axis(nodes[self._parents], self._corners, axis=1)
+        cells = numbers[corners]
         new = np.arange(len(index) - len(cut), len(cells))
         cells[new, np.repeat(DOUBLED, len(cut))] = (
             numbering.local_range[1] + added[comm.rank] + np.arange(len(new))
@@ -127,23 +125,22 @@ class Rebase(Redistribution):
         points = np.concatenate([x[: numbering.size_local], x[corners[new, -1]]])
 
         ranks = np.full(len(index), comm.rank, dtype=np.int64)
-        seen = np.column_stack([ranks, neighbour_ranks(source, ranks)])[self._origin]
+        seen = np.column_stack([ranks, neighbour_ranks(source, ranks)])[self._parents]
         total = count + len(cuts)
         first, last = (total * r // comm.size for r in (comm.rank, comm.rank + 1))
         exchange = RowExchange(comm, self.index, np.arange(first, last))
         targets = [[row[0], *sorted({*row[1:]} - {row[0], -1})] for row in exchange(seen).tolist()]
-        self.mesh = _compat.mesh_on_ranks(comm, exchange(cells), source, points, targets)
+        after = _compat.mesh_on_ranks(comm, exchange(cells), source, points, targets)
+        origin = _compat.input_cell_index(after).copy()
+        second = origin >= count
+        origin[second] = cuts[origin[second] - count, 0]
+        super().__init__(source, after, origin, numbers)
 
     @property
     def halves(self) -> NDArray[np.bool_]:
         """Whether each owned cell of the new mesh is half of one of the old mesh, ``(n,)``."""
         index = _compat.input_cell_index(self.mesh)
         return np.asarray(np.isin(index, self._cut) | (index >= self._count))
-
-    def of_cells(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return values of the owned cells on the new mesh, shape ``(n, ...)`` (collective)."""
-        want = _compat.input_cell_index(self.mesh)
-        return RowExchange(self.mesh.comm, self.index, want)(self.rows(values))
 
     def rows(self, values: NDArray[Any], nodal: bool = False) -> NDArray[Any]:
         """Return values of the owned cells for each of :attr:`index`, on the same rank.
@@ -152,7 +149,7 @@ class Rebase(Redistribution):
             values: Shape ``(n, ...)``, nodal ones ``(n, k, ...)``.
             nodal: Whether halves have a part of the nodes only.
         """
-        taken: NDArray[Any] = values[self._origin]
+        taken: NDArray[Any] = values[self._parents]
         if not nodal:
             return taken
         corners = self._corners.reshape(*self._corners.shape, *[1] * (values.ndim - 2))
@@ -166,20 +163,3 @@ class Rebase(Redistribution):
         want = _compat.input_cell_index(self.mesh)
         exchange = RowExchange(self.mesh.comm, self.index, want)
         return np.asarray(exchange(self.rows(nodal, nodal=True) * self._parts))
-
-    def _node_numbers(self, nodes: NDArray[np.int32]) -> NDArray[np.int64]:
-        return np.asarray(self._numbers[nodes])
-
-    def _tags(self, tags: mesh.MeshTags) -> mesh.MeshTags:
-        dim = self.source.topology.dim
-        if tags.dim < dim:
-            return super()._tags(tags)
-        count = self.source.topology.index_map(dim).size_local
-        own = tags.indices < count
-        values = np.zeros((count, 2), dtype=np.int32)
-        values[tags.indices[own]] = np.column_stack([tags.values[own], np.ones(own.sum())])
-        values = self.of_cells(values)
-        tagged = np.flatnonzero(values[:, 1]).astype(np.int32)
-        moved = mesh.meshtags(self.mesh, dim, tagged, values[tagged, 0])
-        moved.name = tags.name
-        return moved

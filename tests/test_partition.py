@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Particles that live where the background is in which they lie."""
 
+import gc
+import weakref
+
 from mpi4py import MPI
 
 import numpy as np
@@ -13,8 +16,10 @@ import ufl
 from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx import _compat
 from mpm_dolfinx.materials import Hencky, VonMises
 from mpm_dolfinx.partition import Redistribution, cell_centres
+from mpm_dolfinx.rebase import Rebase
 
 SELF = MPI.COMM_SELF
 
@@ -46,7 +51,8 @@ def test_mesh_on_other_ranks(cell, ghosts):
     wanted = WORLD.allreduce(np.bincount(ranks, minlength=WORLD.size))
     assert cells.size_local == wanted[WORLD.rank]
     corners = [
-        m.geometry.x[m.geometry.dofmap[: c.size_local]] for m, c in ((body, before), (moved, cells))
+        m.geometry.x[_compat.geometry_dofmap(m)[: c.size_local]]
+        for m, c in ((body, before), (moved, cells))
     ]
     assert np.array_equal(by_index(body, corners[0]), by_index(moved, corners[1]))
     if WORLD.size > 1:
@@ -61,35 +67,105 @@ def test_mesh_on_other_ranks(cell, ghosts):
             assert area == pytest.approx(fem.assemble_scalar(fem.form(inside)), rel=1e-12)
 
 
+def pieces(body):
+    """Return a copy of a mesh whose cells share no vertex."""
+    nodes = _compat.geometry_dofmap(body)[: body.topology.index_map(body.topology.dim).size_local]
+    index = _compat.input_cell_index(body)
+    corners = body.geometry.x[nodes][:, :, : body.geometry.dim]
+    return _compat.disconnected_mesh(WORLD, corners, body.basix_cell(), index)
+
+
+def moved_once(body):
+    return Redistribution(body, anywhere(body))
+
+
+def moved_thrice(body):
+    """All to one rank, then anywhere, then anywhere else."""
+    carrier = Redistribution(body, np.zeros_like(anywhere(body)))
+    for seed in (2, 3):
+        between = carrier.mesh
+        carrier = carrier.then(Redistribution(between, anywhere(between, seed)))
+    return carrier
+
+
+def moved_and_stretched(body):
+    """To other ranks, then to other places, then to other ranks."""
+    carrier = moved_once(body)
+    between = carrier.mesh
+    nodes = _compat.geometry_dofmap(between)[: len(anywhere(between))]
+    x = between.geometry.x[nodes][:, :, : between.geometry.dim]
+    carrier = carrier.then(Rebase(between, np.zeros((0, 2), dtype=np.int64), 2.0 * x))
+    return carrier.then(Redistribution(carrier.mesh, anywhere(carrier.mesh, 2)))
+
+
 @pytest.mark.parametrize("cell", ALL, ids=scenes.name)
-def test_tags_and_functions_move(cell):
+@pytest.mark.parametrize("apart", [False, True], ids=["joined", "apart"])
+@pytest.mark.parametrize("way", [moved_once, moved_thrice, moved_and_stretched])
+def test_tags_and_functions_move(cell, apart, way):
     body = scenes.unit(3, cell)
+    if apart:
+        body = pieces(body)
     facets = scenes.facet_tags(body, scenes.at(0, 0.0), scenes.at(1, 1.0))
     cells = scenes.cell_tags(body, lambda x: 1 + (x[:, 0] > 0.4) + (x[:, 1] > 0.6))
     values = fem.Function(fem.functionspace(body, ("DG", 0)), name="stiffness")
     values.interpolate(lambda x: 1.0 + x[0] + 2.0 * x[1])
-    move = Redistribution(body, anywhere(body))
+    move = way(body)
+    scale = 2.0 if way is moved_and_stretched else 1.0
     moved = [move.carry(thing) for thing in (facets, cells, values)]
     for old, new in zip((facets, cells), moved, strict=False):
         for tag in (1, 2, 3):
             sizes = []
-            for tags, domain in ((old, body), (new, move.mesh)):
+            for tags, domain, size in ((old, body, 1.0), (new, move.mesh, scale)):
                 kind = "ds" if tags is facets or tags is moved[0] else "dx"
                 measure = ufl.Measure(kind, domain=domain, subdomain_data=tags)
-                x = ufl.SpatialCoordinate(domain)
+                x = ufl.SpatialCoordinate(domain) / size
                 form = fem.form((1.0 + x[0] + 3.0 * x[1]) * measure(tag))
-                sizes.append(WORLD.allreduce(fem.assemble_scalar(form)))
+                area = size ** (body.topology.dim - (kind == "ds"))
+                sizes.append(WORLD.allreduce(fem.assemble_scalar(form)) / area)
             assert sizes[1] == pytest.approx(sizes[0], rel=1e-12, abs=1e-14)
     one, two = (
-        WORLD.allreduce(fem.assemble_scalar(fem.form(f**2 * ufl.SpatialCoordinate(m)[0] * ufl.dx)))
-        for f, m in ((values, body), (moved[2], move.mesh))
+        WORLD.allreduce(
+            fem.assemble_scalar(fem.form(f**2 * ufl.SpatialCoordinate(m)[0] / size * ufl.dx))
+        )
+        / size**body.topology.dim
+        for f, m, size in ((values, body, 1.0), (moved[2], move.mesh, scale))
     )
     assert two == pytest.approx(one, rel=1e-12) and moved[2].name == "stiffness"
-    if WORLD.size > 1:
+    if move.mesh is not body:
         linear = fem.Function(fem.functionspace(body, ("Lagrange", 1)))
         with pytest.raises(mpm.MPMError, match="piecewise constant"):
             move.carry(linear)
     assert move.carry(moved[0]) is moved[0] and move.carry(3.0) == 3.0
+
+
+@pytest.mark.mpi
+def test_meshes_between_are_forgotten():
+    # Each holds some communicators of MPI, of which there are about 2000.
+    problem = flowing("given")
+    particles = problem.particles
+    last = problem.arguments["cell_tags"]
+    young = fem.Function(fem.functionspace(particles.mesh, ("DG", 0)))
+    young.interpolate(lambda x: 1.0 + x[1])
+    meshes = []
+    for seed in range(4):
+        ranks = anywhere(particles.mesh, seed)
+        problem.make_anew(lambda ranks=ranks: particles.move(ranks), lambda state: state)
+        meshes.append(weakref.ref(particles.mesh))
+        last = particles.carry(last)
+    other = flowing("given")
+    for one in (problem, other):
+        one.solve(2)
+    gc.collect()
+    assert [mesh() is not None for mesh in meshes] == [False, False, True, True]
+    assert_same_result(result(problem), result(other))
+    own = slice(particles.num_local)
+    middle = mesh.compute_midpoints(
+        particles.mesh, 2, np.arange(particles.num_local, dtype=np.int32)
+    )
+    np.testing.assert_array_equal(last.values[own], 1 + (middle[:, 1] > 4.0))
+    carried = particles.carry(young)
+    assert carried.function_space.mesh is particles.mesh
+    np.testing.assert_allclose(carried.x.array[own], 1.0 + middle[:, 1], rtol=1e-12)
 
 
 def weight(domain):
