@@ -29,9 +29,8 @@ import ufl
 from dolfinx import fem, geometry, graph, io, la, mesh
 from dolfinx.fem import petsc as fem_petsc
 
-from .errors import MPMError
-
 __all__ = [
+    "NUMBERS_CELLS",
     "CompiledIntegral",
     "NonlinearProblem",
     "are_tags_of",
@@ -60,6 +59,8 @@ __all__ = [
 ]
 
 _VERSION = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])
+#: Whether a mesh that is put together can be told the input index of its cells.
+NUMBERS_CELLS = _VERSION >= (0, 10)
 
 
 def require_supported() -> None:
@@ -200,7 +201,8 @@ def disconnected_mesh(
         nodes: Corners of this rank's cells in DOLFINx order, or all nodes of curved ones,
             equispaced, shape ``(n, k, gdim)``.
         cell: Cell type.
-        index: Input index of each cell; ``None`` numbers them from rank to rank.
+        index: Input index of each cell, where ``NUMBERS_CELLS``; ``None`` numbers them from rank
+            to rank.
         degree: Degree of the cells' map.
     """
     n, k, gdim = nodes.shape
@@ -236,7 +238,7 @@ def _topology(
     """Return the topology of cells that share no vertex (put together by setters before 0.10)."""
     cell_type = mesh.to_type(cell.name)
     connectivity = dolfinx.cpp.graph.AdjacencyList_int32(corners)
-    if not hasattr(dolfinx.cpp.mesh.Topology, "set_index_map"):
+    if NUMBERS_CELLS:
         if index is None:
             index = np.arange(*cells.local_range, dtype=np.int64)
         return dolfinx.cpp.mesh.Topology(
@@ -246,8 +248,7 @@ def _topology(
             cells=connectivity,
             original_index=index,
         )
-    if index is not None:
-        raise MPMError("Boxes without a mesh move between ranks with DOLFINx 0.10 or newer only.")
+    assert index is None
     topology = dolfinx.cpp.mesh.Topology(comm, cell_type)
     single = dolfinx.cpp.graph.AdjacencyList_int32(np.arange(corners.size, dtype=np.int32)[:, None])
     topology.set_index_map(0, vertices)

@@ -213,7 +213,8 @@ def _moved(source: mesh.Mesh, ranks: NDArray[np.int64]) -> tuple[mesh.Mesh, NDAr
     nodes = _compat.geometry_dofmap(source)[: len(index)]
     numbering = source.geometry.index_map()
     cells = source.topology.index_map(source.topology.dim)
-    if numbering.size_global == cells.size_global * nodes.shape[1]:
+    apart = numbering.size_global == cells.size_global * nodes.shape[1]
+    if apart and _compat.NUMBERS_CELLS:
         moved = _moved_apart(source, ranks, index, source.geometry.x[nodes][:, :, :gdim])
         exchange = RowExchange(comm, _compat.input_cell_index(moved), index)
         places = _compat.geometry_dofmap(moved)

@@ -28,7 +28,7 @@ def anywhere(body, seed=1):
     """Return a rank for each cell, by its input index."""
     cells = body.topology.index_map(body.topology.dim)
     every = np.random.default_rng(seed).integers(0, WORLD.size, cells.size_global)
-    return every[body.topology.original_cell_index[: cells.size_local]]
+    return every[_compat.input_cell_index(body)]
 
 
 def by_index(body, values):
@@ -70,9 +70,8 @@ def test_mesh_on_other_ranks(cell, ghosts):
 def pieces(body):
     """Return a copy of a mesh whose cells share no vertex."""
     nodes = _compat.geometry_dofmap(body)[: body.topology.index_map(body.topology.dim).size_local]
-    index = _compat.input_cell_index(body)
     corners = body.geometry.x[nodes][:, :, : body.geometry.dim]
-    return _compat.disconnected_mesh(WORLD, corners, body.basix_cell(), index)
+    return _compat.disconnected_mesh(WORLD, corners, body.basix_cell())
 
 
 def moved_once(body):
