@@ -61,10 +61,11 @@ if [[ -n ${MPIRUN:-} ]]; then
 elif [[ ! -x ${launcher[0]} ]]; then
     launcher=(mpirun)
 fi
+cores=$(env -u OMP_NUM_THREADS nproc) # which it would say instead
 for ranks in "${numbers[@]}"; do
     ((ranks > 1)) || continue
     waiting=() without=()
-    if ((ranks > $(nproc))); then
+    if ((ranks > cores)); then
         # Ranks that wait leave the cores to the others. (MPICH's heavy yield makes any run with a
         # core to spare ten times slower.)
         waiting=(env MPIR_CVAR_CH4_PROGRESS_THROTTLE=1
