@@ -250,6 +250,17 @@ class ConstitutiveHistory:
         particles = np.unique(self._particles.global_index[points // self._particles.num_points])
         return type(error)(error.message.rstrip(".") + " (at {particles})", particles)
 
+    def elastic(self) -> bool:
+        """Return whether no history can have changed in the last update: nothing yields."""
+        return all(
+            before.keys() == {"stress"}
+            or (
+                "plastic_strain" in before
+                and np.array_equal(before["plastic_strain"], after["plastic_strain"])
+            )
+            for before, after in zip(self._states, self._trial, strict=True)
+        )
+
     def commit(self) -> None:
         """Make the last update the history (collective with F-bar)."""
         self._states, self._gradient = self._trial, self._trial_gradient

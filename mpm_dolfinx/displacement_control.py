@@ -312,6 +312,10 @@ class ControlledSystem:
         """Return the tangent at the x and the load factor of the last residual."""
         return self._reduced.tangent()
 
+    def smooth(self) -> bool:
+        """Return whether the last residual is that of a response without a history."""
+        return self._reduced.smooth()
+
     def prediction(self) -> PETSc.Vec | None:
         """Return unknowns to expect, with the prescribed displacement, if the past says any."""
         x = self._reduced.prediction()

@@ -29,6 +29,8 @@ COUNTERS = (
     "rejected_predictions",
     "factorisations",
     "halvings",
+    "trusted_steps",
+    "returns",
     "redirections",
     "converged_at_round_off",
     "workspace_retries",
@@ -56,8 +58,9 @@ class Statistics(dict[str, float]):
     ``repartitions`` (how often particles moved to other ranks),
     ``residuals`` and
     ``factorisations``, ``predictions`` (steps that began at the extrapolated increment) and
-    ``rejected_predictions``, ``halvings`` (of Newton steps by the line search), ``redirections``
-    (of Newton steps that a tangent which is not positive definite led uphill),
+    ``rejected_predictions``, ``halvings`` (of Newton steps by the line search), ``trusted_steps``
+    (taken although the residual grew) and ``returns`` (where that came to nothing),
+    ``redirections`` (of Newton steps that a tangent which is not positive definite led uphill),
     ``converged_at_round_off`` (steps that ended at the floor of round-off),
     ``workspace_retries`` (factorisations that MUMPS repeated with more workspace),
     ``ghost_facets`` and ``aggregated_dofs`` (facets with a ghost penalty, and dofs that follow

@@ -5,8 +5,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from petsc4py import PETSc
+
+import numpy as np
 
 from .errors import MPMError
 from .history import Statistics
@@ -16,9 +19,21 @@ __all__ = ["LineSearch", "stalled"]
 #: Most halvings of a Newton step, and the drop in work that needs none.
 HALVINGS = 8
 SUFFICIENT = 0.8
+#: Steps that may follow one which is taken on trust until the residual is below that before it.
+TRUST = 7
 #: Iterations within which the smallest residual must fall, and to what share of itself.
 PATIENCE = 15
 HEADWAY = 0.7
+
+
+class _Trusted(NamedTuple):
+    """Where a step was taken on trust: unknowns, step, residual's norm and work on the step."""
+
+    x: PETSc.Vec
+    y: PETSc.Vec
+    norm: float
+    work: float
+    iteration: int
 
 
 class LineSearch:
@@ -28,24 +43,42 @@ class LineSearch:
     or the residual's norm falls. Where the whole step does neither and the tangent is not
     positive definite, its direction may be one in which the incremental potential grows; the
     direction is then that of a damped tangent which is (a modified Newton step: Nocedal &
-    Wright 2006, section 3.4). What is left is halved.
+    Wright 2006, section 3.4).
+
+    Otherwise, where the response is smooth, the whole step is taken on trust: a step that turns
+    a stiff body leaves the residual far larger, and Newton's method has forgotten that some
+    iterations later. If seven have not brought the residual below what it was, the search returns
+    to where it was (the watchdog of Chamberlain, Powell, Lemarechal & Pedersen 1982), once in a
+    solve. What is left is halved.
 
     Args:
         evaluate: Evaluates the residual at unknowns into ``F``; returns a failure or ``None``.
-        redirect: Replaces a step for the residual given by a damped one, where the tangent is
-            not positive definite; returns whether it did.
+        uphill: Says whether the step for a residual is not that of a positive definite tangent.
+        redirect: Replaces it by a damped one that is.
+        smooth: Says whether the residual evaluated last is that of a smooth response.
         statistics: Where to count.
     """
 
     def __init__(
         self,
         evaluate: Callable[[PETSc.Vec], MPMError | None],
-        redirect: Callable[[PETSc.Vec, PETSc.Vec], bool],
+        uphill: Callable[[PETSc.Vec, PETSc.Vec], bool],
+        redirect: Callable[[PETSc.Vec, PETSc.Vec], None],
+        smooth: Callable[[], bool],
         statistics: Statistics,
     ) -> None:
         self._evaluate = evaluate
+        self._uphill = uphill
         self._redirect = redirect
+        self._smooth = smooth
         self._statistics = statistics
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a solve."""
+        self._trusted: _Trusted | None = None
+        self._iteration = 0
+        self._trusts = True
 
     def __call__(self, x: PETSc.Vec, y: PETSc.Vec, F: PETSc.Vec, trial: PETSc.Vec) -> bool:
         """Choose the step to ``x - y`` (collective).
@@ -59,29 +92,73 @@ class LineSearch:
         Returns:
             Whether y has changed.
         """
+        self._iteration += 1
         norm, work = F.norm(), F.dot(y)
+        if self._trusted is not None and norm <= self._trusted.norm:
+            self._trusted = None
         start = F.copy()
-        fraction, changed = 1.0, False
-        for halving in range(HALVINGS + 1):
-            trial.waxpy(-1.0, y, x)
-            failure = self._evaluate(trial)
-            if failure is None and (
-                abs(F.dot(y)) <= SUFFICIENT * abs(work) * fraction or F.norm() <= norm
-            ):
+        if self._reduces(x, y, F, trial, norm, work) and not self._overdue(F):
+            return False
+        if self._trusted is None and self._uphill(start, y):
+            self._redirect(start, y)
+            self._statistics.count("redirections")
+            work = start.dot(y)
+            if not self._reduces(x, y, F, trial, norm, work):
+                self._halve(x, y, F, trial, norm, work)
+            return True
+        smooth = bool(np.isfinite(F.norm())) and self._smooth()
+        if smooth and self._trusts and not self._overdue(F):
+            if self._trusted is None:
+                self._trusted = _Trusted(x.copy(), y.copy(), norm, work, self._iteration)
+                self._statistics.count("trusted_steps")
+            return False
+        if self._trusted is None:
+            self._halve(x, y, F, trial, norm, work)
+            return True
+        before, self._trusted, self._trusts = self._trusted, None, False
+        self._statistics.count("returns")
+        self._halve(before.x, before.y, F, trial, before.norm, before.work)
+        y.waxpy(-1.0, trial, x)
+        return True
+
+    def _overdue(self, F: PETSc.Vec) -> bool:
+        """Whether a step taken on trust should have paid by now."""
+        before = self._trusted
+        if before is None or F.norm() <= before.norm:
+            return False
+        return bool(self._iteration - before.iteration >= TRUST)
+
+    def _reduces(
+        self,
+        x: PETSc.Vec,
+        y: PETSc.Vec,
+        F: PETSc.Vec,
+        trial: PETSc.Vec,
+        norm: float,
+        work: float,
+    ) -> bool:
+        """Evaluate at ``x - y``; return whether norm or work fall far enough."""
+        trial.waxpy(-1.0, y, x)
+        if self._evaluate(trial) is not None:
+            return False
+        return bool(abs(F.dot(y)) <= SUFFICIENT * abs(work) or F.norm() <= norm)
+
+    def _halve(
+        self,
+        x: PETSc.Vec,
+        y: PETSc.Vec,
+        F: PETSc.Vec,
+        trial: PETSc.Vec,
+        norm: float,
+        work: float,
+    ) -> None:
+        """Halve the step until norm or work fall far enough."""
+        for _ in range(HALVINGS):
+            y.scale(0.5)
+            work *= 0.5
+            self._statistics.count("halvings")
+            if self._reduces(x, y, F, trial, norm, work):
                 break
-            if halving == 0 and self._redirect(start, y):  # neither, so its direction is doubted
-                self._statistics.count("redirections")
-                work, changed = start.dot(y), True
-                trial.waxpy(-1.0, y, x)
-                failure = self._evaluate(trial)
-                if failure is None and (abs(F.dot(y)) <= SUFFICIENT * work or F.norm() <= norm):
-                    break
-            if halving < HALVINGS:
-                y.scale(0.5)
-                fraction *= 0.5
-                self._statistics.count("halvings")
-        start.destroy()
-        return changed or fraction < 1.0
 
 
 def stalled(norms: Sequence[float]) -> bool:

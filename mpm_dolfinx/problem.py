@@ -174,6 +174,7 @@ class ParticleProblem:
             terms,
             self.bcs,
             evaluate,
+            weakly(self.smooth),
             statistics,
             past,
             cure,
@@ -434,6 +435,10 @@ class ParticleProblem:
         """
 
     # -- What a problem with a material adds -----------------------------------------------
+
+    def smooth(self) -> bool:
+        """Return whether the last residual is that of a response without a history (collective)."""
+        return True
 
     def evaluate(self) -> MPMError | None:
         """Update what the forms hold besides the displacement; return why that cannot be.

@@ -8,6 +8,8 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -212,6 +214,11 @@ class QuasiStaticProblem(ParticleProblem):
         if failure is None:
             self._fill()
         return failure
+
+    def smooth(self) -> bool:
+        """See :meth:`ParticleProblem.smooth`."""
+        elastic = all(stress.elastic() for stress in self._stresses)
+        return bool(self._comm.allreduce(elastic, MPI.LAND))
 
     def commit(self) -> None:
         """Make the last update the history."""

@@ -40,6 +40,7 @@ class ReducedSystem:
         background: Terms on the background.
         bcs: Dirichlet conditions on V.
         evaluate: What the forms need before each assembly; may return a failure.
+        smooth: Whether the last residual is that of a response without a history.
         statistics: Where to count.
         predictor: Says what increment to expect; ``None`` for none.
         stabilisation: What is done about badly supported dofs.
@@ -57,6 +58,7 @@ class ReducedSystem:
         background: BackgroundForms | None,
         bcs: Sequence[fem.DirichletBC],
         evaluate: Callable[[], MPMError | None],
+        smooth: Callable[[], bool],
         statistics: Statistics,
         predictor: Predictor | None = None,
         stabilisation: GhostPenalty | Aggregation | None = None,
@@ -73,6 +75,7 @@ class ReducedSystem:
         self._background = background
         self._bcs = bcs
         self._evaluate = evaluate
+        self.smooth = smooth
         self._statistics = statistics
         self._V = bodies[0].particles.V
         self._comm: MPI.Comm = self._V.mesh.comm

@@ -56,6 +56,9 @@ class ReducedProblem(Protocol):
         tangent has where it is positive definite in all directions that are permitted.
         """
 
+    def smooth(self) -> bool:
+        """Return whether the last residual is that of a response without a history."""
+
     def prediction(self) -> PETSc.Vec | None:
         """Return unknowns to expect at the step's end, if the past says any."""
 
@@ -88,7 +91,8 @@ class NewtonSolver:
     of the body. ``K + shift |diag K|`` is factorised instead, which is K scaled to unit
     diagonal plus ``shift`` times the identity; the residual stays the true one. The line search
     halves a Newton step while a domain inverts, or while both the work of the residual on the
-    step stays above 0.8 of its start and the residual's norm grows.
+    step stays above 0.8 of its start and the residual's norm grows, unless the response is smooth
+    and the next steps make up for it.
 
     Args:
         comm: Communicator.
@@ -125,7 +129,13 @@ class NewtonSolver:
         self._shift = shift
         self._symmetric = symmetric
         self._search = (
-            LineSearch(weakly(self._evaluate), weakly(self._redirect), statistics)
+            LineSearch(
+                weakly(self._evaluate),
+                weakly(self._uphill),
+                weakly(self._redirect),
+                weakly(self._smooth),
+                statistics,
+            )
             if line_search
             else None
         )
@@ -196,6 +206,8 @@ class NewtonSolver:
         self._norm = np.inf
         self._norms: list[float] = []
         self.no_equilibrium = False
+        if self._search is not None:
+            self._search.begin()
         x = self._start(sizes)
         if sizes[1] == 0:
             problem.impose()
@@ -432,28 +444,30 @@ class NewtonSolver:
         self._known = True
         return changed
 
-    def _redirect(self, F: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Solve for the step with a damped tangent, unless the tangent is positive definite.
+    def _smooth(self) -> bool:
+        return self._problem.smooth()
+
+    def _uphill(self, F: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Return whether a step for the residual F is not that of a positive definite tangent."""
+        if not self._symmetric or self._shift == 0.0 or self.K is None:
+            return False
+        return F.dot(y) <= 0.0 or self._negative_pivots() > self._negative
+
+    def _redirect(self, F: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Solve for the step with a damped tangent that is positive definite.
 
         Args:
             F: The residual.
             y: The step; replaced.
-
-        Returns:
-            Whether it was replaced.
         """
-        if not self._symmetric or self._shift == 0.0 or self.K is None:
-            return False
-        if F.dot(y) > 0.0 and self._negative_pivots() <= self._negative:
-            return False
+        assert self.K is not None
         for damping in DAMPINGS:
             self._set_tangent(self.K, damping)
             self._solve_linear(F, y)
             self._negative = self._problem.constrain(y, self._origin, self._solve_linear)
             self.iterations += 1
-            if F.dot(y) > 0.0 and self._negative_pivots() <= self._negative:
-                break
-        return True
+            if not self._uphill(F, y):
+                return
 
     def _negative_pivots(self) -> int:
         """Return how many pivots of the last factor are negative, where it says so."""
