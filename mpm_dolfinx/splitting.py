@@ -94,7 +94,8 @@ def split_concave(problem: QuasiStaticProblem) -> None:
     for body in problem.bodies:
         concave = np.zeros(0, dtype=np.int64)
         if body.on_distortion == "split":
-            concave = body.global_index[(body.domain_distortion() <= 0.0) & ~body.deleted]
+            _, good = _diagonals(body)
+            concave = body.global_index[(body.domain_distortion() <= 0.0) & good]
         chosen.append(concave)
     _split_and_say_so(problem, chosen)
 
@@ -108,13 +109,15 @@ def split_failing(problem: QuasiStaticProblem, error: MPMError) -> bool:
     steps, tries = len(problem.history.steps), 1
     if problem.splits_of_step[0] == steps:
         tries += problem.splits_of_step[1]
-    problem.splits_of_step = steps, tries
+    problem.splits_of_step = (steps, tries) if tries <= TRIES else (0, 0)
     if tries > TRIES or all(body.on_distortion == "error" for body in problem.bodies):
         return False
     comm = problem.bodies[0].V.mesh.comm
     chosen = []
     for body in problem.bodies:
-        whole = (body.on_distortion == "split") & ~body.triangular & ~body.deleted
+        whole = np.zeros(body.num_local, dtype=bool)
+        if body.on_distortion == "split":
+            _, whole = _diagonals(body)
         which = whole & np.isin(body.global_index, error.particles)
         several = len(problem.bodies) > 1
         if several or tries > 1 or not comm.allreduce(int(which.sum())):
@@ -313,6 +316,12 @@ def remesh(
     return moves
 
 
+def _diagonals(body: Particles) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the diagonal of each owned domain, and whether it can be cut along it."""
+    diagonal, least = diagonals(body.corner_jacobians())
+    return diagonal, (least > 0.0) & ~body.triangular & ~body.deleted
+
+
 def _cuts(body: Particles, which: list[int]) -> Cuts:
     """Return how domains of a body are to be cut (collective)."""
     if not which:
@@ -321,8 +330,7 @@ def _cuts(body: Particles, which: list[int]) -> Cuts:
     validate_distortion(
         body.mesh, body.method, body.W.ufl_element().degree, body.quadrature_degree, "split"
     )
-    diagonal, least = diagonals(body.corner_jacobians())
-    good = (least > 0.0) & ~body.triangular & ~body.deleted
+    diagonal, good = _diagonals(body)
     mine = np.isin(body.global_index, which) & good
     told = comm.allgather(np.column_stack([body.global_index, diagonal])[mine])
     cuts = np.concatenate(told)
