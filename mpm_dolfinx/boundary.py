@@ -51,7 +51,10 @@ class Support:
 
     Attributes:
         particles: The body.
+        one_sided: Whether the body may lift off.
     """
+
+    one_sided = False
 
     def __init__(
         self,
@@ -258,7 +261,9 @@ def plane(
     x = ufl.SpatialCoordinate(particles.mesh) + particles.displacement
     gap = ufl.dot(n, x - origin) - particles.load * g
     within = ufl.conditional(ufl.le(gap, TOUCH * _extent(particles)), gap, 0.0)
-    return Support(particles, within * n, facet_tags, tag, modulus, penalty)
+    support = Support(particles, within * n, facet_tags, tag, modulus, penalty)
+    support.one_sided = True
+    return support
 
 
 def _extent(particles: Particles) -> float:

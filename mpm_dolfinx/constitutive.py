@@ -251,15 +251,14 @@ class ConstitutiveHistory:
         return type(error)(error.message.rstrip(".") + " (at {particles})", particles)
 
     def elastic(self) -> bool:
-        """Return whether no history can have changed in the last update: nothing yields."""
-        return all(
-            before.keys() == {"stress"}
-            or (
-                "plastic_strain" in before
-                and np.array_equal(before["plastic_strain"], after["plastic_strain"])
-            )
-            for before, after in zip(self._states, self._trial, strict=True)
-        )
+        """Return whether no internal variable has changed in the last update: nothing yields."""
+        for group, before, after in zip(self._groups, self._states, self._trial, strict=True):
+            if before.keys() == {"stress"}:
+                continue
+            variables = getattr(group.material, "internal_variables", ())
+            if not variables or not all(np.array_equal(before[v], after[v]) for v in variables):
+                return False
+        return True
 
     def commit(self) -> None:
         """Make the last update the history (collective with F-bar)."""

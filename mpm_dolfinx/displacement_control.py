@@ -313,7 +313,7 @@ class ControlledSystem:
         return self._reduced.tangent()
 
     def smooth(self) -> bool:
-        """Return whether the last residual is that of a response without a history."""
+        """Return whether no history changes in the last residual, nor contact."""
         return self._reduced.smooth()
 
     def prediction(self) -> PETSc.Vec | None:

@@ -30,10 +30,11 @@ COUNTERS = (
     "factorisations",
     "halvings",
     "trusted_steps",
-    "returns",
+    "withdrawn_steps",
     "redirections",
     "converged_at_round_off",
     "workspace_retries",
+    "frozen_residual",
     "ghost_facets",
     "aggregated_dofs",
     "folded_domains",
@@ -59,10 +60,13 @@ class Statistics(dict[str, float]):
     ``residuals`` and
     ``factorisations``, ``predictions`` (steps that began at the extrapolated increment) and
     ``rejected_predictions``, ``halvings`` (of Newton steps by the line search), ``trusted_steps``
-    (taken although the residual grew) and ``returns`` (where that came to nothing),
+    (series of them taken although the residual grew) and ``withdrawn_steps`` (where that came to
+    nothing),
     ``redirections`` (of Newton steps that a tangent which is not positive definite led uphill),
     ``converged_at_round_off`` (steps that ended at the floor of round-off),
     ``workspace_retries`` (factorisations that MUMPS repeated with more workspace),
+    ``frozen_residual`` (the largest relative residual that a step left, nearly all in unknowns
+    that move next to nothing),
     ``ghost_facets`` and ``aggregated_dofs`` (facets with a ghost penalty, and dofs that follow
     others, in the last step), ``folded_domains`` (the most after any step; curved ones only),
     ``split_domains`` (quadrilaterals cut in two) and ``lost_particles``, ``lost_volume``

@@ -47,15 +47,16 @@ class LineSearch:
 
     Otherwise, where the response is smooth, the whole step is taken on trust: a step that turns
     a stiff body leaves the residual far larger, and Newton's method has forgotten that some
-    iterations later. If seven have not brought the residual below what it was, the search returns
-    to where it was (the watchdog of Chamberlain, Powell, Lemarechal & Pedersen 1982), once in a
-    solve. What is left is halved.
+    iterations later. If seven have not brought the residual below what it was, or before that a
+    domain turns inside out, the response is no longer smooth or a linear solve breaks down, the
+    search withdraws to where it was (the watchdog of Chamberlain, Powell, Lemarechal & Pedersen
+    1982), once in a solve. What is left is halved.
 
     Args:
         evaluate: Evaluates the residual at unknowns into ``F``; returns a failure or ``None``.
         uphill: Says whether the step for a residual is not that of a positive definite tangent.
         redirect: Replaces it by a damped one that is.
-        smooth: Says whether the residual evaluated last is that of a smooth response.
+        smooth: Says whether no history changes in the residual evaluated last.
         statistics: Where to count.
     """
 
@@ -78,7 +79,7 @@ class LineSearch:
         """Begin a solve."""
         self._trusted: _Trusted | None = None
         self._iteration = 0
-        self._trusts = True
+        self._may_trust = True
 
     def __call__(self, x: PETSc.Vec, y: PETSc.Vec, F: PETSc.Vec, trial: PETSc.Vec) -> bool:
         """Choose the step to ``x - y`` (collective).
@@ -107,7 +108,7 @@ class LineSearch:
                 self._halve(x, y, F, trial, norm, work)
             return True
         smooth = bool(np.isfinite(F.norm())) and self._smooth()
-        if smooth and self._trusts and not self._overdue(F):
+        if smooth and self._may_trust and not self._overdue(F):
             if self._trusted is None:
                 self._trusted = _Trusted(x.copy(), y.copy(), norm, work, self._iteration)
                 self._statistics.count("trusted_steps")
@@ -115,11 +116,28 @@ class LineSearch:
         if self._trusted is None:
             self._halve(x, y, F, trial, norm, work)
             return True
-        before, self._trusted, self._trusts = self._trusted, None, False
-        self._statistics.count("returns")
+        self.withdraw(x, y, F, trial)
+        return True
+
+    @property
+    def trusts(self) -> bool:
+        """Whether a step was taken on trust that has not paid yet."""
+        return self._trusted is not None
+
+    def withdraw(self, x: PETSc.Vec, y: PETSc.Vec, F: PETSc.Vec, trial: PETSc.Vec) -> None:
+        """Go back to where a step was taken on trust, and halve it (collective).
+
+        Args:
+            x: The unknowns.
+            y: Set to the step to be taken from them.
+            F: Set to the residual at the new unknowns.
+            trial: Set to these.
+        """
+        assert self._trusted is not None
+        before, self._trusted, self._may_trust = self._trusted, None, False
+        self._statistics.count("withdrawn_steps")
         self._halve(before.x, before.y, F, trial, before.norm, before.work)
         y.waxpy(-1.0, trial, x)
-        return True
 
     def _overdue(self, F: PETSc.Vec) -> bool:
         """Whether a step taken on trust should have paid by now."""

@@ -30,6 +30,10 @@ from .validation import validate_distortion, validate_options, validate_spaces
 __all__ = ["Particles"]
 
 
+#: How many of the meshes that a body has left are known to :meth:`Particles.carry`, but the first.
+REMEMBERED = 8
+
+
 class Particles(MaterialDomains):
     """A body as particles with finite domains, moved by a background space.
 
@@ -173,7 +177,8 @@ class Particles(MaterialDomains):
 
         Args:
             thing: ``MeshTags`` or a piecewise constant Function on the body mesh that was given,
-                or on the ``mesh`` before the last move; anything else is returned as it is.
+                or on a ``mesh`` of before one of the last eight moves; anything else is returned
+                as it is.
 
         Raises:
             MPMError: A Function that is not piecewise constant.
@@ -220,12 +225,12 @@ class Particles(MaterialDomains):
     def _take(self, move: Carrier, cuts: Cuts, moved: bool) -> None:
         """Live on another mesh (collective)."""
         kept = {name: self.__dict__[name] for name in ("V", "increment", "rebases", "_options")}
-        carriers = [carrier.then(move) for carrier in self._carriers[:1]]
+        carriers = [carrier.then(move) for carrier in self._carriers]
         self.__dict__.clear()
         Particles.__init__(self, move.mesh, kept["V"], **kept["_options"])
         self.__dict__ |= kept
-        # From the mesh that was given and from the last one: those between are forgotten.
-        self._carriers = [*carriers, move]
+        # Each mesh holds communicators of MPI, of which there are about 2000.
+        self._carriers = [*carriers[:1], *carriers[1:][1 - REMEMBERED :], move]
         self.cuts = cuts
         if moved or len(cuts):
             self.expect_reference(moved)

@@ -150,9 +150,13 @@ class Carrier:
         own = tags.indices < count
         values = np.zeros((count, 2), dtype=np.int32)
         values[tags.indices[own]] = np.column_stack([tags.values[own], np.ones(own.sum())])
-        values = self.of_cells(values)
+        moved_values = self.of_cells(values)
+        everywhere = la.vector(self.mesh.topology.index_map(tags.dim), 2)
+        values = everywhere.array.reshape(-1, 2)
+        values[: len(self._origin)] = moved_values
+        everywhere.scatter_forward()
         tagged = np.flatnonzero(values[:, 1]).astype(np.int32)
-        moved = mesh.meshtags(self.mesh, tags.dim, tagged, values[tagged, 0])
+        moved = mesh.meshtags(self.mesh, tags.dim, tagged, values[tagged, 0].astype(np.int32))
         moved.name = tags.name
         return moved
 

@@ -437,8 +437,13 @@ class ParticleProblem:
     # -- What a problem with a material adds -----------------------------------------------
 
     def smooth(self) -> bool:
-        """Return whether the last residual is that of a response without a history (collective)."""
-        return True
+        """Return whether no history changes in the last residual, nor contact (collective).
+
+        Newton steps that let the residual grow are taken on trust then. A problem that overrides
+        :meth:`evaluate` or :meth:`commit` has a history, unless it says otherwise here.
+        """
+        own = type(self)
+        return own.evaluate is ParticleProblem.evaluate and own.commit is ParticleProblem.commit
 
     def evaluate(self) -> MPMError | None:
         """Update what the forms hold besides the displacement; return why that cannot be.

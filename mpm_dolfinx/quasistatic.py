@@ -119,7 +119,7 @@ class QuasiStaticProblem(ParticleProblem):
         if first:
             self.splits_of_step = 0, 0
         count = len(bodies) if isinstance(particles, list | tuple) else 0
-        # Where they have moved to: what is on the mesh of before is not known for ever.
+        # The particles forget the meshes of long ago, so what has moved is kept.
         for name, move in (
             ("material", carried),
             ("cell_tags", Particles.carry),
@@ -217,6 +217,8 @@ class QuasiStaticProblem(ParticleProblem):
 
     def smooth(self) -> bool:
         """See :meth:`ParticleProblem.smooth`."""
+        if any(support.one_sided for support in self.arguments["supports"]):
+            return False
         elastic = all(stress.elastic() for stress in self._stresses)
         return bool(self._comm.allreduce(elastic, MPI.LAND))
 

@@ -40,7 +40,7 @@ class ReducedSystem:
         background: Terms on the background.
         bcs: Dirichlet conditions on V.
         evaluate: What the forms need before each assembly; may return a failure.
-        smooth: Whether the last residual is that of a response without a history.
+        smooth: Whether no history changes in the last residual, nor contact.
         statistics: Where to count.
         predictor: Says what increment to expect; ``None`` for none.
         stabilisation: What is done about badly supported dofs.

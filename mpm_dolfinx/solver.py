@@ -1,12 +1,11 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Newton's method on the reduced system: PETSc SNES, a shifted factor and a line search."""
+"""Newton's method on the reduced system: PETSc SNES, a proximal term and a line search."""
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from mpi4py import MPI
@@ -16,6 +15,7 @@ import numpy as np
 
 from . import _compat
 from .errors import ConvergenceError, MPMError
+from .factor import ShiftedFactor
 from .history import Statistics
 from .line_search import LineSearch, stalled
 
@@ -28,14 +28,6 @@ ROUND_OFF = 1e-13
 KEPT = 2.0
 #: Relative diagonal shifts tried in turn until a tangent is positive definite.
 DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
-#: Values of MUMPS's INFOG(1) that more workspace cures.
-OUT_OF_WORKSPACE = (-8, -9)
-FACTORS = ("lu", "cholesky")
-#: Options of MUMPS unless others are given: K scaled by its diagonal, as the shift is.
-MUMPS = {"mat_mumps_icntl_8": 1}
-#: PORD orders plane graphs three times as fast as METIS and no worse, in space worse; from that
-#: many unknowns on, as it ends the process where all unknowns are neighbours of each other.
-PORD, PORD_FROM = {"mat_mumps_icntl_7": 4}, 10000
 
 
 class ReducedProblem(Protocol):
@@ -57,7 +49,7 @@ class ReducedProblem(Protocol):
         """
 
     def smooth(self) -> bool:
-        """Return whether the last residual is that of a response without a history."""
+        """Return whether no history changes in the last residual, nor contact."""
 
     def prediction(self) -> PETSc.Vec | None:
         """Return unknowns to expect at the step's end, if the past says any."""
@@ -85,21 +77,25 @@ class ReducedProblem(Protocol):
 
 
 class NewtonSolver:
-    """SNES with the shift and the line search that singular transfers need.
+    """SNES with the proximal term and the line search that singular transfers need.
 
     The reduced tangent K is singular whenever a combination of background dofs moves no node
-    of the body. ``K + shift |diag K|`` is factorised instead, which is K scaled to unit
-    diagonal plus ``shift`` times the identity; the residual stays the true one. The line search
-    halves a Newton step while a domain inverts, or while both the work of the residual on the
-    step stays above 0.8 of its start and the residual's norm grows, unless the response is smooth
-    and the next steps make up for it.
+    of the body, and nearly singular where it hardly moves any. ``D (x - x0)`` is added to the
+    residual, where x0 is where the step starts and ``D = shift |diag K|`` at its first tangent:
+    a step of the proximal point method (Rockafellar 1976), by which unknowns that move nothing stay
+    where they are. The tangent is then ``K + D``, which is K scaled to unit diagonal plus
+    ``shift`` times the identity.
+
+    The line search halves a Newton step while a domain inverts, or while both the work of the
+    residual on the step stays above 0.8 of its start and the residual's norm grows, unless the
+    response is smooth and the next steps make up for it.
 
     Args:
         comm: Communicator.
         prefix: PETSc options prefix.
         options: PETSc options, without prefix.
         symmetric: Whether the tangent is symmetric.
-        shift: Relative diagonal shift in the factorisation.
+        shift: Relative diagonal shift.
         line_search: Whether to search.
         statistics: Where to count.
         dim: Dimension of space.
@@ -108,9 +104,8 @@ class NewtonSolver:
         snes: The PETSc SNES.
         residuals: Relative residuals of the last attempt.
         iterations: Linear solves of the last attempt.
-        K: The reduced tangent.
         x: The solution of the last attempt.
-        F: Its residual.
+        F: Its residual, without the proximal term.
         no_equilibrium: Whether the last attempt's iterations came to nothing.
     """
 
@@ -126,7 +121,6 @@ class NewtonSolver:
         dim: int,
     ) -> None:
         self._comm = comm
-        self._shift = shift
         self._symmetric = symmetric
         self._search = (
             LineSearch(
@@ -143,10 +137,9 @@ class NewtonSolver:
         self.residuals: list[float] = []
         self.iterations = 0
         self.no_equilibrium = False
-        self.K: PETSc.Mat | None = None
         self.x: PETSc.Vec | None = None
         self.F: PETSc.Vec | None = None
-        self._P: Any = None
+        self._centre: PETSc.Vec | None = None
         self._failure: MPMError | None = None
         self._known = self._fresh = False
         self._kept = KEPT
@@ -156,33 +149,12 @@ class NewtonSolver:
         self.snes.setType("newtonls")
         _compat.use_basic_line_search(self.snes)
         self.snes.setTolerances(rtol=1e-9, atol=1e-50, stol=0.0, max_it=30)
-        ksp = self.snes.getKSP()
-        ksp.setType("preonly")
-        pc = ksp.getPC()
-        pc.setType("cholesky" if symmetric else "lu")
-        pc.setFactorSolverType("mumps")
-        self._options = {prefix + key: value for key, value in options.items()}
-        self._prefix, self._dim = prefix, dim
-        with self._own_options() as database:
-            self.snes.setFromOptions()
-            own = database.hasName(f"{prefix}pc_factor_mat_solver_type")
-            if pc.getType() in FACTORS and not own:
-                pc.setFactorSolverType("mumps")  # changing the type had dropped it
+        self._factor = ShiftedFactor(self.snes, prefix, options, symmetric, shift, dim, statistics)
 
-    @contextmanager
-    def _own_options(self) -> Iterator[PETSc.Options]:
-        """Put the options into PETSc's database, for what reads them inside the block."""
-        database = PETSc.Options()
-        plane = self._dim == 2 and self.x is not None and self.x.getSize() >= PORD_FROM
-        defaults = {self._prefix + k: v for k, v in (MUMPS | (PORD if plane else {})).items()}
-        options = {k: v for k, v in defaults.items() if not database.hasName(k)} | self._options
-        for key, value in options.items():
-            database[key] = value
-        try:
-            yield database
-        finally:
-            for key in options:
-                database.delValue(key)
+    @property
+    def K(self) -> PETSc.Mat | None:
+        """The reduced tangent."""
+        return self._factor.K
 
     def solve(self, problem: ReducedProblem, sizes: tuple[int, int]) -> None:
         """Find a root of the residual, starting from zero or from the prediction.
@@ -208,6 +180,8 @@ class NewtonSolver:
         self.no_equilibrium = False
         if self._search is not None:
             self._search.begin()
+        self._factor.begin()
+        self._centre = None
         x = self._start(sizes)
         if sizes[1] == 0:
             problem.impose()
@@ -227,6 +201,7 @@ class NewtonSolver:
         self.snes.reset()
         self.x = PETSc.Vec().createMPI(sizes, comm=self._comm)
         self.F = self.x.duplicate()
+        self._R = self.x.duplicate()
         self._trial = self.x.duplicate()
         self.snes.setFunction(weakly(self._function), self.x.duplicate())
         self.snes.setConvergenceTest(weakly(self._test))
@@ -242,11 +217,12 @@ class NewtonSolver:
             forces = self._problem.lift()
             forces.axpy(1.0, self.F)
         predicted = self._predict(x, self.F if forces is None else forces)
+        self._centre = x.copy()
         self._set_tangent(self._problem.tangent() if predicted or K is None else K)
         self._fresh = forces is None or predicted
         if forces is not None and not predicted:
-            self._solve_linear(forces, x)
-            self._negative = self._problem.constrain(x, None, self._solve_linear)
+            self._factor.solve(forces, x)
+            self._negative = self._problem.constrain(x, None, self._factor.solve)
             x.scale(-1.0)
             self.iterations += 1
             self._known = False
@@ -273,10 +249,6 @@ class NewtonSolver:
                 f"Newton's method stopped after {self.iterations} linear solves at a relative "
                 f"residual of {residual:.1e} ({why})"
             )
-
-    def _solve_linear(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
-        with self.statistics.phase("solve"):
-            self.snes.getKSP().solve(b, x)
 
     def _predict(self, x: PETSc.Vec, start: PETSc.Vec) -> bool:
         """Move x from zero to the prediction unless its residual is too far above the start's."""
@@ -311,11 +283,10 @@ class NewtonSolver:
             self._kept = 1.0
 
     def _function(self, snes: PETSc.SNES, x: PETSc.Vec, F: PETSc.Vec) -> None:
-        assert self.F is not None
         if not (self._known and self._same(x, self._trial)):
             self._evaluate(x)
         self._known = False
-        self.F.copy(F)
+        self._R.copy(F)
 
     def _same(self, a: PETSc.Vec, b: PETSc.Vec) -> bool:
         same = np.array_equal(a.array_r, b.array_r)
@@ -333,6 +304,11 @@ class NewtonSolver:
         self._failure = failure
         if failure is not None:
             self.F.set(np.nan)
+        self.F.copy(self._R)
+        if failure is None and self._factor.D is not None and self._centre is not None:
+            gap = x - self._centre
+            gap.pointwiseMult(gap, self._factor.D)
+            self._R.axpy(1.0, gap)
         return failure
 
     def _test(
@@ -354,6 +330,9 @@ class NewtonSolver:
         self._norms.append(norm)
         self.residuals.append(norm / scale if scale > 0 else norm)
         if norm <= max(rtol * scale, atol):
+            if scale > 0.0 and self.F is not None:
+                frozen = max(self.statistics["frozen_residual"], self.F.norm() / scale)
+                self.statistics["frozen_residual"] = frozen
             return reasons.CONVERGED_FNORM_RELATIVE
         step, whole = self._motion
         if iteration > 0 and (
@@ -373,53 +352,8 @@ class NewtonSolver:
         return None
 
     def _set_tangent(self, K: PETSc.Mat, damping: float = 0.0) -> None:
-        """Factorise K with the shift, or with a larger one."""
-        new = self.K is not K
-        shift = max(self._shift, damping)
-        if shift > 0.0:
-            if new:
-                self._P = K.copy()
-            else:
-                K.copy(self._P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-            diagonal = K.getDiagonal()
-            diagonal.abs()
-            largest = diagonal.max()[1]
-            values = diagonal.array_w
-            values[values == 0.0] = largest
-            diagonal.scale(shift)
-            self._P.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
-        else:
-            self._P = K
-        if new:
-            self.K = K
-            self.snes.setJacobian(weakly(self._jacobian), K, self._P)
-            if self._symmetric:
-                self._P.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-            if self.snes.getKSP().getPC().getType() not in FACTORS:
-                self._P.setNearNullSpace(self._problem.rigid_motions())
-        ksp = self.snes.getKSP()
-        if ksp.getPC().getFailedReason():
-            ksp.getPC().reset()  # MUMPS does not factorise again where it failed
-        ksp.setOperators(K, self._P)
-        with self.statistics.phase("factorise"), self._own_options():
-            ksp.setUp()  # where the factor is made, which reads options of its own
-            self._give_workspace(ksp)
-        self.statistics.count("factorisations")
-
-    def _give_workspace(self, ksp: PETSc.KSP) -> None:
-        """Factorise again with more workspace where MUMPS ran out of it."""
-        pc = ksp.getPC()
-        if pc.getType() not in FACTORS or pc.getFactorSolverType() != "mumps":
-            return
-        for percent in (100, 200, 400, 800):
-            if pc.getFactorMatrix().getMumpsInfog(1) not in OUT_OF_WORKSPACE:
-                return
-            pc.reset()
-            ksp.setOperators(self.K, self._P)
-            pc.setFactorSetUpSolverType()
-            pc.getFactorMatrix().setMumpsIcntl(14, percent)
-            ksp.setUp()
-            self.statistics.count("workspace_retries")
+        if self._factor.set(K, self._problem.rigid_motions, damping):
+            self.snes.setJacobian(weakly(self._jacobian), K, self._factor.P)
 
     def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
         if not self._fresh:
@@ -428,14 +362,17 @@ class NewtonSolver:
         self.iterations += 1
 
     def _pre_check(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
-        assert self.F is not None
         self._motion = (0.0, 0.0)
         self._origin = x
-        self._negative = self._problem.constrain(y, x, self._solve_linear)
-        if not np.isfinite(y.norm()):
+        self._negative = self._problem.constrain(y, x, self._factor.solve)
+        finite = bool(np.isfinite(y.norm()))
+        if not finite and not (self._search is not None and self._search.trusts):
             return False  # the evaluation at x - y says so
-        if self._search is not None:
-            changed = self._search(x, y, self.F, self._trial)
+        if self._search is not None and not finite:
+            self._search.withdraw(x, y, self._R, self._trial)
+            changed = True
+        elif self._search is not None:
+            changed = self._search(x, y, self._R, self._trial)
         else:
             changed = False
             self._trial.waxpy(-1.0, y, x)
@@ -449,9 +386,9 @@ class NewtonSolver:
 
     def _uphill(self, F: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Return whether a step for the residual F is not that of a positive definite tangent."""
-        if not self._symmetric or self._shift == 0.0 or self.K is None:
+        if not self._symmetric or self._factor.shift == 0.0:
             return False
-        return F.dot(y) <= 0.0 or self._negative_pivots() > self._negative
+        return F.dot(y) <= 0.0 or self._factor.negative_pivots() > self._negative
 
     def _redirect(self, F: PETSc.Vec, y: PETSc.Vec) -> None:
         """Solve for the step with a damped tangent that is positive definite.
@@ -463,18 +400,11 @@ class NewtonSolver:
         assert self.K is not None
         for damping in DAMPINGS:
             self._set_tangent(self.K, damping)
-            self._solve_linear(F, y)
-            self._negative = self._problem.constrain(y, self._origin, self._solve_linear)
+            self._factor.solve(F, y)
+            self._negative = self._problem.constrain(y, self._origin, self._factor.solve)
             self.iterations += 1
             if not self._uphill(F, y):
                 return
-
-    def _negative_pivots(self) -> int:
-        """Return how many pivots of the last factor are negative, where it says so."""
-        pc = self.snes.getKSP().getPC()
-        if pc.getType() != "cholesky" or pc.getFactorSolverType() != "mumps":
-            return 0
-        return int(pc.getFactorMatrix().getMumpsInfog(12))
 
 
 def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
