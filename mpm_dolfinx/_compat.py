@@ -30,6 +30,7 @@ from dolfinx import fem, geometry, graph, io, la, mesh
 from dolfinx.fem import petsc as fem_petsc
 
 __all__ = [
+    "NOT_FINITE",
     "NUMBERS_CELLS",
     "CompiledIntegral",
     "NonlinearProblem",
@@ -59,6 +60,11 @@ __all__ = [
 ]
 
 _VERSION = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])
+_REASONS: Any = PETSc.SNES.ConvergedReason
+#: Why SNES ends where a norm is not finite (another name before PETSc 3.24).
+NOT_FINITE: Any = getattr(_REASONS, "DIVERGED_FUNCTION_NANORINF", None) or getattr(
+    _REASONS, "DIVERGED_FNORM_NAN", None
+)
 #: Whether a mesh that is put together can be told the input index of its cells.
 NUMBERS_CELLS = _VERSION >= (0, 10)
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dolfinx import fem, mesh
 
+from . import _compat
 from .errors import ConvergenceError, MPMError, agree
 from .f_bar import LowRankTerm, VolumeAveraging
 from .materials import IsotropicElastic, Material, State
@@ -122,6 +123,8 @@ class ConstitutiveHistory:
         body = self._particles.mesh
         if cell_tags is None or cell_tags.dim != body.topology.dim:
             raise MPMError("A dictionary of materials needs cell_tags=, tags of the body's cells.")
+        if not _compat.are_tags_of(cell_tags, body):
+            raise MPMError("cell_tags are those of another mesh than the body's.")
         tags = np.full(self._particles.num_local, -1, dtype=np.int64)
         own = cell_tags.indices < self._particles.num_local
         tags[cell_tags.indices[own]] = cell_tags.values[own]
@@ -235,6 +238,11 @@ class ConstitutiveHistory:
             except np.linalg.LinAlgError as error:
                 raise ConvergenceError(
                     f"The update of {type(group.material).__name__} broke down ({error})"
+                ) from error
+            except Exception as error:
+                raise MPMError(
+                    f"The update of {type(group.material).__name__} failed with "
+                    f"{type(error).__name__}: {error}"
                 ) from error
             assert answer.tangent is not None
             if everywhere:

@@ -12,6 +12,7 @@ import numpy as np
 import ufl
 from dolfinx import fem, mesh
 
+from . import _compat
 from .errors import MPMError, agree
 from .materials import Material
 from .particles import Particles
@@ -108,15 +109,20 @@ def holds(value: Any, kind: Any) -> bool:
 
 
 def known_tags(particles: Particles, facet_tags: Any, what: str) -> set[int]:
-    """Return the tags of a body's facets on all ranks (collective).
+    """Return the tags of a body's boundary on all ranks (collective).
 
     Raises:
-        MPMError: They are no tags of facets.
+        MPMError: They are no tags of facets, or those of another mesh.
     """
     body = particles.mesh
     if not isinstance(facet_tags, mesh.MeshTags) or facet_tags.dim != body.topology.dim - 1:
         raise MPMError(f"{what} need facet_tags=, tags of the body's facets.")
-    return set().union(*body.comm.allgather({int(t) for t in np.unique(facet_tags.values)}))
+    if not _compat.are_tags_of(facet_tags, body):
+        raise MPMError(f"{what} need facet_tags= of the body's mesh, not of another one.")
+    body.topology.create_connectivity(facet_tags.dim, body.topology.dim)
+    outer = mesh.exterior_facet_indices(body.topology)
+    found = facet_tags.values[np.isin(facet_tags.indices, outer)]
+    return set().union(*body.comm.allgather({int(t) for t in np.unique(found)}))
 
 
 def facet_measure(
@@ -131,7 +137,8 @@ def facet_measure(
     for load in loads:
         if not isinstance(load, tuple) or len(load) != 2 or load[1] not in known:
             raise MPMError(
-                f"{what} are pairs of a value and a facet tag among {sorted(known)}, not {load!r}."
+                f"{what} are pairs of a value and a tag of facets on the boundary, among "
+                f"{sorted(known)}, not {load!r}."
             )
     return ufl.Measure(
         "ds",

@@ -85,7 +85,7 @@ def load_steps(
                     run.control.begin_anew()
                     continue
                 go_back(problem, update)
-                raise told from None
+                raise told from error.__cause__
             problem.history.cutbacks += 1
             continue
         except MPMError as error:
@@ -95,7 +95,7 @@ def load_steps(
                 problem.history.stopped = told
                 problem.warn(f"The run stopped. {told!s}")
                 return
-            raise told from None
+            raise told from error.__cause__
         run.control.accept(step.iterations)
         problem.end_step()
         if repartition is not None:
@@ -116,7 +116,7 @@ def single_step(problem: ParticleProblem) -> Step:
     except MPMError as error:
         go_back(problem)
         problem.history.failed_iterations += problem._newton.iterations
-        raise placed(error, problem.reduced, problem._converged.parameter) from None
+        raise placed(error, problem.reduced, problem._converged.parameter) from error.__cause__
     problem.end_step()
     return step
 

@@ -276,13 +276,16 @@ class Particles(MaterialDomains):
         lost = (~rows.basis.found)[self.domain_nodes].any(axis=1)
         return rows, np.flatnonzero(lost & ~self.deleted)
 
-    def _require_inside(self, lost: NDArray[np.int64], what: str, advice: str) -> None:
+    def _require_inside(self, rows: Rows, lost: NDArray[np.int64], what: str, advice: str) -> None:
         with agree(self.mesh.comm):
             if len(lost):
-                where = self.centroid[lost[0]]
+                corners = self.domains if rows.corners is None else rows.corners
+                out = ~rows.basis.found[self.domain_nodes[lost[0]]]
+                where = corners[lost[0]][out][0]
+                where = np.where(np.abs(where) < 1e-12 * np.abs(where).max(), 0.0, where)
                 raise ParticleOutsideError(
-                    f"{what} outside the background mesh, e.g. near "
-                    f"{tuple(float(round(c, 6)) for c in where)}; {advice}",
+                    f"{what} outside the background mesh, e.g. at "
+                    f"{tuple(float(f'{c:.6g}') for c in where)}; {advice}",
                     self.global_index[lost],
                 )
 
@@ -296,6 +299,7 @@ class Particles(MaterialDomains):
         """The rows of T at the last converged positions."""
         rows, lost = self._found_rows()
         self._require_inside(
+            rows,
             lost,
             "The domains of {particles} are",
             "make the background larger or the load smaller",
@@ -327,6 +331,7 @@ class Particles(MaterialDomains):
         left = self.num_local - int(self.deleted.sum()) - len(lost)
         if self.mesh.comm.allreduce(left) == 0:
             self._require_inside(
+                rows,
                 lost,
                 "The domains of {particles}, the last that were not deleted, are",
                 "make the background larger or the load smaller",

@@ -28,7 +28,7 @@ from .bodies import (
     one_for_each,
 )
 from .boundary import Support
-from .cleanup import Cleaner
+from .cleanup import Cleaner, weakly
 from .displacement_control import DisplacementControl
 from .errors import (
     MPMError,
@@ -42,7 +42,7 @@ from .progress import with_bar
 from .quadrature import data_at_points
 from .reduced import ReducedSystem
 from .share import Body
-from .solver import NewtonSolver, weakly
+from .solver import NewtonSolver
 from .stabilisation import stabilisation_of
 from .stepping import Run
 

@@ -248,7 +248,7 @@ class ReducedSystem:
                 body.move(self._u)
                 inverted = body.particles.inverted()
                 failure = failure or distorted("turn inside out", inverted)
-            failure = agreed(self._comm, failure) or agreed(self._comm, self._evaluate())
+            failure = agreed(self._comm, failure) or agreed(self._comm, self._updated())
         if failure is not None:
             return failure
         with self._statistics.phase("assemble"):
@@ -260,6 +260,17 @@ class ReducedSystem:
             self._extend(self._force)
         self._layout.collect(self._force.array_r[self._free], F)
         return None
+
+    def _updated(self) -> MPMError | None:
+        """Update what the forms hold; return why that cannot be, also where a user's code fails."""
+        try:
+            return self._evaluate()
+        except MPMError as error:
+            return error
+        except Exception as error:
+            failure = MPMError(f"evaluate() failed with {type(error).__name__}: {error}")
+            failure.__cause__ = error
+            return failure
 
     def _extend(self, force: PETSc.Vec) -> None:
         """Move what aggregated dofs feel to those that they follow."""

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -14,18 +13,25 @@ from petsc4py import PETSc
 import numpy as np
 
 from . import _compat
+from .cleanup import weakly
 from .errors import ConvergenceError, MPMError
 from .factor import ShiftedFactor
 from .history import Statistics
 from .line_search import LineSearch, stalled
 
-__all__ = ["NewtonSolver", "ReducedProblem", "weakly"]
+__all__ = ["NewtonSolver", "ReducedProblem"]
 
 #: Newton increment, relative to the step's, at which round-off is reached.
 ROUND_OFF = 1e-13
 #: First residual of a prediction that is kept, over that of a start from zero; from 1 on as long
 #: as it saves linear solves.
 KEPT = 2.0
+#: Share of the residual that the proximal term may go on to hold back where it is released.
+HELD = 0.1
+#: Residual, relative to the forces, that may stay where next to nothing moves.
+FROZEN = 1e-5
+#: Share of the forces that the proximal term may bear in the first step.
+LOOSE = 1e-3
 #: Relative diagonal shifts tried in turn until a tangent is positive definite.
 DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 
@@ -84,7 +90,9 @@ class NewtonSolver:
     residual, where x0 is where the step starts and ``D = shift |diag K|`` at its first tangent:
     a step of the proximal point method (Rockafellar 1976), by which unknowns that move nothing stay
     where they are. The tangent is then ``K + D``, which is K scaled to unit diagonal plus
-    ``shift`` times the identity.
+    ``shift`` times the identity. Where the residual itself is not small enough at the end, it is
+    solved for by the last factor, unless more than a tenth of it would stay: that is in unknowns
+    that move next to nothing.
 
     The line search halves a Newton step while a domain inverts, or while both the work of the
     residual on the step stays above 0.8 of its start and the residual's norm grows, unless the
@@ -174,8 +182,9 @@ class NewtonSolver:
         self.residuals = []
         self.iterations = 0
         self._motion = (0.0, 0.0)
-        self._stalled = False
+        self._stalled = self._ended = False
         self._norm = np.inf
+        self._first = 0.0
         self._norms: list[float] = []
         self.no_equilibrium = False
         if self._search is not None:
@@ -216,13 +225,17 @@ class NewtonSolver:
             K = self._problem.tangent()
             forces = self._problem.lift()
             forces.axpy(1.0, self.F)
-        predicted = self._predict(x, self.F if forces is None else forces)
+        start = self.F if forces is None else forces
+        self._first = start.norm()
+        predicted = self._predict(x, start)
         self._centre = x.copy()
         self._set_tangent(self._problem.tangent() if predicted or K is None else K)
         self._fresh = forces is None or predicted
         if forces is not None and not predicted:
             self._factor.solve(forces, x)
             self._negative = self._problem.constrain(x, None, self._factor.solve)
+            if self._is_loose(x, self._first):
+                return
             x.scale(-1.0)
             self.iterations += 1
             self._known = False
@@ -232,7 +245,12 @@ class NewtonSolver:
         with self.statistics.phase("solve"):
             self.snes.solve(None, x)
         reason = self.snes.getConvergedReason()
-        if self._failure is None and reason > 0:
+        if self._failure is None and reason > 0 and not self._ended:
+            self._failure = MPMError(
+                f"PETSc's SNES {self.snes.getType()!r} ended by a test of its own "
+                f"({_reason(reason)}), not where the residual is small; use snes_type 'newtonls'."
+            )
+        elif self._failure is None and reason > 0:
             self._judge(predicted)
         elif self._failure is None:
             residual = self.residuals[-1] if self.residuals else np.nan
@@ -317,7 +335,7 @@ class NewtonSolver:
         _, _, norm = norms
         reasons = PETSc.SNES.ConvergedReason
         if not np.isfinite(norm):
-            return reasons.DIVERGED_FNORM_NAN
+            return _compat.NOT_FINITE
         rtol, atol, _, _ = snes.getTolerances()
         scale = self._problem.scale()
         if iteration >= 2 and norm > max(0.25 * self._norm, rtol * scale):
@@ -329,16 +347,25 @@ class NewtonSolver:
         self._norm = norm
         self._norms.append(norm)
         self.residuals.append(norm / scale if scale > 0 else norm)
-        if norm <= max(rtol * scale, atol):
-            if scale > 0.0 and self.F is not None:
-                frozen = max(self.statistics["frozen_residual"], self.F.norm() / scale)
-                self.statistics["frozen_residual"] = frozen
-            return reasons.CONVERGED_FNORM_RELATIVE
+        small = norm <= max(rtol * scale, atol)
         step, whole = self._motion
-        if iteration > 0 and (
-            step <= ROUND_OFF * whole
-            or (self._stalled and step <= 4 * np.finfo(float).eps * self._problem.extent())
+        if small or (
+            iteration > 0
+            and (
+                step <= ROUND_OFF * whole
+                or (self._stalled and step <= 4 * np.finfo(float).eps * self._problem.extent())
+            )
         ):
+            left = self._release(snes.getSolution(), max(rtol * scale, atol))
+            forces = max(scale, self._first)
+            if left > FROZEN * forces and left > FROZEN * self._problem.internal_scale():
+                self._failure = _not_held(left / max(forces, atol))
+                return reasons.DIVERGED_MAX_IT
+            self._ended = True
+            if small:
+                frozen = max(self.statistics["frozen_residual"], left / max(scale, left, atol))
+                self.statistics["frozen_residual"] = frozen
+                return reasons.CONVERGED_FNORM_RELATIVE
             self.statistics.count("converged_at_round_off")
             return reasons.CONVERGED_SNORM_RELATIVE
         if self._search is not None and stalled(self._norms):
@@ -350,6 +377,32 @@ class NewtonSolver:
             )
             return reasons.DIVERGED_MAX_IT
         return None
+
+    def _release(self, x: PETSc.Vec, tolerance: float) -> float:
+        """Let go what the proximal term holds back, except where next to nothing moves.
+
+        Args:
+            x: The unknowns; replaced by better ones.
+            tolerance: Norm of the residual that is small enough.
+
+        Returns:
+            Norm of the residual that is left.
+        """
+        assert self.F is not None
+        left = self.F.norm()
+        step = x.duplicate()
+        while left > tolerance and self._factor.D is not None:
+            self._factor.solve(self.F, step)
+            if (step * self._factor.D).norm() > HELD * left:
+                break
+            self._problem.constrain(step, x, self._factor.solve)
+            better = self._evaluate(x - step) is None and self.F.norm() <= 0.5 * left
+            if not better:
+                self._evaluate(x)
+                break
+            x.axpy(-1.0, step)
+            left = self.F.norm()
+        return float(left)
 
     def _set_tangent(self, K: PETSc.Mat, damping: float = 0.0) -> None:
         if self._factor.set(K, self._problem.rigid_motions, damping):
@@ -365,6 +418,11 @@ class NewtonSolver:
         self._motion = (0.0, 0.0)
         self._origin = x
         self._negative = self._problem.constrain(y, x, self._factor.solve)
+        if self.iterations == 1 and self._is_loose(y, self._R.norm()):
+            self._trial.waxpy(-1.0, y, x)
+            self._R.set(np.nan)
+            self._known = True
+            return False
         finite = bool(np.isfinite(y.norm()))
         if not finite and not (self._search is not None and self._search.trusts):
             return False  # the evaluation at x - y says so
@@ -383,6 +441,17 @@ class NewtonSolver:
 
     def _smooth(self) -> bool:
         return self._problem.smooth()
+
+    def _is_loose(self, y: PETSc.Vec, force: float) -> bool:
+        """Whether a first step moves a body that nothing holds, which is a failure then."""
+        scale = max(self._problem.scale(), force)
+        if self._factor.D is None or scale == 0.0 or not np.isfinite(y.norm()):
+            return False
+        held = (y * self._factor.D).norm()
+        if held <= LOOSE * scale:
+            return False
+        self._failure = _not_held(held / scale)
+        return True
 
     def _uphill(self, F: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Return whether a step for the residual F is not that of a positive definite tangent."""
@@ -407,20 +476,11 @@ class NewtonSolver:
                 return
 
 
-def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a call of a method that does not keep its object alive.
-
-    PETSc keeps its callbacks out of sight of Python's garbage collection, so a solver that held
-    itself through them would never be freed.
-    """
-    reference = weakref.WeakMethod(method)
-
-    def call(*args: Any) -> Any:
-        bound = reference()
-        assert bound is not None
-        return bound(*args)
-
-    return call
+def _not_held(share: float) -> MPMError:
+    return MPMError(
+        f"Forces ({share:.1e} of all) act where nothing holds the bodies; support each of them "
+        "against all rigid motions, with conditions and supports that reach it where it is"
+    )
 
 
 def _reason(code: int) -> str:

@@ -171,6 +171,26 @@ def test_two_half_columns_are_one_column(case, material):
     assert problem.yield_function.shape == (sum(b.num_local for b in bodies),)
 
 
+@pytest.mark.parametrize("cell", [QUADRILATERAL, TRIANGLE], ids=scenes.name)
+def test_two_bodies_whose_nodes_do_not_match(cell):
+    # Next to each other in a cell, their nodes make T nearly singular: its singular values of 1e-7
+    # are neither zero nor large enough for Newton's method.
+    V = vectors(box([0.0, 0.0], [4.0, 4.0], [16, 16], QUADRILATERAL))
+    lower = mpm.Particles(box([0.0, 0.0], [2.0, 1.0], [8, 4], cell), V)
+    upper = mpm.Particles(box([0.3, 1.0], [1.7, 2.0], [9, 9], TRIANGLE), V)
+    problem = mpm.QuasiStaticProblem(
+        [lower, upper],
+        VonMises(1e3, 0.3, rho_y=20.0),
+        body_force=(0.0, -15.0),
+        bcs=[scenes.fix(V, scenes.at(0, 0.0), component=0), scenes.fix(V, scenes.at(1, 0.0))],
+    )
+    problem.solve(steps=10)
+    assert problem.history.cutbacks == 0 and problem.history.total_iterations <= 40
+    assert 1e-9 < problem.history.statistics["frozen_residual"] < 1e-7
+    weight = 15.0 * sum(WORLD.allreduce(b.initial_volume.sum()) for b in (lower, upper))
+    np.testing.assert_allclose(problem.reaction(problem.bcs[1])[1], weight, rtol=1e-6)
+
+
 def test_several_bodies_in_ufl_and_their_errors():
     V = vectors(box([0.0, 0.0], [1.0, 2.0], [4, 8], QUADRILATERAL))
     low = mpm.Particles(box([0.0, 0.0], [1.0, 0.5], [8, 4], QUADRILATERAL), V)

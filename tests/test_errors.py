@@ -42,6 +42,11 @@ def background(cell=QUADRILATERAL):
     return scenes.box([-1.0, -1.0], [2.0, 2.0], [6, 6], cell)
 
 
+def held_background():
+    """A background with a side at x = 0."""
+    return scenes.box([0.0, -1.0], [2.0, 2.0], [4, 6], QUADRILATERAL)
+
+
 def body():
     return scenes.unit(2, TRIANGLE)
 
@@ -570,7 +575,7 @@ class Touchy(Hencky):
 
 @pytest.mark.parametrize("quadrature_degree", [None, 3])
 def test_law_that_fails_at_one_particle(quadrature_degree):
-    V = scenes.vectors(background())
+    V = scenes.vectors(held_background())
     domain = scenes.unit(4, QUADRILATERAL)
     young = fem.Function(fem.functionspace(domain, ("DG", 0)))
     X = scenes.mesh.compute_midpoints(domain, 2, np.arange(len(young.x.array), dtype=np.int32))
@@ -581,7 +586,7 @@ def test_law_that_fails_at_one_particle(quadrature_degree):
         p,
         Touchy(young, 0.3),
         body_force=(0.0, -1.0),
-        bcs=[scenes.fix(V, scenes.at(0, -1.0))],
+        bcs=[scenes.fix(V, scenes.at(0, 0.0))],
     )
     expected = [int(i) for i in scenes.gather(p.global_index[bad[: p.num_local]])]
     assert len(expected) == 1
@@ -590,6 +595,77 @@ def test_law_that_fails_at_one_particle(quadrature_degree):
     )
     assert error.particles == expected and error.load == 0.0
     assert f"particle {expected[0]}" in str(error)
+
+
+class Broken(Hencky):
+    """A law whose program has an error, on one rank and from some strain on."""
+
+    def update(self, displacement_gradient, state, tangent=True):
+        if WORLD.rank == WORLD.size - 1 and np.abs(displacement_gradient).max(initial=0.0) > 1e-3:
+            raise ValueError("no such thing")
+        return super().update(displacement_gradient, state, tangent)
+
+
+def test_a_law_with_an_error_of_python():
+    problem = scenes.block(material=Broken(1e3, 0.3), force=(0.0, -2.0))
+    cause = r"update of Broken failed with ValueError: no such thing"
+    raises(lambda: problem.solve(steps=1), mpm.MPMError, cause)
+    assert problem.particles.load.value == 0.0 and not problem.history.steps
+    assert not np.any(problem.particles.displacement.x.array)
+
+
+def test_a_problem_with_an_error_of_python():
+    class Wrong(mpm.ParticleProblem):
+        def evaluate(self):
+            if self.particles.load.value > 0.5 and WORLD.rank == WORLD.size - 1:
+                raise KeyError("history")
+
+    p = mpm.Particles(body(), scenes.vectors(held_background()))
+    d, v = p.displacement, ufl.TestFunction(p.W)
+    R = ufl.inner(scenes.linear_stress(d, 1e3, 0.3), ufl.grad(v)) * p.dx
+    R -= p.load * v[1] * p.dx_exact
+    problem = Wrong(R, p, bcs=[scenes.fix(p.V, scenes.at(0, 0.0))])
+    raises(lambda: problem.solve(steps=2), mpm.MPMError, r"evaluate\(\) failed with KeyError")
+    assert problem.history.load == [0.5] and p.load.value == 0.5
+
+
+@pytest.mark.parametrize("held", [None, 0, 1])
+def test_a_body_that_nothing_holds(held):
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
+    bcs = [] if held is None else [scenes.fix(V, scenes.at(held, 0.0), component=held)]
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(scenes.unit(4, TRIANGLE), V), Hencky(1e3, 0.3), bcs=bcs, body_force=(1.0, 1.0)
+    )
+    raises(lambda: problem.solve(steps=1), mpm.MPMError, r"nothing holds the bodies; support each")
+    assert not problem.history.steps and not np.any(problem.particles.displacement.x.array)
+
+
+def test_a_snes_with_a_test_of_its_own():
+    options = {"snes_type": "ksponly"}
+    problem = scenes.block(petsc_options=options)
+    raises(lambda: problem.solve(steps=1), mpm.MPMError, r"SNES 'ksponly' ended by a test of its")
+
+
+def test_tags_of_another_mesh_or_of_no_boundary():
+    p, other = particles(), scenes.unit(3, TRIANGLE)
+    tags = scenes.facet_tags(other, scenes.at(0, 1.0))
+    loads = [((1.0, 0.0), 1)]
+
+    def made(facets):
+        return lambda: mpm.QuasiStaticProblem(
+            p, Hencky(1e3, 0.3), tractions=loads, facet_tags=facets
+        )
+
+    raises(made(tags), mpm.MPMError, r"of the body's mesh, not of another one")
+    inner = scenes.mesh.locate_entities(p.mesh, 1, scenes.at(0, 0.5)).astype(np.int32)
+    inside = scenes.mesh.meshtags(p.mesh, 1, np.sort(inner), np.full(len(inner), 1, np.int32))
+    raises(made(inside), mpm.MPMError, r"facets on the boundary, among \[\]")
+
+
+def test_outside_is_said_by_a_corner_that_is():
+    V = scenes.vectors(scenes.box([0.0, 0.0], [1.0, 1.0], [2, 2], QUADRILATERAL))
+    domain = scenes.box([0.5, 0.0], [1.25, 0.5], [1, 1], QUADRILATERAL)
+    raises(lambda: mpm.Particles(domain, V), mpm.ParticleOutsideError, r"at \(1\.25, 0\.[05]\)")
 
 
 def with_one_value(p, all_others, first):

@@ -172,6 +172,36 @@ def test_trust_that_is_abused_ends():
     np.testing.assert_allclose(solver.x.array_r + problem.start, 0.0, atol=1e-9)
 
 
+def test_trust_ends_where_a_linear_solve_breaks_down():
+    solver = newton()
+    problem = Flat([1.0, 1.0], 0.0, start=np.array([1.5, -10.0]))  # a tangent of 1e-300 soon
+    solver.solve(problem, (2, 2))
+    assert solver.statistics["withdrawn_steps"] == 1
+    np.testing.assert_allclose(solver.x.array_r + problem.start, 0.0, atol=1e-9)
+
+
+class Springs(DoubleWell):
+    """Two springs, one of them 1e-14 as stiff, under forces that deform both by one."""
+
+    def residual(self, x, F):
+        F.array_w[:] = self.c * (x.array_r - 1.0)
+        return None
+
+    def tangent(self):
+        for i, value in enumerate(self.c):
+            self.K.setValue(i, i, value)
+        self.K.assemble()
+        return self.K
+
+
+@pytest.mark.parametrize("shift", [1e-13, 1e-3])
+def test_proximal_term_holds_nothing_back_that_moves(shift):
+    solver = newton(shift=shift)
+    solver.solve(Springs([1.0, 1e-2], 0.0), (2, 2))
+    np.testing.assert_allclose(solver.x.array_r, 1.0, rtol=1e-8)
+    assert solver.statistics["frozen_residual"] <= 1e-9
+
+
 @pytest.mark.parametrize("strain", [1e-4, 1e-1])
 def test_response_is_smooth_where_nothing_yields(strain):
     problem = scenes.slump(QUADRILATERAL, 1e3, h=1.0)
@@ -181,6 +211,25 @@ def test_response_is_smooth_where_nothing_yields(strain):
     assert problem.smooth() == (strain < 1e-2)
     problem.roll_back()
     assert problem.smooth()
+
+
+def test_histories_and_contact_are_not_smooth():
+    problem = scenes.block()
+    particles = problem.particles
+    d, v = particles.displacement, scenes.ufl.TestFunction(particles.W)
+    R = scenes.ufl.inner(scenes.linear_stress(d, 1e3, 0.3), scenes.ufl.grad(v)) * particles.dx
+
+    class WithHistory(mpm.ParticleProblem):
+        def commit(self):
+            pass
+
+    assert problem.smooth() and mpm.ParticleProblem(R, particles, bcs=problem.bcs).smooth()
+    assert not WithHistory(R, particles, bcs=problem.bcs).smooth()
+    wall = mpm.boundary.plane(particles, (1.5, 0.0), (-1.0, 0.0))
+    touching = mpm.QuasiStaticProblem(
+        particles, mpm.materials.Hencky(1e3, 0.3), bcs=problem.bcs, supports=[wall]
+    )
+    assert not touching.smooth()
 
 
 def nearly_incompressible(**options):
