@@ -131,9 +131,10 @@ class ConstitutiveHistory:
         known = np.isin(tags, list(assignment))
         without = self._particles.global_index[~known]
         if len(without):
+            missing = ", ".join(str(tag) if tag >= 0 else "none" for tag in np.unique(tags[~known]))
             raise MPMError(
-                "The cell tags of {particles} have no material; give a material for each tag "
-                f"(there are {', '.join(map(str, assignment))}).",
+                f"The cell tags of {{particles}} ({missing}) have no material, as there are "
+                f"materials for {', '.join(map(str, assignment))} alone; give one for each tag.",
                 without,
             )
         tags = np.repeat(tags, self._particles.num_points)

@@ -61,6 +61,8 @@ def load_steps(
         raise MPMError(f"The number of steps must be a whole number from 1 on, not {steps!r}.")
     if update is not None:
         update = on_all_ranks(problem._comm, update)
+    if control is not None and not isinstance(control, DisplacementControl):
+        raise MPMError(f"control= is a DisplacementControl, not {control!r}.")
     run = _begin_run(problem, int(steps), update, control)
     may_split = any(body.on_distortion == "split" for body in problem.bodies)
     if control is not None and (repartition is not None or may_split):
@@ -233,4 +235,5 @@ def _warn_of_outside(problem: ParticleProblem) -> None:
             for body in problem.bodies:
                 body.locate()
     except ParticleOutsideError as error:
-        problem.warn(f"The run is complete, but {error!s}")
+        told = str(error)
+        problem.warn(f"The run is complete, but {told[0].lower()}{told[1:]}")

@@ -80,7 +80,7 @@ class ParticleProblem:
             background dofs that move no node of the body make the reduced tangent singular;
             without a shift the factor of such a matrix is noise.
         line_search: Whether Newton steps are halved where they invert domains or do not
-            reduce the residual.
+            reduce the residual, and where nothing yields taken on trust.
         dependent_dofs: What becomes of dofs that others can stand for, as no node of the body
             tells them apart: ``"shift"`` leaves them to the shift, ``"remove"`` looks for them in
             each step and takes them from the unknowns (then ``shift=0.0`` is possible, and
