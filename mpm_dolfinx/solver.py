@@ -447,10 +447,15 @@ class NewtonSolver:
         scale = max(self._problem.scale(), force)
         if self._factor.D is None or scale == 0.0 or not np.isfinite(y.norm()):
             return False
-        held = (y * self._factor.D).norm()
-        if held <= LOOSE * scale:
+        held = y * self._factor.D
+        share = held.norm() / scale
+        if share <= LOOSE:
             return False
-        self._failure = _not_held(held / scale)
+        again = y.duplicate()
+        self._factor.solve(held, again)  # what is held softly, but held, gives way now
+        if (again * self._factor.D).norm() <= 0.5 * held.norm():
+            return False
+        self._failure = _not_held(share)
         return True
 
     def _uphill(self, F: PETSc.Vec, y: PETSc.Vec) -> bool:

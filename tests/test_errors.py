@@ -640,6 +640,20 @@ def test_a_body_that_nothing_holds(held):
     assert not problem.history.steps and not np.any(problem.particles.displacement.x.array)
 
 
+def test_what_is_held_softly_is_held():
+    # Slender, one cell thick: bending has an eigenvalue some 1e-11 times that of a single cell.
+    V = scenes.vectors(scenes.box([0.0, 0.0], [600.0, 3.0], [600, 3], QUADRILATERAL))
+    beam = scenes.box([0.0, 1.0], [600.0, 2.0], [600, 1], QUADRILATERAL)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(beam, V, quadrature_degree=2),
+        LinearElastic(1e3, 0.0),
+        bcs=[scenes.fix(V, scenes.at(0, 0.0))],
+        body_force=(0.0, -1e-10),
+    )
+    problem.solve(steps=1)
+    np.testing.assert_allclose(problem.reaction(problem.bcs[0]), [0.0, 6e-8], rtol=1e-6, atol=1e-12)
+
+
 def test_a_snes_with_a_test_of_its_own():
     options = {"snes_type": "ksponly"}
     problem = scenes.block(petsc_options=options)
