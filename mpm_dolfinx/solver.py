@@ -359,12 +359,12 @@ class NewtonSolver:
             left = self._release(snes.getSolution(), max(rtol * scale, atol))
             forces = max(scale, self._first)
             if left > FROZEN * forces and left > FROZEN * self._problem.internal_scale():
-                self._failure = _not_held(left / max(forces, atol))
+                self._failure = _not_held(left / forces if forces > 0.0 else np.inf)
                 return reasons.DIVERGED_MAX_IT
             self._ended = True
             if small:
-                frozen = max(self.statistics["frozen_residual"], left / max(scale, left, atol))
-                self.statistics["frozen_residual"] = frozen
+                frozen = left / scale if scale > 0.0 else 0.0
+                self.statistics["frozen_residual"] = max(self.statistics["frozen_residual"], frozen)
                 return reasons.CONVERGED_FNORM_RELATIVE
             self.statistics.count("converged_at_round_off")
             return reasons.CONVERGED_SNORM_RELATIVE

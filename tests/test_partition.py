@@ -157,7 +157,7 @@ def test_meshes_between_are_forgotten():
     for one in (problem, other):
         one.solve(2)
     gc.collect()
-    assert [known() is not None for known in meshes] == [False] * 3 + [True] * 8
+    assert [known() is not None for known in meshes] == [False] * 2 + [True] * 9
     assert_same_result(result(problem), result(other))
     own = slice(particles.num_local)
     middle = mesh.compute_midpoints(
