@@ -85,6 +85,8 @@ def pytest_collectreport(report: pytest.CollectReport) -> None:
 @pytest.hookimpl(trylast=True)
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Stop where the ranks collected different tests: they would wait for each other."""
+    gc.collect()
+    gc.freeze()  # what is there already need not be looked through after each test
     if comm.size == 1:
         return
     tests = comm.allgather([item.nodeid for item in session.items])
