@@ -26,14 +26,18 @@ PATIENCE = 15
 HEADWAY = 0.7
 
 
-class _Trusted(NamedTuple):
-    """Where a step was taken on trust: unknowns, step, residual's norm and work on the step."""
+class _Step(NamedTuple):
+    """A step to be taken: unknowns, step, norm of the residual there and its work on the step."""
 
     x: PETSc.Vec
     y: PETSc.Vec
     norm: float
     work: float
-    iteration: int
+
+    def halved(self) -> _Step:
+        """Halve the step."""
+        self.y.scale(0.5)
+        return self._replace(work=0.5 * self.work)
 
 
 class LineSearch:
@@ -77,8 +81,8 @@ class LineSearch:
 
     def begin(self) -> None:
         """Begin a solve."""
-        self._trusted: _Trusted | None = None
-        self._iteration = 0
+        self._trusted: _Step | None = None
+        self._since = 0  # iterations
         self._may_trust = True
 
     def __call__(self, x: PETSc.Vec, y: PETSc.Vec, F: PETSc.Vec, trial: PETSc.Vec) -> bool:
@@ -93,30 +97,30 @@ class LineSearch:
         Returns:
             Whether y has changed.
         """
-        self._iteration += 1
-        norm, work = F.norm(), F.dot(y)
-        if self._trusted is not None and norm <= self._trusted.norm:
+        step = _Step(x, y, F.norm(), F.dot(y))
+        self._since += 1
+        if self._trusted is not None and step.norm <= self._trusted.norm:
             self._trusted = None
         start = F.copy()
-        if self._reduces(x, y, F, trial, norm, work) and not self._overdue(F):
+        if self._reduces(step, F, trial) and not self._overdue(F):
             return False
         if self._trusted is None and self._uphill(start, y):
             self._redirect(start, y)
             self._statistics.count("redirections")
-            work = start.dot(y)
-            if not self._reduces(x, y, F, trial, norm, work):
-                self._halve(x, y, F, trial, norm, work)
+            step = step._replace(work=start.dot(y))
+            if not self._reduces(step, F, trial):
+                self._halve(step, F, trial)
             return True
         smooth = bool(np.isfinite(F.norm())) and self._smooth()
         if smooth and self._may_trust and not self._overdue(F):
             if self._trusted is None:
-                self._trusted = _Trusted(x.copy(), y.copy(), norm, work, self._iteration)
+                self._trusted, self._since = step._replace(x=x.copy(), y=y.copy()), 0
                 self._statistics.count("trusted_steps")
             return False
         if self._trusted is None:
-            self._halve(x, y, F, trial, norm, work)
-            return True
-        self.withdraw(x, y, F, trial)
+            self._halve(step, F, trial)
+        else:
+            self.withdraw(x, y, F, trial)
         return True
 
     @property
@@ -136,46 +140,28 @@ class LineSearch:
         assert self._trusted is not None
         before, self._trusted, self._may_trust = self._trusted, None, False
         self._statistics.count("withdrawn_steps")
-        self._halve(before.x, before.y, F, trial, before.norm, before.work)
+        self._halve(before, F, trial)
         y.waxpy(-1.0, trial, x)
 
     def _overdue(self, F: PETSc.Vec) -> bool:
         """Whether a step taken on trust should have paid by now."""
-        before = self._trusted
-        if before is None or F.norm() <= before.norm:
+        if self._trusted is None or self._since < TRUST:
             return False
-        return bool(self._iteration - before.iteration >= TRUST)
+        return bool(F.norm() > self._trusted.norm)
 
-    def _reduces(
-        self,
-        x: PETSc.Vec,
-        y: PETSc.Vec,
-        F: PETSc.Vec,
-        trial: PETSc.Vec,
-        norm: float,
-        work: float,
-    ) -> bool:
-        """Evaluate at ``x - y``; return whether norm or work fall far enough."""
-        trial.waxpy(-1.0, y, x)
+    def _reduces(self, step: _Step, F: PETSc.Vec, trial: PETSc.Vec) -> bool:
+        """Evaluate at the step's end; return whether norm or work fall far enough."""
+        trial.waxpy(-1.0, step.y, step.x)
         if self._evaluate(trial) is not None:
             return False
-        return bool(abs(F.dot(y)) <= SUFFICIENT * abs(work) or F.norm() <= norm)
+        return bool(abs(F.dot(step.y)) <= SUFFICIENT * abs(step.work) or F.norm() <= step.norm)
 
-    def _halve(
-        self,
-        x: PETSc.Vec,
-        y: PETSc.Vec,
-        F: PETSc.Vec,
-        trial: PETSc.Vec,
-        norm: float,
-        work: float,
-    ) -> None:
+    def _halve(self, step: _Step, F: PETSc.Vec, trial: PETSc.Vec) -> None:
         """Halve the step until norm or work fall far enough."""
         for _ in range(HALVINGS):
-            y.scale(0.5)
-            work *= 0.5
+            step = step.halved()
             self._statistics.count("halvings")
-            if self._reduces(x, y, F, trial, norm, work):
+            if self._reduces(step, F, trial):
                 break
 
 

@@ -150,13 +150,9 @@ class Carrier:
         own = tags.indices < count
         values = np.zeros((count, 2), dtype=np.int32)
         values[tags.indices[own]] = np.column_stack([tags.values[own], np.ones(own.sum())])
-        moved_values = self.of_cells(values)
-        everywhere = la.vector(self.mesh.topology.index_map(tags.dim), 2)
-        values = everywhere.array.reshape(-1, 2)
-        values[: len(self._origin)] = moved_values
-        everywhere.scatter_forward()
+        values = _with_ghosts(self.mesh.topology.index_map(tags.dim), self.of_cells(values))
         tagged = np.flatnonzero(values[:, 1]).astype(np.int32)
-        moved = mesh.meshtags(self.mesh, tags.dim, tagged, values[tagged, 0].astype(np.int32))
+        moved = mesh.meshtags(self.mesh, tags.dim, tagged, values[tagged, 0])
         moved.name = tags.name
         return moved
 
@@ -251,6 +247,15 @@ def _moved_apart(
     return _compat.disconnected_mesh(comm, places[order], source.basix_cell(), numbers[order])
 
 
+def _with_ghosts(cells: Any, values: NDArray[Any]) -> NDArray[Any]:
+    """Return whole numbers of the owned cells on ghosts too, shape ``(n, k)`` (collective)."""
+    everywhere = la.vector(cells, values.shape[1])
+    result = everywhere.array.reshape(-1, values.shape[1])
+    result[: len(values)] = values
+    everywhere.scatter_forward()
+    return result.astype(values.dtype)
+
+
 def neighbour_ranks(source: mesh.Mesh, ranks: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the new rank behind each facet of each owned cell; none in a mesh without ghosts."""
     topology, dim = source.topology, source.topology.dim
@@ -259,9 +264,7 @@ def neighbour_ranks(source: mesh.Mesh, ranks: NDArray[np.int64]) -> NDArray[np.i
         return np.zeros((len(ranks), 0), dtype=np.int64)
     topology.create_connectivity(dim, dim - 1)
     topology.create_connectivity(dim - 1, dim)
-    everywhere = la.vector(cells, 1)
-    everywhere.array[: len(ranks)] = ranks
-    everywhere.scatter_forward()
+    everywhere = _with_ghosts(cells, ranks[:, None])[:, 0]
     behind = topology.connectivity(dim - 1, dim)
     first, last = behind.array[behind.offsets[:-1]], behind.array[behind.offsets[1:] - 1]
     facets = topology.connectivity(dim, dim - 1).array.reshape(
@@ -269,4 +272,4 @@ def neighbour_ranks(source: mesh.Mesh, ranks: NDArray[np.int64]) -> NDArray[np.i
     )
     facets = facets[: len(ranks)]
     other = first[facets] + last[facets] - np.arange(len(ranks))[:, None]
-    return np.asarray(everywhere.array[other], dtype=np.int64)
+    return np.asarray(everywhere[other])

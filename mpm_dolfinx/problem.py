@@ -159,7 +159,6 @@ class ParticleProblem:
         if background is not None:
             terms = BackgroundForms(background, self.bodies[0], **options)
         statistics = self.history.statistics
-        evaluate = weakly(self.evaluate)
         past = Predictor() if predictor else None
         remove, simple = dependent_dofs == "remove", V.ufl_element().degree == 1
         left_alone = simple and stabilisation == "auto" and (remove or background is not None)
@@ -173,7 +172,7 @@ class ParticleProblem:
             self.shares,
             terms,
             self.bcs,
-            evaluate,
+            weakly(self.evaluate),
             weakly(self.smooth),
             statistics,
             past,

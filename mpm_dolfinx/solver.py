@@ -423,10 +423,9 @@ class NewtonSolver:
             self._R.set(np.nan)
             self._known = True
             return False
-        finite = bool(np.isfinite(y.norm()))
-        if not finite and not (self._search is not None and self._search.trusts):
-            return False  # the evaluation at x - y says so
-        if self._search is not None and not finite:
+        if not np.isfinite(y.norm()):
+            if self._search is None or not self._search.trusts:
+                return False  # the evaluation at x - y says so
             self._search.withdraw(x, y, self._R, self._trial)
             changed = True
         elif self._search is not None:

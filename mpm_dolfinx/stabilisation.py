@@ -202,15 +202,7 @@ class Aggregation:
         self._positions = coordinates[dofs][:, :, : self._V.mesh.geometry.dim]
 
     def unknowns(self, active: NDArray[np.bool_], statistics: Statistics) -> NDArray[np.bool_]:
-        """Look at the bodies where they are at the last converged step (collective).
-
-        Args:
-            active: Whether each own node of V has weight.
-            statistics: Where to count.
-
-        Returns:
-            Which own nodes are unknowns.
-        """
+        """See :meth:`GhostPenalty.unknowns`."""
         cells, V = self._cells, self._V
         support = CellFill.of(self._bodies, cells.num_own)
         good = support.active & (support.fill.sum(axis=1) >= FILL)

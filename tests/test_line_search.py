@@ -181,7 +181,7 @@ def test_trust_ends_where_a_linear_solve_breaks_down():
 
 
 class Springs(DoubleWell):
-    """Two springs, one of them 1e-14 as stiff, under forces that deform both by one."""
+    """Springs of different stiffness under forces that lengthen each by one."""
 
     def residual(self, x, F):
         F.array_w[:] = self.c * (x.array_r - 1.0)
