@@ -16,10 +16,10 @@ BIN := $(VENV)/bin
 SETUP := sh scripts/setup_env.sh
 
 # Benchmarks that print a JSON object; work_precision.py writes its results and pictures itself.
-BENCHMARKS := $(wildcard $(patsubst %,benchmarks/%.py,assembly step skip solvers scaling ranks))
+BENCHMARKS := $(wildcard $(patsubst %,benchmarks/%.py,assembly step skip solvers scaling ranks cantilever_reference))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-debian stress bench bench-smoke lint docs clean
+.PHONY: help demo test test-debian stress bench bench-smoke studies lint docs clean
 
 help: ## This list
 	@echo "make TARGET [VENV=path of an environment] [PYTHON=path of an interpreter]"
@@ -28,10 +28,10 @@ help: ## This list
 demo: ## Install what is needed, run the first demo, make its picture
 	@$(SETUP) wheel plot
 	@mkdir -p output
-	"$(BIN)/python" demos/demo_column_roller.py --plot output/column_roller.png
+	cd output && "$(abspath $(BIN)/python)" ../demos/demo_column_roller.py
 	@echo "The picture is output/column_roller.png"
 
-test: ## Run the tests on one rank, then on NP="2 3" ranks (ARGS="-k name" goes to pytest)
+test: ## Half an hour: the tests on 1, then on NP="2 3" ranks (ARGS=tests/materials: seconds)
 	@$(SETUP) wheel plot test
 	@bash scripts/run_tests.sh $(ARGS)
 
@@ -58,6 +58,10 @@ bench-smoke: ## Run all benchmarks at tiny sizes, in less than a minute
 	@set -e; for script in $(BENCHMARKS) benchmarks/work_precision.py; do \
 	    echo "$$script --smoke"; "$(BIN)/python" "$$script" --smoke; \
 	done
+
+studies: ## Make the tables of the docs again, say which no longer follow (ARGS="--check" runs few)
+	@$(SETUP) wheel plot test
+	"$(BIN)/python" docs/studies/make.py $(ARGS)
 
 lint: ## ruff check, ruff format --check, mypy
 	@$(SETUP) wheel plot test

@@ -74,8 +74,8 @@ class Scene:
         d[:] = 1e-3 * h * random.standard_normal(d.size)
 
     def prepared(self, problem: mpm.ParticleProblem) -> mpm.ParticleProblem:
-        assert problem.evaluate() is None
-        problem.reduced.begin(np.zeros_like(problem.bodies[0].increment.x.array), 1.0)
+        assert all(body.update() is None for body in problem.body_terms)
+        problem.reduced.begin([np.zeros_like(problem.bodies[0].increment.x.array)], 1.0)
         return problem
 
     def plastic(self, assembly: str = "fast") -> mpm.ParticleProblem:
@@ -160,10 +160,11 @@ def plastic_update(count: float, dim: int = 2) -> float:
     shear = np.zeros_like(X)
     shear[:, 0] = 0.1 * X[:, 1]
     scene.particles.displacement.x.array[:] = shear.ravel()
-    assert problem.evaluate() is None
+    (body,) = problem.body_terms
+    assert body.update() is None
     assert problem.yield_function.max() < 0.0  # of the last converged step
-    (time_of,) = seconds(problem.evaluate)
-    problem.commit()
+    (time_of,) = seconds(body.update)
+    body.commit()
     assert (scene.particles.plastic_strain > 0.0).all()
     return 1e6 * time_of / scene.particles.num_local
 
@@ -179,10 +180,10 @@ def whole(count: float) -> dict[str, float]:
     def step() -> None:
         scene.particles.restore(scene.particles.displacement.x.array.reshape(-1, 2).copy())
         problem.reduced.forget()
-        problem.reduced.begin(np.zeros_like(problem.bodies[0].increment.x.array), 1.0)
+        problem.reduced.begin([np.zeros_like(problem.bodies[0].increment.x.array)], 1.0)
         for _ in range(5):
-            problem.evaluate()
-            problem.shares[0].forms.assemble_residual()
+            problem.body_terms[0].update()
+            problem.body_terms[0].forms.assemble_residual()
             problem.reduced.tangent()
 
     (time_of,) = seconds(step, repeats=2)

@@ -1,8 +1,8 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Numbers of all demos on several ranks against those on the first number of ranks.
+"""Numbers of all cases on several ranks against those on the first number of ranks.
 
-Each demo runs with its main variants. No number of its JSON object may differ by more than 1e-9,
+Each case runs with its main variants. No number of its JSON object may differ by more than 1e-9,
 relatively, or absolutely where it is an error's norm; counts of solves and cutbacks must be the
 same. Printed is the largest difference of each run and the number that it is of; the exit status
 is 1 where one is too large.
@@ -19,11 +19,11 @@ from launcher import launched
 
 import mpm_dolfinx as mpm
 
-DEMOS = Path(__file__).parents[1] / "demos"
+CASES = Path(__file__).parent / "cases"
 BOUND = 1e-9
 
-#: Demos and their arguments.
-CASES = (
+#: Cases and their arguments.
+RUNS = (
     "compaction --elements 16",
     "compaction --elements 16 --domain tri",
     "compaction --elements 4 --domain hex --steps 10",
@@ -57,7 +57,7 @@ CASES = (
     "collapse --cell 2 --f-bar patch --steps 20",
     "footing --cell 0.25 --steps 16",
     "gmsh_body",
-    "pressurised_cylinder --elements 8",
+    "cylinder --elements 8",
     "cell_crossing --steps 20",
     "snap_through",
     "domain_distortion --steps 8",
@@ -79,9 +79,9 @@ def difference(key: str, one: Any, other: Any) -> float:
 
 
 def compare(case: str, ranks: list[int]) -> dict[str, Any]:
-    """Run a demo on each number of ranks, and compare."""
-    demo, *arguments = case.split()
-    runs = [launched(n, DEMOS / f"demo_{demo}.py", *arguments, "--json") for n in ranks]
+    """Run a case on each number of ranks, and compare."""
+    name, *arguments = case.split()
+    runs = [launched(n, CASES / f"{name}.py", *arguments, "--json") for n in ranks]
     result: dict[str, Any] = {"case": case, "completed": runs[0]["completed"]}
     for n, run in zip(ranks[1:], runs[1:], strict=True):
         gaps = {key: difference(key, value, run.get(key)) for key, value in runs[0].items()}
@@ -100,7 +100,7 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="one tiny case: does it run?")
     args = parser.parse_args()
     ranks = [int(n) for n in args.ranks.split(",")]
-    cases = [case for case in CASES if case.startswith(args.only)]
+    cases = [case for case in RUNS if case.startswith(args.only)]
     if args.smoke:
         ranks, cases = [1, 2], ["compaction --elements 4 --steps 4"]
     rows = []

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Scenes of the demos as functions: the same bodies, backgrounds, loads and errors."""
+"""Scenes of the cases as functions: the same bodies, backgrounds, loads and errors."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
 
-sys.path.append(str(Path(__file__).resolve().parent.parent / "demos"))
+sys.path.append(str(Path(__file__).resolve().parent / "cases"))
 
-import demo_tools as tools
+import kit
 
 
 @dataclass
@@ -54,10 +54,8 @@ def _column(
     """A column one cell wide between rollers, with two by two domains in a cell."""
     n = round(elements)
     upper = [height / n, height]
-    V = fem.functionspace(
-        tools.box(upper, [1, n], tools.DOMAINS["quad"]), ("Lagrange", degree, (2,))
-    )
-    body = tools.box(upper, [2, 2 * n], tools.DOMAINS[domain])
+    V = fem.functionspace(kit.box(upper, [1, n], kit.DOMAINS["quad"]), ("Lagrange", degree, (2,)))
+    body = kit.box(upper, [2, 2 * n], kit.DOMAINS[domain])
     particles = mpm.Particles(body, V, method=method, degree=degree)
     problem = mpm.QuasiStaticProblem(
         particles,
@@ -72,7 +70,7 @@ def _column(
 def compaction(
     size: float, domain: str = "quad", method: str = "cpdi2", degree: int = 1, steps: int = 40
 ) -> Scene:
-    """Case A, `demo_compaction.py`: `size` cells over the height; `error` of the stress."""
+    """Case A, `cases/compaction.py`: `size` cells over the height; `error` of the stress."""
     height, weight = 50.0, 800.0
     law = mpm.materials.Hencky(1e4, 0.0)
     particles, problem = _column(size, height, law, weight, domain, method, degree)
@@ -80,7 +78,7 @@ def compaction(
     def measure() -> dict[str, float]:
         exact = -weight * (height - particles.initial_centroid[:, 1])
         off = np.abs(particles.stress[:, 1, 1] - exact) / (weight * height)
-        return {"error": tools.mean(off, particles.initial_volume)}
+        return {"error": kit.mean(off, particles.initial_volume)}
 
     return Scene(problem, steps, measure)
 
@@ -88,7 +86,7 @@ def compaction(
 def column_roller(
     size: float, domain: str = "quad", method: str = "cpdi2", degree: int = 1, steps: int = 40
 ) -> Scene:
-    """Case B, `demo_column_roller.py`: `error` of the vertical stress, `error_sxx`."""
+    """Case B, `cases/column_roller.py`: `error` of the vertical stress, `error_sxx`."""
     height, weight = 10.0, 8e3
     young, poisson, rho_y = 2e5, 0.3, 20e3
     law = mpm.materials.VonMises(young, poisson, rho_y=rho_y)
@@ -99,8 +97,8 @@ def column_roller(
 
     def measure() -> dict[str, float]:
         s_yy = -weight * (height - particles.initial_centroid[:, 1])
-        elastic = tools.lambert_w(-s_yy / M)
-        plastic = tools.lambert_w(-s_yy / K * np.exp(c / K)) - c / K
+        elastic = kit.lambert_w(-s_yy / M)
+        plastic = kit.lambert_w(-s_yy / K * np.exp(c / K)) - c / K
         s_xx = np.where(
             -s_yy < M * w_y * np.exp(w_y),
             -(K - 2.0 * G / 3.0) * elastic * np.exp(elastic),
@@ -109,8 +107,8 @@ def column_roller(
         stress, volume = particles.stress, particles.initial_volume
         scale = weight * height
         return {
-            "error": tools.mean(np.abs(stress[:, 1, 1] - s_yy) / scale, volume),
-            "error_sxx": tools.mean(np.abs(stress[:, 0, 0] - s_xx) / scale, volume),
+            "error": kit.mean(np.abs(stress[:, 1, 1] - s_yy) / scale, volume),
+            "error_sxx": kit.mean(np.abs(stress[:, 0, 0] - s_xx) / scale, volume),
         }
 
     return Scene(problem, steps, measure)
@@ -124,11 +122,11 @@ def column_free(
     steps: int = 40,
     f_bar: str = "none",
 ) -> Scene:
-    """Case C, `demo_column_free.py` at 20 kN/m3: `size` is that of a cell, m; `y_mean`."""
+    """Case C, `cases/column_free.py` at 20 kN/m3: `size` is that of a cell, m; `y_mean`."""
     cells = [round(20.0 / size), round(10.0 / size)]
-    background = tools.box([20.0, 10.0], cells, tools.DOMAINS["quad"])
+    background = kit.box([20.0, 10.0], cells, kit.DOMAINS["quad"])
     V = fem.functionspace(background, ("Lagrange", degree, (2,)))
-    body = tools.box([4.0, 8.0], [round(8.0 / size), round(16.0 / size)], tools.DOMAINS[domain])
+    body = kit.box([4.0, 8.0], [round(8.0 / size), round(16.0 / size)], kit.DOMAINS[domain])
     rule = 2 if f_bar == "domain" else None
     particles = mpm.Particles(body, V, method=method, degree=degree, quadrature_degree=rule)
     problem = mpm.QuasiStaticProblem(
@@ -141,7 +139,7 @@ def column_free(
     )
 
     def measure() -> dict[str, float]:
-        return {"y_mean": tools.mean(particles.centroid[:, 1], particles.initial_volume)}
+        return {"y_mean": kit.mean(particles.centroid[:, 1], particles.initial_volume)}
 
     return Scene(problem, steps, measure)
 
@@ -158,16 +156,16 @@ CANTILEVER = (0.554005, 0.825387)  # finite elements: shortening, deflection ove
 def cantilever(
     size: float, domain: str = "quad", method: str = "cpdi2", degree: int = 1, steps: int = 50
 ) -> Scene:
-    """Case E, `demo_cantilever.py`, clamped: `size` is that of a cell, m; `error` of the tip."""
+    """Case E, `cases/cantilever.py`, clamped: `size` is that of a cell, m; `error` of the tip."""
     length, axis = 10.0, 9.5
     cells = [round(11.0 / size), round(10.0 / size)]
-    background = tools.box([11.0, 10.0], cells, tools.DOMAINS["quad"])
+    background = kit.box([11.0, 10.0], cells, kit.DOMAINS["quad"])
     V = fem.functionspace(background, ("Lagrange", degree, (2,)))
     body = mesh.create_rectangle(
-        tools.comm,
+        kit.comm,
         [[0.0, axis - 0.5], [length, axis + 0.5]],
         [round(20.0 / size), max(2, round(2.0 / size))],
-        tools.DOMAINS[domain],
+        kit.DOMAINS[domain],
         diagonal=mesh.DiagonalType.left_right,
     )
     ends = np.sort(mesh.locate_entities_boundary(body, 1, lambda x: np.isclose(x[0], length)))

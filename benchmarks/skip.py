@@ -47,7 +47,8 @@ def elastic(**options: Any) -> mpm.materials.Material:
 def run(problem: mpm.QuasiStaticProblem, steps: int, rebuild: bool = False) -> None:
     for _ in problem.steps(steps):
         if rebuild:
-            problem.reduced._fused._A = None
+            for tangent in problem.reduced.fused:
+                tangent.forget()
 
 
 def rise(problem: mpm.QuasiStaticProblem) -> float:

@@ -7,19 +7,22 @@ from . import _compat
 _compat.require_supported()
 
 from . import boundary, materials, plot  # noqa: E402
-from .displacement_control import DisplacementControl  # noqa: E402
+from .assembly.volume_ratio import AveragedVolumeRatio  # noqa: E402
 from .errors import (  # noqa: E402
     ConvergenceError,
     DomainDistortionError,
     MPMError,
     ParticleOutsideError,
 )
-from .history import History, Loss, Statistics, Step  # noqa: E402
-from .particles import Particles  # noqa: E402
-from .problem import ParticleProblem  # noqa: E402
-from .quasistatic import QuasiStaticProblem  # noqa: E402
-from .transfer import Weights  # noqa: E402
-from .volume_average import AveragedVolumeRatio  # noqa: E402
+from .history import Energy, History, Loss, Statistics, Step  # noqa: E402
+from .particles.particles import Particles  # noqa: E402
+from .problems.dynamic import DynamicProblem  # noqa: E402
+from .problems.particle_problem import ParticleProblem  # noqa: E402
+from .problems.quasistatic import QuasiStaticProblem  # noqa: E402
+from .stepping.displacement_control import DisplacementControl  # noqa: E402
+from .system.coupling import Tie  # noqa: E402
+from .system.term import Term  # noqa: E402
+from .transfer.weights import Weights  # noqa: E402
 
 __version__ = "0.1.0"
 
@@ -28,6 +31,8 @@ __all__ = [
     "ConvergenceError",
     "DisplacementControl",
     "DomainDistortionError",
+    "DynamicProblem",
+    "Energy",
     "History",
     "Loss",
     "MPMError",
@@ -37,6 +42,8 @@ __all__ = [
     "QuasiStaticProblem",
     "Statistics",
     "Step",
+    "Term",
+    "Tie",
     "Weights",
     "__version__",
     "boundary",

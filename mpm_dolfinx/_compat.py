@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import singledispatchmethod
 from inspect import signature
 from typing import Any, NamedTuple
 
@@ -28,6 +29,9 @@ import basix.ufl
 import ufl
 from dolfinx import fem, geometry, graph, io, la, mesh
 from dolfinx.fem import petsc as fem_petsc
+from ufl.algorithms import expand_derivatives
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.strip_terminal_data import strip_terminal_data
 
 __all__ = [
     "NOT_FINITE",
@@ -37,13 +41,16 @@ __all__ = [
     "are_tags_of",
     "candidate_cells",
     "cell_tree",
+    "cell_vertices",
     "compiled_integrals",
     "create_vector",
     "disconnected_mesh",
     "entity_nodes",
     "equispaced_element",
+    "expanded",
     "geometry_degree",
     "geometry_dofmap",
+    "gmsh_order",
     "input_cell_index",
     "interpolation_points",
     "is_condition_on",
@@ -56,7 +63,7 @@ __all__ = [
     "tabulated",
     "tags_from_nodes",
     "use_basic_line_search",
-    "vtk_order",
+    "vtk_cell",
 ]
 
 _VERSION = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])
@@ -185,9 +192,45 @@ def equispaced_element(cell: basix.CellType, degree: int, gdim: int) -> Any:
     return basix.ufl.element("Lagrange", cell.name, degree, lagrange_variant=variant, shape=(gdim,))
 
 
-def vtk_order(cell: basix.CellType, count: int) -> NDArray[np.int64]:
-    """Return which of a cell's nodes, equispaced, is each of VTK's."""
+#: VTK's types of cells of degree 1, the order of their corners, and the types of Lagrange cells.
+_VTK = {
+    "triangle": (5, [0, 1, 2], 69),
+    "quadrilateral": (9, [0, 1, 3, 2], 70),
+    "tetrahedron": (10, [0, 1, 2, 3], 71),
+    "hexahedron": (12, [0, 1, 3, 2, 4, 5, 7, 6], 72),
+}
+
+
+def vtk_cell(cell: basix.CellType, degree: int, count: int) -> tuple[int, NDArray[np.int64]]:
+    """Return VTK's type of a cell, and which of its nodes, equispaced, is each of VTK's.
+
+    Args:
+        cell: The cell.
+        degree: Its degree.
+        count: Number of its nodes.
+    """
+    straight, corners, curved = _VTK[cell.name]
+    return (straight, np.array(corners)) if degree == 1 else (curved, _vtk_order(cell, count))
+
+
+def _vtk_order(cell: basix.CellType, count: int) -> NDArray[np.int64]:
+    """Return which of a curved cell's nodes, equispaced, is each of VTK's."""
     return np.argsort(dolfinx.cpp.io.perm_vtk(mesh.to_type(cell.name), count))
+
+
+def gmsh_order(cell: basix.CellType, count: int) -> NDArray[np.int64]:
+    """Return which of a cell's nodes, in Gmsh's order, is each of DOLFINx's."""
+    order = dolfinx.cpp.io.perm_gmsh(mesh.to_type(cell.name), count)
+    return np.asarray(order, dtype=np.int64)
+
+
+def cell_vertices(domain: mesh.Mesh, count: int) -> NDArray[np.int64]:
+    """Return the global vertices of the first cells, in the order of the reference cell."""
+    topology = domain.topology
+    corners = len(basix.geometry(domain.basix_cell()))
+    local = topology.connectivity(topology.dim, 0).array[: count * corners]
+    whole = topology.index_map(0).local_to_global(np.asarray(local, dtype=np.int32))
+    return np.asarray(whole, dtype=np.int64).reshape(count, corners)
 
 
 def disconnected_mesh(
@@ -405,12 +448,42 @@ def packed(form: fem.Form) -> tuple[Any, Any]:
     return dolfinx.cpp.fem.pack_constants(own), dolfinx.cpp.fem.pack_coefficients(own)
 
 
+def expanded(integral: Any) -> Any:
+    """Return an integrand with its derivatives carried out.
+
+    UFL's traversals dispatch by ``functools.singledispatchmethod``, which with Python 3.13 keeps
+    for ever what it was used for: all of the form, down to meshes and their communicators. So the
+    integrand is that of an integral without data, and what was kept is dropped.
+    """
+    stripped, _ = strip_terminal_data(integral)
+    result = expand_derivatives(apply_algebra_lowering(stripped.integrand()))
+    for traversal in _traversals():
+        for method in vars(traversal).values():
+            kept = getattr(method, "_method_cache", None)
+            if isinstance(method, singledispatchmethod) and kept is not None:
+                kept.clear()
+    return result
+
+
+def _traversals() -> Iterator[type]:
+    """Yield the classes of UFL's traversals (since 2025.1)."""
+    try:
+        from ufl.corealg.dag_traverser import DAGTraverser
+    except ImportError:
+        return
+    classes: list[type] = [DAGTraverser]
+    while classes:
+        yield classes[-1]
+        classes.extend(classes.pop().__subclasses__())
+
+
 def own_dofs(bc: fem.DirichletBC, V: fem.FunctionSpace) -> NDArray[np.int32]:
     """Return the dofs of V, local numbers, that a condition on V or a part of it has on this rank.
 
-    DOLFINx says where ghosts begin too, but 0.9 takes dofs for blocks there.
+    Each stands there once, sorted, however often the condition names it. DOLFINx says where
+    ghosts begin too, but 0.9 takes dofs for blocks there.
     """
-    dofs = np.asarray(bc.dof_indices()[0])
+    dofs = np.unique(np.asarray(bc.dof_indices()[0]))
     return np.asarray(dofs[dofs < V.dofmap.index_map.size_local * V.dofmap.index_map_bs])
 
 

@@ -5,11 +5,15 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Self, cast
 
 from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
 
 __all__ = [
     "ConvergenceError",
@@ -18,8 +22,10 @@ __all__ = [
     "ParticleOutsideError",
     "agree",
     "agreed",
+    "as_ours",
     "name_particles",
     "on_all_ranks",
+    "warn",
 ]
 
 
@@ -59,6 +65,16 @@ class ParticleOutsideError(MPMError):
 class DomainDistortionError(MPMError):
     """A particle domain is inverted or crosses itself."""
 
+    @classmethod
+    def of(cls, how: str, which: Sequence[int] | NDArray[np.int64]) -> Self | None:
+        """Return an error about particles, if there are any.
+
+        Args:
+            how: What their domains do.
+            which: Their global indices.
+        """
+        return cls(f"The domains of {{particles}} {how}", which) if len(which) else None
+
 
 class ConvergenceError(MPMError):
     """Newton's method, or a constitutive update, did not converge."""
@@ -72,7 +88,7 @@ def name_particles(particles: Sequence[int], most: int = 8) -> str:
     return f"{word} {shown}" + (f" and {rest} more" if rest > 0 else "")
 
 
-def agreed(comm: MPI.Comm, error: MPMError | None) -> MPMError | None:
+def agreed[E: BaseException](comm: MPI.Comm, error: E | None) -> E | None:
     """Return one error for all ranks where any rank has one (collective).
 
     Args:
@@ -80,41 +96,67 @@ def agreed(comm: MPI.Comm, error: MPMError | None) -> MPMError | None:
         error: This rank's error.
 
     Returns:
-        The lowest failing rank's error with the particles of all ranks that have one of its
-        class, or ``None``.
+        The lowest failing rank's error, or ``None``; one of this package has the particles of
+        all ranks that have one of its class.
     """
     if comm.size == 1 or not comm.allreduce(error is not None, MPI.LOR):
         return error
-    errors = [e for e in comm.allgather(error) if e is not None]
-    first: MPMError = errors[0]
-    particles = {p for e in errors if type(e) is type(first) for p in e.particles}
-    return type(first)(first.message, particles, first.load)
+    errors = comm.allgather(None if error is None else _sendable(error))
+    rank = next(r for r, e in enumerate(errors) if e is not None)
+    first = errors[rank]
+    if isinstance(first, MPMError):
+        particles = {p for e in errors if type(e) is type(first) for p in e.particles}
+        common = type(first)(first.message, particles, first.load)
+        if rank == comm.rank and error is not None:
+            common.__cause__ = error.__cause__
+        return cast(E, common)
+    return error if rank == comm.rank else first
 
 
 @contextmanager
-def agree(comm: MPI.Comm) -> Iterator[None]:
+def agree(comm: MPI.Comm, what: str | None = None) -> Iterator[None]:
     """Raise an error of any rank on all ranks, with one sentence and all particles.
 
-    The block must hold no collective call that an error on one rank would skip on that rank
-    alone.
+    It is for what may fail on one rank alone, such as a user's code. The block must hold no
+    collective call that an error on one rank would skip on that rank alone.
 
     Args:
         comm: The ranks that reach this block together (collective).
+        what: What the block does, for a sentence about errors that are not of this package;
+            ``None`` leaves them as they are.
 
     Raises:
         MPMError: What any rank raised inside the block.
+        BaseException: Other errors, as raised; a ``RuntimeError`` instead on ranks to which one
+            cannot be sent.
     """
-    mine: MPMError | None = None
+    mine: BaseException | None = None
     try:
         yield
-    except MPMError as error:
+    except BaseException as error:
         mine = error
+        if what is not None and isinstance(error, Exception):
+            mine = as_ours(error, what)
     common = agreed(comm, mine)
     try:
         if common is not None:
-            raise common from None
+            raise common from common.__cause__
     finally:
         del mine, common  # an error that its own frame holds would keep problems alive
+
+
+def as_ours(error: Exception, what: str) -> MPMError:
+    """Return an error of this package: itself, or a sentence on what failed.
+
+    Args:
+        error: The error.
+        what: What failed.
+    """
+    if isinstance(error, MPMError):
+        return error
+    ours = MPMError(f"{what} failed with {type(error).__name__}: {error}")
+    ours.__cause__ = error
+    return ours
 
 
 def on_all_ranks(comm: MPI.Comm, function: Callable[[float], None]) -> Callable[[float], None]:
@@ -126,26 +168,26 @@ def on_all_ranks(comm: MPI.Comm, function: Callable[[float], None]) -> Callable[
     """
 
     def call(value: float) -> None:
-        mine: Exception | None = None
-        try:
+        with agree(comm):
             function(value)
-        except Exception as error:
-            mine = error
-        try:
-            if comm.size > 1 and comm.allreduce(mine is not None, MPI.LOR):
-                failures = comm.allgather(None if mine is None else _sendable(mine))
-                rank = next(r for r, failure in enumerate(failures) if failure is not None)
-                if rank != comm.rank:
-                    mine = failures[rank]
-            if mine is not None:
-                raise mine
-        finally:
-            del mine  # an error that its own frame holds would keep problems alive
 
     return call
 
 
-def _sendable(error: Exception) -> Exception:
+def warn(comm: MPI.Comm, sentence: str, stacklevel: int = 2) -> None:
+    """Warn the user on rank 0; where that is an error (``-W error``), it is on all (collective).
+
+    Args:
+        comm: The ranks.
+        sentence: The warning.
+        stacklevel: As for ``warnings.warn``, where this function is called.
+    """
+    with agree(comm):
+        if comm.rank == 0:
+            warnings.warn(sentence, stacklevel=stacklevel + 1)
+
+
+def _sendable(error: BaseException) -> BaseException:
     """Return an error that can be sent to other ranks, this one if it can be."""
     try:
         pickle.loads(pickle.dumps(error))

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,7 +12,7 @@ from dataclasses import dataclass, field
 
 from .errors import ParticleOutsideError
 
-__all__ = ["History", "Loss", "Statistics", "Step"]
+__all__ = ["Energy", "History", "Loss", "Statistics", "Step"]
 
 PHASES = ("locate", "transfer", "constitutive", "assemble", "factorise", "solve", "commit")
 COUNTERS = (
@@ -114,12 +115,14 @@ class Step:
         iterations: Linear solves it took.
         residuals: Relative residual before each of Newton's iterations and at the end.
         displacement: The controlled displacement at its end, under displacement control.
+        time: Time at its end: the number of stages before it, and how much of its own is done.
     """
 
     load: float
     iterations: int
     residuals: list[float]
     displacement: float | None = None
+    time: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -141,6 +144,34 @@ class Loss:
     mass: float | None
 
 
+@dataclass(frozen=True)
+class Energy:
+    """Energies of a motion at one time, of all bodies; sums are over the steps up to it.
+
+    :attr:`balance` stays what it was at the beginning, but for the work of Dirichlet values that
+    move and of a ghost penalty, and for stress that deleted particles take away.
+
+    Attributes:
+        time: The time.
+        kinetic: Kinetic energy.
+        internal: Work done against stress, pressures, supports and terms, stored or not.
+        external: Work of body forces and tractions.
+        lost: Kinetic energy that was lost as no motion of the background could follow it, to
+            backward Euler, with deleted particles, and to other meshes of a body.
+    """
+
+    time: float
+    kinetic: float
+    internal: float
+    external: float
+    lost: float
+
+    @property
+    def balance(self) -> float:
+        """What stays: kinetic energy, less work of loads, plus what was stored, used and lost."""
+        return self.kinetic + self.internal - self.external + self.lost
+
+
 @dataclass
 class History:
     """The steps of a run; it grows as the run goes on and stays after an error.
@@ -152,6 +183,7 @@ class History:
         losses: What ``outside="delete"`` has deleted.
         stopped: Why a run with ``outside="stop"`` ended before its whole load, else ``None``.
         statistics: Counters and seconds per phase.
+        energies: Of a :class:`DynamicProblem`, at the beginning and after each step.
     """
 
     steps: list[Step] = field(default_factory=list)
@@ -160,6 +192,7 @@ class History:
     losses: list[Loss] = field(default_factory=list)
     stopped: ParticleOutsideError | None = None
     statistics: Statistics = field(default_factory=Statistics)
+    energies: list[Energy] = field(default_factory=list)
 
     @property
     def iterations(self) -> list[int]:
@@ -173,11 +206,18 @@ class History:
 
     @property
     def time(self) -> float:
-        """What orders the states of a run: the last load, or the number of a controlled step."""
-        if not self.steps:
-            return 0.0
-        last = self.steps[-1]
-        return last.load if last.displacement is None else float(len(self.steps))
+        """Time of the last converged step, which increases from step to step; 0 before the first.
+
+        It is the number of stages before it, and how much of its own is done, from 0 to 1. Each
+        call of ``solve``, ``steps`` or ``step`` is a stage, but where it goes on with a run from a
+        checkpoint. Of a :class:`DynamicProblem` it is the physical time.
+        """
+        return self.steps[-1].time if self.steps else 0.0
+
+    @property
+    def stage(self) -> float:
+        """Number of the stages so far, those that ended early too: the time when one begins."""
+        return float(math.ceil(self.time))
 
     @property
     def total_iterations(self) -> int:

@@ -21,19 +21,10 @@ from dolfinx import fem, mesh
 
 from . import _compat
 from .errors import MPMError, agree
-from .particles import Particles
+from .particles.particles import Particles
 
 __all__ = ["background", "domains", "grid"]
 
-#: VTK's cell types, and its order of the corners of DOLFINx's cells.
-VTK_CELLS = {
-    "triangle": (5, [0, 1, 2]),
-    "quadrilateral": (9, [0, 1, 3, 2]),
-    "tetrahedron": (10, [0, 1, 2, 3]),
-    "hexahedron": (12, [0, 1, 3, 2, 4, 5, 7, 6]),
-}
-#: VTK's Lagrange cells.
-VTK_CURVED = {"triangle": 69, "quadrilateral": 70, "tetrahedron": 71, "hexahedron": 72}
 #: Straight pieces that an edge is drawn with where it is curved.
 PIECES = 8
 
@@ -53,6 +44,9 @@ def domains(
     **options: Any,
 ) -> Any:
     """Draw the domains of particles in the plane at their current positions (collective).
+
+    They are those of ``particles.displacement``, as the particles' values are: the last converged
+    step's, or what has been written into it.
 
     Args:
         particles: The body.
@@ -134,7 +128,7 @@ def background(
     _require_plane(grid_mesh)
     collections = _imported("matplotlib.collections", comm)
     own = grid_mesh.topology.index_map(grid_mesh.topology.dim).size_local
-    corners = VTK_CELLS[grid_mesh.basix_cell().name][1]
+    _, corners = _compat.vtk_cell(grid_mesh.basix_cell(), 1, 0)
     nodes = _compat.geometry_dofmap(grid_mesh)[:own, corners]
     cells = comm.gather(grid_mesh.geometry.x[nodes, :2])
     if cells is None:
@@ -166,7 +160,11 @@ def grid(particles: Particles) -> Any:
     """
     comm: MPI.Comm = particles.mesh.comm
     pyvista = _imported("pyvista", comm)
-    cell_type, nodes = _vtk_cell(particles)
+    cell_type, nodes = _compat.vtk_cell(
+        particles.mesh.basix_cell(),
+        particles.W.ufl_element().degree,
+        particles.domain_nodes.shape[1],
+    )
     gdim = particles.mesh.geometry.dim
     data: dict[str, NDArray[Any]] = {
         "particle": particles.global_index,
@@ -193,18 +191,10 @@ def grid(particles: Particles) -> Any:
     return result
 
 
-def _vtk_cell(particles: Particles) -> tuple[int, Any]:
-    """Return VTK's type of the domains, and which of their nodes it wants in turn."""
-    cell = particles.mesh.basix_cell()
-    if particles.W.ufl_element().degree == 1:
-        return VTK_CELLS[cell.name]
-    return VTK_CURVED[cell.name], _compat.vtk_order(cell, particles.domain_nodes.shape[1])
-
-
 def _outlines(particles: Particles, warp: float) -> NDArray[np.float64]:
     """Return the boundaries of the owned domains as polygons, shape ``(n, m, 2)``."""
     cell = particles.mesh.basix_cell()
-    corners = basix.geometry(cell)[VTK_CELLS[cell.name][1]]
+    corners = basix.geometry(cell)[_compat.vtk_cell(cell, 1, 0)[1]]
     shape_functions = particles.W.ufl_element().basix_element
     pieces = 1 if shape_functions.degree == 1 else PIECES
     share = np.arange(pieces)[:, None] / pieces

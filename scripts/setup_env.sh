@@ -5,8 +5,8 @@
 # usage: setup_env.sh EXTRA...
 #
 # Make the environment $VENV (default .venv) where it is missing, and install this package in
-# it, editable, with the extras named. What was installed for which pyproject.toml and compiled
-# sources is noted in $VENV/.mpm-dolfinx, after it has succeeded, so that a second call has
+# it, editable, with the extras named. What was installed for which pyproject.toml, modules and
+# compiled sources is noted in $VENV/.mpm-dolfinx, after it has succeeded, so that a second call has
 # nothing to do.
 set -eu
 
@@ -53,7 +53,12 @@ py=$venv/bin/python
 "$py" -c 'import sys; sys.exit(sys.version_info < (3, 12))' 2>/dev/null </dev/null ||
     fail "The Python of $venv does not run or is older than 3.12: remove $venv, or name another environment with VENV=."
 
-key="$root $(cat pyproject.toml CMakeLists.txt mpm_dolfinx/_core/*.cpp mpm_dolfinx/_core/*.h | cksum)"
+# The editable installation knows the package's files by name.
+modules=$(find mpm_dolfinx -name '*.py' | LC_ALL=C sort)
+key="$root $({
+    echo "$modules"
+    cat pyproject.toml CMakeLists.txt mpm_dolfinx/_core/*.cpp mpm_dolfinx/_core/*.h
+} | cksum)"
 installed=$state/installed
 if [ "$(sed -n 1p "$installed" 2>/dev/null)" = "$key" ]; then
     missing=

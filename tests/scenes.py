@@ -14,6 +14,8 @@ import ufl
 from dolfinx import fem, la, mesh
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx import _compat
+from mpm_dolfinx.materials import LinearElastic
 
 WORLD = MPI.COMM_WORLD
 TRIANGLE, QUADRILATERAL = mesh.CellType.triangle, mesh.CellType.quadrilateral
@@ -374,3 +376,46 @@ def block(material=None, cell=TRIANGLE, n=4, comm=WORLD, force=(0.0, -10.0), **o
         body_force=force,
         **options,
     )
+
+
+def times_tangent(problem, values):
+    """Return the tangent of the last residual times a vector on W, at this rank's own dofs."""
+    forms = problem.body_terms[0].forms
+    if forms.stock:
+        forms.assemble_tangent()
+    vector = forms.r.duplicate()
+    vector.array_w[:] = values.ravel()[: vector.getLocalSize()]
+    return forms.stiffness_force(vector).array_r.copy()
+
+
+def top(problem):
+    """Return the height of the highest node."""
+    return node_positions(problem.particles)[:, 1].max()
+
+
+def falling(depth=1.0, outside="delete", method="cpdi2", density=3.0, cell=QUADRILATERAL):
+    """Return a unit block, 0.5 above the end of the background, moved down as a whole."""
+    V = vectors(box([-0.5, -0.5], [1.5, 1.5], [4, 4], QUADRILATERAL))
+    bc, u = everywhere(V)
+    u.x.array.reshape(-1, 2)[:] = [0.0, -depth]
+    particles = mpm.Particles(unit(4, cell), V, method=method, outside=outside)
+    return mpm.QuasiStaticProblem(particles, LinearElastic(1e4, 0.3), density=density, bcs=[bc])
+
+
+def anywhere(body, seed=1):
+    """Return a rank for each cell, by its input index."""
+    cells = body.topology.index_map(body.topology.dim)
+    every = np.random.default_rng(seed).integers(0, WORLD.size, cells.size_global)
+    return every[_compat.input_cell_index(body)]
+
+
+def pulled(material, end=0.4, **options):
+    """Return a block that is pulled at its right side, where the background ends."""
+    V = vectors(box([0.0, -0.5], [2.0, 1.5], [8, 8], QUADRILATERAL))
+    body = box([0.0, 0.0], [1.0, 1.0], [4, 4], TRIANGLE)
+    nodes = V.tabulate_dof_coordinates()
+    grip = np.flatnonzero(nodes[:, 0] > 0.99).astype(np.int32)
+    value = fem.Constant(V.mesh, np.array([end, 0.0]))
+    bcs = [fix(V, at(0, 0.0)), fem.dirichletbc(value, grip, V)]
+    problem = mpm.QuasiStaticProblem(mpm.Particles(body, V), material, bcs=bcs, **options)
+    return problem, value

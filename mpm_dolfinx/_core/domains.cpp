@@ -59,6 +59,48 @@ inline void add_block(const double* left, const double* gradient, double* block,
     }
 }
 
+// The blocks of a tangent (3, 3, 3, 3) of a body of revolution: in the plane, and with the hoop.
+struct Revolution
+{
+  double plane[16], plane_hoop[4], hoop_plane[4], hoop;
+
+  explicit Revolution(const double* A)
+  {
+    for (int i = 0; i < 2; ++i)
+      for (int J = 0; J < 2; ++J)
+      {
+        const double* row = A + (i * 3 + J) * 9;
+        for (int k = 0; k < 2; ++k)
+          for (int L = 0; L < 2; ++L)
+            plane[((i * 2 + J) * 2 + k) * 2 + L] = row[k * 3 + L];
+        plane_hoop[i * 2 + J] = row[8];
+        hoop_plane[i * 2 + J] = A[8 * 9 + i * 3 + J];
+      }
+    hoop = A[80];
+  }
+
+  // Add what hoop strains have to the tangent K of a domain at one point.
+  void add(const double* gradients, const double* h, double weight, int nodes, double* K) const
+  {
+    const int width = 2 * nodes;
+    for (int c = 0; c < nodes; ++c)
+      for (int e = 0; e < nodes; ++e)
+        for (int i = 0; i < 2; ++i)
+        {
+          double left = 0.0, right = 0.0;
+          for (int J = 0; J < 2; ++J)
+          {
+            left += gradients[c * 2 + J] * plane_hoop[i * 2 + J];
+            right += hoop_plane[i * 2 + J] * gradients[e * 2 + J];
+          }
+          K[(2 * c + i) * width + 2 * e] += weight * left * h[e];
+          K[2 * c * width + 2 * e + i] += weight * h[c] * right;
+          if (i == 0)
+            K[2 * c * width + 2 * e] += weight * h[c] * hoop * h[e];
+        }
+  }
+};
+
 // Room for the products of one domain.
 struct Work
 {
@@ -154,6 +196,7 @@ void core::internal_force(const Domains& domains, const double* P, double* force
 {
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
+    const int strain = domains.strain();
     for (std::size_t p = 0; p < domains.count; ++p)
     {
       const std::int32_t* nodes = domains.dofmap + p * domains.nodes;
@@ -161,12 +204,15 @@ void core::internal_force(const Domains& domains, const double* P, double* force
       {
         const std::size_t point = p * domains.points + q;
         const double* gradients = domains.gradients + point * domains.nodes * dim;
+        const double* stress = P + point * strain * strain;
         for (int c = 0; c < domains.nodes; ++c)
           for (int i = 0; i < dim; ++i)
           {
             double sum = 0.0;
             for (int J = 0; J < dim; ++J)
-              sum += P[(point * dim + i) * dim + J] * gradients[c * dim + J];
+              sum += stress[i * strain + J] * gradients[c * dim + J];
+            if (domains.hoop != nullptr && i == 0)
+              sum += stress[8] * domains.hoop[point * domains.nodes + c];
             force[nodes[c] * dim + i] += domains.weights[point] * sum;
           }
       }
@@ -285,13 +331,24 @@ HOT_LOOP void core::assemble_domains(const Domains& domains, const double* trans
       {
         const std::size_t point = p * domains.points + q;
         const double* gradients = domains.gradients + point * domains.nodes * dim;
-        double left[dim * block];
-        for (int c = 0; c < domains.nodes; ++c)
+        const auto add = [&](const double* tangent) {
+          double left[dim * block];
+          for (int c = 0; c < domains.nodes; ++c)
+          {
+            contract<dim>(tangent, gradients + c * dim, domains.weights[point], left);
+            for (int e = 0; e < domains.nodes; ++e)
+              add_block<dim>(left, gradients + e * dim, K.data() + c * dim * width + e * dim,
+                             width);
+          }
+        };
+        if (domains.hoop == nullptr)
+          add(A + point * block * block);
+        else if constexpr (dim == 2)
         {
-          contract<dim>(A + point * block * block, gradients + c * dim, domains.weights[point],
-                        left);
-          for (int e = 0; e < domains.nodes; ++e)
-            add_block<dim>(left, gradients + e * dim, K.data() + c * dim * width + e * dim, width);
+          const Revolution parts(A + point * 81);
+          add(parts.plane);
+          parts.add(gradients, domains.hoop + point * domains.nodes, domains.weights[point],
+                    domains.nodes, K.data());
         }
       }
       if (vectors != nullptr)

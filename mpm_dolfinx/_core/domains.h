@@ -17,6 +17,12 @@ struct Domains
   const std::int32_t* dofmap; // (count, nodes)
   const double* gradients;    // (count, points, nodes, dim)
   const double* weights;      // (count, points)
+  // Of a body of revolution N / r, (count, points, nodes): stresses are 3 x 3 then, and the
+  // displacement in direction 0 strains (2, 2) by it. Otherwise null.
+  const double* hoop = nullptr;
+
+  // Dimension of stress and strain.
+  int strain() const { return hoop == nullptr ? dim : 3; }
 };
 
 // H = grad u at the points, (count, points, dim, dim), of u at the nodes.

@@ -1,22 +1,27 @@
 // Copyright (C) 2026 the mpm-dolfinx authors
 // SPDX-License-Identifier: LGPL-3.0-or-later
 //
-// Hencky elasticity and von Mises plasticity in logarithmic strain, point by point.
+// Hencky elasticity and laws of plasticity in logarithmic strain, point by point.
 //
-// The same algorithm as mpm_dolfinx.materials (kinematics, von_mises), which is its oracle. The
-// law is isotropic, so stress and strain share the axes of the trial elastic b, and its tangent
-// has 8 (plane) or 21 (space) entries other than zero in that frame.
+// The same algorithms as mpm_dolfinx.materials (kinematics, von_mises, mohr_coulomb,
+// drucker_prager, cam_clay), which are their oracles. All are isotropic, so stress and strain share the axes
+// of the trial elastic b, and tangents have 8 (plane) or 21 (space) entries other than zero in that
+// frame.
 
 #include "material.h"
 #include "hot_loop.h"
 
+#include <algorithm>
 #include <array>
 #include <cmath>
+#include <initializer_list>
 #include <limits>
+#include <utility>
 #include <vector>
 
 namespace
 {
+constexpr double root_two = 1.41421356237309504880;
 constexpr double root_half = 0.70710678118654752440;
 constexpr double root_two_thirds = 0.81649658092772603273;
 
@@ -153,70 +158,567 @@ Matrix<dim> from_principal(const std::array<double, 3>& values, const Matrix<dim
   return tensor;
 }
 
-struct Parameters
-{
-  double bulk, shear, rho_y, hardening;
-};
-
-// Answer of the law in the principal frame; the shear response is that of all off-diagonal
-// entries, `normal` that of the principal strains.
+// Answer of the law in the principal frame: `normal` holds the derivatives of the stresses by the
+// strains, `shear` the quotients of their differences.
 struct Response
 {
   std::array<double, 3> stress, elastic_strain;
-  double plastic_strain;
+  std::array<double, core::max_variables> variables;
   bool plastic;
-  double shear;
+  double shear[3][3];
   double normal[3][3];
 };
 
-// Radial return (Wilkins 1964) with the consistent tangent of Simo & Taylor (1985).
-Response integrate(const std::array<double, 3>& strain, double plastic_strain,
-                   const Parameters& parameters, double tolerance)
+// Hencky's law as the answer to a strain: what an elastic step gives.
+void answer_elastic(const std::array<double, 3>& strain, double bulk, double shear, Response& r)
 {
-  const auto [bulk, shear, rho_y, h] = parameters;
-  const double trace = strain[0] + strain[1] + strain[2];
-  std::array<double, 3> deviator;
-  double size = 0.0;
-  for (int a = 0; a < 3; ++a)
-  {
-    deviator[a] = strain[a] - trace / 3.0;
-    size += deviator[a] * deviator[a];
-  }
-  size = std::sqrt(size);
-  const double rho = rho_y + root_two_thirds * h * plastic_strain;
-  Response r;
-  r.plastic = 2.0 * shear * size / rho - 1.0 > tolerance;
-  r.plastic_strain = plastic_strain;
+  const double lame = bulk - 2.0 / 3.0 * shear, sum = lame * (strain[0] + strain[1] + strain[2]);
+  r.plastic = false;
   r.elastic_strain = strain;
-  r.shear = 2.0 * shear;
-  double along = 0.0;
-  if (r.plastic)
-  {
-    const double slope = 2.0 / 3.0 * h;
-    const double flow = (2.0 * shear * size - rho) / (2.0 * shear + slope);
-    const double strength = rho + slope * flow;
-    r.shear = strength / size;
-    along = 2.0 * shear * slope / (2.0 * shear + slope) - r.shear;
-    for (int a = 0; a < 3; ++a)
-    {
-      const double direction = deviator[a] / size;
-      r.stress[a] = bulk * trace + strength * direction;
-      r.elastic_strain[a] -= flow * direction;
-    }
-    r.plastic_strain += root_two_thirds * flow;
-  }
-  else
-    for (int a = 0; a < 3; ++a)
-      r.stress[a] = bulk * trace + 2.0 * shear * deviator[a];
   for (int a = 0; a < 3; ++a)
+  {
+    r.stress[a] = sum + 2.0 * shear * strain[a];
     for (int b = 0; b < 3; ++b)
     {
-      r.normal[a][b] = bulk - r.shear / 3.0 + (a == b ? r.shear : 0.0);
-      if (r.plastic)
-        r.normal[a][b] += along * (deviator[a] / size) * (deviator[b] / size);
+      r.normal[a][b] = lame + (a == b ? 2.0 * shear : 0.0);
+      r.shear[a][b] = 2.0 * shear;
     }
-  return r;
+  }
 }
+
+double norm_of_difference(const std::array<double, 3>& x, const std::array<double, 3>& y)
+{
+  const double a = x[0] - y[0], b = x[1] - y[1], c = x[2] - y[2];
+  return std::sqrt(a * a + b * b + c * c);
+}
+
+struct Hencky
+{
+  double bulk, shear;
+  explicit Hencky(const double* p) : bulk(p[0]), shear(p[1]) {}
+
+  void operator()(const std::array<double, 3>& strain, double, Response& r) const
+  {
+    answer_elastic(strain, bulk, shear, r);
+  }
+};
+
+// Radial return (Wilkins 1964) with the consistent tangent of Simo & Taylor (1985).
+struct VonMises
+{
+  double bulk, shear, rho_y, h;
+  explicit VonMises(const double* p) : bulk(p[0]), shear(p[1]), rho_y(p[2]), h(p[3]) {}
+
+  void operator()(const std::array<double, 3>& strain, double tolerance, Response& r) const
+  {
+    const double plastic_strain = r.variables[0];
+    const double trace = strain[0] + strain[1] + strain[2];
+    std::array<double, 3> deviator;
+    double size = 0.0;
+    for (int a = 0; a < 3; ++a)
+    {
+      deviator[a] = strain[a] - trace / 3.0;
+      size += deviator[a] * deviator[a];
+    }
+    size = std::sqrt(size);
+    const double rho = rho_y + root_two_thirds * h * plastic_strain;
+    r.plastic = 2.0 * shear * size / rho - 1.0 > tolerance;
+    r.elastic_strain = strain;
+    double along = 0.0, secant = 2.0 * shear;
+    if (r.plastic)
+    {
+      const double slope = 2.0 / 3.0 * h;
+      const double flow = (2.0 * shear * size - rho) / (2.0 * shear + slope);
+      const double strength = rho + slope * flow;
+      secant = strength / size;
+      along = 2.0 * shear * slope / (2.0 * shear + slope) - secant;
+      for (int a = 0; a < 3; ++a)
+      {
+        const double direction = deviator[a] / size;
+        r.stress[a] = bulk * trace + strength * direction;
+        r.elastic_strain[a] -= flow * direction;
+      }
+      r.variables[0] += root_two_thirds * flow;
+    }
+    else
+      for (int a = 0; a < 3; ++a)
+        r.stress[a] = bulk * trace + 2.0 * shear * deviator[a];
+    for (int a = 0; a < 3; ++a)
+      for (int b = 0; b < 3; ++b)
+      {
+        r.shear[a][b] = secant;
+        r.normal[a][b] = bulk - secant / 3.0 + (a == b ? secant : 0.0);
+        if (r.plastic)
+          r.normal[a][b] += along * (deviator[a] / size) * (deviator[b] / size);
+      }
+  }
+};
+
+// Principal values in descending order; see mpm_dolfinx.materials.mohr_coulomb.
+struct MohrCoulomb
+{
+  double bulk, shear, friction, dilation, strength, tension, lame;
+  explicit MohrCoulomb(const double* p)
+      : bulk(p[0]), shear(p[1]), friction(p[2]), dilation(p[3]), strength(p[4]), tension(p[5]),
+        lame(p[0] - 2.0 / 3.0 * p[1])
+  {
+  }
+
+  using Vector = std::array<double, 3>;
+
+  struct Answer
+  {
+    Vector stress, elastic;
+    double normal[3][3];
+  };
+
+  Vector stress_of(const Vector& e) const
+  {
+    const double sum = lame * (e[0] + e[1] + e[2]);
+    return {sum + 2.0 * shear * e[0], sum + 2.0 * shear * e[1], sum + 2.0 * shear * e[2]};
+  }
+
+  enum Where
+  {
+    plane,
+    compression,
+    extension
+  };
+
+  // The average over the two equal values of an edge.
+  static Vector averaged(Where where, const Vector& x)
+  {
+    if (where == compression)
+      return {0.5 * (x[0] + x[1]), 0.5 * (x[0] + x[1]), x[2]};
+    if (where == extension)
+      return {x[0], 0.5 * (x[1] + x[2]), 0.5 * (x[1] + x[2])};
+    return x;
+  }
+
+  // Return to the plane or an edge, as if these went on for ever.
+  Vector along(Where where, const Vector& strain, Answer* answer) const
+  {
+    const Vector yield = averaged(where, {1.0 + friction, 0.0, friction - 1.0});
+    const Vector flow = averaged(where, {1.0 + dilation, 0.0, dilation - 1.0});
+    const Vector e = averaged(where, strain);
+    const Vector push = stress_of(flow), trial = stress_of(e);
+    const double curvature = yield[0] * push[0] + yield[1] * push[1] + yield[2] * push[2];
+    const double f = yield[0] * trial[0] + yield[1] * trial[1] + yield[2] * trial[2] - strength;
+    const double multiplier = f / curvature;
+    Vector elastic;
+    for (int a = 0; a < 3; ++a)
+      elastic[a] = e[a] - multiplier * flow[a];
+    if (answer != nullptr)
+    {
+      const Vector pull = stress_of(yield);
+      answer->elastic = elastic;
+      answer->stress = stress_of(elastic);
+      for (int a = 0; a < 3; ++a)
+      {
+        Vector unit{};
+        unit[a] = 1.0;
+        unit = averaged(where, unit);
+        for (int b = 0; b < 3; ++b)
+          answer->normal[a][b] = lame + 2.0 * shear * unit[b] - push[a] * pull[b] / curvature;
+      }
+    }
+    return elastic;
+  }
+
+  // The answer with some stresses given and no plastic strain along the other axes.
+  Answer at_stress(const Vector& strain, const std::array<bool, 3>& given,
+                   const Vector& values) const
+  {
+    const double unit = 2.0 * shear;
+    const int count = given[0] + given[1] + given[2];
+    const double slope = 1.0 / (1.0 + count * lame / unit);
+    double trace = 0.0;
+    for (int a = 0; a < 3; ++a)
+      trace += given[a] ? values[a] / unit : strain[a];
+    trace *= slope;
+    Answer answer;
+    for (int a = 0; a < 3; ++a)
+    {
+      answer.elastic[a] = given[a] ? (values[a] - lame * trace) / unit : strain[a];
+      answer.stress[a] = given[a] ? values[a] : lame * trace + unit * strain[a];
+      for (int b = 0; b < 3; ++b)
+        answer.normal[a][b]
+            = given[a] || given[b] ? 0.0 : lame * slope + (a == b ? unit : 0.0);
+    }
+    return answer;
+  }
+
+  static double largest(std::initializer_list<double> values)
+  {
+    double result = -std::numeric_limits<double>::infinity();
+    for (double value : values)
+      result = value > result ? value : result;
+    return result;
+  }
+
+  // Return to the cut-off, its edges and corners: what fits best, or fits.
+  Answer tensile(const Vector& strain) const
+  {
+    const double t = tension, unit = 2.0 * shear;
+    const double least = ((1.0 + friction) * t - strength) / (1.0 - friction);
+    const double ratio = (1.0 + dilation) / (1.0 - dilation);
+    double best = std::numeric_limits<double>::infinity();
+    Answer answer{};
+    auto compare = [&](const std::array<bool, 3>& given, const Vector& values, int number) {
+      const Answer candidate = at_stress(strain, given, values);
+      const Vector& s = candidate.stress;
+      Vector p;
+      for (int a = 0; a < 3; ++a)
+        p[a] = strain[a] - candidate.elastic[a];
+      double misfit = 0.0;
+      switch (number)
+      {
+      case 0:
+        misfit = largest({-p[0], (s[1] - t) / unit, (least - s[2]) / unit});
+        break;
+      case 1:
+        misfit = largest({-p[0], -p[1], (s[2] - t) / unit, (least - s[2]) / unit});
+        break;
+      case 2:
+        misfit = largest({-p[0], -p[1], -p[2]});
+        break;
+      case 3:
+        misfit = largest(
+            {p[2], -ratio * p[2] - p[0], (s[1] - t) / unit, (least - s[1]) / unit});
+        break;
+      case 4:
+        misfit = largest({p[2], -p[0], -p[1], -ratio * p[2] - p[0] - p[1]});
+        break;
+      default:
+        misfit = largest({p[1], p[2], -ratio * (p[1] + p[2]) - p[0]});
+      }
+      if (misfit < best)
+      {
+        best = misfit;
+        answer = candidate;
+      }
+    };
+    compare({true, false, false}, {t, t, t}, 0);
+    compare({true, true, false}, {t, t, t}, 1);
+    compare({true, true, true}, {t, t, t}, 2);
+    compare({true, false, true}, {t, t, least}, 3);
+    compare({true, true, true}, {t, t, least}, 4);
+    compare({true, true, true}, {t, least, least}, 5);
+    return answer;
+  }
+
+  // Return to the pyramid without cut-off.
+  void pyramid(const Vector& strain, double apex, Answer& answer) const
+  {
+    const Vector e = along(plane, strain, nullptr);
+    const bool low = e[0] < e[1], high = e[1] < e[2];
+    if (!low && !high)
+    {
+      along(plane, strain, &answer);
+      return;
+    }
+    for (const Where edge : {compression, extension})
+      if (edge == compression ? low : high)
+      {
+        const Vector there = along(edge, strain, nullptr);
+        if (there[0] >= there[2])
+        {
+          along(edge, strain, &answer);
+          return;
+        }
+      }
+    answer = at_stress(strain, {true, true, true}, {apex, apex, apex});
+  }
+
+  void operator()(const Vector& unsorted, double tolerance, Response& r) const
+  {
+    int order[3] = {0, 1, 2};
+    auto swap = [&](int i, int j) {
+      if (unsorted[order[i]] < unsorted[order[j]])
+        std::swap(order[i], order[j]);
+    };
+    swap(0, 1);
+    swap(1, 2);
+    swap(0, 1);
+    const Vector strain = {unsorted[order[0]], unsorted[order[1]], unsorted[order[2]]};
+    Answer answer;
+    answer.stress = stress_of(strain);
+    const double pull = (1.0 + friction) * answer.stress[0];
+    const double push = (1.0 - friction) * answer.stress[2];
+    const double room = tolerance * (std::abs(pull) + std::abs(push) + strength);
+    const bool shears = pull - push - strength > room;
+    const double apex = strength / (2.0 * friction);
+    if (shears)
+      pyramid(strain, apex, answer);
+    // The cut-off lies beyond the apex where it is larger.
+    if (answer.stress[0] - tension > room && !(tension >= apex))
+      answer = tensile(strain);
+    else if (!shears)
+    {
+      answer_elastic(unsorted, bulk, shear, r);
+      return;
+    }
+    r.plastic = true;
+    r.variables[0] += root_two_thirds * norm_of_difference(strain, answer.elastic);
+    const double near
+        = 1e-12 * std::max(std::max(std::abs(strain[0]), std::abs(strain[1])), std::abs(strain[2]));
+    for (int a = 0; a < 3; ++a)
+    {
+      r.stress[order[a]] = answer.stress[a];
+      r.elastic_strain[order[a]] = answer.elastic[a];
+      for (int b = 0; b < 3; ++b)
+        r.normal[order[a]][order[b]] = answer.normal[a][b];
+      for (int b = a + 1; b < 3; ++b)
+      {
+        const double difference = strain[a] - strain[b];
+        double quotient;
+        if (difference <= near)
+          quotient = 0.5
+                     * (answer.normal[a][a] - answer.normal[a][b] - answer.normal[b][a]
+                        + answer.normal[b][b]);
+        else
+          quotient = 2.0 * shear * ((answer.elastic[a] - answer.elastic[b]) / difference);
+        quotient = std::min(std::max(quotient, 0.0), 2.0 * shear);
+        r.shear[order[a]][order[b]] = r.shear[order[b]][order[a]] = quotient;
+      }
+    }
+  }
+};
+
+// The cone, or the cap at the largest mean stress; see mpm_dolfinx.materials.drucker_prager.
+struct DruckerPrager
+{
+  double bulk, shear, eta, flow, strength, top;
+  explicit DruckerPrager(const double* p)
+      : bulk(p[0]), shear(p[1]), eta(p[2]), flow(p[3]), strength(p[4]), top(p[5])
+  {
+  }
+
+  void operator()(const std::array<double, 3>& strain, double tolerance, Response& r) const
+  {
+    const double trace = strain[0] + strain[1] + strain[2], mean = bulk * trace;
+    std::array<double, 3> deviator;
+    double size = 0.0;
+    for (int a = 0; a < 3; ++a)
+    {
+      deviator[a] = strain[a] - trace / 3.0;
+      size += deviator[a] * deviator[a];
+    }
+    size = std::sqrt(size);
+    const double root = root_two * shear * size;
+    const double room = tolerance * (root + std::abs(mean) + strength);
+    const double f = root + eta * mean - strength;
+    if (!(f > room || mean - top > room))
+    {
+      answer_elastic(strain, bulk, shear, r);
+      return;
+    }
+    const double stiffness = shear + bulk * eta * flow;
+    const double multiplier = f > 0.0 ? f / stiffness : 0.0;
+    double p = mean - bulk * flow * multiplier, q = root - shear * multiplier;
+    // Derivatives of p and q by the trace and the size of the deviator.
+    double p_trace = 0.0, q_size = 0.0, p_size = 0.0, q_trace = 0.0;
+    if (p > top)
+    {
+      const double limit = std::max(strength - eta * top, 0.0);
+      p = top;
+      q_size = root < limit ? root_two * shear : 0.0;
+      q = std::min(root, limit);
+    }
+    else
+    {
+      p_trace = bulk * (1.0 - bulk * eta * flow / stiffness);
+      q_size = root_two * shear * (1.0 - shear / stiffness);
+      p_size = -root_two * shear * bulk * flow / stiffness;
+      q_trace = -shear * bulk * eta / stiffness;
+    }
+    const double ratio = root > 0.0 ? q / root : 0.0, secant = 2.0 * shear * ratio;
+    const double along = root_two * q_size - secant;
+    std::array<double, 3> direction;
+    r.plastic = true;
+    for (int a = 0; a < 3; ++a)
+    {
+      direction[a] = size > 0.0 ? deviator[a] / size : 0.0;
+      r.stress[a] = p + secant * deviator[a];
+      r.elastic_strain[a] = ratio * deviator[a] + p / (3.0 * bulk);
+    }
+    r.variables[0] += root_two_thirds * norm_of_difference(strain, r.elastic_strain);
+    for (int a = 0; a < 3; ++a)
+      for (int b = 0; b < 3; ++b)
+      {
+        r.shear[a][b] = secant;
+        r.normal[a][b] = secant * ((a == b ? 1.0 : 0.0) - 1.0 / 3.0)
+                         + along * direction[a] * direction[b] + p_trace + p_size * direction[b]
+                         + root_two * q_trace * direction[a];
+      }
+  }
+};
+
+// Two equations for the elastic strain of volume x and the multiplier y, with stresses over the old
+// p_c; see mpm_dolfinx.materials.cam_clay.
+struct CamClay
+{
+  double plastic, swelling, ratio, modulus, pressure;
+  explicit CamClay(const double* p)
+      : plastic(p[0] - p[1]), swelling(p[1]), ratio(p[2]), modulus(p[3]), pressure(p[4])
+  {
+  }
+
+  struct Point
+  {
+    double plastic, swelling, ratio, shear, reference, softness, volume, shape;
+
+    struct Values
+    {
+      double p, p_c, left, q, flow, f;
+    };
+
+    // q is that of the ellipse, over M.
+    Values at(double x, double y) const
+    {
+      Values v;
+      v.p = reference * std::exp(x / swelling);
+      v.p_c = std::exp((volume - x) / plastic);
+      v.left = 1.0 + softness * y;
+      v.q = 3.0 * shear * shape / v.left / ratio;
+      v.flow = x - volume + y * (2.0 * v.p - v.p_c);
+      v.f = v.q * v.q + v.p * (v.p - v.p_c);
+      return v;
+    }
+
+    // Derivatives of the residuals: flow by x, by y, yield by x, by y.
+    std::array<double, 4> jacobian(const Values& v, double y) const
+    {
+      const double slope = v.p / swelling, hardening = v.p_c / plastic;
+      return {1.0 + y * (2.0 * slope + hardening), 2.0 * v.p - v.p_c,
+              (2.0 * v.p - v.p_c) * slope + v.p * hardening,
+              -2.0 * v.q * v.q * softness / v.left};
+    }
+
+    double volume_at(double y, double low, double high) const
+    {
+      for (int k = 0; k < halvings; ++k)
+      {
+        const double middle = 0.5 * (low + high);
+        (at(middle, y).flow > 0.0 ? high : low) = middle;
+      }
+      return 0.5 * (low + high);
+    }
+
+    void search(double& x, double& y, double low, double high) const
+    {
+      double largest = 1.0, least = 0.0;
+      for (int k = 0; k < halvings; ++k)
+        if (at(volume_at(largest, low, high), largest).f > 0.0)
+          largest *= 4.0;
+        else
+          break;
+      for (int k = 0; k < halvings; ++k)
+      {
+        const double middle = 0.5 * (least + largest);
+        (at(volume_at(middle, low, high), middle).f > 0.0 ? least : largest) = middle;
+      }
+      y = largest;
+      x = volume_at(y, low, high);
+    }
+
+    // From the trial state to the solution.
+    void solve(double& x, double& y, Values& v) const
+    {
+      const double rates = 1.0 / swelling + 1.0 / plastic;
+      const double critical = (volume / plastic - std::log(2.0 * reference)) / rates;
+      const double low = std::min(volume, critical), high = std::max(volume, critical);
+      bool done = false;
+      auto step = [&](double& dx, double& dy) {
+        const auto [a, b, c, d] = jacobian(v, y);
+        const double det = a * d - b * c;
+        dx = -(d * v.flow - b * v.f) / det;
+        dy = -(a * v.f - c * v.flow) / det;
+      };
+      double dx, dy;
+      for (int k = 0; k < steps && !done; ++k)
+      {
+        step(dx, dy);
+        x = std::min(std::max(x + dx, low), high);
+        y = std::max(y + dy, 0.0);
+        v = at(x, y);
+        const double size = v.p + v.p_c;
+        done = std::abs(v.flow) <= nearly * swelling && std::abs(v.f) <= nearly * size * size
+               && y > 0.0;
+      }
+      if (!done)
+      {
+        search(x, y, low, high);
+        v = at(x, y);
+      }
+      step(dx, dy);
+      if (std::isfinite(dx) && std::isfinite(dy))
+      {
+        x += dx;
+        y += dy;
+        v = at(x, y);
+      }
+    }
+  };
+
+  static constexpr double nearly = 1e-9;
+  static constexpr int steps = 40, halvings = 80;
+
+  void operator()(const std::array<double, 3>& strain, double tolerance, Response& r) const
+  {
+    const double p_c = r.variables[1], trace = strain[0] + strain[1] + strain[2];
+    std::array<double, 3> deviator, direction;
+    double size = 0.0;
+    for (int a = 0; a < 3; ++a)
+    {
+      deviator[a] = strain[a] - trace / 3.0;
+      size += deviator[a] * deviator[a];
+    }
+    size = std::sqrt(size);
+    const double shear = modulus / p_c;
+    const Point point{plastic, swelling, ratio,  shear, pressure / p_c, 6.0 * shear / (ratio * ratio),
+                      -trace,  root_two_thirds * size};
+    double x = -trace, y = 0.0;
+    Point::Values v = point.at(x, y);
+    r.plastic = v.f > tolerance;
+    double p_v = v.p / swelling, p_s = 0.0, q_v = 0.0, q_s = 3.0 * shear;
+    if (r.plastic)
+    {
+      point.solve(x, y, v);
+      const auto [a, b, c, d] = point.jacobian(v, y);
+      const double det = a * d - b * c, hardening = v.p_c / plastic, q = ratio * v.q;
+      const double flow_v = 1.0 + y * hardening, f_v = v.p * hardening;
+      const double f_s = -2.0 * q / (ratio * ratio) * 3.0 * shear / v.left;
+      const double slope = v.p / swelling, fall = -q * point.softness / v.left;
+      p_v = slope * (d * flow_v - b * f_v) / det;
+      p_s = slope * (-b * f_s / det);
+      q_v = fall * (a * f_v - c * flow_v) / det;
+      q_s = 3.0 * shear / v.left + fall * (a * f_s / det);
+    }
+    const double secant = 2.0 * modulus / v.left;
+    r.elastic_strain = strain;
+    for (int a = 0; a < 3; ++a)
+    {
+      direction[a] = size > 0.0 ? deviator[a] / size : 0.0;
+      r.stress[a] = secant * deviator[a] - v.p * p_c;
+      if (r.plastic)
+        r.elastic_strain[a] = deviator[a] / v.left - x / 3.0;
+    }
+    if (r.plastic)
+    {
+      r.variables[0] += root_two_thirds * norm_of_difference(strain, r.elastic_strain);
+      r.variables[1] *= v.p_c;
+    }
+    for (int a = 0; a < 3; ++a)
+      for (int b = 0; b < 3; ++b)
+      {
+        r.shear[a][b] = secant;
+        r.normal[a][b] = secant * ((a == b ? 1.0 : 0.0) - 1.0 / 3.0)
+                         + (2.0 / 3.0 * q_s * p_c - secant) * direction[a] * direction[b]
+                         + p_c * (p_v - root_two_thirds * (p_s * direction[b] + q_v * direction[a]));
+      }
+  }
+};
 
 // P = tau F^-T and dP/dF, put together from the dyads Q_a (F^-1 Q)_b.
 //
@@ -254,17 +756,17 @@ void tangent(const Response& r, const std::array<double, dim>& principal, const 
       add(r.normal[a][b] - (a == b ? r.stress[a] : 0.0), dyad[a][a], dyad[b][b]);
       if (a != b)
       {
-        const double rate = r.shear * logarithm_quotient(principal[a], principal[b]);
+        const double rate = r.shear[a][b] * logarithm_quotient(principal[a], principal[b]);
         add(rate * (1.0 + principal[b]), dyad[a][b], dyad[a][b]);
         add(rate * (1.0 + principal[a]) - r.stress[a], dyad[a][b], dyad[b][a]);
       }
     }
 }
 
-template <int dim>
+template <int dim, typename Law>
 bool update_point(const double* gradient, const double* old_gradient, const double* old_c,
-                  double plastic_strain, const Parameters& parameters, double tolerance, double* P,
-                  double* A, double* stress, double* c, double* new_plastic_strain)
+                  const Law& law, double tolerance, Response& r, double* P, double* A,
+                  double* stress, double* c)
 {
   constexpr int m = dim == 2 ? 4 : 6;
   Matrix<dim> H, inverse_F;
@@ -337,7 +839,7 @@ bool update_point(const double* gradient, const double* old_gradient, const doub
   if (!valid)
     return false;
 
-  const Response r = integrate(strain, plastic_strain, parameters, tolerance);
+  law(strain, tolerance, r);
   const Matrix<dim> tau = from_principal<dim>(r.stress, axes);
   for (int i = 0; i < dim; ++i)
     for (int J = 0; J < dim; ++J)
@@ -364,36 +866,58 @@ bool update_point(const double* gradient, const double* old_gradient, const doub
       if constexpr (dim == 2)
         c[2] = returned[2];
     }
-    *new_plastic_strain = r.plastic_strain;
   }
   return true;
 }
 
-template <int dim>
+template <int dim, typename Law>
 std::vector<std::int64_t> update_all(const core::Update& u)
 {
   constexpr int size = dim * dim, m = dim == 2 ? 4 : 6;
   std::vector<std::int64_t> invalid;
   const bool history = u.old_gradient != nullptr;
+  const std::size_t parameters = core::num_parameters(u.law), variables = core::num_variables(u.law);
   for (std::size_t p = 0; p < u.count; ++p)
   {
-    const Parameters parameters{u.bulk(p), u.shear(p),
-                                history ? u.rho_y(p) : std::numeric_limits<double>::infinity(),
-                                history ? u.hardening(p) : 0.0};
+    double values[core::max_parameters];
+    for (std::size_t k = 0; k < parameters; ++k)
+      values[k] = u.parameters[k](p);
+    Response r;
+    for (std::size_t k = 0; k < variables; ++k)
+      r.variables[k] = u.old_variables[k][p];
     const bool valid = update_point<dim>(
         u.gradient + p * size, history ? u.old_gradient + p * size : nullptr,
-        history ? u.old_c + p * m : nullptr, history ? u.old_plastic_strain[p] : 0.0, parameters,
-        u.tolerance, u.P + p * size, u.A == nullptr ? nullptr : u.A + p * size * size,
-        u.stress + p * m, history ? u.c + p * m : nullptr,
-        history ? u.plastic_strain + p : nullptr);
+        history ? u.old_c + p * m : nullptr, Law(values), u.tolerance, r, u.P + p * size,
+        u.A == nullptr ? nullptr : u.A + p * size * size, u.stress + p * m,
+        history ? u.c + p * m : nullptr);
+    for (std::size_t k = 0; k < variables; ++k)
+      u.variables[k][p] = r.variables[k];
     if (!valid)
       invalid.push_back(static_cast<std::int64_t>(p));
   }
   return invalid;
 }
+
+template <typename Law>
+std::vector<std::int64_t> update_all(const core::Update& u, int dim)
+{
+  return dim == 2 ? update_all<2, Law>(u) : update_all<3, Law>(u);
+}
 } // namespace
 
 HOT_LOOP std::vector<std::int64_t> core::update_logarithmic(const Update& update, int dim)
 {
-  return dim == 2 ? update_all<2>(update) : update_all<3>(update);
+  switch (update.law)
+  {
+  case Law::von_mises:
+    return update_all<VonMises>(update, dim);
+  case Law::mohr_coulomb:
+    return update_all<MohrCoulomb>(update, dim);
+  case Law::drucker_prager:
+    return update_all<DruckerPrager>(update, dim);
+  case Law::cam_clay:
+    return update_all<CamClay>(update, dim);
+  default:
+    return update_all<Hencky>(update, dim);
+  }
 }

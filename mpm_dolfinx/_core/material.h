@@ -17,14 +17,50 @@ struct Parameter
   double operator()(std::size_t point) const { return values[point * stride]; }
 };
 
-// Input and output of an update of many points; see update_logarithmic in module.cpp.
+enum class Law
+{
+  hencky,       // bulk, shear
+  von_mises,    // bulk, shear, rho_y, hardening
+  mohr_coulomb, // bulk, shear, sin(phi), sin(psi), 2 c cos(phi), cut-off
+  drucker_prager, // bulk, shear, eta, eta_psi, xi c, largest mean stress
+  cam_clay // compression, swelling, M, shear, reference pressure
+};
+
+constexpr std::size_t max_parameters = 6;
+constexpr std::size_t max_variables = 2;
+
+// How many parameters and internal variables a law has.
+constexpr std::size_t num_parameters(Law law)
+{
+  switch (law)
+  {
+  case Law::hencky:
+    return 2;
+  case Law::von_mises:
+    return 4;
+  case Law::cam_clay:
+    return 5;
+  default:
+    return 6;
+  }
+}
+constexpr std::size_t num_variables(Law law)
+{
+  return law == Law::hencky ? 0 : law == Law::cam_clay ? 2 : 1;
+}
+
+// Input and output of an update of many points; see update_plastic in module.cpp. Without
+// old_gradient there is no history.
 struct Update
 {
+  Law law;
   std::size_t count;
-  const double *gradient, *old_gradient, *old_c, *old_plastic_strain;
-  Parameter bulk, shear, rho_y, hardening;
+  const double *gradient, *old_gradient, *old_c;
+  const double* old_variables[max_variables];
+  Parameter parameters[max_parameters];
   double tolerance;
-  double *P, *A, *stress, *c, *plastic_strain;
+  double *P, *A, *stress, *c;
+  double* variables[max_variables];
 };
 
 // Update all points; return those whose det F or trial b is not positive and finite.

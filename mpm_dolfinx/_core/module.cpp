@@ -3,11 +3,15 @@
 //
 // The compiled loops as Python functions: arrays and addresses of kernels, nothing else.
 
+#include <string>
 #include <type_traits>
 #include <utility>
+#include <vector>
 
 #include <nanobind/stl/pair.h>
+#include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
 #include "arrays.h"
 #include "domains.h"
@@ -62,6 +66,16 @@ Domains domains_of(const Indices& dofmap, const Reals& gradients, const Reals* w
   return domains;
 }
 
+// Hand over what makes domains those of a body of revolution, or nothing.
+void revolve(Domains& domains, const Reals& hoop)
+{
+  if (hoop.size() == 0)
+    return;
+  const std::size_t count = domains.count * domains.points * domains.nodes;
+  require(domains.dim == 2 && hoop.size() == count, "hoop (n, nq, k) in the plane, or none");
+  domains.hoop = hoop.data();
+}
+
 std::size_t num_points(const Domains& domains)
 {
   return domains.count * domains.points;
@@ -79,6 +93,57 @@ Parameter parameter_of(const Reals& values, std::size_t count)
 {
   require(values.size() == 1 || values.size() == count, "one parameter, or one for each point");
   return {values.data(), values.size() == 1 ? std::size_t{0} : std::size_t{1}};
+}
+
+Law law_of(const std::string& name)
+{
+  if (name == "hencky")
+    return Law::hencky;
+  if (name == "cam_clay")
+    return Law::cam_clay;
+  if (name == "von_mises")
+    return Law::von_mises;
+  if (name == "mohr_coulomb")
+    return Law::mohr_coulomb;
+  if (name == "drucker_prager")
+    return Law::drucker_prager;
+  throw std::invalid_argument("there is no compiled law " + name);
+}
+
+// Update a law with a history, from arrays of which the shapes are looked at.
+auto update_with_history(Law law, const Reals& gradient, const Reals& old_gradient,
+                         const Reals& old_c, const std::vector<Reals>& old_variables,
+                         const std::vector<Reals>& parameters, double tolerance, RealsOut& P,
+                         RealsOut& A, RealsOut& stress, RealsOut& c,
+                         std::vector<RealsOut>& variables)
+{
+  require(gradient.ndim() == 3 && old_gradient.size() == gradient.size()
+              && old_c.shape(0) == gradient.shape(0),
+          "displacement gradients (n, dim, dim) and states (n, ...)");
+  Update u{};
+  u.law = law;
+  u.count = gradient.shape(0);
+  require(parameters.size() == num_parameters(law), "the parameters of the law");
+  require(old_variables.size() == num_variables(law) && variables.size() == num_variables(law),
+          "the internal variables of the law");
+  u.gradient = gradient.data();
+  u.old_gradient = old_gradient.data();
+  u.old_c = old_c.data();
+  for (std::size_t k = 0; k < parameters.size(); ++k)
+    u.parameters[k] = parameter_of(parameters[k], u.count);
+  for (std::size_t k = 0; k < variables.size(); ++k)
+  {
+    require(old_variables[k].size() == u.count && variables[k].size() == u.count,
+            "internal variables (n,)");
+    u.old_variables[k] = old_variables[k].data();
+    u.variables[k] = variables[k].data();
+  }
+  u.tolerance = tolerance;
+  u.P = P.data();
+  u.A = A.size() > 0 ? A.data() : nullptr;
+  u.stress = stress.data();
+  u.c = c.data();
+  return to_numpy(update_logarithmic(u, static_cast<int>(gradient.shape(2))));
 }
 
 Target target_of(const Domains& domains, const Offsets& offsets, const Indices& positions,
@@ -100,11 +165,13 @@ NB_MODULE(_loops, m)
   }, "u"_a, "dofmap"_a, "gradients"_a, "H"_a.noconvert(), "Set H to grad u at the points.");
 
   m.def("internal_force",
-        [](Reals P, Indices dofmap, Reals gradients, Reals weights, RealsOut force) {
-    const Domains domains = domains_of(dofmap, gradients, &weights);
-    require(P.size() == num_points(domains) * domains.dim * domains.dim, "P (n, nq, dim, dim)");
+        [](Reals P, Indices dofmap, Reals gradients, Reals weights, Reals hoop, RealsOut force) {
+    Domains domains = domains_of(dofmap, gradients, &weights);
+    revolve(domains, hoop);
+    const int strain = domains.strain();
+    require(P.size() == num_points(domains) * strain * strain, "P (n, nq, dim, dim)");
     internal_force(domains, P.data(), force.data());
-  }, "P"_a, "dofmap"_a, "gradients"_a, "weights"_a, "force"_a.noconvert(),
+  }, "P"_a, "dofmap"_a, "gradients"_a, "weights"_a, "hoop"_a, "force"_a.noconvert(),
         "Add the integral of P : grad v to the force at the nodes.");
 
   m.def("supports",
@@ -201,10 +268,11 @@ NB_MODULE(_loops, m)
         "Add the reduced tangents of domains with one point.");
 
   m.def("assemble_domains",
-        [](Indices dofmap, Reals gradients, Reals weights, Reals transfers, Reals A, Reals vectors,
-           Offsets offsets, Indices positions, RealsOut values) {
-    const Domains domains = domains_of(dofmap, gradients, &weights);
-    const int square = domains.dim * domains.dim;
+        [](Indices dofmap, Reals gradients, Reals weights, Reals hoop, Reals transfers, Reals A,
+           Reals vectors, Offsets offsets, Indices positions, RealsOut values) {
+    Domains domains = domains_of(dofmap, gradients, &weights);
+    revolve(domains, hoop);
+    const int square = domains.strain() * domains.strain();
     require(A.size() == num_points(domains) * square * square, "A (n, nq, dim, dim, dim, dim)");
     require(vectors.size() == 0
                 || vectors.size() == domains.count * 3 * domains.nodes * domains.dim,
@@ -213,8 +281,8 @@ NB_MODULE(_loops, m)
                      vectors.size() > 0 ? vectors.data() : nullptr,
                      target_of(domains, offsets, positions, values));
   },
-        "dofmap"_a, "gradients"_a, "weights"_a, "transfers"_a, "A"_a, "vectors"_a, "offsets"_a,
-        "positions"_a, "values"_a.noconvert(),
+        "dofmap"_a, "gradients"_a, "weights"_a, "hoop"_a, "transfers"_a, "A"_a, "vectors"_a,
+        "offsets"_a, "positions"_a, "values"_a.noconvert(),
         "Add the reduced tangents of domains with any number of points.");
 
   m.def("assemble_form",
@@ -246,10 +314,11 @@ NB_MODULE(_loops, m)
         [](Reals gradient, Reals bulk, Reals shear, RealsOut P, RealsOut A, RealsOut stress) {
     require(gradient.ndim() == 3, "displacement gradients (n, dim, dim)");
     Update u{};
+    u.law = Law::hencky;
     u.count = gradient.shape(0);
     u.gradient = gradient.data();
-    u.bulk = parameter_of(bulk, u.count);
-    u.shear = parameter_of(shear, u.count);
+    u.parameters[0] = parameter_of(bulk, u.count);
+    u.parameters[1] = parameter_of(shear, u.count);
     u.P = P.data();
     u.A = A.size() > 0 ? A.data() : nullptr;
     u.stress = stress.data();
@@ -262,30 +331,26 @@ NB_MODULE(_loops, m)
         [](Reals gradient, Reals old_gradient, Reals old_c, Reals old_plastic_strain, Reals bulk,
            Reals shear, Reals rho_y, Reals hardening, double tolerance, RealsOut P, RealsOut A,
            RealsOut stress, RealsOut c, RealsOut plastic_strain) {
-    require(gradient.ndim() == 3 && old_gradient.size() == gradient.size()
-                && old_c.shape(0) == gradient.shape(0)
-                && old_plastic_strain.shape(0) == gradient.shape(0),
-            "displacement gradients (n, dim, dim) and states (n, ...)");
-    const std::size_t n = gradient.shape(0);
-    const Update u{n,
-                   gradient.data(),
-                   old_gradient.data(),
-                   old_c.data(),
-                   old_plastic_strain.data(),
-                   parameter_of(bulk, n),
-                   parameter_of(shear, n),
-                   parameter_of(rho_y, n),
-                   parameter_of(hardening, n),
-                   tolerance,
-                   P.data(),
-                   A.size() > 0 ? A.data() : nullptr,
-                   stress.data(),
-                   c.data(),
-                   plastic_strain.data()};
-    return to_numpy(update_logarithmic(u, static_cast<int>(gradient.shape(2))));
+    std::vector<RealsOut> variables{plastic_strain};
+    return update_with_history(Law::von_mises, gradient, old_gradient, old_c, {old_plastic_strain},
+                               {bulk, shear, rho_y, hardening}, tolerance, P, A, stress, c,
+                               variables);
   },
         "gradient"_a, "old_gradient"_a, "old_c"_a, "old_plastic_strain"_a, "bulk"_a, "shear"_a,
         "rho_y"_a, "hardening"_a, "tolerance"_a, "P"_a.noconvert(), "A"_a.noconvert(),
         "stress"_a.noconvert(), "c"_a.noconvert(), "plastic_strain"_a.noconvert(),
         "Update von Mises' law; return the points whose domains are inverted.");
+
+  m.def("update_plastic",
+        [](const std::string& law, Reals gradient, Reals old_gradient, Reals old_c,
+           const std::vector<Reals>& old_variables, const std::vector<Reals>& parameters,
+           double tolerance, RealsOut P, RealsOut A, RealsOut stress, RealsOut c,
+           std::vector<RealsOut> variables) {
+    return update_with_history(law_of(law), gradient, old_gradient, old_c, old_variables,
+                               parameters, tolerance, P, A, stress, c, variables);
+  },
+        "law"_a, "gradient"_a, "old_gradient"_a, "old_c"_a, "old_variables"_a, "parameters"_a,
+        "tolerance"_a, "P"_a.noconvert(), "A"_a.noconvert(), "stress"_a.noconvert(),
+        "c"_a.noconvert(), "variables"_a.noconvert(),
+        "Update a law with a history; return the points whose domains are inverted.");
 }

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Materials: the contract, laws in strain space, and tools to write and check one's own."""
 
-from mpm_dolfinx.materials import mandel
-from mpm_dolfinx.materials.base import (
+from . import mandel
+from .base import (
     Integration,
     Material,
     Parameter,
@@ -13,22 +13,30 @@ from mpm_dolfinx.materials.base import (
     check_parameter,
     per_row,
 )
-from mpm_dolfinx.materials.check import check_tangent
-from mpm_dolfinx.materials.elastic import Hencky, IsotropicElastic, LinearElastic
-from mpm_dolfinx.materials.return_mapping import ReturnMapping
-from mpm_dolfinx.materials.von_mises import SmallStrainVonMises, VonMises
+from .cam_clay import ModifiedCamClay
+from .check import check_tangent
+from .drucker_prager import DruckerPrager
+from .elastic import Hencky, IsotropicElastic, LinearElastic
+from .mohr_coulomb import FrictionalMaterial, MohrCoulomb, Tresca
+from .return_mapping import ReturnMapping
+from .von_mises import SmallStrainVonMises, VonMises
 
 __all__ = [
+    "DruckerPrager",
+    "FrictionalMaterial",
     "Hencky",
     "Integration",
     "IsotropicElastic",
     "LinearElastic",
     "Material",
+    "ModifiedCamClay",
+    "MohrCoulomb",
     "Parameter",
     "ReturnMapping",
     "SmallStrainVonMises",
     "State",
     "StrainMaterial",
+    "Tresca",
     "Update",
     "VonMises",
     "check_parameter",

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, cast
@@ -16,9 +16,9 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.errors import MPMError, agree
-from mpm_dolfinx.materials.kinematics import KINEMATICS, Kinematics
-from mpm_dolfinx.materials.mandel import num_components, to_tensor
+from ..errors import MPMError, agree
+from .kinematics import KINEMATICS, Kinematics
+from .mandel import norm, num_components, to_tensor, to_vector
 
 __all__ = [
     "Field",
@@ -41,11 +41,44 @@ type State = dict[str, NDArray[np.float64]]
 
 
 class Field(Protocol):
-    """A piecewise constant ``dolfinx.fem.Function``, whose values are ``x.array``."""
+    """A piecewise constant ``dolfinx.fem.Function``, whose values are ``x.array``.
+
+    Or a ``dolfinx.fem.Constant``, whose value is ``value``.
+    """
 
     @property
     def x(self) -> Any:
         """The vector of values."""
+
+
+class Parameters(Mapping[str, Parameter]):
+    """Parameters of a material by name, which cannot be set.
+
+    Args:
+        values: The parameters.
+    """
+
+    def __init__(self, values: Mapping[str, Parameter]) -> None:
+        self._values = dict(values)
+
+    def __getitem__(self, name: str) -> Parameter:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __repr__(self) -> str:
+        return repr(self._values)
+
+    def __setitem__(self, name: str, value: Parameter) -> None:
+        raise MPMError(
+            f"The parameter {name} of a material cannot be set; give a DG0 Function or a Constant, "
+            f"whose values problems follow, or make another material: "
+            f"material.with_parameters({name}=...)."
+        )
 
 
 class Update(NamedTuple):
@@ -92,13 +125,24 @@ class Material(ABC):
 
     Attributes:
         symmetric: Whether the tangent has major symmetry, dP_iJ/dF_kL = dP_kL/dF_iJ, always.
+        limits: What the values of a parameter must be: keywords of ``check_parameter`` by name.
         parameters: Parameters by name: numbers, or arrays ``(n,)`` with one value per point.
-            A piecewise constant Function may stand here until the problem puts its values at
-            the points in its place (:meth:`with_parameters`).
+            A piecewise constant Function or a Constant may stand here; the problem works with
+            a copy of the material that has its values instead (:meth:`with_parameters`).
     """
 
     symmetric: bool
-    parameters: Mapping[str, Parameter] = MappingProxyType({})
+    limits: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType({})
+    _parameters: Parameters = Parameters({})
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """Parameters by name; a material that is made sets them as a whole."""
+        return self._parameters
+
+    @parameters.setter
+    def parameters(self, values: Mapping[str, Parameter]) -> None:
+        self._parameters = Parameters(values)
 
     @abstractmethod
     def initial_state(self, n: int, dim: int) -> State:
@@ -137,6 +181,22 @@ class Material(ABC):
             displacement_gradient: Shape ``(n, dim, dim)``.
             state: The state that belongs to it.
         """
+
+    def stressed_state(self, cauchy_stress: NDArray[np.float64], dim: int) -> State:
+        """Return the state of points that carry a stress where their body is undeformed.
+
+        The state belongs to a displacement gradient of zero; an update of it gives this stress.
+
+        Args:
+            cauchy_stress: Shape ``(n, 3, 3)``, symmetric; in plane strain xz and yz are zero.
+            dim: Dimension of the body.
+
+        Raises:
+            MPMError: The material cannot carry it; ``particles`` are the numbers of the points.
+        """
+        raise MPMError(
+            f"{type(self).__name__} cannot begin with a stress; give it a method stressed_state."
+        )
 
     def with_parameters(self, **parameters: Parameter) -> Self:
         """Return a copy of this material with other values of some parameters."""
@@ -220,17 +280,57 @@ class StrainMaterial(Material):
             state[name] = np.zeros((n, *shape))
         return state
 
+    def elastic_strain(self, stress: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the elastic strain of a stress: the law without its plastic part, turned round.
+
+        Args:
+            stress: Shape ``(n, m)``.
+
+        Returns:
+            Shape ``(n, m)``; not a number where there is none.
+        """
+        raise MPMError(
+            f"{type(self).__name__} cannot begin with a stress; give it a method elastic_strain, "
+            "which returns the elastic strain of stresses (n, m)."
+        )
+
+    def stressed_state(self, cauchy_stress: NDArray[np.float64], dim: int) -> State:
+        """See :meth:`Material.stressed_state`.
+
+        The points carry the elastic strain of this stress, which must not be beyond yield.
+        """
+        stress = to_vector(cauchy_stress, dim)
+        state = self.initial_state(len(stress), dim)
+        strain = self.elastic_strain(stress)
+        size = norm(stress)
+        lost = np.abs(cauchy_stress - to_tensor(stress)).max(axis=(1, 2), initial=0.0)
+        possible = (lost <= 1e-12 * size) & np.isfinite(strain).all(axis=1)
+        variables = {name: state[name] for name in self.internal_variables}
+        with np.errstate(invalid="ignore"):
+            answer = self.integrate(np.where(possible[:, None], strain, 0.0), variables, False)
+        possible &= norm(answer.stress - stress) <= 1e-9 * size
+        if not possible.all():
+            points = np.flatnonzero(~possible)
+            raise MPMError(
+                f"{type(self).__name__} cannot bear the initial stress of {len(points)} of "
+                f"{len(stress)} points: it is beyond yield, not finite, not symmetric, or shears "
+                "out of the plane; give a stress that the material can bear.",
+                points,
+            )
+        return state | {"stress": stress} | self._kinematics.history_of(strain, dim)
+
     def update(
         self, displacement_gradient: NDArray[np.float64], state: State, tangent: bool = True
     ) -> Update:
         """See :meth:`Material.update`."""
-        frame = self._kinematics(displacement_gradient, state if self.inelastic else None)
+        remembers = "displacement_gradient" in state  # elastic points that began with a stress too
+        frame = self._kinematics(displacement_gradient, state if remembers else None)
         variables = {name: state[name] for name in self.internal_variables}
         stress, D, elastic_strain, variables = self.integrate(
             frame.trial_strain, variables, tangent
         )
         new = {"stress": stress, **variables}
-        if self.inelastic:
+        if remembers:
             new |= frame.history(elastic_strain)
         A = None if D is None else frame.tangent(stress, D)
         return Update(frame.first_piola(stress), A, new)
@@ -275,7 +375,8 @@ def check_parameter(
 
     Args:
         name: Name for the message.
-        value: Number, array ``(n,)``, or Function, which is returned as it is.
+        value: Number, array ``(n,)``, of which a copy is returned that cannot be written to,
+            or Function or Constant, which is returned as it is.
         above: The values are greater than this.
         below: The values are smaller than this.
         least: The values are not smaller than this.
@@ -283,10 +384,14 @@ def check_parameter(
     Raises:
         MPMError: A value is not finite or out of range.
     """
+    held = isinstance(getattr(value, "value", None), np.ndarray)  # a Constant
+    given: Any = value.x.array if hasattr(value, "x") else getattr(value, "value", value)
     try:
-        values = np.asarray(value.x.array if hasattr(value, "x") else value, dtype=np.float64)
+        values = np.array(given, dtype=np.float64)
     except (TypeError, ValueError):
         raise MPMError(f"{name} must be a number or one number per point, not {value!r}") from None
+    if held and values.ndim > 0:
+        raise MPMError(f"{name} must be a scalar Constant, not one of shape {values.shape}")
     if values.ndim > 1:
         raise MPMError(f"{name} must be a number or one number per point, not {values.ndim}-D")
     allowed = np.isfinite(values)
@@ -310,6 +415,7 @@ def check_parameter(
                 refused.message = message
                 return refused
             raise MPMError(message)
-    if hasattr(value, "x"):
+    if held or hasattr(value, "x"):
         return cast(Parameter, value)
+    values.flags.writeable = False
     return float(values) if values.ndim == 0 else values

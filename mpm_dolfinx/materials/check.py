@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.errors import MPMError
-from mpm_dolfinx.materials.base import Material, State
+from ..errors import MPMError
+from .base import Material, State
 
 __all__ = ["check_tangent"]
 
@@ -74,6 +74,7 @@ def check_tangent(
         if A is None:
             raise MPMError(f"{name}.update returned no tangent")
         largest = np.abs(A).max(axis=(1, 2, 3, 4))
+        largest[largest == 0.0] = 1.0  # a material that has nothing to resist with: so be it
         if material.symmetric:
             skew = np.abs(A - A.transpose(0, 3, 4, 1, 2)).max(axis=(1, 2, 3, 4)) / largest
             if not skew.max() <= tolerance:

@@ -4,25 +4,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx._core import loops
-from mpm_dolfinx.materials.base import Parameter, State, Update
-from mpm_dolfinx.materials.kinematics import require_valid
-from mpm_dolfinx.materials.mandel import num_components
+from .._core import loops
+from .base import Parameter, State, StrainMaterial, Update
+from .kinematics import require_valid
+from .mandel import num_components
 
-if TYPE_CHECKING:
-    from mpm_dolfinx.materials.elastic import IsotropicElastic
-    from mpm_dolfinx.materials.von_mises import VonMises
+__all__ = ["CompiledMaterial", "update_hencky", "update_plastic", "update_von_mises"]
 
-__all__ = ["CompiledUpdate", "update_hencky", "update_von_mises"]
 
-type CompiledUpdate = Callable[..., Update]
-"""Called with a material, displacement gradients, a state and whether to find the tangent."""
+class CompiledMaterial(StrainMaterial):
+    """A law that may have a compiled update: the method ``_compiled_update`` of its class.
+
+    Attributes:
+        compiled: Whether a compiled update is used where the law itself (not a law derived from
+            it) has one and the package was built with it; its answer differs from
+            :meth:`StrainMaterial.update` by round-off alone.
+    """
+
+    compiled: bool = True
+
+    def update(
+        self, displacement_gradient: NDArray[np.float64], state: State, tangent: bool = True
+    ) -> Update:
+        """See :meth:`Material.update`."""
+        rule = vars(type(self)).get("_compiled_update")
+        if rule is None or loops is None or not self.compiled:
+            return super().update(displacement_gradient, state, tangent)
+        return cast(Update, rule(self, displacement_gradient, state, tangent))
 
 
 def _values(parameter: Parameter) -> NDArray[np.float64]:
@@ -45,26 +59,87 @@ def _check(invalid: NDArray[np.int64], count: int) -> None:
 
 
 def update_hencky(
-    material: IsotropicElastic,
+    bulk: Parameter,
+    shear: Parameter,
     displacement_gradient: NDArray[np.float64],
-    state: State,
     tangent: bool,
 ) -> Update:
-    """Update Hencky's law, see :meth:`Material.update`."""
+    """Update Hencky's law.
+
+    Args:
+        bulk: Bulk modulus, a number or shape ``(n,)``, as all parameters.
+        shear: Shear modulus.
+        displacement_gradient: As for :meth:`Material.update`.
+        tangent: As there.
+    """
     H = np.ascontiguousarray(displacement_gradient)
     P, A, stress = _outputs(H, tangent)
-    invalid = loops.update_hencky(H, _values(material.bulk), _values(material.shear), P, A, stress)
+    invalid = loops.update_hencky(H, _values(bulk), _values(shear), P, A, stress)
     _check(invalid, len(H))
     return Update(P, A if tangent else None, {"stress": stress})
 
 
-def update_von_mises(
-    material: VonMises,
+def update_plastic(
+    law: str,
+    parameters: Sequence[Parameter],
+    variables: Sequence[str],
+    yield_tolerance: float,
     displacement_gradient: NDArray[np.float64],
     state: State,
     tangent: bool,
 ) -> Update:
-    """Update von Mises' law at finite strain, see :meth:`Material.update`."""
+    """Update a law with a history at finite strain.
+
+    Args:
+        law: Name of the law in ``material.h``.
+        parameters: Bulk and shear modulus and the constants of the law, numbers or shape ``(n,)``.
+        variables: Names of its internal variables.
+        yield_tolerance: Excess of the yield function over the strength that counts as round-off.
+        displacement_gradient: As for :meth:`Material.update`.
+        state: As there.
+        tangent: As there.
+    """
+    H = np.ascontiguousarray(displacement_gradient)
+    P, A, stress = _outputs(H, tangent)
+    b, new_variables = np.empty_like(stress), [np.empty(len(H)) for _ in variables]
+    invalid = loops.update_plastic(
+        law,
+        H,
+        np.ascontiguousarray(state["displacement_gradient"]),
+        np.ascontiguousarray(state["elastic_b_minus_identity"]),
+        [np.ascontiguousarray(state[name]) for name in variables],
+        [_values(p) for p in parameters],
+        yield_tolerance,
+        P,
+        A,
+        stress,
+        b,
+        new_variables,
+    )
+    _check(invalid, len(H))
+    new = {"stress": stress, "displacement_gradient": H.copy(), "elastic_b_minus_identity": b}
+    new |= dict(zip(variables, new_variables, strict=True))
+    return Update(P, A if tangent else None, new)
+
+
+def update_von_mises(
+    elastic: tuple[Parameter, Parameter],
+    plastic: tuple[Parameter, Parameter],
+    yield_tolerance: float,
+    displacement_gradient: NDArray[np.float64],
+    state: State,
+    tangent: bool,
+) -> Update:
+    """Update von Mises' law at finite strain.
+
+    Args:
+        elastic: Bulk and shear modulus, numbers or shape ``(n,)``.
+        plastic: Norm of the stress deviator at first yield, and hardening.
+        yield_tolerance: Value of the yield function that counts as round-off.
+        displacement_gradient: As for :meth:`Material.update`.
+        state: As there.
+        tangent: As there.
+    """
     H = np.ascontiguousarray(displacement_gradient)
     P, A, stress = _outputs(H, tangent)
     b, plastic_strain = np.empty_like(stress), np.empty(len(H))
@@ -74,9 +149,8 @@ def update_von_mises(
             np.ascontiguousarray(state[name])
             for name in ("displacement_gradient", "elastic_b_minus_identity", "plastic_strain")
         ),
-        *(_values(p) for p in (material.bulk, material.shear, material.rho_y)),
-        _values(material.parameters["hardening"]),
-        material.yield_tolerance,
+        *(_values(p) for p in (*elastic, *plastic)),
+        yield_tolerance,
         P,
         A,
         stress,

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.materials.mandel import deviator, norm
+from .mandel import deviator, norm
 
 __all__ = ["difference_by_stress", "slope_by_plastic_strain", "slope_by_stress"]
 

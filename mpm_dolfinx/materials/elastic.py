@@ -4,40 +4,35 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, cast
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx._core import loops
-from mpm_dolfinx.materials.base import (
+from .base import (
     Field,
     Integration,
     Parameter,
     State,
-    StrainMaterial,
     Update,
     check_parameter,
     per_row,
 )
-from mpm_dolfinx.materials.compiled import CompiledUpdate, update_hencky
-from mpm_dolfinx.materials.mandel import deviator, deviatoric_projector, identity, trace
+from .compiled import CompiledMaterial, update_hencky, update_plastic
+from .mandel import deviator, deviatoric_projector, identity, trace
 
 __all__ = ["Hencky", "IsotropicElastic", "LinearElastic"]
 
 
-class IsotropicElastic(StrainMaterial):
-    """Stress K tr(eps) I + 2 G dev(eps), the elastic part of the laws of this package.
-
-    Attributes:
-        compiled: Whether a compiled update is used where the law itself (not a law derived from
-            it) has one and the package was built with it; its answer differs from
-            :meth:`StrainMaterial.update` by round-off alone.
-    """
+class IsotropicElastic(CompiledMaterial):
+    """Stress K tr(eps) I + 2 G dev(eps), the elastic part of most laws of this package."""
 
     symmetric = True
-    compiled: bool = True
-    _compiled_update: ClassVar[CompiledUpdate]
+    limits: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType(
+        {"young": {"above": 0.0}, "poisson": {"above": -1.0, "below": 0.5}}
+    )
 
     def __init__(self, young: ArrayLike | Field, poisson: ArrayLike | Field) -> None:
         """Set the elastic constants.
@@ -50,18 +45,9 @@ class IsotropicElastic(StrainMaterial):
             MPMError: Not ``young > 0`` or not ``-1 < poisson < 0.5``.
         """
         self.parameters = {
-            "young": check_parameter("young", young, above=0.0),
-            "poisson": check_parameter("poisson", poisson, above=-1.0, below=0.5),
+            "young": check_parameter("young", young, **self.limits["young"]),
+            "poisson": check_parameter("poisson", poisson, **self.limits["poisson"]),
         }
-
-    def update(
-        self, displacement_gradient: NDArray[np.float64], state: State, tangent: bool = True
-    ) -> Update:
-        """See :meth:`Material.update`."""
-        rule = vars(type(self)).get("_compiled_update")
-        if rule is None or loops is None or not self.compiled:
-            return super().update(displacement_gradient, state, tangent)
-        return cast(Update, rule(self, displacement_gradient, state, tangent))
 
     @property
     def bulk(self) -> Parameter:
@@ -79,6 +65,13 @@ class IsotropicElastic(StrainMaterial):
         stress *= per_row(2.0 * self.shear)
         stress[:, :3] += (self.bulk * trace(strain))[:, None]
         return stress
+
+    def elastic_strain(self, stress: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the elastic strain, shape ``(n, m)``, of stresses ``(n, m)``."""
+        strain = deviator(stress)
+        strain /= per_row(2.0 * self.shear)
+        strain[:, :3] += (trace(stress) / (9.0 * self.bulk))[:, None]
+        return strain
 
     def elastic_tangent(self, n: int, m: int) -> NDArray[np.float64]:
         """Return the elastic stiffness of ``n`` points, shape ``(n, m, m)``, read-only."""
@@ -109,4 +102,11 @@ class Hencky(IsotropicElastic):
     """
 
     kinematics: ClassVar[Literal["small", "logarithmic"]] = "logarithmic"
-    _compiled_update = update_hencky
+
+    def _compiled_update(
+        self, displacement_gradient: NDArray[np.float64], state: State, tangent: bool
+    ) -> Update:
+        if "displacement_gradient" not in state:
+            return update_hencky(self.bulk, self.shear, displacement_gradient, tangent)
+        moduli = (self.bulk, self.shear)
+        return update_plastic("hencky", moduli, (), 0.0, displacement_gradient, state, tangent)

@@ -19,9 +19,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.errors import DomainDistortionError
-from mpm_dolfinx.materials.mandel import num_components
-from mpm_dolfinx.materials.tensors import (
+from ..errors import DomainDistortionError
+from .mandel import num_components
+from .tensors import (
     determinant,
     eigen,
     inverse,
@@ -79,6 +79,11 @@ class Kinematics(ABC):
     def initial_history(n: int, dim: int) -> dict[str, Array]:
         """Return the history of ``n`` unstrained points."""
 
+    @staticmethod
+    @abstractmethod
+    def history_of(elastic_strain: Array, dim: int) -> dict[str, Array]:
+        """Return the history of points that have not moved, of elastic strain ``(n, m)``."""
+
     @abstractmethod
     def history(self, elastic_strain: Array) -> dict[str, Array]:
         """Return the new history for the law's elastic strain, shape ``(n, m)``."""
@@ -124,6 +129,15 @@ class SmallStrain(Kinematics):
         return {
             "displacement_gradient": np.zeros((n, dim, dim)),
             "elastic_strain": np.zeros((n, num_components(dim))),
+        }
+
+    @staticmethod
+    def history_of(elastic_strain: Array, dim: int) -> dict[str, Array]:
+        """Return displacement gradient and elastic strain."""
+        n = len(elastic_strain)
+        return {
+            "displacement_gradient": np.zeros((n, dim, dim)),
+            "elastic_strain": elastic_strain.copy(),
         }
 
     def history(self, elastic_strain: Array) -> dict[str, Array]:
@@ -179,15 +193,10 @@ class LogarithmicStrain(Kinematics):
         self._trial_c = c
         self._principal, self._axes = eigen(unpack(c, dim))
         require_valid((self._principal > -1.0).all(axis=0))
-        strain = self._assemble(0.5 * np.log1p(self._principal), self._axes)
+        strain = _assemble(0.5 * np.log1p(self._principal), self._axes)
         if m == 4:
             strain[2] = 0.5 * np.log1p(c[2])
         self.trial_strain = strain.T
-
-    @staticmethod
-    def _assemble(values: Array, axes: Array) -> Array:
-        """Return Mandel vectors ``(m, n)`` from eigenvalues and eigenvectors."""
-        return pack(np.einsum("ian,jan->ijn", values * axes, axes))
 
     @staticmethod
     def initial_history(n: int, dim: int) -> dict[str, Array]:
@@ -195,6 +204,15 @@ class LogarithmicStrain(Kinematics):
         return {
             "displacement_gradient": np.zeros((n, dim, dim)),
             "elastic_b_minus_identity": np.zeros((n, num_components(dim))),
+        }
+
+    @staticmethod
+    def history_of(elastic_strain: Array, dim: int) -> dict[str, Array]:
+        """Return displacement gradient and b - I."""
+        n = len(elastic_strain)
+        return {
+            "displacement_gradient": np.zeros((n, dim, dim)),
+            "elastic_b_minus_identity": _exponential(elastic_strain.T, dim).T,
         }
 
     def history(self, elastic_strain: Array) -> dict[str, Array]:
@@ -206,12 +224,7 @@ class LogarithmicStrain(Kinematics):
         c = self._trial_c.copy()
         (moved,) = np.nonzero((elastic_strain != self.trial_strain).any(axis=1))
         if len(moved):
-            strain = elastic_strain.T[:, moved]
-            principal, axes = eigen(unpack(strain, self._dim))
-            returned = self._assemble(np.expm1(2.0 * principal), axes)
-            if self._dim == 2:
-                returned[2] = np.expm1(2.0 * strain[2])
-            c[:, moved] = returned
+            c[:, moved] = _exponential(elastic_strain.T[:, moved], self._dim)
         gradient = np.moveaxis(self._gradient, -1, 0)
         return {"displacement_gradient": gradient, "elastic_b_minus_identity": c.T}
 
@@ -257,6 +270,20 @@ class LogarithmicStrain(Kinematics):
     def volume_ratio(displacement_gradient: Array) -> Array:
         """Return det F."""
         return determinant(points_last(displacement_gradient))
+
+
+def _assemble(values: Array, axes: Array) -> Array:
+    """Return Mandel vectors ``(m, n)`` from eigenvalues and eigenvectors."""
+    return pack(np.einsum("ian,jan->ijn", values * axes, axes))
+
+
+def _exponential(strain: Array, dim: int) -> Array:
+    """Return b - I, shape ``(m, n)``, of elastic strains ``(m, n)``."""
+    principal, axes = eigen(unpack(strain, dim))
+    c = _assemble(np.expm1(2.0 * principal), axes)
+    if dim == 2:
+        c[2] = np.expm1(2.0 * strain[2])
+    return c
 
 
 KINEMATICS: dict[str, type[Kinematics]] = {

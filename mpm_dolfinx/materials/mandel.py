@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.errors import MPMError
+from ..errors import MPMError
 
 __all__ = [
     "deviator",

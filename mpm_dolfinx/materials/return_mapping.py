@@ -12,15 +12,11 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.errors import ConvergenceError
-from mpm_dolfinx.materials.base import Integration, State
-from mpm_dolfinx.materials.derivatives import (
-    difference_by_stress,
-    slope_by_plastic_strain,
-    slope_by_stress,
-)
-from mpm_dolfinx.materials.elastic import IsotropicElastic
-from mpm_dolfinx.materials.mandel import norm
+from ..errors import ConvergenceError
+from .base import Integration, State
+from .derivatives import difference_by_stress, slope_by_plastic_strain, slope_by_stress
+from .elastic import IsotropicElastic
+from .mandel import norm
 
 __all__ = ["ReturnMapping"]
 
@@ -93,7 +89,7 @@ class ReturnMapping(IsotropicElastic):
         self, stress: NDArray[Any], plastic_strain: NDArray[Any]
     ) -> NDArray[Any]:
         """Return dg/dstress, shape ``(n, m)``; by default through complex steps."""
-        if self._associated:
+        if _is_associated(self):
             return self.yield_gradient(stress, plastic_strain)
         return slope_by_stress(self.plastic_potential, stress, plastic_strain)
 
@@ -104,31 +100,8 @@ class ReturnMapping(IsotropicElastic):
 
         By default through complex steps of a subclass's gradient, or through differences.
         """
-        slope = slope_by_stress if self._analytic_gradient else difference_by_stress
+        slope = slope_by_stress if _has_analytic_gradient(self) else difference_by_stress
         return slope(self.potential_gradient, stress, plastic_strain)
-
-    @property
-    def _associated(self) -> bool:
-        return type(self).plastic_potential is ReturnMapping.plastic_potential
-
-    @property
-    def _analytic_gradient(self) -> bool:
-        kind = type(self)
-        if kind.potential_gradient is not ReturnMapping.potential_gradient:
-            return True
-        return self._associated and kind.yield_gradient is not ReturnMapping.yield_gradient
-
-    def _gradient_by_plastic_strain(
-        self, stress: NDArray[np.float64], plastic_strain: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return d2g/dstress dkappa, shape ``(n, m)``."""
-        if self._analytic_gradient:
-            return slope_by_plastic_strain(self.potential_gradient, stress, plastic_strain)
-        return difference_by_stress(
-            lambda s, k: slope_by_plastic_strain(self.plastic_potential, s, k),
-            stress,
-            plastic_strain,
-        )
 
     def integrate(
         self, trial_strain: NDArray[np.float64], variables: State, tangent: bool
@@ -176,6 +149,31 @@ class ReturnMapping(IsotropicElastic):
         slope = norm(self.at(points).yield_gradient(stress[points], plastic_strain[points]))
         excess = f[points] > YIELD_TOLERANCE * slope * norm(stress[points])
         return np.asarray(points[excess | ~np.isfinite(slope)])
+
+
+def _is_associated(law: ReturnMapping) -> bool:
+    return type(law).plastic_potential is ReturnMapping.plastic_potential
+
+
+def _has_analytic_gradient(law: ReturnMapping) -> bool:
+    """Return whether a subclass has given dg/dstress."""
+    kind = type(law)
+    if kind.potential_gradient is not ReturnMapping.potential_gradient:
+        return True
+    return _is_associated(law) and kind.yield_gradient is not ReturnMapping.yield_gradient
+
+
+def _potential_gradient_by_plastic_strain(
+    law: ReturnMapping, stress: NDArray[np.float64], plastic_strain: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return d2g/dstress dkappa, shape ``(n, m)``."""
+    if _has_analytic_gradient(law):
+        return slope_by_plastic_strain(law.potential_gradient, stress, plastic_strain)
+    return difference_by_stress(
+        lambda s, k: slope_by_plastic_strain(law.plastic_potential, s, k),
+        stress,
+        plastic_strain,
+    )
 
 
 class _System(NamedTuple):
@@ -231,7 +229,7 @@ class _System(NamedTuple):
         g = law.potential_gradient(stress, kappa)
         direction = g / norm(g)[:, None]
         by_strain = multiplier[:, None, None] * (law.potential_hessian(stress, kappa) @ D)
-        by_kappa = multiplier[:, None] * law._gradient_by_plastic_strain(stress, kappa)
+        by_kappa = multiplier[:, None] * _potential_gradient_by_plastic_strain(law, stress, kappa)
         f_slope = law.yield_gradient(stress, kappa)
 
         J = np.empty((n, m + 2, m + 2))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.materials.mandel import PAIRS, POSITIONS, WEIGHTS, num_components
+from .mandel import PAIRS, POSITIONS, WEIGHTS, num_components
 
 __all__ = [
     "determinant",

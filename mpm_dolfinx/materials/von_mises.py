@@ -11,11 +11,11 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mpm_dolfinx.errors import MPMError
-from mpm_dolfinx.materials.base import Field, Integration, Parameter, State, check_parameter
-from mpm_dolfinx.materials.compiled import update_von_mises
-from mpm_dolfinx.materials.elastic import IsotropicElastic
-from mpm_dolfinx.materials.mandel import deviator, deviatoric_projector, identity, norm, trace
+from ..errors import MPMError
+from .base import Field, Integration, Parameter, State, Update, check_parameter
+from .compiled import update_von_mises
+from .elastic import IsotropicElastic
+from .mandel import deviator, deviatoric_projector, identity, norm, trace
 
 __all__ = ["SmallStrainVonMises", "VonMises"]
 
@@ -39,7 +39,14 @@ class VonMises(IsotropicElastic):
     internal_variables: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType(
         {"plastic_strain": ()}
     )
-    _compiled_update = update_von_mises
+    limits: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType(
+        {
+            **IsotropicElastic.limits,
+            "rho_y": {"above": 0.0},
+            "yield_stress": {"above": 0.0},
+            "hardening": {"least": 0.0},
+        }
+    )
     yield_tolerance: ClassVar[float] = 1e-13
 
     def __init__(
@@ -69,8 +76,8 @@ class VonMises(IsotropicElastic):
             raise MPMError("give exactly one of rho_y and yield_stress, which is sqrt(3/2) rho_y")
         self.parameters = {
             **self.parameters,
-            name: check_parameter(name, strength, above=0.0),
-            "hardening": check_parameter("hardening", hardening, least=0.0),
+            name: check_parameter(name, strength, **self.limits[name]),
+            "hardening": check_parameter("hardening", hardening, **self.limits["hardening"]),
         }
 
     @property
@@ -106,8 +113,8 @@ class VonMises(IsotropicElastic):
         elastic_strain = trial_strain.copy(order="K")
         plastic_strain = variables["plastic_strain"].copy()
         stress.T[:, points], elastic_strain.T[:, points], plastic_strain[points], D_plastic = (
-            self.at(points)._radial_return(
-                trial_strain.T[:, points], plastic_strain[points], tangent
+            _radial_return(
+                self.at(points), trial_strain.T[:, points], plastic_strain[points], tangent
             )
         )
         if D is not None:
@@ -117,36 +124,16 @@ class VonMises(IsotropicElastic):
             D = np.moveaxis(everywhere, -1, 0)
         return Integration(stress, D, elastic_strain, {"plastic_strain": plastic_strain})
 
-    def _radial_return(
-        self, trial_strain: NDArray[np.float64], plastic_strain: NDArray[np.float64], tangent: bool
-    ) -> tuple[
-        NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None
-    ]:
-        """Return plastic points to the yield surface; arrays have their points last."""
-        m = len(trial_strain)
-        dev, size = deviator(trial_strain.T).T, norm(deviator(trial_strain.T))
-        direction = dev / size
-        hardening, shear = 2.0 / 3.0 * self.parameters["hardening"], 2.0 * self.shear
-        rho = self.strength(plastic_strain)
-        flow = (shear * size - rho) / (shear + hardening)
-        rho = rho + hardening * flow
-        # The deviator is scaled to rho, not reduced by the flow: f = 0 to round-off.
-        stress = rho * direction
-        stress[:3] += self.bulk * trace(trial_strain.T)
-        D = None
-        if tangent:
-            # K I x I + rho/|e| (P - n x n) + 2 G h/(2 G + h) n x n, with the projector P
-            one = identity(m)[:, None, None]
-            secant = rho / size
-            along = shear * hardening / (shear + hardening) - secant
-            D = (along * direction)[:, None] * direction
-            D += secant * deviatoric_projector(m)[:, :, None]
-            D += self.bulk * (one * one.transpose(1, 0, 2))
-        return (
-            stress,
-            trial_strain - flow * direction,
-            plastic_strain + np.sqrt(2.0 / 3.0) * flow,
-            D,
+    def _compiled_update(
+        self, displacement_gradient: NDArray[np.float64], state: State, tangent: bool
+    ) -> Update:
+        return update_von_mises(
+            (self.bulk, self.shear),
+            (self.rho_y, self.parameters["hardening"]),
+            self.yield_tolerance,
+            displacement_gradient,
+            state,
+            tangent,
         )
 
 
@@ -154,3 +141,39 @@ class SmallStrainVonMises(VonMises):
     """:class:`VonMises` with infinitesimal strain and the Cauchy stress."""
 
     kinematics: ClassVar[Literal["small", "logarithmic"]] = "small"
+
+
+def _radial_return(
+    law: VonMises,
+    trial_strain: NDArray[np.float64],
+    plastic_strain: NDArray[np.float64],
+    tangent: bool,
+) -> tuple[
+    NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None
+]:
+    """Return plastic points to the yield surface; arrays have their points last."""
+    m = len(trial_strain)
+    dev, size = deviator(trial_strain.T).T, norm(deviator(trial_strain.T))
+    direction = dev / size
+    hardening, shear = 2.0 / 3.0 * law.parameters["hardening"], 2.0 * law.shear
+    rho = law.strength(plastic_strain)
+    flow = (shear * size - rho) / (shear + hardening)
+    rho = rho + hardening * flow
+    # The deviator is scaled to rho, not reduced by the flow: f = 0 to round-off.
+    stress = rho * direction
+    stress[:3] += law.bulk * trace(trial_strain.T)
+    D = None
+    if tangent:
+        # K I x I + rho/|e| (P - n x n) + 2 G h/(2 G + h) n x n, with the projector P
+        one = identity(m)[:, None, None]
+        secant = rho / size
+        along = shear * hardening / (shear + hardening) - secant
+        D = (along * direction)[:, None] * direction
+        D += secant * deviatoric_projector(m)[:, :, None]
+        D += law.bulk * (one * one.transpose(1, 0, 2))
+    return (
+        stress,
+        trial_strain - flow * direction,
+        plastic_strain + np.sqrt(2.0 / 3.0) * flow,
+        D,
+    )

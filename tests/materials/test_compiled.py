@@ -8,7 +8,14 @@ from materials.test_von_mises import random_path
 
 from mpm_dolfinx import DomainDistortionError
 from mpm_dolfinx._core import loops
-from mpm_dolfinx.materials import Hencky, VonMises
+from mpm_dolfinx.materials import (
+    DruckerPrager,
+    Hencky,
+    ModifiedCamClay,
+    MohrCoulomb,
+    Tresca,
+    VonMises,
+)
 
 pytestmark = pytest.mark.skipif(loops is None, reason="the package was built without a compiler")
 
@@ -20,6 +27,19 @@ LAWS = {
     "perfect": VonMises(1e3, 0.3, rho_y=2.0),
     "hardening by point": VonMises(
         1e3 * SPREAD, 0.49, yield_stress=2.0 * SPREAD, hardening=50.0 * SPREAD
+    ),
+    "tresca": Tresca(1e3, 0.3, 2.0),
+    "mohr-coulomb": MohrCoulomb(1e3, 0.3, 2.0, 30.0, 10.0),
+    "mohr-coulomb without cohesion": MohrCoulomb(1e3, 0.3, 0.0, 30.0),
+    "mohr-coulomb by point, cut off": MohrCoulomb(
+        1e3 * SPREAD, 0.3, 2.0 * SPREAD, 20.0 * SPREAD, 5.0 * SPREAD, tension_cutoff=SPREAD
+    ),
+    "cam clay": ModifiedCamClay(0.2, 0.04, 1.2, 300.0, 20.0, 5.0),
+    "cam clay by point": ModifiedCamClay(0.2, 0.04, SPREAD, 300.0, 20.0 * SPREAD, 10.0 * SPREAD),
+    "drucker-prager": DruckerPrager(1e3, 0.3, 2.0, 30.0, 10.0, match="plane_strain"),
+    "drucker-prager without cohesion": DruckerPrager(1e3, 0.3, 0.0, 30.0),
+    "drucker-prager by point, cut off": DruckerPrager(
+        1e3 * SPREAD, 0.3, 2.0 * SPREAD, 20.0 * SPREAD, 5.0 * SPREAD, tension_cutoff=SPREAD
     ),
 }
 
@@ -35,6 +55,7 @@ def test_compiled_update_is_that_of_numpy(law, dim, size):
     for H in random_path(COUNT, dim, 4, size=size, turn=turn):
         H[0] = 0.0
         H[1] = 0.05 * np.eye(dim)
+        H[2] = -0.05 * np.eye(dim)
         mine, theirs = compiled.update(H, state), reference.update(H, state)
         assert mine.state.keys() == theirs.state.keys()
         pairs = [(mine.first_piola, theirs.first_piola), (mine.tangent, theirs.tangent)]
@@ -64,6 +85,14 @@ def test_impossible_deformations_are_named(law, bad):
     with pytest.raises(DomainDistortionError) as caught:
         LAWS[law].update(H, LAWS[law].initial_state(COUNT, 2))
     assert list(caught.value.particles) == [3, 7]
+
+
+def test_unknown_laws_are_refused():
+    H, empty = np.zeros((3, 2, 2)), np.empty(0)
+    with pytest.raises(ValueError, match="no compiled law rubber"):
+        loops.update_plastic("rubber", H, H, H, [], [], 0.0, H, empty, empty, empty, [])
+    with pytest.raises(ValueError, match="parameters of the law"):
+        loops.update_plastic("von_mises", H, H, H, [], [], 0.0, H, empty, empty, empty, [])
 
 
 def test_shapes_that_do_not_fit_are_refused():

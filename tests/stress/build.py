@@ -14,6 +14,7 @@ from dolfinx import fem, mesh
 from stress import generator
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx import _compat
 
 
 class Run(NamedTuple):
@@ -29,6 +30,8 @@ class Run(NamedTuple):
         bcs: The Dirichlet conditions.
         update: What sets the loads at t in (0, 1], or None for a ramp.
         factor: The load factor at t.
+        youngs: Young's modulus of each domain of each body, or that of all.
+        second: What sets the loads at t in a second stage, or None.
     """
 
     problem: Any
@@ -40,6 +43,8 @@ class Run(NamedTuple):
     bcs: list[Any]
     update: Any
     factor: Any
+    youngs: list[Any]
+    second: Any = None
 
 
 def grid(comm, lower, upper, n, cell, diagonal):
@@ -118,6 +123,41 @@ def make_background(comm, data, low, high, floor):
     return domain, lower, upper, h
 
 
+def fold(domain, place):
+    """Invert a triangle, or make a quadrilateral cross itself, in the middle (collective)."""
+    x = domain.geometry.x
+    low, high = box_of([domain])
+    corners = x[_compat.geometry_dofmap(domain)]
+    gap = np.linalg.norm(corners[:, :, :2].mean(axis=1) - low - place * (high - low), axis=1)
+    mine = (gap.min(initial=np.inf), domain.comm.rank, corners[gap.argmin()])
+    _, _, corners = min(domain.comm.allgather(mine), key=lambda one: one[:2])
+    moved = corners.copy()
+    if len(corners) == 3:
+        moved[0] += 2.2 * (corners[1:].mean(axis=0) - corners[0])
+    else:
+        moved[:2] = corners[1::-1]
+    before = x.copy()
+    for old, new in zip(corners, moved, strict=True):
+        x[np.abs(before - old).max(axis=1) < 1e-9 * np.abs(high - low).max()] = new
+
+
+def stiffnesses(body, scene, young):
+    """Return Young's modulus as a DG0 Function, stiff in a part of a body."""
+    result = fem.Function(fem.functionspace(body, ("DG", 0)))
+    cells = np.arange(len(result.x.array), dtype=np.int32)
+    x = mesh.compute_midpoints(body, 2, cells)[:, :2] / scene["units"][0]
+    low, high = (v / scene["units"][0] for v in box_of([body]))
+    place = (x - low) / (high - low)
+    marked = {
+        "top": place[:, 1] > 0.5,
+        "inside": (np.abs(place - 0.5) < 0.3).all(axis=1),
+        "checks": (np.floor(4.0 * place).sum(axis=1) % 2).astype(bool),
+        "some": wobble(np.round(place, 6), 1.0)[:, 0] > 0.5,
+    }[scene["stiff"]]
+    result.x.array[:] = young * np.where(marked, scene["contrast"], 1.0)
+    return result
+
+
 def box_of(bodies):
     """Return the lower and upper corner of bodies on all ranks."""
     comm, dim = bodies[0].comm, bodies[0].geometry.dim
@@ -187,6 +227,8 @@ def make(scene, comm) -> Run:
     length, stress = scene["units"]
     shapes = [scene["body"], *([scene["second"]] if "second" in scene else [])]
     meshes = [make_body(comm, data, length) for data in shapes]
+    if scene.get("fold") == "body":
+        fold(meshes[0], scene["place"])
     low, high = box_of(meshes)
     support = scene["support"]
     if support == "stand" and any(data["shape"] not in generator.FLAT for data in shapes):
@@ -198,6 +240,8 @@ def make(scene, comm) -> Run:
     background, lower, _, h = make_background(
         comm, {**scene["background"], "unit": length}, low, high, floor
     )
+    if scene.get("fold") == "background":
+        fold(background, scene["place"])
     dim = scene["dim"]
     V = fem.functionspace(background, ("Lagrange", scene.get("degree", 1), (dim,)))
     options = {"method": scene["method"], "quadrature_degree": scene["quadrature_degree"]}
@@ -230,11 +274,22 @@ def make(scene, comm) -> Run:
     density = stress / length
     gravity = np.array(scene["weight"])
     material, young = make_material(scene["material"], stress)
+    youngs = [young for _ in bodies]
+    if "contrast" in scene:
+        field = stiffnesses(meshes[0], scene, young)
+        youngs = [field.x.array[: bodies[0].num_local].copy()]
+        material = material.with_parameters(young=field)
+    force = fem.Constant(meshes[0], gravity) if "second_weight" in scene else tuple(gravity)
+
+    def second(t):
+        gravity[:] = (1.0 - t) * np.array(scene["weight"]) + t * np.array(scene["second_weight"])
+        force.value[:] = gravity
+
     problem = mpm.QuasiStaticProblem(
         bodies if len(bodies) > 1 else bodies[0],
         material,
         density=density,
-        body_force=tuple(gravity),
+        body_force=force,
         bcs=bcs,
         petsc_options_prefix=f"stress_{scene['number']}_",
         **scene.get("options", {}),
@@ -249,4 +304,6 @@ def make(scene, comm) -> Run:
         bcs,
         None if scene["path"] == "ramp" else update,
         factor,
+        youngs,
+        second if "second_weight" in scene else None,
     )

@@ -49,12 +49,13 @@ def numbers() -> dict[int, str]:
     }
 
 
-def scene(number: int) -> Scene:
+def scene(number: int, seed: int = SEED) -> Scene:
     """Return a scene, the same each time."""
     name = list(CLASSES)[number // 1000 - 1]
     index = number % 1000
-    made = CLASSES[name][1](np.random.default_rng([SEED, number]), index)
-    return {"number": number, "class": name, "well_posed": CLASSES[name][2], **made}
+    made = CLASSES[name][1](np.random.default_rng([seed, number]), index)
+    about = {"number": number, "seed": seed, "class": name, "well_posed": CLASSES[name][2]}
+    return {**about, **made}
 
 
 # -- Parts that the classes share ----------------------------------------------------------
@@ -591,4 +592,84 @@ def many_particles(rng: Random, index: int) -> Scene:
         support="stand",
         steps=2,
         limit=600.0,
+    )
+
+
+# -- Added later -----------------------------------------------------------------------------
+
+
+@scene_class(12, well_posed=True)
+def revolution(rng: Random, index: int) -> Scene:
+    """Bodies of revolution, hollow or not, with each F-bar and without."""
+    kind = ("none", "domain", "pair", "patch")[index % 4]
+    cell = {"domain": "quadrilateral", "pair": "triangle"}.get(kind) or pick(rng, *CELLS[2])
+    hollow = bool(rng.integers(2))
+    plastic = index % 3 == 2
+    return assembled(
+        rng,
+        body=body(
+            rng,
+            shape=pick(rng, "block", "jitter"),
+            cell=cell,
+            origin=[1.0 if hollow else 0.0, 0.0],
+            diagonal=pick(rng, "left", "right", "left_right"),
+        ),
+        material=von_mises(rng, 1e-2)
+        if plastic
+        else hencky(rng, poisson=float(pick(rng, 0.3, 0.49, 0.499))),
+        quadrature_degree=2 if kind == "domain" else pick(rng, None, 2),
+        weight=down(between(rng, 1e-4, 5e-3)),
+        support="stand" if hollow else "roll",
+        options={"axisymmetric": True, "f_bar": kind},
+    )
+
+
+@scene_class(10, well_posed=True)
+def staged(rng: Random, index: int) -> Scene:
+    """A weight, then a path on which it grows, turns or goes."""
+    plastic = index % 2 == 1
+    first = down(between(rng, 1e-4, 5e-3), turn=float(rng.uniform(-0.5, 0.5)))
+    second = down(float(pick(rng, 0.0, 1e-3, 6e-3)), turn=float(rng.uniform(-1.5, 1.5)))
+    return assembled(
+        rng,
+        body=body(rng, shape=pick(rng, *FLAT)),
+        material=von_mises(rng, 1e-2, hardening=0.05) if plastic else hencky(rng),
+        weight=first,
+        second_weight=second,
+        second_steps=int(pick(rng, 1, 3, 5)),
+        support="stand",
+        steps=int(pick(rng, 1, 3)),
+    )
+
+
+@scene_class(10, well_posed=True)
+def contrast(rng: Random, index: int) -> Scene:
+    """Parts 1e6 to 1e12 times as stiff as the rest: on top, inside, checks, here and there."""
+    where = ("top", "inside", "checks", "some")[index % 4]
+    return assembled(
+        rng,
+        body=body(rng, shape=pick(rng, "block", "turned", "disc", "jitter"), size=[1.0, 1.0]),
+        material=hencky(rng, law=pick(rng, "hencky", "hencky", "linear")),
+        contrast=10.0 ** (6.0 + 6.0 * index / 9.0),
+        stiff=where,
+        weight=down(between(rng, 1e-6, 3e-3), turn=float(rng.uniform(-0.5, 0.5))),
+        support="stand",
+        steps=1,
+    )
+
+
+@scene_class(8, well_posed=True)
+def folded(rng: Random, index: int) -> Scene:
+    """Meshes with a cell that is inverted or crosses itself, which must be refused."""
+    cell = CELLS[2][index % 2]
+    given = {"cell": cell}
+    return assembled(
+        rng,
+        body=body(rng, shape="block", **(given if index % 4 < 2 else {})),
+        background=background(rng, **(given if index % 4 >= 2 else {})),
+        fold="body" if index % 4 < 2 else "background",
+        place=float(rng.uniform(0.3, 0.7)),
+        weight=down(1e-4),
+        support="stand",
+        steps=1,
     )

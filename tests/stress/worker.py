@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Runs scenes: ``python -m stress.worker`` takes numbers on its input, one a line.
+"""Runs scenes: ``python -m stress.worker`` takes number and seed on its input, one scene a line.
 
 For each it prints one line, a JSON object, to the file descriptor that is its standard output
 at the start; whatever else is printed goes to its standard error.
@@ -29,9 +29,10 @@ OUTCOMES = ("completed", "stopped", "silent", "crashed", "hung")
 def run(scene, comm=MPI.COMM_WORLD):
     """Run a scene and return what became of it (collective).
 
-    ``outcome`` is ``completed``; ``stopped`` (by an error of the package, with the last
-    converged state whole); ``silent`` (converged, but a check fails, whether it stopped later or
-    not); or ``crashed`` (another error, or a state that the failure has changed).
+    ``outcome`` is ``completed`` (or refused, as folded input must be); ``stopped`` (by an error of
+    the package, with the last converged state whole); ``silent`` (converged, but a check fails,
+    whether it stopped later or not); or ``crashed`` (another error, or a state that the failure
+    has changed).
     """
     start = time.process_time()
     result = {"number": scene["number"], "class": scene["class"], "steps": 0}
@@ -47,6 +48,9 @@ def run(scene, comm=MPI.COMM_WORLD):
                 warnings.filterwarnings("ignore", message="The run ")
                 for _ in problem.steps(scene["steps"], made.update):
                     observer.step()
+                if made.second is not None:
+                    for _ in problem.steps(scene["second_steps"], made.second):
+                        observer.step()
         except mpm.MPMError as failure:
             error = failure
         if observer is not None:
@@ -61,6 +65,12 @@ def run(scene, comm=MPI.COMM_WORLD):
                 result |= {"outcome": "silent", "reason": "; ".join(complaints)}
             if error is None and history.stopped is not None:
                 error = history.stopped
+        if "fold" in scene and "outcome" not in result:
+            named = any(word in str(error) for word in ("folded", "lie on a neighbour"))
+            refused = problem is None and named
+            given = f"a folded {scene['fold']} was not refused when the problem was made"
+            result |= {"outcome": "completed" if refused else "silent"}
+            result |= {"reason": f"refused: {error}" if refused else given}
         if "outcome" not in result:
             if error is None:
                 result |= {"outcome": "completed", "reason": ""}
@@ -82,7 +92,7 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     for line in sys.stdin:
-        answer = run(generator.scene(int(line)))
+        answer = run(generator.scene(*map(int, line.split())))
         gc.collect()
         PETSc.garbage_cleanup()
         answers.write(json.dumps(answer) + "\n")

@@ -1,0 +1,333 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Residuals and tangents on the body mesh, one compiled form per quadrature rule."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, Protocol
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ufl
+from dolfinx import fem
+from dolfinx.fem import petsc as fem_petsc
+
+from .. import _compat
+from .._core import loops
+from ..constitutive.averaging import Linearised, LowRankTerm
+from ..errors import MPMError
+from ..meshes.quadrature import nodal_forces, with_hoop
+from ..particles.particles import Particles
+from .low_rank import LowRankTangent
+from .petsc import assemble_into, assemble_matrix
+from .rules import couples_cells, depends_on, follows, form_of_rank, is_zero, split_by_rule
+from .volume_ratio import average_in
+
+__all__ = ["BodyForms", "PointStress", "no_values"]
+
+no_values: NDArray[np.float64] = np.zeros(0)
+
+
+class PointStress(Protocol):
+    """Stress at a body's quadrature points, of which the compiled loops make forces.
+
+    Attributes:
+        first_piola: First Piola stress, shape ``(n nq, dim, dim)``.
+        tangent: Its pointwise derivative by F, shape ``(n nq, dim, dim, dim, dim)``.
+    """
+
+    first_piola: NDArray[np.float64]
+    tangent: NDArray[np.float64]
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the tangent has major symmetry."""
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Undeformed volume of each point, shape ``(n, nq)``; 0 where deleted."""
+
+    @property
+    def hoop(self) -> NDArray[np.float64] | None:
+        """Hoop strains of a body of revolution's nodes, shape ``(n, nq, k)``; dim is 3 then."""
+
+
+class BodyForms:
+    """A residual on the body mesh, one compiled form per quadrature rule.
+
+    Args:
+        R: Residual in the displacement and a test function of W; ``None`` where the internal
+            stress is all there is.
+        J: Its tangent, or ``None`` for ``ufl.derivative``.
+        particles: The body.
+        internal: Stress whose virtual work ``P : grad v`` is added by the compiled loops.
+        low_rank: What the tangent has besides the forms and the pointwise one of ``internal``;
+            that of an averaged volume ratio in R is known.
+        fast: Whether :attr:`fused` forms are left to the compiled loops.
+        **options: Passed on to ``dolfinx.fem.form``.
+
+    Attributes:
+        internal: As given.
+        fused: Parts of the tangent that the compiled loops assemble.
+        stock: Parts of the tangent in :attr:`K`.
+        follows_load: Whether what the load factor does depends on the displacement.
+        K: The stock parts of the tangent, on W, as assembled last; on the reference route with
+            the low-rank part.
+
+    Raises:
+        MPMError: A form with other arguments, or rules that do not go together.
+    """
+
+    def __init__(
+        self,
+        R: ufl.Form | None,
+        J: ufl.Form | None,
+        particles: Particles,
+        internal: PointStress | None = None,
+        low_rank: Linearised | None = None,
+        fast: bool = False,
+        **options: Any,
+    ) -> None:
+        self._options = options
+        self._fast = fast
+        self._particles = particles
+        self.internal = internal
+        d = particles.displacement
+        parts: list[ufl.Form] = []
+        self._average = average_in(R)
+        if R is not None and (internal is None or not is_zero(R)):
+            (self._test,) = form_of_rank(R, 1, particles.W, "the residual R", "particles.W")
+            parts = split_by_rule(R, d)
+        if particles.deletion is not None:
+            parts = [particles.deletion.present_only(part) for part in parts]
+        live = [p for p in parts if follows(p, d)]
+        dead = [p for p in parts if not follows(p, d)]
+        tangents: list[ufl.Form]
+        if J is None or (internal is not None and is_zero(J)):
+            tangents = [ufl.derivative(p, d) for p in live if depends_on(p, d)]
+        else:
+            form_of_rank(J, 2, particles.W, "the tangent J", "particles.W")
+            tangents = split_by_rule(J, d)
+            if particles.deletion is not None:
+                tangents = [particles.deletion.present_only(part) for part in tangents]
+        if not tangents and internal is None:
+            raise MPMError(
+                "The residual R does not depend on particles.displacement; write it in that "
+                "Function, or give its tangent as J."
+            )
+        self._parts = parts
+        self._body = particles.mesh
+        self._element = particles.W.ufl_element()
+        self._live = self._compile(live)
+        self._dead = self._compile(dead)
+        load = particles.load
+        self._loaded = [
+            form
+            for part, form in zip([*live, *dead], [*self._live, *self._dead], strict=True)
+            if any(constant is load for constant in part.constants())
+        ]
+        self.follows_load = any(any(c is load for c in part.constants()) for part in live)
+        together = [fast and not couples_cells(form) for form in tangents]
+        compiled = self._compile(tangents)
+        self.fused = [form for form, fuse in zip(compiled, together, strict=True) if fuse]
+        self.stock = [form for form, fuse in zip(compiled, together, strict=True) if not fuse]
+        self._stock_ufl = [form for form, fuse in zip(tangents, together, strict=True) if not fuse]
+        source = low_rank if self._average is None else self._average
+        self._source = source
+        self._low_rank = None if source is None else LowRankTangent(particles, source)
+        whole = internal is not None and particles.num_points > 1
+        self._by_domains = fast and whole and source is not None and source.groups.single
+        self.r: PETSc.Vec = _compat.create_vector(particles.W)
+        self.external: PETSc.Vec = _compat.create_vector(particles.W)
+
+    def _compile(self, forms: list[ufl.Form]) -> list[fem.Form]:
+        return [fem.form(form, **self._options) for form in forms]
+
+    @property
+    def low_rank(self) -> LowRankTangent | None:
+        """What the tangent has besides stock, fused and internal parts, if anything."""
+        return self._low_rank if self._fast and not self._by_domains else None
+
+    def low_rank_of_domains(self) -> LowRankTerm | None:
+        """Return what the internal tangent has besides, each domain for itself, if anything."""
+        if not self._by_domains or self._source is None:
+            return None
+        return self._source.linearise()
+
+    @cached_property
+    def _sparse(self) -> PETSc.Mat:
+        matrix = fem_petsc.create_matrix(self._pattern(self._stock_ufl, self._particles.W))
+        self.K: PETSc.Mat = matrix
+        return matrix
+
+    def _pattern(self, tangents: list[ufl.Form], W: fem.FunctionSpace) -> fem.Form:
+        """Return a form whose sparsity holds all tangents."""
+        kinds = {i.integral_type() for t in tangents for i in t.integrals()}
+        if "interior_facet" not in kinds:
+            for form, compiled in zip(tangents, self.stock, strict=True):
+                for i in form.integrals():
+                    if (i.integral_type(), i.subdomain_id()) == ("cell", "everywhere"):
+                        return compiled
+        u, v = ufl.TrialFunction(W), ufl.TestFunction(W)
+        pattern = ufl.inner(u, v) * ufl.dx
+        if "interior_facet" in kinds:
+            pattern += ufl.inner(ufl.avg(u), ufl.avg(v)) * ufl.dS
+        return self._compile([pattern])[0]
+
+    def update_average(self) -> None:
+        """Set the averaged volume ratio that the residual may hold (collective)."""
+        if self._average is not None:
+            self._average.update()
+
+    def assemble_external(self) -> None:
+        """Assemble the parts that do not depend on the displacement."""
+        assemble_into(self.external, self._dead)
+
+    def load_derivative(self, order: int = 1) -> tuple[PETSc.Vec, float]:
+        """Return a difference quotient of the residual by the load factor (collective).
+
+        Args:
+            order: 1, which is the derivative where the residual is affine in the load factor,
+                or 2, which is zero there.
+
+        Returns:
+            The quotient, and the size of what it is the difference of.
+        """
+        load, coefficients = self._particles.load, {1: (-1.0, 1.0), 2: (1.0, -2.0, 1.0)}[order]
+        present, size = load.value.copy(), 0.0
+        total, at = self.r.duplicate(), self.r.duplicate()
+        total.set(0.0)
+        for factor, coefficient in enumerate(coefficients):
+            load.value[...] = factor
+            assemble_into(at, self._loaded)
+            total.axpy(coefficient, at)
+            size += float(at.norm())
+        load.value[...] = present
+        return total, size
+
+    def assemble_residual(self) -> PETSc.Vec:
+        """Assemble the residual; the external parts are those of ``assemble_external``."""
+        self.update_average()
+        internal = self.internal
+        start = None if internal is None else self._force_of(internal, internal.first_piola)
+        assemble_into(self.r, self._live, start)
+        self.r.axpy(1.0, self.external)
+        return self.r
+
+    def _force_of(
+        self, internal: PointStress, first_piola: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the virtual work of a stress at this rank's own and ghost dofs."""
+        particles = self._particles
+        force: NDArray[np.float64] = np.zeros(len(particles.displacement.x.array))
+        loops.internal_force(
+            np.ascontiguousarray(first_piola),
+            particles.domain_nodes,
+            particles.quadrature.gradients,
+            internal.weights,
+            no_values if internal.hoop is None else internal.hoop,
+            force,
+        )
+        return force
+
+    def stiffness_force(self, w: PETSc.Vec) -> PETSc.Vec:
+        """Return the whole tangent times a vector on W (collective)."""
+        total = self.r.duplicate()
+        total.set(0.0)
+        if self.stock:
+            self.K.multAdd(w, total, total)
+        for form in self.fused:
+            matrix = fem_petsc.create_matrix(form)
+            assemble_matrix(matrix, form)
+            matrix.assemble()
+            matrix.multAdd(w, total, total)
+            matrix.destroy()
+        if self.internal is not None:
+            part = self.r.duplicate()
+            assemble_into(part, [], self._internal_stiffness_force(self.internal, w))
+            total.axpy(1.0, part)
+        if self._fast and self._low_rank is not None:
+            total.axpy(1.0, self.low_rank_force(w))
+        return total
+
+    def _nodal(self, w: PETSc.Vec) -> NDArray[np.float64]:
+        """Return a vector on W at the domains' nodes, shape ``(n, k, gdim)`` (collective)."""
+        values = fem.Function(self._particles.W)
+        values.x.array[: w.getLocalSize()] = w.array_r
+        values.x.scatter_forward()
+        nodal = values.x.array.reshape(-1, self._element.block_size)
+        return np.asarray(nodal[self._particles.domain_nodes])
+
+    def low_rank_force(self, w: PETSc.Vec) -> PETSc.Vec:
+        """Return the low-rank part of the tangent times a vector on W (collective)."""
+        assert self._low_rank is not None
+        force = np.zeros(len(self._particles.displacement.x.array))
+        contributions = self._low_rank.times(self._nodal(w))
+        nodes = self._particles.domain_nodes
+        np.add.at(force.reshape(-1, self._element.block_size), nodes, contributions)
+        total = self.r.duplicate()
+        assemble_into(total, [], force)
+        return total
+
+    def _internal_stiffness_force(self, internal: PointStress, w: PETSc.Vec) -> NDArray[np.float64]:
+        """Return the internal pointwise tangent times a vector on W, at own and ghost dofs."""
+        nodal = self._nodal(w)
+        gradient = self._particles.quadrature.displacement_gradient(nodal)
+        if internal.hoop is not None:
+            gradient = with_hoop(gradient, internal.hoop, nodal)
+        gradient = gradient.reshape(internal.first_piola.shape)
+        stress = np.einsum("niJkL,nkL->niJ", internal.tangent, gradient)
+        return self._force_of(internal, stress)
+
+    def assemble_tangent(self) -> PETSc.Mat:
+        """Assemble the stock parts of the tangent, always the same object."""
+        self._sparse.zeroEntries()
+        for form in self.stock:
+            assemble_matrix(self._sparse, form)
+        self._sparse.assemble()
+        if self._low_rank is not None and not self._fast:
+            self.K = self._low_rank.added_to(self._sparse)
+        return self.K
+
+    @cached_property
+    def _elementwise(self) -> tuple[list[fem.Form], PETSc.Vec]:
+        """The residual tested domain by domain: element vectors that are not summed."""
+        broken = fem.functionspace(
+            self._body,
+            ("Discontinuous Lagrange", self._element.degree, (self._element.block_size,)),
+        )
+        swap = {self._test: ufl.TestFunction(broken)}
+        forms = self._compile([ufl.replace(part, swap) for part in self._parts])
+        return forms, _compat.create_vector(broken)
+
+    def absolute_contributions(self, domain_nodes: NDArray[np.int32]) -> PETSc.Vec:
+        """Return the sum over domains of the absolute values of what each adds to the residual.
+
+        It measures the forces inside a body that is in equilibrium with itself.
+        """
+        gdim = self._element.block_size
+        n, k = domain_nodes.shape
+        own: NDArray[np.float64] = np.zeros((n, k, gdim))
+        if self._parts:
+            forms, vector = self._elementwise
+            assemble_into(vector, forms)
+            own += vector.array_r[: n * k * gdim].reshape(n, k, gdim)
+        if self.internal is not None:
+            weights = self.internal.weights
+            P = self.internal.first_piola.reshape(
+                *weights.shape, *self.internal.first_piola.shape[1:]
+            )
+            own += nodal_forces(
+                P, weights, self._particles.quadrature.gradients, self.internal.hoop
+            )
+        own = np.abs(own)
+        total = self.r.duplicate()
+        with total.localForm() as local:
+            local.set(0.0)
+            np.add.at(local.array_w.reshape(-1, gdim), domain_nodes, own)
+        total.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+        return total

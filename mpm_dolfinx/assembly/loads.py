@@ -1,0 +1,79 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The virtual work of stress and loads on a body, in UFL."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import ufl
+from dolfinx import fem
+
+from ..constitutive.strain import Strain
+from .inputs import as_expression, facet_measure
+
+__all__ = ["VirtualWork"]
+
+
+class VirtualWork:
+    """The forms of a body.
+
+    Args:
+        strain: What the body is strained in.
+    """
+
+    def __init__(self, strain: Strain) -> None:
+        self._strain = strain
+        self._body = strain.particles
+        self._dim = self._body.mesh.geometry.dim
+        self._v = ufl.TestFunction(self._body.W)
+
+    def internal(self, P: fem.Function, A: fem.Function) -> tuple[ufl.Form, ufl.Form]:
+        """Return the internal virtual work and its tangent."""
+        i, j, k, m = ufl.indices(4)
+        trial = self._strain.ufl_gradient(ufl.TrialFunction(self._body.W))
+        test = self._strain.ufl_gradient(self._v)
+        work = self._strain.turn * ufl.inner(P, test) * self._body.dx
+        tangent = self._strain.turn * A[i, j, k, m] * trial[k, m] * test[i, j] * self._body.dx
+        return work, tangent
+
+    def mass(self, density: Any, test: Any) -> ufl.Form:
+        """Return the integral of the density times a test function."""
+        form: ufl.Form = density * self._strain.turn * test * self._body.dx_exact
+        return form
+
+    def _at_load(self, terms: Sequence[ufl.Form]) -> ufl.Form:
+        """Return the sum of terms times the load factor."""
+        return ufl.Form([i for term in terms for i in (self._body.load * term).integrals()])
+
+    def body_force(self, density: Any, force: Any) -> ufl.Form:
+        """Return the virtual work of the body force."""
+        b = as_expression(force, self._body, "body_force", (self._dim,))
+        work: ufl.Form = density * self._strain.turn * ufl.inner(b, self._v) * self._body.dx_exact
+        return self._at_load([work])
+
+    def tractions(self, loads: Sequence[tuple[Any, int]], tags: Any) -> ufl.Form:
+        """Return the virtual work of dead tractions."""
+        ds = facet_measure(self._body, tags, loads, "tractions")
+        terms = [
+            self._strain.turn
+            * self._body.area_ratio
+            * ufl.inner(as_expression(t, self._body, "a traction", (self._dim,)), self._v)
+            * ds(tag)
+            for t, tag in loads
+        ]
+        return self._at_load(terms)
+
+    def pressures(self, loads: Sequence[tuple[Any, int]], tags: Any) -> ufl.Form:
+        """Return minus the virtual work of pressures on the deformed facets."""
+        ds = facet_measure(self._body, tags, loads, "pressures")
+        d = self._body.displacement
+        F = ufl.Identity(self._dim) + ufl.grad(d)
+        area = ufl.det(F) * ufl.inv(F).T * ufl.FacetNormal(self._body.mesh)
+        area *= self._strain.present_turn
+        terms = [
+            as_expression(p, self._body, "a pressure", ()) * ufl.inner(area, self._v) * ds(tag)
+            for p, tag in loads
+        ]
+        return self._at_load(terms)

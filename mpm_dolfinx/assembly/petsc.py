@@ -1,0 +1,121 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""PETSc matrices and vectors that sums over cells are added to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+from dolfinx.fem import petsc as fem_petsc
+
+from .. import _compat
+
+__all__ = ["MatrixSum", "assemble_into", "assemble_matrix", "assembled", "blocked", "marked"]
+
+# Their types name the first of several dispatched signatures only.
+assemble_vector: Any = fem_petsc.assemble_vector
+assemble_matrix: Any = fem_petsc.assemble_matrix
+SUBSET = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
+DIFFERENT = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
+
+
+def assemble_into(
+    vector: PETSc.Vec, forms: list[fem.Form], start: NDArray[np.float64] | None = None
+) -> None:
+    """Assemble forms, added to what this rank has at its own and ghost dofs."""
+    with vector.localForm() as local:
+        local.set(0.0)
+        if start is not None:
+            local.array_w[:] = start
+    for form in forms:
+        assemble_vector(vector, form)
+    vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+
+
+def marked(V: fem.FunctionSpace, nodes: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which of this rank's own nodes any rank names by their global numbers."""
+    imap = V.dofmap.index_map
+    mark = PETSc.Vec().createMPI((imap.size_local, imap.size_global), comm=V.mesh.comm)
+    named = np.unique(nodes).astype(PETSc.IntType)
+    mark.setValues(named, np.ones(len(named)), addv=PETSc.InsertMode.ADD_VALUES)
+    mark.assemble()
+    result = np.asarray(mark.array_r > 0.0)
+    mark.destroy()
+    return result
+
+
+def assembled(
+    V: fem.FunctionSpace,
+    rows: NDArray[np.int64],
+    columns: NDArray[np.int64],
+    values: NDArray[np.float64],
+    bs: int = 1,
+) -> PETSc.Mat:
+    """Return the sum of entries of any rank on nodes (bs 1) or dofs of V (collective)."""
+    imap = V.dofmap.index_map
+    sizes = (imap.size_local * bs, imap.size_global * bs)
+    matrix = PETSc.Mat().create(comm=V.mesh.comm)
+    matrix.setSizes((sizes, sizes))
+    matrix.setType("aij")
+    _compat.set_entry_places(matrix, rows.astype(PETSc.IntType), columns.astype(PETSc.IntType))
+    _compat.set_entries(matrix, np.ascontiguousarray(values))
+    return matrix
+
+
+def blocked(
+    V: fem.FunctionSpace,
+    rows: NDArray[np.int64],
+    columns: NDArray[np.int64],
+    values: NDArray[np.float64],
+    bs: int,
+) -> PETSc.Mat:
+    """Return entries on nodes summed up as a matrix on dofs, the same for all components."""
+    scalar = assembled(V, rows, columns, values)
+    offsets, nodes, data = scalar.getValuesCSR()
+    scalar.destroy()
+    count = np.repeat(np.diff(offsets), bs)
+    indptr = np.concatenate([[0], np.cumsum(count)])
+    place = np.repeat(np.repeat(offsets[:-1], bs) - indptr[:-1], count) + np.arange(indptr[-1])
+    component = np.repeat(np.tile(np.arange(bs), len(offsets) - 1), count)
+    imap = V.dofmap.index_map
+    sizes = (imap.size_local * bs, imap.size_global * bs)
+    indices = (nodes[place] * bs + component).astype(PETSc.IntType)
+    csr = (indptr.astype(PETSc.IntType), indices, data[place])
+    return PETSc.Mat().createAIJ((sizes, sizes), csr=csr, comm=V.mesh.comm)
+
+
+class MatrixSum:
+    """The sum of matrices, of which each keeps its sparsity as long as it is the same object."""
+
+    def __init__(self) -> None:
+        self._parts: list[PETSc.Mat] = []
+        self._total: PETSc.Mat | None = None
+
+    def of(self, parts: Sequence[PETSc.Mat]) -> PETSc.Mat:
+        """Return the sum, the same object for the same parts (collective).
+
+        Args:
+            parts: Matrices of the same size and layout; a single one is returned as it is.
+        """
+        if len(parts) == 1:
+            return parts[0]
+        known = len(parts) == len(self._parts) and all(
+            one is other for one, other in zip(parts, self._parts, strict=True)
+        )
+        if not known or self._total is None:
+            self._parts = list(parts)
+            self._total = parts[0].copy()
+            for part in parts[1:]:
+                self._total.axpy(1.0, part, structure=DIFFERENT)
+            return self._total
+        self._total.zeroEntries()
+        for part in parts:
+            self._total.axpy(1.0, part, structure=SUBSET)
+        return self._total

@@ -1,0 +1,142 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What the integrals of a form depend on, and the rule that each one needs."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+
+import ufl
+from dolfinx import fem
+from ufl.algorithms.estimate_degrees import estimate_total_polynomial_degree
+from ufl.corealg.traversal import traverse_unique_terminals
+
+from .. import _compat
+from ..errors import MPMError
+from ..meshes.quadrature import quadrature_rule
+
+__all__ = [
+    "couples_cells",
+    "data_at_points",
+    "depends_on",
+    "follows",
+    "form_of_rank",
+    "is_zero",
+    "split_by_rule",
+    "vanishes",
+]
+
+
+def form_of_rank(form: Any, rank: int, space: fem.FunctionSpace, what: str, where: str) -> Any:
+    """Return test (and trial) function of a form, if they are from a space."""
+    if isinstance(form, ufl.Form) and is_zero(form):
+        raise MPMError(f"{what} is zero.")
+    arguments = form.arguments() if isinstance(form, ufl.Form) else ()
+    if len(arguments) != rank:
+        kind = "one test function" if rank == 1 else "a test and a trial function"
+        raise MPMError(f"{what} must be a UFL form with {kind} of {where}.")
+    if any(argument.ufl_function_space() != space for argument in arguments):
+        kind = "test function" if rank == 1 else "test and trial functions"
+        raise MPMError(f"The {kind} of {what} must be from {where}.")
+    return arguments
+
+
+def is_zero(form: Any) -> bool:
+    """Return whether nothing is left of a form, as of ``0.0 * form``."""
+    return isinstance(form, ufl.Form) and all(map(vanishes, form.integrals()))
+
+
+def couples_cells(form: ufl.Form) -> bool:
+    """Return whether a form's element tensors have dofs of more than one cell."""
+    return any(i.integral_type() not in ("cell", "exterior_facet") for i in form.integrals())
+
+
+def depends_on(form: ufl.Form, function: fem.Function) -> bool:
+    """Return whether a form contains a function."""
+    return any(c is function for c in form.coefficients())
+
+
+def follows(form: ufl.Form, displacement: fem.Function) -> bool:
+    """Return whether a form changes during a step.
+
+    It does where it has the displacement, or data injected at quadrature points.
+    """
+    return depends_on(form, displacement) or bool(data_at_points(form))
+
+
+def data_at_points(form: ufl.Form) -> set[fem.Function]:
+    """Return the Functions at quadrature points that a form holds."""
+    return {c for c in form.coefficients() if c.ufl_element().has_custom_quadrature}
+
+
+def vanishes(integral: Any) -> bool:
+    """Return whether an integral is zero, as in ``0.0 * form``: FFCx makes nothing of it."""
+    return isinstance(_compat.expanded(integral), ufl.constantvalue.Zero)
+
+
+def _rule(integral: Any) -> tuple[int, str]:
+    """Return the degree and scheme that one integral is meant to be integrated with."""
+    metadata = integral.metadata()
+    degree = metadata.get("quadrature_degree", -1)
+    scheme = str(metadata.get("quadrature_rule", "default"))
+    for terminal in traverse_unique_terminals(integral.integrand()):
+        element = (
+            terminal.function_space.ufl_element() if isinstance(terminal, fem.Function) else None
+        )
+        if element is None or not element.has_custom_quadrature:
+            continue
+        points = element.custom_quadrature()[0]
+        if degree == -1:
+            degree = element.degree
+        cell = terminal.function_space.mesh.basix_cell()
+        rule, _ = quadrature_rule(cell, degree)
+        if points.shape != rule.shape or not np.allclose(points, rule):
+            raise MPMError(
+                f"The form integrates '{terminal.name}', known at {len(points)} quadrature "
+                f"point(s) of a domain, with a rule of {len(rule)} point(s); integrate it with "
+                "particles.dx."
+            )
+    if degree == -1:
+        estimate = estimate_total_polynomial_degree(_compat.expanded(integral))
+        degree = max(estimate) if isinstance(estimate, tuple) else estimate
+    return int(degree), scheme
+
+
+def split_by_rule(form: ufl.Form, displacement: fem.Function) -> list[ufl.Form]:
+    """Split a form so that each part has one rule, one kind of dependence and one set of tags.
+
+    Integrals that are zero are left out.
+
+    FFCx (0.9 to 0.11) miscompiles a form that mixes a one-point rule with another rule, so
+    each rule gets a form of its own; parts that are constant during a step are apart too.
+
+    Args:
+        form: Any UFL form on the body mesh.
+        displacement: The displacement of the body.
+
+    Returns:
+        The parts, whose sum is ``form``.
+
+    Raises:
+        MPMError: Where data at quadrature points meet another rule.
+    """
+    parts: dict[tuple[bool, str, int, str, int], list[Any]] = defaultdict(list)
+    markers: list[Any] = []
+    for integral in form.integrals():
+        if vanishes(integral):
+            continue
+        degree, scheme = _rule(integral)
+        metadata = dict(integral.metadata())
+        metadata.update(quadrature_degree=degree, quadrature_rule=scheme)
+        one = integral.reconstruct(metadata=metadata)
+        constant = not follows(ufl.Form([one]), displacement)
+        tags = integral.subdomain_data()
+        seen = [i for i, known in enumerate(markers) if known is tags]
+        if not seen:
+            markers.append(tags)
+        place = seen[0] if seen else len(markers) - 1
+        parts[constant, integral.integral_type(), degree, scheme, place].append(one)
+    return [ufl.Form(parts[key]) for key in sorted(parts)]

@@ -1,0 +1,97 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Values of the background's basis at points, on the ranks that ask."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from .. import _compat
+from .cells import DROP, TOLERANCE, Cells, CellTable
+from .tiles import Tiles
+
+__all__ = ["BackgroundBasis", "PointBasis"]
+
+
+class PointBasis(NamedTuple):
+    """Background basis functions at points.
+
+    Attributes:
+        nodes: Global node (block) numbers of V, shape ``(n, k)``.
+        values: Their values at the points, zero where below 1e-13, shape ``(n, k)``.
+        found: Whether a background cell holds the point, shape ``(n,)``.
+        gradients: Their gradients, shape ``(n, k, gdim)``, where asked for.
+        cell: The cell, a local number on the rank that owns it, shape ``(n,)``; ``None`` where
+            values are of several cells.
+        rank: That rank, shape ``(n,)``.
+    """
+
+    nodes: NDArray[np.int64]
+    values: NDArray[np.float64]
+    found: NDArray[np.bool_]
+    gradients: NDArray[np.float64] | None = None
+    cell: NDArray[np.int64] | None = None
+    rank: NDArray[np.int64] | None = None
+
+    def part(self, count: int) -> PointBasis:
+        """Return what is known of the first points."""
+        return PointBasis._make(None if a is None else a[:count] for a in self)
+
+
+class BackgroundBasis:
+    """Evaluates the basis of a background space at points, wherever their cells live.
+
+    On several ranks each learns of the cells around its points from the ranks that own them, and
+    remembers them: where points stay among known cells, nothing is sent.
+
+    Args:
+        V: Vector Lagrange space on the background mesh (collective).
+    """
+
+    def __init__(self, V: fem.FunctionSpace) -> None:
+        self._mesh = V.mesh
+        self._basis = V.ufl_element().basix_element
+        own = CellTable.owned(V)
+        self._tiles = Tiles(V.mesh.comm, own) if V.mesh.comm.size > 1 else None
+        self._cells = Cells(V.mesh, own if self._tiles is None else self._tiles.cells)
+
+    def at(self, points: NDArray[np.float64], gradients: bool = False) -> PointBasis:
+        """Evaluate the basis at points (collective).
+
+        A point on a facet belongs to that of its cells that comes first in the mesh's input,
+        on any number of ranks. A point at most 1e-10 of a cell outside the mesh counts as on it.
+
+        Args:
+            points: This rank's points, shape ``(n, gdim)``; they may lie in cells of any rank.
+            gradients: Whether to evaluate gradients too.
+
+        Returns:
+            Nodes, values and whether a cell was found.
+        """
+        if self._tiles is not None and self._tiles.know(points):
+            self._cells = Cells(self._mesh, self._tiles.cells)
+        cells = self._cells
+        n, k = len(points), cells.nodes.shape[1]
+        if n == 0 or len(cells.index) == 0:
+            slopes = np.zeros((n, k, points.shape[1])) if gradients else None
+            none = np.zeros(n, dtype=np.int64)
+            nodes = np.zeros((n, k), dtype=np.int64)
+            return PointBasis(nodes, np.zeros((n, k)), none > 0, slopes, none, none)
+        cell, reference, violation = cells.locate(points)
+        reference = cells.clip(reference)
+        table = _compat.tabulated(self._basis, int(gradients), reference)
+        found = violation <= TOLERANCE
+        inside = found[:, None]
+        values = np.where((np.abs(table[0]) >= DROP) & inside, table[0], 0.0)
+        slopes = None
+        if gradients:
+            jacobian = cells.jacobians(cell, reference)
+            slopes = np.einsum("jpk,pji->pki", table[1:], np.linalg.inv(jacobian))
+            slopes = np.where(inside[:, :, None], slopes, 0.0)
+        nodes = cells.nodes[cell]
+        return PointBasis(nodes, values, found, slopes, cells.home[cell], cells.rank[cell])

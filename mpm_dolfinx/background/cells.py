@@ -1,0 +1,333 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Cells of the background: which one holds a point, and where in it."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from itertools import product
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+import basix.ufl
+from dolfinx import fem, mesh
+
+from .. import _compat
+
+__all__ = ["DROP", "TOLERANCE", "CellTable", "Cells", "cell_volumes"]
+
+#: Reference distance within which a point outside a cell counts as on its boundary.
+TOLERANCE = 1e-10
+#: Reference distance within which a point is on a facet; the cell first in the input takes it.
+FACET = 1e-12
+#: Points looked for at once, so that what is known of them stays in the cache.
+BLOCK = 1 << 14
+#: Basis values below this are no weight.
+DROP = 1e-13
+
+
+class CellTable(NamedTuple):
+    """Background cells, of any rank.
+
+    Attributes:
+        vertices: Their geometry nodes, shape ``(n, k, gdim)``.
+        nodes: Global nodes of V, shape ``(n, K)``.
+        number: Input indices, shape ``(n,)``.
+        home: Local numbers on the ranks that own them, shape ``(n,)``.
+        rank: These ranks, shape ``(n,)``.
+    """
+
+    vertices: NDArray[np.float64]
+    nodes: NDArray[np.int64]
+    number: NDArray[np.int64]
+    home: NDArray[np.int64]
+    rank: NDArray[np.int64]
+
+    @classmethod
+    def owned(cls, V: fem.FunctionSpace) -> CellTable:
+        """Return the cells that this rank owns."""
+        background = V.mesh
+        count = background.topology.index_map(background.topology.dim).size_local
+        corners = _compat.geometry_dofmap(background)[:count]
+        dofs = V.dofmap.list[:count]
+        return cls(
+            background.geometry.x[corners][:, :, : background.geometry.dim],
+            V.dofmap.index_map.local_to_global(dofs.ravel()).reshape(dofs.shape),
+            _compat.input_cell_index(background),
+            np.arange(count),
+            np.full(count, background.comm.rank),
+        )
+
+    def part(self, which: slice | NDArray[np.int64]) -> CellTable:
+        """Return some of the cells."""
+        return CellTable._make(a[which] for a in self)
+
+    def joined(self, other: CellTable) -> CellTable:
+        """Return the cells of both tables, each once."""
+        both = CellTable._make(np.concatenate(pair) for pair in zip(self, other, strict=True))
+        return both.part(np.unique(both.number, return_index=True)[1])
+
+
+class Cells:
+    """Background cells, and the inverse of their maps.
+
+    Args:
+        background: The mesh.
+        table: All of its cells, or some.
+    """
+
+    def __init__(self, background: mesh.Mesh, table: CellTable) -> None:
+        self.vertices, self.nodes, self.index, self.home, self.rank = table
+        self.gdim = background.geometry.dim
+        count = len(self.vertices)
+        self._background = background
+        self._name = background.basix_cell()
+        self.simplex = self._name in (basix.CellType.triangle, basix.CellType.tetrahedron)
+        self.map = basix.ufl.element(
+            "Lagrange", self._name.name, _compat.geometry_degree(background)
+        ).basix_element
+        self.middle = basix.geometry(self._name).mean(axis=0)
+        # Of coordinates: no small part of a cell that is tiny or far from the origin.
+        self.roundoff = 8.0 * np.finfo(float).eps * np.abs(self.vertices).max(initial=0.0)
+        self.affine = self._is_affine()
+        if self.affine:
+            every = np.arange(count)
+            self._slopes = np.linalg.inv(self.jacobians(every, np.tile(self.middle, (count, 1))))
+            self._centres = np.einsum(
+                "k,nki->ni", self.map.tabulate(0, self.middle[None])[0, 0, :, 0], self.vertices
+            )
+        self.grid = None if self.simplex or not self.affine else RegularGrid.of(self.vertices)
+
+    @cached_property
+    def tree(self) -> Any:
+        """A tree of the cells' bounding boxes."""
+        size = np.ptp(self.vertices.reshape(-1, self.gdim), axis=0).max()
+        domain = self._background
+        if domain.comm.size > 1:
+            degree = self.map.degree
+            domain = _compat.disconnected_mesh(
+                MPI.COMM_SELF, self.vertices, self._name, degree=degree
+            )
+        cells = np.arange(len(self.vertices), dtype=np.int32)
+        return _compat.cell_tree(domain, cells, 1e2 * TOLERANCE * size)
+
+    def _is_affine(self) -> bool:
+        if len(self.vertices) == 0 or (self.simplex and self.map.degree == 1):
+            return True
+        corners = np.vstack([self.middle, self.middle + 0.37 / (1 + np.arange(self.gdim))])
+        jacobians = self.jacobians(
+            np.arange(len(self.vertices)).repeat(2), np.tile(corners, (len(self.vertices), 1))
+        ).reshape(-1, 2, self.gdim, self.gdim)
+        change = np.abs(jacobians[:, 0] - jacobians[:, 1]).max(axis=(1, 2))
+        slack = 1e-12 * np.abs(jacobians).max(axis=(1, 2, 3))
+        return bool(np.all(change <= np.maximum(slack, self.roundoff)))
+
+    def jacobians(
+        self, cells: NDArray[np.int64], reference: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return ``dx/dX`` of cells at reference points, shape ``(n, gdim, gdim)``."""
+        table = _compat.tabulated(self.map, 1, reference)[1:]
+        return np.asarray(np.einsum("jpk,pki->pij", table, self.vertices[cells]))
+
+    def pull_back(
+        self, cells: NDArray[np.int64], points: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return reference coordinates of points in cells; NaN where Newton fails.
+
+        Args:
+            cells: Local cells, shape ``(n,)``.
+            points: Points, shape ``(n, gdim)``.
+
+        Returns:
+            Reference coordinates, shape ``(n, gdim)``, where cells are not affine by at most 30
+            Newton steps.
+        """
+        if self.affine:
+            gaps = points - self._centres[cells]
+            return np.asarray(self.middle + np.einsum("nij,nj->ni", self._slopes[cells], gaps))
+        reference = np.tile(self.middle, (len(points), 1))
+        active = np.arange(len(points))
+        smallest = np.ptp(self.vertices, axis=1).max(axis=1).min(initial=np.inf)
+        floor = self.roundoff / smallest
+        for _ in range(30):
+            table = _compat.tabulated(self.map, 1, reference[active])
+            corners = self.vertices[cells[active]]
+            gap = points[active] - np.einsum("pk,pki->pi", table[0], corners)
+            jacobian = np.einsum("jpk,pki->pij", table[1:], corners)
+            with np.errstate(all="ignore"):
+                step = _solve(jacobian, gap)
+            reference[active] += step
+            size = np.abs(step).max(axis=1)
+            lost = ~(size < 1e3)
+            reference[active[lost]] = np.nan
+            active = active[~lost & (size > max(1e-14, floor))]
+            if len(active) == 0:
+                return reference
+        reference[active[size[~lost & (size > max(1e-14, floor))] > 1e-12]] = np.nan
+        return reference
+
+    def violation(self, reference: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far reference coordinates lie outside the cell (0 inside, inf for NaN)."""
+        low = -reference.min(axis=1, initial=0.0)
+        high = reference.sum(axis=1) - 1 if self.simplex else reference.max(axis=1) - 1
+        worst = np.maximum(low, high)
+        return np.where(np.isnan(worst), np.inf, np.where(worst <= FACET, 0.0, worst))
+
+    def clip(self, reference: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return reference coordinates moved onto the cell."""
+        if not self.simplex:
+            return np.clip(reference, 0.0, 1.0)
+        inside = np.maximum(reference, 0.0)
+        return np.asarray(inside / np.maximum(1.0, inside.sum(axis=1))[:, None])
+
+    def locate(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return for each point the best cell, its reference coordinates and its violation."""
+        n = len(points)
+        cell = np.zeros(n, dtype=np.int64)
+        reference = np.tile(self.middle, (n, 1))
+        violation = np.full(n, np.inf)
+        for start in range(0, n if len(self.vertices) else 0, BLOCK):
+            block = np.arange(start, min(start + BLOCK, n))
+            block = block[np.isfinite(points[block]).all(axis=1)]
+            if self.grid is not None:
+                inside, found = self.grid.find(points[block], self.index)
+                known = block[inside]
+                cell[known] = found
+                reference[known] = self.pull_back(found, points[known])
+                violation[known] = self.violation(reference[known])
+                block = block[violation[block] > TOLERANCE]
+            if len(block) == 0:
+                continue
+            hit, found, coordinates, outside = self._search(points[block])
+            known = block[hit]
+            cell[known], reference[known], violation[known] = found, coordinates, outside
+        return cell, reference, violation
+
+    def _search(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return which points lie in a cell's bounding box, and for them what ``locate`` does."""
+        padded = np.zeros((len(points), 3))
+        padded[:, : self.gdim] = points
+        offsets, candidates = _compat.candidate_cells(self.tree, padded)
+        counts = np.diff(offsets)
+        hit = np.flatnonzero(counts)
+        if len(hit) == 0:
+            return hit, hit, points[hit], np.zeros(0)
+        cells: NDArray[np.int64] = candidates.astype(np.int64)
+        reference = self.pull_back(cells, np.repeat(points, counts, axis=0))
+        outside = self.violation(reference)
+        starts, counts = offsets[hit], counts[hit]
+        least = np.repeat(np.minimum.reduceat(outside, starts), counts)
+        rank = np.where(outside == least, self.index[cells], np.iinfo(np.int64).max)
+        first = np.repeat(np.minimum.reduceat(rank, starts), counts)
+        best = np.flatnonzero(rank == first)
+        return hit, cells[best], reference[best], outside[best]
+
+
+class RegularGrid:
+    """Index arithmetic on cells that are the boxes of a rectilinear grid, or some of them.
+
+    Args:
+        lines: Coordinates of the grid lines in each direction.
+        table: Cell in each box, -1 where there is none.
+    """
+
+    def __init__(self, lines: list[NDArray[np.float64]], table: NDArray[np.int64]) -> None:
+        self._lines = lines
+        self._table = table
+
+    @classmethod
+    def of(cls, vertices: NDArray[np.float64]) -> RegularGrid | None:
+        """Return the grid of cells with these vertices ``(n, k, gdim)``, if they are one."""
+        if len(vertices) == 0:
+            return None
+        lines, places = [], []
+        for x in np.moveaxis(vertices, 2, 0):
+            line = np.unique(x)
+            line = line[np.diff(line, prepend=-np.inf) > 1e-9 * (line[-1] - line[0])]
+            middles = 0.5 * (x.min(axis=1) + x.max(axis=1))
+            place = np.searchsorted(line, middles) - 1
+            ends = line[np.clip([place, place + 1], 0, len(line) - 1)]
+            near = np.minimum(np.abs(x - ends[0][:, None]), np.abs(x - ends[1][:, None]))
+            if near.max() > 1e-9 * np.diff(line).min():
+                return None
+            lines.append(line)
+            places.append(place)
+        shape = tuple(len(line) - 1 for line in lines)
+        if np.prod(shape, dtype=float) > 16 * len(vertices):
+            return None
+        table = np.full(shape, -1, dtype=np.int64)
+        table[tuple(places)] = np.arange(len(vertices))
+        return cls(lines, table)
+
+    @staticmethod
+    def _place(line: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the interval of a line that holds each coordinate, or is next to it."""
+        size = (line[-1] - line[0]) / (len(line) - 1)
+        if np.ptp(np.diff(line)) > 1e-6 * size:
+            return np.asarray(np.clip(np.searchsorted(line, x, "right") - 1, 0, len(line) - 2))
+        place = np.clip((x - line[0]) / size, 0, len(line) - 2).astype(np.int64)
+        place -= (x < line[place]) & (place > 0)
+        place += (x >= line[place + 1]) & (place < len(line) - 2)
+        return np.asarray(place)
+
+    def find(
+        self, points: NDArray[np.float64], index: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return which points lie in boxes with a cell, and these cells.
+
+        Args:
+            points: Points, shape ``(n, gdim)``.
+            index: Input index of each cell; on a facet the first cell wins.
+        """
+        low, high = [], []
+        for line, x in zip(self._lines, points.T, strict=True):
+            place = self._place(line, x)
+            reach = FACET * (line[place + 1] - line[place])
+            low.append(np.where(x - line[place] <= reach, np.maximum(place - 1, 0), place))
+            beyond = np.minimum(place + 1, len(line) - 2)
+            high.append(np.where(line[place + 1] - x <= reach, beyond, place))
+        cell = self._table[tuple(high)]
+        between = np.flatnonzero(np.any([a != b for a, b in zip(low, high, strict=True)], axis=0))
+        for pick in product(*zip(low, high, strict=True)) if len(between) else ():
+            other = self._table[tuple(p[between] for p in pick)]
+            mine = cell[between]
+            better = (other >= 0) & ((mine < 0) | (index[other] < index[mine]))
+            cell[between[better]] = other[better]
+        inside = np.flatnonzero(cell >= 0)
+        return inside, cell[inside]
+
+
+def _solve(matrix: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Solve many 2 x 2 or 3 x 3 systems by Cramer's rule."""
+    if matrix.shape[-1] == 2:
+        (a, b), (c, d) = matrix[:, 0].T, matrix[:, 1].T
+        x, y = vector.T
+        cofactors = np.stack([d * x - b * y, a * y - c * x], axis=1)
+        return np.asarray(cofactors / (a * d - b * c)[:, None])
+    u, v, w = matrix[:, :, 0], matrix[:, :, 1], matrix[:, :, 2]
+    vw = np.cross(v, w)
+    numerators = [vw, np.cross(w, u), np.cross(u, v)]
+    determinant = np.einsum("pi,pi->p", u, vw)
+    cofactors = np.stack([np.einsum("pi,pi->p", k, vector) for k in numerators], axis=1)
+    return np.asarray(cofactors / determinant[:, None])
+
+
+def cell_volumes(background: mesh.Mesh) -> NDArray[np.float64]:
+    """Return the volumes of the cells that this rank owns, shape ``(c,)``; areas in the plane."""
+    cell, gdim = background.basix_cell(), background.geometry.dim
+    degree = _compat.geometry_degree(background)
+    element = basix.ufl.element("Lagrange", cell.name, degree).basix_element
+    points, weights = basix.make_quadrature(cell, gdim * degree)
+    slopes = element.tabulate(1, points)[1:, :, :, 0]
+    count = background.topology.index_map(background.topology.dim).size_local
+    x = background.geometry.x[_compat.geometry_dofmap(background)[:count], :gdim]
+    jacobian = np.einsum("jqk,nki->nqij", slopes, x)
+    return np.asarray(np.abs(np.linalg.det(jacobian)) @ weights)

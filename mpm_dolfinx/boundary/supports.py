@@ -1,0 +1,316 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Supports on the body's own boundary, which need not lie on lines of the background.
+
+A support pushes back with a traction on facets of the body,
+
+    t = -penalty M / h (n . d - value) n,
+
+M a modulus of the material and h the thickness of the domain behind the facet (its volume over
+the facet's area), so that ``penalty`` is a number without unit. The term is symmetric and its
+error, a gap of ``strain h / penalty``, is far below that of the domains' displacement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ufl
+from dolfinx import fem
+
+from ..assembly.inputs import as_expression, is_tag, known_tags
+from ..errors import MPMError, agree
+from ..particles.particles import Particles
+
+__all__ = ["Support", "fixed", "plane", "roller"]
+
+#: Stiffness of a support in units of the modulus over the thickness of a domain.
+PENALTY = 1e3
+#: Gap, relative to the body's coordinates, at which a plane is touched: their round-off.
+TOUCH = 1e-14
+
+
+class Support:
+    """A support on facets of a body, made by :func:`roller`, :func:`fixed` or :func:`plane`.
+
+    Give it to ``QuasiStaticProblem(..., supports=[...])``, or add ``support.residual`` to a
+    residual of your own.
+
+    Args:
+        particles: The body.
+        gap: What the displacement lacks of the support's, UFL, shape ``(gdim,)``.
+        facet_tags: Tags of the body's facets.
+        tag: The tag of those on the support; ``None`` is the whole boundary.
+        modulus: As for :func:`roller`.
+        penalty: As for :func:`roller`.
+
+    Attributes:
+        particles: The body.
+        one_sided: Whether the body may lift off.
+    """
+
+    one_sided = False
+
+    def __init__(
+        self,
+        particles: Particles,
+        gap: Any,
+        facet_tags: Any,
+        tag: int | None,
+        modulus: Any,
+        penalty: float,
+    ) -> None:
+        if not isinstance(penalty, float | int) or not 0.0 < penalty < np.inf:
+            raise MPMError(f"penalty must be a positive number, not {penalty!r}.")
+        self.particles = particles
+        body = particles.mesh
+        metadata = particles.dx_exact.metadata()
+        if tag is None:
+            self._ds = ufl.Measure("ds", domain=body, metadata=metadata)
+        else:
+            known = known_tags(particles, facet_tags, "Supports")
+            if is_tag(tag) and tag in known:
+                known_tags(particles, facet_tags, "Supports", [tag])
+            else:
+                raise MPMError(f"There is no facet tag {tag!r}; there are {sorted(known)}.")
+            self._ds = ufl.Measure(
+                "ds", domain=body, subdomain_data=facet_tags, subdomain_id=tag, metadata=metadata
+            )
+        self._stiffness = fem.Function(fem.functionspace(body, ("Discontinuous Lagrange", 0)))
+        self._penalty = float(penalty)
+        self._modulus = modulus is not None
+        if modulus is not None:
+            self.scale(as_expression(modulus, particles, "modulus", ()))
+        self._traction = -self._stiffness * gap
+        self._turn: Any = 1.0
+        self._sums: list[fem.Form] | None = None
+
+    @property
+    def has_modulus(self) -> bool:
+        """Whether the modulus is known."""
+        return self._modulus
+
+    def scale(self, modulus: Any) -> None:
+        """Set the modulus that the penalty is relative to (collective).
+
+        Args:
+            modulus: A UFL expression on the body mesh.
+        """
+        each = ufl.TestFunction(self._stiffness.function_space)
+        area, volume, weighted = (
+            fem.assemble_vector(fem.form(form)).array
+            for form in (
+                each * self._ds,
+                each * self.particles.dx_exact,
+                modulus * each * self.particles.dx_exact,
+            )
+        )
+        behind = area > 0.0
+        self._stiffness.x.array[behind] = (
+            self._penalty * weighted[behind] * area[behind] / volume[behind] ** 2
+        )
+        values = self._stiffness.x.array[behind]
+        with agree(self.particles.mesh.comm):
+            if not (np.isfinite(values).all() and (values > 0.0).all()):
+                raise MPMError("modulus must be positive and finite where the support is.")
+        self._stiffness.x.scatter_forward()
+        self._modulus = True
+
+    def revolve(self, turn: Any) -> None:
+        """Take the support around the axis of a body of revolution.
+
+        Args:
+            turn: Length of the way around, UFL on the body mesh.
+        """
+        self._turn = turn
+
+    def at_body(self, moduli: Callable[[], NDArray[np.float64]], turn: Any) -> ufl.Form:
+        """Return minus the virtual work of the support on a body with a material (collective).
+
+        Args:
+            moduli: Returns the modulus of each domain this rank owns, shape ``(n,)``; asked where
+                none was given.
+            turn: As for :meth:`revolve`.
+        """
+        if not self._modulus:
+            each = fem.Function(self._stiffness.function_space)
+            cells = each.function_space.dofmap.list[: self.particles.num_local, 0]
+            each.x.array[cells] = moduli()
+            self.scale(each)
+        self.revolve(turn)
+        return self.residual
+
+    @property
+    def residual(self) -> ufl.Form:
+        """What the support adds to a residual: minus the virtual work of its traction.
+
+        Raises:
+            MPMError: No modulus was given.
+        """
+        if not self._modulus:
+            raise MPMError(
+                "This support needs modulus=, since no material says how stiff the body is; give "
+                "the confined modulus (lambda + 2 mu) or its like."
+            )
+        test = ufl.TestFunction(self.particles.W)
+        form: ufl.Form = -self._turn * ufl.inner(self._traction, test) * self._ds
+        return form
+
+    @property
+    def reaction(self) -> NDArray[np.float64]:
+        """Force of the support on the body now, shape ``(gdim,)``, on all ranks (collective)."""
+        if self._sums is None:
+            gdim = self.particles.mesh.geometry.dim
+            forms = [self._turn * self._traction[i] * self._ds for i in range(gdim)]
+            if self.particles.deletion is not None:
+                forms = [self.particles.deletion.present_only(form) for form in forms]
+            self._sums = [fem.form(form) for form in forms]
+        mine = np.array([fem.assemble_scalar(form) for form in self._sums])
+        return np.asarray(self.particles.mesh.comm.allreduce(mine))
+
+
+def roller(
+    particles: Particles,
+    facet_tags: Any,
+    tag: int,
+    normal: Any,
+    value: Any = 0.0,
+    *,
+    modulus: Any = None,
+    penalty: float = PENALTY,
+) -> Support:
+    """Hold facets of a body in one direction: ``n . d = value``.
+
+    Args:
+        particles: The body.
+        facet_tags: Tags of its facets.
+        tag: The tag of those that are held.
+        normal: Direction in which they are held, numbers or UFL, shape ``(gdim,)``; numbers
+            are made a unit vector.
+        value: Displacement in that direction at full load, a number, Constant or UFL; a path
+            (``update=``) takes it as it is, as it does Dirichlet values.
+        modulus: Modulus of the body that the penalty is relative to, a number or UFL; in a
+            QuasiStaticProblem the material's by default.
+        penalty: Stiffness of the support in units of modulus over thickness of a domain.
+
+    Returns:
+        The support.
+
+    Raises:
+        MPMError: Tags, directions or numbers that make no sense.
+    """
+    n = _unit(normal, particles)
+    g = as_expression(value, particles, "value", ())
+    gap = ufl.dot(n, particles.displacement) - _reached(particles) * g
+    return Support(particles, gap * n, facet_tags, tag, modulus, penalty)
+
+
+def fixed(
+    particles: Particles,
+    facet_tags: Any,
+    tag: int,
+    value: Any = None,
+    *,
+    modulus: Any = None,
+    penalty: float = PENALTY,
+) -> Support:
+    """Hold facets of a body in all directions: ``d = value``.
+
+    Args:
+        particles: The body.
+        facet_tags: Tags of its facets.
+        tag: The tag of those that are held.
+        value: Their displacement, as for :func:`roller`; numbers, Constant or UFL, shape
+            ``(gdim,)``; ``None`` is zero.
+        modulus: As for :func:`roller`.
+        penalty: As for :func:`roller`.
+
+    Returns:
+        The support.
+
+    Raises:
+        MPMError: Tags or numbers that make no sense.
+    """
+    gdim = _require(particles).mesh.geometry.dim
+    g = as_expression(np.zeros(gdim) if value is None else value, particles, "value", (gdim,))
+    gap = particles.displacement - _reached(particles) * g
+    return Support(particles, gap, facet_tags, tag, modulus, penalty)
+
+
+def plane(
+    particles: Particles,
+    point: Any,
+    normal: Any,
+    value: Any = 0.0,
+    facet_tags: Any = None,
+    tag: int | None = None,
+    *,
+    modulus: Any = None,
+    penalty: float = PENALTY,
+) -> Support:
+    """Keep the boundary of a body on one side of a smooth line or plane, which may move.
+
+    The boundary may touch it, slide on it and lift off: ``n . (X + d - point) >= value``.
+
+    Args:
+        particles: The body.
+        point: A point of the plane before it moves, numbers or UFL, shape ``(gdim,)``.
+        normal: Its normal, towards the body, as for :func:`roller`.
+        value: How far the plane has moved along its normal, as for :func:`roller`.
+        facet_tags: Tags of the body's facets, where not all of its boundary may touch.
+        tag: The tag of those that may.
+        modulus: As for :func:`roller`.
+        penalty: As for :func:`roller`.
+
+    Returns:
+        The support.
+
+    Raises:
+        MPMError: Tags, directions or numbers that make no sense.
+    """
+    n = _unit(normal, particles)
+    gdim = particles.mesh.geometry.dim
+    origin = as_expression(point, particles, "point", (gdim,))
+    g = as_expression(value, particles, "value", ())
+    x = ufl.SpatialCoordinate(particles.mesh) + particles.displacement
+    gap = ufl.dot(n, x - origin) - _reached(particles) * g
+    within = ufl.conditional(ufl.le(gap, TOUCH * _extent(particles)), gap, 0.0)
+    support = Support(particles, within * n, facet_tags, tag, modulus, penalty)
+    support.one_sided = True
+    return support
+
+
+def _extent(particles: Particles) -> float:
+    """Return the largest coordinate of the undeformed body on all ranks (collective)."""
+    x = particles.initial_domains
+    return float(particles.mesh.comm.allreduce(np.abs(x).max(initial=0.0), MPI.MAX))
+
+
+def _reached(particles: Particles) -> Any:
+    """Return the share of a support's displacement that is reached."""
+    proportional = particles.proportional
+    return particles.load * proportional + (1.0 - proportional)
+
+
+def _require(particles: Any) -> Particles:
+    if not isinstance(particles, Particles):
+        raise MPMError(f"A support needs mpm.Particles, not {type(particles).__name__}.")
+    return particles
+
+
+def _unit(normal: Any, particles: Particles) -> Any:
+    """Return a direction as UFL; numbers are made a unit vector."""
+    gdim = _require(particles).mesh.geometry.dim
+    if not isinstance(normal, ufl.core.expr.Expr):
+        as_expression(normal, particles, "normal", (gdim,))
+        length = float(np.linalg.norm(np.asarray(normal, dtype=np.float64)))
+        if length == 0.0:
+            raise MPMError("normal must not be zero.")
+        normal = np.asarray(normal, dtype=np.float64) / length
+    return as_expression(normal, particles, "normal", (gdim,))

@@ -1,0 +1,307 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""F-bar: volume ratios averaged over domains, pairs or patches, against locking.
+
+A material sees ``Fbar = (Jbar / J)^(1/dim) F`` (de Souza Neto, Peric, Dutko & Owen 1996), in
+plane strain with the power 1/2, which leaves the third direction alone; Jbar is the mean of J over
+a group of domains. The stress is that of the energy ``int psi(Fbar) dX``: residual
+``P(Fbar) : delta Fbar``, so the tangent is symmetric wherever the material's is.
+
+Nothing but shear would keep J at single points, and it would drift as a body flows, until domains
+fold. Let d be ln of a point's J over its average. To the energy is added
+``int 3 G Phi(d) dX``, G the shear modulus, convex and zero for small d (:func:`deviation`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import MPMError
+from .groups import Groups, pairs, patches, singles
+from .strain import Strain
+
+__all__ = ["F_BARS", "Array", "Linearised", "LowRankTerm", "VolumeAveraging", "deviation"]
+
+F_BARS = ("none", "domain", "pair", "patch")
+#: Deviation of ln J from its average that costs nothing, and that from which all is resisted.
+FREE = {"domain": (0.2, 0.6), "pair": (0.2, 0.6), "patch": (0.1, 0.5)}
+type Array = NDArray[np.float64]
+
+
+def deviation(d: Array, free: float, whole: float) -> tuple[Array, Array]:
+    """Return what a deviation of ln J from its average costs: Phi' and Phi''.
+
+    Phi' is odd, 0 up to ``free``, then a parabola up to ``whole``, and has slope 1 beyond.
+
+    Args:
+        d: Deviations, any shape.
+        free: Largest deviation that costs nothing.
+        whole: Deviation from which the slope is 1.
+    """
+    width = whole - free
+    excess = np.maximum(np.abs(d) - free, 0.0)
+    force = np.where(excess < width, excess**2 / (2.0 * width), excess - width / 2.0)
+    return np.sign(d) * force, np.minimum(excess / width, 1.0)
+
+
+class LowRankTerm(NamedTuple):
+    """``sum_m left_m g_m^T + g_m right_m^T`` on the dofs of W, m a group.
+
+    The vectors of a group are the sums of what its domains contribute to their nodes.
+
+    Attributes:
+        groups: The groups; ``groups.number`` are those of the owned domains, shape ``(n,)``.
+        g: Contributions to g, shape ``(n, k, gdim)``.
+        left: Contributions to the left vectors, shape ``(n, k, gdim)``.
+        right: The same array where the term is symmetric.
+    """
+
+    groups: Groups
+    g: Array
+    left: Array
+    right: Array
+
+    @classmethod
+    def of(cls, groups: Groups, h: Array, g: Array, left: Array, right: Array) -> LowRankTerm:
+        """Return ``sum_m h_m g_m g_m^T + left_m g_m^T + g_m right_m^T``.
+
+        Args:
+            groups: The groups.
+            h: Factor of each owned domain's group, shape ``(n,)``.
+            g: Contributions to g, shape ``(n, k, gdim)``.
+            left: Contributions to the left vectors, shape ``(n, k, gdim)``.
+            right: The same array where the material's tangent is symmetric.
+        """
+        half = 0.5 * h[:, None, None] * g
+        first = half + left
+        return cls(groups, g, first, first if right is left else half + right)
+
+    def times(self, nodal: Array) -> Array:
+        """Return what the owned domains contribute to the term times a vector (collective).
+
+        Args:
+            nodal: The vector at the domains' nodes, shape ``(n, k, gdim)``.
+        """
+        parts = [np.einsum("nki,nki->n", vector, nodal) for vector in (self.g, self.right)]
+        sums = self.groups.sum(np.stack(parts, axis=1))[:, :, None, None]
+        return np.asarray(sums[:, 0] * self.left + sums[:, 1] * self.g)
+
+
+class Linearised(Protocol):
+    """What knows the low-rank part of a body's tangent.
+
+    Attributes:
+        groups: The groups of domains.
+    """
+
+    groups: Groups
+
+    def linearise(self) -> LowRankTerm:
+        """Return it at the last evaluation (collective)."""
+
+
+class VolumeAveraging:
+    """F-bar on the points of a body.
+
+    One evaluation is :meth:`average`, the material's update, then :meth:`effective` or, where the
+    update failed, :meth:`abandon`; each is collective.
+
+    Args:
+        strain: What the points of the body are strained in.
+        kind: ``"domain"``, ``"pair"`` or ``"patch"``.
+        material: Number of each owned domain's material; groups have one material.
+        modulus: Modulus that resists deviations from an average, for each owned domain, ``(n,)``.
+        symmetric: Whether the material's tangent is symmetric.
+
+    Attributes:
+        kind: As given.
+        groups: The groups of domains.
+        modulus: As given.
+
+    Raises:
+        MPMError: Domains that the kind of average is not for.
+    """
+
+    def __init__(
+        self,
+        strain: Strain,
+        kind: str,
+        material: NDArray[np.int64],
+        modulus: Array,
+        symmetric: bool,
+    ) -> None:
+        self._particles = strain.particles
+        self._strain, self._dim = strain, strain.dim
+        self._symmetric = symmetric
+        self._weights = strain.volumes()
+        self._volume = self._weights.sum(axis=1)
+        self.modulus = modulus
+        self.groups = self._grouped(kind, material)
+        self.kind = kind
+        self._low_rank: LowRankTerm | None = None
+
+    def _grouped(self, kind: str, material: NDArray[np.int64]) -> Groups:
+        body = self._particles
+        if kind == "domain":
+            if body.num_points == 1:
+                raise MPMError(
+                    "f_bar='domain' averages over the points of a domain, but these have one "
+                    "each; make the particles with quadrature_degree=2, or use f_bar='patch'."
+                )
+            return singles(body)
+        if kind == "pair":
+            if body.mesh.topology.cell_name() != "triangle":
+                raise MPMError(
+                    "f_bar='pair' averages over the two triangles of a quadrilateral, but the "
+                    f"body has {body.mesh.topology.cell_name()} cells; use 'domain' or 'patch'."
+                )
+            return pairs(body, material)
+        return patches(body, material)
+
+    def average(self, gradient: Array) -> Array:
+        """Return the displacement gradient that the material sees, Fbar - I (collective).
+
+        Args:
+            gradient: Displacement gradient F - I with det F > 0, shape ``(n, nq, dim, dim)``.
+        """
+        a = 1.0 / self._dim
+        excess = _determinant_minus_one(gradient)
+        of_domain = (self._weights * excess).sum(axis=1)
+        present = ~self._particles.deleted
+        sizes = np.stack([self._volume, of_domain], axis=1)
+        sums = self.groups.sum(np.where(present[:, None], sizes, 0.0))
+        group_volume = np.where(present, sums[:, 0], self._volume)
+        of_group = np.where(present, sums[:, 1], of_domain)
+        ln_group = np.log1p(of_group / group_volume)[:, None]
+        self._deviation = np.log1p(excess) - ln_group
+        change = -a * self._deviation
+        self._group_size = group_volume + of_group
+        self._counted = self._weights * present[:, None]
+        self._J = 1.0 + excess
+        self._F = np.eye(self._dim) + gradient
+        self._Z = np.linalg.inv(self._F).swapaxes(2, 3)
+        self._s = np.exp(change)
+        scale = self._s[:, :, None, None]
+        return np.asarray(np.expm1(change)[:, :, None, None] * np.eye(self._dim) + scale * gradient)
+
+    def abandon(self) -> None:
+        """Take part in the sums of an evaluation that failed on this rank (collective)."""
+        self.groups.sum(np.zeros((len(self._volume), 2)))
+
+    def effective(self, P: Array, A: Array) -> tuple[Array, Array]:
+        """Return the first Piola stress that does work on F, and its pointwise tangent.
+
+        The rest of the tangent is :meth:`linearise` (collective).
+
+        Args:
+            P: The material's first Piola stress at Fbar, shape ``(n, nq, dim, dim)``.
+            A: Its derivative dP_iJ/dFbar_kL, shape ``(n, nq, dim, dim, dim, dim)``.
+
+        Returns:
+            Arrays of the same shapes.
+        """
+        a, s, F, Z, J = 1.0 / self._dim, self._s, self._F, self._Z, self._J
+        s2 = s[:, :, None, None]
+        left = P + s2 * np.einsum("nqiJkL,nqkL->nqiJ", A, F)
+        right = left
+        if not self._symmetric:
+            right = P + s2 * np.einsum("nqiJ,nqiJkL->nqkL", F, A)
+        p = s * np.einsum("nqiJ,nqiJ->nq", P, F)
+        stiffness = s * np.einsum("nqiJ,nqiJ->nq", left, F)
+        in_domain = a * (self._counted * p).sum(axis=1)
+        H = a**2 * (self._counted * stiffness).sum(axis=1)
+        force, stiffening = self._resistance()
+        sums = self.groups.sum(
+            np.stack(
+                [
+                    in_domain - (self._counted * force).sum(axis=1),
+                    H + (self._counted * stiffening).sum(axis=1),
+                ],
+                axis=1,
+            )
+        )
+        B = sums[:, 0]
+        beta = (B / self._group_size)[:, None] * J
+
+        factor = (beta + force - a * p)[:, :, None, None]
+        stress = s2 * P + factor * Z
+        tangent = s2[:, :, :, :, None, None] ** 2 * A
+        tangent -= _dyad((a * s2) * left, Z)
+        tangent -= _dyad(Z, (a * s2) * right)
+        tangent += _dyad((a**2 * stiffness + beta + stiffening)[:, :, None, None] * Z, Z)
+        tangent -= np.einsum("nqiL,nqkJ->nqiJkL", factor * Z, Z)
+
+        g = self._nodal((J / self._group_size[:, None])[:, :, None, None] * Z)
+        projected = (a**2 * stiffness + stiffening)[:, :, None, None] * Z
+        left = self._nodal(a * s2 * left - projected)
+        right = left if self._symmetric else self._nodal(a * s2 * right - projected)
+        self._low_rank = LowRankTerm.of(self.groups, sums[:, 1] - B, g, left, right)
+        return stress, tangent
+
+    def linearise(self) -> LowRankTerm:
+        """Return what the pointwise tangent of the last evaluation lacks."""
+        assert self._low_rank is not None
+        return self._low_rank
+
+    def _resistance(self) -> tuple[Array, Array]:
+        """Return force and stiffness, per volume, against deviations at the points."""
+        modulus = self.modulus[:, None]
+        force, stiffness = deviation(self._deviation, *FREE[self.kind])
+        return modulus * force, modulus * stiffness
+
+    def _nodal(self, stress: Array) -> Array:
+        """Return the integrals of ``stress : grad N`` over each domain, ``(n, k, gdim)``."""
+        return self._strain.nodal(stress, self._counted)
+
+    # -- Output ---------------------------------------------------------------------------
+
+    def recover(self, stress: Array) -> Array:
+        """Return stresses with the averaged part recovered linearly in each patch (collective).
+
+        Only the mean of the normal stresses that an average acts on (in plane strain, and apart
+        from it the third) is constant on a patch. It gets the slope of the plane fitted by least
+        squares to the patch's and its neighbours' means, about its own.
+
+        Args:
+            stress: Volume averages of the Cauchy stress, shape ``(n, 3, 3)``.
+
+        Returns:
+            The same shape.
+        """
+        if self.kind == "domain":
+            return stress
+        x = self._particles.initial_centroid
+        gdim = x.shape[1]
+        normal = np.einsum("nii->ni", stress)
+        parts = [normal[:, : self._dim].mean(axis=1)]
+        parts += [normal[:, 2]] if self._dim == 2 else []
+        own = np.stack(parts, axis=1)
+        present = ~self._particles.deleted
+        weighted = np.column_stack([x, own, np.ones(len(x))]) * (self._volume * present)[:, None]
+        totals = self.groups.totals(weighted)
+        means = totals[:, :-1] / np.where(totals[:, -1:] > 0.0, totals[:, -1:], 1.0)
+        centre, mean = means[:, :gdim], means[:, gdim:]
+        number = self.groups.number
+        slopes = self.groups.slopes(centre, mean)[number]
+        change = mean[number] - own + np.einsum("nvi,ni->nv", slopes, x - centre[number])
+        result = stress.copy()
+        for i in range(3):
+            result[present, i, i] += change[present, i // self._dim]
+        return result
+
+
+def _determinant_minus_one(gradient: Array) -> Array:
+    """Return det(I + H) - 1 with the relative precision of a small H."""
+    dim = gradient.shape[-1]
+    minors = 0.5 * (
+        np.einsum("...ii->...", gradient) ** 2 - np.einsum("...ij,...ji->...", gradient, gradient)
+    )
+    change = np.einsum("...ii->...", gradient) + minors
+    return np.asarray(change if dim == 2 else change + np.linalg.det(gradient))
+
+
+def _dyad(a: Array, b: Array) -> Array:
+    return np.asarray(a[..., :, :, None, None] * b[..., None, None, :, :])

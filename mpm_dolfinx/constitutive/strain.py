@@ -1,0 +1,155 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What the points of a body are strained in: the plane, space, or all around an axis."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ufl
+
+from ..meshes.quadrature import nodal_forces
+from ..particles.particles import Particles
+
+__all__ = ["Revolution", "Strain", "strain_of"]
+
+type Array = NDArray[np.float64]
+
+
+class Strain:
+    """Plane strain of a body in the plane, three-dimensional strain of one in space.
+
+    Args:
+        particles: The body.
+
+    Attributes:
+        dim: Dimension of the deformation gradient.
+        particles: As given.
+    """
+
+    def __init__(self, particles: Particles) -> None:
+        self.particles = particles
+        self.dim: int = particles.mesh.geometry.dim
+
+    # -- At the history's points ----------------------------------------------------------
+
+    @property
+    def hoop(self) -> Array | None:
+        """Hoop strain by a radial displacement of each node, ``(n, nq, k)``; ``None`` for none."""
+        return None
+
+    def gradient(self) -> Array:
+        """Return ``F - I`` at the present displacement, shape ``(n, nq, dim, dim)``."""
+        return self.particles.displacement_gradient()
+
+    def volumes(self) -> Array:
+        """Return the undeformed volume of each point, shape ``(n, nq)``."""
+        return self.particles.point_volumes()
+
+    def present_volumes(self) -> Array:
+        """Return the undeformed volume of each point, 0 where deleted, shape ``(n, nq)``."""
+        volumes = self.volumes()
+        if self.particles.deletion is None:
+            return volumes
+        return np.where(self.particles.deleted[:, None], 0.0, volumes)
+
+    def average(self, values: Array) -> Array:
+        """Return volume averages of values ``(n, nq, ...)`` over the undeformed domains."""
+        volumes = self.volumes()
+        parts = volumes / volumes.sum(axis=1, keepdims=True)
+        return np.asarray(np.einsum("nq,nq...->n...", parts, values))
+
+    def nodal(self, stress: Array, volumes: Array) -> Array:
+        """Return the integrals of ``stress : grad N`` over each domain, shape ``(n, k, gdim)``.
+
+        Args:
+            stress: Shape ``(n, nq, dim, dim)``.
+            volumes: Of the points, shape ``(n, nq)``.
+        """
+        gradients = self.particles.quadrature.gradients
+        return nodal_forces(stress, volumes, gradients, self.hoop)
+
+    def beyond(self) -> tuple[str, NDArray[np.int64]]:
+        """Return what no domain may do in a converged step besides crossing itself, and which do.
+
+        Returns:
+            The words for an error, and global indices.
+        """
+        return "", self.particles.global_index[:0]
+
+    # -- In UFL ---------------------------------------------------------------------------
+
+    @property
+    def turn(self) -> Any:
+        """Length of the way around the axis in the undeformed body, or 1."""
+        return 1.0
+
+    @property
+    def present_turn(self) -> Any:
+        """Length of the way around the axis at the present displacement, or 1."""
+        return 1.0
+
+    def ufl_gradient(self, w: Any) -> Any:
+        """Return the gradient of a displacement, shape ``(dim, dim)``."""
+        return ufl.grad(w)
+
+
+class Revolution(Strain):
+    """A body of revolution about ``x[0] = 0``, with the strain ``d_r / R`` around it.
+
+    Raises:
+        MPMError: ``x[0]`` cannot be a radius.
+    """
+
+    def __init__(self, particles: Particles) -> None:
+        super().__init__(particles)
+        particles.require_radius()
+        self.dim = 3
+        self._radius = ufl.SpatialCoordinate(particles.mesh)[0]
+
+    @property
+    def hoop(self) -> Array | None:
+        """See :class:`Strain`."""
+        return self.particles.hoop
+
+    def gradient(self) -> Array:
+        """See :meth:`Strain.gradient`."""
+        return self.particles.displacement_gradient(axisymmetric=True)
+
+    def volumes(self) -> Array:
+        """See :meth:`Strain.volumes`: all around."""
+        return self.particles.point_volumes(axisymmetric=True)
+
+    def beyond(self) -> tuple[str, NDArray[np.int64]]:
+        """See :meth:`Strain.beyond`: the axis stays where it is."""
+        words = "reach across the axis x[0] = 0 (nodes on it must be held against the radius)"
+        return words, self.particles.behind_axis()
+
+    @property
+    def turn(self) -> Any:
+        """See :class:`Strain`."""
+        return 2.0 * np.pi * self._radius
+
+    @property
+    def present_turn(self) -> Any:
+        """See :class:`Strain`."""
+        return 2.0 * np.pi * (self._radius + self.particles.displacement[0])
+
+    def ufl_gradient(self, w: Any) -> Any:
+        """See :meth:`Strain.ufl_gradient`."""
+        g = ufl.grad(w)
+        hoop = w[0] / self._radius
+        return ufl.as_tensor([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, hoop]])
+
+
+def strain_of(particles: Particles, axisymmetric: bool) -> Strain:
+    """Return what a body is strained in (collective).
+
+    Args:
+        particles: The body.
+        axisymmetric: Whether it is one of revolution.
+    """
+    return Revolution(particles) if axisymmetric else Strain(particles)

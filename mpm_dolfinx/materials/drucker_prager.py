@@ -1,0 +1,194 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Plasticity of Drucker and Prager, returned in closed form."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import MPMError
+from .base import Field, Integration, Parameter, State, Update
+from .compiled import update_plastic
+from .mandel import deviator, deviatoric_projector, identity, norm, trace
+from .mohr_coulomb import FrictionalMaterial
+
+__all__ = ["DruckerPrager"]
+
+Array = NDArray[np.float64]
+Match = Literal["outer", "inner", "plane_strain"]
+
+
+class DruckerPrager(FrictionalMaterial):
+    """Elastoplasticity of Drucker and Prager at finite strain, with its apex and a cut-off.
+
+    Yield function sqrt(J2) + eta p - xi c of the Kirchhoff stress, with the mean stress p,
+    tension positive, and flow along the derivative of sqrt(J2) + eta_psi p. The cut-off is one
+    of the mean stress, p at most ``tension_cutoff``, with flow along p. Backward Euler in closed
+    form: the cone, or the cap at the largest mean stress, which is the apex without cut-off (de
+    Souza Neto, Peric & Owen 2008, section 8.3). Without dilation the apex is returned to along
+    the hydrostatic axis.
+
+    The constants are those of a cone that meets Mohr-Coulomb's pyramid (section 6.4.4 there):
+
+    - ``"outer"``: at the edges of triaxial compression, eta = 6 sin(phi)/(sqrt(3) (3 - sin(phi)));
+    - ``"inner"``: at those of extension, with 3 + sin(phi) in the denominator;
+    - ``"plane_strain"``: where plastic flow in plane strain goes on for ever. With the dilation
+      eta_psi = sin(psi)/sqrt(1 + sin(psi)^2/3) and S = sqrt(1 - eta_psi^2/3) this is
+      eta = sin(phi)/(S + eta_psi sin(phi)/3), for associated flow
+      eta = 3 tan(phi)/sqrt(9 + 12 tan(phi)^2).
+
+    xi is eta/tan(phi), and eta_psi is eta with psi in place of phi, and of associated flow.
+    """
+
+    def __init__(
+        self,
+        young: ArrayLike | Field,
+        poisson: ArrayLike | Field,
+        cohesion: ArrayLike | Field,
+        friction_angle: ArrayLike | Field,
+        dilation_angle: ArrayLike | Field = 0.0,
+        tension_cutoff: ArrayLike | Field | None = None,
+        match: Match = "outer",
+    ) -> None:
+        """Set the parameters.
+
+        Args:
+            young: Young's modulus, in units of stress.
+            poisson: Poisson's ratio.
+            cohesion: Cohesion c of the Mohr-Coulomb law that is matched, in units of stress.
+            friction_angle: Its angle of friction phi in degrees.
+            dilation_angle: Its angle of dilation psi in degrees, at most that of friction; where
+                it is the same (the same number or the same object) flow is associated and the
+                tangent symmetric.
+            tension_cutoff: Largest mean stress that is borne; ``None``: as far as the cone goes.
+            match: ``"outer"``, ``"inner"`` or ``"plane_strain"``.
+
+        Raises:
+            MPMError: A value is out of range.
+        """
+        super().__init__(young, poisson, cohesion, friction_angle, dilation_angle, tension_cutoff)
+        if match not in get_args(Match):
+            raise MPMError(f"match is {match!r} but must be one of {', '.join(get_args(Match))}")
+        self.match = match
+
+    def _constants(self) -> tuple[Parameter, ...]:
+        """Return eta, eta_psi, the strength xi c, and the largest mean stress."""
+        friction, dilation, cosine = self._sines()
+        if self.match == "plane_strain":
+            flow = dilation / np.sqrt(1.0 + dilation**2 / 3.0)
+            slope = np.sqrt(1.0 - flow**2 / 3.0) + flow * friction / 3.0
+            eta, xi = friction / slope, cosine / slope
+        else:
+            sign = -1.0 if self.match == "outer" else 1.0
+            slope = np.sqrt(3.0) * (3.0 + sign * friction) / 6.0
+            eta, xi = friction / slope, cosine / slope
+            flow = dilation * 6.0 / (np.sqrt(3.0) * (3.0 + sign * dilation))
+        strength = xi * self.parameters["cohesion"]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            apex = np.where(np.equal(eta, 0.0), np.inf, np.divide(strength, eta))
+        top = np.minimum(apex, self._tension())
+        return eta, flow, strength, top if np.ndim(top) else float(top)
+
+    def yield_function(self, stress: Array, plastic_strain: Array) -> Array:
+        """Return f, shape ``(n,)``, in units of stress, of stresses ``(n, m)``.
+
+        The larger one of sqrt(J2) + eta p - xi c and p less the cut-off.
+        """
+        eta, _, strength, _ = self._constants()
+        mean = trace(stress) / 3.0
+        cone = np.sqrt(0.5) * norm(deviator(stress)) + eta * mean - strength
+        return np.asarray(np.maximum(cone, mean - self._tension()))
+
+    def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
+        """See :meth:`StrainMaterial.integrate`."""
+        n, m = trial_strain.shape
+        stress = self.elastic_stress(trial_strain)
+        D = self.elastic_tangent(n, m) if tangent else None
+        constants = _Constants(
+            *(np.broadcast_to(c, n) for c in (self.bulk, self.shear, *self._constants()))
+        )
+        bulk, shear, eta, _, strength, top = constants
+        mean = bulk * trace(trial_strain)
+        root = np.sqrt(2.0) * shear * norm(deviator(trial_strain))
+        room = self.yield_tolerance * (root + np.abs(mean) + strength)
+        beyond = (root + eta * mean - strength > room) | (mean - top > room)
+        points = np.flatnonzero(beyond)
+        if len(points) == 0:
+            return Integration(stress, D, trial_strain, variables)
+        elastic, kappa = trial_strain.copy(), variables["plastic_strain"].copy()
+        stress[points], elastic[points], D_plastic = _give_back(
+            _Constants(*(values[points] for values in constants)), trial_strain[points], tangent
+        )
+        kappa[points] += np.sqrt(2.0 / 3.0) * norm(trial_strain[points] - elastic[points])
+        if D is not None:
+            D = D.copy()
+            D[points] = D_plastic
+        return Integration(stress, D, elastic, {"plastic_strain": kappa})
+
+    def _compiled_update(self, displacement_gradient: Array, state: State, tangent: bool) -> Update:
+        return update_plastic(
+            "drucker_prager",
+            (self.bulk, self.shear, *self._constants()),
+            ("plastic_strain",),
+            self.yield_tolerance,
+            displacement_gradient,
+            state,
+            tangent,
+        )
+
+
+class _Constants(NamedTuple):
+    """Constants of a number of points, shape ``(n,)`` each."""
+
+    bulk: Array
+    shear: Array
+    eta: Array
+    flow: Array
+    strength: Array
+    top: Array
+
+
+def _give_back(
+    constants: _Constants, strain: Array, tangent: bool
+) -> tuple[Array, Array, Array | None]:
+    """Return stress, elastic strain and tangent of trial strains ``(n, m)`` that yield."""
+    n, m = strain.shape
+    bulk, shear, eta, flow, strength, top = constants
+    mean, dev = bulk * trace(strain), deviator(strain)
+    size = norm(dev)
+    root = np.sqrt(2.0) * shear * size
+    # The cone, and where its mean stress is too large, the cap.
+    stiffness = shear + bulk * eta * flow
+    multiplier = np.maximum(root + eta * mean - strength, 0.0) / stiffness
+    returned = mean - bulk * flow * multiplier
+    cap = returned > top
+    with np.errstate(invalid="ignore"):
+        limit = np.where(cap, np.maximum(strength - eta * top, 0.0), np.inf)
+    p = np.where(cap, top, returned)
+    held = cap & (root < limit)
+    q = np.where(cap, np.minimum(root, limit), root - shear * multiplier)
+    ratio = np.divide(q, root, out=np.ones(n), where=root > 0.0)
+    ratio = np.where(cap & ~held & (root == 0.0), 0.0, ratio)
+    elastic = ratio[:, None] * dev
+    elastic[:, :3] += (p / (3.0 * bulk))[:, None]
+    stress = (2.0 * shear * ratio)[:, None] * dev
+    stress[:, :3] += p[:, None]
+    if not tangent:
+        return stress, elastic, None
+    # Derivatives of p and q, the root of J2, by the trace and by the size of the deviator.
+    p_trace = np.where(cap, 0.0, bulk * (1.0 - bulk * eta * flow / stiffness))
+    q_size = np.sqrt(2.0) * shear * np.where(cap, held, 1.0 - shear / stiffness)
+    p_size = np.where(cap, 0.0, -np.sqrt(2.0) * shear * bulk * flow / stiffness)
+    q_trace = np.where(cap, 0.0, -shear * bulk * eta / stiffness)
+    one = identity(m)
+    direction = np.divide(dev, size[:, None], out=np.zeros_like(dev), where=size[:, None] > 0.0)
+    along = np.sqrt(2.0) * q_size - 2.0 * shear * ratio
+    D = np.einsum("n,ij->nij", 2.0 * shear * ratio, deviatoric_projector(m))
+    D += np.einsum("n,ni,nj->nij", along, direction, direction)
+    D += np.einsum("n,i,j->nij", p_trace, one, one)
+    D += np.einsum("n,i,nj->nij", p_size, one, direction)
+    D += np.einsum("n,ni,j->nij", np.sqrt(2.0) * q_trace, direction, one)
+    return stress, elastic, D

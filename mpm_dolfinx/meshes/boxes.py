@@ -1,0 +1,78 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Clouds of axis-aligned boxes, as meshes whose cells share no vertex."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+import basix
+from dolfinx import mesh
+
+from .. import _compat
+from ..errors import MPMError, agree
+from ..parallel.exchange import swap
+
+__all__ = ["BOX_CELLS", "mesh_of_boxes"]
+
+BOX_CELLS = (basix.CellType.quadrilateral, basix.CellType.hexahedron)
+#: Distance of centres, relative to the smallest side, below which they are in one place.
+SAME = 1e-6
+
+
+def mesh_of_boxes(comm: MPI.Comm, points: Any, lengths: Any, gdim: int) -> mesh.Mesh:
+    """Return a mesh of rectangles or boxes, one for each point (collective).
+
+    Args:
+        comm: The ranks; each box is given by one of them.
+        points: Centres of this rank's boxes, shape ``(n, gdim)``.
+        lengths: Side lengths, a number or shape ``(n, gdim)``.
+        gdim: Dimension, 2 or 3.
+
+    Raises:
+        MPMError: Shapes that do not fit, or lengths that are not positive.
+    """
+    with agree(comm):
+        try:
+            centres = np.asarray(points, dtype=np.float64)
+        except (TypeError, ValueError):
+            centres = np.array(np.nan)
+        if centres.ndim != 2 or centres.shape[1] != gdim or not np.isfinite(centres).all():
+            raise MPMError(f"points must be finite and of shape (n, {gdim}).")
+        try:
+            sides = np.broadcast_to(np.asarray(lengths, np.float64), centres.shape)
+        except (TypeError, ValueError):
+            raise MPMError(
+                f"lengths must be a number or of shape {centres.shape}, not {np.shape(lengths)}."
+            ) from None
+        if not (np.isfinite(sides).all() and (sides > 0.0).all()):
+            raise MPMError("lengths must be positive and finite.")
+    _require_apart(comm, centres, sides)
+    cell = BOX_CELLS[gdim - 2]
+    unit = basix.geometry(cell) - 0.5
+    corners = centres[:, None] + unit * sides[:, None]
+    return _compat.disconnected_mesh(comm, corners, cell)
+
+
+def _require_apart(comm: MPI.Comm, centres: NDArray[np.float64], sides: Any) -> None:
+    """Raise an error where two boxes, of any ranks, are in one place (collective)."""
+    least = comm.allreduce(float(sides.min(initial=np.inf)), MPI.MIN)
+    places = np.round(centres / (SAME * least)).astype(np.int64)
+    homes = (places @ np.array([7919, 104729, 1299709])[: centres.shape[1]]) % comm.size
+    first = sum(comm.allgather(len(centres))[: comm.rank])
+    rows = np.column_stack([places, np.arange(first, first + len(centres))])
+    here = np.concatenate(swap(comm, [rows[homes == rank] for rank in range(comm.size)]))
+    _, which, times = np.unique(here[:, :-1], axis=0, return_inverse=True, return_counts=True)
+    twice = here[times[which.ravel()] > 1, -1]
+    with agree(comm):
+        if len(twice):
+            raise MPMError(
+                "The boxes of {particles} have others in the same place; give each box once, on "
+                "one rank.",
+                twice,
+            )

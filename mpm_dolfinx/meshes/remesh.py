@@ -1,0 +1,212 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Body meshes made anew under the same particles: quadrilaterals cut in two, nodes moved.
+
+DOLFINx has no meshes of quadrilaterals and triangles together, so a triangle is a quadrilateral
+with two corners in one place, one of which is a new vertex. At the middle of such a quadrilateral
+are the gradients of the triangle, and its area is that of the one-point rule. Nodes in one place
+move alike, since the background has one value there. So the halves of a quadrilateral need not
+share their diagonal, and do not: two cells with two facets in common, the diagonal and the edge of
+no length, are more than DOLFINx (0.11) bears.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+import basix
+from dolfinx import mesh
+
+from .. import _compat
+from ..parallel.exchange import RowExchange
+from .redistribution import Carrier, neighbour_ranks
+
+__all__ = ["HALVES", "HALVES_OF_MASS", "PLACES", "Column", "Cuts", "Place", "Remesh", "diagonals"]
+
+type Cuts = NDArray[np.int64]
+"""Global index and diagonal of quadrilaterals to be cut, shape ``(m, 2)``, on all ranks.
+
+Diagonal 0 is that of the corners 0 and 3, diagonal 1 that of 1 and 2.
+"""
+
+type Place = Literal["cells", "points", "nodes", "facets"]
+"""Where kept values live; the first axis is always that of the owned cells.
+
+``"cells"``: ``(n, ...)``; ``"points"``: at the quadrature points, ``(n, nq, ...)``; ``"nodes"``: at
+each cell's nodes, ``(n, k, ...)``; ``"facets"``: at points of each cell's facets,
+``(n, facets, points, ...)``, in the order of the facet's corners and symmetric about its middle.
+"""
+
+PLACES: tuple[str, ...] = get_args(Place.__value__)
+
+
+class Column(NamedTuple):
+    """Values cell by cell, and where they live: what becomes of them on another mesh.
+
+    Attributes:
+        values: One row for each cell that this rank owns, shape ``(n, ...)``.
+        at: Where they live.
+    """
+
+    values: NDArray[Any]
+    at: Place
+
+
+#: Corners of the two halves of a quadrilateral, by diagonal. Corner ``DOUBLED`` of each half is a
+#: new vertex in the place of its last one.
+HALVES = np.array([[[0, 1, 3, 3], [0, 3, 2, 3]], [[1, 3, 2, 2], [1, 2, 0, 2]]])
+DOUBLED = (2, 1)
+#: Difference of areas, relative to the largest, that does not decide between diagonals.
+EQUAL = 1e-6
+#: What share of the mass at its corners each half gets.
+HALVES_OF_MASS = np.array([[0.5, 1.0, 0.25, 0.25], [0.5, 0.25, 1.0, 0.25]])
+
+
+def diagonals(
+    corner_jacobians: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the better diagonal of quadrilaterals, and the smaller one of its triangles' areas.
+
+    The triangles that a diagonal makes have the areas of the other two corners. Of a concave
+    quadrilateral, the diagonal through the reflex corner alone makes two of positive area.
+
+    Args:
+        corner_jacobians: Determinants at the four corners, shape ``(n, 4)``.
+
+    Returns:
+        Diagonals, and the areas over half the Jacobian's, each shape ``(n,)``.
+    """
+    areas = np.stack(
+        [corner_jacobians[:, [1, 2]].min(axis=1), corner_jacobians[:, [0, 3]].min(axis=1)], axis=1
+    )
+    second = areas[:, 1] > areas[:, 0] + EQUAL * np.abs(corner_jacobians).max(axis=1)
+    return second.astype(np.int64), np.where(second, areas[:, 1], areas[:, 0])
+
+
+class Remesh(Carrier):
+    """A mesh on the same ranks with some quadrilaterals cut in two, or with moved nodes.
+
+    The first half of a quadrilateral keeps its input index; the second ones follow after all
+    others, in the order of the cuts.
+
+    Args:
+        source: The mesh before (collective).
+        cuts: Quadrilaterals of degree 1 to be cut.
+        positions: Where the owned cells' nodes are to be, shape ``(n, k, gdim)``; ``None`` leaves
+            them.
+
+    Attributes:
+        source: The mesh before.
+        mesh: The mesh after.
+        index: Input indices on the new mesh of the owned cells of the old one and of their halves.
+    """
+
+    def __init__(
+        self, source: mesh.Mesh, cuts: Cuts, positions: NDArray[np.float64] | None = None
+    ) -> None:
+        comm = source.comm
+        index = _compat.input_cell_index(source)
+        count = source.topology.index_map(source.topology.dim).size_global
+        self._count, self._cut = count, cuts[:, 0]
+        order = np.argsort(index)
+        place = np.searchsorted(index, cuts[:, 0], sorter=order)
+        place[place == len(index)] = 0
+        here = np.zeros(len(cuts), dtype=bool)
+        if len(index):
+            here = index[order[place]] == cuts[:, 0]
+        cut, diagonal = order[place[here]], cuts[here, 1]
+        whole = np.ones(len(index), dtype=bool)
+        whole[cut] = False
+        self._parents = np.concatenate([np.flatnonzero(whole), cut, cut])
+        self.index = np.concatenate(
+            [index[whole], index[cut], count + np.flatnonzero(here).astype(np.int64)]
+        )
+        nodes = _compat.geometry_dofmap(source)[: len(index)]
+        own, both = np.arange(nodes.shape[1]), (0, 1) if len(cut) else ()
+        corners = np.broadcast_to(own, (len(index), len(own)))[whole]
+        self._corners = np.concatenate([corners, *(HALVES[diagonal, half] for half in both)])
+        self._parts = np.concatenate(
+            [np.ones(corners.shape), *(HALVES_OF_MASS[[half] * len(cut)] for half in both)]
+        )
+
+        x = source.geometry.x[:, : source.geometry.dim].copy()
+        if positions is not None:
+            x[nodes] = positions
+        numbering = source.geometry.index_map()
+        added = np.cumsum([0, *comm.allgather(2 * len(cut))])
+        firsts = np.array(comm.allgather(numbering.local_range[0]))
+        old = numbering.local_to_global(np.arange(len(x), dtype=np.int32))
+        numbers = old + added[np.searchsorted(firsts, old, side="right") - 1]
+        corners = np.take_along_axis(nodes[self._parents], self._corners, axis=1)
+        cells = numbers[corners]
+        new = np.arange(len(index) - len(cut), len(cells))
+        cells[new, np.repeat(DOUBLED, len(cut))] = (
+            numbering.local_range[1] + added[comm.rank] + np.arange(len(new))
+        )
+        points = np.concatenate([x[: numbering.size_local], x[corners[new, -1]]])
+
+        ranks = np.full(len(index), comm.rank, dtype=np.int64)
+        seen = np.column_stack([ranks, neighbour_ranks(source, ranks)])[self._parents]
+        total = count + len(cuts)
+        first, last = (total * r // comm.size for r in (comm.rank, comm.rank + 1))
+        exchange = RowExchange(comm, self.index, np.arange(first, last))
+        targets = [[row[0], *sorted({*row[1:]} - {row[0], -1})] for row in exchange(seen).tolist()]
+        after = _compat.mesh_on_ranks(comm, exchange(cells), source, points, targets)
+        origin = _compat.input_cell_index(after).copy()
+        second = origin >= count
+        origin[second] = cuts[origin[second] - count, 0]
+        super().__init__(source, after, origin, numbers)
+
+    @property
+    def halves(self) -> NDArray[np.bool_]:
+        """Whether each owned cell of the new mesh is half of one of the old mesh, ``(n,)``."""
+        index = _compat.input_cell_index(self.mesh)
+        return np.asarray(np.isin(index, self._cut) | (index >= self._count))
+
+    def rows(self, values: NDArray[Any], nodal: bool = False) -> NDArray[Any]:
+        """Return values of the owned cells for each of :attr:`index`, on the same rank.
+
+        Args:
+            values: Shape ``(n, ...)``, nodal ones ``(n, k, ...)``.
+            nodal: Whether halves have a part of the nodes only.
+        """
+        taken: NDArray[Any] = values[self._parents]
+        if not nodal:
+            return taken
+        corners = self._corners.reshape(*self._corners.shape, *[1] * (values.ndim - 2))
+        return np.asarray(np.take_along_axis(taken, corners, axis=1))
+
+    def column(self, column: Column) -> Column:
+        """Return kept values for each of :attr:`index`, on the same rank.
+
+        A half has the values of its cell and of its points, of those corners that are its own,
+        and of those facets; there is nothing yet on the facets that the cut has made.
+        """
+        if column.at != "facets":
+            return Column(self.rows(column.values, nodal=column.at == "nodes"), column.at)
+        taken = column.values[self._parents]
+        cell = self.source.basix_cell()
+        edges = np.sort(basix.topology(cell)[self.source.topology.dim - 1], axis=1)
+        if len(self._cut) == 0:
+            return Column(taken, column.at)
+        ends = self._corners[:, edges]
+        same = np.all(np.sort(ends, axis=2)[:, :, None] == edges, axis=3)
+        facet, there = same.argmax(axis=2), same.any(axis=2)
+        turned = ends[:, :, 0] > ends[:, :, 1]
+        more = (1,) * (taken.ndim - 2)
+        taken = np.take_along_axis(taken, facet.reshape(*facet.shape, *more), axis=1)
+        if taken.ndim > 2:
+            taken = np.where(turned.reshape(*turned.shape, *more), taken[:, :, ::-1], taken)
+        return Column(np.where(there.reshape(*there.shape, *more), taken, 0), column.at)
+
+    def masses(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the shares in masses at nodes ``(n, k)`` of each cell of the new mesh, ``(n, k)``.
+
+        A half has that of the corner which is its own, and half of those on the diagonal.
+        """
+        want = _compat.input_cell_index(self.mesh)
+        exchange = RowExchange(self.mesh.comm, self.index, want)
+        return np.asarray(exchange(self.rows(nodal, nodal=True) * self._parts))

@@ -1,0 +1,9 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What ranks owe each other: rows sent by global index, even shares, shared garbage.
+
+Nothing here knows a mesh or a particle. :mod:`~mpm_dolfinx.parallel.exchange` sends rows of arrays
+to the ranks that ask for their global indices; :mod:`~mpm_dolfinx.parallel.bisection` parts points
+in space evenly and :mod:`~mpm_dolfinx.parallel.balance` parts a count; what PETSc leaves when a
+problem ends is freed on all ranks together by :mod:`~mpm_dolfinx.parallel.garbage`.
+"""

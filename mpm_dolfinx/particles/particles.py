@@ -1,0 +1,566 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Particles: a body mesh whose displacement is carried by a background space."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem, mesh
+
+from ..background.basis import BackgroundBasis, PointBasis
+from ..background.ownership import ranks_of_background
+from ..errors import MPMError, ParticleOutsideError, agree
+from ..meshes.boxes import mesh_of_boxes
+from ..meshes.redistribution import Carrier, Redistribution, cell_centres
+from ..meshes.remesh import Column, Cuts, Remesh
+from ..meshes.trail import Trail
+from ..parallel.given import require_same
+from ..transfer.method import CornerBasis, DomainState, ParticleState
+from ..transfer.methods import METHODS
+from ..transfer.transfer import Transfer
+from ..transfer.weights import Weights, domain_weights, sum_by_particle
+from .geometry import Geometry
+from .options import (
+    Coordinates,
+    validate_cells,
+    validate_distortion,
+    validate_options,
+    validate_spaces,
+)
+from .reference import Reference
+from .response import MaterialDomains
+
+__all__ = ["LoadFactor", "Particles"]
+
+
+class LoadFactor(fem.Constant):
+    """The load factor of one body, which the problem of that body sets."""
+
+
+class Particles(MaterialDomains):
+    """A body as particles with finite domains, moved by a background space.
+
+    Each cell of ``body`` is the domain of one particle. The body mesh is the undeformed body
+    and never moves; where the particles are is ``displacement``. A step's increment u in V
+    moves the nodes of the domains by ``T u``. The methods differ in T alone:
+
+    - ``"cpdi2"``: corners ride on the background (Sadeghirad, Brannon & Guilkey 2013);
+    - ``"cpdi"``: parallelograms that the particle's F deforms (Sadeghirad, Brannon &
+      Burghardt 2011);
+    - ``"gimp"``: axis-aligned boxes (Bardenhagen & Kober 2004), on structured backgrounds of
+      rectangles or boxes;
+    - ``"mpm"``: points (Sulsky, Chen & Schreyer 1994).
+
+    Args:
+        body: Undeformed body: triangles or quadrilaterals in the plane, tetrahedra or
+            hexahedra in space. Its cells are the particles.
+        V: Vector Lagrange space on the background mesh, on the same ranks.
+        method: ``"cpdi2"``, ``"cpdi"``, ``"gimp"`` or ``"mpm"``.
+        degree: Degree of the domains' shape functions.
+        quadrature_degree: Degree of the rule that carries the history; ``None`` is one point
+            per domain for degree 1.
+        outside: What happens when a step takes a corner of a domain out of the background:
+            ``"error"`` ends the run with an error, ``"stop"`` without one (both before that
+            step), ``"delete"`` goes on without the domain and adds up what is lost.
+        domain_update: For ``"gimp"``: ``"stretch"`` (half-lengths follow the diagonal of the
+            right stretch) or ``"fixed"`` (the box only translates).
+        partition: ``"given"`` leaves the cells of ``body`` on their ranks; ``"background"``
+            makes ``mesh`` a copy of it whose cells are on the ranks that own the background
+            where they lie, or in even compact parts where a rank would get too many.
+        on_distortion: What a problem with a material does about quadrilaterals that a step has
+            made concave: ``"error"`` nothing, until one crosses itself; ``"split"`` cuts them into
+            two triangles each.
+
+    Attributes:
+        mesh: The body mesh, undeformed: ``body``, or its copy with ``partition="background"``.
+        V: The background space.
+        W: Space of the domains' displacement.
+        displacement: Total displacement d in W.
+        increment: The background displacement u in V of the step being solved.
+        load: The load factor, a Constant on the body mesh.
+        proportional: A Constant, 1 as long as displacements of supports grow with the load factor,
+            0 from the first path on, which takes them as they are.
+        dx: Measure with the rule that carries the history.
+        dx_exact: Measure exact for body force and mass.
+        num_local: Number of particles this rank owns.
+        num_global: Number of particles of all ranks.
+        global_index: Input index of each owned particle, shape ``(n,)``, the same on any number
+            of ranks.
+        domain_nodes: Local nodes of W of each owned domain, shape ``(n, k)``.
+        outside: The policy for domains that leave the background.
+        deletion: Which domains are deleted, with ``outside="delete"``, otherwise ``None``.
+        on_distortion: As given.
+        mass_share: Factor of the density that keeps the mass at each node where domains were
+            split or the body rebased, otherwise ``None``.
+        shares_nodes: Whether neighbours share their nodes, as with ``"cpdi2"``.
+        rebases: How often the nodes of the mesh were moved.
+        origin: Undeformed positions of the nodes of W where the body was rebased, otherwise
+            ``None``.
+
+    Raises:
+        MPMError: Spaces, meshes, method or degrees that do not go together.
+        ParticleOutsideError: The body does not lie inside the background.
+        DomainDistortionError: A cell of the body is degenerate.
+    """
+
+    def __init__(
+        self,
+        body: mesh.Mesh,
+        V: fem.FunctionSpace,
+        method: str = "cpdi2",
+        degree: int = 1,
+        quadrature_degree: int | None = None,
+        outside: str = "error",
+        domain_update: str = "stretch",
+        partition: str = "given",
+        on_distortion: str = "error",
+    ) -> None:
+        validate_spaces(body, V)
+        require_same(
+            body.comm,
+            V=V,
+            method=method,
+            degree=degree,
+            quadrature_degree=quadrature_degree,
+            outside=outside,
+            domain_update=domain_update,
+            partition=partition,
+            on_distortion=on_distortion,
+        )
+        validate_options(body, V, method, degree, quadrature_degree, outside, domain_update)
+        validate_distortion(body, method, degree, quadrature_degree, on_distortion)
+        if partition not in ("given", "background"):
+            raise MPMError(f"Unknown partition={partition!r}; choose 'given' or 'background'.")
+        validate_cells(body, "body")
+        validate_cells(V.mesh, "background")
+        self.V = V
+        self.method = method
+        self.increment = fem.Function(V, name="increment")
+        self.outside = outside
+        self.on_distortion = on_distortion
+        self._degrees = degree, quadrature_degree
+        self._domain_update = domain_update
+        self._background = BackgroundBasis(V)
+        self._background_coordinates = Coordinates(V.mesh, "background")
+        self._trail = Trail()
+        if partition == "background":
+            ranks = ranks_of_background(V, self._background, cell_centres(body))
+            self._trail.append(move := Redistribution(body, ranks))
+            body = move.mesh
+        self._settle(body)
+        self._method = METHODS[method](V, domain_update)
+        self._method.require(body, self.initial_domains, self.global_index)
+        self._geometry.require_volume(self.quadrature)
+        self.locate()
+
+    def __del__(self) -> None:
+        """Let go of the meshes here, where no exception is on its way.
+
+        A call that Python refuses, as one with a misspelt keyword, drops its arguments while the
+        exception is set. mpi4py's clean-up of a mesh's communicator then leaves a lock shut, and
+        the next one that needs it waits for ever.
+        """
+        if not sys.is_finalizing():
+            vars(self).clear()
+
+    def _settle(self, body: mesh.Mesh) -> None:
+        """Live on a body mesh, undeformed: at the start and after each move (collective)."""
+        family = "Lagrange" if METHODS[self.method].shares_nodes else "Discontinuous Lagrange"
+        self._live_on(Geometry(body, family, *self._degrees), self.outside == "delete")
+        self._coordinates = Coordinates(body, "body")
+        self.load = LoadFactor(body, 0.0)
+        self.proportional = fem.Constant(body, 1.0)
+        self._converged = np.zeros_like(self._geometry.nodes)
+        self._transfer: Transfer | None = None
+
+    @classmethod
+    def from_points(
+        cls,
+        points: NDArray[np.float64],
+        lengths: NDArray[np.float64] | float,
+        V: fem.FunctionSpace,
+        method: str = "gimp",
+        **options: Any,
+    ) -> Particles:
+        """Make particles of a cloud of axis-aligned boxes, without a mesh.
+
+        Args:
+            points: Centres of this rank's boxes, shape ``(n, gdim)``; each box is given by
+                one rank.
+            lengths: Side lengths, a number or shape ``(n, gdim)``.
+            V: As for :class:`Particles`.
+            method: As for :class:`Particles`. With ``"cpdi2"`` neighbours are not connected.
+            **options: As for :class:`Particles`.
+
+        Raises:
+            MPMError: Shapes that do not fit, or lengths that are not positive.
+        """
+        body = mesh_of_boxes(V.mesh.comm, points, lengths, V.mesh.geometry.dim)
+        return cls(body, V, method=method, **options)
+
+    def carry(self, thing: Any) -> Any:
+        """Return tags or a DG0 Function on ``mesh``, to which cells have moved (collective).
+
+        Args:
+            thing: ``MeshTags`` or a piecewise constant Function on the body mesh that was given,
+                or on a ``mesh`` of before one of the last eight moves; anything else is returned
+                as it is.
+
+        Raises:
+            MPMError: A Function that is not piecewise constant.
+        """
+        return self._trail.carry(thing)
+
+    def ranks_of_background(self) -> NDArray[np.int64]:
+        """Return the rank on which each particle would best be now, shape ``(n,)`` (collective).
+
+        That which owns the background where the particle is; where a rank would get more than
+        5 % above an even share, that of the compact part that the particle is in.
+        """
+        return ranks_of_background(self.V, self._background, self.centroid)
+
+    def move(self, ranks: NDArray[np.int64]) -> None:
+        """Move particles to other ranks, undeformed (collective).
+
+        ``mesh``, ``W``, ``displacement`` and ``load`` are new ones then. What else there is to
+        be moved is the business of :meth:`QuasiStaticProblem.repartition`.
+
+        Args:
+            ranks: New rank of each particle this rank owns, shape ``(n,)``.
+        """
+        self._take(Redistribution(self.mesh, ranks), self.origin is not None)
+
+    def rebase(self, cuts: Cuts, positions: NDArray[np.float64] | None = None) -> Remesh:
+        """Cut quadrilaterals of the mesh in two, or move its nodes (collective).
+
+        As in :meth:`move`, the rest is the business of :meth:`QuasiStaticProblem.split` and
+        :meth:`QuasiStaticProblem.rebase`.
+
+        Args:
+            cuts: Which are cut, the same on all ranks.
+            positions: Where the domains' corners are to be, shape ``(n, k, gdim)``, if elsewhere.
+        """
+        move = Remesh(self.mesh, cuts, positions)
+        self._take(move, positions is not None or self.origin is not None, cuts, positions)
+        return move
+
+    def _take(
+        self,
+        move: Carrier,
+        moved: bool,
+        cuts: Cuts | None = None,
+        positions: NDArray[np.float64] | None = None,
+    ) -> None:
+        """Live on another mesh (collective)."""
+        self._trail.append(move, cuts, positions is not None)
+        self._settle(move.mesh)
+        if moved or len(self.cuts):
+            self.expect_reference(moved)
+
+    def require_meshes_as_they_were(self) -> None:
+        """Raise an error where coordinates of body or background have changed on this rank.
+
+        Raises:
+            MPMError: They have.
+        """
+        for coordinates in (self._coordinates, self._background_coordinates):
+            coordinates.require_same()
+
+    @property
+    def cuts(self) -> Cuts:
+        """Which quadrilaterals were cut, in the order of the cuts, shape ``(m, 2)``."""
+        return self._trail.cuts
+
+    @property
+    def rebases(self) -> int:
+        """How often the nodes of the mesh were moved."""
+        return self._trail.rebases
+
+    @property
+    def origin_index(self) -> NDArray[np.int64]:
+        """Input index of the domain that each particle is, or is half of, shape ``(n,)``."""
+        return self._trail.origin_index(self.global_index, self.num_global)
+
+    @property
+    def shares_nodes(self) -> bool:
+        """Whether neighbours share their nodes, so that the body hangs together."""
+        return self._method.shares_nodes
+
+    @property
+    def moves_at_nodes(self) -> bool:
+        """Whether the rows of T are values of the background at the domains' corners."""
+        return self._method.at_nodes
+
+    def locate(self) -> None:
+        """Find the background cells of all domain nodes, unless that is done (collective).
+
+        Raises:
+            ParticleOutsideError: A domain of the last converged step is not wholly inside the
+                background.
+        """
+        if self._transfer is not None:
+            return
+        rows = self._method.rows(self._at_converged(), self._background)
+        self._require_inside(
+            rows,
+            self._lost(rows),
+            "The domains of {particles} are",
+            "make the background larger or the load smaller",
+        )
+        self._transfer = self._transfer_by(rows)
+
+    @property
+    def transfer(self) -> Transfer:
+        """T and what follows from it, at the last converged positions (collective)."""
+        self.locate()
+        assert self._transfer is not None
+        return self._transfer
+
+    def forget_transfer(self) -> None:
+        """Drop T, which is made anew when it is needed."""
+        self._transfer = None
+
+    def _state(
+        self, displacement: NDArray[np.float64], gradient: Callable[[], NDArray[np.float64]]
+    ) -> DomainState:
+        """Return where nodes displaced ``(N, gdim)`` and ``F - I`` at points put the domains."""
+        nodes, corners = self._geometry.nodes, self._geometry.corners
+
+        def centred() -> ParticleState:
+            return ParticleState(
+                self.initial_centroid,
+                self.mean(corners + self._of_domains(displacement)),
+                # methods that ask for it have one point
+                np.eye(self._geometry.gdim) + gradient()[:, 0],
+            )
+
+        return DomainState(nodes, displacement, self.domain_nodes, self._of_domains, centred)
+
+    def _at_converged(self) -> DomainState:
+        """Return where the domains are at the last converged step."""
+        return self._state(self._converged, self.converged_gradient)
+
+    def _converged_corners(self) -> NDArray[np.float64]:
+        """Return the positions of the domains' nodes, last converged, ``(n, k, gdim)``."""
+        return np.asarray(self._geometry.corners + self._of_domains(self._converged))
+
+    def _lost(self, rows: CornerBasis) -> NDArray[np.int64]:
+        """Return the local domains that are not wholly in the background."""
+        lost = (~rows.basis.found)[self.domain_nodes].any(axis=1)
+        return np.flatnonzero(lost & ~self.deleted)
+
+    def _transfer_by(self, rows: CornerBasis) -> Transfer:
+        """Return the transfer by rows, without the weight of deleted domains' own nodes."""
+        if self.deletion is not None:
+            values = rows.basis.values
+            values[self.deletion.dead[: len(values)]] = 0.0
+            if rows.corners is not None:
+                rows.corners[self.deleted] = self.converged_domains[self.deleted]
+        return Transfer(rows, self.W, self.V)
+
+    def _require_inside(
+        self, rows: CornerBasis, lost: NDArray[np.int64], what: str, advice: str
+    ) -> None:
+        with agree(self.mesh.comm):
+            if len(lost):
+                corners = self.converged_domains if rows.corners is None else rows.corners
+                out = ~rows.basis.found[self.domain_nodes[lost[0]]]
+                where = corners[lost[0]][out][0]
+                where = np.where(np.abs(where) < 1e-12 * np.abs(where).max(), 0.0, where)
+                raise ParticleOutsideError(
+                    f"{what} outside the background mesh, e.g. at "
+                    f"{tuple(float(f'{c:.6g}') for c in where)}; {advice}",
+                    self.global_index[lost],
+                )
+
+    def converged_gradient(self) -> NDArray[np.float64]:
+        """Return ``F - I`` at the history's points, last converged, ``(n, nq, gdim, gdim)``."""
+        gradient = self.quadrature.displacement_gradient(self._of_domains(self._converged))
+        return self._whole_gradient(gradient)
+
+    def leaving(self) -> NDArray[np.int64]:
+        """Return which of this rank's particles the last step took out (collective).
+
+        Returns:
+            Their local indices, with ``outside="delete"``; without it there are none.
+
+        Raises:
+            ParticleOutsideError: Some are outside and shall not be deleted, or all would be.
+        """
+        if self.deletion is None:
+            self.locate()
+            return np.zeros(0, dtype=np.int64)
+        rows = self._method.rows(self._at_converged(), self._background)
+        lost = self._lost(rows)
+        left = self.num_local - int(self.deleted.sum()) - len(lost)
+        if self.mesh.comm.allreduce(left) == 0:
+            self._require_inside(
+                rows,
+                lost,
+                "The domains of {particles}, the last that were not deleted, are",
+                "make the background larger or the load smaller",
+            )
+        self._transfer = self._transfer_by(rows)
+        return lost
+
+    def delete(self, domains: NDArray[np.int64]) -> None:
+        """Delete domains (collective), after :meth:`leaving`.
+
+        Args:
+            domains: Local indices of this rank's particles.
+        """
+        assert self.deletion is not None
+        self.deletion.add(domains, self._of_domains(self._converged))
+        self._transfer = self._transfer_by(self.transfer.rows)
+
+    @property
+    def T(self) -> PETSc.Mat:
+        """The transfer: all dofs of W by all dofs of V, at the last converged positions."""
+        return self.transfer.T
+
+    @property
+    def active_nodes(self) -> NDArray[np.int32]:
+        """Nodes of V with weight that this rank owns, local numbers, sorted."""
+        return self.transfer.active_nodes
+
+    @property
+    def active_dofs(self) -> NDArray[np.int64]:
+        """Global dofs of V with weight that this rank owns, sorted."""
+        bs = self.V.dofmap.index_map_bs
+        start = self.V.dofmap.index_map.local_range[0]
+        return np.asarray(
+            ((self.active_nodes + start)[:, None] * bs + np.arange(bs)).ravel(), dtype=np.int64
+        )
+
+    def weights(self) -> Weights:
+        """Return the published weights S_ip and grad S_ip of the current configuration.
+
+        Returns:
+            Compressed rows, one for each particle this rank owns (Sadeghirad, Brannon &
+            Guilkey 2013; their body force uses these, ours integrates over the undeformed
+            body, which is the same for triangles and undistorted quadrilaterals).
+        """
+        _, average, gradient = self._domain_averages()
+        weights = sum_by_particle(average, gradient, self.node_basis, self.domain_nodes)
+        return weights if self.deletion is None else weights.without(self.deleted)
+
+    @property
+    def domains(self) -> NDArray[np.float64]:
+        """Corners of the particles' own domains at the present displacement, ``(n, k, gdim)``.
+
+        For cpdi2 they are those of the displaced body mesh, for cpdi parallelograms, for gimp
+        boxes; for mpm, whose particles are points, parallelograms of their volume.
+        """
+        present = np.asarray(self.displacement.x.array, dtype=np.float64)
+        present = present.reshape(-1, self._geometry.gdim)
+        return self._method.domains(self._state(present, self.displacement_gradient))
+
+    @property
+    def converged_domains(self) -> NDArray[np.float64]:
+        """Corners of the particles' own domains at the last converged step, ``(n, k, gdim)``."""
+        return self._method.domains(self._at_converged())
+
+    @property
+    def converged_displacement(self) -> NDArray[np.float64]:
+        """Displacement at the last converged step, on the local dofs of W."""
+        return self._converged.ravel()
+
+    @property
+    def node_positions(self) -> NDArray[np.float64]:
+        """Positions of this rank's nodes of W at the last converged step, shape ``(N, gdim)``."""
+        return np.asarray(self._geometry.nodes + self._converged)
+
+    def _domain_averages(
+        self,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        corners = self.transfer.rows.corners
+        return domain_weights(
+            self.converged_domains if corners is None else corners,
+            self._geometry.shape_functions,
+            self.mesh.basix_cell(),
+            self._geometry.exact_degree,
+        )
+
+    @property
+    def node_basis(self) -> PointBasis:
+        """The background basis at the local nodes of W, at the last converged positions."""
+        return self.transfer.rows.basis
+
+    @property
+    def background_basis(self) -> BackgroundBasis:
+        """What evaluates the basis of V at points."""
+        return self._background
+
+    def quadrature_points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return positions ``(n nq, gdim)`` and volumes ``(n nq,)`` of the history's points.
+
+        They are those of the last converged step, without deleted particles.
+        """
+        there = ~self.deleted
+        nodal = self._converged_corners()
+        points = np.einsum("qk,nki->nqi", self.quadrature.shapes, nodal[there])
+        jacobian = np.linalg.det(np.eye(self._geometry.gdim) + self.converged_gradient()[there])
+        volumes = self.quadrature.weights[there] * jacobian
+        return points.reshape(-1, self._geometry.gdim), volumes.ravel()
+
+    def options(self) -> dict[str, Any]:
+        """Return method and degrees, for a checkpoint to know these particles by."""
+        return {
+            "method": self.method,
+            "degree": self.W.ufl_element().degree,
+            "quadrature_degree": self.quadrature_degree,
+            "domain_update": self._domain_update,
+            "delete": self.deletion is not None,
+        }
+
+    def converged_state(self) -> dict[str, Column]:
+        """Return the last converged step cell by cell, for a checkpoint."""
+        nodal = self._converged[self.domain_nodes]
+        columns = {"displacement": Column(nodal, "nodes")}
+        if self.deletion is not None:
+            columns["deleted"] = Column(self.deletion.mask, "cells")
+            columns["kept"] = Column(self.deletion.kept(nodal), "nodes")
+        if self.mass_share is not None:
+            columns |= self.reference.columns()
+            columns["mass share"] = Column(self.mass_shares(), "nodes")
+        if self.origin is not None:
+            columns["mesh nodes"] = Column(self._geometry.corners, "nodes")
+        return columns
+
+    def set_converged_state(self, arrays: dict[str, NDArray[Any]]) -> None:
+        """Make what :meth:`converged_state` once returned the last converged step (collective)."""
+        d = self.displacement.x
+        d.array.reshape(-1, self._geometry.gdim)[self.domain_nodes] = arrays["displacement"]
+        d.scatter_forward()
+        if self.deletion is not None:
+            self.deletion.restore(np.zeros_like(self.deletion.mask), arrays["kept"])
+            self.deletion.restore(arrays["deleted"], arrays["kept"])
+        if self.mass_share is not None:
+            self.refer(Reference(*(arrays[f"reference {name}"] for name in Reference._fields)))
+            self.set_mass_shares(arrays["mass share"])
+        self.commit()
+
+    def commit(self) -> NDArray[np.float64]:
+        """Make the present displacement the converged one; return what that was before."""
+        before = self._converged
+        present = self.displacement.x.array.reshape(-1, self._geometry.gdim)
+        self.restore(np.array(present, dtype=np.float64))
+        return before
+
+    def restore(self, converged: NDArray[np.float64]) -> None:
+        """Set the converged displacement, shape ``(N, gdim)`` at the local nodes of W."""
+        self._converged = converged
+        self._transfer = None
+
+    def roll_back(self) -> None:
+        """Restore the converged displacement."""
+        self.displacement.x.array[:] = self._converged.ravel()
+        self.increment.x.array[:] = 0.0

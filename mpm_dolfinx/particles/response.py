@@ -1,0 +1,158 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Domains with a material: their stress, internal variables and fields for output."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import MPMError
+from .domains import Domains
+from .geometry import Geometry
+
+__all__ = ["MaterialDomains", "Response"]
+
+
+class Kinematics(Protocol):
+    """What the points of a body are strained in."""
+
+    def gradient(self) -> NDArray[np.float64]:
+        """Return ``F - I`` at the points, shape ``(n, nq, dim, dim)``."""
+
+    def average(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return volume averages of values ``(n, nq, ...)``."""
+
+
+class Response(Protocol):
+    """What answers for the stress and internal variables of a body, at its points.
+
+    Attributes:
+        recovery: What is added to the mean stress of each domain, shape ``(n, 3, 3)``, or 0.
+    """
+
+    recovery: NDArray[np.float64] | float
+
+    @property
+    def strain(self) -> Kinematics:
+        """What the points are strained in."""
+
+    def cauchy_stress(self) -> NDArray[np.float64]:
+        """Return the Cauchy stress, shape ``(n, nq, 3, 3)``."""
+
+    def plastic_strain(self) -> NDArray[np.float64]:
+        """Return the accumulated plastic strain, shape ``(n, nq)``."""
+
+
+class MaterialDomains(Domains):
+    """Domains for whose stress and internal variables a response may answer.
+
+    Attributes:
+        governed_by: What stands for the problem that was made of them last, ``None`` before one.
+    """
+
+    governed_by: object | None = None
+
+    def _live_on(self, geometry: Geometry, deletable: bool) -> None:
+        """See :class:`Domains`; no response answers for the domains of another mesh yet."""
+        super()._live_on(geometry, deletable)
+        self._response: Response | None = None
+
+    def attach(self, response: Response) -> None:
+        """Let a response answer for stress and internal variables."""
+        self._response = response
+
+    def _average(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return volume averages of values ``(n, nq, ...)`` over the undeformed domains."""
+        if self._response is not None:
+            return self._response.strain.average(values)
+        weights = self.point_volumes()
+        parts = weights / weights.sum(axis=1, keepdims=True)
+        return np.asarray(np.einsum("nq,nq...->n...", parts, values))
+
+    @property
+    def deformation_gradient(self) -> NDArray[np.float64]:
+        """Deformation gradient, shape ``(n, 3, 3)`` (volume averages, plane strain in 2-D)."""
+        return _in_space(self._average(self._strained()))
+
+    def _strained(self) -> NDArray[np.float64]:
+        """Return ``F - I`` at the points, with what its response adds to that of the mesh."""
+        if self._response is None:
+            return self.displacement_gradient()
+        return self._response.strain.gradient()
+
+    @property
+    def has_material(self) -> bool:
+        """Whether a problem with a material governs these particles."""
+        return self._response is not None
+
+    @property
+    def stress(self) -> NDArray[np.float64]:
+        """Cauchy stress, shape ``(n, 3, 3)`` (volume averages).
+
+        With ``f_bar="pair"`` or ``"patch"`` the part of it that is constant on a patch is
+        recovered linearly from the patches around.
+
+        Raises:
+            MPMError: The particles have no material (a problem written in UFL).
+        """
+        response = self._answering("stress")
+        return self._average(response.cauchy_stress()) + response.recovery
+
+    @property
+    def plastic_strain(self) -> NDArray[np.float64]:
+        """Accumulated plastic strain ``sqrt(2/3) |d eps_p|``, shape ``(n,)``."""
+        return self._average(self._answering("plastic strain").plastic_strain())
+
+    @property
+    def point_stress(self) -> NDArray[np.float64]:
+        """Cauchy stress at the quadrature points, shape ``(n, nq, 3, 3)``.
+
+        Raises:
+            MPMError: The particles have no material (a problem written in UFL).
+        """
+        return self._answering("stress").cauchy_stress()
+
+    @property
+    def point_plastic_strain(self) -> NDArray[np.float64]:
+        """Accumulated plastic strain at the quadrature points, shape ``(n, nq)``."""
+        return self._answering("plastic strain").plastic_strain()
+
+    @property
+    def point_deformation_gradient(self) -> NDArray[np.float64]:
+        """Deformation gradient at the quadrature points, shape ``(n, nq, 3, 3)``."""
+        return _in_space(self._strained())
+
+    def fields(self) -> dict[str, NDArray[np.float64]]:
+        """Return what is known of each particle, for output: arrays ``(n, ...)`` by name.
+
+        ``volume_ratio`` and, where there is a material, ``stress`` (Cauchy), ``pressure``
+        (mean of the normal stresses, compression positive) and ``plastic_strain``; with
+        ``outside="delete"`` also ``deleted`` (1 where a particle is).
+        """
+        values = {"volume_ratio": self.volume / self.initial_volume}
+        if self.has_material:
+            values["stress"] = self.stress
+            values["pressure"] = -np.trace(values["stress"], axis1=1, axis2=2) / 3.0
+            values["plastic_strain"] = self.plastic_strain
+        if self.deletion is not None:
+            values["deleted"] = self.deleted.astype(np.float64)
+        return values
+
+    def _answering(self, what: str) -> Response:
+        if self._response is None:
+            raise MPMError(
+                f"These particles have no material, so no {what}; give them one with "
+                "QuasiStaticProblem, or evaluate your own UFL expression."
+            )
+        return self._response
+
+
+def _in_space(gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``I + H`` of gradients ``(..., dim, dim)``, shape ``(..., 3, 3)``."""
+    dim = gradient.shape[-1]
+    F = np.tile(np.eye(3), (*gradient.shape[:-2], 1, 1))
+    F[..., :dim, :dim] += gradient
+    return F

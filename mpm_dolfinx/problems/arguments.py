@@ -1,0 +1,272 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What users give to a problem, made uniform, and whether it can move."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+import ufl
+from dolfinx import fem, mesh
+from ufl.corealg.traversal import traverse_unique_terminals
+from ufl.domain import extract_unique_domain
+
+from .. import _compat
+from ..assembly.inputs import is_tag
+from ..errors import MPMError
+from ..materials.base import Material
+from ..particles.particles import LoadFactor, Particles
+from ..system.term import Term
+
+__all__ = [
+    "as_bodies",
+    "as_conditions",
+    "as_terms",
+    "by_space",
+    "carried",
+    "holds",
+    "one_for_each",
+    "require_background_fields",
+    "require_own_fields",
+]
+
+#: Names of the measures of integrals, and how many dimensions less than the mesh they have.
+MEASURES = {"cell": ("dx", 0), "exterior_facet": ("ds", 1), "interior_facet": ("dS", 1)}
+#: Where they are.
+PLACES = {"cell": "of the mesh", "exterior_facet": "on the boundary", "interior_facet": "inside"}
+
+
+def as_bodies(particles: Particles | Sequence[Particles]) -> list[Particles]:
+    """Return the bodies of a problem as a list.
+
+    Raises:
+        MPMError: Something else than particles, or particles that share no space or ranks.
+    """
+    bodies = [particles] if isinstance(particles, Particles) else particles
+    if (
+        not isinstance(bodies, list | tuple)
+        or not bodies
+        or not all(isinstance(body, Particles) for body in bodies)
+    ):
+        raise MPMError(
+            f"particles must be mpm.Particles or a list of them, not {type(particles).__name__}."
+        )
+    if len({id(body) for body in bodies}) < len(bodies):
+        raise MPMError("The same particles are given twice.")
+    first = bodies[0].V.mesh
+    same = (MPI.IDENT, MPI.CONGRUENT)
+    if any(
+        body.V.mesh.geometry.dim != first.geometry.dim
+        or MPI.Comm.Compare(body.V.mesh.comm, first.comm) not in same
+        for body in bodies
+    ):
+        raise MPMError(
+            "All particles of one problem must be in a space of the same dimension and on the same "
+            "ranks."
+        )
+    return list(bodies)
+
+
+def require_own_fields(form: Any, number: int, bodies: Sequence[Particles], what: str) -> None:
+    """Raise an error where a form of a body holds what its tangent or its steps do not see.
+
+    Args:
+        form: A UFL form, or anything else, which is left to others.
+        number: Number of its body.
+        bodies: The bodies of the problem.
+        what: What it is called in a sentence.
+
+    Raises:
+        MPMError: A displacement or load factor of another body, or something of another mesh.
+    """
+    if not isinstance(form, ufl.Form):
+        return
+    body = bodies[number]
+    name = what if len(bodies) == 1 else f"{what} of body {number}"
+    for other, displacement in enumerate(b.displacement for b in bodies):
+        if other != number and any(c is displacement for c in form.coefficients()):
+            raise MPMError(
+                f"The {name} holds the displacement of body {other}, whose change it would feel a "
+                "step late; a residual knows its own body alone, and bodies of one problem act on "
+                "each other by the background that they share, or by terms=."
+            )
+    _require_own_load(form, body, name)
+    _require_mesh(form, body.mesh, name, "particles.mesh")
+
+
+def require_background_fields(form: Any, bodies: Sequence[Particles]) -> None:
+    """Raise an error where a form on the background holds what its tangent does not see.
+
+    Args:
+        form: A UFL form, or anything else, which is left to others.
+        bodies: The bodies of the problem; it is in the increment of the first one.
+
+    Raises:
+        MPMError: An increment or load factor of another body, or something of another mesh.
+    """
+    if not isinstance(form, ufl.Form):
+        return
+    for other, body in enumerate(bodies[1:], start=1):
+        if any(c is body.increment for c in form.coefficients()):
+            raise MPMError(
+                f"The background form holds the increment of body {other}, which is that of all; "
+                "write it in that of the first body."
+            )
+    _require_own_load(form, bodies[0], "background form")
+    _require_mesh(form, bodies[0].V.mesh, "background form", "the background")
+
+
+def _require_own_load(form: ufl.Form, body: Particles, name: str) -> None:
+    if any(isinstance(c, LoadFactor) and c is not body.load for c in form.constants()):
+        raise MPMError(
+            f"The {name} holds the load factor of other particles, which is not followed here; "
+            "write it with particles.load of its own body"
+            + (", the first one." if name == "background form" else ".")
+        )
+
+
+def _require_mesh(form: ufl.Form, domain: mesh.Mesh, name: str, where: str) -> None:
+    """Raise an error where a form holds Functions or geometry of another mesh."""
+    own = domain.ufl_domain()
+    for integral in form.integrals():
+        if integral.ufl_domain() != own:
+            raise MPMError(f"The {name} integrates over another mesh than {where}.")
+        for terminal in traverse_unique_terminals(integral.integrand()):
+            kinds = (ufl.Coefficient, ufl.classes.GeometricQuantity)
+            if isinstance(terminal, kinds) and extract_unique_domain(terminal) != own:
+                called = type(terminal).__name__
+                if isinstance(terminal, fem.Function):
+                    called = f"'{terminal.name}'"
+                raise MPMError(
+                    f"The {name} holds {called} of another mesh, but must be written on {where}; "
+                    "interpolate it there."
+                )
+        _require_tags(integral, domain, name, where)
+
+
+def _require_tags(integral: ufl.Integral, domain: mesh.Mesh, name: str, where: str) -> None:
+    """Raise an error where the tags of an integral are none of its mesh, or name nothing there.
+
+    DOLFINx would integrate over nothing, or over entities of another mesh, which may end the
+    process (collective).
+    """
+    kind, wanted, data = (
+        integral.integral_type(),
+        integral.subdomain_id(),
+        integral.subdomain_data(),
+    )
+    measure, codim = MEASURES.get(kind, (kind, None))
+    if codim is None:
+        return
+    dim = domain.topology.dim - codim
+    if isinstance(data, mesh.MeshTags):
+        if not _compat.are_tags_of(data, domain):
+            raise MPMError(
+                f"The {name} integrates over {measure} with tags of another mesh; make them on "
+                f"{where}."
+            )
+        if data.dim != dim:
+            raise MPMError(
+                f"The {name} integrates over {measure} with tags of dimension {data.dim}, but "
+                f"needs tags of dimension {dim}."
+            )
+        found = data.values
+        if kind == "exterior_facet":
+            domain.topology.create_connectivity(dim, dim + 1)
+            outer = mesh.exterior_facet_indices(domain.topology)
+            found = found[np.isin(data.indices, outer)]
+        mine = {int(tag) for tag in np.unique(found)}
+    elif isinstance(data, list | tuple):
+        mine = {int(tag) for tag, entities in data if len(entities)}
+    else:
+        mine = set()
+    known = set().union(*domain.comm.allgather(mine))
+    for tag in wanted if isinstance(wanted, tuple) else (wanted,):
+        if is_tag(tag) and tag not in known:
+            there = f"there are {sorted(known)}" if known else "its measure has none"
+            raise MPMError(
+                f"The {name} integrates over {measure}({tag}), but nothing {PLACES[kind]} has the "
+                f"tag {tag}; {there}."
+            )
+
+
+def one_for_each(forms: Any, bodies: Sequence[Particles], what: str) -> list[Any]:
+    """Return forms, of which each body has one, as a list.
+
+    Raises:
+        MPMError: More or less of them than bodies.
+    """
+    given = list(forms) if isinstance(forms, list | tuple) else [forms]
+    if len(given) != len(bodies):
+        raise MPMError(f"There are {len(bodies)} bodies; give one {what} for each, as a list.")
+    return given
+
+
+def by_space(bodies: Sequence[Particles]) -> list[list[Particles]]:
+    """Return the bodies on each background space, in the order in which the spaces come first."""
+    groups: list[list[Particles]] = []
+    for body in bodies:
+        known = [group for group in groups if group[0].V is body.V]
+        if known:
+            known[0].append(body)
+        else:
+            groups.append([body])
+    return groups
+
+
+def as_terms(terms: Any, bodies: Sequence[Particles]) -> list[Term]:
+    """Return what acts on bodies as a list.
+
+    Raises:
+        MPMError: Something else than terms, or terms on other bodies.
+    """
+    if not isinstance(terms, list | tuple) or not all(isinstance(t, Term) for t in terms):
+        raise MPMError("terms must be a list of mpm.Term, such as mpm.Tie.")
+    for term in terms:
+        if any(all(own is not body for body in bodies) for own in term.bodies):
+            raise MPMError(
+                f"A {type(term).__name__} acts on other particles than those of this problem."
+            )
+    return list(terms)
+
+
+def as_conditions(bcs: Any, spaces: Sequence[fem.FunctionSpace]) -> list[fem.DirichletBC]:
+    """Return Dirichlet conditions on some background spaces as a list.
+
+    Raises:
+        MPMError: Something else than conditions, or conditions on another space.
+    """
+    if not isinstance(bcs, list | tuple) or not all(isinstance(bc, fem.DirichletBC) for bc in bcs):
+        raise MPMError("bcs must be a list of dolfinx.fem.DirichletBC.")
+    if not all(any(_compat.is_condition_on(bc, V) for V in spaces) for bc in bcs):
+        raise MPMError(
+            "A Dirichlet condition is not on the background space V of the particles "
+            "or on a component of it (V.sub(i))."
+        )
+    return list(bcs)
+
+
+def carried(particles: Particles, assignment: Any) -> Any:
+    """Return materials with their DG0 parameters on the mesh to which the particles have moved."""
+    if isinstance(assignment, Mapping):
+        return {tag: carried(particles, material) for tag, material in assignment.items()}
+    if not isinstance(assignment, Material):
+        return assignment
+    functions = {
+        name: particles.carry(value)
+        for name, value in assignment.parameters.items()
+        if isinstance(value, fem.Function)
+    }
+    return assignment.with_parameters(**functions) if functions else assignment
+
+
+def holds(value: Any, kind: Any) -> bool:
+    """Return whether a value, or one in lists and tuples, is of a kind."""
+    if isinstance(value, list | tuple):
+        return any(holds(entry, kind) for entry in value)
+    return isinstance(value, kind)

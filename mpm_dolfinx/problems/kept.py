@@ -1,0 +1,375 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What every problem keeps: bodies, material points, Functions, increments, and how far it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from ..errors import MPMError, ParticleOutsideError
+from ..history import History, Loss, Statistics, Step
+from ..io.snapshot import Kept, Taken, fill, of_cells
+from ..meshes.remesh import Column
+from ..particles.particles import Particles
+from ..stepping.control import Converged, Progress, Run
+from ..system.reduced import ReducedSystem
+
+__all__ = ["Bodies", "Functions", "Increments", "Material", "Past", "Standing"]
+
+
+class Bodies(Kept):
+    """Displacement of the bodies, what they are on their meshes, and what was deleted of them."""
+
+    def __init__(self, bodies: Sequence[Particles]) -> None:
+        self._bodies = bodies
+
+    def numbers(self) -> dict[str, Any]:
+        """Return how quadrilaterals were cut."""
+        return {"cuts": [body.cuts.tolist() for body in self._bodies]}
+
+    def columns(self, body: int | None) -> dict[str, Column]:
+        """See :class:`Kept`."""
+        return {} if body is None else self._bodies[body].converged_state()
+
+    def require(self, source: str, taken: Taken) -> None:
+        """Raise an error where a state holds what nothing here takes."""
+        for body, columns in zip(self._bodies, taken.columns, strict=False):
+            unknown = sorted(columns.keys() - body.converged_state().keys())
+            if unknown:
+                raise MPMError(f"{source} holds {unknown}, which this problem does not keep.")
+            missing = sorted(body.converged_state().keys() - columns.keys())
+            if missing:
+                raise MPMError(f"{source} does not hold {missing}, which this problem keeps.")
+
+    def restore(self, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        for body, columns in zip(self._bodies, taken.columns, strict=False):
+            body.set_converged_state(columns)
+
+
+class Material(Kept):
+    """The history at the bodies' points, or one of the user's own.
+
+    Args:
+        get: Returns it at the last converged step.
+        put: Takes it again.
+        at: Where arrays live that do not say it; ``None``: they must.
+    """
+
+    key = "history"
+
+    def __init__(
+        self,
+        get: Callable[[], list[dict[str, Any]]],
+        put: Callable[[list[dict[str, NDArray[Any]]]], None],
+        at: Any,
+    ) -> None:
+        self._get, self._put, self._at = get, put, at
+
+    def columns(self, body: int | None) -> dict[str, Column]:
+        """See :class:`Kept`."""
+        if body is None:
+            return {}
+        return {
+            name: value
+            if isinstance(value, Column) or self._at is None
+            else Column(np.asarray(value), self._at)
+            for name, value in self._get()[body].items()
+        }
+
+    def require(self, source: str, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        for number, history in enumerate(taken.columns[:-1]):
+            present = self.columns(number)
+            for name, column in present.items():
+                shape = None if name not in history else history[name].shape[1:]
+                if shape != column.values.shape[1:]:
+                    raise MPMError(
+                        f"{source} has no history {name!r} of the kind that this problem has."
+                    )
+            if history and not present:
+                raise MPMError(
+                    f"{source} has a history of stress, which this problem has no use for."
+                )
+
+    def restore(self, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        self._put(taken.columns[:-1])
+
+
+class Functions(Kept):
+    """Functions on the bodies' meshes that are part of the user's state.
+
+    Args:
+        functions: As given to ``save`` or ``restore``.
+        bodies: The bodies.
+        needed: Functions at quadrature points that must be among them.
+
+    Raises:
+        MPMError: They cannot be kept, or one is missing.
+    """
+
+    key = "function"
+
+    def __init__(
+        self,
+        functions: Sequence[fem.Function],
+        bodies: Sequence[Particles],
+        needed: set[fem.Function],
+    ) -> None:
+        known = isinstance(functions, list | tuple) and all(
+            isinstance(f, fem.Function)
+            and any(f.function_space.mesh is body.mesh for body in bodies)
+            for f in functions
+        )
+        if not known:
+            raise MPMError("functions must be a list of dolfinx.fem.Function on the body mesh.")
+        shares = [[f for f in functions if f.function_space.mesh is body.mesh] for body in bodies]
+        for own in shares:
+            names = [f.name for f in own]
+            if len(set(names)) < len(names):
+                raise MPMError(
+                    "functions are known by their names, which must differ, not "
+                    f"{', '.join(names)}."
+                )
+        missing = needed.difference(functions)
+        if missing:
+            names = sorted(f.name for f in missing)
+            raise MPMError(
+                f"The residual holds data at quadrature points ({', '.join(names)}); give these "
+                "Functions as functions=[...], so that they are saved and restored too."
+            )
+        self._of = shares
+
+    def columns(self, body: int | None) -> dict[str, Column]:
+        """See :class:`Kept`."""
+        own = [] if body is None else self._of[body]
+        return {f.name: Column(of_cells(f), "nodes") for f in own}
+
+    def require(self, source: str, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        for own, columns in zip(self._of, taken.columns, strict=False):
+            given = {f.name for f in own}
+            if columns.keys() != given:
+                raise MPMError(
+                    f"{source} holds the functions {sorted(columns)}, but functions= names "
+                    f"{sorted(given)}."
+                )
+            for function in own:
+                space = function.function_space
+                shape = (space.dofmap.list.shape[1], space.dofmap.bs)
+                if columns[function.name].shape[1:] != shape:
+                    raise MPMError(f"{source} holds the function {function.name} in another space.")
+
+    def restore(self, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        for own, columns in zip(self._of, taken.columns, strict=False):
+            for function in own:
+                fill(function, columns[function.name])
+
+
+class Increments(Kept):
+    """The last increments, which predict the next."""
+
+    key = "past"
+
+    def __init__(self, reduced: ReducedSystem, bodies: Sequence[Particles]) -> None:
+        self._predictor, self._bodies = reduced.predictor, bodies
+
+    def numbers(self) -> dict[str, Any]:
+        """Return the sizes of their steps."""
+        return {"": [size for size, _ in self._past()]}
+
+    def columns(self, body: int | None) -> dict[str, Column]:
+        """See :class:`Kept`."""
+        if body is None:
+            return {}
+        W = self._bodies[body].W
+        return {
+            str(i): Column(of_cells(_function(W, increments[body])), "nodes")
+            for i, (_, increments) in enumerate(self._past())
+        }
+
+    def require(self, source: str, taken: Taken) -> None:
+        """See :class:`Kept`; those of another run are as good."""
+
+    def restore(self, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        if self._predictor is None:
+            return
+        self._predictor.past = [
+            (
+                size,
+                [
+                    _owned(_filled(body.W, columns[str(i)]))
+                    for body, columns in zip(self._bodies, taken.columns, strict=False)
+                ],
+            )
+            for i, size in enumerate(taken.numbers[""])
+        ]
+
+    def _past(self) -> list[tuple[float, Any]]:
+        return [] if self._predictor is None else self._predictor.past
+
+
+class Past(Kept):
+    """What a run did, and the moduli that its ghost penalty began with."""
+
+    def __init__(self, history: History, reduced: ReducedSystem, comm: MPI.Comm) -> None:
+        self._history, self._reduced, self._comm = history, reduced, comm
+
+    def numbers(self) -> dict[str, Any]:
+        """See :class:`Kept`."""
+        history = self._history
+        return {
+            "moduli": self._reduced.moduli,
+            "steps": [
+                [s.load, s.iterations, s.residuals, s.displacement, s.time] for s in history.steps
+            ],
+            "cutbacks": history.cutbacks,
+            "failed_iterations": history.failed_iterations,
+            "losses": [vars(loss) for loss in history.losses],
+            "stopped": None if history.stopped is None else history.stopped.__reduce__()[1],
+            "statistics": _average(self._comm, history.statistics),
+        }
+
+    def require(self, source: str, taken: Taken) -> None:
+        """See :class:`Kept`."""
+
+    def restore(self, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        numbers, history = taken.numbers, self._history
+        self._reduced.moduli = numbers["moduli"]
+        history.steps[:] = _steps(numbers["steps"])
+        history.cutbacks = numbers["cutbacks"]
+        history.failed_iterations = numbers["failed_iterations"]
+        history.losses[:] = [Loss(**entries) for entries in numbers["losses"]]
+        stopped = numbers["stopped"]
+        history.stopped = None if stopped is None else ParticleOutsideError(*stopped)
+        history.statistics.update(numbers["statistics"])
+
+
+class Standing(Kept):
+    """How far a problem is: the values of the last converged step on V, and the run.
+
+    Args:
+        progress: How far it is; after :meth:`restore`, how far it was.
+        spaces: The background spaces.
+        history: What the run did, restored before.
+
+    Attributes:
+        progress: As given, or restored.
+    """
+
+    def __init__(
+        self, progress: Progress, spaces: Sequence[fem.FunctionSpace], history: History
+    ) -> None:
+        self.progress, self._spaces, self._history = progress, spaces, history
+
+    def numbers(self) -> dict[str, Any]:
+        """See :class:`Kept`."""
+        converged, run = self.progress.converged, self.progress.run
+        return {
+            "load": converged.load,
+            "parameter": converged.parameter,
+            "proportional": converged.proportional,
+            "reactions": converged.reactions is not None,
+            "run": None if run is None else run.numbers(),
+            "experience": self.progress.experience,
+        }
+
+    def on_background(self, number: int) -> dict[str, Column]:
+        """See :class:`Kept`."""
+        converged, run = self.progress.converged, self.progress.run
+        totals = {
+            "prescribed": converged.prescribed[number],
+            "reactions": None if converged.reactions is None else converged.reactions[number],
+            "base": None if run is None else run.base[number],
+        }
+        return {
+            name: Column(of_cells(_function(self._spaces[number], values)), "nodes")
+            for name, values in totals.items()
+        }
+
+    def require(self, source: str, taken: Taken) -> None:
+        """See :class:`Kept`."""
+
+    def restore(self, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        numbers = taken.numbers
+        totals = {
+            name: [
+                _filled(V, columns[name])
+                for V, columns in zip(self._spaces, taken.backgrounds, strict=True)
+            ]
+            for name in ("prescribed", "reactions", "base")
+        }
+        reactions = [_owned(f) for f in totals["reactions"]] if numbers["reactions"] else None
+        converged = Converged(
+            numbers["load"],
+            numbers["parameter"],
+            [np.asarray(f.x.array) for f in totals["prescribed"]],
+            reactions,
+            numbers.get("proportional", True),
+        )
+        run = None
+        if numbers["run"] is not None:
+            base = [np.asarray(f.x.array) for f in totals["base"]]
+            run = Run.of(numbers["run"], base, self._history.time)
+        self.progress = Progress(converged, tuple(numbers["experience"]), run)
+
+
+def _steps(entries: list[list[Any]]) -> list[Step]:
+    """Return the steps of a checkpoint; those of files of before have no time."""
+    steps: list[Step] = []
+    stage, load = 0.0, 0.0
+    for number, entry in enumerate(entries):
+        step = Step(*entry)
+        if len(entry) == 4:
+            controlled = step.displacement is not None
+            if not controlled and step.load <= load:
+                stage = float(math.ceil(steps[-1].time)) if steps else 0.0
+            time = number + 1.0 if controlled else stage + max(step.load, 0.0)
+            step = replace(step, time=time)
+            load = step.load
+        steps.append(step)
+    return steps
+
+
+def _function(space: fem.FunctionSpace, owned: NDArray[np.float64] | None) -> fem.Function:
+    """Return a Function with owned values, or none."""
+    function = fem.Function(space)
+    if owned is not None:
+        function.x.array[: len(owned)] = owned
+    function.x.scatter_forward()
+    return function
+
+
+def _filled(space: fem.FunctionSpace, values: NDArray[np.float64]) -> fem.Function:
+    """Return a Function with the nodal values of each owned cell, ``(n, k, bs)``."""
+    function = fem.Function(space)
+    fill(function, values)
+    return function
+
+
+def _owned(function: fem.Function) -> NDArray[np.float64]:
+    """Return a copy of the values that this rank owns; they come first."""
+    dofmap = function.function_space.dofmap
+    return np.array(function.x.array[: dofmap.index_map.size_local * dofmap.index_map_bs])
+
+
+def _average(comm: MPI.Comm, statistics: Statistics) -> dict[str, float]:
+    """Return counters, which all ranks share, and the mean seconds of the ranks."""
+    every = comm.allgather(statistics.seconds)
+    mean = {name: sum(s[name] for s in every) / comm.size for name in statistics.seconds}
+    return {**statistics, **mean}

@@ -1,0 +1,827 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""A UFL residual on particles, solved in load steps."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ufl
+from dolfinx import fem
+
+from ..assembly.background_forms import BackgroundForms
+from ..assembly.body_forms import BodyForms, PointStress
+from ..assembly.fused import is_fast
+from ..assembly.rules import data_at_points
+from ..boundary.supports import Support
+from ..constitutive.averaging import Linearised
+from ..errors import MPMError, agree, warn
+from ..history import History, Step
+from ..io import checkpoint, identity
+from ..io.series import Output, read_series
+from ..io.snapshot import Kept, adopt, capture, require_key, spaces_of
+from ..parallel.garbage import Cleaner
+from ..parallel.given import require_same
+from ..particles.particles import Particles
+from ..solvers.newton import NewtonSolver
+from ..stabilisation.choice import stabilisation_of
+from ..stepping.control import Run
+from ..stepping.diagnosis import crossed
+from ..stepping.displacement_control import DisplacementControl
+from ..stepping.loading import Mender, Stepper
+from ..stepping.progress import with_bar
+from ..system.body import BodyTerm, PointHistory
+from ..system.conditions import force_at
+from ..system.field import Field
+from ..system.predictor import Predictor
+from ..system.reduced import ReducedSystem
+from ..system.term import Term, UserTerm
+from . import kept
+from .arguments import (
+    as_bodies,
+    as_conditions,
+    as_terms,
+    by_space,
+    one_for_each,
+    require_background_fields,
+    require_own_fields,
+)
+from .setup import Numerics
+
+__all__ = ["Contribution", "Law", "ParticleProblem"]
+
+
+class Contribution(NamedTuple):
+    """What a body adds to the system.
+
+    Attributes:
+        residual: Form on the body mesh, or ``None``.
+        tangent: Form on the body mesh; ``None`` is the residual's derivative.
+        internal: Stress whose virtual work is not in the residual, or ``None``.
+        low_rank: What the tangent has besides forms and the pointwise one, or ``None``.
+        symmetric: Whether the tangent is symmetric.
+        material: The material at its points, if the above hold one.
+        injected: Functions in the forms for stress and tangent of the material, or ``None``.
+        contact: Whether the forms have one-sided supports.
+    """
+
+    residual: ufl.Form | None
+    tangent: ufl.Form | None
+    internal: PointStress | None
+    low_rank: Linearised | None
+    symmetric: bool
+    material: PointHistory | None = None
+    injected: tuple[fem.Function, fem.Function] | None = None
+    contact: bool = False
+
+
+type Law = tuple[str, dict[str, Any]]
+"""Name of a material, and its parameters: numbers, or indices and values of points."""
+
+
+class ParticleProblem:
+    """Find the displacement of particles at which a UFL residual vanishes.
+
+    The residual is written on the body mesh as for finite elements. Each step's increment
+    lives in the background space: ``d = d_n + T u``, residual ``T^T R`` and tangent
+    ``T^T J T``.
+
+    Args:
+        R: Residual in ``particles.displacement`` and a test function of ``particles.W``; for
+            several bodies one for each.
+        particles: The body, or a list of bodies. Those on the same V do not slip where they touch;
+            those on a V of their own meet by ``terms`` alone.
+        J: Tangent; ``None`` is ``ufl.derivative(R, particles.displacement)``.
+        bcs: Dirichlet conditions on V (any of them); their values are totals at full load.
+        background: Form in ``particles.increment`` (of the first body on V) and a test function
+            of V, added to R; a list where there are several V.
+        petsc_options_prefix: Prefix of the PETSc options.
+        petsc_options: PETSc options for SNES, KSP and PC, without prefix.
+        form_compiler_options: Options of FFCx.
+        jit_options: Options of the compilation at run time.
+        assembly: ``"fast"``: the compiled loops assemble the reduced tangent domain by domain;
+            ``"reference"``: DOLFINx assembles on the body mesh and PETSc multiplies by T;
+            ``"auto"``: fast where the package was built with the loops, unless the environment
+            variable ``MPM_DOLFINX_ASSEMBLY`` says ``reference``.
+        symmetric: Whether J is symmetric (an LDL^T factorisation instead of LU).
+        shift: Diagonal shift in the factorisation, relative to the diagonal. Combinations of
+            background dofs that move no node of the body make the reduced tangent singular;
+            without a shift the factor of such a matrix is noise.
+        line_search: Whether Newton steps are halved where they invert domains or do not
+            reduce the residual, and where nothing yields taken on trust.
+        dependent_dofs: What becomes of dofs that others can stand for, as no node of the body
+            tells them apart: ``"shift"`` leaves them to the shift, ``"remove"`` looks for them in
+            each step and takes them from the unknowns (then ``shift=0.0`` is possible, and
+            ``statistics["dependent_dofs"]`` is the largest number of them).
+        predictor: Whether Newton's method starts from the last increments extrapolated, where
+            the residual there is not above twice that of a start from zero.
+        stabilisation: What is done about background dofs that the body supports badly:
+            ``"ghost"`` penalty, ``"aggregate"``, ``None``, or ``"auto"``, a ghost penalty where a
+            cut is small, on backgrounds of degree 2 or more and, on those of degree 1, while
+            the bodies have hardly more nodes than the background (not beside ``background=``
+            or ``dependent_dofs="remove"``).
+        terms: What else acts on the bodies: a list of :class:`mpm_dolfinx.Term`.
+
+    Attributes:
+        particles: The body or bodies, as given.
+        bodies: The bodies, as a list.
+        reduced: Residual and tangent in the free dofs of V.
+        history: Steps, counters and seconds; filled as a run goes on.
+        bcs: The Dirichlet conditions.
+        terms: As given.
+        body_terms: What each body is made of and loaded by.
+
+    Raises:
+        MPMError: Forms, spaces or conditions that do not go together.
+    """
+
+    def __init__(
+        self,
+        R: ufl.Form | Sequence[ufl.Form | None],
+        particles: Particles | Sequence[Particles],
+        J: ufl.Form | Sequence[ufl.Form | None] | None = None,
+        bcs: Sequence[fem.DirichletBC] = (),
+        background: ufl.Form | Sequence[ufl.Form] | None = None,
+        petsc_options_prefix: str = "mpm_",
+        petsc_options: dict[str, Any] | None = None,
+        form_compiler_options: dict[str, Any] | None = None,
+        jit_options: dict[str, Any] | None = None,
+        *,
+        assembly: str = "auto",
+        symmetric: bool = False,
+        shift: float = 1e-13,
+        line_search: bool = True,
+        dependent_dofs: str = "shift",
+        predictor: bool = True,
+        stabilisation: str | None = "auto",
+        terms: Sequence[Term] = (),
+    ) -> None:
+        bodies = as_bodies(particles)
+        require_same(
+            bodies[0].V.mesh.comm,
+            R=R,
+            particles=particles,
+            J=J,
+            bcs=bcs,
+            background=background,
+            petsc_options_prefix=petsc_options_prefix,
+            petsc_options=petsc_options,
+            form_compiler_options=form_compiler_options,
+            jit_options=jit_options,
+            assembly=assembly,
+            symmetric=symmetric,
+            shift=shift,
+            line_search=line_search,
+            dependent_dofs=dependent_dofs,
+            predictor=predictor,
+            stabilisation=stabilisation,
+            terms=len(terms),
+        )
+        numerics = Numerics(
+            petsc_options_prefix,
+            petsc_options or {},
+            form_compiler_options,
+            jit_options,
+            assembly,
+            shift,
+            line_search,
+            dependent_dofs,
+            predictor,
+            stabilisation,
+        )
+        residuals = one_for_each(R, bodies, "residual R")
+        tangents = [None] * len(bodies) if J is None else one_for_each(J, bodies, "J")
+        if any(body.on_distortion == "split" for body in bodies):
+            raise MPMError(
+                "The residual is written on the present body mesh, so domains cannot be split; "
+                "on_distortion='split' is for mpm.QuasiStaticProblem."
+            )
+        self._given = [
+            Contribution(r, j, None, None, symmetric)
+            for r, j in zip(residuals, tangents, strict=True)
+        ]
+        self._begin(particles, bcs, background, numerics, terms)
+
+    def _begin(
+        self,
+        particles: Particles | Sequence[Particles],
+        bcs: Sequence[fem.DirichletBC],
+        background: ufl.Form | Sequence[ufl.Form] | None,
+        numerics: Numerics,
+        terms: Sequence[Term],
+        mender: Mender | None = None,
+    ) -> None:
+        """Take what outlives the present meshes of the bodies, and build the rest (collective).
+
+        Args:
+            particles: The body or bodies.
+            bcs: Dirichlet conditions.
+            background: Form on the background.
+            numerics: How the problem is solved.
+            terms: What else acts on the bodies.
+            mender: What changes meshes between steps, if anything.
+        """
+        self.particles = particles
+        self.bodies = as_bodies(particles)
+        self.bcs = as_conditions(bcs, [group[0].V for group in by_space(self.bodies)])
+        self.terms = as_terms(terms, self.bodies)
+        self.history = History()
+        self.identity: dict[str, Any] | None = None
+        self._comm: MPI.Comm = self.bodies[0].V.mesh.comm
+        self._background, self._numerics = background, numerics
+        self._output = Output()
+        self._kept: list[Kept] = []
+        self._stepper = Stepper(self, mender)
+        self._build()
+        for term in self.terms:
+            for thing in term.kept():
+                self.keep(thing)
+
+    def _build(self) -> None:
+        """Make the system and its solver for the present meshes of the bodies (collective).
+
+        It is called again whenever these are other ones.
+        """
+        groups = by_space(self.bodies)
+        meshes = [group[0].V.mesh for group in groups]
+        clean_up = Cleaner(self._comm, [*meshes, *(body.mesh for body in self.bodies)])
+        try:
+            self._build_system(groups, clean_up)
+        except BaseException:
+            clean_up.end()  # what is half built is freed by the next problem
+            raise
+        self._govern()
+
+    def _build_system(self, groups: list[list[Particles]], clean_up: Cleaner) -> None:
+        """Make the system and its solver (collective).
+
+        Args:
+            groups: The bodies on each background space.
+            clean_up: Frees what is out of use.
+        """
+        numerics = self._numerics
+        contributions = self._contributions()
+        for number, given in enumerate(contributions):
+            require_own_fields(given.residual, number, self.bodies, "residual R")
+            require_own_fields(given.tangent, number, self.bodies, "tangent J")
+        fast, options = is_fast(numerics.assembly), numerics.of_forms
+        self.body_terms = [
+            BodyTerm(
+                body,
+                BodyForms(c.residual, c.tangent, body, c.internal, c.low_rank, fast, **options),
+                c.material,
+                c.injected,
+                c.contact,
+            )
+            for body, c in zip(self.bodies, contributions, strict=True)
+        ]
+        on_backgrounds = _on_backgrounds(self._background, groups, **options)
+        remove = numerics.dependent_dofs == "remove"
+        fields = [
+            Field(
+                group,
+                self.bcs,
+                forms,
+                stabilisation_of(numerics.stabilisation, group, remove, forms is not None),
+            )
+            for group, forms in zip(groups, on_backgrounds, strict=True)
+        ]
+        statistics = self.history.statistics
+        reduced = ReducedSystem(
+            self.bodies,
+            fields,
+            [*self.body_terms, *self.terms, UserTerm(self)],
+            statistics,
+            Predictor() if numerics.predictor else None,
+        )
+        newton = NewtonSolver(
+            self._comm,
+            numerics.petsc_options_prefix,
+            numerics.petsc_options,
+            all(given.symmetric for given in contributions)
+            and all(term.symmetric for term in self.terms),
+            numerics.shift,
+            numerics.line_search,
+            statistics,
+            groups[0][0].V.mesh.geometry.dim,
+        )
+        self._stepper.follow(reduced, newton, clean_up)
+        forms = [f for given in contributions for f in (given.residual, given.tangent) if f]
+        every = [*forms, *_as_list(self._background)]
+        loads = [constant for body in self.bodies for constant in (body.load, body.proportional)]
+        self._constants = [
+            constant
+            for form in every
+            for constant in form.constants()
+            if not any(constant is load for load in loads)
+        ]
+        self._data = set().union(*map(data_at_points, forms))
+
+    def _contributions(self) -> list[Contribution]:
+        """Return what each body adds to the system, on its present mesh (collective)."""
+        return self._given
+
+    def __del__(self) -> None:
+        """Leave PETSc's objects to the next clean-up; at the program's end PETSc drops them.
+
+        The meshes are let go of here too: see :meth:`Particles.__del__`.
+        """
+        if sys.is_finalizing():
+            return
+        if hasattr(self, "_stepper"):
+            self._release()
+        vars(self).clear()
+
+    def _release(self) -> None:
+        """Let go of what was built for the present meshes."""
+        for body in self.bodies:
+            body.forget_transfer()
+        self.body_terms = []
+        self._stepper.release()
+
+    def renew(
+        self,
+        change: Callable[[], None],
+        carry: Callable[[checkpoint.Snapshot], checkpoint.Snapshot],
+    ) -> None:
+        """Build the problem on other meshes of the same bodies, in the same state (collective).
+
+        Args:
+            change: Gives the particles their meshes.
+            carry: Makes of the state before the one on these meshes.
+        """
+        snapshot = self._snapshot()
+        seconds = self.history.statistics.seconds
+        self._release()
+        change()
+        self._build()
+        self._adopt(carry(snapshot), (), "The state before")
+        self.history.statistics.update(seconds)
+
+    # -- PETSc objects --------------------------------------------------------------------
+
+    @property
+    def reduced(self) -> ReducedSystem:
+        """Residual and tangent in the free dofs of V."""
+        return self._stepper.reduced
+
+    @property
+    def solver(self) -> PETSc.SNES:
+        """The nonlinear solver."""
+        return self._stepper.newton.snes
+
+    @property
+    def A(self) -> PETSc.Mat | None:
+        """The reduced tangent of the last Newton iteration."""
+        return self._stepper.newton.K
+
+    @property
+    def b(self) -> PETSc.Vec | None:
+        """The reduced residual that was evaluated last."""
+        return self._stepper.newton.F
+
+    @property
+    def x(self) -> PETSc.Vec | None:
+        """The free dofs of the last step's increment."""
+        return self._stepper.newton.x
+
+    # -- Which problem governs the bodies -----------------------------------------------------
+
+    def _govern(self) -> None:
+        """Take the bodies over from problems that were made of them before."""
+        self._reign = object()
+        for body in self.bodies:
+            body.governed_by = self._reign
+
+    def _require_governing(self) -> None:
+        """Raise an error where a later problem has taken a body over."""
+        if any(body.governed_by is not self._reign for body in self.bodies):
+            raise MPMError(
+                "Another problem was made of these particles since, and governs them now; go on "
+                "with that one, or give each problem particles of its own."
+            )
+
+    # -- Loading --------------------------------------------------------------------------
+
+    def solve(
+        self,
+        steps: int = 1,
+        update: Callable[[float], None] | None = None,
+        progress: bool = False,
+        repartition: float | None = None,
+        control: DisplacementControl | None = None,
+    ) -> History:
+        """Apply the whole load.
+
+        Args:
+            steps: Number of equal load steps; a step that fails is halved, none is larger.
+            update: The user's path: ``update(t)`` sets values of Dirichlet conditions,
+                Constants and Functions to their totals at t in (0, 1]. It may be called again
+                with a smaller t after a failure. The load factor goes from its present value
+                to 1 in proportion to t unless it sets another.
+            progress: Whether rank 0 shows a progress bar.
+            repartition: Share of the particles that makes them move to other ranks after a
+                step (:meth:`QuasiStaticProblem.repartition`); ``None`` leaves them.
+            control: A displacement of a body that goes to a value in equal steps; the load
+                factor is found for each, which may fall again. Dirichlet values stay.
+
+        Returns:
+            The history of the run.
+
+        Raises:
+            MPMError: The run cannot go on; the state is that of the last converged step. With
+                ``outside="stop"`` a particle that leaves the background is no error: the run
+                ends, ``history.stopped`` and a warning say why.
+        """
+        path = self.steps(steps, update, repartition, control)
+        for _ in with_bar(path, steps, self._share) if progress and self._comm.rank == 0 else path:
+            pass
+        return self.history
+
+    def steps(
+        self,
+        steps: int,
+        update: Callable[[float], None] | None = None,
+        repartition: float | None = None,
+        control: DisplacementControl | None = None,
+    ) -> Iterator[Step]:
+        """Apply the whole load, one converged step at a time.
+
+        After :meth:`restore` it goes on with the run that was interrupted.
+
+        Args:
+            steps: As in :meth:`solve`.
+            update: As in :meth:`solve`.
+            repartition: As in :meth:`solve`.
+            control: As in :meth:`solve`.
+
+        Yields:
+            Each converged step.
+
+        Raises:
+            MPMError: As in :meth:`solve`.
+        """
+        self._require_governing()
+        require_same(
+            self._comm, steps=steps, update=update, repartition=repartition, control=control
+        )
+        return self._stepper.steps(steps, update, repartition, control)
+
+    def _share(self, _: Step) -> float:
+        """Return how much of the run is done."""
+        return self._stepper.share
+
+    def step(self) -> Step:
+        """Make one increment to the present values of loads and conditions.
+
+        Loads count times the load factor, which is that of the last step unless
+        ``particles.load`` is set, and so do displacements of supports before the first path;
+        Dirichlet values, and supports after a path, are taken as they are.
+
+        Returns:
+            The converged step.
+
+        Raises:
+            MPMError: It does not converge; the state is that of the last converged step.
+        """
+        self._require_governing()
+        return self._stepper.step()
+
+    # -- Results --------------------------------------------------------------------------
+
+    def reaction(self, bc: fem.DirichletBC | Support) -> NDArray[np.float64]:
+        """Return the force of a support on the body at the last converged load.
+
+        The force at each dof of the condition counts once, however often the condition names
+        it; where two conditions share a dof, it is in the force of both.
+
+        Args:
+            bc: One of the problem's Dirichlet conditions, or a support of
+                :mod:`mpm_dolfinx.boundary` on one of its bodies.
+
+        Returns:
+            Force, shape ``(gdim,)``, the same on all ranks.
+
+        Raises:
+            MPMError: The condition is not one of the problem's.
+        """
+        if isinstance(bc, Support):
+            if all(bc.particles is not body for body in self.bodies):
+                raise MPMError("reaction() needs a support on one of the bodies of this problem.")
+            return bc.reaction
+        if not any(bc is known for known in self.bcs):
+            raise MPMError("reaction(bc) needs one of the Dirichlet conditions of this problem.")
+        reactions = self._stepper.converged.reactions
+        number, field = next(
+            (number, field)
+            for number, field in enumerate(self.reduced.fields)
+            if any(bc is known for known in field.conditions)
+        )
+        return force_at(bc, None if reactions is None else reactions[number], field.V)
+
+    def write(self, path: str | Path, time: float | None = None) -> None:
+        """Add the present state to a time series for ParaView (collective).
+
+        The domains are written at their current positions, with displacement, volume ratio
+        and, where there is a material, Cauchy stress, pressure and plastic strain.
+
+        Args:
+            path: A ``.pvd`` file; the first call replaces it, unless the problem was restored
+                from a checkpoint of the run that wrote it: then the series goes on, without
+                what is later than the checkpoint. With several bodies each has its own, numbered
+                from 0: ``name_0.pvd``. Each state has one file besides, ``name_000000.vtu``.
+            time: Time of the state, ``history.time`` by default. It replaces a state of the same
+                time that was written last.
+
+        Raises:
+            MPMError: The name does not end in ``.pvd``, the time lies before that of the state
+                that was written last, or a file cannot be written, or not all of it.
+        """
+        self._require_governing()
+        moment = self.history.time if time is None else time
+        with agree(self._comm):
+            if not isinstance(moment, float | int | np.number) or not np.isfinite(moment):
+                raise MPMError(f"time must be a finite number, not {time!r}.")
+        self._output.write(Path(path), self.bodies, float(moment), len(self.history.steps))
+
+    def keep_identity(self) -> None:
+        """Note what this problem is known by, before its body meshes change (collective)."""
+        self.identity = identity.identity(self)
+
+    def warn(self, sentence: str) -> None:
+        """Warn the user, on one rank (collective)."""
+        warn(self._comm, sentence, stacklevel=4)
+
+    def repartition(self, threshold: float = 0.1) -> bool:
+        """Move particles with their history to where they are best now (collective).
+
+        Args:
+            threshold: Share of the particles that must be better elsewhere.
+
+        Returns:
+            Whether particles have moved.
+
+        Raises:
+            MPMError: The problem holds what cannot move: a residual in UFL.
+        """
+        raise MPMError(
+            "The residual is written on the present body mesh, so its particles cannot move; "
+            "place them at the start with Particles(..., partition='background')."
+        )
+
+    def save(self, path: str | Path, functions: Sequence[fem.Function] = ()) -> None:
+        """Write a checkpoint of the last converged step (collective).
+
+        Call it wherever one likes, also between the steps of :meth:`steps`. The file replaces
+        the one before when it is whole and on the disk; whatever interrupts that leaves the one
+        before.
+
+        Args:
+            path: Name of the file.
+            functions: Functions on the bodies' meshes that are part of the state, known by
+                their names: data at quadrature points that the residual holds, and whatever
+                else the run depends on.
+
+        Raises:
+            MPMError: The file cannot be written, or functions that cannot be kept.
+        """
+        self._require_governing()
+        checkpoint.write(self._comm, Path(path), self._snapshot(functions))
+
+    def _snapshot(self, functions: Sequence[fem.Function] = ()) -> checkpoint.Snapshot:
+        """Return the state at the last converged step (collective).
+
+        Args:
+            functions: As in :meth:`save`.
+
+        Raises:
+            MPMError: Functions that cannot be kept, or that are missing.
+        """
+        if functions and self.identity is not None:
+            raise MPMError(
+                "Domains were split or the body rebased, so functions= on its new mesh could not "
+                "be restored; save the state without them."
+            )
+        things, _ = self._all_kept(functions)
+        snapshot = capture(things, self.bodies)
+        snapshot.numbers["identity"] = identity.identity(self)
+        snapshot.numbers["series"] = self._output.written()
+        return snapshot
+
+    def _all_kept(self, functions: Sequence[fem.Function]) -> tuple[list[Kept], kept.Standing]:
+        """Return all that goes with the problem, and what knows how far it is.
+
+        Args:
+            functions: As in :meth:`save`.
+
+        Raises:
+            MPMError: Functions that cannot be kept, or that are missing.
+        """
+        standing = kept.Standing(self._stepper.progress(), spaces_of(self.bodies), self.history)
+        things = [
+            kept.Bodies(self.bodies),
+            kept.Material(self.converged_state, self.set_converged_state, self._history_at),
+            kept.Functions(functions, self.bodies, self.data_at_points()),
+            kept.Increments(self.reduced, self.bodies),
+            kept.Past(self.history, self.reduced, self._comm),
+            *self._kept,
+            standing,
+        ]
+        return things, standing
+
+    def _adopt(
+        self, snapshot: checkpoint.Snapshot, functions: Sequence[fem.Function], source: str
+    ) -> Run | None:
+        """Go to a state, and return the run that was going on (collective)."""
+        things, standing = self._all_kept(functions)
+        adopt(things, self.bodies, snapshot, source)
+        self._stepper.take(standing.progress)
+        return standing.progress.run
+
+    def keep(self, thing: Kept) -> None:
+        """Let something of the user's own go with the problem.
+
+        It is split and rebased with the bodies, moves to other ranks, and is saved and restored.
+
+        Args:
+            thing: An heir of :class:`mpm_dolfinx.io.Kept` with a key of its own.
+
+        Raises:
+            MPMError: It is something else, or its key is taken.
+        """
+        if not isinstance(thing, Kept) or not isinstance(thing.key, str):
+            raise MPMError(f"keep() needs an heir of mpm_dolfinx.io.Kept, not {thing!r}.")
+        things, _ = self._all_kept(tuple(self.data_at_points()))
+        require_key(thing.key, things, len(self.bodies))
+        self._kept.append(thing)
+
+    def restore(
+        self, path: str | Path, functions: Sequence[fem.Function] = (), resume: bool = True
+    ) -> None:
+        """Return to the state of a checkpoint, on any number of ranks (collective).
+
+        The problem must be made as the one that was saved: same meshes, space, method and
+        materials. Loads and Dirichlet conditions are not compared, so that a run may go on with
+        others.
+
+        Args:
+            path: A file that :meth:`save` wrote.
+            functions: As they were given to :meth:`save`; their values are restored.
+            resume: Whether :meth:`solve` or :meth:`steps`, with the same number of steps as
+                before, goes on with the run that was interrupted; else they begin a new one
+                from the present load.
+
+        Raises:
+            MPMError: The file is missing, no checkpoint, newer than this package, truncated,
+                damaged, or that of another problem, or a time series that it was writing cannot
+                be read; the state is what it was.
+        """
+        self._require_governing()
+        snapshot, source = checkpoint.read(self._comm, Path(path)), f"The checkpoint '{path}'"
+        identity.require_same(identity.identity(self), snapshot, source, self._comm)
+        written = snapshot.numbers.get("series", {})
+        series = read_series(self._comm, written)
+        self.cut_as(snapshot, bool(functions), source)
+        run = self._adopt(snapshot, functions, source)
+        self._stepper.resume(run if resume else None)
+        steps = len(self.history.steps)
+        self._output.go_back(series, written, self.history.time, steps)
+
+    def cut_as(self, snapshot: checkpoint.Snapshot, functions: bool, source: str) -> None:
+        """Split the domains that were split in a state (collective).
+
+        Args:
+            snapshot: The state, one of this problem.
+            functions: Whether it is to be restored with Functions on the present mesh.
+            source: What to call it in an error.
+
+        Raises:
+            MPMError: Domains were split that are not, or the other way round.
+        """
+
+    # -- What a problem with a material adds -----------------------------------------------
+
+    def smooth(self) -> bool:
+        """Return whether no history changes in the last residual, nor contact (collective).
+
+        Newton steps that let the residual grow are taken on trust then. A problem that overrides
+        :meth:`evaluate` or :meth:`commit` has a history, unless it says otherwise here.
+        """
+        own = type(self)
+        return own.evaluate is ParticleProblem.evaluate and own.commit is ParticleProblem.commit
+
+    def evaluate(self) -> MPMError | None:
+        """Update what the forms hold besides the displacement; return why that cannot be.
+
+        Called before each assembly with ``particles.displacement`` set. Must not change the
+        history. It may differ between ranks.
+        """
+        return None
+
+    def masses(self, number: int) -> NDArray[np.float64] | None:
+        """Return the mass of each particle of a body that this rank owns, if it is known."""
+        return None
+
+    def begin_step(self) -> None:
+        """Look at what may have changed since the last step (collective).
+
+        Raises:
+            MPMError: The coordinates of a mesh have, other problems govern the bodies, or ranks
+                have different loads.
+        """
+        self._require_governing()
+        with agree(self._comm):
+            for body in self.bodies:
+                body.require_meshes_as_they_were()
+        load = [float(body.load.value) for body in self.bodies]
+        require_same(self._comm, load=load, bcs=self.bcs, constants=self._constants)
+
+    def improper(self) -> MPMError | None:
+        """Return why the domains as they are now cannot be those of a converged step (collective).
+
+        They may not cross themselves, nor reach across the axis of a body of revolution.
+        """
+        return crossed(self.bodies)
+
+    def commit(self) -> None:
+        """Make the last evaluation the converged one."""
+
+    def end_step(self) -> None:
+        """Do what is to be done between two steps."""
+
+    def mend(self, error: MPMError) -> bool:
+        """Change what made the smallest step fail; return whether to go on (collective)."""
+        return False
+
+    def roll_back(self) -> None:
+        """Return to the last converged evaluation."""
+
+    #: Where arrays of :meth:`converged_state` live that do not say it; ``None``: they must.
+    _history_at: str | None = "cells"
+
+    def converged_state(self) -> list[dict[str, Any]]:
+        """Return the history at the last converged step, for a checkpoint.
+
+        Returns:
+            One dictionary for each body: arrays ``(n, ...)`` of its owned particles by name, or
+            :class:`mpm_dolfinx.io.Column`, which says where they live. A problem that can be
+            split needs the latter.
+        """
+        return [{} for _ in self.bodies]
+
+    def set_converged_state(self, states: list[dict[str, NDArray[Any]]]) -> None:
+        """Make what :meth:`converged_state` once returned the history.
+
+        :meth:`roll_back` is called after it.
+
+        Args:
+            states: As returned there.
+        """
+
+    def laws(self) -> list[list[Law]]:
+        """Return the materials of each body, for a checkpoint to know them by."""
+        return [[] for _ in self.bodies]
+
+    def data_at_points(self) -> set[fem.Function]:
+        """Return Functions at quadrature points that the forms hold and no history keeps."""
+        keeps = type(self).converged_state is not ParticleProblem.converged_state
+        return set() if keeps else self._data
+
+
+def _as_list(background: Any) -> list[Any]:
+    """Return one form on the background, several or none as a list."""
+    if background is None:
+        return []
+    return list(background) if isinstance(background, list | tuple) else [background]
+
+
+def _on_backgrounds(
+    background: Any, groups: Sequence[Sequence[Particles]], **options: Any
+) -> list[BackgroundForms | None]:
+    """Return the terms on each background space, by the space of their test functions.
+
+    Args:
+        background: A form, or a list of forms, or ``None``.
+        groups: The bodies on each space.
+        **options: Passed on to ``dolfinx.fem.form``.
+    """
+    own: list[list[Any]] = [[] for _ in groups]
+    for form in _as_list(background):
+        arguments = form.arguments() if isinstance(form, ufl.Form) else ()
+        spaces = [argument.ufl_function_space() for argument in arguments]
+        number = next((n for n, group in enumerate(groups) if group[0].V in spaces), 0)
+        require_background_fields(form, groups[number])
+        own[number].append(form)
+    return [
+        BackgroundForms(sum(mine[1:], mine[0]), group[0], **options) if mine else None
+        for mine, group in zip(own, groups, strict=True)
+    ]

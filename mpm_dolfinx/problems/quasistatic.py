@@ -1,0 +1,467 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Quasi-static equilibrium of particles with a material."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ufl
+from dolfinx import fem
+
+from ..assembly.fused import is_fast
+from ..assembly.inputs import Density, functions_of
+from ..assembly.loads import VirtualWork
+from ..assembly.rules import depends_on
+from ..boundary.supports import Support
+from ..constitutive.groups import background_cells
+from ..constitutive.points import MaterialPoints
+from ..constitutive.strain import strain_of
+from ..errors import DomainDistortionError, MPMError, agree, agreed, warn
+from ..io.checkpoint import Snapshot
+from ..parallel.given import require_same
+from ..particles.particles import Particles
+from ..system.term import Term
+from .arguments import as_bodies, as_terms
+from .particle_problem import Contribution, Law, ParticleProblem
+from .remeshing import Remeshing, as_indices
+from .setup import BodySetup, Numerics, Setup
+
+__all__ = ["QuasiStaticProblem"]
+
+#: Mean share of a background cell that a domain fills, from which one point is too few.
+CROWDED = 0.5
+
+
+class QuasiStaticProblem(ParticleProblem):
+    """Equilibrium of bodies with materials, under body force, tractions and supports.
+
+    ``int P : grad v dX - load (int density b . v dX + int t . v dS) = 0`` on the undeformed
+    body; the first Piola stress P and its tangent dP/dF are Functions on a quadrature element,
+    injected into the UFL forms. With several bodies, ``material``, ``density``,
+    ``body_force``, ``tractions``, ``pressures``, ``cell_tags`` and ``facet_tags`` are each one
+    for all, or a list with one for each body.
+
+    Args:
+        particles: The body, or a list of bodies. Those on the same V do not slip where they touch;
+            those on a V of their own meet by ``terms`` alone.
+        material: A material, or ``{cell tag: material}`` with ``cell_tags``.
+        density: Mass per undeformed volume: a number, Constant, Function or UFL expression.
+        body_force: Force per mass at full load: a tuple, Constant, Function or UFL expression
+            on the body mesh, or a function that makes one from the mesh.
+        bcs: Dirichlet conditions on V, totals at full load.
+        tractions: Pairs of a dead load per undeformed area at full load (tuple or UFL) and a
+            tag of ``facet_tags``.
+        pressures: Pairs of a pressure at full load (number or UFL) and a tag of
+            ``facet_tags``; it acts on the deformed facets, against their normal, per deformed
+            area (a follower load, whose tangent is not symmetric).
+        cell_tags: Tags of the body's cells.
+        facet_tags: Tags of the body's facets.
+        axisymmetric: Whether ``x[0]`` is the radius of a body of revolution about ``x[0] = 0``;
+            loads and reactions are then those of the whole circumference.
+        supports: Supports on the bodies' own boundaries, of :mod:`mpm_dolfinx.boundary`.
+        background: Form on the background, as in :class:`ParticleProblem`.
+        f_bar: Average of the volume ratio that the material sees, against hourglass modes and
+            locking: ``"none"``, ``"domain"`` (over a domain's points), ``"pair"`` (over the two
+            triangles of a quadrilateral) or ``"patch"`` (over the domains of about one
+            background cell).
+        petsc_options_prefix: Prefix of the PETSc options.
+        petsc_options: PETSc options, without prefix.
+        assembly: As in :class:`ParticleProblem`; the reference route also updates the built-in
+            materials by NumPy.
+        shift: As in :class:`ParticleProblem`.
+        line_search: As in :class:`ParticleProblem`.
+        dependent_dofs: As in :class:`ParticleProblem`.
+        predictor: As in :class:`ParticleProblem`.
+        stabilisation: As in :class:`ParticleProblem`.
+        form_compiler_options: As in :class:`ParticleProblem`.
+        jit_options: As in :class:`ParticleProblem`.
+        terms: As in :class:`ParticleProblem`.
+
+    Raises:
+        MPMError: Materials, loads or conditions that do not go together.
+    """
+
+    def __init__(
+        self,
+        particles: Particles | Sequence[Particles],
+        material: Any,
+        density: Any = 1.0,
+        body_force: Any = None,
+        bcs: Sequence[fem.DirichletBC] = (),
+        tractions: Sequence[Any] = (),
+        pressures: Sequence[Any] = (),
+        cell_tags: Any = None,
+        facet_tags: Any = None,
+        axisymmetric: bool = False,
+        supports: Sequence[Support] = (),
+        background: ufl.Form | Sequence[ufl.Form] | None = None,
+        f_bar: str = "none",
+        petsc_options_prefix: str = "mpm_",
+        petsc_options: dict[str, Any] | None = None,
+        *,
+        assembly: str = "auto",
+        shift: float = 1e-13,
+        line_search: bool = True,
+        dependent_dofs: str = "shift",
+        predictor: bool = True,
+        stabilisation: str | None = "auto",
+        form_compiler_options: dict[str, Any] | None = None,
+        jit_options: dict[str, Any] | None = None,
+        terms: Sequence[Term] = (),
+    ) -> None:
+        bodies = as_bodies(particles)
+        require_same(
+            bodies[0].V.mesh.comm,
+            particles=particles,
+            material=material,
+            density=density,
+            body_force=body_force,
+            bcs=bcs,
+            tractions=tractions,
+            pressures=pressures,
+            cell_tags=cell_tags,
+            facet_tags=facet_tags,
+            axisymmetric=axisymmetric,
+            supports=supports,
+            background=background,
+            f_bar=f_bar,
+            petsc_options_prefix=petsc_options_prefix,
+            petsc_options=petsc_options,
+            assembly=assembly,
+            shift=shift,
+            line_search=line_search,
+            dependent_dofs=dependent_dofs,
+            predictor=predictor,
+            stabilisation=stabilisation,
+            form_compiler_options=form_compiler_options,
+            jit_options=jit_options,
+        )
+        supports = _as_supports(supports, bodies)
+        count = len(bodies) if isinstance(particles, list | tuple) else 0
+        given = zip(
+            bodies,
+            _for_each(material, count),
+            _for_each(density, count),
+            _for_each(body_force, count),
+            _for_each(tractions, count, pairs=True),
+            _for_each(pressures, count, pairs=True),
+            _for_each(cell_tags, count),
+            _for_each(facet_tags, count),
+            [tuple(s for s in supports if s.particles is body) for body in bodies],
+            strict=True,
+        )
+        setup = Setup(
+            tuple(BodySetup(*values) for values in given),
+            axisymmetric,
+            f_bar,
+            tuple(as_terms(terms, bodies)),
+        )
+        if any(body.on_distortion == "split" for body in bodies):
+            setup.require_divisible()
+        self.setup = setup
+        self._parameters = self._functions()
+        self._left: dict[int, tuple[fem.Function, NDArray[np.float64]]] = {}
+        self._remeshing = Remeshing(self)
+        self._compiled = is_fast(assembly)
+        numerics = Numerics(
+            petsc_options_prefix,
+            petsc_options or {},
+            form_compiler_options,
+            jit_options,
+            assembly,
+            shift,
+            line_search,
+            dependent_dofs,
+            predictor,
+            stabilisation,
+        )
+        self._begin(particles, bcs, background, numerics, terms, self._remeshing)
+        for body in bodies:
+            _warn_of_hourglass(body)
+
+    def _build(self) -> None:
+        """See :meth:`ParticleProblem._build`."""
+        self.setup = self.setup.carried()
+        present = self._functions()
+        for function in self._parameters:
+            if id(function) not in self._left and all(function is not f for f in present):
+                self._left[id(function)] = function, function.x.array.copy()
+        super()._build()
+        for body, stress in zip(self.bodies, self._stresses, strict=True):
+            body.attach(stress)
+
+    def _functions(self) -> list[fem.Function]:
+        """Return the parameters of materials that are Functions."""
+        return [f for body in self.setup.bodies for f in functions_of(body.material)]
+
+    def _contributions(self) -> list[Contribution]:
+        """See :meth:`ParticleProblem._contributions`."""
+        self._stresses: list[MaterialPoints] = []
+        self._density: list[tuple[VirtualWork, Density]] = []
+        return [self._contribution(given) for given in self.setup.bodies]
+
+    def _contribution(self, given: BodySetup) -> Contribution:
+        """Return what one body adds to the system (collective)."""
+        body = given.particles
+        strain = strain_of(body, self.setup.axisymmetric)
+        history = MaterialPoints(
+            strain, given.material, given.cell_tags, self.setup.f_bar, self._compiled
+        )
+        self._stresses.append(history)
+        work = VirtualWork(strain)
+        density = Density(given.density, body)
+        density.require()
+        self._density.append((work, density))
+        mass = density.value
+        if body.mass_share is not None:
+            mass = mass * body.mass_share
+        symmetric = history.symmetric and not given.pressures
+        loads: list[ufl.Form] = []
+        if given.body_force is not None:
+            loads.append(-work.body_force(mass, given.body_force))
+        if given.tractions:
+            loads.append(-work.tractions(given.tractions, given.facet_tags))
+            symmetric = symmetric and not depends_on(loads[-1], body.displacement)
+        loads += [s.at_body(history.initial_modulus, strain.turn) for s in given.supports]
+        if given.pressures:
+            loads.append(work.pressures(given.pressures, given.facet_tags))
+        slopes = [
+            ufl.derivative(load, body.displacement)
+            for load in loads
+            if depends_on(load, body.displacement)
+        ]
+        injected = None
+        if not self._compiled:
+            injected = _functions_at_points(body, history.dim)
+            internal, tangent = work.internal(*injected)
+            loads.append(internal)
+            slopes.append(tangent)
+        return Contribution(
+            sum(loads[1:], loads[0]) if loads else None,
+            sum(slopes[1:], slopes[0]) if slopes else None,
+            history if self._compiled else None,
+            history.averaging,
+            symmetric,
+            history,
+            injected,
+            any(support.one_sided for support in given.supports),
+        )
+
+    def begin_step(self) -> None:
+        """See :meth:`ParticleProblem.begin_step`; parameters of materials have new values then."""
+        super().begin_step()
+        with agree(self._comm):
+            for function, values in self._left.values():
+                if not np.array_equal(function.x.array, values):
+                    raise MPMError(
+                        f"A parameter of a material ('{function.name}') was changed on a mesh that "
+                        "the particles have left; make a new problem with a Function on "
+                        "particles.mesh."
+                    )
+        for _, density in self._density:
+            density.require()
+        for stress in self._stresses:
+            stress.follow_parameters()
+
+    def improper(self) -> MPMError | None:
+        """See :meth:`ParticleProblem.improper`."""
+        found: MPMError | None = None
+        for stress in self._stresses:
+            found = found or DomainDistortionError.of(*stress.strain.beyond())
+        return super().improper() or agreed(self._comm, found)
+
+    def masses(self, number: int) -> NDArray[np.float64]:
+        """See :meth:`ParticleProblem.masses`."""
+        return self.nodal_masses(number).sum(axis=1)
+
+    def repartition(self, threshold: float = 0.1) -> bool:
+        """Move particles with their history to where they are best now (collective).
+
+        A particle is best on the rank that owns the background around it, unless that has 5 %
+        more than an even share already. Tags and DG0 parameters move too; the answer does not
+        change. Afterwards ``particles.mesh``, ``W``, ``displacement`` and ``load`` are new
+        ones, and what was made on those before is out of use: take tags over by
+        ``particles.carry``.
+
+        Args:
+            threshold: Share of the particles that must be better elsewhere.
+
+        Returns:
+            Whether particles have moved.
+
+        Raises:
+            MPMError: The problem holds what cannot move: UFL expressions, supports or arrays of
+                parameters on the present body mesh. Nothing is changed.
+        """
+        self._require_governing()
+        if not isinstance(threshold, float | int) or not 0.0 <= threshold <= 1.0:
+            raise MPMError(f"threshold must be a share from 0 to 1, not {threshold!r}.")
+        self.setup.require_movable()
+        ranks = [body.ranks_of_background() for body in self.bodies]
+        leaving = sum(int(np.count_nonzero(r != self._comm.rank)) for r in ranks)
+        share = self._comm.allreduce(leaving) / sum(body.num_global for body in self.bodies)
+        if share <= threshold or share == 0.0:
+            return False
+
+        def move() -> None:
+            for body, targets in zip(self.bodies, ranks, strict=True):
+                body.move(targets)
+
+        self.renew(move, lambda snapshot: snapshot)
+        self.history.statistics.count("repartitions")
+        return True
+
+    def split(self, particles: Sequence[int], body: int = 0) -> None:
+        """Cut quadrilaterals with one point in two, as they are now (collective).
+
+        Each is cut along the diagonal that makes the better triangles; the halves have its
+        deformation gradient, stress and history. Mass at each node, and with it momentum, does
+        not change, nor do the forces: what was in equilibrium still is. The first half keeps the
+        global index, the second ones follow after all others (``particles.origin_index``). As
+        after :meth:`repartition`, ``particles.mesh``, ``W``, ``displacement`` and ``load`` are
+        new ones then; ``particles.carry`` takes tags and DG0 Functions over.
+
+        Args:
+            particles: Global indices; each on one rank or on several.
+            body: Number of the body, where there are several.
+
+        Raises:
+            MPMError: Domains or a problem that cannot be split. Nothing is changed.
+        """
+        self._require_governing()
+        if body not in range(len(self.bodies)):
+            raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
+        chosen = [np.zeros(0, dtype=np.int64) for _ in self.bodies]
+        with agree(self._comm):
+            chosen[body] = as_indices(particles)
+        self._remeshing.split(chosen)
+
+    def rebase(self) -> None:
+        """Take the body as it is now for the mesh that displacements are counted from (collective).
+
+        ``particles.displacement`` starts from zero. All else goes on: deformation gradient, stress
+        and history, mass at each node, ``initial_volume`` and ``initial_centroid``, dead loads per
+        undeformed area, and the undeformed shape in pictures and series. The objects on the body
+        mesh are new ones as after :meth:`split`.
+
+        Raises:
+            MPMError: Domains or a problem that cannot be rebased. Nothing is changed.
+        """
+        self._require_governing()
+        self._remeshing.rebase()
+
+    def nodal_masses(self, number: int) -> NDArray[np.float64]:
+        """Return ``int density Q_c dX`` of each owned domain of a body, ``(n, k)`` (collective)."""
+        body, (work, density) = self.bodies[number], self._density[number]
+        space = fem.functionspace(body.mesh, ("Discontinuous Lagrange", 1))
+        test: Any = ufl.TestFunction(space)
+        if body.mass_share is not None:
+            test = body.mass_share * test
+        vector = fem.assemble_vector(fem.form(work.mass(density.value, test)))
+        return np.asarray(vector.array[space.dofmap.list[: body.num_local]])
+
+    def mass_matrices(self, number: int) -> NDArray[np.float64]:
+        """Return ``int density Q_c Q_d dX`` of each owned domain, ``(n, k, k)`` (collective)."""
+        body, (work, density) = self.bodies[number], self._density[number]
+        space = fem.functionspace(body.mesh, ("Discontinuous Lagrange", 1))
+        product = ufl.TrialFunction(space) * ufl.TestFunction(space)
+        matrix = fem.assemble_matrix(fem.form(work.mass(density.value, product)))
+        n, k = body.num_local, space.dofmap.list.shape[1]
+        return matrix.data[: n * k * k].reshape(n, k, k)
+
+    def cut_as(self, snapshot: Snapshot, functions: bool, source: str) -> None:
+        """See :meth:`ParticleProblem.cut_as`."""
+        self._remeshing.repeat(snapshot, functions, source)
+
+    _history_at = None
+
+    def converged_state(self) -> list[dict[str, Any]]:
+        """See :meth:`ParticleProblem.converged_state`."""
+        return [dict(stress.converged_state()) for stress in self._stresses]
+
+    def set_converged_state(self, states: list[dict[str, NDArray[Any]]]) -> None:
+        """See :meth:`ParticleProblem.set_converged_state`."""
+        for stress, arrays in zip(self._stresses, states, strict=True):
+            stress.set_converged_state(arrays)
+
+    def laws(self) -> list[list[Law]]:
+        """See :meth:`ParticleProblem.laws`."""
+        return [stress.laws() for stress in self._stresses]
+
+    @property
+    def yield_function(self) -> NDArray[np.float64]:
+        """Largest yield function of each particle's points, shape ``(n,)``.
+
+        In the unit of the material's own function; -1 where a material has none.
+        With several bodies, their particles one body after the other.
+        """
+        values = [s.yield_function().max(axis=1, initial=-np.inf) for s in self._stresses]
+        return np.concatenate(values)
+
+
+def _functions_at_points(body: Particles, dim: int) -> tuple[fem.Function, fem.Function]:
+    """Return Functions on a quadrature element for a body's stress and its tangent."""
+    return (
+        body.quadrature_function("first_piola", (dim, dim)),
+        body.quadrature_function("tangent", (dim,) * 4),
+    )
+
+
+def _for_each(value: Any, count: int, pairs: bool = False) -> list[Any]:
+    """Return one value for each of ``count`` bodies (0: one body that is not in a list)."""
+    if count == 0:
+        return [value]
+    listed = isinstance(value, list) and (
+        not pairs or all(isinstance(entry, list) for entry in value)
+    )
+    if not listed or not value:
+        return [value] * count
+    if len(value) != count:
+        raise MPMError(f"There are {count} bodies, but a list of {len(value)} for them.")
+    return list(value)
+
+
+def _warn_of_hourglass(particles: Particles) -> None:
+    """Say so where the points of a domain leave motions without strain (collective).
+
+    Those are as many as Gauss points of the background's degree, in domains as large as its cells.
+    """
+    cell = particles.mesh.topology.cell_name()
+    degree = particles.V.ufl_element().degree
+    points = particles.num_points
+    few = points <= degree**particles.mesh.geometry.dim
+    if not few or cell not in ("quadrilateral", "hexahedron"):
+        return
+    _, size = background_cells(particles)
+    fill = particles.mesh.comm.allreduce(float((particles.initial_volume / size).sum()))
+    if fill > CROWDED * particles.num_global:
+        cure = "use two domains each way in a cell"
+        if degree > 1:
+            cure = f"use quadrature_degree={2 * degree}, or {cure[4:]}"
+        elif particles.shares_nodes:
+            cure = f"use quadrature_degree=2 with f_bar='domain', or {cure[4:]}"
+        warn(
+            particles.mesh.comm,
+            f"The domains have {'one' if points == 1 else points} quadrature point"
+            f"{'s'[: points > 1]} each and are about as large as the cells of the background, so "
+            f"motions without strain (hourglass) meet no resistance; {cure}.",
+            stacklevel=4,
+        )
+
+
+def _as_supports(supports: Any, bodies: Sequence[Particles]) -> list[Support]:
+    """Return supports as a list.
+
+    Raises:
+        MPMError: Something else, or supports on other bodies.
+    """
+    if not isinstance(supports, list | tuple) or not all(isinstance(s, Support) for s in supports):
+        raise MPMError("supports must be a list of supports made by mpm.boundary.")
+    if any(all(s.particles is not body for body in bodies) for s in supports):
+        raise MPMError("A support was made with other particles than those of this problem.")
+    return list(supports)

@@ -1,0 +1,193 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What a user has given for a problem, kept unchanged: all that its system is made from.
+
+A problem is built from its setup and the present meshes of its bodies, at first and again whenever
+these are other ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+import ufl
+
+from ..boundary.supports import Support
+from ..constitutive.averaging import F_BARS
+from ..errors import MPMError
+from ..particles.particles import Particles
+from ..system.term import Term
+from .arguments import carried, holds
+
+__all__ = ["BodySetup", "Numerics", "Setup"]
+
+
+@dataclass(frozen=True)
+class Numerics:
+    """How a problem is solved; see :class:`ParticleProblem` for each.
+
+    Raises:
+        MPMError: Something that there is not.
+    """
+
+    petsc_options_prefix: str
+    petsc_options: dict[str, Any]
+    form_compiler_options: dict[str, Any] | None
+    jit_options: dict[str, Any] | None
+    assembly: str
+    shift: float
+    line_search: bool
+    dependent_dofs: str
+    predictor: bool
+    stabilisation: str | None
+
+    def __post_init__(self) -> None:
+        """Say so where something is unknown."""
+        if self.dependent_dofs not in ("shift", "remove"):
+            raise MPMError(
+                f"Unknown dependent_dofs={self.dependent_dofs!r}; choose 'shift' or 'remove'."
+            )
+        if not isinstance(self.shift, float | int) or not 0.0 <= self.shift < 1.0:
+            raise MPMError(f"shift must be at least 0 and below 1, not {self.shift!r}.")
+
+    @property
+    def of_forms(self) -> dict[str, Any]:
+        """Options with which forms are compiled."""
+        return {
+            "form_compiler_options": self.form_compiler_options,
+            "jit_options": self.jit_options,
+        }
+
+
+@dataclass(frozen=True)
+class BodySetup:
+    """What a body is made of, and what acts on it; see :class:`QuasiStaticProblem` for each."""
+
+    particles: Particles
+    material: Any
+    density: Any
+    body_force: Any
+    tractions: Sequence[Any]
+    pressures: Sequence[Any]
+    cell_tags: Any
+    facet_tags: Any
+    supports: tuple[Support, ...]
+
+    def carried(self) -> BodySetup:
+        """Return the same on the present mesh of the particles (collective)."""
+        return replace(
+            self,
+            material=carried(self.particles, self.material),
+            cell_tags=self.particles.carry(self.cell_tags),
+            facet_tags=self.particles.carry(self.facet_tags),
+        )
+
+    def require_movable(self, consequence: str = "the particles cannot move") -> None:
+        """Raise an error unless the body can be taken to another mesh.
+
+        Args:
+            consequence: What else cannot be.
+
+        Raises:
+            MPMError: Something lives on its present mesh.
+        """
+        for name in ("density", "body_force", "tractions", "pressures"):
+            if holds(getattr(self, name), ufl.core.expr.Expr):
+                raise MPMError(
+                    f"{name} is written on the present body mesh, so {consequence}; give a "
+                    "function that makes it from a mesh, e.g. "
+                    "lambda mesh: ufl.SpatialCoordinate(mesh)[1]."
+                )
+        if self.supports:
+            raise MPMError(f"supports= lie on the present body mesh, so {consequence}.")
+        laws = self.material.values() if isinstance(self.material, Mapping) else [self.material]
+        for law in laws:
+            if any(isinstance(value, np.ndarray) for value in law.parameters.values()):
+                raise MPMError(
+                    "A material has arrays of parameters, one value for each particle of a rank, "
+                    f"so {consequence}; use DG0 Functions."
+                )
+
+    def require_movable_nodes(self, consequence: str) -> None:
+        """Raise an error unless the nodes of the body's mesh can be moved; see above."""
+        self.require_movable(consequence)
+        for name in ("density", "body_force", "tractions", "pressures"):
+            if holds(getattr(self, name), Callable):
+                raise MPMError(
+                    f"{name} is a function of the mesh, whose nodes move, so {consequence}."
+                )
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The bodies of a problem with materials, and what holds for all of them.
+
+    Attributes:
+        bodies: One setup for each body.
+        axisymmetric: Whether ``x[0]`` is the radius of a body of revolution.
+        f_bar: Average of the volume ratio that materials see.
+        terms: What else acts on the bodies.
+
+    Raises:
+        MPMError: An average that there is not, or a term that takes the bodies for others.
+    """
+
+    bodies: tuple[BodySetup, ...]
+    axisymmetric: bool
+    f_bar: str
+    terms: tuple[Term, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Say so where something is unknown."""
+        if self.f_bar not in F_BARS:
+            raise MPMError(
+                f"Unknown f_bar={self.f_bar!r}; choose one of {', '.join(map(repr, F_BARS))}."
+            )
+        for term in self.terms:
+            if term.axisymmetric not in (None, self.axisymmetric):
+                raise MPMError(
+                    f"A {type(term).__name__} was made with axisymmetric={term.axisymmetric}, but "
+                    f"the problem has axisymmetric={self.axisymmetric}; give both the same."
+                )
+
+    def carried(self) -> Setup:
+        """Return the same on the present meshes of the particles (collective)."""
+        return replace(self, bodies=tuple(body.carried() for body in self.bodies))
+
+    def require_movable(self, consequence: str = "the particles cannot move") -> None:
+        """Raise an error unless all bodies can be taken to other meshes.
+
+        Args:
+            consequence: What else cannot be.
+
+        Raises:
+            MPMError: Something lives on a present mesh.
+        """
+        for body in self.bodies:
+            body.require_movable(consequence)
+        for term in self.terms:
+            term.require_movable(consequence)
+
+    def require_divisible(self) -> None:
+        """Raise an error unless domains may be split.
+
+        Raises:
+            MPMError: They may not.
+        """
+        self.require_movable("domains cannot be split")
+        for term in self.terms:
+            term.require_remeshable("domains cannot be split")
+        if self.f_bar != "none":
+            raise MPMError(
+                f"Domains cannot be split with f_bar={self.f_bar!r}, whose averages they would "
+                "change; it keeps most domains from folding by itself."
+            )
+        if self.axisymmetric:
+            raise MPMError(
+                "Domains of a body of revolution cannot be split, since the halves have other "
+                "radii; use quadrature_degree=2 with f_bar='domain'."
+            )

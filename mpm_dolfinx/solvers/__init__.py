@@ -1,0 +1,7 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Newton's method, its line search, and the linear solver; no particle is known here.
+
+:mod:`~mpm_dolfinx.solvers.newton` solves a problem that is given by a protocol,
+:mod:`~mpm_dolfinx.solvers.linear` factorises the shifted tangent.
+"""

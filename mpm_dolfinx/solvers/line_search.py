@@ -1,0 +1,191 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Line search of Newton's method, and whether its iterations make headway."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from petsc4py import PETSc
+
+import numpy as np
+
+from ..errors import MPMError
+from ..history import Statistics
+from ..parallel.magnitudes import norm, unit_sized
+
+__all__ = ["LineSearch", "stalled"]
+
+#: Most halvings of a Newton step, and the drop in work that needs none.
+HALVINGS = 8
+SUFFICIENT = 0.8
+#: Steps that may follow one which is taken on trust until the residual is below that before it.
+TRUST = 7
+#: Iterations within which the smallest residual must fall, and to what share of itself.
+PATIENCE = 15
+HEADWAY = 0.7
+
+
+class _Step(NamedTuple):
+    """A step to be taken.
+
+    Attributes:
+        x: The unknowns.
+        y: The step from them.
+        direction: The step, or a multiple of it with which products are numbers of the machine.
+        norm: Norm of the residual at the unknowns.
+        work: Product of that residual with the direction.
+    """
+
+    x: PETSc.Vec
+    y: PETSc.Vec
+    direction: PETSc.Vec
+    norm: float
+    work: float
+
+    @classmethod
+    def of(cls, x: PETSc.Vec, y: PETSc.Vec, F: PETSc.Vec) -> _Step:
+        """Return the step y from unknowns with the residual F (collective)."""
+        direction, _ = unit_sized(y)
+        return cls(x, y, direction, norm(F), F.dot(direction))
+
+    def halved(self) -> _Step:
+        """Halve the step."""
+        self.y.scale(0.5)
+        if self.direction is not self.y:
+            self.direction.scale(0.5)
+        return self._replace(work=0.5 * self.work)
+
+
+class LineSearch:
+    """Shortens a Newton step, in another direction where its own leads uphill.
+
+    A step is taken where the residual's work on it falls to 0.8 of its start in absolute value,
+    or the residual's norm falls. Where the whole step does neither and the tangent is not
+    positive definite, its direction may be one in which the incremental potential grows; the
+    direction is then that of a damped tangent which is (a modified Newton step: Nocedal &
+    Wright 2006, section 3.4).
+
+    Otherwise, where the response is smooth, the whole step is taken on trust: a step that turns
+    a stiff body leaves the residual far larger, and Newton's method has forgotten that some
+    iterations later. If seven have not brought the residual below what it was, or before that a
+    domain turns inside out, the response is no longer smooth or a linear solve breaks down, the
+    search withdraws to where it was (the watchdog of Chamberlain, Powell, Lemarechal & Pedersen
+    1982), once in a solve. What is left is halved.
+
+    Args:
+        evaluate: Evaluates the residual at unknowns into ``F``; returns a failure or ``None``.
+        uphill: Says whether the step for a residual is not that of a positive definite tangent.
+        redirect: Replaces it by a damped one that is.
+        smooth: Says whether no history changes in the residual evaluated last.
+        statistics: Where to count.
+    """
+
+    def __init__(
+        self,
+        evaluate: Callable[[PETSc.Vec], MPMError | None],
+        uphill: Callable[[PETSc.Vec, PETSc.Vec], bool],
+        redirect: Callable[[PETSc.Vec, PETSc.Vec], None],
+        smooth: Callable[[], bool],
+        statistics: Statistics,
+    ) -> None:
+        self._evaluate = evaluate
+        self._uphill = uphill
+        self._redirect = redirect
+        self._smooth = smooth
+        self._statistics = statistics
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a solve."""
+        self._trusted: _Step | None = None
+        self._since = 0  # iterations
+        self._may_trust = True
+
+    def __call__(self, x: PETSc.Vec, y: PETSc.Vec, F: PETSc.Vec, trial: PETSc.Vec) -> bool:
+        """Choose the step to ``x - y`` (collective).
+
+        Args:
+            x: The unknowns.
+            y: The Newton step; replaced by the step to be taken.
+            F: The residual at x; afterwards that at the new unknowns.
+            trial: Set to the new unknowns.
+
+        Returns:
+            Whether y has changed.
+        """
+        step = _Step.of(x, y, F)
+        self._since += 1
+        if self._trusted is not None and step.norm <= self._trusted.norm:
+            self._trusted = None
+        start = F.copy()
+        if self._reduces(step, F, trial) and not self._overdue(F):
+            return False
+        if self._trusted is None and self._uphill(start, y):
+            self._redirect(start, y)
+            self._statistics.count("redirections")
+            step = _Step.of(x, y, start)
+            if not self._reduces(step, F, trial):
+                self._halve(step, F, trial)
+            return True
+        smooth = bool(np.isfinite(norm(F))) and self._smooth()
+        if smooth and self._may_trust and not self._overdue(F):
+            if self._trusted is None:
+                self._trusted, self._since = _Step.of(x.copy(), y.copy(), start), 0
+                self._statistics.count("trusted_steps")
+            return False
+        if self._trusted is None:
+            self._halve(step, F, trial)
+        else:
+            self.withdraw(x, y, F, trial)
+        return True
+
+    @property
+    def trusts(self) -> bool:
+        """Whether a step was taken on trust that has not paid yet."""
+        return self._trusted is not None
+
+    def withdraw(self, x: PETSc.Vec, y: PETSc.Vec, F: PETSc.Vec, trial: PETSc.Vec) -> None:
+        """Go back to where a step was taken on trust, and halve it (collective).
+
+        Args:
+            x: The unknowns.
+            y: Set to the step to be taken from them.
+            F: Set to the residual at the new unknowns.
+            trial: Set to these.
+        """
+        assert self._trusted is not None
+        before, self._trusted, self._may_trust = self._trusted, None, False
+        self._statistics.count("withdrawn_steps")
+        self._halve(before, F, trial)
+        y.waxpy(-1.0, trial, x)
+
+    def _overdue(self, F: PETSc.Vec) -> bool:
+        """Whether a step taken on trust should have paid by now."""
+        if self._trusted is None or self._since < TRUST:
+            return False
+        return norm(F) > self._trusted.norm
+
+    def _reduces(self, step: _Step, F: PETSc.Vec, trial: PETSc.Vec) -> bool:
+        """Evaluate at the step's end; return whether norm or work fall far enough."""
+        trial.waxpy(-1.0, step.y, step.x)
+        if self._evaluate(trial) is not None:
+            return False
+        work = abs(F.dot(step.direction))
+        return bool(work <= SUFFICIENT * abs(step.work) or norm(F) <= step.norm)
+
+    def _halve(self, step: _Step, F: PETSc.Vec, trial: PETSc.Vec) -> None:
+        """Halve the step until norm or work fall far enough."""
+        for _ in range(HALVINGS):
+            step = step.halved()
+            self._statistics.count("halvings")
+            if self._reduces(step, F, trial):
+                break
+
+
+def stalled(norms: Sequence[float]) -> bool:
+    """Return whether the norms of the residuals so far stopped falling."""
+    if len(norms) <= PATIENCE:
+        return False
+    return min(norms[-PATIENCE:]) > HEADWAY * min(norms[:-PATIENCE])

@@ -1,0 +1,650 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Newton's method on the reduced system: PETSc SNES, a proximal term and a line search."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+
+from .. import _compat
+from ..errors import ConvergenceError, MPMError
+from ..history import Statistics
+from ..parallel.garbage import weakly
+from ..parallel.magnitudes import norm, sign_of_product
+from .line_search import LineSearch, stalled
+from .linear import ShiftedFactor
+
+__all__ = ["NewtonSolver", "ReducedProblem"]
+
+#: Newton increment, relative to the step's, at which round-off is reached.
+ROUND_OFF = 1e-13
+#: First residual of a prediction that is kept, over that of a start from zero; from 1 on as long
+#: as it saves linear solves.
+KEPT = 2.0
+#: Share of the residual that the proximal term may go on to hold back where it is released.
+HELD = 0.1
+#: Residual, relative to the forces, that may stay where next to nothing moves.
+FROZEN = 1e-8
+#: Share of the forces that the proximal term may bear in the first step.
+LOOSE = 1e-3
+#: Stiffness along a motion, relative to that of its unknowns one by one and to the shift, up to
+#: which nothing holds it.
+MECHANISM = 1e-5
+#: Most inverse iterations that look for such a motion.
+INVERSE_ITERATIONS = 100
+#: Newton increment, relative to the step's, from which on a refined one needs no line search, and
+#: is at the floor of round-off where it does not fall to a quarter of that before.
+SETTLED = 1e-9
+#: What the norm of ``F - K y`` falls to, relative to F, where a step is refined.
+REFINED = 1e-6
+#: Relative diagonal shifts tried in turn until a tangent is positive definite.
+DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
+
+
+class ReducedProblem(Protocol):
+    """What the solver asks of a problem. All calls are collective."""
+
+    def residual(self, x: PETSc.Vec, F: PETSc.Vec) -> MPMError | None:
+        """Evaluate the residual at x, or say why that cannot be."""
+
+    def tangent(self) -> PETSc.Mat:
+        """Return the tangent at the x of the last residual, always the same object."""
+
+    def constrain(
+        self, y: PETSc.Vec, x: PETSc.Vec | None, solve: Callable[[PETSc.Vec, PETSc.Vec], None]
+    ) -> int:
+        """Amend a Newton step y from x (``None``: zero) so that ``x - y`` is permitted.
+
+        ``solve`` solves with the factor that gave y. Returns how many negative eigenvalues the
+        tangent has where it is positive definite in all directions that are permitted.
+        """
+
+    def smooth(self) -> bool:
+        """Return whether no history changes in the last residual, nor contact."""
+
+    def prediction(self) -> PETSc.Vec | None:
+        """Return unknowns to expect at the step's end, if the past says any."""
+
+    def rigid_motions(self) -> PETSc.NullSpace:
+        """Return the rigid motions in the unknowns, which multigrid must know."""
+
+    def impose(self) -> bool:
+        """Impose the step's Dirichlet values from now on; return whether there are any."""
+
+    def lift(self) -> PETSc.Vec:
+        """Return the linearised forces of the step's Dirichlet values."""
+
+    def scale(self, F: PETSc.Vec | None = None) -> float:
+        """Return the size of external forces and reactions, by which a residual F is judged."""
+
+    def internal_scale(self) -> float:
+        """Return the size of the absolute internal contributions at the last residual."""
+
+    def resultant(self) -> float:
+        """Return the size of the sum of the last residual over the unknowns."""
+
+    def stiffness(self, x: PETSc.Vec) -> float:
+        """Return ``x . K x`` for the last tangent, without cancellation in rigid motions."""
+
+    def motion(self, x: PETSc.Vec) -> float:
+        """Return the size of the displacement that x causes on the body."""
+
+    def extent(self) -> float:
+        """Return the size of the positions of the body, in the same norm."""
+
+
+class NewtonSolver:
+    """SNES with the proximal term and the line search that singular transfers need.
+
+    The reduced tangent K is singular whenever a combination of background dofs moves no node
+    of the body, and nearly singular where it hardly moves any. ``D (x - x0)`` is added to the
+    residual, where x0 is where the step starts and ``D = shift |diag K|`` at its first tangent:
+    a step of the proximal point method (Rockafellar 1976), by which unknowns that move nothing stay
+    where they are. The tangent is then ``K + D``, which is K scaled to unit diagonal plus
+    ``shift`` times the identity. Where the residual itself is not small enough at the end, it is
+    solved for by the last factor, unless more than a tenth of it would stay: that is in unknowns
+    that move next to nothing.
+
+    The line search halves a Newton step while a domain inverts, or while both the work of the
+    residual on the step stays above 0.8 of its start and the residual's norm grows, unless the
+    response is smooth and the next steps make up for it.
+
+    Args:
+        comm: Communicator.
+        prefix: PETSc options prefix.
+        options: PETSc options, without prefix.
+        symmetric: Whether the tangent is symmetric.
+        shift: Relative diagonal shift.
+        line_search: Whether to search.
+        statistics: Where to count.
+        dim: Dimension of space.
+
+    Attributes:
+        snes: The PETSc SNES.
+        residuals: Relative residuals of the last attempt.
+        iterations: Linear solves of the last attempt.
+        x: The solution of the last attempt.
+        F: Its residual, without the proximal term.
+        no_equilibrium: Whether the last attempt's iterations came to nothing.
+    """
+
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        prefix: str,
+        options: dict[str, Any],
+        symmetric: bool,
+        shift: float,
+        line_search: bool,
+        statistics: Statistics,
+        dim: int,
+    ) -> None:
+        self._comm = comm
+        self._symmetric = symmetric
+        self._search = (
+            LineSearch(
+                weakly(self._evaluate),
+                weakly(self._uphill),
+                weakly(self._redirect),
+                weakly(self._smooth),
+                statistics,
+            )
+            if line_search
+            else None
+        )
+        self.statistics = statistics
+        self.residuals: list[float] = []
+        self.iterations = 0
+        self.no_equilibrium = False
+        self.x: PETSc.Vec | None = None
+        self.F: PETSc.Vec | None = None
+        self._centre: PETSc.Vec | None = None
+        self._failure: MPMError | None = None
+        self._raised: BaseException | None = None
+        self._known = self._fresh = False
+        self._kept = KEPT
+        self._from_zero = 0
+        self.snes = PETSc.SNES().create(comm)
+        self.snes.setOptionsPrefix(prefix)
+        self.snes.setType("newtonls")
+        _compat.use_basic_line_search(self.snes)
+        self.snes.setTolerances(rtol=1e-9, atol=0.0, stol=0.0, max_it=30)
+        self._factor = ShiftedFactor(self.snes, prefix, options, symmetric, shift, dim, statistics)
+
+    @property
+    def K(self) -> PETSc.Mat | None:
+        """The reduced tangent."""
+        return self._factor.K
+
+    def solve(self, problem: ReducedProblem, sizes: tuple[int, int]) -> None:
+        """Find a root of the residual, starting from zero or from the prediction.
+
+        The prediction is kept only where its residual is small beside that of a start from zero.
+        From zero, the first linear solve carries the step's Dirichlet values, as it does in
+        finite elements, and their linearised forces count as part of the first residual.
+
+        Args:
+            problem: Residual and tangent.
+            sizes: Local and global number of unknowns.
+
+        Raises:
+            MPMError: Why there is none; ``x`` and ``F`` are the last evaluated then.
+            BaseException: What a user's code has raised inside a call of PETSc's, as it is.
+        """
+        self._problem = problem
+        self.residuals = []
+        self.iterations = 0
+        self._motion = (0.0, 0.0)
+        self._stalled = self._ended = self._refines = False
+        self._goes_on = 0
+        self._shrinks = True
+        self._norm = np.inf
+        self._first = 0.0
+        self._norms: list[float] = []
+        self.no_equilibrium = False
+        if self._search is not None:
+            self._search.begin()
+        self._factor.begin()
+        self._centre = None
+        x = self._start(sizes)
+        if sizes[1] == 0:
+            problem.impose()
+        self._evaluate(x)
+        if self._failure is None and sizes[1] > 0:
+            self._iterate(x)
+        if self._failure is not None:
+            raise self._failure
+
+    def _start(self, sizes: tuple[int, int]) -> PETSc.Vec:
+        """Return the zero vector of unknowns, with vectors and SNES of its size."""
+        same = self.x is not None and self.x.getSizes() == sizes
+        if self._comm.allreduce(same, MPI.LAND):
+            assert self.x is not None
+            self.x.set(0.0)
+            return self.x
+        self.snes.reset()
+        self.x = PETSc.Vec().createMPI(sizes, comm=self._comm)
+        self.F = self.x.duplicate()
+        self._R = self.x.duplicate()
+        self._trial = self.x.duplicate()
+        self.snes.setFunction(self._callback(self._function), self.x.duplicate())
+        self.snes.setConvergenceTest(self._callback(self._test))
+        self.snes.setLineSearchPreCheck(self._callback(self._pre_check))
+        return self.x
+
+    def _iterate(self, x: PETSc.Vec) -> None:
+        assert self.F is not None
+        K: PETSc.Mat | None = None
+        forces: PETSc.Vec | None = None
+        if self._problem.impose():
+            K = self._problem.tangent()
+            forces = self._problem.lift()
+            forces.axpy(1.0, self.F)
+        start = self.F if forces is None else forces
+        self._first = norm(start)
+        predicted = self._predict(x, start)
+        self._centre = x.copy()
+        self._set_tangent(self._problem.tangent() if predicted or K is None else K)
+        self._fresh = forces is None or predicted
+        if forces is not None and not predicted:
+            self._factor.solve(forces, x)
+            self._negative = self._problem.constrain(x, None, self._solve)
+            if self._is_loose(x, self._first):
+                return
+            if self._refines:
+                self._solve(forces, x)
+                self._negative = self._problem.constrain(x, None, self._solve)
+            x.scale(-1.0)
+            self.iterations += 1
+            self._known = False
+        else:
+            x.copy(self._trial)
+            self._known = True
+        with self.statistics.phase("solve"):
+            self._run_snes(x)
+        reason = self.snes.getConvergedReason()
+        if self._failure is None and reason > 0 and not self._ended:
+            self._failure = MPMError(
+                f"PETSc's SNES {self.snes.getType()!r} ended by a test of its own "
+                f"({_reason(reason)}), not where the residual is small; use snes_type 'newtonls'."
+            )
+        elif self._failure is None and reason > 0:
+            self._judge(predicted)
+        elif self._failure is None:
+            residual = self.residuals[-1] if self.residuals else np.nan
+            if reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
+                why = "as a linear solve failed"
+                if self.snes.getKSP().getConvergedReason() == (
+                    PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
+                ):
+                    why = "as the factorisation of the tangent failed"
+            else:
+                why = _reason(reason)
+                self.no_equilibrium = True
+            self._failure = ConvergenceError(
+                f"Newton's method stopped after {self.iterations} linear solves at a relative "
+                f"residual of {residual:.1e} ({why})"
+            )
+
+    def _run_snes(self, x: PETSc.Vec) -> None:
+        """Let SNES iterate; an exception in a callback comes out as itself, not as PETSc's."""
+        try:
+            self.snes.solve(None, x)
+        except BaseException:
+            raised, self._raised = self._raised, None
+            self.x = None  # what SNES has broken off is not gone on with
+            self._factor.forget()
+            try:
+                if raised is not None:
+                    raise raised from raised.__cause__
+                raise
+            finally:
+                del raised  # an error that its own frame holds would keep problems alive
+
+    def _callback(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a callback for PETSc that notes what it raises."""
+        call, note = weakly(method), weakly(self._note)
+
+        def noting(*args: Any) -> Any:
+            try:
+                return call(*args)
+            except BaseException as error:
+                note(error)
+                raise
+
+        return noting
+
+    def _note(self, error: BaseException) -> None:
+        if self._raised is None:
+            self._raised = error
+
+    def _predict(self, x: PETSc.Vec, start: PETSc.Vec) -> bool:
+        """Move x from zero to the prediction unless its residual is too far above the start's."""
+        assert self.F is not None
+        guess = self._problem.prediction()
+        if guess is None:
+            return False
+        size = norm(start)
+        if self._evaluate(guess) is None and norm(self.F) < self._kept * size:
+            guess.copy(x)
+            self._risky = norm(self.F) >= size
+            self.statistics.count("predictions")
+            return True
+        self.statistics.count("rejected_predictions")
+        self._evaluate(x)
+        return False
+
+    @property
+    def experience(self) -> tuple[float, int]:
+        """What earlier steps have taught about predictions, for a checkpoint."""
+        return self._kept, self._from_zero
+
+    @experience.setter
+    def experience(self, values: tuple[float, int]) -> None:
+        self._kept, self._from_zero = values
+
+    def _judge(self, predicted: bool) -> None:
+        """Keep only sure predictions from now on, if a doubtful one has saved no linear solve."""
+        if not predicted:
+            self._from_zero = self.iterations
+        elif self._risky and self.iterations >= self._from_zero:
+            self._kept = 1.0
+
+    def _function(self, snes: PETSc.SNES, x: PETSc.Vec, F: PETSc.Vec) -> None:
+        if not (self._known and self._same(x, self._trial)):
+            self._evaluate(x)
+        self._known = False
+        self._R.copy(F)
+
+    def _same(self, a: PETSc.Vec, b: PETSc.Vec) -> bool:
+        same = np.array_equal(a.array_r, b.array_r)
+        return bool(self._comm.allreduce(same, MPI.LAND)) if self._comm.size > 1 else same
+
+    def _evaluate(self, x: PETSc.Vec) -> MPMError | None:
+        assert self.F is not None
+        self.statistics.count("residuals")
+        if np.isfinite(norm(x)):
+            failure = self._problem.residual(x, self.F)
+            if failure is None and not np.isfinite(norm(self.F)):
+                failure = ConvergenceError("The residual is not finite")
+        else:
+            failure = ConvergenceError("The linear solve broke down on a singular matrix")
+        self._failure = failure
+        if failure is not None:
+            self.F.set(np.nan)
+        self.F.copy(self._R)
+        if failure is None and self._factor.D is not None and self._centre is not None:
+            gap = x - self._centre
+            gap.pointwiseMult(gap, self._factor.D)
+            self._R.axpy(1.0, gap)
+        return failure
+
+    def _test(
+        self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]
+    ) -> PETSc.SNES.ConvergedReason | None:
+        size = norms[2]
+        reasons = PETSc.SNES.ConvergedReason
+        if not np.isfinite(size):
+            return _compat.NOT_FINITE
+        size = norm(self._R)  # as that of SNES, but of small numbers too
+        rtol, atol, _, _ = snes.getTolerances()
+        scale = self._problem.scale(self._R)
+        if iteration >= 2 and size > max(0.25 * self._norm, rtol * scale):
+            self._stalled = True
+        if self._stalled or scale == 0.0:
+            internal = self._problem.internal_scale()
+            if scale < 1e-6 * internal:
+                scale = internal
+        self._norm = size
+        self._norms.append(size)
+        self.residuals.append(size / scale if scale > 0 else size)
+        tolerance = max(rtol * scale, atol)
+        small = size <= tolerance
+        if small or (
+            iteration > 0
+            and (self._is_round_off(*self._motion) or self._is_at_floor(*self._motion))
+        ):
+            left = self._release(snes.getSolution(), tolerance)
+            if left > tolerance:
+                verdict = self._judge_rest(snes.getSolution(), left, tolerance, scale)
+                if verdict == "failed":
+                    return reasons.DIVERGED_MAX_IT
+                if verdict == "go on":
+                    self._refine()
+                    return None
+            self._ended = True
+            if small:
+                frozen = left / scale if scale > 0.0 else 0.0
+                self.statistics["frozen_residual"] = max(self.statistics["frozen_residual"], frozen)
+                return reasons.CONVERGED_FNORM_RELATIVE
+            self.statistics.count("converged_at_round_off")
+            return reasons.CONVERGED_SNORM_RELATIVE
+        if self._search is not None and stalled(self._norms):
+            self.no_equilibrium = True
+            lowest = min(self.residuals)
+            self._failure = ConvergenceError(
+                f"Newton's method makes no headway: in {self.iterations} linear solves the "
+                f"relative residual did not stay below {lowest:.1e}"
+            )
+            return reasons.DIVERGED_MAX_IT
+        return None
+
+    def _is_round_off(self, step: float, whole: float) -> bool:
+        """Whether a step's motion is round-off of the whole motion or, after a stall, of places."""
+        return step <= ROUND_OFF * whole or bool(
+            self._stalled and step <= 4 * np.finfo(float).eps * self._problem.extent()
+        )
+
+    def _is_at_floor(self, step: float, whole: float) -> bool:
+        """Whether a refined step's motion is small, and no longer falls from one to the next."""
+        return self._refines and not self._shrinks and step <= SETTLED * whole
+
+    def _is_settled(self, y: PETSc.Vec, x: PETSc.Vec) -> bool:
+        """Whether a refined step is too small for the residual to judge it."""
+        return self._refines and self._problem.motion(y) <= SETTLED * self._problem.motion(x)
+
+    def _release(self, x: PETSc.Vec, tolerance: float) -> float:
+        """Let go what the proximal term holds back, except where next to nothing moves.
+
+        Args:
+            x: The unknowns; replaced by better ones.
+            tolerance: Norm of the residual that is small enough.
+
+        Returns:
+            Norm of the residual that is left.
+        """
+        assert self.F is not None
+        left = norm(self.F)
+        step = x.duplicate()
+        while left > tolerance and self._factor.D is not None:
+            self._factor.solve(self.F, step)
+            if norm(step * self._factor.D) > HELD * left:
+                self._factor.refine(self.F, step, 0.5 * tolerance / left)
+            self._problem.constrain(step, x, self._solve)
+            better = self._evaluate(x - step) is None and norm(self.F) <= 0.5 * left
+            if not better:
+                self._evaluate(x)
+                break
+            x.axpy(-1.0, step)
+            left = norm(self.F)
+        return left
+
+    def _judge_rest(self, x: PETSc.Vec, left: float, tolerance: float, scale: float) -> str:
+        """Say what to do about a residual that is left.
+
+        Args:
+            x: The unknowns.
+            left: Norm of the residual.
+            tolerance: Norm that is small enough.
+            scale: Size of the forces that it is compared with.
+
+        Returns:
+            ``"go on"``, ``"round-off"``, ``"frozen"``, or ``"failed"``: then ``_failure`` says so.
+        """
+        assert self.F is not None
+        if self._factor.D is None:
+            return "round-off"
+        step = x.duplicate()
+        self._factor.solve(self.F, step)
+        rest = self._factor.refine(self.F, step, self._refined)
+        self._problem.constrain(step, x, self._solve)
+        moved, whole = self._problem.motion(step), self._problem.motion(x)
+        balanced = self._problem.resultant() <= np.sqrt(step.getSize()) * tolerance
+        if self._is_round_off(moved, whole) or (self._is_at_floor(moved, whole) and balanced):
+            return "round-off"
+        forces = max(scale, self._first)
+        if rest <= 0.5 and self._goes_on < 5:
+            self._goes_on += 1
+            return "go on"
+        if left > FROZEN * forces and left > FROZEN * self._problem.internal_scale():
+            share = left / forces if forces > 0.0 else np.inf
+            self._failure = _not_held(share) if self._is_mechanism(step) else _unbalanced(share)
+            return "failed"
+        return "frozen"
+
+    def _solve(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Solve with the last factor, and for the tangent itself where the shift matters."""
+        self._factor.solve(b, x)
+        if self._refines:
+            self._factor.refine(b, x, self._refined)
+
+    @property
+    def _refined(self) -> float:
+        """How far a step is refined: a residual of round-off hides what the soft parts lack."""
+        return REFINED**2 if self._stalled else REFINED
+
+    def _refine(self) -> None:
+        """Solve for the tangent itself from now on, and let go what the proximal term holds."""
+        assert self.F is not None
+        self._refines = True
+        self._centre = None
+        self.F.copy(self._R)
+
+    def _set_tangent(self, K: PETSc.Mat, damping: float = 0.0) -> None:
+        if self._factor.set(K, self._problem.rigid_motions, damping):
+            self.snes.setJacobian(self._callback(self._jacobian), K, self._factor.P)
+
+    def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
+        if not self._fresh:
+            self._set_tangent(self._problem.tangent())
+        self._fresh = False
+        self.iterations += 1
+
+    def _pre_check(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+        before, self._motion = self._motion, (0.0, 0.0)
+        self._origin = x
+        refined = self._refines
+        if refined:
+            self._solve(self._R, y)
+        self._negative = self._problem.constrain(y, x, self._solve)
+        if self.iterations == 1 and self._is_loose(y, norm(self._R)):
+            self._trial.waxpy(-1.0, y, x)
+            self._R.set(np.nan)
+            self._known = True
+            return False
+        if self._refines and not refined:
+            self._solve(self._R, y)
+            self._negative = self._problem.constrain(y, x, self._solve)
+        if not np.isfinite(norm(y)):
+            if self._search is None or not self._search.trusts:
+                return False  # the evaluation at x - y says so
+            self._search.withdraw(x, y, self._R, self._trial)
+            changed = True
+        elif self._search is not None and not self._is_settled(y, x):
+            changed = self._search(x, y, self._R, self._trial)
+        else:
+            changed = False
+            self._trial.waxpy(-1.0, y, x)
+            self._evaluate(self._trial)
+        self._motion = (self._problem.motion(y), self._problem.motion(self._trial))
+        self._shrinks = self._motion[0] <= 0.25 * before[0]
+        self._known = True
+        return changed or self._refines
+
+    def _smooth(self) -> bool:
+        return self._problem.smooth()
+
+    def _is_loose(self, y: PETSc.Vec, force: float) -> bool:
+        """Whether a first step moves a body that nothing holds, which is a failure then."""
+        scale = max(self._problem.scale(), force)
+        if self._factor.D is None or scale == 0.0 or not np.isfinite(norm(y)):
+            return False
+        share = norm(y * self._factor.D) / scale
+        if share <= LOOSE:
+            return False
+        if self._is_mechanism(y):
+            self._failure = _not_held(share)
+            return True
+        self._refine()
+        return False
+
+    def _is_mechanism(self, y: PETSc.Vec) -> bool:
+        """Whether of the motions that the proximal term holds in y one is held by nothing else.
+
+        Solving for the forces of that term, again and again, leaves what gives way to them most;
+        the stiffness along it tells a soft body, or a stiff one on a soft one, from a motion
+        without any.
+        """
+        assert self._factor.D is not None
+        mode, force = y.copy(), y.duplicate()
+        before = np.inf
+        for _ in range(INVERSE_ITERATIONS):
+            force.pointwiseMult(mode, self._factor.D)
+            force.scale(1.0 / norm(force))
+            self._factor.solve(force, mode)
+            mode.scale(1.0 / norm(mode))
+            force.pointwiseMult(mode, self._factor.D)
+            ratio = self._problem.stiffness(mode) / mode.dot(force)
+            if ratio <= MECHANISM:
+                return True
+            if ratio > 0.95 * before:
+                return False
+            before = ratio
+        return False
+
+    def _uphill(self, F: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Return whether a step for the residual F is not that of a positive definite tangent."""
+        if not self._symmetric or self._factor.shift == 0.0:
+            return False
+        return sign_of_product(F, y) <= 0.0 or self._factor.negative_pivots() > self._negative
+
+    def _redirect(self, F: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Solve for the step with a damped tangent that is positive definite.
+
+        Args:
+            F: The residual.
+            y: The step; replaced.
+        """
+        assert self.K is not None
+        for damping in DAMPINGS:
+            self._set_tangent(self.K, damping)
+            self._factor.solve(F, y)
+            self._negative = self._problem.constrain(y, self._origin, self._factor.solve)
+            self.iterations += 1
+            if not self._uphill(F, y):
+                return
+
+
+def _not_held(share: float) -> MPMError:
+    return MPMError(
+        f"Forces ({share:.1e} of all) act where nothing holds the bodies; support each of them "
+        "against all rigid motions, with conditions and supports that reach it where it is"
+    )
+
+
+def _unbalanced(share: float) -> ConvergenceError:
+    return ConvergenceError(
+        f"Newton's method cannot balance {share:.1e} of the forces, as round-off of the tangent is "
+        "larger than what resists them; make stiffnesses differ less"
+    )
+
+
+def _reason(code: int) -> str:
+    names = {v: k for k, v in vars(PETSc.SNES.ConvergedReason).items() if isinstance(v, int)}
+    return str(names.get(code, code)).lower().replace("_", " ")

@@ -1,0 +1,16 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Cures of badly supported and of dependent dofs.
+
+Background dofs that hardly anything of a body supports make a tangent singular or nearly so. They
+are held by a penalty on facets (:mod:`~mpm_dolfinx.stabilisation.ghost_penalty`), follow the
+polynomial of a well filled cell (:mod:`~mpm_dolfinx.stabilisation.aggregation`), or stand in for
+each other (:mod:`~mpm_dolfinx.stabilisation.dependent_dofs`);
+:mod:`~mpm_dolfinx.stabilisation.choice` chooses.
+"""
+
+from .aggregation import Aggregation
+from .choice import stabilisation_of
+from .ghost_penalty import PENALTY, GhostPenalty
+
+__all__ = ["PENALTY", "Aggregation", "GhostPenalty", "stabilisation_of"]

@@ -1,0 +1,78 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Which part of each background cell the bodies fill."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import la
+
+from ..background.basis import PointBasis
+from ..background.cells import cell_volumes
+from ..particles.particles import Particles
+
+__all__ = ["CellFill"]
+
+
+class CellFill(NamedTuple):
+    """What the bodies do to the cells of the background that this rank owns.
+
+    Attributes:
+        fill: Volume of each body inside each cell over the cell's, shape ``(c, bodies)``.
+        active: Whether a body reaches into the cell, shape ``(c,)``.
+    """
+
+    fill: NDArray[np.float64]
+    active: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, bodies: Sequence[Particles], count: int) -> CellFill:
+        """Look at bodies at their last converged positions (collective).
+
+        The volume is that of the history's quadrature points in the cell. A body may also
+        reach into a cell with nodes alone, a sliver: the fill is zero then, but nodes of the
+        cell have weight that belong to no filled cell.
+
+        Args:
+            bodies: The bodies.
+            count: Number of background cells that this rank owns.
+        """
+        V = bodies[0].V
+        comm: MPI.Comm = V.mesh.comm
+        volume = np.zeros((count, len(bodies)))
+        used = np.zeros(count, dtype=np.uint64)
+        bit = np.uint64(1) << np.arange(V.dofmap.list.shape[1], dtype=np.uint64)
+        for number, body in enumerate(bodies):
+            points, volumes = body.quadrature_points()
+            at = body.background_basis.at(points)
+            for cells, values in _sent(comm, at, at.found, volumes):
+                np.add.at(volume[:, number], cells, values)
+            rows = body.node_basis.part(body.W.dofmap.index_map.size_local)
+            bits = ((rows.values != 0.0) * bit).sum(axis=1, dtype=np.uint64)
+            for cells, values in _sent(comm, rows, rows.found, bits):
+                np.bitwise_or.at(used, cells, values)
+        filled = volume.any(axis=1)
+        own = V.dofmap.list[:count]
+        known = la.vector(V.dofmap.index_map)
+        known.array[own[filled]] = 1.0
+        known.scatter_reverse(la.InsertMode.add)
+        known.scatter_forward()
+        alone = ((known.array[own] == 0.0) * bit).sum(axis=1, dtype=np.uint64)
+        active = filled | ((used & alone) != 0)
+        return cls(volume / cell_volumes(V.mesh)[:, None], active)
+
+
+def _sent(
+    comm: MPI.Comm, at: PointBasis, which: NDArray[np.bool_], values: NDArray[Any]
+) -> list[tuple[NDArray[np.int64], NDArray[Any]]]:
+    """Send values at some points to the owners of their cells; return what comes (collective)."""
+    assert at.cell is not None and at.rank is not None
+    chosen = [which & (at.rank == r) for r in range(comm.size)]
+    return comm.alltoall([(at.cell[pick], values[pick]) for pick in chosen])

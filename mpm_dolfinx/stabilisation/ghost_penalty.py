@@ -1,0 +1,130 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Ghost penalty on facets of badly filled background cells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..assembly.petsc import blocked, marked
+from ..background.pairs import CellPairs
+from ..background.polynomials import CellPolynomials
+from ..particles.particles import Particles
+from ..transfer.touched import TouchedNodes
+from .aggregation import FILL
+from .cell_fill import CellFill
+from .cure import Cure
+
+__all__ = ["GhostPenalty"]
+
+#: Ghost penalty over shear modulus / cell size^2.
+PENALTY = 1e-4
+
+
+class GhostPenalty(Cure):
+    """Each badly filled cell is tied to the polynomials of its neighbours (Burman 2010).
+
+    On facets between two cells that a body reaches into, of which one is filled below one
+    half, ``gamma G / h^2 int (p_1 - p_2) (q_1 - q_2) dx`` over both cells is added to residual
+    and tangent (the direct form of Preuss 2018), where p_1 and p_2 are the increment of either
+    cell, continued over both as polynomials. It vanishes where the increment is one polynomial.
+    All nodes of these cells become unknowns.
+
+    Args:
+        bodies: The bodies (collective).
+        least: Number of background nodes with weight over that of the bodies' nodes, below which
+            there is no penalty.
+    """
+
+    def __init__(self, bodies: Sequence[Particles], least: float = 0.0) -> None:
+        super().__init__()
+        self._bodies = list(bodies)
+        self._V = bodies[0].V
+        self._least = least * sum(_num_nodes(body) for body in bodies)
+        self._acts = False
+
+    @cached_property
+    def _cells(self) -> CellPairs:
+        return CellPairs(self._V)
+
+    @cached_property
+    def _polynomials(self) -> CellPolynomials:
+        return CellPolynomials(self._V)
+
+    @property
+    def penalises(self) -> bool:
+        """See :class:`Cure`."""
+        return self._acts
+
+    def unknowns(self, touched: TouchedNodes, held: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """See :meth:`Cure.unknowns`: also all dofs of cells that are tied together."""
+        active = touched.has_weight
+        self._acts = self._V.mesh.comm.allreduce(len(touched.active)) >= self._least
+        if self._acts:
+            self._choose()
+            active = active | self._marked
+        self.counts = {"ghost_facets": self._num_chosen if self._acts else 0}
+        return touched.on_dofs(active)
+
+    def _choose(self) -> None:
+        """Find the pairs of cells that are tied together."""
+        cells = self._cells
+        support = CellFill.of(self._bodies, cells.num_own)
+        fill, active = cells.with_others(support.fill), cells.with_others(support.active)
+        a, b = cells.pairs.T
+        least = np.minimum(fill[a].sum(axis=1), fill[b].sum(axis=1))
+        chosen = cells.pairs[cells.mine & active[a] & active[b] & (least < FILL)]
+        self._chosen = chosen
+        self._shares = fill[chosen].sum(axis=1)
+        self._marked = marked(self._V, cells.nodes[chosen])
+        self._num_chosen: int = self._V.mesh.comm.allreduce(len(chosen))
+
+    def penalty(self, moduli: Sequence[float]) -> PETSc.Mat | None:
+        """See :meth:`Cure.penalty`."""
+        if not self._acts:
+            return None
+        chosen, cells, bs = self._chosen, self._cells, self._V.dofmap.index_map_bs
+        body = np.asarray(moduli)
+        total = self._shares.sum(axis=1)
+        mean = self._shares @ body / np.where(total > 0.0, total, 1.0)
+        modulus = PENALTY * np.where(total > 0.0, mean, body.min())
+        nodes = cells.nodes[chosen].reshape(len(chosen), 2 * cells.nodes.shape[1])
+        values = modulus[:, None, None] * self._penalties(cells.vertices[chosen])
+        rows = np.broadcast_to(nodes[:, :, None], values.shape)
+        columns = np.broadcast_to(nodes[:, None, :], values.shape)
+        return blocked(self._V, rows.ravel(), columns.ravel(), values.ravel(), bs)
+
+    def _penalties(self, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the matrices of pairs of cells, each shape of a pair once computed.
+
+        Args:
+            vertices: Geometry nodes of both cells, shape ``(n, 2, m, gdim)``.
+        """
+        n, _, _, gdim = vertices.shape
+        size = np.ptp(vertices.reshape(n, 2 * vertices.shape[2], gdim), axis=1).max(axis=1)
+        shape = (vertices - vertices[:, :1, :1]) / size[:, None, None, None]
+        keys = np.round(shape.reshape(n, vertices[:1].size), 9)
+        _, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        each = self._unit_penalties(shape[first])[which.reshape(-1)]
+        return np.asarray(each * (size ** (gdim - 2))[:, None, None])
+
+    def _unit_penalties(self, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+        frame = self._polynomials.frame(vertices[:, 0])
+        one, two = (self._polynomials.moments(vertices[:, side], frame) for side in (0, 1))
+        jump = np.concatenate([one.coefficients, -two.coefficients], axis=2)
+        size = (0.5 * (one.volume + two.volume)) ** (2.0 / vertices.shape[3])
+        values = jump.swapaxes(1, 2) @ (one.mass + two.mass) @ jump / size[:, None, None]
+        return np.asarray(0.5 * (values + values.swapaxes(1, 2)))
+
+
+def _num_nodes(body: Particles) -> int:
+    """Return the number of nodes of a body, each counted once where domains may part."""
+    nodes: int = body.W.dofmap.index_map.size_global
+    corners: int = body.mesh.topology.index_map(0).size_global
+    return min(nodes, corners) if body.W.ufl_element().degree == 1 else nodes

@@ -1,0 +1,108 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Where and at what load a step failed, and what can be done about it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mpi4py import MPI
+
+import numpy as np
+
+from ..errors import ConvergenceError, DomainDistortionError, MPMError, agreed
+from ..history import Statistics
+from ..particles.particles import Particles
+from ..system.field import Field
+from ..system.reduced import ReducedSystem
+
+__all__ = ["count_folded", "crossed", "placed"]
+
+
+def crossed(bodies: Sequence[Particles]) -> MPMError | None:
+    """Return an error where domains cross themselves (collective)."""
+    found: MPMError | None = None
+    for body in bodies:
+        found = found or DomainDistortionError.of("cross themselves", body.crossed())
+    return agreed(bodies[0].mesh.comm, found)
+
+
+def count_folded(bodies: Sequence[Particles], statistics: Statistics) -> None:
+    """Count the curved domains that are folded (collective)."""
+    curved = [body for body in bodies if body.W.ufl_element().degree > 1]
+    if curved:
+        folded = curved[0].mesh.comm.allreduce(sum(len(body.folded()) for body in curved))
+        statistics["folded_domains"] = max(statistics["folded_domains"], folded)
+
+
+def placed(
+    error: MPMError, reduced: ReducedSystem, load: float, limit: str | None = None
+) -> MPMError:
+    """Return an error that says at what load it happened, and what to do (collective).
+
+    Args:
+        error: It.
+        reduced: The system whose residual did not vanish.
+        load: Load, or parameter of the path, at the last converged step.
+        limit: Up to what no equilibrium was found, if that may be a limit, and what to do.
+    """
+    advice = {
+        DomainDistortionError: "; take more steps, smaller loads or finer domains",
+        ConvergenceError: "; take more steps, or look whether a limit load is reached",
+    }.get(type(error), "")
+    if limit is not None:
+        advice = f"; {limit}"
+    particles, text = error.particles, error.message.rstrip(".")
+    dofs: list[int] = []
+    if isinstance(error, ConvergenceError) and not particles:
+        particles = _worst_particles(reduced)
+        dofs, where, space = _worst_dof(reduced)
+        if particles and dofs:
+            text += f"; the residual is largest at dof {dofs[0]} of {space} near {where}"
+            text += ", and at {particles}"
+    told = type(error)(f"{text}, in the step after load {load:.6g}{advice}.", particles, load)
+    told.dofs = dofs
+    return told
+
+
+def _worst_dof(reduced: ReducedSystem) -> tuple[list[int], tuple[float, ...], str]:
+    """Return the global dof with the largest residual, if any, where it is, and its space."""
+    best: tuple[float, int, tuple[float, ...], int] = (-1.0, -1, (), 0)
+    for number, field in enumerate(reduced.fields):
+        best = max(best, (*_worst_of(field), number))
+    _, dof, where, number = max(reduced.fields[0].V.mesh.comm.allgather(best))
+    space = "V" if len(reduced.fields) == 1 else f"the V of background {number}"
+    return ([dof] if dof >= 0 else []), where, space
+
+
+def _worst_of(field: Field) -> tuple[float, int, tuple[float, ...]]:
+    """Return this rank's largest residual of a field, its global dof, and where that is."""
+    if field.free is None or len(field.dofs) == 0:
+        return -1.0, -1, ()
+    V, gdim = field.V, field.V.mesh.geometry.dim
+    size = np.nan_to_num(np.abs(field.force.array_r[field.dofs]), nan=0.0, posinf=0.0)
+    dof = int(field.dofs[size.argmax()])
+    x = V.tabulate_dof_coordinates()[dof // V.dofmap.index_map_bs, :gdim]
+    start = V.dofmap.index_map.local_range[0] * V.dofmap.index_map_bs
+    return float(size.max()), start + dof, tuple(float(round(c, 6)) for c in x)
+
+
+def _worst_particles(reduced: ReducedSystem) -> list[int]:
+    """Return the particles at the node with the largest residual."""
+    best: tuple[float, list[int]] = (0.0, [])
+    for field in reduced.fields:
+        residual = field.residual_at_unknowns()
+        if residual is None:
+            continue
+        comm: MPI.Comm = field.V.mesh.comm
+        for motion in field.motions:
+            body = motion.particles
+            size = np.nan_to_num(motion.nodal_size(residual), nan=0.0, posinf=0.0)
+            largest = comm.allreduce(float(size.max(initial=0.0)), MPI.MAX)
+            if largest <= best[0]:
+                continue
+            nodes = np.flatnonzero(size >= largest)
+            touches = np.isin(body.domain_nodes, nodes).any(axis=1)
+            mine = [int(p) for p in body.global_index[touches]]
+            best = largest, sorted({p for ps in comm.allgather(mine) for p in ps})
+    return best[1]

@@ -1,0 +1,448 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Load steps of a problem: tried, committed, or taken back and made smaller."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from typing import NoReturn, Protocol
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import (
+    ConvergenceError,
+    DomainDistortionError,
+    MPMError,
+    ParticleOutsideError,
+    agree,
+    on_all_ranks,
+)
+from ..history import History, Step
+from ..parallel.garbage import Cleaner
+from ..parallel.interruption import Hold, Interrupted, held, interrupted, settle
+from ..particles.particles import Particles
+from ..solvers.newton import NewtonSolver, ReducedProblem
+from ..system.conditions import dirichlet_values
+from ..system.reduced import ReducedSystem
+from .control import Converged, Progress, Run, StepControl
+from .diagnosis import count_folded, placed
+from .displacement_control import ControlledSystem, DisplacementControl
+from .leaving import may_stop, move_bodies
+
+__all__ = ["Mender", "Owner", "Stepper"]
+
+type Path = Callable[[float], None]
+"""A path of the user's: sets loads and conditions to their totals at t in (0, 1]."""
+
+
+class Owner(Protocol):
+    """What load steps ask of the problem that they are steps of. All calls are collective."""
+
+    bodies: list[Particles]
+    history: History
+
+    def masses(self, number: int) -> NDArray[np.float64] | None:
+        """Return the mass of each particle of a body that this rank owns, if it is known."""
+
+    def begin_step(self) -> None:
+        """Take over what the user may change between two steps, if that is allowed."""
+
+    def improper(self) -> MPMError | None:
+        """Return why the domains as they are now cannot be those of a converged step."""
+
+    def end_step(self) -> None:
+        """Do what is to be done between two steps."""
+
+    def mend(self, error: MPMError) -> bool:
+        """Change what made the smallest step fail; return whether to go on."""
+
+    def repartition(self, threshold: float) -> bool:
+        """Move particles to where they are best now; return whether any have moved."""
+
+    def warn(self, sentence: str) -> None:
+        """Warn the user, on one rank."""
+
+
+class Mender(Protocol):
+    """What changes the meshes of bodies between steps. All calls are collective."""
+
+    def after_step(self) -> None:
+        """Look at what a converged step has made of the domains."""
+
+    def mend(self, error: MPMError) -> bool:
+        """Change what made the smallest step fail; return whether to go on."""
+
+
+class Stepper:
+    """Takes a problem from one converged step to the next.
+
+    It outlives the meshes of the bodies: :meth:`follow` gives it what the problem is solved by, at
+    first and where that is made for other meshes.
+
+    Args:
+        owner: The problem, which is not kept alive.
+        mender: What changes meshes between steps, if anything.
+
+    Attributes:
+        converged: What is known of the last converged step.
+        run: The run that was begun last, ``None`` after its end.
+        newton: What finds a root of the residual.
+    """
+
+    def __init__(self, owner: Owner, mender: Mender | None = None) -> None:
+        self._owner = weakref.ref(owner)
+        self._mender = mender
+        self.run: Run | None = None
+        self._resumes = self._follows = False
+
+    def follow(self, reduced: ReducedSystem, newton: NewtonSolver, clean_up: Cleaner) -> None:
+        """Take what the problem is solved by, and its present load for that of a converged step.
+
+        Args:
+            reduced: Residual and tangent.
+            newton: What finds a root of the residual.
+            clean_up: Frees what is out of use.
+        """
+        self._reduced, self.newton, self._clean_up = reduced, newton, clean_up
+        self._follows = True
+        first = self.owner.bodies[0]
+        load = float(first.load.value)
+        none = [np.zeros(len(field.bodies[0].increment.x.array)) for field in reduced.fields]
+        self.converged = Converged(load, load, none, None, bool(first.proportional.value))
+
+    def release(self) -> None:
+        """Let go of what :meth:`follow` has given; what PETSc holds is freed together later."""
+        if self._follows:
+            del self._reduced, self.newton
+            self._clean_up.end()
+        self._follows = False
+
+    @property
+    def owner(self) -> Owner:
+        """The problem."""
+        owner = self._owner()
+        assert owner is not None
+        return owner
+
+    @property
+    def reduced(self) -> ReducedSystem:
+        """Residual and tangent."""
+        return self._reduced
+
+    @property
+    def _comm(self) -> MPI.Comm:
+        comm: MPI.Comm = self.owner.bodies[0].V.mesh.comm
+        return comm
+
+    @property
+    def share(self) -> float:
+        """How much of the run is done."""
+        return 1.0 if self.run is None else self.run.control.share
+
+    def progress(self) -> Progress:
+        """Return how far the problem is, for a checkpoint."""
+        return Progress(self.converged, self.newton.experience, self.run)
+
+    def take(self, progress: Progress) -> None:
+        """Go to where a problem has been, its bodies and histories being there (collective).
+
+        The run is not taken over: see :meth:`resume`.
+        """
+        self.converged = progress.converged
+        self.newton.experience = progress.experience
+        self._reduced.forget()
+        self.go_back()
+
+    def resume(self, run: Run | None) -> None:
+        """Let the next run be one that was interrupted, or a new one."""
+        self.run, self._resumes = run, run is not None
+
+    def steps(
+        self,
+        steps: int,
+        update: Path | None,
+        repartition: float | None,
+        control: DisplacementControl | None,
+        span: tuple[float, float] | None = None,
+    ) -> Iterator[Step]:
+        """Apply the whole load: see :meth:`ParticleProblem.steps`.
+
+        Args:
+            steps: As there.
+            update: As there; through time it is called with the time.
+            repartition: As there.
+            control: As there.
+            span: Times at beginning and end; ``None``: not through time.
+        """
+        return self._steps(self.owner, steps, update, repartition, control, span)
+
+    @property
+    def interrupted(self) -> Run | None:
+        """The run that a checkpoint interrupted, if the next one is to go on with it."""
+        return self.run if self._resumes else None
+
+    def _steps(
+        self,
+        owner: Owner,  # which the iterator keeps alive
+        steps: int,
+        update: Path | None,
+        repartition: float | None,
+        control: DisplacementControl | None,
+        span: tuple[float, float] | None,
+    ) -> Iterator[Step]:
+        if not isinstance(steps, int | np.integer) or steps < 1:
+            raise MPMError(f"The number of steps must be a whole number from 1 on, not {steps!r}.")
+        if update is not None:
+            update = on_all_ranks(self._comm, update)
+        if control is not None and not isinstance(control, DisplacementControl):
+            raise MPMError(f"control= is a DisplacementControl, not {control!r}.")
+        comm = self._comm
+        # Between two steps Ctrl-C acts as ever, but on several ranks, where it would take some of
+        # them out of what the others go on with.
+        with held() if comm.size > 1 else nullcontext(Hold()) as hold:
+            last = Hold()
+            run = self._begin(int(steps), update, control, span)
+            may_split = any(body.on_distortion == "split" for body in owner.bodies)
+            if control is not None and (repartition is not None or may_split):
+                control.require_movable()
+            while not run.control.finished:
+                with held() as now:
+                    if interrupted(comm, last.left):
+                        self._leave(update)
+                    try:
+                        step = self._try(run, update, control)
+                    except ParticleOutsideError as told:
+                        if not may_stop(owner.bodies):
+                            raise
+                        owner.history.stopped = told
+                        owner.warn(f"The run stopped. {told!s}")
+                        return
+                    if step is not None:
+                        self._end_step(owner)
+                        if repartition is not None:
+                            owner.repartition(repartition)
+                last = now
+                if step is not None:
+                    yield step
+            self.run = None
+            self._warn_of_outside()
+            if interrupted(comm, last.left):
+                self._leave()
+        if hold.left:
+            raise KeyboardInterrupt
+
+    def _try(
+        self, run: Run, update: Path | None, control: DisplacementControl | None
+    ) -> Step | None:
+        """Try a step of a run; return it, or ``None`` where another one is to be tried.
+
+        Raises:
+            MPMError: The run cannot go on.
+            BaseException: What a user's code has raised, or Ctrl-C.
+        """
+        owner = self.owner
+        t, end = run.control.target, run.parameter
+        try:
+            if control is None:
+                self._set_load(run.aim, update is None and self.converged.proportional)
+            if update is not None:
+                update(t if run.end is None else run.time)
+            values = run.dirichlet_values(self._totals())
+            step = self._advance(end, values, run.time, t == 1.0, control)
+        except Interrupted:
+            self.go_back()
+            self._leave(update)
+        except (ConvergenceError, DomainDistortionError) as error:
+            self.go_back()
+            owner.history.failed_iterations += self.newton.iterations
+            no_equilibrium = self.newton.no_equilibrium
+            if run.control.cut_back(no_equilibrium):
+                owner.history.cutbacks += 1
+                return None
+            limit = run.limit if no_equilibrium else None
+            told = placed(error, self._reduced, self.converged.parameter, limit)
+            if owner.mend(told) or (self._mender is not None and self._mender.mend(told)):
+                run.control.begin_anew()
+                return None
+            self.go_back(update)
+            raise told from error.__cause__
+        except MPMError as error:
+            self.go_back(update)
+            told = placed(error, self._reduced, self.converged.parameter)
+            raise told from error.__cause__
+        except BaseException:
+            self.go_back()
+            raise
+        run.control.accept(step.iterations)
+        return step
+
+    def _leave(self, update: Path | None = None) -> NoReturn:
+        """Obey Ctrl-C on all ranks, at the last converged step (collective)."""
+        self._follow_back(update)
+        settle(self._comm)
+        raise KeyboardInterrupt from None
+
+    def step(self) -> Step:
+        """Make one increment to the present values: see :meth:`ParticleProblem.step`."""
+        owner = self.owner
+        with held() as hold:
+            self.run = None
+            self.converged.parameter = self.converged.load
+            try:
+                load = float(owner.bodies[0].load.value)
+                self._set_load(load, self.converged.proportional)
+                step = self._advance(load, self._totals(), owner.history.stage + 1.0, last=True)
+            except Interrupted:
+                self.go_back()
+                self._leave()
+            except MPMError as error:
+                self.go_back()
+                owner.history.failed_iterations += self.newton.iterations
+                raise placed(error, self._reduced, self.converged.parameter) from error.__cause__
+            except BaseException:
+                self.go_back()
+                raise
+            self._end_step(owner)
+            if interrupted(self._comm):
+                self._leave()
+        if hold.left:
+            raise KeyboardInterrupt
+        return step
+
+    def go_back(self, update: Path | None = None) -> None:
+        """Return to the last converged step (collective).
+
+        Args:
+            update: A path of the user's, to be called with the parameter of that step.
+        """
+        for body in self.owner.bodies:
+            body.roll_back()
+        self._set_load(self.converged.load, self.converged.proportional)
+        self._reduced.roll_back()
+        self._follow_back(update)
+
+    def _follow_back(self, update: Path | None) -> None:
+        """Let a path of the user's set what it does at the last converged step."""
+        if update is not None and self.converged.parameter > 0.0:
+            update(self.converged.parameter)
+
+    def _begin(
+        self,
+        steps: int,
+        update: Path | None,
+        control: DisplacementControl | None,
+        span: tuple[float, float] | None,
+    ) -> Run:
+        """Return a new run, or the one that a checkpoint interrupted."""
+        goal = None
+        if control is not None:
+            control.require_for(self.owner.bodies, update is not None)
+            goal = control.value
+        if self._resumes and self.run is not None:
+            self.run.require(steps, update is not None, goal, None if span is None else span[1])
+            self._resumes = False
+            return self.run
+        start = self.converged.load if control is None else control.present()
+        if control is None and update is None and self.converged.load >= 1.0:
+            raise MPMError(
+                "The whole load is applied already; go on with problem.step() or with a path "
+                "(update=...)."
+            )
+        if start == goal:
+            raise MPMError("The controlled displacement has its value already.")
+        self.converged.parameter = self.converged.load if update is None else 0.0
+        if self._reduced.predictor is not None:
+            self._reduced.predictor.clear()
+        base = [values.copy() for values in self.converged.prescribed]
+        began = self.owner.history.stage
+        end = None
+        if span is not None:
+            began, end = span
+            self.converged.parameter = began
+        self.run = Run(StepControl(steps), update is not None, start, base, goal, began, end)
+        return self.run
+
+    def _advance(
+        self,
+        parameter: float,
+        values: list[NDArray[np.float64]],
+        time: float,
+        last: bool,
+        control: DisplacementControl | None = None,
+    ) -> Step:
+        """Solve one step to Dirichlet totals, and commit it.
+
+        Unless it is the last one it must leave all particles inside the background. Under
+        displacement control the parameter is the displacement.
+        """
+        owner, reduced = self.owner, self._reduced
+        owner.begin_step()
+        size = parameter - self.converged.parameter
+        if control is not None:
+            size = abs(parameter - control.present())
+        before = self.converged.prescribed
+        reduced.begin([new - old for new, old in zip(values, before, strict=True)], size)
+        system: ReducedProblem = reduced
+        displacement = None
+        if control is not None:
+            system = ControlledSystem(reduced, control, parameter, owner.bodies)
+            displacement = parameter
+        experience = self.newton.experience
+        self.newton.solve(system, reduced.sizes)
+        if (failure := owner.improper()) is not None:
+            raise failure
+        if control is not None:
+            parameter = float(owner.bodies[0].load.value)
+        before = [body.converged_displacement for body in owner.bodies]
+        move_bodies(owner.bodies, owner.history, owner.masses, parameter, last)
+        with owner.history.statistics.phase("commit"):
+            try:
+                reduced.commit()
+            except BaseException:
+                for body, converged in zip(owner.bodies, before, strict=True):
+                    body.restore(converged.reshape(-1, body.mesh.geometry.dim))
+                self.newton.experience = experience
+                raise
+            load = float(owner.bodies[0].load.value)
+            reactions = [force.array_r.copy() for force in reduced.forces]
+            prescribed = [total.copy() for total in values]
+            proportional = bool(owner.bodies[0].proportional.value)
+            self.converged = Converged(load, parameter, prescribed, reactions, proportional)
+            reduced.end()
+            count_folded(owner.bodies, owner.history.statistics)
+            self._clean_up()
+        newton = self.newton
+        step = Step(parameter, newton.iterations, list(newton.residuals), displacement, time)
+        owner.history.steps.append(step)
+        return step
+
+    def _end_step(self, owner: Owner) -> None:
+        with agree(self._comm, "end_step()"):
+            owner.end_step()
+        if self._mender is not None:
+            self._mender.after_step()
+
+    def _totals(self) -> list[NDArray[np.float64]]:
+        """Return the present totals of the Dirichlet conditions, for each field."""
+        return [dirichlet_values(field.conditions, field.V) for field in self._reduced.fields]
+
+    def _set_load(self, load: float, proportional: bool) -> None:
+        """Set the load factor, and whether supports move in proportion to it or to totals."""
+        for body in self.owner.bodies:
+            np.copyto(body.load.value, load)
+            np.copyto(body.proportional.value, float(proportional))
+
+    def _warn_of_outside(self) -> None:
+        """Say so where the last step, which is converged, took particles off the background."""
+        try:
+            with self.owner.history.statistics.phase("locate"):
+                for body in self.owner.bodies:
+                    body.locate()
+        except ParticleOutsideError as error:
+            told = str(error)
+            self.owner.warn(f"The run is complete, but {told[0].lower()}{told[1:]}")

@@ -1,0 +1,18 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The unknowns of the backgrounds, and residual and tangent in them.
+
+What acts on bodies lives on their nodes, whatever moves these: it is a term
+(:mod:`~mpm_dolfinx.system.term`). A body's own stress and loads are one
+(:mod:`~mpm_dolfinx.system.body`), what couples two bodies is another
+(:mod:`~mpm_dolfinx.system.coupling`), inertia a third (:mod:`~mpm_dolfinx.system.inertia`). Each
+background space with the bodies on it is a field (:mod:`~mpm_dolfinx.system.field`), with unknowns,
+conditions
+(:mod:`~mpm_dolfinx.system.conditions`) and a cure of its own. T takes terms down to fields,
+
+    r = sum_b T_b^T r_b,    K = sum_ab T_a^T K_ab T_b,
+
+and :mod:`~mpm_dolfinx.system.reduced` is the one system that Newton's method sees, in the unknowns
+of all fields (:mod:`~mpm_dolfinx.system.numbering`), with a first guess from the steps before
+(:mod:`~mpm_dolfinx.system.predictor`).
+"""

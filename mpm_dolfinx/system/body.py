@@ -1,0 +1,180 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What one body is made of and loaded by, as a term of the reduced system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from ..assembly.body_forms import BodyForms
+from ..assembly.low_rank import ReducedLowRank
+from ..errors import MPMError
+from ..particles.particles import Particles
+from .term import Term, Transfer
+
+__all__ = ["BodyTerm", "PointHistory"]
+
+
+class PointHistory(Protocol):
+    """A material at a body's points, with its history. No call is collective."""
+
+    def update(self) -> None:
+        """Update stress and tangent for the present displacement, or raise an MPMError."""
+
+    def elastic(self) -> bool:
+        """Return whether the history stays as it is in the last update."""
+
+    def commit(self) -> Callable[[], None]:
+        """Make the last update the history; return what takes that back."""
+
+    def roll_back(self) -> None:
+        """Return to the stress of the last converged step."""
+
+    def on_mesh(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return stress and tangent at the points, in the dimension of the forms."""
+
+
+class BodyTerm(Term):
+    """The forms on one body's mesh, and the material at its points.
+
+    Args:
+        particles: The body.
+        forms: Its residual and tangent.
+        material: Its material, if the forms hold one.
+        injected: Functions in the forms for the material's stress and its tangent, if they take
+            these by Functions.
+        contact: Whether one-sided supports act on it.
+
+    Attributes:
+        particles: As given.
+        forms: As given.
+    """
+
+    from_outside = False
+
+    def __init__(
+        self,
+        particles: Particles,
+        forms: BodyForms,
+        material: PointHistory | None = None,
+        injected: tuple[fem.Function, fem.Function] | None = None,
+        contact: bool = False,
+    ) -> None:
+        super().__init__([particles])
+        self.particles = particles
+        self.forms = forms
+        self._material = material
+        self._injected = injected
+        self._contact = contact
+        self._T: PETSc.Mat | None = None
+        self._low_rank: ReducedLowRank | None = None
+
+    @property
+    def fused(self) -> Sequence[tuple[Particles, BodyForms]]:
+        """See :attr:`Term.fused`."""
+        forms = self.forms
+        return [(self.particles, forms)] if forms.internal is not None or forms.fused else []
+
+    @property
+    def follows_load(self) -> bool:
+        """See :attr:`Term.follows_load`."""
+        return self.forms.follows_load
+
+    def begin(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.begin`."""
+        self.forms.assemble_external()
+        return [self.forms.external]
+
+    def update(self) -> MPMError | None:
+        """See :meth:`Term.update`."""
+        if self._material is None:
+            return None
+        try:
+            self._material.update()
+        except MPMError as error:
+            return error
+        self._inject()
+        return None
+
+    def _inject(self) -> None:
+        """Set the injected Functions to the present stress and tangent."""
+        if self._material is not None and self._injected is not None:
+            for function, values in zip(self._injected, self._material.on_mesh(), strict=True):
+                function.x.array[: values.size] = values.ravel()
+
+    def smooth(self) -> bool:
+        """See :meth:`Term.smooth`. It may differ between ranks."""
+        return not self._contact and (self._material is None or self._material.elastic())
+
+    def residuals(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.residuals`."""
+        return [self.forms.assemble_residual()]
+
+    def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
+        """See :meth:`Term.tangents`."""
+        return {(0, 0): self.forms.assemble_tangent()} if self.forms.stock else {}
+
+    def reduced_tangents(self, transfer: Transfer) -> Sequence[PETSc.Mat]:
+        """See :meth:`Term.reduced_tangents`: low-rank parts apart from others."""
+        if self.forms.low_rank is None:
+            return []
+        T = transfer(self.particles)
+        if T is not self._T:
+            self._T, self._low_rank = T, None
+        self._low_rank = self.forms.low_rank.reduced(T, self._low_rank)
+        return self._low_rank.parts
+
+    def reduced_product(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.reduced_product`."""
+        return [] if self.forms.low_rank is None else [self.forms.low_rank_force(motions[0])]
+
+    def absolute_contributions(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.absolute_contributions`."""
+        return [self.forms.absolute_contributions(self.particles.domain_nodes)]
+
+    def load_derivative(self, order: int) -> tuple[Sequence[PETSc.Vec], float]:
+        """See :meth:`Term.load_derivative`."""
+        part, size = self.forms.load_derivative(order)
+        return [part], size
+
+    def stiffness_force(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.stiffness_force`."""
+        return [self.forms.stiffness_force(motions[0])]
+
+    def shear_modulus(self) -> float:
+        """Return the stiffness of the body to simple shear: its mean at the present state.
+
+        It is the smallest positive energy ``g : C : g`` over uniform gradients g with one entry,
+        for an isotropic elastic body its shear modulus, or the mean of it.
+        """
+        particles, u = self.particles, self.particles.T.createVecRight()
+        gdim = particles.mesh.geometry.dim
+        x = particles.V.tabulate_dof_coordinates()[: u.getLocalSize() // gdim, :gdim]
+        volume = particles.mesh.comm.allreduce(float(particles.initial_volume.sum()))
+        motion = particles.T.createVecLeft()
+        energies = []
+        for i, j in np.ndindex(gdim, gdim):
+            u.set(0.0)
+            u.array_w.reshape(-1, gdim)[:, i] = x[:, j]
+            particles.T.mult(u, motion)
+            energies.append(self.forms.stiffness_force(motion).dot(motion) / volume)
+        return min((energy for energy in energies if energy > 0.0), default=0.0)
+
+    def commit(self) -> Callable[[], None] | None:
+        """See :meth:`Term.commit`."""
+        return None if self._material is None else self._material.commit()
+
+    def roll_back(self) -> None:
+        """See :meth:`Term.roll_back`."""
+        self.forms.update_average()
+        if self._material is not None:
+            self._material.roll_back()
+            self._inject()

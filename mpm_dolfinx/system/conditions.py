@@ -1,0 +1,51 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Dirichlet values at the present load, and the forces that they need."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from .. import _compat
+from ..errors import MPMError
+
+__all__ = ["dirichlet_values", "force_at"]
+
+
+def dirichlet_values(bcs: Sequence[fem.DirichletBC], V: fem.FunctionSpace) -> NDArray[np.float64]:
+    """Return the present totals of Dirichlet conditions, on the local dofs of V (collective).
+
+    Raises:
+        MPMError: Some are not finite.
+    """
+    values: NDArray[np.float64] = np.array(fem.Function(V).x.array)
+    for bc in bcs:
+        bc.set(values, None, 1.0)
+    if not V.mesh.comm.allreduce(bool(np.isfinite(values).all()), MPI.LAND):
+        raise MPMError("A Dirichlet condition has a value that is not finite")
+    return values
+
+
+def force_at(
+    bc: fem.DirichletBC, forces: NDArray[np.float64] | None, V: fem.FunctionSpace
+) -> NDArray[np.float64]:
+    """Return the sum of forces on the dofs of a condition, ``(gdim,)`` (collective).
+
+    Args:
+        bc: The condition.
+        forces: Forces on this rank's own dofs of V; ``None`` are none.
+        V: The background space.
+    """
+    gdim = V.dofmap.index_map_bs
+    force = np.zeros(gdim)
+    if forces is not None:
+        own = _compat.own_dofs(bc, V)
+        np.add.at(force, own % gdim, forces[own])
+    return np.asarray(V.mesh.comm.allreduce(force))

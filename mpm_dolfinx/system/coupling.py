@@ -1,0 +1,238 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Terms that tie bodies together, whatever backgrounds move them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+import basix
+from dolfinx import fem, mesh
+
+from .. import _compat
+from ..assembly.inputs import is_tag, known_tags
+from ..background.basis import BackgroundBasis
+from ..errors import MPMError, agree
+from ..particles.particles import Particles
+from .term import Term
+
+__all__ = ["Tie"]
+
+#: Share of a point's displacement from nodes of deleted domains, from which it is gone with them.
+GONE = 1e-9
+
+
+class Tie(Term):
+    """Springs between two faces that lie on each other in the undeformed bodies.
+
+    The energy ``1/2 int k |d_a - d_b|^2 dS`` over facets of the undeformed body a pulls each of
+    their points to the point of body b that was at the same place. Meshes and backgrounds need
+    not match. A traction t opens a gap of ``t / k``; where that is to be small beside the strain of
+    domains of size h, take k some hundred times a modulus over h. Where particles of either are
+    deleted (``outside="delete"``) nothing is tied any more.
+
+    Give it to ``QuasiStaticProblem([a, b], ..., terms=[tie])``.
+
+    Args:
+        a: The body whose facets are integrated over; best the one with the finer mesh.
+        b: The other body.
+        facet_tags: Tags of the facets of a.
+        tag: The tag of those that are tied.
+        stiffness: k, force per undeformed area and gap.
+        quadrature_degree: Degree of the rule on each facet; ``None`` is twice that of the shape
+            functions of a, which is exact where the nodes of both faces match.
+        axisymmetric: Whether ``x[0]`` is a radius, and the face that of a body of revolution.
+
+    Raises:
+        MPMError: Bodies that do not hang together (methods with domains apart), curved facets, or
+            what makes no sense.
+    """
+
+    def __init__(
+        self,
+        a: Particles,
+        b: Particles,
+        facet_tags: mesh.MeshTags,
+        tag: int,
+        stiffness: float,
+        quadrature_degree: int | None = None,
+        axisymmetric: bool = False,
+    ) -> None:
+        for body in (a, b):
+            if not isinstance(body, Particles) or not body.shares_nodes:
+                raise MPMError("A Tie needs two bodies of mpm.Particles with method='cpdi2'.")
+        if a is b:
+            raise MPMError("A Tie needs two bodies, not the same one twice.")
+        known = isinstance(stiffness, float | int | np.number) and not isinstance(stiffness, bool)
+        if not known or not 0.0 < stiffness < np.inf:
+            raise MPMError(f"The stiffness of a Tie must be a positive number, not {stiffness!r}.")
+        if _compat.geometry_degree(a.mesh) > 1:
+            raise MPMError("A Tie needs straight facets; exchange the two bodies.")
+        tags = known_tags(a, facet_tags, "A Tie")
+        if not is_tag(tag) or tag not in tags:
+            raise MPMError(f"There is no facet tag {tag!r}; there are {sorted(tags)}.")
+        known_tags(a, facet_tags, "A Tie", [tag])
+        super().__init__([a, b])
+        self.stiffness = float(stiffness)
+        self._tags, self._tag = facet_tags, tag
+        degree = 2 * a.W.ufl_element().degree if quadrature_degree is None else quadrature_degree
+        self._degree, self.axisymmetric = degree, axisymmetric
+        self._spaces: tuple[fem.FunctionSpace, ...] = ()
+        self._held: NDArray[np.bool_] = np.zeros(0, dtype=bool)
+        self._settle()
+
+    @property
+    def symmetric(self) -> bool:
+        """See :attr:`Term.symmetric`."""
+        return True
+
+    def require_movable(self, consequence: str) -> None:
+        """Raise nothing: the tie finds its points on other ranks."""
+
+    def begin(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.begin`: look for the points again where bodies have other meshes."""
+        self._settle()
+        return ()
+
+    def _settle(self) -> None:
+        """Find the points of the face in both bodies, unless that is done (collective)."""
+        a, b = self.bodies
+        spaces = tuple(body.W for body in self.bodies)
+        if self._spaces and all(a is b for a, b in zip(spaces, self._spaces, strict=True)):
+            held = self._present()
+            if a.mesh.comm.allreduce(not np.array_equal(held, self._held), MPI.LOR):
+                self._held = held
+                self._multiply()
+            return
+        points, weights = self._points(a, a.carry(self._tags))
+        self._at = [_interpolation(W, points, a.mesh.comm) for W in spaces]
+        with agree(a.mesh.comm):
+            for body, (_, found) in zip((a, b), self._at, strict=True):
+                if not found.all():
+                    where = tuple(float(f"{x:.6g}") for x in points[~found][0])
+                    count = "no" if body is a else "only one"
+                    raise MPMError(
+                        f"The point {where} of a Tie is in {count} body; "
+                        "faces that are tied lie on each other in the undeformed bodies."
+                    )
+        self._face = np.repeat(weights, points.shape[1])
+        self._held = self._present()
+        self._multiply()
+        self._spaces = spaces
+
+    def _present(self) -> NDArray[np.bool_]:
+        """Return at which rows of the points both bodies are still there (collective)."""
+        held = np.ones(len(self._face), dtype=bool)
+        for body, (rows, _) in zip(self.bodies, self._at, strict=True):
+            if body.deletion is None:
+                continue
+            nodes, points = rows.createVecs()
+            dim = body.mesh.geometry.dim
+            nodes.array_w[:] = np.repeat(body.deletion.dead, dim)[: nodes.getLocalSize()]
+            rows.mult(nodes, points)
+            held &= np.abs(points.array_r) < GONE
+        return held
+
+    def _multiply(self) -> None:
+        """Make the tangents for a stiffness of one (collective)."""
+        self._weights = np.where(self._held, self._face, 0.0)
+        diagonal = self._at[0][0].createVecLeft()
+        diagonal.array_w[:] = self._weights
+        self._blocks: dict[tuple[int, int], PETSc.Mat] = {}
+        for j, (right, _) in enumerate(self._at):
+            scaled = right.copy()
+            scaled.diagonalScale(L=diagonal)
+            for i, (left, _) in enumerate(self._at):
+                block = left.transposeMatMult(scaled)
+                if i != j:
+                    block.scale(-1.0)
+                self._blocks[i, j] = block
+        self._tangents = {pair: block.copy() for pair, block in self._blocks.items()}
+
+    def _points(
+        self, body: Particles, tags: mesh.MeshTags
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return points and weights of this rank's own facets."""
+        domain, dim = body.mesh, body.mesh.topology.dim - 1
+        own = tags.find(self._tag)
+        own = own[own < domain.topology.index_map(dim).size_local]
+        domain.topology.create_connectivity(dim, dim + 1)
+        kinds = (basix.CellType.interval, basix.CellType.triangle)
+        cell = domain.basix_cell()
+        kind = kinds[dim - 1]
+        if cell == basix.CellType.hexahedron:
+            kind = basix.CellType.quadrilateral
+        reference, weights = map(np.asarray, basix.make_quadrature(kind, self._degree))
+        element = basix.create_element(basix.ElementFamily.P, kind, 1)
+        shapes = np.asarray(element.tabulate(1, reference), dtype=np.float64)
+        corners = domain.geometry.x[_compat.entity_nodes(domain, dim, own)][:, :, : dim + 1]
+        points = np.einsum("qk,nki->nqi", shapes[0, :, :, 0], corners)
+        along = np.einsum("jqk,nki->nqij", shapes[1:, :, :, 0], corners)
+        area = np.sqrt(np.linalg.det(along.swapaxes(2, 3) @ along))
+        if self.axisymmetric:
+            area = 2.0 * np.pi * points[:, :, 0] * area
+        return points.reshape(-1, dim + 1), (weights * area).ravel()
+
+    def tractions(self) -> NDArray[np.float64]:
+        """Return what the springs pull b with, at this rank's points, shape ``(n, gdim)``."""
+        gaps = []
+        for body, (rows, _) in zip(self.bodies, self._at, strict=True):
+            d, gap = rows.createVecs()
+            d.array_w[:] = body.displacement.x.array[: d.getLocalSize()]
+            rows.mult(d, gap)
+            gaps.append(gap.array_r)
+        gdim = self.bodies[0].mesh.geometry.dim
+        pull = np.where(self._held, self.stiffness * (gaps[0] - gaps[1]), 0.0)
+        return pull.reshape(-1, gdim)
+
+    def residuals(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.residuals`."""
+        pull = self._weights * self.tractions().ravel()
+        forces = []
+        for sign, (rows, _) in zip((1.0, -1.0), self._at, strict=True):
+            force, at_points = rows.createVecs()
+            at_points.array_w[:] = sign * pull
+            rows.multTranspose(at_points, force)
+            forces.append(force)
+        return forces
+
+    def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
+        """See :meth:`Term.tangents`."""
+        for pair, block in self._blocks.items():
+            block.copy(self._tangents[pair], structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+            self._tangents[pair].scale(self.stiffness)
+        return self._tangents
+
+
+def _interpolation(
+    W: fem.FunctionSpace, points: NDArray[np.float64], comm: Any
+) -> tuple[PETSc.Mat, NDArray[np.bool_]]:
+    """Return what gives values at points from dofs of W, and which points are in its mesh.
+
+    Args:
+        W: Space of a body (collective).
+        points: This rank's points, shape ``(n, gdim)``.
+        comm: Communicator of the points.
+    """
+    basis = BackgroundBasis(W).at(points)
+    n, k = basis.nodes.shape
+    gdim = points.shape[1]
+    component = np.arange(gdim)
+    columns = basis.nodes[:, None, :] * gdim + component[:, None]
+    values = np.broadcast_to(basis.values[:, None, :], columns.shape)
+    offsets = k * np.arange(n * gdim + 1)
+    size = W.dofmap.index_map
+    csr = (
+        offsets.astype(PETSc.IntType),
+        columns.ravel().astype(PETSc.IntType),
+        np.ascontiguousarray(values).ravel(),
+    )
+    sizes = ((n * gdim, None), (size.size_local * gdim, size.size_global * gdim))
+    return PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm), basis.found

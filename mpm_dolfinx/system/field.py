@@ -1,0 +1,351 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""A background space with the bodies that it moves: its unknowns, conditions and stabilisation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from .. import _compat
+from ..assembly.background_forms import BackgroundForms
+from ..assembly.fused import Restriction
+from ..parallel.magnitudes import joint_norm, norm
+from ..particles.particles import Particles
+from ..stabilisation.cure import Cure
+from ..transfer.touched import TouchedNodes, TransferRows
+from .numbering import FreeDofs
+from .predictor import map_to_background
+
+__all__ = ["Field", "Motion"]
+
+
+class Motion:
+    """How one body follows its background: ``d = d_n + T u``.
+
+    Args:
+        particles: The body.
+
+    Attributes:
+        particles: As given.
+    """
+
+    def __init__(self, particles: Particles) -> None:
+        self.particles = particles
+
+    def begin(self) -> None:
+        """Take over the present transfer."""
+        self._work = self.particles.T.createVecLeft()
+        self._free_T: PETSc.Mat | None = None
+
+    def free_T(self, prolongation: PETSc.Mat) -> PETSc.Mat:
+        """Return T times what gives u from the unknowns, made once a step (collective)."""
+        if self._free_T is None:
+            self._free_T = self.particles.T.matMult(prolongation)
+        return self._free_T
+
+    def move(self, u: PETSc.Vec) -> None:
+        """Set ``d = d_n + T u``."""
+        self.particles.T.mult(u, self._work)
+        d = self.particles.displacement.x
+        rows = self._work.getLocalSize()
+        self._before = self.particles.converged_displacement[:rows]
+        d.array[:rows] = self._before + self._work.array_r
+        d.scatter_forward()
+
+    def increment(self) -> NDArray[np.float64]:
+        """Return the last change of displacement on this rank's own dofs of W."""
+        rows = self._work.getLocalSize()
+        d = self.particles.displacement.x.array[:rows]
+        return np.asarray(d - self._before)
+
+    def of(self, u: PETSc.Vec) -> PETSc.Vec:
+        """Return ``T u``, in a vector that the next call changes."""
+        self.particles.T.mult(u, self._work)
+        return self._work
+
+    def extent(self) -> float:
+        """Return the norm of the positions of the body's nodes."""
+        rows = self._work.getLocalSize()
+        self._work.array_w[:] = self.particles.node_positions.ravel()[:rows]
+        return norm(self._work)
+
+    def nodal_size(self, force: PETSc.Vec) -> NDArray[np.float64]:
+        """Return the size of ``T f`` at this rank's nodes."""
+        gdim = self.particles.mesh.geometry.dim
+        return np.asarray(np.linalg.norm(self.of(force).array_r.reshape(-1, gdim), axis=1))
+
+
+class Field:
+    """One background space with all bodies that it moves. All calls are collective.
+
+    Args:
+        bodies: The bodies on this space.
+        conditions: Dirichlet conditions, of which those on this space count.
+        background: Terms on it.
+        cure: What is done about dofs that the bodies support badly; ``None``: nothing.
+
+    Attributes:
+        V: The space.
+        bodies: As given.
+        motions: How each body follows.
+        moduli: Shear modulus of each body at the first step with a penalty, which is scaled by
+            them; ``None`` before.
+        u: The increment of the last residual, on this rank's own dofs of V.
+        force: The residual on all dofs of V that was evaluated last: at supports, their force.
+        free: The dofs that are unknowns; ``None`` until they are found.
+        dofs: Their local numbers.
+        touched: The nodes of V that bodies touch.
+        prescribes: Whether Dirichlet values change in the step that has begun.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[Particles],
+        conditions: Sequence[fem.DirichletBC] = (),
+        background: BackgroundForms | None = None,
+        cure: Cure | None = None,
+    ) -> None:
+        self.bodies = list(bodies)
+        self.V = V = bodies[0].V
+        self._conditions = conditions
+        self.motions = [Motion(body) for body in bodies]
+        self.moduli: list[float] | None = None
+        self.free: FreeDofs | None = None
+        self._background = background
+        self._cure = Cure() if cure is None else cure
+        self._comm: MPI.Comm = V.mesh.comm
+        self._bs = V.dofmap.index_map_bs
+        self._owned = V.dofmap.index_map.size_local * self._bs
+
+    @property
+    def conditions(self) -> list[fem.DirichletBC]:
+        """The Dirichlet conditions on this space."""
+        return [bc for bc in self._conditions if _compat.is_condition_on(bc, self.V)]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What was found about badly supported dofs, by the names of the statistics."""
+        return self._cure.counts
+
+    def begin(self, change: NDArray[np.float64]) -> None:
+        """Take over the change of the Dirichlet values in a step, on the local dofs of V."""
+        self._change = change[: self._owned]
+        self._imposed = False
+        self.prescribes = bool(self._comm.allreduce(bool(np.any(change)), MPI.LOR))
+
+    # -- Unknowns -------------------------------------------------------------------------
+
+    def find(self) -> FreeDofs:
+        """Find the unknowns: dofs with weight or a background term, and without a condition."""
+        owned = [body.W.dofmap.index_map.size_local for body in self.bodies]
+        self.touched = TouchedNodes(self.V, [body.node_basis for body in self.bodies], owned)
+        supported = np.zeros(self._owned, dtype=bool)
+        if self._background is not None:
+            supported[self._background.support()] = True
+        self._fixed = np.zeros(self._owned, dtype=bool)
+        for bc in self.conditions:
+            self._fixed[_compat.own_dofs(bc, self.V)] = True
+        free = self._cure.unknowns(self.touched, supported | self._fixed)
+        free |= supported & ~self._cure.followers(self._owned)
+        self.dofs = np.flatnonzero(free & ~self._fixed).astype(np.int32)
+        self.free = FreeDofs(self.V, self.dofs, self.touched)
+        self._extension = self._cure.extension(self._fixed)
+        T = self.bodies[0].T
+        self.u, self.force, self._part = (T.createVecRight() for _ in range(3))
+        for motion in self.motions:
+            motion.begin()
+        self._penalty: tuple[PETSc.Mat, PETSc.Mat] | None = None
+        self._product: PETSc.Mat | None = None
+        return self.free
+
+    def forget(self) -> None:
+        """Forget the unknowns."""
+        self.free = None
+
+    def number(self, part: slice, numbers: NDArray[np.int64], sizes: tuple[int, int]) -> None:
+        """Take over the numbers of the unknowns among those of all fields.
+
+        Args:
+            part: Where they are among this rank's.
+            numbers: Number of the unknown of each free dof.
+            sizes: Number of all fields' unknowns of this rank and of all ranks.
+        """
+        self._part_of_x, self._numbers, self._sizes = part, numbers, sizes
+        self._prolongation: PETSc.Mat | None = None
+
+    @property
+    def extends(self) -> bool:
+        """Whether dofs follow others."""
+        return self._cure.extends
+
+    def restriction(self, rows: Sequence[TransferRows]) -> tuple[Restriction, tuple[int, int]]:
+        """Return where a tangent goes that is reduced by rows of T, and its size.
+
+        These are the unknowns or, where dofs follow others, all dofs of V.
+        """
+        if self.extends:
+            first, last = self.u.getOwnershipRange()
+            every = np.arange(first, last, dtype=np.int32)
+            return Restriction(self.touched, rows, every, slice(0, last - first)), self.u.getSizes()
+        numbers = np.full(self._owned, -1, dtype=np.int32)
+        numbers[self.dofs] = self._numbers
+        return Restriction(self.touched, rows, numbers, self._part_of_x), self._sizes
+
+    @property
+    def prolongation(self) -> PETSc.Mat:
+        """What gives the increment of all dofs of V, zero at the fixed ones, from all unknowns."""
+        if self._prolongation is None:
+            offsets = np.zeros(self._owned + 1, dtype=PETSc.IntType)
+            offsets[1 + self.dofs] = 1
+            csr = (
+                np.cumsum(offsets, dtype=PETSc.IntType),
+                self._numbers.astype(PETSc.IntType),
+                np.ones(len(self.dofs)),
+            )
+            sizes = (self.u.getSizes(), self._sizes)
+            matrix = PETSc.Mat().createAIJ(sizes, csr=csr, comm=self._comm)
+            if self._extension is not None:
+                matrix = self._extension.matMult(matrix)
+            self._prolongation = matrix
+        return self._prolongation
+
+    # -- Vectors --------------------------------------------------------------------------
+
+    def spread(self, x: PETSc.Vec) -> None:
+        """Set increment and bodies to what the unknowns x and the imposed values give."""
+        values = self._lifts() if self._imposed else np.zeros(self._owned)
+        self._set(self.u, x, values)
+        first, *others = [body.increment.x for body in self.bodies]
+        first.array[: self._owned] = self.u.array_r
+        first.scatter_forward()
+        for other in others:
+            other.array[:] = first.array
+        for motion in self.motions:
+            motion.move(self.u)
+
+    def _set(self, u: PETSc.Vec, x: PETSc.Vec, values: NDArray[np.float64]) -> None:
+        """Set u to the unknowns x, and to values at other dofs; dofs that follow others do."""
+        assert self.free is not None
+        values[self.dofs] = self.free.spread(x.array_r[self._part_of_x])
+        u.array_w[:] = values
+        self._extend(u)
+
+    def _extend(self, u: PETSc.Vec) -> None:
+        """Give dofs that follow others their values."""
+        if self._extension is not None:
+            self._extension.mult(u, self._part)
+            self._part.copy(u)
+
+    def gather_extended(self, force: PETSc.Vec) -> None:
+        """Move what dofs feel that follow others to those that they follow."""
+        if self._extension is not None:
+            self._extension.multTranspose(force, self._part)
+            self._part.copy(force)
+
+    def collect(self, force: PETSc.Vec, F: PETSc.Vec) -> None:
+        """Set the unknowns' part of F to a force on all dofs of V."""
+        assert self.free is not None
+        F.array_w[self._part_of_x] = self.free.collect(force.array_r[self.dofs])
+
+    def residual_at_unknowns(self) -> PETSc.Vec | None:
+        """Return the last residual at the free dofs, zero elsewhere, if these are known."""
+        if self.free is None:
+            return None
+        values = self.force.duplicate()
+        values.set(0.0)
+        values.array_w[self.dofs] = self.force.array_r[self.dofs]
+        return values
+
+    def impose(self) -> bool:
+        """Impose the step's Dirichlet values from now on; return whether there are any."""
+        self._imposed = True
+        return bool(self._comm.allreduce(bool(np.any(self._lifts())), MPI.LOR))
+
+    def _lifts(self) -> NDArray[np.float64]:
+        return np.where(self._fixed, self._change, 0.0)
+
+    def lift(self) -> PETSc.Vec:
+        """Return the increment that the step's Dirichlet values are."""
+        self.u.array_w[:] = self._lifts()
+        self._extend(self.u)
+        return self.u
+
+    def on_background(self, x: PETSc.Vec) -> PETSc.Vec:
+        """Return the increment of V with unknowns x, and zero at the fixed dofs."""
+        u = self.u.duplicate()
+        self._set(u, x, np.zeros(self._owned))
+        return u
+
+    def on_bodies(self, x: PETSc.Vec) -> list[float]:
+        """Return the size of the displacement that the unknowns x cause on each body."""
+        u = self.on_background(x)
+        return [norm(motion.of(u)) for motion in self.motions]
+
+    def predict(self, increments: list[NDArray[np.float64]], x: PETSc.Vec) -> None:
+        """Set the unknowns' part of x to what increments of the bodies' nodes are on V."""
+        assert self.free is not None
+        u = map_to_background([body.T for body in self.bodies], increments)
+        self._cure.stand_in(u)
+        x.array_w[self._part_of_x] = self.free.collect(u[self.dofs])
+
+    def reactions(self) -> float:
+        """Return the norm of the last residual at Dirichlet conditions."""
+        forces = np.where(self._fixed, self.force.array_r, 0.0)
+        return joint_norm(forces, self._comm)
+
+    def resultant(self) -> float:
+        """Return the size of the sum of the last residual over the free dofs."""
+        free = self.force.array_r[self.dofs]
+        sums = np.bincount(self.dofs % self._bs, weights=free, minlength=self._bs)
+        return joint_norm(np.asarray(self._comm.allreduce(sums)))
+
+    # -- What acts on the background itself ---------------------------------------------------
+
+    def add_residual(self, stiffness: Callable[[], list[float]]) -> None:
+        """Add what acts on the background to the force of the last increment.
+
+        Args:
+            stiffness: Returns the shear modulus of each body.
+        """
+        if self._background is not None:
+            self.force.axpy(1.0, self._background.assemble_residual())
+        if self._cure.penalises and self._sizes[1] > 0 and norm(self.u) > 0.0:
+            self._matrices(stiffness)[0].multAdd(self.u, self.force, self.force)
+
+    def tangents(self, stiffness: Callable[[], list[float]]) -> list[PETSc.Mat]:
+        """Return the tangents of what acts on the background, in the unknowns."""
+        found = []
+        if self._background is not None:
+            whole = self._background.assemble_tangent()
+            self._product = whole.ptap(self.prolongation, result=self._product)
+            found.append(self._product)
+        if self._cure.penalises:
+            found.append(self._matrices(stiffness)[1])
+        return found
+
+    def add_product(
+        self, u: PETSc.Vec, force: PETSc.Vec, stiffness: Callable[[], list[float]]
+    ) -> None:
+        """Add the product of these tangents on all dofs of V with an increment."""
+        if self._background is not None:
+            self._background.assemble_tangent().multAdd(u, force, force)
+        if self._cure.penalises:
+            self._matrices(stiffness)[0].multAdd(u, force, force)
+
+    def _matrices(self, stiffness: Callable[[], list[float]]) -> tuple[PETSc.Mat, PETSc.Mat]:
+        """Return the step's penalty on all dofs of V and in the unknowns."""
+        if self._penalty is None:
+            if self.moduli is None:
+                self.moduli = stiffness()
+            matrix = self._cure.penalty(self.moduli)
+            assert matrix is not None
+            self._penalty = matrix, matrix.ptap(self.prolongation)
+        return self._penalty

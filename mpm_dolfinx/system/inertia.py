@@ -1,0 +1,550 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Inertia of bodies: velocities at their nodes, and the balance of momentum over a step.
+
+Velocities live on W, where a body has its displacement; no acceleration is kept. A step can follow
+what is in the range of T: let P be the projector on it that is orthogonal in M, the consistent
+mass. With ``w = T u``, ``"midpoint"`` solves
+
+    T^T [ (2/dt) M (w/dt - v_n) + (f_n + f_1)/2 ] = 0,    v_1 = 2 w/dt - P v_n
+
+or ``- v_n`` (reflect), f being the forces of all other terms at the step's ends; ``"euler"`` solves
+``T^T [ M (w/dt - v_n)/dt + f_1 ] = 0`` and has ``v_1 = w/dt``. Whatever T is, with L the loss
+
+    1/2 |v_1|^2 - 1/2 |v_n|^2 = - f . w - L,    L = 1/2 |(I - P) v_n|^2,  0  or  1/2 |v_1 - v_n|^2,
+
+f being the mean of the ends or that of the last end, norms those of M.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from ..errors import ConvergenceError, MPMError
+from ..history import Energy
+from ..io.snapshot import Kept, Taken, fill, of_cells
+from ..meshes.remesh import Column
+from ..particles.particles import Particles
+from .term import Motion, Term, Transfer
+
+__all__ = ["OUT_OF_RANGE", "SCHEMES", "Inertia"]
+
+SCHEMES = ("midpoint", "euler")
+OUT_OF_RANGE = ("project", "reflect")
+#: What the residual of a projection falls to, and the most iterations and refinements of it.
+PROJECTED, MOST_ITERATIONS, REFINEMENTS = 1e-13, 300, 6
+#: The same for one that has come to the end of what round-off lets it do.
+AT_ROUND_OFF = 1e-10
+#: Diagonal shift in a projection, relative to the diagonal.
+SHIFT = 1e-13
+#: What is added to it in turn where the factor is at round-off.
+RAISES = (0.0, 1e-12, 1e-11, 1e-10)
+
+type MassMatrix = Callable[[int], PETSc.Mat]
+"""Assembles the consistent mass of a body on its W, by its number."""
+
+
+class Inertia(Term):
+    """The inertia of all bodies of a problem. See the module for the formulas.
+
+    The residual is scaled so that forces at the step's end have the factor 1, as in equilibrium;
+    :attr:`share` of it is the force.
+
+    Args:
+        bodies: The bodies.
+        velocities: At the beginning, on W of each body.
+        scheme: ``"midpoint"`` or ``"euler"``.
+        out_of_range: ``"project"`` or ``"reflect"``; of no meaning to ``"euler"``.
+        energies: Where the account is kept, one entry for each step.
+
+    Attributes:
+        velocities: At the last converged step, on W of each body.
+        dt: Duration of the step.
+        time: Time of the last converged step.
+    """
+
+    from_outside = True
+
+    def __init__(
+        self,
+        bodies: Sequence[Particles],
+        velocities: Sequence[fem.Function],
+        scheme: str,
+        out_of_range: str,
+        energies: list[Energy],
+    ) -> None:
+        if scheme not in SCHEMES:
+            raise MPMError(f"Unknown scheme={scheme!r}; choose one of {', '.join(SCHEMES)}.")
+        if out_of_range not in OUT_OF_RANGE:
+            raise MPMError(
+                f"Unknown out_of_range={out_of_range!r}; choose one of {', '.join(OUT_OF_RANGE)}."
+            )
+        super().__init__(bodies)
+        self.scheme, self.out_of_range = scheme, out_of_range
+        self.velocities = list(velocities)
+        self.dt, self.time = 1.0, 0.0
+        self._end = 1.0
+        self._energies = energies
+        self._kinetic = 0.0
+        self._totals = np.zeros(3)  # internal, external, lost
+        self._forces = [fem.Function(body.W) for body in bodies]
+        self._external = [fem.Function(body.W) for body in bodies]
+        self._others: list[Term] = []
+        self._deleted: list[int] | None = None
+        self._transferred: list[PETSc.Mat] = []
+
+    @property
+    def share(self) -> float:
+        """What of the residual is the force: the mean over the step, with ``"midpoint"``."""
+        return 0.5 if self.scheme == "midpoint" else 1.0
+
+    @property
+    def _factors(self) -> tuple[float, float, float]:
+        """Factors of M w, of M v_n and of the forces at the step's beginning."""
+        if self.scheme == "midpoint":
+            return 4.0 / self.dt**2, 4.0 / self.dt, 1.0
+        return 1.0 / self.dt**2, 1.0 / self.dt, 0.0
+
+    @property
+    def symmetric(self) -> bool:
+        """See :attr:`Term.symmetric`."""
+        return True
+
+    def follow(self, others: Sequence[Term], mass: MassMatrix) -> None:
+        """Take over what else acts on the bodies, and what assembles their mass.
+
+        Args:
+            others: The other terms, on the present meshes.
+            mass: Assembles the mass.
+        """
+        self._others, self._mass = list(others), mass
+        self._deleted = None
+
+    # -- Mass and velocity ----------------------------------------------------------------
+
+    def settle(self) -> None:
+        """Assemble the mass for the present meshes and domains, unless that is done (collective).
+
+        What kinetic energy changes by that is lost, or won.
+        """
+        deleted = [
+            0 if body.deletion is None else body.mesh.comm.allreduce(int(body.deletion.mask.sum()))
+            for body in self.bodies
+        ]
+        if deleted == self._deleted:
+            return
+        self._deleted = deleted
+        self.masses = [self._mass(number) for number in range(len(self.bodies))]
+        for body, M in zip(self.bodies, self.masses, strict=True):
+            _require_mass(body, M)
+        kinetic = self.kinetic()
+        if self._energies:
+            self._totals[2] += self._kinetic - kinetic
+        self._kinetic = kinetic
+
+    def _vectors(self, functions: Sequence[fem.Function]) -> list[PETSc.Vec]:
+        """Return values of Functions on W of each body as vectors."""
+        vectors = []
+        for M, function in zip(self.masses, functions, strict=True):
+            vector = M.createVecLeft()
+            vector.array_w[:] = function.x.array[: vector.getLocalSize()]
+            vectors.append(vector)
+        return vectors
+
+    def _times_mass(self, vectors: Sequence[PETSc.Vec]) -> list[PETSc.Vec]:
+        """Return M times vectors on W of each body."""
+        products = [vector.duplicate() for vector in vectors]
+        for M, vector, product in zip(self.masses, vectors, products, strict=True):
+            M.mult(vector, product)
+        return products
+
+    def kinetic(self) -> float:
+        """Return the kinetic energy at the last converged step (collective)."""
+        self.settle()
+        v = self._vectors(self.velocities)
+        return 0.5 * _dot(v, self._times_mass(v))
+
+    def momentum(self) -> NDArray[np.float64]:
+        """Return the momentum at the last converged step, shape ``(gdim,)`` (collective)."""
+        self.settle()
+        p = self._times_mass(self._vectors(self.velocities))
+        gdim = self.bodies[0].mesh.geometry.dim
+        own = sum(part.array_r.reshape(-1, gdim).sum(axis=0) for part in p)
+        return np.asarray(self.bodies[0].V.mesh.comm.allreduce(own))
+
+    def angular_momentum(self) -> NDArray[np.float64]:
+        """Return the angular momentum about the origin (collective).
+
+        Returns:
+            Shape ``(1,)`` in the plane, about the axis normal to it, or ``(3,)``.
+        """
+        self.settle()
+        gdim = self.bodies[0].mesh.geometry.dim
+        total: NDArray[np.float64] = np.zeros(1 if gdim == 2 else 3)
+        for body, p in zip(
+            self.bodies, self._times_mass(self._vectors(self.velocities)), strict=True
+        ):
+            part = p.array_r.reshape(-1, gdim)
+            x = body.node_positions[: len(part)]
+            if gdim == 2:
+                total += np.sum(x[:, 0] * part[:, 1] - x[:, 1] * part[:, 0])
+            else:
+                total += np.cross(x, part).sum(axis=0)
+        return np.asarray(self.bodies[0].V.mesh.comm.allreduce(total))
+
+    def begin_run(self, time: float) -> None:
+        """Take the forces as they are now for those at the beginning of the next step (collective).
+
+        Loads are those that are set; stress is that of the last converged step.
+
+        Args:
+            time: Time of the last converged step.
+        """
+        self.time = time
+        self.settle()
+        for term in self._others:
+            term.roll_back()
+        self._note_forces()
+        if not self._energies:
+            self._kinetic = self.kinetic()
+            self._energies.append(Energy(time, self._kinetic, 0.0, 0.0, 0.0))
+
+    def _note_forces(self) -> None:
+        """Keep the forces of all other terms, as they are now."""
+        for functions in (self._forces, self._external):
+            for function in functions:
+                function.x.array[:] = 0.0
+        for term in self._others:
+            self._gather(term, term.begin(), self._external)
+            self._gather(term, term.residuals(), self._forces)
+        for function in (*self._forces, *self._external):
+            function.x.scatter_forward()
+
+    def _gather(self, term: Term, vectors: Sequence[PETSc.Vec], to: Sequence[fem.Function]) -> None:
+        for body, vector in zip(term.bodies if vectors else (), vectors, strict=True):
+            target = to[self._number(body)].x.array
+            target[: vector.getLocalSize()] += vector.array_r
+
+    def _number(self, particles: Particles) -> int:
+        return next(i for i, body in enumerate(self.bodies) if body is particles)
+
+    def aim(self, time: float) -> None:
+        """Take a time for the end of the step to try."""
+        self.dt, self._end = time - self.time, time
+
+    # -- A step ---------------------------------------------------------------------------
+
+    def begin(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.begin`."""
+        self.settle()
+        _, b, share = self._factors
+        self._v = self._vectors(self.velocities)
+        self._staying = self._times_mass(self._v)
+        self._sizes = []
+        for force, before in zip(self._staying, self._vectors(self._forces), strict=True):
+            force.scale(-b)
+            size = force.copy()
+            size.abs()
+            force.axpy(share, before)
+            before.abs()
+            size.axpy(share, before)
+            self._sizes.append(size)
+        return self._staying
+
+    def start(self, transfer: Transfer, prescribed: Motion) -> PETSc.Vec | None:
+        """See :meth:`Term.start`: the M-projection of ``dt v_n``, where that is needed at all.
+
+        From zero the solver's proximal term takes energy, if any; from elsewhere it may give some.
+        Where nothing is projected, and nothing lost, steps therefore start from zero.
+        """
+        Ts = [transfer(body) for body in self.bodies]
+        if not all(T is known for T, known in zip(Ts, self._transferred, strict=False)) or not (
+            self._transferred
+        ):
+            self._transferred = Ts
+            self._reduce(Ts)
+        if self.scheme != "midpoint" or self.out_of_range != "project":
+            return None
+        if any(prescribed(body) is not None for body in self.bodies):
+            raise MPMError(
+                "Dirichlet values that change in time do not go with out_of_range='project', which "
+                "does not know their velocity; move a support on the body "
+                "(mpm.boundary.fixed(value=)), or use 'reflect'"
+            )
+        right = self._A.createVecLeft()
+        right.set(0.0)
+        for T, force in zip(Ts, self._times_mass(self._v), strict=True):
+            T.multTransposeAdd(force, right, right)
+        y = right.duplicate()
+        if y.getSize() > 0:
+            self._solve(right, y)
+        self._projected = [v.duplicate() for v in self._v]
+        for T, part in zip(Ts, self._projected, strict=True):
+            T.mult(y, part)
+        y.scale(self.dt)
+        return y
+
+    def _reduce(self, Ts: Sequence[PETSc.Mat]) -> None:
+        """Reduce the mass by T, and prepare to solve with it."""
+        parts = [M.ptap(T) for M, T in zip(self.masses, Ts, strict=True)]
+        self._A = parts[0]
+        for part in parts[1:]:
+            self._A.axpy(1.0, part, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        self._scaled = self._A.copy()
+        self._unit = scale = self._A.getDiagonal()
+        values = scale.array_w
+        values[:] = np.where(values > 0.0, values, 1.0) ** -0.5
+        shifted = self._A.copy()
+        shifted.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
+        shifted.diagonalScale(scale, scale)
+        diagonal = shifted.getDiagonal()
+        values = diagonal.array_w
+        values[:] = np.where(values > 0.0, SHIFT, 1.0)
+        shifted.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
+        self._shifted = shifted
+        self._factor: PETSc.KSP | None = None
+        self._iterates = max(body.V.ufl_element().degree for body in self.bodies) == 1
+
+    def _solve(self, right: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Solve for the unknowns of a projection (collective).
+
+        Combinations of unknowns that hardly move the bodies' nodes are kept small by a shift, as
+        in Newton's method, for which this is the start.
+
+        Raises:
+            ConvergenceError: That failed.
+        """
+        scaled = right.duplicate()
+        scaled.pointwiseMult(right, self._unit)
+        if scaled.norm() > 0.0:
+            self._solve_scaled(scaled, y)
+            y.pointwiseMult(y, self._unit)
+
+    def _solve_scaled(self, right: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Solve with the matrix of unit diagonal: by iterations, or where they fail by a factor."""
+        size = right.norm()
+        if self._iterates:
+            ksp = _solver(self._shifted, "cg", "none")
+            ksp.setTolerances(rtol=PROJECTED, atol=0.0, max_it=MOST_ITERATIONS)
+            ksp.solve(right, y)
+            if ksp.getConvergedReason() > 0:
+                return
+            self._iterates = False
+        for more in RAISES:
+            if self._factor is None:
+                self._shifted.shift(more)
+                self._factor = _solver(self._shifted, "preonly", "cholesky")
+                self._factor.getPC().setFactorSolverType("mumps")
+            y.set(0.0)
+            rest, part = right.copy(), y.duplicate()
+            for _ in range(REFINEMENTS):
+                self._factor.solve(rest, part)
+                y.axpy(1.0, part)
+                self._shifted.mult(y, rest)
+                rest.aypx(-1.0, right)
+                if rest.norm() <= PROJECTED * size:
+                    return
+            if rest.norm() <= AT_ROUND_OFF * size:
+                return
+            self._factor = None
+        raise ConvergenceError("The projection of the velocities on the range of T failed")
+
+    def _increments(self) -> list[PETSc.Vec]:
+        """Return the present change of displacement, on W of each body."""
+        found = []
+        for body, M in zip(self.bodies, self.masses, strict=True):
+            w = M.createVecLeft()
+            own = slice(0, w.getLocalSize())
+            w.array_w[:] = body.displacement.x.array[own] - body.converged_displacement[own]
+            found.append(w)
+        return found
+
+    def residuals(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.residuals`."""
+        self._w = self._increments()
+        forces = self._times_mass(self._w)
+        a, _, _ = self._factors
+        for force, staying in zip(forces, self._staying, strict=True):
+            force.scale(a)
+            force.axpy(1.0, staying)
+        return forces
+
+    def absolute_contributions(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.absolute_contributions`."""
+        forces = self._times_mass(self._w)
+        for force, size in zip(forces, self._sizes, strict=True):
+            force.scale(self._factors[0])
+            force.abs()
+            force.axpy(1.0, size)
+        return forces
+
+    def reduced_tangents(self, transfer: Transfer) -> Sequence[PETSc.Mat]:
+        """See :meth:`Term.reduced_tangents`."""
+        self._A.copy(self._scaled, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        self._scaled.scale(self._factors[0])
+        return [self._scaled]
+
+    def reduced_product(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.reduced_product`."""
+        return self.stiffness_force(motions)
+
+    def stiffness_force(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.stiffness_force`."""
+        forces = self._times_mass(motions)
+        for force in forces:
+            force.scale(self._factors[0])
+        return forces
+
+    def commit(self) -> None:
+        """See :meth:`Term.commit`: take the new velocities, forces and energies."""
+        if self.scheme == "euler":
+            taken = [v.duplicate() for v in self._v]
+            factor = 1.0
+            for v in taken:
+                v.set(0.0)
+        else:
+            taken = self._projected if self.out_of_range == "project" else self._v
+            factor = 2.0
+        lost = [v.copy() for v in self._v]
+        new = [w.copy() for w in self._w]
+        for v, before, out in zip(new, taken, lost, strict=True):
+            v.scale(factor / self.dt)
+            v.axpy(-1.0, before)
+            out.axpy(-1.0, v if self.scheme == "euler" else before)
+        self._totals[2] += 0.5 * _dot(lost, self._times_mass(lost))
+        kinetic = 0.5 * _dot(new, self._times_mass(new))
+        parts = [self._forces, self._external]
+        before = [self._vectors(functions) for functions in parts]
+        self._note_forces()
+        begin, end = (0.5, 0.5) if self.scheme == "midpoint" else (0.0, 1.0)
+        works = [
+            begin * _dot(self._w, old) + end * _dot(self._w, self._vectors(functions))
+            for old, functions in zip(before, parts, strict=True)
+        ]
+        self._totals[:2] += works[0] - works[1], -works[1]
+        for function, v in zip(self.velocities, new, strict=True):
+            function.x.array[: v.getLocalSize()] = v.array_r
+            function.x.scatter_forward()
+        self.time, self._kinetic = self._end, kinetic
+        self._transferred = []
+        self.settle()
+        self._energies.append(Energy(self.time, self._kinetic, *map(float, self._totals)))
+
+    # -- What goes with the problem -------------------------------------------------------
+
+    def kept(self) -> Sequence[Kept]:
+        """See :meth:`Term.kept`."""
+        return [_Velocities(self)]
+
+    def require_movable(self, consequence: str) -> None:
+        """Raise nothing: velocities move with their bodies."""
+
+    def require_remeshable(self, consequence: str) -> None:
+        """Raise nothing: velocities are those of the same nodes."""
+
+    def numbers(self) -> dict[str, Any]:
+        """Return scheme, time and account, for a checkpoint."""
+        return {
+            "scheme": [self.scheme, self.out_of_range],
+            "time": self.time,
+            "energies": [list(vars(energy).values()) for energy in self._energies],
+            "totals": [*self._totals.tolist(), self._kinetic],
+        }
+
+    def columns(self, body: int) -> dict[str, Column]:
+        """Return velocity and forces at the nodes of a body."""
+        named = {
+            "velocity": self.velocities,
+            "force": self._forces,
+            "external": self._external,
+        }
+        return {name: Column(of_cells(f[body]), "nodes") for name, f in named.items()}
+
+    def take(self, taken: Taken) -> None:
+        """Take over what :meth:`numbers` and :meth:`columns` returned (collective)."""
+        for number, body in enumerate(self.bodies):
+            columns = taken.columns[number]
+            for functions, name in (
+                (self.velocities, "velocity"),
+                (self._forces, "force"),
+                (self._external, "external"),
+            ):
+                if functions[number].function_space is not body.W:
+                    functions[number] = fem.Function(body.W, name=functions[number].name)
+                fill(functions[number], columns[name])
+        self.time = taken.numbers["time"]
+        self._energies[:] = [Energy(*entries) for entries in taken.numbers["energies"]]
+        *self._totals[:], self._kinetic = taken.numbers["totals"]
+        self._transferred = []
+
+
+class _Velocities(Kept):
+    """Velocities, the forces that were there with them, and the account of energies.
+
+    Args:
+        inertia: Has them.
+    """
+
+    key = "inertia"
+
+    def __init__(self, inertia: Inertia) -> None:
+        self._inertia = inertia
+
+    def numbers(self) -> dict[str, Any]:
+        """See :class:`Kept`."""
+        return self._inertia.numbers()
+
+    def columns(self, body: int | None) -> dict[str, Column]:
+        """See :class:`Kept`."""
+        return {} if body is None else self._inertia.columns(body)
+
+    def require(self, source: str, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        if "scheme" not in taken.numbers:
+            raise MPMError(f"{source} holds no velocities; it is not that of a DynamicProblem.")
+        mine, its = self._inertia.numbers()["scheme"], taken.numbers["scheme"]
+        if list(its) != mine:
+            raise MPMError(
+                f"{source} was made with scheme={its[0]!r}, out_of_range={its[1]!r}, and this "
+                f"problem with {mine[0]!r}, {mine[1]!r}."
+            )
+        super().require(source, taken)
+
+    def restore(self, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        self._inertia.take(taken)
+
+
+def _solver(A: PETSc.Mat, kind: str, preconditioner: str) -> PETSc.KSP:
+    """Return a solver with a matrix (collective)."""
+    ksp = PETSc.KSP().create(A.comm)
+    ksp.setType(kind)
+    ksp.setOperators(A)
+    ksp.getPC().setType(preconditioner)
+    return ksp
+
+
+def _dot(some: Sequence[PETSc.Vec], others: Sequence[PETSc.Vec]) -> float:
+    """Return the scalar product of vectors on W of all bodies (collective)."""
+    return float(sum(a.dot(b) for a, b in zip(some, others, strict=True)))
+
+
+def _require_mass(body: Particles, M: PETSc.Mat) -> None:
+    """Raise an error unless all nodes of domains that are present have mass (collective)."""
+    gdim = body.mesh.geometry.dim
+    light = M.getDiagonal().array_r.reshape(-1, gdim).min(axis=1) <= 0.0
+    if body.deletion is not None:
+        light &= ~body.deletion.dead[: len(light)]
+    if body.mesh.comm.allreduce(bool(light.any())):
+        raise MPMError(
+            "A DynamicProblem needs a positive density at all nodes; a body without mass belongs "
+            "into a QuasiStaticProblem."
+        )

@@ -1,0 +1,551 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The reduced system of a step: residual and tangent in the free dofs of the backgrounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..assembly.body_forms import BodyForms
+from ..assembly.fused import FusedTangent
+from ..assembly.petsc import MatrixSum
+from ..errors import DomainDistortionError, MPMError, agree, agreed, as_ours
+from ..history import Statistics
+from ..parallel.balance import imbalance
+from ..parallel.interruption import Interrupted, note, noted
+from ..parallel.magnitudes import joint_norm, norm
+from ..particles.particles import Particles
+from ..transfer.touched import TransferRows
+from .field import Field, Motion
+from .numbering import Numbering
+from .predictor import Predictor
+from .term import Term
+
+__all__ = ["ReducedSystem"]
+
+#: Counters of which the largest of all steps is kept.
+LARGEST = ("dependent_dofs",)
+
+type Tangents = Mapping[tuple[int, int], PETSc.Mat]
+
+
+class ReducedSystem:
+    """``sum_b T_b^T r_b(d_n + T u) = 0`` in the unknowns of all fields, as the solver sees it.
+
+    Args:
+        bodies: All bodies, in the problem's order.
+        fields: The background spaces that move them.
+        terms: What acts on them.
+        statistics: Where to count.
+        predictor: Says what increment to expect; ``None`` for none.
+
+    Attributes:
+        fields: As given.
+        fused: The tangents that the compiled loops reduce: one of all fields together, and one of
+            each field in which dofs follow others.
+        predictor: As given.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[Particles],
+        fields: Sequence[Field],
+        terms: Sequence[Term],
+        statistics: Statistics,
+        predictor: Predictor | None = None,
+    ) -> None:
+        self.fields = list(fields)
+        self.predictor = predictor
+        self._terms = list(terms)
+        self._statistics = statistics
+        self._comm: MPI.Comm = self.fields[0].V.mesh.comm
+        motions = [(field, motion) for field in fields for motion in field.motions]
+        self._places = [
+            next(place for place in motions if place[1].particles is body) for body in bodies
+        ]
+        self._numbering: Numbering | None = None
+        self._start: PETSc.Vec | None = None
+        groups = [[field for field in fields if not field.extends]]
+        groups += [[field] for field in fields if field.extends]
+        self._groups = [
+            (group, pairs)
+            for group in groups
+            if any(pairs := [self._fused_on(field) for field in group])
+        ]
+        self.fused = [FusedTangent(self._comm, pairs, statistics) for _, pairs in self._groups]
+
+    def _fused_on(self, field: Field) -> list[tuple[Particles, BodyForms]]:
+        """Return the forms on bodies of a field that the compiled loops reduce."""
+        every = [pair for term in self._terms for pair in term.fused]
+        return [pair for pair in every if any(pair[0] is body for body in field.bodies)]
+
+    def _place(self, particles: Particles) -> tuple[Field, Motion]:
+        """Return the field that moves a body, and how."""
+        return next(place for place in self._places if place[1].particles is particles)
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Number of unknowns of this rank and of all ranks."""
+        assert self._numbering is not None
+        return self._numbering.sizes
+
+    @property
+    def forces(self) -> list[PETSc.Vec]:
+        """The residual on all dofs of each V that was evaluated last: at supports, their force."""
+        return [field.force for field in self.fields]
+
+    @property
+    def follows_load(self) -> bool:
+        """Whether what the load factor does depends on the displacement."""
+        return any(term.follows_load for term in self._terms)
+
+    @property
+    def prescribes(self) -> bool:
+        """Whether Dirichlet values change in the step that has begun."""
+        return any(field.prescribes for field in self.fields)
+
+    @property
+    def moduli(self) -> list[float | None] | None:
+        """Shear modulus of each body at the first step with a ghost penalty; ``None`` before."""
+        found: list[float | None] = []
+        for field, motion in self._places:
+            number = field.motions.index(motion)
+            found.append(None if field.moduli is None else field.moduli[number])
+        return None if all(modulus is None for modulus in found) else found
+
+    @moduli.setter
+    def moduli(self, values: Sequence[float | None] | None) -> None:
+        every = [None] * len(self._places) if values is None else values
+        for field in self.fields:
+            own = [
+                value
+                for value, (its, _) in zip(every, self._places, strict=True)
+                if its is field and value is not None
+            ]
+            field.moduli = own or None
+
+    # -- A step ---------------------------------------------------------------------------
+
+    def begin(self, changes: Sequence[NDArray[np.float64]], size: float) -> None:
+        """Prepare a step, or another try of the same.
+
+        Args:
+            changes: Change of the Dirichlet values, on the local dofs of V, for each field.
+            size: Size of the step, in load factor or parameter of the path.
+
+        Raises:
+            ParticleOutsideError: Where the last step left a domain outside the background.
+        """
+        for field, change in zip(self.fields, changes, strict=True):
+            field.begin(change)
+        self._size = size
+        with self._statistics.phase("locate"):
+            for _, motion in self._places:
+                motion.particles.locate()
+        if self._numbering is None:
+            with self._statistics.phase("transfer"):
+                self._find_unknowns()
+        with self._statistics.phase("assemble"):
+            self._set_forces()
+            for term in self._terms:
+                self._add(term, term.begin())
+            self._external = [norm(field.force) for field in self.fields]
+            starts = [term.start(self._free_T, self._prescribed) for term in self._terms]
+            self._start = next((x for x in starts if x is not None), None)
+
+    def _prescribed(self, particles: Particles) -> PETSc.Vec | None:
+        """Return how the step's Dirichlet values move a body, ``None``: not at all."""
+        field, motion = self._place(particles)
+        return motion.of(field.lift()).copy() if field.prescribes else None
+
+    def end(self) -> None:
+        """Take note of the increments; forget the unknowns, since the bodies have moved."""
+        self.forget()
+        if self.predictor is not None:
+            increments = [motion.increment() for _, motion in self._places]
+            self.predictor.record(self._size, increments)
+
+    def forget(self) -> None:
+        """Forget the unknowns."""
+        self._numbering = None
+        for field in self.fields:
+            field.forget()
+
+    def commit(self) -> None:
+        """Make the last evaluation the converged one: of all terms, or where one fails of none."""
+        done: list[Callable[[], None]] = []
+        try:
+            for term in self._terms:
+                undo = None
+                with agree(self._comm, "commit()"):
+                    undo = term.commit()
+                if undo is not None:
+                    done.append(undo)
+        except BaseException:
+            for undo in reversed(done):
+                undo()
+            raise
+
+    def roll_back(self) -> None:
+        """Return to the last converged evaluation."""
+        for term in self._terms:
+            term.roll_back()
+
+    def _find_unknowns(self) -> None:
+        free = [field.find() for field in self.fields]
+        numbering = self._numbering = Numbering(self._comm, free)
+        for field, part, numbers in zip(
+            self.fields, numbering.parts, numbering.numbers, strict=True
+        ):
+            field.number(part, numbers, numbering.sizes)
+        self._sum = MatrixSum()
+        self._products: dict[tuple[int, int, int], tuple[PETSc.Mat | None, ...]] = {}
+        self._extended: list[PETSc.Mat | None] = [None] * len(self.fused)
+        self._tangents: list[Tangents] = []
+        for fused, (group, pairs) in zip(self.fused, self._groups, strict=True):
+            found = [
+                field.restriction([_rows(field, body) for body, _ in own])
+                for field, own in zip(group, pairs, strict=True)
+            ]
+            fused.restrict([restriction for restriction, _ in found], found[0][1])
+        self._count(numbering)
+
+    def _count(self, numbering: Numbering) -> None:
+        statistics = self._statistics
+        counts: dict[str, int] = {}
+        for field in self.fields:
+            for name, count in field.counts.items():
+                counts[name] = counts.get(name, 0) + count
+        for name, count in counts.items():
+            statistics[name] = max(statistics[name], count) if name in LARGEST else count
+        statistics.count("transfers")
+        statistics["free_dofs"] = self.sizes[1]
+        rows, off, columns = (int(count) for count in numbering.off_rank)
+        statistics["off_rank_rows"] = off / max(rows, 1)
+        statistics["off_rank_columns"] = columns
+        statistics["dof_imbalance"] = imbalance(self._comm, self.sizes[0])
+        particles = sum(motion.particles.num_local for _, motion in self._places)
+        statistics["particle_imbalance"] = imbalance(self._comm, particles)
+
+    # -- Forces ---------------------------------------------------------------------------
+
+    def _set_forces(self) -> None:
+        for field in self.fields:
+            field.force.set(0.0)
+
+    def _add(
+        self, term: Term, vectors: Sequence[PETSc.Vec], to: Sequence[PETSc.Vec] | None = None
+    ) -> None:
+        """Add ``T^T`` times a term's vectors on its bodies to the forces, or to other vectors."""
+        if not vectors:
+            return
+        targets = self.forces if to is None else to
+        for body, vector in zip(term.bodies, vectors, strict=True):
+            field, _ = self._place(body)
+            target = targets[self.fields.index(field)]
+            body.T.multTransposeAdd(vector, target, target)
+
+    def residual(self, x: PETSc.Vec, F: PETSc.Vec) -> MPMError | None:
+        """Evaluate the residual at x, or say why that cannot be.
+
+        Raises:
+            BaseException: What a user's code has raised on any rank to end the program.
+        """
+        for field in self.fields:
+            field.spread(x)
+        with self._statistics.phase("constitutive"):
+            failure: BaseException | None = Interrupted() if noted() else None
+            for _, motion in self._places:
+                inverted = motion.particles.inverted()
+                failure = failure or DomainDistortionError.of("turn inside out", inverted)
+            failure = agreed(self._comm, failure) or agreed(self._comm, self._updated())
+        if isinstance(failure, MPMError):
+            return failure
+        if failure is not None:
+            raise failure
+        with self._statistics.phase("assemble"):
+            self._set_forces()
+            self._outer = [0.0] * len(self.fields)
+            for term in self._terms:
+                if term.from_outside:
+                    self._add_outer(term)
+                else:
+                    self._add(term, term.residuals())
+            for field in self.fields:
+                field.add_residual(partial(self._stiffness, field))
+                field.gather_extended(field.force)
+        for field in self.fields:
+            field.collect(field.force, F)
+        return None
+
+    def _add_outer(self, term: Term) -> None:
+        """Add a term's forces, and take note of their size."""
+        parts = self._zeros()
+        self._add(term, term.residuals(), parts)
+        for number, (field, part) in enumerate(zip(self.fields, parts, strict=True)):
+            self._outer[number] += norm(part)
+            field.force.axpy(1.0, part)
+
+    def _zeros(self) -> list[PETSc.Vec]:
+        vectors = [force.duplicate() for force in self.forces]
+        for vector in vectors:
+            vector.set(0.0)
+        return vectors
+
+    def _updated(self) -> BaseException | None:
+        """Update the terms; return the first failure."""
+        failure: BaseException | None = None
+        for term in self._terms:
+            found = _updated(term)
+            failure = failure or found
+        return failure
+
+    def _stiffness(self, field: Field) -> list[float]:
+        """Return the shear modulus of each body of a field."""
+        return [
+            sum(term.shear_modulus() for term in self._terms if term.bodies == (body,))
+            for body in field.bodies
+        ]
+
+    def smooth(self) -> bool:
+        """Return whether no history changes in the last residual, nor contact."""
+        smooth = [term.smooth() for term in self._terms]
+        return bool(self._comm.allreduce(all(smooth), MPI.LAND))
+
+    def load_derivative(self, order: int = 1) -> tuple[list[PETSc.Vec], float]:
+        """Return :meth:`BodyForms.load_derivative` on all dofs of each V (collective)."""
+        with self._statistics.phase("assemble"):
+            totals, whole = self._zeros(), 0.0
+            for term in self._terms:
+                parts, size = term.load_derivative(order)
+                self._add(term, parts, totals)
+                whole += size
+            for field, total in zip(self.fields, totals, strict=True):
+                field.gather_extended(total)
+            return totals, whole
+
+    def functional(self, particles: Particles, row: PETSc.Vec) -> PETSc.Vec:
+        """Return the coefficients on the unknowns of a functional on a body's W (collective)."""
+        totals = self._zeros()
+        field, _ = self._place(particles)
+        total = totals[self.fields.index(field)]
+        particles.T.multTranspose(row, total)
+        field.gather_extended(total)
+        return self.restricted(totals)
+
+    def restricted(self, forces: Sequence[PETSc.Vec]) -> PETSc.Vec:
+        """Return vectors on all dofs of each V at the unknowns (collective)."""
+        assert self._numbering is not None
+        reduced = self._numbering.vector()
+        for field, force in zip(self.fields, forces, strict=True):
+            field.collect(force, reduced)
+        return reduced
+
+    # -- Tangent --------------------------------------------------------------------------
+
+    def constrain(
+        self, y: PETSc.Vec, x: PETSc.Vec | None, solve: Callable[[PETSc.Vec, PETSc.Vec], None]
+    ) -> int:
+        """Leave a Newton step as it is: all steps are permitted."""
+        return 0
+
+    def tangent(self) -> PETSc.Mat:
+        """Return the tangent at the x of the last residual, one object within a step."""
+        with self._statistics.phase("assemble"):
+            parts = [self._fused_tangent(number) for number in range(len(self.fused))]
+            self._tangents = [term.tangents() for term in self._terms]
+            parts += [
+                self._product(term, number, pair, K)
+                for number, (term, tangents) in enumerate(
+                    zip(self._terms, self._tangents, strict=True)
+                )
+                for pair, K in tangents.items()
+            ]
+            for term in self._terms:
+                parts += term.reduced_tangents(self._free_T)
+            for field in self.fields:
+                parts += field.tangents(partial(self._stiffness, field))
+            return self._sum.of(parts)
+
+    def _fused_tangent(self, number: int) -> PETSc.Mat:
+        fused, (group, _) = self.fused[number], self._groups[number]
+        whole = fused.assemble([field.prescribes for field in group])
+        if not group[0].extends:
+            return whole
+        result = whole.ptap(group[0].prolongation, result=self._extended[number])
+        self._extended[number] = result
+        return result
+
+    def _product(self, term: Term, number: int, pair: tuple[int, int], K: PETSc.Mat) -> PETSc.Mat:
+        """Return ``T_a^T K T_b`` in the unknowns, the same object for the same K."""
+        key = (number, *pair)
+        T_a, T_b = (self._free_T(term.bodies[i]) for i in pair)
+        known, half, result = self._products.get(key, (None, None, None))
+        if known is not K:
+            half = result = None
+        if pair[0] == pair[1]:
+            result = K.ptap(T_a, result=result)
+        else:
+            half = K.matMult(T_b, result=half)
+            result = T_a.transposeMatMult(half, result=result)
+        self._products[key] = K, half, result
+        return result
+
+    def _free_T(self, particles: Particles) -> PETSc.Mat:
+        field, motion = self._place(particles)
+        return motion.free_T(field.prolongation)
+
+    def prediction(self) -> PETSc.Vec | None:
+        """Return the unknowns to expect at the step's end, if a term or the past says any."""
+        if self._start is not None:
+            return self._start.copy()
+        if self.predictor is None:
+            return None
+        increments = self.predictor.increments(self._size)
+        if increments is None:
+            return None
+        assert self._numbering is not None
+        x = self._numbering.vector()
+        for field in self.fields:
+            own = [i for i, (its, _) in zip(increments, self._places, strict=True) if its is field]
+            field.predict(own, x)
+        return x
+
+    def rigid_motions(self) -> PETSc.NullSpace:
+        """Return the rigid motions of each background in the unknowns (collective)."""
+        assert self._numbering is not None
+        return self._numbering.rigid_motions()
+
+    def impose(self) -> bool:
+        """Impose the step's Dirichlet values from now on; return whether there are any."""
+        return any([field.impose() for field in self.fields])
+
+    def lift(self) -> PETSc.Vec:
+        """Return the linearised forces of the step's Dirichlet values on the unknowns.
+
+        It is that of the last tangent.
+        """
+        forces = self._zeros()
+        for field, force in zip(self.fields, forces, strict=True):
+            field.add_product(field.lift(), force, partial(self._stiffness, field))
+        for fused, (group, _) in zip(self.fused, self._groups, strict=True):
+            for number, field in enumerate(group):
+                if field.prescribes:
+                    fused.multiply_add(number, field.u, forces[self.fields.index(field)])
+        for term, tangents in zip(self._terms, self._tangents, strict=True):
+            for (a, b), K in tangents.items():
+                field, motion = self._place(term.bodies[b])
+                force = K.createVecLeft()
+                K.mult(motion.of(field.u), force)
+                target = forces[self.fields.index(self._place(term.bodies[a])[0])]
+                term.bodies[a].T.multTransposeAdd(force, target, target)
+        for term in self._terms:
+            motions = [motion.of(field.u) for field, motion in map(self._place, term.bodies)]
+            self._add(term, term.reduced_product(motions), forces)
+        for field, force in zip(self.fields, forces, strict=True):
+            field.gather_extended(force)
+        return self.restricted(forces)
+
+    # -- Sizes ----------------------------------------------------------------------------
+
+    def scale(self, F: PETSc.Vec | None = None) -> float:
+        """Return the size of external forces and reactions, by which a residual is judged.
+
+        Args:
+            F: The residual. Where there are several fields, its norm over what is returned is the
+                largest of the fields' own ratios, so that each has to converge by itself.
+        """
+        scales = [
+            max(external, field.reactions(), outer)
+            for field, external, outer in zip(self.fields, self._external, self._outer, strict=True)
+        ]
+        if len(scales) == 1:
+            return scales[0]
+        if F is None:
+            return joint_norm(scales)
+        assert self._numbering is not None
+        sizes = [joint_norm(F.array_r[part], self._comm) for part in self._numbering.parts]
+        if any(scale == 0.0 < size for size, scale in zip(sizes, scales, strict=True)):
+            inner = self._internal_scales()
+            scales = [scale or other for scale, other in zip(scales, inner, strict=True)]
+        ratios = [
+            size / scale for size, scale in zip(sizes, scales, strict=True) if size > 0.0 < scale
+        ]
+        return norm(F) / max(ratios) if ratios else joint_norm(scales)
+
+    def internal_scale(self) -> float:
+        """Return the size of what all domains add to the residual, in absolute values."""
+        return joint_norm(self._internal_scales())
+
+    def _internal_scales(self) -> list[float]:
+        with self._statistics.phase("assemble"):
+            totals = self._zeros()
+            for term in self._terms:
+                self._add(term, term.absolute_contributions(), totals)
+            return [norm(total) for total in totals]
+
+    def resultant(self) -> float:
+        """Return the size of the sum of the last residual over the unknowns.
+
+        It is what loads and supports, as computed, differ by: the stress of a domain adds
+        nothing to it, nor does round-off of the stress.
+        """
+        return joint_norm([field.resultant() for field in self.fields])
+
+    def stiffness(self, x: PETSc.Vec) -> float:
+        """Return ``x . K x``, summed domain by domain: nothing, for a rigid motion.
+
+        The reduced tangent has each entry to round-off of the stiffest domain around; the
+        gradient of a rigid motion is round-off in every domain.
+        """
+        total = 0.0
+        increments = [field.on_background(x) for field in self.fields]
+        for field, u in zip(self.fields, increments, strict=True):
+            force = u.duplicate()
+            force.set(0.0)
+            field.add_product(u, force, partial(self._stiffness, field))
+            total += force.dot(u)
+        for term in self._terms:
+            motions = []
+            for field, motion in map(self._place, term.bodies):
+                motions.append(motion.of(increments[self.fields.index(field)]))
+            forces = term.stiffness_force(motions)
+            for force, moved in zip(forces, motions, strict=False):
+                total += force.dot(moved)
+        return float(total)
+
+    def motion(self, x: PETSc.Vec) -> float:
+        """Return the size of the displacement that x causes on the bodies."""
+        return joint_norm([size for field in self.fields for size in field.on_bodies(x)])
+
+    def extent(self) -> float:
+        """Return the size of the positions of all nodes."""
+        return joint_norm([motion.extent() for _, motion in self._places])
+
+
+def _updated(term: Term) -> BaseException | None:
+    """Update a term; return why that cannot be, also where a user's code fails or wants to end."""
+    try:
+        return term.update()
+    except MPMError as error:
+        return error
+    except KeyboardInterrupt:
+        note()
+        return Interrupted()
+    except Exception as error:
+        return as_ours(error, term.evaluation)
+    except BaseException as error:
+        return error
+
+
+def _rows(field: Field, particles: Particles) -> TransferRows:
+    """Return the rows of T of one of a field's bodies."""
+    number = next(i for i, body in enumerate(field.bodies) if body is particles)
+    return field.touched.rows[number]

@@ -1,0 +1,249 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What acts on the nodes of bodies: its forces, their tangent, and what it remembers."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar, Protocol
+
+from petsc4py import PETSc
+
+from ..assembly.body_forms import BodyForms
+from ..errors import MPMError
+from ..io.snapshot import Kept
+from ..particles.particles import Particles
+
+__all__ = ["Hooks", "Motion", "Term", "Transfer", "UserTerm"]
+
+
+type Transfer = Callable[[Particles], PETSc.Mat]
+type Motion = Callable[[Particles], PETSc.Vec | None]
+
+
+class Term:
+    """Something that acts on the nodes of one body or of several.
+
+    The residual of a step is ``sum_b T_b^T r_b`` and its tangent ``sum_ab T_a^T K_ab T_b``, where
+    r_b and K_ab are sums over terms and live on the spaces W of the bodies, whatever
+    backgrounds move these. An heir overrides what it has; what is here adds nothing. All calls
+    are collective, and made with the displacements set. Nodes of deleted particles alone
+    (``outside="delete"``) stay where they were, and forces on them are lost.
+
+    Args:
+        bodies: The bodies on which it acts.
+
+    Attributes:
+        bodies: As given.
+        evaluation: What :meth:`update` is called where it fails.
+        from_outside: Whether its forces come from outside of its bodies: then they count for the
+            scale of forces, as loads and reactions do.
+        axisymmetric: Whether its forces are those of a body of revolution, ``None`` where it does
+            not say; a problem refuses one that differs.
+    """
+
+    evaluation: ClassVar[str] = "update()"
+    from_outside: ClassVar[bool] = True
+    axisymmetric: bool | None = None
+
+    def __init__(self, bodies: Sequence[Particles] = ()) -> None:
+        self.bodies: tuple[Particles, ...] = tuple(bodies)
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether its tangent is symmetric, all bodies taken together."""
+        return False
+
+    @property
+    def fused(self) -> Sequence[tuple[Particles, BodyForms]]:
+        """Forms whose tangent the compiled loops reduce domain by domain, with their bodies."""
+        return ()
+
+    @property
+    def follows_load(self) -> bool:
+        """Whether what the load factor does depends on the displacement."""
+        return False
+
+    def begin(self) -> Sequence[PETSc.Vec]:
+        """Prepare a step, or another try of it, from the last converged positions.
+
+        Returns:
+            The forces that stay through the step, on W of each body, for the scale of forces; they
+            are part of :meth:`residuals`. Empty: none.
+        """
+        return ()
+
+    def start(self, transfer: Transfer, prescribed: Motion) -> PETSc.Vec | None:
+        """Return where Newton's method is to start, after :meth:`begin`; ``None``: no matter.
+
+        Args:
+            transfer: Returns T of a body in all unknowns, the same object through a step.
+            prescribed: Returns how the step's Dirichlet values move a body, ``None``: not at all.
+
+        Returns:
+            The unknowns.
+        """
+        return None
+
+    def update(self) -> MPMError | None:
+        """Update what the forces depend on; return why that cannot be. It must not be kept yet.
+
+        Failures may differ between ranks.
+        """
+        return None
+
+    def smooth(self) -> bool:
+        """Return whether no history changes in the last residual, nor contact."""
+        return True
+
+    def residuals(self) -> Sequence[PETSc.Vec]:
+        """Return the forces on W of each body, or nothing."""
+        return ()
+
+    def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
+        """Return the derivatives of the forces on a body by the displacement of a body.
+
+        Returns:
+            Matrices on W_a x W_b by the numbers (a, b) of these in :attr:`bodies`; the same object
+            in each call as long as its sparsity is the same. Without what :attr:`fused` and
+            :meth:`reduced_tangents` have.
+        """
+        return {}
+
+    def reduced_tangents(self, transfer: Transfer) -> Sequence[PETSc.Mat]:
+        """Return what the term reduces by T itself, as matrices ``T_a^T K_ab T_b`` of all unknowns.
+
+        Args:
+            transfer: Returns T of a body in all unknowns, the same object through a step.
+        """
+        return ()
+
+    def reduced_product(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
+        """Return the forces on W of each body by what :meth:`reduced_tangents` had last, if any.
+
+        Args:
+            motions: Displacements on W of each body.
+        """
+        return ()
+
+    def stiffness_force(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
+        """Return the whole tangent times displacements on W of each body, or nothing.
+
+        Args:
+            motions: The displacements.
+        """
+        forces: dict[int, PETSc.Vec] = {}
+        for (a, b), K in self.tangents().items():
+            if a not in forces:
+                forces[a] = K.createVecLeft()
+                forces[a].set(0.0)
+            K.multAdd(motions[b], forces[a], forces[a])
+        return [forces[a] for a in range(len(self.bodies))] if forces else ()
+
+    def absolute_contributions(self) -> Sequence[PETSc.Vec]:
+        """Return the sums of absolute values of what the residuals consist of, or nothing."""
+        sizes = [force.copy() for force in self.residuals()]
+        for size in sizes:
+            size.abs()
+        return sizes
+
+    def load_derivative(self, order: int) -> tuple[Sequence[PETSc.Vec], float]:
+        """Return a difference quotient of the residuals by the load factor.
+
+        Args:
+            order: 1 or 2: see :meth:`BodyForms.load_derivative`.
+
+        Returns:
+            The quotients, or nothing, and the size of what they are differences of.
+        """
+        return (), 0.0
+
+    def shear_modulus(self) -> float:
+        """Return the stiffness of its body to simple shear, if it is what the body is made of."""
+        return 0.0
+
+    def commit(self) -> Callable[[], None] | None:
+        """Make the last evaluation the converged one.
+
+        Bodies commit first, then the terms of the user, then the hooks of a problem's heir.
+
+        Returns:
+            A function that takes it back, which is called where another commit fails; ``None``
+            where there is nothing to take back.
+        """
+        return None
+
+    def roll_back(self) -> None:
+        """Return to the last converged evaluation."""
+
+    def kept(self) -> Sequence[Kept]:
+        """Return what is to be saved and restored with it, and to move with the bodies."""
+        return ()
+
+    def require_movable(self, consequence: str) -> None:
+        """Raise an error unless it follows bodies whose particles move to other ranks.
+
+        Args:
+            consequence: What cannot be otherwise.
+
+        Raises:
+            MPMError: It does not, as it does unless an heir can do more.
+        """
+        raise MPMError(f"A {type(self).__name__} lives on the present body mesh, so {consequence}.")
+
+    def require_remeshable(self, consequence: str) -> None:
+        """Raise an error unless it follows bodies that are split or rebased; see above."""
+        raise MPMError(f"A {type(self).__name__} lives on the present body mesh, so {consequence}.")
+
+
+class Hooks(Protocol):
+    """What an heir of a problem class may override."""
+
+    def evaluate(self) -> MPMError | None:
+        """Update what the forms hold besides the displacement."""
+
+    def smooth(self) -> bool:
+        """Return whether no history changes in the last residual, nor contact."""
+
+    def commit(self) -> None:
+        """Make the last evaluation the converged one."""
+
+    def roll_back(self) -> None:
+        """Return to the last converged evaluation."""
+
+
+class UserTerm(Term):
+    """What the heir of a problem class does in its hooks.
+
+    Args:
+        hooks: The problem, which is not kept alive.
+    """
+
+    evaluation = "evaluate()"
+
+    def __init__(self, hooks: Hooks) -> None:
+        super().__init__()
+        self._reference = weakref.ref(hooks)
+
+    @property
+    def _hooks(self) -> Hooks:
+        hooks = self._reference()
+        assert hooks is not None
+        return hooks
+
+    def update(self) -> MPMError | None:
+        """See :meth:`Term.update`."""
+        return self._hooks.evaluate()
+
+    def smooth(self) -> bool:
+        """See :meth:`Term.smooth`."""
+        return self._hooks.smooth()
+
+    def commit(self) -> None:
+        """See :meth:`Term.commit`."""
+        self._hooks.commit()
+
+    def roll_back(self) -> None:
+        """See :meth:`Term.roll_back`."""
+        self._hooks.roll_back()

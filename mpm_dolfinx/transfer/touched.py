@@ -1,0 +1,142 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Rows of T, and the background nodes that they touch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from ..background.basis import PointBasis
+from ..parallel.exchange import swap
+
+__all__ = ["TouchedNodes", "TransferRows"]
+
+
+class TransferRows(NamedTuple):
+    """Rows of T, one for each local node of W, in compressed rows of touched nodes of V."""
+
+    offsets: NDArray[np.int64]
+    nodes: NDArray[np.int32]
+    values: NDArray[np.float64]
+
+
+class TouchedNodes:
+    """The nodes of V that the bodies' nodes on this rank touch, and the ranks that own them.
+
+    Args:
+        V: Background space (collective).
+        bases: Background basis at the local nodes of W of each body.
+        owned: How many of these are the rank's own, which come first.
+
+    Attributes:
+        nodes: The touched nodes, global numbers, sorted.
+        rows: The rows of T of each body, in numbers of the touched nodes.
+        num_own: Number of this rank's own nodes of V.
+        active: This rank's own nodes of V that any rank touches, local numbers, sorted.
+        homes: For each of these the rank that touches it most often.
+    """
+
+    def __init__(
+        self, V: fem.FunctionSpace, bases: Sequence[PointBasis], owned: Sequence[int]
+    ) -> None:
+        self._comm: MPI.Comm = V.mesh.comm
+        self._owned = owned
+        first, last = V.dofmap.index_map.local_range
+        self.num_own: int = last - first
+        self._bs = V.dofmap.index_map_bs
+        kept = [basis.values != 0.0 for basis in bases]
+        every = np.concatenate([basis.nodes[keep] for basis, keep in zip(bases, kept, strict=True)])
+        self.nodes, numbers, counts = _distinct(every)
+        self.rows = []
+        for basis, keep in zip(bases, kept, strict=True):
+            ends = np.cumsum(np.count_nonzero(keep, axis=1))
+            mine, numbers = np.split(numbers, [int(ends[-1]) if len(ends) else 0])
+            offsets = np.concatenate([[0], ends]).astype(np.int64)
+            self.rows.append(TransferRows(offsets, mine, basis.values[keep]))
+        firsts = self._comm.allgather(first)
+        self._ends = np.searchsorted(self.nodes, firsts[1:])
+        told = swap(self._comm, self._by_owner(np.column_stack([self.nodes, counts])))
+        self._own = [part[:, 0] - first for part in told]
+        most = np.zeros(self.num_own, dtype=np.int64)
+        homes = np.zeros(self.num_own, dtype=np.int64)
+        for rank, (own, part) in enumerate(zip(self._own, told, strict=True)):
+            better = part[:, 1] > most[own]
+            homes[own[better]] = rank
+            most[own[better]] = part[better, 1]
+        self.active: NDArray[np.int32] = np.flatnonzero(most).astype(np.int32)
+        self.homes: NDArray[np.int64] = homes[self.active]
+
+    @property
+    def has_weight(self) -> NDArray[np.bool_]:
+        """Whether any rank touches each of this rank's own nodes of V."""
+        result = np.zeros(self.num_own, dtype=bool)
+        result[self.active] = True
+        return result
+
+    def on_dofs(self, nodes: NDArray[Any]) -> NDArray[Any]:
+        """Return values of this rank's own nodes of V at its own dofs."""
+        return np.repeat(nodes, self._bs)
+
+    def _by_owner(self, values: NDArray[Any]) -> list[NDArray[Any]]:
+        return np.split(values, self._ends)
+
+    def spread(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return at the touched nodes what their owners have (collective).
+
+        Args:
+            values: One row for each own node of V, shape ``(n, ...)``.
+        """
+        return np.concatenate(swap(self._comm, [values[own] for own in self._own]))
+
+    def collect(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the sums of all ranks' values at this rank's own nodes of V (collective).
+
+        Args:
+            values: One row for each touched node, shape ``(n, ...)``.
+        """
+        result = np.zeros((self.num_own, *values.shape[1:]), dtype=values.dtype)
+        for own, part in zip(self._own, swap(self._comm, self._by_owner(values)), strict=True):
+            result[own] += part
+        return result
+
+    def off_rank(self, owner: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return how many rows of T there are, how many have a node on another rank, and those.
+
+        Args:
+            owner: Rank of each own node of V as an unknown, -1 where it is none (collective).
+
+        Returns:
+            All rows, rows with such a node, and such nodes, each on all ranks, shape ``(3,)``.
+        """
+        comm = self._comm
+        ranks = self.spread(owner)
+        off = (ranks >= 0) & (ranks != comm.rank)
+        rows = 0
+        for row, owned in zip(self.rows, self._owned, strict=True):
+            before = np.concatenate([[0], np.cumsum(off[row.nodes])])[row.offsets[: owned + 1]]
+            rows += int(np.count_nonzero(np.diff(before)))
+        return np.asarray(comm.allreduce(np.array([sum(self._owned), rows, off.sum()])))
+
+
+def _distinct(
+    nodes: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
+    """Return the distinct nodes, sorted; the number of each among them; how often they occur."""
+    low = int(nodes.min(initial=np.iinfo(np.int64).max))
+    span = int(nodes.max(initial=low - 1)) - low + 1
+    if span > 8 * len(nodes):
+        found, number, counts = np.unique(nodes, return_inverse=True, return_counts=True)
+        return found, number.astype(np.int32), counts
+    counts = np.bincount(nodes - low, minlength=span)
+    found = np.flatnonzero(counts)
+    table = np.empty(span, dtype=np.int32)
+    table[found] = np.arange(len(found))
+    return found + low, table[nodes - low], counts[found]

@@ -1,0 +1,309 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The fast route against the reference route: DOLFINx's assembly and PETSc's products."""
+
+import numpy as np
+import pytest
+import scenes
+
+import ufl
+from dolfinx import fem, mesh
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx._core import loops
+
+pytestmark = pytest.mark.skipif(loops is None, reason="the package was built without a compiler")
+
+QUADRILATERAL, TRIANGLE = mesh.CellType.quadrilateral, mesh.CellType.triangle
+HEXAHEDRON, TETRAHEDRON = mesh.CellType.hexahedron, mesh.CellType.tetrahedron
+PLASTIC = mpm.materials.VonMises(1e3, 0.3, rho_y=5.0, hardening=20.0)
+
+
+def space(dim, degree=1, cell=None):
+    cell = cell or (QUADRILATERAL if dim == 2 else HEXAHEDRON)
+    n = 6 if dim == 2 else 4
+    return scenes.vectors(scenes.box([-1.0] * dim, [2.0] * dim, [n] * dim, cell), degree)
+
+
+def bent(cell, corner=0.1):
+    dim = 3 if cell in (HEXAHEDRON, TETRAHEDRON) else 2
+    n = 4 if dim == 2 else 2
+    lower = np.full(dim, corner) if np.isscalar(corner) else np.array(corner)
+    body = scenes.box(lower, lower + 1.0, [n] * dim, cell)
+    x = body.geometry.x[:, :dim]
+    x += 0.04 * np.sin(3.0 * x[:, ::-1])
+    return body
+
+
+def floor(V):
+    """Fix a row of dofs, so that some columns of T go."""
+    dim = V.mesh.geometry.dim
+    component, _ = V.sub(dim - 1).collapse()
+    at = fem.locate_dofs_geometrical(
+        (V.sub(dim - 1), component), lambda x: np.isclose(x[dim - 1], 0.5)
+    )
+    moved = fem.Function(component)
+    moved.x.array[:] = -0.05
+    return fem.dirichletbc(moved, at, V.sub(dim - 1))
+
+
+def quasi_static(particles, assembly, **options):
+    V = (particles[0] if isinstance(particles, list) else particles).V
+    dim = V.mesh.geometry.dim
+    options.setdefault("material", PLASTIC)
+    return mpm.QuasiStaticProblem(
+        particles,
+        density=2.0,
+        body_force=(0.5,) * dim,
+        bcs=[floor(V)],
+        assembly=assembly,
+        **options,
+    )
+
+
+def compare(make, symmetric=False):
+    """Compare residual, tangent and lift of both routes at the same state (collective)."""
+    found = []
+    for assembly in ("fast", "reference"):
+        problem = make(assembly)
+        system = problem.reduced
+        change = np.zeros(len(problem.bodies[0].increment.x.array))
+        problem.bcs[0].set(change, None, 1.0)
+        for body in problem.bodies:
+            body.load.value = 1.0
+        system.begin([change], 1.0)
+        first, local = system.sizes[1], system.sizes[0]
+        problem._stepper.newton._start(system.sizes)
+        x, F = problem._stepper.newton.x, problem._stepper.newton.F
+        assert system.residual(x, F) is None
+        system.tangent()
+        system.impose()
+        start = x.getOwnershipRange()[0]
+        x.array_w[:] = 0.02 * np.sin(1.7 * (start + np.arange(local)))
+        assert system.residual(x, F) is None
+        K = system.tangent()
+        lift = system.lift()
+        modulus = [share.shear_modulus() for share in problem.body_terms]
+        found.append((F.copy(), K.copy(), lift, system.motion(x), modulus, first))
+        if symmetric:
+            skew = K.copy()
+            skew.transpose()
+            skew.axpy(-1.0, K)
+            assert skew.norm() < 1e-13 * K.norm()
+    fast, reference = found
+    assert fast[5] == reference[5] > 0
+    for a, b in zip(fast[:3], reference[:3], strict=True):
+        size = b.norm()
+        assert size > 0.0
+        a.axpy(-1.0, b)
+        assert a.norm() < 1e-12 * size
+    assert fast[3] == pytest.approx(reference[3], rel=1e-12)
+    assert fast[4] == pytest.approx(reference[4], rel=1e-10)
+
+
+CELLS = [QUADRILATERAL, TRIANGLE, HEXAHEDRON, TETRAHEDRON]
+
+
+@pytest.mark.parametrize("cell", CELLS, ids=scenes.name)
+@pytest.mark.parametrize("rule", [None, 2])
+def test_domains_of_any_cell_and_rule(cell, rule):
+    dim = 3 if cell in (HEXAHEDRON, TETRAHEDRON) else 2
+    particles = mpm.Particles(bent(cell), space(dim), quadrature_degree=rule)
+    compare(lambda assembly: quasi_static(particles, assembly))
+
+
+@pytest.mark.parametrize("method", ["cpdi", "gimp", "mpm"])
+def test_other_methods(method):
+    body = scenes.box([0.1, 0.1], [1.1, 1.1], [4, 4], QUADRILATERAL)
+    particles = mpm.Particles(body, space(2), method=method)
+    compare(lambda assembly: quasi_static(particles, assembly))
+
+
+@pytest.mark.parametrize("cell", [QUADRILATERAL, TRIANGLE], ids=scenes.name)
+def test_degree_two(cell):
+    particles = mpm.Particles(bent(cell), space(2, 2), degree=2)
+    compare(lambda assembly: quasi_static(particles, assembly))
+
+
+@pytest.mark.parametrize("stabilisation", ["ghost", "aggregate"])
+def test_stabilised(stabilisation):
+    particles = mpm.Particles(bent(QUADRILATERAL), space(2, 2), degree=2)
+    compare(lambda assembly: quasi_static(particles, assembly, stabilisation=stabilisation))
+
+
+def boundary_tags(body):
+    """Tag all facets of the boundary with 7."""
+    dim = body.topology.dim - 1
+    body.topology.create_connectivity(dim, dim + 1)
+    facets = mesh.exterior_facet_indices(body.topology)
+    return mesh.meshtags(body, dim, facets, np.full(len(facets), 7, dtype=np.int32))
+
+
+@pytest.mark.parametrize("bodies", [1, 2])
+@pytest.mark.parametrize("follower", [False, True], ids=["symmetric", "follower"])
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("f_bar", ["none", "domain", "pair", "patch"])
+@pytest.mark.parametrize("kind", ["plane", "axisymmetric", "space"])
+def test_every_combination(kind, f_bar, degree, follower, bodies):
+    plane = kind != "space"
+    cell = HEXAHEDRON if not plane else TRIANGLE if f_bar == "pair" else QUADRILATERAL
+    V = space(2 if plane else 3, degree)
+    corners = [[0.1, 0.1, 0.1], [0.1, -0.9, -0.9]][:bodies]
+    meshes = [bent(cell, corner[: 2 if plane else 3]) for corner in corners]
+    rule = 2 if f_bar == "domain" and degree == 1 else None
+    particles = [mpm.Particles(body, V, degree=degree, quadrature_degree=rule) for body in meshes]
+    loads = {}
+    if follower:
+        loads = {
+            "pressures": [[(3.0, 7)] for _ in meshes],
+            "facet_tags": [boundary_tags(body) for body in meshes],
+        }
+
+    def make(assembly):
+        return quasi_static(
+            particles, assembly, f_bar=f_bar, axisymmetric=kind == "axisymmetric", **loads
+        )
+
+    if f_bar == "pair" and not plane:
+        for assembly in ("fast", "reference"):
+            with pytest.raises(mpm.MPMError, match="use 'domain' or 'patch'"):
+                make(assembly)
+        return
+    compare(make, symmetric=not follower)
+
+
+class Friction(mpm.materials.ReturnMapping):
+    """Drucker and Prager's yield surface with isochoric flow: the tangent is not symmetric."""
+
+    def yield_function(self, stress, plastic_strain):
+        trace = mpm.materials.mandel.trace(stress)
+        return self.plastic_potential(stress, plastic_strain) + 0.1 * trace - 40.0
+
+    def plastic_potential(self, stress, plastic_strain):
+        return mpm.materials.mandel.norm(mpm.materials.mandel.deviator(stress))
+
+
+@pytest.mark.parametrize("axisymmetric", [False, True], ids=["plane", "axisymmetric"])
+@pytest.mark.parametrize(
+    ("f_bar", "rule"), [("none", 1), ("none", 2), ("domain", 2), ("patch", 1), ("patch", 2)]
+)
+def test_a_law_without_symmetry_beside_deleted_domains(f_bar, rule, axisymmetric):
+    particles = mpm.Particles(
+        bent(QUADRILATERAL), space(2), quadrature_degree=rule, outside="delete"
+    )
+    particles.commit()
+    particles.leaving()
+    particles.delete(np.flatnonzero(particles.global_index == 5))
+    law = Friction(1e3, 0.3)
+    compare(
+        lambda assembly: quasi_static(
+            particles, assembly, material=law, f_bar=f_bar, axisymmetric=axisymmetric
+        )
+    )
+
+
+@pytest.mark.parametrize("stabilisation", ["ghost", "aggregate"])
+def test_stabilised_patches_of_revolution(stabilisation):
+    particles = mpm.Particles(bent(QUADRILATERAL), space(2, 2), degree=2)
+    compare(
+        lambda assembly: quasi_static(
+            particles, assembly, stabilisation=stabilisation, f_bar="patch", axisymmetric=True
+        )
+    )
+
+
+@pytest.mark.parametrize(("over", "rule"), [("domain", 2), ("patch", 1)])
+def test_averaged_volume_ratio(over, rule):
+    particles = mpm.Particles(bent(QUADRILATERAL), space(2), quadrature_degree=rule)
+    F = ufl.Identity(2) + ufl.grad(particles.displacement)
+
+    def make(assembly):
+        ratio = mpm.AveragedVolumeRatio(particles, over)
+        energy = 5.0 * ufl.inner(F, F) / ufl.det(F) + 300.0 * (ratio - 1.0) ** 2
+        R = ratio.residual(energy * particles.dx)
+        return mpm.ParticleProblem(R, particles, bcs=[floor(particles.V)], assembly=assembly)
+
+    compare(make)
+
+
+def test_triangular_background():
+    particles = mpm.Particles(bent(TRIANGLE), space(2, 1, TRIANGLE))
+    compare(lambda assembly: quasi_static(particles, assembly))
+
+
+def test_two_bodies():
+    V = space(2)
+    bodies = [mpm.Particles(bent(QUADRILATERAL, c), V) for c in (0.1, -0.9)]
+    compare(lambda assembly: quasi_static(bodies, assembly))
+
+
+def test_body_of_revolution():
+    particles = mpm.Particles(bent(QUADRILATERAL), space(2))
+    compare(lambda assembly: quasi_static(particles, assembly, axisymmetric=True))
+
+
+def test_follower_pressure():
+    body = bent(QUADRILATERAL)
+    tags = boundary_tags(body)
+    particles = mpm.Particles(body, space(2))
+    compare(
+        lambda assembly: quasi_static(particles, assembly, pressures=[(3.0, 7)], facet_tags=tags)
+    )
+
+
+@pytest.mark.parametrize("term", ["cells", "tagged cells", "facets", "inner facets"])
+def test_ufl_terms(term):
+    body = bent(QUADRILATERAL)
+    particles = mpm.Particles(body, space(2))
+    d, v = particles.displacement, ufl.TestFunction(particles.W)
+    C = (ufl.Identity(2) + ufl.grad(d)).T * (ufl.Identity(2) + ufl.grad(d))
+    k = fem.Constant(body, 3.0)
+    R = ufl.derivative(k * ufl.inner(C, C) * particles.dx, d, v)
+    if term == "tagged cells":
+        n = body.topology.index_map(2).size_local
+        tags = mesh.meshtags(
+            body, 2, np.arange(n, dtype=np.int32), np.arange(n, dtype=np.int32) % 2
+        )
+        dx = ufl.Measure("dx", domain=body, subdomain_data=tags)
+        R += k * ufl.inner(d, v) * dx(1)
+    if term == "facets":
+        R += k * ufl.inner(d, v) * ufl.ds(body)
+    if term == "inner facets":
+        R += k * ufl.inner(ufl.jump(ufl.grad(d)), ufl.jump(ufl.grad(v))) * ufl.dS(body)
+    compare(
+        lambda assembly: mpm.ParticleProblem(
+            R, particles, bcs=[floor(particles.V)], assembly=assembly
+        )
+    )
+
+
+def sink(assembly):
+    """Let a block sink a little into itself, its bottom held in both directions."""
+    V = space(2)
+    particles = mpm.Particles(bent(QUADRILATERAL), V)
+    held = fem.locate_dofs_geometrical(V, lambda x: x[1] < 0.6)
+    problem = mpm.QuasiStaticProblem(
+        particles,
+        mpm.materials.Hencky(1e4, 0.3),
+        body_force=(0.0, -300.0),
+        bcs=[fem.dirichletbc(np.zeros(2), held, V)],
+        assembly=assembly,
+    )
+    problem.solve(4)
+    return problem
+
+
+def test_pattern_lasts_while_no_node_changes_its_cell():
+    fast, reference = sink("fast"), sink("reference")
+    statistics = fast.history.statistics
+    assert 1 <= statistics["patterns"] < statistics["transfers"] == 4
+    there = reference.particles.displacement.x.array
+    largest = scenes.largest(there)
+    assert largest > 1e-3
+    assert fast.particles.displacement.x.array == pytest.approx(there, abs=1e-11 * largest)
+
+
+def test_unknown_route():
+    particles = mpm.Particles(bent(QUADRILATERAL), space(2))
+    with pytest.raises(mpm.MPMError, match="assembly='fused'; choose 'auto', 'fast'"):
+        quasi_static(particles, "fused")

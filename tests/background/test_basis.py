@@ -1,0 +1,189 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The background basis at points, against forward maps and hat functions."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+import scenes
+from scenes import ALL, HEXAHEDRON, PLANE, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
+
+from mpm_dolfinx.background.basis import BackgroundBasis
+
+MESHES = {
+    **{f"structured {c.name}": (lambda c=c: scenes.unit(4, c)) for c in ALL},
+    "unstructured triangle": lambda: scenes.bend(scenes.unit(5, TRIANGLE), 0.05),
+    "unstructured tetrahedron": lambda: scenes.bend(scenes.unit(3, TETRAHEDRON), 0.05),
+    **{f"sheared {c.name}": (lambda c=c: scenes.shear(scenes.unit(4, c))) for c in ALL},
+    "distorted quadrilateral": lambda: scenes.bend(scenes.unit(5, QUADRILATERAL), 0.04),
+    "distorted hexahedron": lambda: scenes.bend(scenes.unit(3, HEXAHEDRON), 0.04),
+}
+
+
+def shape_functions(simplex, reference):
+    """Return linear or multilinear shape functions in tensor order, (n, k)."""
+    if simplex:
+        return np.column_stack([1 - reference.sum(axis=1), reference])
+    corners = [c[::-1] for c in product((0, 1), repeat=reference.shape[1])]
+    return np.column_stack([np.prod(np.where(c, reference, 1 - reference), 1) for c in corners])
+
+
+def reference_points(simplex, dim):
+    """Return points inside a reference cell, on its facets, edges and vertices."""
+    random = np.random.default_rng(1)
+    inside = random.dirichlet(np.ones(dim + 1), 4)[:, 1:] if simplex else random.random((4, dim))
+    lattice = np.array(list(product((0.0, 0.5, 1.0), repeat=dim)))
+    return np.vstack([inside, lattice[lattice.sum(axis=1) <= 1] if simplex else lattice])
+
+
+def points_of_cells(V):
+    """Return points in all cells of all ranks, and the dense values of the basis there."""
+    dim = V.mesh.geometry.dim
+    simplex = V.mesh.topology.cell_name() in ("triangle", "tetrahedron")
+    N = shape_functions(simplex, reference_points(simplex, dim))
+    count = V.mesh.topology.index_map(dim).size_local
+    dofs = V.dofmap.list[:count]
+    vertices = V.tabulate_dof_coordinates()[dofs][:, :, :dim]
+    points = np.einsum("qk,cki->cqi", N, vertices).reshape(-1, dim)
+    nodes = V.dofmap.index_map.local_to_global(dofs.ravel()).reshape(dofs.shape)
+    values = np.zeros((count, len(N), V.dofmap.index_map.size_global))
+    for c in range(count):
+        values[c, :, nodes[c]] = N.T
+    return scenes.gather(points), scenes.gather(values.reshape(len(points), -1))
+
+
+def to_dense(basis, V):
+    """Return the values of all basis functions at all points, (n, nodes of V)."""
+    values = np.zeros((len(basis.nodes), V.dofmap.index_map.size_global))
+    np.add.at(values, (np.arange(len(values))[:, None], basis.nodes), basis.values)
+    return values
+
+
+@pytest.mark.parametrize("kind", MESHES)
+def test_basis_at_points_of_all_ranks(kind):
+    V = scenes.vectors(MESHES[kind]())
+    points, expected = points_of_cells(V)
+    # Each rank asks for another part, most of which other ranks own.
+    mine = slice((WORLD.rank + 1) % WORLD.size, None, WORLD.size)
+    basis = BackgroundBasis(V).at(points[mine])
+    assert basis.found.all()
+    assert basis.nodes.dtype == np.int64
+    values = to_dense(basis, V)
+    np.testing.assert_allclose(values, expected[mine], atol=1e-12)
+    np.testing.assert_allclose(values.sum(axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(values @ scenes.coordinates(V), points[mine], atol=1e-13)
+    kept = basis.values[basis.values != 0.0]
+    assert np.all(kept >= 1e-13)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_structured_grid_has_hat_functions(dim):
+    n, cell = 4, QUADRILATERAL if dim == 2 else HEXAHEDRON
+    V = scenes.vectors(scenes.unit(n, cell))
+    points = np.random.default_rng(WORLD.rank).random((50, dim))
+    gap = np.abs(points[:, None] - scenes.coordinates(V)[None]) * n
+    hats = np.prod(np.maximum(0.0, 1.0 - gap), axis=2)
+    np.testing.assert_allclose(to_dense(BackgroundBasis(V).at(points), V), hats, atol=1e-12)
+
+
+@pytest.mark.parametrize("cell", PLANE, ids=scenes.name)
+@pytest.mark.parametrize("bent", [False, True])
+def test_points_that_wander_through_a_large_background(cell, bent):
+    # Ranks learn of the cells around their points step by step; who owns them plays no part.
+    domain = scenes.unit(40, cell)
+    V = scenes.vectors(scenes.bend(domain, 0.005) if bent else domain)
+    background = BackgroundBasis(V)
+    corners = scenes.coordinates(V)
+    for x in (0.0, 0.3, 0.9, 0.4):
+        points = np.random.default_rng(WORLD.rank).random((60, 2)) * [0.1, 1.0] + [x, 0.0]
+        basis = background.at(points)
+        assert basis.found.all()
+        near = np.abs(corners[basis.nodes] - points[:, None]).max(axis=2)
+        assert near.max() < 0.04
+        np.testing.assert_allclose(basis.values.sum(axis=1), 1.0, atol=1e-12)
+        moved = np.einsum("nk,nki->ni", basis.values, corners[basis.nodes])
+        np.testing.assert_allclose(moved, points, atol=1e-13)
+
+
+@pytest.mark.parametrize("kind", MESHES)
+def test_points_just_outside(kind):
+    V = scenes.vectors(MESHES[kind]())
+    dim = V.mesh.geometry.dim
+    square = np.random.default_rng(2).random((40, dim))
+    side, face = np.arange(40) % dim, np.arange(40) // dim % 2
+    normal = np.where(np.arange(dim) == side[:, None], 2.0 * face[:, None] - 1.0, 0.0)
+    square[np.arange(40), side] = face
+    linear = np.eye(dim)
+    if kind.startswith("sheared"):
+        corner = scenes.coordinates(V)
+        span = [corner[np.argmin(np.abs(corner - e).sum(axis=1))] for e in shear_columns(dim)]
+        linear = np.array(span).T
+    basis = BackgroundBasis(V)
+    on = (square + 1e-12 * normal) @ linear.T
+    near = basis.at(on)
+    assert near.found.all()
+    values = to_dense(near, V)
+    np.testing.assert_allclose(values @ scenes.coordinates(V), on, atol=3e-12)
+    np.testing.assert_allclose(values.sum(axis=1), 1.0, atol=1e-12)
+    for distance in (1e-6, 1e-2, 1e3):
+        away = basis.at((square + distance * normal) @ linear.T)
+        assert not away.found.any()
+        assert np.all(away.values == 0.0)
+
+
+def shear_columns(dim):
+    """Return the images of the unit vectors under ``scenes.shear``."""
+    unit = scenes.shear.__defaults__[0]
+    return np.array(unit)[:dim, :dim].T
+
+
+@pytest.mark.parametrize("kind", MESHES)
+def test_cells_far_from_the_origin(kind):
+    # Round-off of coordinates, 2e-12, is 1e-11 of a cell.
+    domain = MESHES[kind]()
+    dim = domain.topology.dim
+    domain.geometry.x[:, :dim] += 1e4
+    V = scenes.vectors(domain)
+    points, expected = points_of_cells(V)
+    basis = BackgroundBasis(V).at(points)
+    assert basis.found.all()
+    np.testing.assert_allclose(to_dense(basis, V), expected, atol=1e-10)
+
+
+@pytest.mark.parametrize("cell", PLANE, ids=scenes.name)
+def test_hole_is_outside(cell):
+    # A point in a re-entrant corner is in the bounding box of the mesh, not in the mesh.
+    domain = scenes.unit(4, cell)
+    dim = domain.topology.dim
+    cells = domain.topology.index_map(dim).size_local
+    middle = scenes.mesh.compute_midpoints(domain, dim, np.arange(cells, dtype=np.int32))
+    keep = np.flatnonzero((middle[:, :2] < 0.5).any(axis=1)).astype(np.int32)
+    corner = scenes.mesh.create_submesh(domain, dim, keep)[0]
+    found = BackgroundBasis(scenes.vectors(corner)).at(
+        np.array([[0.75, 0.75], [0.5 + 1e-6, 0.5 + 1e-6], [0.5, 0.75], [0.25, 0.75], [0.9, 0.1]])
+    )
+    assert found.found.tolist() == [False, False, True, True, True]
+
+
+def test_points_that_are_not_numbers_are_outside():
+    basis = BackgroundBasis(scenes.vectors(scenes.unit(3, QUADRILATERAL)))
+    points = np.array([[np.nan, 0.5], [np.inf, 0.5], [0.5, 0.5], [0.5, -np.inf]])
+    assert basis.at(points).found.tolist() == [False, False, True, False]
+
+
+@pytest.mark.parametrize("cell", ALL, ids=scenes.name)
+def test_ranks_without_points_or_cells(cell):
+    V = scenes.vectors(scenes.unit(1, cell))
+    dim = V.mesh.geometry.dim
+    asks = WORLD.rank == WORLD.size - 1
+    points = np.random.default_rng(3).random((7 if asks else 0, dim))
+    basis = BackgroundBasis(V).at(points)
+    assert (
+        basis.nodes.shape
+        == basis.values.shape
+        == (len(points), 2**dim if cell in (QUADRILATERAL, HEXAHEDRON) else dim + 1)
+    )
+    assert basis.found.shape == (len(points),) and basis.found.all()
+    x = scenes.coordinates(V)
+    np.testing.assert_allclose(to_dense(basis, V) @ x, points, atol=1e-14)

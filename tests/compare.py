@@ -1,0 +1,58 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Comparisons of runs, states and errors."""
+
+import numpy as np
+import pytest
+import scenes
+from scenes import WORLD
+
+#: Tolerance of what is the same bit by bit on one rank: on several, MUMPS adds contributions in the
+#: order in which messages arrive.
+EXACT = 0.0 if WORLD.size == 1 else 1e-11
+
+
+def outcome(problem, *more):
+    """Return the arrays of a problem's particles, in the order of the input, and its reactions.
+
+    ``more`` names further arrays of the particles.
+    """
+    values = {}
+    for i, body in enumerate(problem.bodies):
+        names = ["centroid", "volume", "deformation_gradient", *more]
+        names += ["stress", "plastic_strain"] if body.has_material else []
+        for name in names:
+            values[f"{name} {i}"] = scenes.in_order(body, getattr(body, name))
+    for i, bc in enumerate(problem.bcs):
+        values[f"reaction {i}"] = problem.reaction(bc)
+    return values
+
+
+def same_run(one, two, tolerance):
+    """Compare two outcomes: bit by bit, or relative to sizes (of reactions: the largest one)."""
+    assert one.keys() == two.keys()
+    reactions = [v for k, v in two.items() if k.startswith("reaction")]
+    force = max((np.abs(v).max(initial=0.0) for v in reactions), default=0.0)
+    for name, values in one.items():
+        if tolerance == 0.0:
+            assert np.array_equal(values, two[name]), name
+            continue
+        size = force if name.startswith("reaction") else np.abs(two[name]).max(initial=0.0)
+        np.testing.assert_allclose(values, two[name], rtol=0.0, atol=tolerance * size, err_msg=name)
+
+
+def raises(build, error, sentence):
+    """Check class and sentence of an error, and that all ranks raise the same."""
+    try:
+        build()
+        caught = None
+    except Exception as exception:
+        caught = exception
+    texts = WORLD.allgather(f"{type(caught).__name__}: {caught}")
+    assert all(text == texts[0] for text in texts), texts
+    assert type(caught) is error, texts[0]
+    message = str(caught)
+    assert "\n" not in message and "Traceback" not in message
+    with pytest.raises(error, match=sentence):
+        raise caught
+    return caught

@@ -1,0 +1,70 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Groups of domains: pairs and patches."""
+
+import numpy as np
+import pytest
+import scenes
+from constitutive.blocks import CASES, ELASTIC, PLASTIC, block, label
+from scenes import QUADRILATERAL, TRIANGLE, box, vectors
+
+import mpm_dolfinx as mpm
+
+
+def members(problem):
+    """Return the group of each particle by its smallest member, in the order of the input."""
+    particles = problem.particles
+    averaging = problem._stresses[0].averaging
+    number = scenes.in_order(particles, averaging.groups.number)
+    first = np.full(number.max() + 1, len(number))
+    np.minimum.at(first, number, np.arange(len(number)))
+    return first[number]
+
+
+@pytest.mark.parametrize(("cell", "f_bar", "rule", "axisymmetric"), CASES[2:], ids=label)
+def test_groups_do_not_depend_on_the_ranks(cell, f_bar, rule, axisymmetric):
+    problem = block(cell, f_bar, rule, axisymmetric)
+    alone = block(cell, f_bar, rule, axisymmetric, comm=scenes.MPI.COMM_SELF)
+    number = alone._stresses[0].averaging.groups.number
+    order = np.argsort(alone.particles.global_index)
+    first = np.full(number.max() + 1, len(number))
+    np.minimum.at(first, number[order], np.arange(len(number)))
+    np.testing.assert_array_equal(members(problem), first[number[order]])
+
+
+@pytest.mark.parametrize("diagonal", ["left", "right", "left_right", "right_left"])
+def test_pairs_are_the_quadrilaterals(diagonal):
+    V = vectors(box([0.0, 0.0], [1.0, 1.0], [2, 2], QUADRILATERAL))
+    body = box([0.0, 0.0], [1.0, 1.0], [4, 4], TRIANGLE, diagonal=diagonal)
+    problem = mpm.QuasiStaticProblem(mpm.Particles(body, V), ELASTIC, f_bar="pair")
+    centre = scenes.in_order(problem.particles, problem.particles.initial_centroid)
+    square = np.floor(centre * 4.0) @ [1.0, 4.0]
+    group = members(problem)
+    assert len(np.unique(group)) == 16
+    assert (square == square[group]).all()
+
+
+@pytest.mark.parametrize("cell", scenes.PLANE, ids=label)
+@pytest.mark.parametrize("offset", [0.0, 0.1])
+def test_patches_fill_about_a_background_cell(cell, offset):
+    V = vectors(box([0.0, 0.0], [2.0, 2.0], [8, 8], QUADRILATERAL))
+    body = box([offset, offset], [1.0 + offset, 1.0 + offset], [8, 8], cell)
+    problem = mpm.QuasiStaticProblem(mpm.Particles(body, V), ELASTIC, f_bar="patch")
+    group = members(problem)
+    volume = scenes.in_order(problem.particles, problem.particles.initial_volume)
+    size = np.bincount(group, volume)[np.unique(group)] * 16.0
+    if offset == 0.0:
+        np.testing.assert_allclose(size, 1.0)
+    assert size.min() >= 0.4 and size.max() <= 2.0
+    assert len(size) <= 25
+
+
+def test_patches_keep_materials_apart():
+    V = vectors(box([0.0, 0.0], [1.0, 1.0], [2, 2], QUADRILATERAL))
+    body = box([0.0, 0.0], [1.0, 1.0], [4, 4], QUADRILATERAL)
+    tags = scenes.cell_tags(body, lambda x: 1 + (x[:, 0] > 0.25))
+    laws = {1: ELASTIC, 2: PLASTIC}
+    problem = mpm.QuasiStaticProblem(mpm.Particles(body, V), laws, cell_tags=tags, f_bar="patch")
+    centre = scenes.in_order(problem.particles, problem.particles.initial_centroid)
+    left = centre[:, 0] < 0.25
+    assert (left == left[members(problem)]).all()

@@ -1,0 +1,63 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The demos: each is a lecture note that runs by itself, and ends with a check and a picture."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+DEMOS = Path(__file__).parents[2] / "demos"
+NAMES = sorted(path.stem for path in DEMOS.glob("*.py"))
+
+
+@pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("name", NAMES)
+def test_text_is_a_lecture_note(name):
+    text = (DEMOS / f"{name}.py").read_text()
+    assert "# It illustrates how to:\n" in text
+    assert r"\tag{1}" in text
+    assert "assert " in text[-2000:]
+
+
+@pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("name", NAMES)
+def test_stands_alone(name):
+    tree = ast.parse((DEMOS / f"{name}.py").read_text())
+    imported = {
+        module
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for module in (
+            [node.module] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names]
+        )
+    }
+    assert not any(module.startswith("mpm_dolfinx.") or "demo" in module for module in imported)
+    assert not imported & {"argparse", "json", "sys"}
+
+
+@pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("name", NAMES)
+def test_runs_and_meets_its_own_assertions(name, tmp_path):
+    # In a process of its own, from a directory of its own, where it leaves its picture.
+    if name == "demo_gmsh_body":
+        pytest.importorskip("gmsh", exc_type=(ImportError, OSError))
+    done = subprocess.run(
+        [sys.executable, str(DEMOS / f"{name}.py")],
+        capture_output=True,
+        text=True,
+        timeout=400,
+        cwd=tmp_path,
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
+            "MPLBACKEND": "agg",
+        },
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() and "Exception ignored" not in done.stderr
+    picture = (tmp_path / f"{name.removeprefix('demo_')}.png").read_bytes()
+    assert picture[:8] == b"\x89PNG\r\n\x1a\n" and len(picture) > 5000

@@ -1,0 +1,26 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The examples of README and documentation run, each page from top to bottom."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+PAGES = {
+    page.name: page.read_text("utf-8")
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+    if EXAMPLE.search(page.read_text("utf-8"))
+}
+
+
+@pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("page", PAGES)
+def test_examples_of_a_page_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": "__main__"}
+    for example in EXAMPLE.finditer(PAGES[page]):
+        line = PAGES[page][: example.start()].count("\n") + 1
+        exec(compile("\n" * line + example[1], page, "exec"), names)

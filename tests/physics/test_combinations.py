@@ -1,0 +1,380 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Any two features of a problem together: they work, or a sentence says that they do not.
+
+``docs/combinations.md`` has the table; each of its cells is built and run here.
+"""
+
+import re
+from pathlib import Path
+
+from petsc4py import PETSc
+
+import numpy as np
+import pytest
+import scenes
+from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
+
+import ufl
+from dolfinx import fem, la
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.io import Kept
+from mpm_dolfinx.materials import DruckerPrager, Hencky, MohrCoulomb, VonMises
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "combinations.md"
+EXACT = {"quadrature_degree": 8}
+GRAVITY, YOUNG, POISSON = 10.0, 1e3, 0.3
+
+#: What each feature asks for. Two that ask one option for different values exclude each other.
+FEATURES = {
+    "gimp": {"method": "gimp"},
+    "cpdi": {"method": "cpdi"},
+    "mpm": {"method": "mpm"},
+    "degree 2": {"degree": 2},
+    "degree 3": {"degree": 3},
+    "f_bar domain": {"f_bar": "domain", "quadrature": 2},
+    "f_bar pair": {"f_bar": "pair", "simplices": True},
+    "f_bar patch": {"f_bar": "patch"},
+    "axisymmetric": {"axisymmetric": True},
+    "3-D": {"dim": 3},
+    "bodies on one V": {"bodies": "one V"},
+    "bodies on several V": {"bodies": "several V"},
+    "Tie": {"bodies": "tied"},
+    "Term": {"term": True},
+    "support": {"support": True},
+    "pressure": {"pressure": True},
+    "background form": {"background": True},
+    "VonMises": {"law": VonMises(YOUNG, POISSON, rho_y=6.0)},
+    "MohrCoulomb": {"law": MohrCoulomb(YOUNG, POISSON, 4.0, 30.0)},
+    "DruckerPrager": {"law": DruckerPrager(YOUNG, POISSON, 4.0, 30.0)},
+    "ghost": {"stabilisation": "ghost"},
+    "aggregate": {"stabilisation": "aggregate"},
+    "remove": {"dependent_dofs": "remove"},
+    "path": {"stage": "path"},
+    "control": {"stage": "control"},
+    "split": {"split": True},
+    "rebase": {"rebase": True},
+    "repartition": {"repartition": True},
+    "checkpoint": {"checkpoint": True},
+    "delete": {"delete": True},
+}
+
+
+class Springs(mpm.Term, Kept):
+    """Springs at the nodes of a body, which soften with each step."""
+
+    key = "springs"
+
+    def __init__(self, body):
+        super().__init__([body])
+        self.stiffness = 0.5
+        space = body.W.dofmap
+        sizes = (n * space.bs for n in (space.index_map.size_local, space.index_map.size_global))
+        self.K = PETSc.Mat().createAIJ([tuple(sizes)] * 2, nnz=1, comm=body.mesh.comm)
+        self.K.setUp()
+
+    def residuals(self):
+        force = self.K.createVecLeft()
+        force.array_w[:] = self.stiffness * scenes.own(self.bodies[0].displacement)
+        return [force]
+
+    def tangents(self):
+        diagonal = self.K.createVecLeft()
+        diagonal.set(self.stiffness)
+        self.K.setDiagonal(diagonal)
+        self.K.assemble()
+        return {(0, 0): self.K}
+
+    def pull(self):
+        """Return the force on the body at the displacement that it has."""
+        body = self.bodies[0]
+        present = la.vector(body.W.dofmap.index_map, 1)
+        present.array[:] = 0.0
+        present.array[body.W.dofmap.list[: body.num_local][~body.deleted]] = 1.0
+        present.scatter_reverse(la.InsertMode.add)
+        force = -self.residuals()[0].array_r.reshape(-1, body.mesh.geometry.dim)
+        return WORLD.allreduce(force[present.array[: len(force)] > 0.0].sum(axis=0))
+
+    def kept(self):
+        return [self]
+
+    def numbers(self):
+        return {"stiffness": self.stiffness}
+
+    def restore(self, taken):
+        self.stiffness = taken.numbers["stiffness"]
+
+
+class Scene:
+    """A block on a base, or two on each other, with what features ask for.
+
+    Args:
+        wanted: Options of the features.
+    """
+
+    def __init__(self, wanted):
+        self.wanted = wanted
+        self.dim = wanted.get("dim", 2)
+        self.degree = wanted.get("degree", 1)
+        self.springs, self.goal = None, None
+        self.supports = []
+        n, h = (2, 1.0) if self.dim == 3 and "delete" not in wanted else (4, 0.5)
+        if self.dim == 2 and self.degree > 1:
+            n, h = 2, 1.0
+        two = "bodies" in wanted
+        V = self.space(0.0, 2.0 if wanted.get("bodies") == "one V" else 1.0, h)
+        bodies = [self.body(V, 0.0, n)]
+        self.wall = fem.Constant(V.mesh, np.zeros(self.dim))
+        self.wall.value[-1] = -0.3 if "delete" in wanted else 0.0
+        self.bases = [self.base(V, 0.0, self.wall)]
+        if two:
+            above = V
+            if wanted["bodies"] == "several V":
+                above = self.space(1.0, 2.0, h)
+                self.bases.append(self.base(above, 1.0, fem.Constant(above.mesh, self.wall.value)))
+            elif wanted["bodies"] == "tied":
+                above = self.space(1.0 - 1.5 * h, 2.0, h)
+            bodies.append(self.body(above, 1.0, n))
+        self.problem = self.made(bodies, two)
+
+    def space(self, bottom, top, h):
+        """Return a background space with a cell of room, but below where particles are to leave."""
+        lower, upper = np.full(self.dim, -h), np.full(self.dim, 1.0 + h)
+        lower[-1], upper[-1] = bottom if "delete" in self.wanted else bottom - h, top + h
+        if "axisymmetric" in self.wanted:
+            lower[0] = 0.0
+        cells = np.ceil((upper - lower) / h - 1e-9).astype(int)
+        cell = HEXAHEDRON if self.dim == 3 else QUADRILATERAL
+        return scenes.vectors(scenes.box(lower, lower + h * cells, cells, cell), self.degree)
+
+    def body(self, V, bottom, n):
+        """Return a unit block."""
+        kinds = (TRIANGLE, TETRAHEDRON) if "simplices" in self.wanted else (None, HEXAHEDRON)
+        cell = kinds[self.dim - 2] or QUADRILATERAL
+        lower, upper = np.zeros(self.dim), np.ones(self.dim)
+        lower[-1], upper[-1] = bottom, bottom + 1.0
+        return mpm.Particles(
+            scenes.box(lower, upper, [n] * self.dim, cell),
+            V,
+            method=self.wanted.get("method", "cpdi2"),
+            degree=self.degree,
+            quadrature_degree=self.wanted.get("quadrature") if self.degree == 1 else None,
+            outside="delete" if "delete" in self.wanted else "error",
+        )
+
+    def base(self, V, bottom, value):
+        """Return the condition that holds a bottom."""
+        dofs = fem.locate_dofs_geometrical(V, lambda x: x[self.dim - 1] < bottom + 1e-9)
+        return fem.dirichletbc(value, dofs, V)
+
+    def made(self, bodies, two):
+        """Return the problem."""
+        wanted, first, up = self.wanted, bodies[0], self.dim - 1
+        spaces = [first.V] if bodies[-1].V is first.V else [body.V for body in bodies]
+        sides = [side_of(V) for V in spaces]
+        side = scenes.facet_tags(first.mesh, scenes.at(0, 1.0))
+        tags, pressures = [side, None] if two else side, []
+        self.side = side
+        terms = []
+        if "support" in wanted:
+            self.grip = fem.Constant(first.mesh, self.wall.value)
+            self.supports = [mpm.boundary.fixed(first, side, 1, self.grip)]
+        if "pressure" in wanted:
+            pressures = [[(5.0, 1)], []] if two else [(5.0, 1)]
+        if wanted.get("bodies") == "tied":
+            top = scenes.facet_tags(first.mesh, scenes.at(up, 1.0))
+            axisymmetric = wanted.get("axisymmetric", False)
+            terms.append(mpm.Tie(*bodies, top, 1, 1e5, axisymmetric=axisymmetric))
+        if "term" in wanted:
+            self.springs = Springs(first)
+            terms.append(self.springs)
+        background = None
+        if "background" in wanted:
+            u, v = first.increment, ufl.TestFunction(first.V)
+            background = 1e-3 * ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx
+        names = ("f_bar", "axisymmetric", "stabilisation", "dependent_dofs")
+        return mpm.QuasiStaticProblem(
+            bodies if two else first,
+            wanted.get("law", Hencky(YOUNG, POISSON)),
+            body_force=(*[0.0] * up, -GRAVITY),
+            bcs=[*self.bases, *sides],
+            tractions=(),
+            pressures=pressures,
+            facet_tags=tags,
+            supports=self.supports,
+            background=background,
+            terms=terms,
+            petsc_options={"snes_rtol": 1e-11},
+            **{name: wanted[name] for name in names if name in wanted},
+        )
+
+    def change(self):
+        """Take the bodies to other meshes or ranks."""
+        problem = self.problem
+        if "split" in self.wanted:
+            body = problem.bodies[0]
+            every = [pair for part in WORLD.allgather(heights(body)) for pair in part]
+            problem.split([max(every)[1]])
+        if "rebase" in self.wanted:
+            problem.rebase()
+        if "repartition" in self.wanted:
+            problem.repartition(0.0)
+
+    def steps(self, goal=None):
+        """Return the second stage.
+
+        Args:
+            goal: Of the displacement control, where another scene has begun it.
+        """
+        body, stage = self.problem.bodies[0], self.wanted.get("stage")
+        down = self.wall.value[-1]
+
+        def path(t):
+            self.wall.value[-1] = down + 0.01 * t
+            if self.supports:
+                self.grip.value[-1] = down + 0.01 * t
+
+        if stage == "path":
+            return self.problem.steps(2, update=path)
+        if stage == "control":
+            point, direction = corner(body), [*[0.0] * (self.dim - 1), 1.0]
+            control = mpm.DisplacementControl(body, 0.0, point=point, direction=direction)
+            self.goal = control.present() - 0.002 if goal is None else goal
+            control = mpm.DisplacementControl(body, self.goal, point=point, direction=direction)
+            return self.problem.steps(2, control=control)
+        return self.step(body)
+
+    def step(self, body):
+        """Make one step with more load."""
+        body.load.value = 1.1
+        yield self.problem.step()
+
+    def require_equilibrium(self):
+        """Compare the weight with all forces that carry it."""
+        problem = self.problem
+        weight = 0.0
+        for number, body in enumerate(problem.bodies):
+            masses = problem.masses(number)[~body.deleted]
+            weight += GRAVITY * float(body.load.value) * WORLD.allreduce(masses.sum())
+        held = sum(problem.reaction(s)[-1] for s in (*self.bases, *self.supports))
+        if "pressure" in self.wanted:
+            held += self.pressed()
+        if self.springs is not None:
+            held += self.springs.pull()[-1]
+        assert held == pytest.approx(weight, rel=1e-7)
+
+    def pressed(self):
+        """Return the vertical force of the pressure on the deformed side."""
+        body = self.problem.bodies[0]
+        F = ufl.Identity(self.dim) + ufl.grad(body.displacement)
+        area = -ufl.det(F) * ufl.dot(ufl.inv(F).T, ufl.FacetNormal(body.mesh))
+        if "axisymmetric" in self.wanted:
+            area *= 2.0 * np.pi * (ufl.SpatialCoordinate(body.mesh) + body.displacement)[0]
+        ds = ufl.ds(body.mesh, subdomain_data=body.carry(self.side), metadata=EXACT)
+        form = 5.0 * body.load * area[self.dim - 1] * ds(1)
+        if body.deletion is not None:
+            form = body.deletion.present_only(form)
+        return WORLD.allreduce(fem.assemble_scalar(fem.form(form)))
+
+
+def side_of(V):
+    """Return the condition that holds the side at the axis, in its normal direction."""
+    part, (whole, _) = V.sub(0), V.sub(0).collapse()
+    dofs = fem.locate_dofs_geometrical((part, whole), lambda x: x[0] < 1e-9)
+    return fem.dirichletbc(0.0, dofs[0], part)
+
+
+def heights(body):
+    """Return height and index of this rank's particles."""
+    up = body.mesh.geometry.dim - 1
+    rows = zip(body.centroid[:, up], body.global_index, strict=True)
+    return [(round(float(z), 6), int(index)) for z, index in rows]
+
+
+def corner(body):
+    """Return the upper node of the body's mesh at the axis."""
+    dim = body.mesh.geometry.dim
+    every = np.concatenate(WORLD.allgather(body.mesh.geometry.x[:, :dim]))
+    return max(every.tolist(), key=lambda x: (round(x[-1], 6), -round(x[0], 6)))
+
+
+def run(wanted, directory):
+    """Run a scene: its weight, what changes its meshes, another stage, perhaps interrupted."""
+    scene = Scene(wanted)
+    scene.problem.solve()
+    if "delete" in wanted:
+        assert scene.problem.history.statistics["lost_particles"] > 0
+    else:
+        scene.require_equilibrium()
+    scene.change()
+    steps = scene.steps()
+    if "checkpoint" not in wanted:
+        finish(scene, steps)
+        return
+    if "stage" in wanted:
+        next(steps)
+    scene.problem.save(directory / "state")
+    finish(scene, steps)
+    again = Scene(wanted)
+    again.problem.restore(directory / "state")
+    finish(again, again.steps(scene.goal))
+    for one, two in zip(scene.problem.bodies, again.problem.bodies, strict=True):
+        gap = scenes.in_order(one, one.centroid) - scenes.in_order(two, two.centroid)
+        assert np.abs(gap).max() < 1e-9
+
+
+def finish(scene, steps):
+    """Run what is left of the second stage."""
+    for _ in steps:
+        scene.require_equilibrium()
+    times = [step.time for step in scene.problem.history.steps]
+    assert times == sorted(set(times)) and times[-1] == 2.0
+
+
+# -- The page ----------------------------------------------------------------------------
+
+
+def excludes(one, other):
+    """Return whether two features want different values of one option."""
+    return any(one[key] is not other[key] for key in one.keys() & other.keys())
+
+
+def page():
+    """Return the rows of the page's table by feature, and its sentences by letter."""
+    text = PAGE.read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d+) \| (.+?) \| (.+) \|$", text, re.MULTILINE)
+    assert [int(number) for number, _, _ in rows] == list(range(1, len(rows) + 1))
+    table = {feature.replace("`", ""): cells.split(" | ") for _, feature, cells in rows}
+    return table, dict(re.findall(r"^- \*\*([a-z])\*\*: `([^`]+)`", text, re.MULTILINE))
+
+
+def test_the_page_has_each_pair():
+    table, sentences = page()
+    assert list(table) == list(FEATURES)
+    cells = np.array(list(table.values()))
+    assert np.array_equal(cells, cells.T)
+    assert set(cells.ravel()) == {"+", "-", *sentences}
+    assert (cells.diagonal() == "+").all()
+    for row, wanted in zip(cells, FEATURES.values(), strict=True):
+        for cell, other in zip(row, FEATURES.values(), strict=True):
+            assert (cell == "-") == excludes(wanted, other)
+
+
+@pytest.mark.parametrize("feature", FEATURES)
+@pytest.mark.filterwarnings("ignore:The run is complete, but the domains")
+def test_a_feature_with_those_before_it(feature, mpi_tmp_path):
+    table, sentences = page()
+    for cell, (other, options) in zip(table[feature], FEATURES.items(), strict=False):
+        wanted = FEATURES[feature] | options
+        try:
+            if cell == "+":
+                run(wanted, mpi_tmp_path)
+            elif cell != "-":
+                with pytest.raises(mpm.MPMError, match=re.escape(sentences[cell])):
+                    run(wanted, mpi_tmp_path)
+        except BaseException as error:
+            error.add_note(f"{feature} with {other}: {cell}")
+            raise
+        if other == feature:
+            break

@@ -1,0 +1,568 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Motion: momentum, energy and order, against exact solutions; splits, ranks and restarts."""
+
+import numpy as np
+import pytest
+from compare import EXACT, raises
+from scenes import (
+    HEXAHEDRON,
+    QUADRILATERAL,
+    TRIANGLE,
+    WORLD,
+    anywhere,
+    at,
+    box,
+    fix,
+    in_order,
+    largest,
+    vectors,
+)
+
+import ufl
+from dolfinx import fem, mesh
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.boundary import fixed, plane
+from mpm_dolfinx.errors import ConvergenceError
+from mpm_dolfinx.materials import Hencky, LinearElastic, VonMises
+
+SCHEMES = [("midpoint", "project"), ("midpoint", "reflect"), ("euler", "project")]
+
+
+def plate(comm=WORLD, degree=1):
+    """Return the space on a background of 4 x 4."""
+    return vectors(box([0.0, 0.0], [4.0, 4.0], [16, 16], QUADRILATERAL, comm), degree)
+
+
+def square(cell=QUADRILATERAL, corner=(1.23, 1.51), V=None, degree=1, comm=WORLD, **options):
+    """Return a unit square on a background of 4 x 4."""
+    body = box(list(corner), [c + 1.0 for c in corner], [8, 8], cell, comm)
+    V = plate(comm, degree) if V is None else V
+    return mpm.Particles(body, V, degree=degree, **options)
+
+
+def spin(x):
+    """Return a rotation about (1.73, 2.01) at one radian in a unit of time."""
+    return np.stack([-(x[1] - 2.01), x[0] - 1.73])
+
+
+def spinning(particles=None, material=None, velocity=spin, **options):
+    """Return a problem of a square that spins."""
+    particles = square() if particles is None else particles
+    law = Hencky(100.0, 0.3) if material is None else material
+    options = {"petsc_options": {"snes_rtol": 1e-12}, **options}
+    return mpm.DynamicProblem(particles, law, 2.0, velocity=velocity, **options)
+
+
+def change_of_balance(history):
+    """Return the largest change of what the account must keep, relative to the kinetic energy."""
+    balances = np.array([energy.balance for energy in history.energies])
+    return np.abs(balances - balances[0]).max() / history.energies[0].kinetic
+
+
+def nodal(function):
+    return function.x.array.reshape(-1, function.function_space.dofmap.bs)
+
+
+# -- Free bodies, exactly -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize(("scheme", "out"), SCHEMES)
+def test_a_free_body_flies_on(scheme, out, degree):
+    problem = spinning(
+        square(degree=degree),
+        velocity=(0.3, -0.2),
+        scheme=scheme,
+        out_of_range=out,
+        petsc_options={},
+    )
+    momentum, turning, energy = problem.momentum, problem.angular_momentum, problem.kinetic_energy
+    np.testing.assert_allclose(momentum, [0.6, -0.4], rtol=1e-13)
+    np.testing.assert_allclose(turning, 1.73 * -0.4 - 2.01 * 0.6, rtol=1e-13)
+    history = problem.solve(2.0, 0.1)
+    most = 0 if out == "project" and scheme == "midpoint" and degree == 1 else 1
+    assert all(step.iterations <= most for step in history.steps)
+    moved = nodal(problem.particles.displacement) - [0.6, -0.4]
+    assert largest(moved) < 1e-10
+    np.testing.assert_allclose(problem.momentum, momentum, atol=1e-11)
+    np.testing.assert_allclose(problem.angular_momentum, turning, atol=1e-10)
+    assert problem.kinetic_energy == pytest.approx(energy, rel=1e-9)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize(("scheme", "out"), SCHEMES)
+def test_dust_that_spins_flies_apart_in_straight_lines(scheme, out, degree):
+    # Without stress each node keeps its velocity: x + t v(x), a motion in the range of T.
+    dust = LinearElastic(1e-14, 0.3)
+    problem = spinning(
+        square(degree=degree), dust, scheme=scheme, out_of_range=out, stabilisation=None
+    )
+    velocity = nodal(problem.velocity).copy()
+    momentum, turning, energy = problem.momentum, problem.angular_momentum, problem.kinetic_energy
+    problem.solve(0.7, 0.1)
+    assert largest(nodal(problem.particles.displacement) - 0.7 * velocity) < 1e-10
+    np.testing.assert_allclose(problem.momentum, momentum, atol=1e-11)
+    np.testing.assert_allclose(problem.angular_momentum, turning, atol=1e-11)
+    assert problem.kinetic_energy == pytest.approx(energy, rel=1e-11)
+
+
+@pytest.mark.parametrize("cell", [TRIANGLE, QUADRILATERAL])
+def test_a_body_falls_on_a_parabola(cell):
+    problem = spinning(square(cell), velocity=(0.1, 0.4), body_force=(0.0, -1.0))
+    history = problem.solve(1.0, 0.13)  # the steps are 1/8
+    assert [step.time for step in history.steps] == [k / 8 for k in range(1, 9)]
+    for energy in history.energies:
+        t = energy.time
+        assert energy.kinetic == pytest.approx(0.1**2 + (0.4 - t) ** 2, abs=1e-11)
+        assert energy.external == pytest.approx(-2.0 * (0.4 * t - 0.5 * t**2), abs=1e-11)
+    assert largest(nodal(problem.particles.displacement) - [0.1, -0.1]) < 1e-11
+    np.testing.assert_allclose(problem.momentum, [0.2, -1.2], atol=1e-11)
+
+
+def test_a_load_in_time_gives_the_momentum_of_its_trapezium():
+    particles = square()
+    force = fem.Constant(particles.mesh, (0.0, 0.0))
+    problem = spinning(particles, velocity=None, body_force=force)
+
+    def update(t):
+        force.value = (3.0 * t**2, 1.0)
+
+    problem.solve(1.0, 0.25, update)
+    mean = np.mean([3.0 * (a**2 + (a + 0.25) ** 2) / 2 for a in (0.0, 0.25, 0.5, 0.75)])
+    np.testing.assert_allclose(problem.momentum, [2.0 * mean, 2.0], rtol=1e-11)
+    force.value = (0.0, -1.0)
+    problem.step(0.5)  # what is set acts all through it
+    np.testing.assert_allclose(problem.momentum, [2.0 * mean, 1.0], rtol=1e-11)
+
+
+# -- Energy, order --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("scheme", "out"), SCHEMES)
+def test_a_spinning_body_keeps_momentum_and_its_account(scheme, out):
+    problem = spinning(scheme=scheme, out_of_range=out)
+    momentum, turning = problem.momentum, problem.angular_momentum
+    history = problem.solve(2.0, 0.05)
+    np.testing.assert_allclose(problem.momentum, momentum, atol=1e-11)
+    if scheme == "midpoint":  # to second order; the spin of the whole run is two radians
+        np.testing.assert_allclose(problem.angular_momentum, turning, rtol=1e-3)
+    assert change_of_balance(history) < 1e-10
+    lost = np.array([energy.lost for energy in history.energies])
+    assert np.all(np.diff(lost) >= 0.0)
+    assert (lost[-1] == 0.0) == (out == "reflect")
+
+
+@pytest.mark.parametrize("out", ["project", "reflect"])
+@pytest.mark.parametrize("dt", [0.02, 0.05, 0.31])
+@pytest.mark.parametrize("speed", [0.1, 0.37, 0.8, 1.25])
+def test_an_elastic_bar_wins_no_energy_at_any_speed(speed, dt, out):
+    # The bar vibrates, and flies through the cells; small strains have an energy that the mean of
+    # the end forces keeps.
+    V = vectors(box([0.0, 0.0], [9.0, 0.375], [72, 3], QUADRILATERAL))
+    body = box([0.3, 0.141], [1.3, 0.266], [16, 2], QUADRILATERAL)
+    problem = mpm.DynamicProblem(
+        mpm.Particles(body, V),
+        LinearElastic(1.0, 0.3),
+        1.0,
+        velocity=lambda x: np.stack([speed + 0.3 * np.cos(np.pi * (x[0] - 0.3)), 0.0 * x[0]]),
+        out_of_range=out,
+    )
+    history = problem.solve(50 * dt if speed * 50 * dt < 7.0 else 5.0, dt)
+    whole = np.array([energy.kinetic + energy.internal for energy in history.energies])
+    assert whole.max() <= whole[0] * (1.0 + 1e-10)
+    assert whole.min() >= whole[0] * (1.0 - (1e-3 if out == "reflect" else 0.05))
+    assert np.diff([energy.balance for energy in history.energies]).max() < 1e-10 * whole[0]
+
+
+def vibrating(steps, scheme):
+    """Return the error of displacement of a bar's first mode, relative to its amplitude."""
+    V = vectors(box([0.0, 0.0], [2.5, 3 / 32], [80, 3], QUADRILATERAL))
+    body = box([0.3, 1 / 32], [1.3, 2 / 32], [64, 2], QUADRILATERAL)
+    particles, w, speed, end = mpm.Particles(body, V), np.pi, 0.37, 2.25
+
+    def velocity(x):
+        return np.stack([speed + 0.1 * w * np.cos(np.pi * (x[0] - 0.3)), 0.0 * x[0]])
+
+    problem = mpm.DynamicProblem(
+        particles, LinearElastic(1.0, 0.0), 1.0, velocity=velocity, scheme=scheme
+    )
+    problem.solve(end, end / steps)
+    x = particles.W.tabulate_dof_coordinates()[:, 0] - 0.3
+    exact = 0.1 * np.sin(w * end) * np.cos(np.pi * x)
+    return largest(nodal(particles.displacement)[:, 0] - speed * end - exact) / 0.1
+
+
+@pytest.mark.parametrize(("scheme", "rates"), [("midpoint", (1.9, 2.2)), ("euler", (0.7, 1.0))])
+def test_order_in_time_of_a_bar_that_vibrates_and_flies(scheme, rates):
+    errors = [
+        vibrating(steps, scheme) for steps in ((18, 36) if scheme == "midpoint" else (72, 144))
+    ]
+    assert rates[0] < np.log2(errors[0] / errors[1]) < rates[1]
+    assert errors[1] < (0.02 if scheme == "midpoint" else 0.15)
+
+
+def test_a_bar_that_is_shaken_at_its_end_carries_the_wave():
+    # d'Alembert: d(x, t) = g(t - x) until the wave comes back.
+    V = vectors(box([0.0, 0.0], [1.5, 3 / 32], [48, 3], QUADRILATERAL))
+    body = box([0.2, 1 / 32], [1.2, 2 / 32], [64, 2], QUADRILATERAL)
+    particles = mpm.Particles(body, V)
+    base = mesh.locate_entities_boundary(body, 1, lambda x: np.isclose(x[0], 0.2))
+    tags = mesh.meshtags(body, 1, np.sort(base), np.full(len(base), 1, dtype=np.int32))
+    shaken = fem.Constant(body, (0.0, 0.0))
+    support = fixed(particles, tags, 1, value=shaken)
+    problem = mpm.DynamicProblem(particles, LinearElastic(1.0, 0.0), 1.0, supports=[support])
+
+    def path(t):
+        return 0.02 * np.sin(np.pi * np.clip(t, 0.0, 1.0)) ** 2
+
+    def update(t):
+        shaken.value[0] = path(t)
+
+    problem.solve(0.9, 0.9 / 60, update)
+    x = particles.W.tabulate_dof_coordinates()[:, 0] - 0.2
+    assert largest(nodal(particles.displacement)[:, 0] - path(0.9 - x)) < 0.03 * 0.02
+
+
+@pytest.mark.parametrize("scheme", ["midpoint", "euler"])
+def test_the_reaction_is_the_force_that_moves_a_body(scheme):
+    # All of the background is held, and follows g: the body has the acceleration of g.
+    V = plate()
+    value = fem.Function(V)
+    dofs = np.arange(V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts, dtype=np.int32)
+    bc = fem.dirichletbc(value, dofs)
+    problem = spinning(square(V=V), velocity=None, bcs=[bc], scheme=scheme, out_of_range="reflect")
+
+    def update(t):
+        nodal(value)[:] = (0.1 * t**2, -0.05 * t**2)
+
+    forces = []
+    for step in problem.steps(0.5, 0.1, update):
+        if scheme == "midpoint":
+            np.testing.assert_allclose(
+                problem.momentum, 2.0 * step.time * np.array([0.2, -0.1]), atol=1e-11
+            )
+        forces.append(problem.reaction(bc))
+    np.testing.assert_allclose(forces[1:], np.tile([0.4, -0.2], (4, 1)), rtol=1e-9)
+    raises(
+        lambda: list(spinning(square(V=V), bcs=[bc]).steps(0.1, 0.1, update)),
+        mpm.MPMError,
+        "out_of_range='project'",
+    )
+
+
+def test_a_body_of_revolution_falls_and_keeps_its_account():
+    V = plate()
+    particles = square(V=V, corner=(0.0, 1.51))
+    problem = spinning(
+        particles,
+        velocity=lambda x: np.stack([0.1 * x[0], 0.0 * x[0]]),
+        axisymmetric=True,
+        bcs=[fix(V, at(0, 0.0), 0.0, component=0)],
+        body_force=(0.0, -1.0),
+    )
+    mass = 2.0 * np.pi
+    history = problem.solve(0.5, 0.05)
+    np.testing.assert_allclose(problem.momentum[1], -0.5 * mass, rtol=1e-10)
+    assert change_of_balance(history) < 1e-9
+    assert history.energies[-1].external == pytest.approx(mass * 0.125, rel=1e-10)
+
+
+def test_a_cube_spins_in_space():
+    V = vectors(box([0.0] * 3, [2.0] * 3, [6] * 3, HEXAHEDRON))
+    body = box([0.53] * 3, [1.53] * 3, [4] * 3, HEXAHEDRON)
+    problem = mpm.DynamicProblem(
+        mpm.Particles(body, V),
+        VonMises(100.0, 0.3, rho_y=5.0),
+        1.0,
+        velocity=lambda x: np.stack([0.1 - x[1] + 1.03, x[0] - 1.03, 0.0 * x[2]]),
+        petsc_options={"snes_rtol": 1e-12},
+        stabilisation=None,
+    )
+    momentum, turning = problem.momentum, problem.angular_momentum
+    assert turning.shape == (3,)
+    history = problem.solve(0.2, 0.05)
+    np.testing.assert_allclose(problem.momentum, momentum, atol=1e-11)
+    np.testing.assert_allclose(problem.angular_momentum, turning, atol=2e-4)
+    assert change_of_balance(history) < 1e-10
+
+
+def test_backward_euler_brings_a_body_to_rest_on_a_plane():
+    particles = square(corner=(1.23, 1.0))
+    floor = plane(particles, (0.0, 1.0), (0.0, 1.0), modulus=100.0)
+    options = {"body_force": (0.0, -1.0), "supports": [floor], "velocity": None}
+    problem = spinning(particles, scheme="euler", **options)
+    problem.solve(4.0, 0.1)
+    assert problem.kinetic_energy < 1e-6
+    np.testing.assert_allclose(problem.reaction(floor), [0.0, 2.0], atol=1e-3)
+
+
+# -- What goes with the rest of the package -------------------------------------------------------
+
+
+def run_of(problem):
+    """Return what a run gives, in an order that ranks do not change."""
+    found = {}
+    for number, body in enumerate(problem.bodies):
+        nodes = body.domain_nodes
+        velocity = nodal(problem.inertia.velocities[number])[nodes]
+        n = body.num_local
+        found[f"positions {number}"] = in_order(body, body.domains.reshape(n, -1))
+        found[f"stress {number}"] = in_order(body, body.stress.reshape(n, -1))
+        found[f"velocity {number}"] = in_order(body, velocity.reshape(n, -1))
+    energies = problem.history.energies
+    found["energies"] = np.array([list(vars(energy).values()) for energy in energies])
+    return found
+
+
+def require_same(one, other, tolerance):
+    assert one.keys() == other.keys()
+    for name, values in one.items():
+        atol = tolerance * np.abs(other[name]).max(initial=0.0)
+        np.testing.assert_allclose(values, other[name], rtol=0.0, atol=atol, err_msg=name)
+
+
+def thrown(comm=WORLD, out="project", **options):
+    """Return a body that yields, spins and falls."""
+    particles = square(V=plate(comm), comm=comm, **options)
+    law = VonMises(100.0, 0.3, rho_y=3.0)
+    return spinning(particles, law, body_force=(0.0, -1.0), out_of_range=out)
+
+
+@pytest.mark.parametrize("out", ["project", "reflect"])
+def test_a_run_that_is_restored_goes_on_bit_for_bit(tmp_path, out):
+    path = WORLD.bcast(tmp_path) / "run.ckpt"
+    whole = thrown(out=out)
+    for step in whole.steps(0.5, 0.05, output_at=[0.33]):
+        if step.time == 0.25 or len(whole.history.steps) == 5:
+            whole.save(path)
+    restored = thrown(out=out)
+    restored.restore(path)
+    assert len(restored.history.steps) == 5
+    restored.solve(0.5, 0.05, output_at=[0.33])
+    assert [s.time for s in restored.history.steps] == [s.time for s in whole.history.steps]
+    require_same(run_of(restored), run_of(whole), EXACT)
+    raises(
+        lambda: thrown(out="reflect" if out == "project" else "project").restore(path),
+        mpm.MPMError,
+        "was made with scheme='midpoint'",
+    )
+    static = mpm.QuasiStaticProblem(square(), VonMises(100.0, 0.3, rho_y=3.0))
+    static.save(path)
+    raises(lambda: thrown(out=out).restore(path), mpm.MPMError, "holds no velocities")
+
+
+def test_ranks_and_moves_between_them_change_nothing():
+    alone = thrown(mesh_comm()) if WORLD.size > 1 else thrown()
+    alone.solve(0.5, 0.05)
+    moving = thrown()
+    for number, _ in enumerate(moving.steps(0.5, 0.05)):
+        if number % 3 == 0:
+            ranks = anywhere(moving.particles.mesh, number)
+            moving.renew(lambda ranks=ranks: moving.particles.move(ranks), lambda state: state)
+    require_same(run_of(moving), run_of(alone), 1e-9)
+
+
+def mesh_comm():
+    from mpi4py import MPI
+
+    return MPI.COMM_SELF
+
+
+@pytest.mark.parametrize("out", ["project", "reflect"])
+def test_split_and_rebase_keep_momentum(out):
+    problem = thrown(out=out)
+    problem.solve(0.2, 0.05)
+    expected = problem.momentum
+    problem.split([3, 17, 40])
+    np.testing.assert_allclose(problem.momentum, expected, atol=1e-12)
+    problem.rebase()
+    np.testing.assert_allclose(problem.momentum, expected, atol=1e-12)
+    history = problem.solve(0.4, 0.05)
+    np.testing.assert_allclose(problem.momentum, expected - [0.0, 0.2 * 2.0], atol=1e-11)
+    assert change_of_balance(history) < 1e-9
+
+
+def test_two_bodies_collide_on_one_background():
+    # No momentum is lost, and they part by themselves.
+    V = vectors(box([-1.0, 0.0], [4.0, 1.5], [20, 6], QUADRILATERAL))
+    bodies = [square(corner=(x, 0.27), V=V) for x in (0.3, 1.6)]
+    problem = mpm.DynamicProblem(
+        bodies,
+        Hencky(100.0, 0.3),
+        1.0,
+        velocity=[(0.5, 0.0), (-0.5, 0.0)],
+        petsc_options={"snes_rtol": 1e-12},
+    )
+    history = problem.solve(0.8, 0.01)  # (the gap to contact is known to a step)
+    np.testing.assert_allclose(problem.momentum, 0.0, atol=1e-11)
+    speeds = []
+    for body, velocity in zip(bodies, problem.velocity, strict=True):
+        n = body.num_local
+        mean = nodal(velocity)[body.domain_nodes].mean(axis=1)[:n, 0].sum()
+        speeds.append(WORLD.allreduce(mean) / 64)
+    assert speeds[0] < -0.25 and speeds[1] > 0.25  # the rest vibrates
+    least = min(energy.kinetic for energy in history.energies)
+    assert least < 0.2 * history.energies[0].kinetic
+    assert change_of_balance(history) < 1e-9
+
+
+OTHERS = {
+    "cpdi": ({"method": "cpdi"}, {}),
+    "gimp": ({"method": "gimp"}, {}),
+    "mpm": ({"method": "mpm"}, {}),
+    "F-bar": ({"quadrature_degree": 2}, {"f_bar": "domain"}),
+    "degree 3": ({"degree": 3}, {"stabilisation": None}),
+    "aggregation": ({"degree": 2}, {"stabilisation": "aggregate"}),
+    "reference route": ({}, {"assembly": "reference"}),
+    "removed dofs": ({}, {"dependent_dofs": "remove"}),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_methods_and_options_keep_momentum_and_the_account(name):
+    of_particles, options = OTHERS[name]
+    problem = spinning(square(**of_particles), velocity=lambda x: 0.3 + 0.5 * spin(x), **options)
+    momentum, turning = problem.momentum, problem.angular_momentum
+    history = problem.solve(0.4, 0.05)
+    np.testing.assert_allclose(problem.momentum, momentum, atol=1e-10)
+    np.testing.assert_allclose(problem.angular_momentum, turning, atol=2e-4)
+    assert change_of_balance(history) < 1e-7
+    energies = history.energies
+    assert all(
+        energy.kinetic + energy.internal <= 1.0001 * energies[0].kinetic for energy in energies
+    )
+
+
+def test_a_pressure_and_a_tie_give_the_account_their_work():
+    V, other = plate(), plate()
+    bodies = [square(V=V), square(V=other, corner=(2.23, 1.51))]
+    tags = [
+        mesh.meshtags(
+            body.mesh,
+            1,
+            np.sort(found := mesh.locate_entities_boundary(body.mesh, 1, where)),
+            np.full(len(found), 1, dtype=np.int32),
+        )
+        for body, where in zip(bodies, (at(0, 2.23), at(0, 3.23)), strict=True)
+    ]
+    problem = mpm.DynamicProblem(
+        bodies,
+        Hencky(100.0, 0.3),
+        2.0,
+        terms=[mpm.Tie(*bodies, tags[0], 1, 1e3)],
+        pressures=[[], [(1.0, 1)]],
+        facet_tags=tags,
+        petsc_options={"snes_rtol": 1e-12},
+    )
+    history = problem.solve(0.5, 0.025)
+    # A pressure of 1 on a face that is about as long as at first drives both to the left.
+    np.testing.assert_allclose(problem.momentum, [-0.5, 0.0], atol=0.01)
+    means = [nodal(v)[:, 0].mean() for v in problem.velocity]
+    if WORLD.size == 1:
+        np.testing.assert_allclose(means, -0.125, atol=0.02)
+    balances = [energy.balance for energy in history.energies]
+    assert np.ptp(balances) < 1e-9 * history.energies[-1].kinetic
+
+
+def test_two_fields_fly_apart_as_if_each_were_alone():
+    alone = []
+    for speed in (0.4, -0.3):
+        problem = spinning(velocity=lambda x, s=speed: s * spin(x))
+        problem.solve(0.5, 0.05)
+        alone.append(run_of(problem))
+    pair = [square(), square()]
+    together = spinning(pair, velocity=[lambda x, s=s: s * spin(x) for s in (0.4, -0.3)])
+    together.solve(0.5, 0.05)
+    found = run_of(together)
+    for number, own in enumerate(alone):
+        for name in ("positions", "stress", "velocity"):
+            size = np.abs(own[f"{name} 0"]).max()
+            np.testing.assert_allclose(
+                found[f"{name} {number}"], own[f"{name} 0"], atol=1e-8 * size, err_msg=name
+            )
+
+
+def test_times_asked_for_are_hit_and_written(tmp_path):
+    path = WORLD.bcast(tmp_path) / "run.pvd"
+    problem = thrown()
+    wanted = [0.1, 1.0 / 3.0, 0.37]
+    history = problem.solve(0.4, 0.06, output_at=wanted, output=path)
+    times = [step.time for step in history.steps]
+    assert set(wanted) <= set(times) and times[-1] == 0.4 == history.time
+    assert np.diff([0.0, *times]).max() <= 0.06 * (1 + 1e-12)
+    assert path.read_text().count("<DataSet") == 5
+    assert [energy.time for energy in history.energies] == [0.0, *times]
+    problem.step(0.1)
+    assert problem.history.time == 0.5
+
+
+def test_a_step_that_fails_is_halved_and_later_ones_recover():
+    problem = thrown()
+    refuses = [2]
+
+    def evaluate():
+        if problem.inertia.dt > 0.04 and refuses[0]:
+            refuses[0] -= 1
+            return ConvergenceError("not so fast")
+        return None
+
+    calls = []
+    problem.evaluate = evaluate
+    history = problem.solve(0.3, 0.05, update=calls.append)
+    assert history.cutbacks >= 1
+    assert history.time == 0.3
+    lengths = np.diff([energy.time for energy in history.energies])
+    assert lengths.min() == pytest.approx(0.025) and lengths[-1] == pytest.approx(0.05)
+    assert calls[0] == 0.0 and calls[-1] == 0.3
+    np.testing.assert_allclose(problem.momentum[1], momentum_of_spin()[1] - 0.6, atol=1e-10)
+
+
+def momentum_of_spin():
+    return spinning().momentum
+
+
+def test_particles_that_leave_take_their_momentum_with_them():
+    V = plate()
+    problem = spinning(square(V=V, corner=(2.53, 1.51), outside="delete"), velocity=(1.0, 0.0))
+    history = problem.solve(1.0, 0.05)
+    left = history.statistics["lost_mass"]
+    assert 0.5 < left < 2.0
+    np.testing.assert_allclose(problem.momentum, [2.0 - left, 0.0], atol=1e-9)
+    assert history.energies[-1].lost == pytest.approx(0.5 * left, rel=1e-8)
+
+
+def test_what_does_not_go_with_inertia_is_refused():
+    def refused(sentence, density=1.0, law=None, **options):
+        law = Hencky(100.0, 0.3) if law is None else law
+        particles = options.pop("particles", None) or square()
+        raises(
+            lambda: mpm.DynamicProblem(particles, law, density, **options), mpm.MPMError, sentence
+        )
+
+    refused("Unknown scheme='newmark'", scheme="newmark")
+    refused("Unknown out_of_range='keep'", out_of_range="keep")
+    refused("positive density", density=0.0)
+    refused("leave predictor= out", predictor=True)
+    refused("velocity has the shape", velocity=(1.0, 2.0, 3.0))
+    refused("velocity must be finite", velocity=lambda x: np.full((2, x.shape[1]), np.inf))
+    refused("function that gives velocity failed", velocity=lambda x: x[5])
+    particles = square()
+    other = fem.Function(square().W)
+    refused("velocity lives on another mesh", particles=particles, velocity=other)
+    refused("There are 2 bodies, but a list of 1", particles=[square(), square()], velocity=[None])
+    floor = plane(particles, (0.0, 1.0), (0.0, 1.0), modulus=1.0)
+    refused("One-sided supports", particles=particles, supports=[floor])
+    form = ufl.inner(particles.increment, ufl.TestFunction(particles.V)) * ufl.dx
+    refused("form on the background has no past", particles=particles, background=form)
+    problem = spinning()
+    for call, sentence in (
+        (lambda: problem.solve(-1.0, 0.1), "give a later time"),
+        (lambda: problem.solve(1.0, 0.0), "dt must be positive"),
+        (lambda: problem.solve(np.nan, 0.1), "time must be a finite number"),
+        (lambda: problem.solve(1.0, 0.1, output_at=[2.0]), "later than the end"),
+        (lambda: problem.solve(1.0, 0.1, output_at=3), "must be a list of times"),
+        (lambda: problem.step(-0.1), "dt must be positive"),
+    ):
+        raises(call, mpm.MPMError, sentence)

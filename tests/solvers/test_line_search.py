@@ -1,0 +1,190 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Hard steps: directions uphill, stalls, limit loads, and what a failure names."""
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+import pytest
+import scenes
+from scenes import QUADRILATERAL
+from solvers.double_well import DoubleWell, newton
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.solvers.line_search import stalled
+
+
+def test_a_step_uphill_is_redirected():
+    # Near an inflection the potential's curvature is small and negative: Newton's own step is long
+    # and leads uphill, where the residual grows.
+    problem = DoubleWell([1.0, 5.0, 0.3], 0.1)
+    solver = newton()
+    solver.solve(problem, (3, 3))
+    assert solver.statistics["redirections"] >= 1
+    x = solver.x.array_r + problem.start
+    assert np.all(3.0 * x**2 > 1.0)  # a minimum of the potential, not its maximum
+    assert np.all(x > 0.0)  # the one downhill from the start
+    assert problem.potential(x) < problem.potential(np.full(3, problem.start))
+    np.testing.assert_allclose(problem.c * (x**3 - x), 0.1, atol=1e-8)
+    assert solver.statistics["factorisations"] == solver.iterations
+
+
+@pytest.mark.parametrize("options", [{"symmetric": False}, {"shift": 0.0}, {"line_search": False}])
+def test_no_redirection_without_its_conditions(options):
+    solver = newton(**options)
+    try:
+        solver.solve(DoubleWell([1.0, 5.0, 0.3], 0.1), (3, 3))
+    except mpm.ConvergenceError:
+        assert solver.no_equilibrium
+    assert solver.statistics["redirections"] == 0
+
+
+class Rod(DoubleWell):
+    """A stiff rod from the origin to (1, 0), its end held by a soft spring and pulled sideways.
+
+    Gradient of ``stiffness (|X|^2 - 1)^2 / 8 + |X - start|^2 / 2 - X_1``.
+    """
+
+    def __init__(self, stiffness, has_history):
+        super().__init__([stiffness, stiffness], 1.0, np.array([1.0, 0.0]))
+        self.stiffness, self.has_history = stiffness, has_history
+        self.K = PETSc.Mat().createAIJ((2, 2), nnz=2, comm=MPI.COMM_SELF)
+
+    def residual(self, x, F):
+        self.x = x.array_r + self.start
+        self.force = 0.5 * self.stiffness * (self.x @ self.x - 1.0)
+        F.array_w[:] = self.force * self.x + x.array_r - [0.0, 1.0]
+        return None
+
+    def tangent(self):
+        dense = self.stiffness * np.outer(self.x, self.x) + (self.force + 1.0) * np.eye(2)
+        self.K.setValues([0, 1], [0, 1], dense)
+        self.K.assemble()
+        return self.K
+
+    def smooth(self):
+        return not self.has_history
+
+
+def test_a_step_that_turns_a_stiff_rod_is_trusted():
+    # The first Newton step stretches the rod by 1.4: its force is 10^6 times the load then.
+    solver, problem = newton(), Rod(1e6, has_history=False)
+    solver.solve(problem, (2, 2))
+    assert solver.statistics["trusted_steps"] == 1 and solver.statistics["halvings"] == 0
+    assert solver.iterations < 10 and max(solver.residuals) > 1e5
+    # A rod that hardly stretches stands at 45 degrees: spring and load pull along it.
+    np.testing.assert_allclose(solver.x.array_r + problem.start, 0.5**0.5, rtol=0.0, atol=1e-6)
+
+
+def test_a_response_with_a_history_is_not_trusted():
+    ends, solves = [], []
+    for has_history in (False, True):
+        solver, problem = newton(), Rod(1e3, has_history)
+        solver.solve(problem, (2, 2))
+        assert (solver.statistics["trusted_steps"] > 0) != has_history
+        assert (solver.statistics["halvings"] > 0) == has_history
+        ends.append(solver.x.array_r + problem.start)
+        solves.append(solver.iterations)
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=1e-9)
+    assert 2 * solves[0] < solves[1]
+
+
+class Flat(DoubleWell):
+    """Gradient of a convex potential, ``arctan(X)``: Newton's own steps from afar run away."""
+
+    def residual(self, x, F):
+        self.x = x.array_r + self.start
+        F.array_w[:] = np.arctan(self.x)
+        return None
+
+    def tangent(self):
+        for i, value in enumerate(1.0 / (1.0 + self.x**2)):
+            self.K.setValue(i, i, value)
+        self.K.assemble()
+        return self.K
+
+
+def test_trust_that_is_abused_ends():
+    solver = newton()
+    problem = Flat([1.0, 1.0], 0.0, start=np.array([1.5, -3.0]))
+    solver.solve(problem, (2, 2))
+    assert solver.statistics["trusted_steps"] == solver.statistics["withdrawn_steps"] == 1
+    assert solver.statistics["halvings"] > 0 and solver.iterations < 20
+    np.testing.assert_allclose(solver.x.array_r + problem.start, 0.0, atol=1e-9)
+
+
+def test_trust_ends_where_a_linear_solve_breaks_down():
+    solver = newton()
+    problem = Flat([1.0, 1.0], 0.0, start=np.array([1.5, -10.0]))  # a tangent of 1e-300 soon
+    solver.solve(problem, (2, 2))
+    assert solver.statistics["withdrawn_steps"] == 1
+    np.testing.assert_allclose(solver.x.array_r + problem.start, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("strain", [1e-4, 1e-1])
+def test_response_is_smooth_where_nothing_yields(strain):
+    problem = scenes.slump(QUADRILATERAL, 1e3, h=1.0)
+    problem.solve(steps=1)
+    problem.particles.displacement.interpolate(lambda x: (strain * x[1], 0.0 * x[0]))
+    (term,) = problem.body_terms
+    assert term.update() is None
+    assert problem.reduced.smooth() == (strain < 1e-2)
+    problem.reduced.roll_back()
+    assert problem.reduced.smooth()
+
+
+def test_histories_and_contact_are_not_smooth():
+    problem = scenes.block()
+    particles = problem.particles
+    d, v = particles.displacement, scenes.ufl.TestFunction(particles.W)
+    R = scenes.ufl.inner(scenes.linear_stress(d, 1e3, 0.3), scenes.ufl.grad(v)) * particles.dx
+
+    class WithHistory(mpm.ParticleProblem):
+        def commit(self):
+            pass
+
+    assert problem.reduced.smooth()
+    assert mpm.ParticleProblem(R, particles, bcs=problem.bcs).reduced.smooth()
+    assert not WithHistory(R, particles, bcs=problem.bcs).reduced.smooth()
+    wall = mpm.boundary.plane(particles, (1.5, 0.0), (-1.0, 0.0))
+    touching = mpm.QuasiStaticProblem(
+        particles, mpm.materials.Hencky(1e3, 0.3), bcs=problem.bcs, supports=[wall]
+    )
+    assert not touching.reduced.smooth()
+
+
+def nearly_incompressible(**options):
+    """A cantilever that bends by 0.6 of its length in 10 steps, volume averaged over patches."""
+    V = scenes.vectors(scenes.box([0.0, 0.0], [11.0, 10.0], [22, 20], QUADRILATERAL))
+    body = scenes.box([0.0, 8.5], [10.0, 9.5], [40, 4], QUADRILATERAL)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(body, V),
+        mpm.materials.Hencky(12e6, 0.4999),
+        bcs=[scenes.fix(V, scenes.at(0, 0.0))],
+        tractions=[((0.0, -30e3), 1)],
+        facet_tags=scenes.facet_tags(body, scenes.at(0, 10.0)),
+        f_bar="patch",
+        **options,
+    )
+    problem.solve(steps=10)
+    return problem
+
+
+def test_line_search_lets_a_nearly_incompressible_body_bend():
+    search, plain = nearly_incompressible(), nearly_incompressible(line_search=False)
+    assert search.history.statistics["trusted_steps"] > 0
+    solves = [sum(p.history.iterations) + p.history.failed_iterations for p in (search, plain)]
+    assert solves[0] <= 1.5 * solves[1]
+    ends = [scenes.in_order(p.particles, p.particles.centroid) for p in (search, plain)]
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=1e-6)
+
+
+def test_stalls():
+    falling = [2.0**-i for i in range(40)]
+    assert not any(stalled(falling[:n]) for n in range(1, 41))
+    assert not stalled([1.0] * 15)
+    assert stalled([1.0] * 16)
+    cycle = [1.0, 0.3, 2.0] * 10
+    assert stalled(cycle)
+    assert not stalled([1.0] * 14 + [0.6, 0.5])

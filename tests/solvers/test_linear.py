@@ -1,0 +1,94 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""PETSc options, direct and iterative solvers."""
+
+from petsc4py import PETSc
+
+import numpy as np
+import scenes
+from scenes import QUADRILATERAL, TRIANGLE, WORLD
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.materials import Hencky
+
+
+def test_results_do_not_depend_on_the_direct_solver():
+    runs = []
+    for solver in ("superlu_dist", "mumps"):
+        options = {"pc_type": "lu", "pc_factor_mat_solver_type": solver}
+        problem = scenes.slump(TRIANGLE, 15e3, h=1.0, petsc_options=options)
+        problem.solve(steps=10)
+        runs.append(problem.particles.displacement.x.array.copy())
+        assert problem.solver.getKSP().getPC().getFactorSolverType() == solver
+    assert scenes.largest(runs[0]) > 1.0
+    assert scenes.largest(runs[0] - runs[1]) < 1e-6
+
+
+def test_petsc_options_reach_their_problem_and_no_other():
+    options = {"snes_rtol": 1e-5, "snes_max_it": 17}
+    problem = scenes.block(petsc_options=options)
+    rtol, _, _, max_it = problem.solver.getTolerances()
+    assert (rtol, max_it) == (1e-5, 17)
+    rtol, _, _, max_it = scenes.block().solver.getTolerances()
+    assert (rtol, max_it) == (1e-9, 30)
+    problem.solve(steps=1)
+    assert 1e-12 < problem.history.steps[0].residuals[-1] < 1e-5
+
+
+def test_petsc_options_by_prefix():
+    # Options from the command line or the database, as in any PETSc program.
+    database = PETSc.Options()
+    database["lines_snes_max_it"] = 7
+    problem = scenes.block(petsc_options_prefix="lines_", petsc_options={"snes_rtol": 1e-6})
+    rtol, _, _, max_it = problem.solver.getTolerances()
+    assert (rtol, max_it) == (1e-6, 7)
+    assert problem.solver.getOptionsPrefix() == "lines_"
+    database.delValue("lines_snes_max_it")
+
+
+def test_multigrid_knows_the_rigid_motions():
+    # Without conditions these are what the tangent of a body at rest gives no force to.
+    V = scenes.vectors(scenes.box([0.0, 0.0], [4.0, 3.0], [20, 15], QUADRILATERAL))
+    body = scenes.box([0.5, 0.3], [3.5, 2.7], [30, 24], TRIANGLE)
+    options = {"ksp_type": "cg", "pc_type": "gamg", "ksp_rtol": 1e-10}
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(body, V),
+        Hencky(1e4, 0.3),
+        density=1.0,
+        body_force=(0.0, -1.0),
+        bcs=[scenes.fix(V, scenes.at(1, 0.6))],
+        petsc_options=options,
+    )
+    problem.bcs.clear()
+    problem.reduced.begin([np.zeros_like(problem.particles.increment.x.array)], 1.0)
+    x = PETSc.Vec().createMPI(problem.reduced.sizes, comm=WORLD)
+    problem.reduced.residual(x, x.duplicate())
+    K = problem.reduced.tangent()
+    motions = problem.reduced.rigid_motions().getVecs()
+    assert len(motions) == 3
+    for number, motion in enumerate(motions):
+        assert abs(motion.norm() - 1.0) < 1e-14
+        assert all(abs(motion.dot(other)) < 1e-14 for other in motions[:number])
+        assert (K * motion).norm() < 1e-12 * K.norm()
+
+
+def test_iterative_solver():
+    options = {"ksp_type": "cg", "pc_type": "gamg", "ksp_rtol": 1e-10, "ksp_max_it": 200}
+    moved = []
+    for given in ({}, options):
+        problem = scenes.slump(TRIANGLE, 5e3, h=0.25, petsc_options=given)
+        problem.solve(steps=2)
+        body = problem.particles
+        moved.append(scenes.in_order(body, body.centroid - body.initial_centroid))
+    assert problem.solver.getKSP().getPC().getType() == "gamg"
+    assert np.abs(moved[0]).max() > 1e-3
+    assert np.abs(moved[0] - moved[1]).max() < 1e-8
+
+
+def test_options_of_the_factor_reach_it():
+    # PETSc reads them when it makes the factor, at the first solve.
+    problem = scenes.block(petsc_options={"mat_mumps_icntl_7": 0, "mat_mumps_icntl_14": 77})
+    problem.solve(steps=1)
+    factor = problem.solver.getKSP().getPC().getFactorMatrix()
+    assert factor.getMumpsIcntl(7) == 0 and factor.getMumpsIcntl(14) == 77
+    assert not PETSc.Options().hasName("mpm_mat_mumps_icntl_7")

@@ -1,0 +1,75 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Newton's method: convergence, the proximal term, what nothing holds."""
+
+import numpy as np
+import pytest
+import scenes
+from compare import raises
+from scenes import QUADRILATERAL, TRIANGLE
+from solvers.double_well import DoubleWell, newton
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.materials import Hencky, LinearElastic
+
+
+@pytest.mark.parametrize("held", [None, 0, 1])
+def test_a_body_that_nothing_holds(held):
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
+    bcs = [] if held is None else [scenes.fix(V, scenes.at(held, 0.0), component=held)]
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(scenes.unit(4, TRIANGLE), V), Hencky(1e3, 0.3), bcs=bcs, body_force=(1.0, 1.0)
+    )
+    raises(lambda: problem.solve(steps=1), mpm.MPMError, r"nothing holds the bodies; support each")
+    assert not problem.history.steps and not np.any(problem.particles.displacement.x.array)
+
+
+def test_what_is_held_softly_is_held():
+    # Slender, one cell thick: bending has an eigenvalue some 1e-11 times that of a single cell.
+    V = scenes.vectors(scenes.box([0.0, 0.0], [600.0, 3.0], [600, 3], QUADRILATERAL))
+    beam = scenes.box([0.0, 1.0], [600.0, 2.0], [600, 1], QUADRILATERAL)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(beam, V, quadrature_degree=2),
+        LinearElastic(1e3, 0.0),
+        bcs=[scenes.fix(V, scenes.at(0, 0.0))],
+        body_force=(0.0, -1e-10),
+    )
+    problem.solve(steps=1)
+    np.testing.assert_allclose(problem.reaction(problem.bcs[0]), [0.0, 6e-8], rtol=1e-6, atol=1e-12)
+
+
+def test_a_snes_with_a_test_of_its_own():
+    options = {"snes_type": "ksponly"}
+    problem = scenes.block(petsc_options=options)
+    raises(lambda: problem.solve(steps=1), mpm.MPMError, r"SNES 'ksponly' ended by a test of its")
+
+
+class Springs(DoubleWell):
+    """Springs of different stiffness under forces that lengthen each by one."""
+
+    def residual(self, x, F):
+        F.array_w[:] = self.c * (x.array_r - 1.0)
+        return None
+
+    def tangent(self):
+        for i, value in enumerate(self.c):
+            self.K.setValue(i, i, value)
+        self.K.assemble()
+        return self.K
+
+
+@pytest.mark.parametrize("shift", [1e-13, 1e-3])
+def test_proximal_term_holds_nothing_back_that_moves(shift):
+    solver = newton(shift=shift)
+    solver.solve(Springs([1.0, 1e-2], 0.0), (2, 2))
+    np.testing.assert_allclose(solver.x.array_r, 1.0, rtol=1e-8)
+    assert solver.statistics["frozen_residual"] <= 1e-9
+
+
+def test_round_off_counts_as_converged():
+    # A tolerance that no residual can meet.
+    problem = scenes.block(petsc_options={"snes_rtol": 1e-20})
+    history = problem.solve(steps=2)
+    assert history.cutbacks == 0
+    assert history.statistics["converged_at_round_off"] >= 1
+    assert max(step.residuals[-1] for step in history.steps) < 1e-12

@@ -1,0 +1,119 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Ghost penalty and aggregation: exact on polynomials, bounded condition, right in parallel."""
+
+import numpy as np
+import pytest
+import scenes
+from scenes import QUADRILATERAL
+
+import ufl
+
+import mpm_dolfinx as mpm
+
+
+def cantilever(offset, stabilisation, degree=2, h=0.5, **options):
+    """Return a short elastic beam, clamped, that bends under a load on its end."""
+    V = scenes.vectors(
+        scenes.box([0.0, 0.0], [4.0, 4.0], [round(4 / h)] * 2, QUADRILATERAL), degree
+    )
+    n = round(2 / h)
+    body = scenes.box([0.0, 2.5 - offset], [3.0, 3.5 - offset], [3 * n, n], QUADRILATERAL)
+    tags = scenes.facet_tags(body, scenes.at(0, 3.0))
+    return mpm.QuasiStaticProblem(
+        mpm.Particles(body, V, degree=degree),
+        mpm.materials.Hencky(1e4, 0.2),
+        bcs=[scenes.fix(V, scenes.at(0, 0.0))],
+        tractions=[((0.0, -400.0), 1)],
+        facet_tags=tags,
+        stabilisation=stabilisation,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("stabilisation", ["ghost", "aggregate"])
+def test_slivers_do_not_matter(stabilisation):
+    tips = []
+    for offset in (0.0, 1e-9, 0.05, 0.185):
+        problem = cantilever(offset, stabilisation)
+        problem.solve(steps=4)
+        assert problem.history.cutbacks == 0
+        volume = problem.particles.initial_volume
+        drop = problem.particles.centroid - problem.particles.initial_centroid
+        tips.append(scenes.total(problem.particles, drop * volume[:, None]))
+    tips = np.array(tips)
+    assert np.abs(tips - tips[0]).max() < 3e-3 * np.abs(tips[0]).max()
+
+
+def condition(problem):
+    """Return the condition number of the reduced tangent scaled to unit diagonal."""
+    problem.solve(steps=1)
+    K = scenes.dense(problem.A)
+    scale = 1.0 / np.sqrt(np.diag(K))
+    size = np.linalg.eigvalsh(K * np.outer(scale, scale))
+    return size[-1] / max(size[0], 1e-300)
+
+
+@pytest.mark.parametrize("stabilisation", ["ghost", "aggregate"])
+def test_condition_is_bounded(stabilisation):
+    conditions = [condition(cantilever(s, stabilisation)) for s in (0.25, 0.1, 1e-3, 1e-6)]
+    assert max(conditions) < 1e3 * min(conditions)
+
+
+def test_auto_acts_for_degree_2_and_where_a_cut_is_small():
+    problem = cantilever(0.1, "auto", degree=1)
+    problem.solve(steps=1)
+    assert problem.history.statistics["ghost_facets"] == 0
+    assert problem.reduced.moduli is None
+    problem = cantilever(0.05, "auto")
+    problem.solve(steps=1)
+    assert problem.history.statistics["ghost_facets"] > 0
+    grid = scenes.vectors(scenes.unit(3, QUADRILATERAL), 2)
+    particles = mpm.Particles(scenes.unit(6, QUADRILATERAL), grid, degree=2)
+    sides = [(0, (0.0, 1.0)), (1, (0.0,))]
+    problem = mpm.QuasiStaticProblem(
+        particles,
+        mpm.materials.Hencky(1e3, 0.3),
+        body_force=(0.0, -1.0),
+        bcs=[scenes.fix(grid, scenes.at(i, *ends), component=i) for i, ends in sides],
+    )
+    problem.solve(steps=1)
+    assert problem.history.statistics["ghost_facets"] == 0
+    assert np.isclose(problem.reduced.moduli[0], 1e3 / 2.6, rtol=1e-6)
+
+
+def test_modulus_and_answer_do_not_depend_on_units():
+    tips = []
+    for unit in (1.0, 1e9):
+        problem = cantilever(0.05, "ghost")
+        particles = problem.particles
+        d, v = particles.displacement, ufl.TestFunction(particles.W)
+        R = ufl.inner(scenes.linear_stress(d, 1e3 * unit, 0.3), ufl.grad(v)) * particles.dx
+        b = ufl.as_vector([0.0, -unit])
+        R -= particles.load * ufl.inner(b, v) * particles.dx_exact
+        mine = mpm.ParticleProblem(R, particles, bcs=problem.bcs, stabilisation="ghost")
+        mine.solve(steps=2)
+        assert np.isclose(mine.reduced.moduli[0], unit * 1e3 / 2.6)
+        tips.append(scenes.in_order(particles, particles.centroid))
+    assert np.abs(tips[1] - tips[0]).max() < 1e-9
+
+
+@pytest.mark.parametrize("stabilisation", ["ghost", "aggregate"])
+def test_imposed_displacement(stabilisation):
+    # A uniform strain is imposed on the background's boundary; slivers follow.
+    V = scenes.vectors(scenes.box([0.0, 0.0], [1.0, 2.0], [2, 4], QUADRILATERAL), 2)
+    body = scenes.box([0.0, 0.0], [1.0, 1.5 + 1e-7], [4, 6], QUADRILATERAL)
+    bcs = [
+        scenes.fix(V, scenes.at(0, 0.0), component=0),
+        scenes.fix(V, scenes.at(0, 1.0), -0.1, component=0),
+        scenes.fix(V, scenes.at(1, 0.0), component=1),
+    ]
+    particles = mpm.Particles(body, V, degree=2)
+    problem = mpm.QuasiStaticProblem(
+        particles, mpm.materials.Hencky(1e3, 0.3), bcs=bcs, stabilisation=stabilisation
+    )
+    problem.solve(steps=1)
+    stress = particles.stress
+    assert scenes.largest(stress[:, 1, 1]) < 1e-6 * scenes.largest(stress[:, 0, 0])
+    force = problem.reaction(bcs[1])
+    assert np.isclose(force[0], -problem.reaction(bcs[0])[0], rtol=1e-9)

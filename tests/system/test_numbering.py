@@ -1,0 +1,69 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Where the unknowns of a step live."""
+
+import numpy as np
+import scenes
+from scenes import QUADRILATERAL, TRIANGLE, WORLD
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.materials import Hencky
+from mpm_dolfinx.parallel.balance import imbalance
+from mpm_dolfinx.system.numbering import FreeDofs, Numbering
+from mpm_dolfinx.transfer.touched import TouchedNodes
+
+
+def corner():
+    """A body in a corner of a large background: the unknowns are one rank's there."""
+    V = scenes.vectors(scenes.box([0.0, 0.0], [20.0, 20.0], [20, 20], QUADRILATERAL))
+    body = scenes.box([0.1, 0.0], [4.1, 4.0], [12, 12], TRIANGLE)
+    return mpm.QuasiStaticProblem(
+        mpm.Particles(body, V),
+        Hencky(1e4, 0.3),
+        density=1.0,
+        body_force=(0.0, -25.0),
+        bcs=[scenes.fix(V, scenes.at(1, 0.0))],
+    )
+
+
+def test_numbers_and_values():
+    particles = corner().particles
+    V = particles.V
+    bs = V.dofmap.index_map_bs
+    free = np.flatnonzero(np.isin(np.arange(bs * V.dofmap.index_map.size_local) % 7, [0, 2, 3]))
+    owned = particles.W.dofmap.index_map.size_local
+    touched = TouchedNodes(V, [particles.node_basis], [owned])
+    layout = FreeDofs(V, free.astype(np.int32), touched)
+    start = V.dofmap.index_map.local_range[0] * bs
+    numbering = Numbering(WORLD, [layout])
+    local, size = numbering.sizes
+    assert numbering.parts == [slice(0, local)] and layout.count == local
+    assert size == WORLD.allreduce(len(free)) and WORLD.allreduce(local) == size
+    assert local <= np.ceil(1.05 * size / WORLD.size)
+    numbers = np.concatenate(WORLD.allgather(numbering.numbers[0]))
+    assert np.array_equal(np.sort(numbers), np.arange(size))
+    columns = np.concatenate(WORLD.allgather(layout.collect(free + start)))
+    assert np.array_equal(columns[numbering.numbers[0]], free + start)
+    values = np.sin(free + start)
+    assert np.array_equal(layout.spread(2.0 * layout.collect(values)), 2.0 * values)
+
+
+def test_unknowns_follow_the_body():
+    problem = corner()
+    particles = problem.particles
+    problem.solve(steps=2)
+    statistics = problem.history.statistics
+    assert statistics["dof_imbalance"] <= 1.06 + WORLD.size / statistics["free_dofs"]
+    assert statistics["particle_imbalance"] == imbalance(WORLD, particles.num_local)
+    assert problem.A.getLocalSize() == (problem.x.getLocalSize(),) * 2
+    # In the background's own layout most rows have their columns on other ranks.
+    starts, columns, _ = particles.T.getValuesCSR()
+    first, last = particles.T.getOwnershipRangeColumn()
+    off = (columns < first) | (columns >= last)
+    rows = np.count_nonzero(np.diff(np.concatenate([[0], np.cumsum(off)])[starts]))
+    before = WORLD.allreduce(rows) / WORLD.allreduce(len(starts) - 1)
+    if WORLD.size == 1:
+        assert statistics["off_rank_rows"] == statistics["off_rank_columns"] == before == 0.0
+    else:
+        assert before > 0.4
+        assert 0.0 < statistics["off_rank_rows"] < before

@@ -1,0 +1,77 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""T against dense loops over cells."""
+
+import numpy as np
+import pytest
+import scenes
+from scenes import ALL
+from transfer.reference import PAIRS, SOLID, basis_by_loop, local_positions, scene
+
+from dolfinx import geometry
+
+import mpm_dolfinx as mpm
+
+
+@pytest.mark.parametrize(("background", "cell"), [*PAIRS, *SOLID], ids=scenes.name)
+@pytest.mark.parametrize("moved", [False, True])
+def test_T_against_loop_over_cells(background, cell, moved):
+    particles = scene(background, cell, moved)
+    dim = particles.mesh.geometry.dim
+    owned = particles.W.dofmap.index_map.size_local
+    N = scenes.gather(basis_by_loop(particles.V, local_positions(particles)[:owned]))
+    T = scenes.dense(particles.T)
+    np.testing.assert_allclose(T, np.kron(N, np.eye(dim)), atol=1e-12)
+    # partition of unity and linear reproduction
+    np.testing.assert_allclose(T.sum(axis=1), 1.0, atol=1e-12)
+    u = (scenes.coordinates(particles.V) @ np.arange(1, dim * dim + 1).reshape(dim, dim)).ravel()
+    x = scenes.gather(local_positions(particles)[:owned])
+    expected = (x @ np.arange(1, dim * dim + 1).reshape(dim, dim)).ravel()
+    np.testing.assert_allclose(T @ u, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(("background", "cell"), [*PAIRS, *SOLID[:2]], ids=scenes.name)
+def test_T_by_functions_of_the_background(background, cell):
+    # T u is the background Function u at the body's nodes, for any u.
+    particles = scene(background, cell)
+    u = particles.increment
+    u.interpolate(lambda x: np.sin(np.outer([1.0, 2.0, 3.0][: len(u)], 3 * x[0] + 2 * x[1])))
+    result = particles.T.createVecLeft()
+    particles.T.mult(u.x.petsc_vec, result)
+    owned = particles.W.dofmap.index_map.size_local
+    dim = particles.mesh.geometry.dim
+    x = scenes.gather(local_positions(particles)[:owned])
+    padded = np.zeros((len(x), 3))
+    padded[:, :dim] = x
+    domain = particles.V.mesh
+    tree = geometry.bb_tree(domain, domain.topology.dim)
+    near = geometry.compute_collisions_points(tree, padded)
+    cells = geometry.compute_colliding_cells(domain, near, padded)
+    mine = np.flatnonzero(np.diff(cells.offsets))
+    values = np.full((len(x), dim), -np.inf)
+    if len(mine):
+        values[mine] = u.eval(padded[mine], cells.array[cells.offsets[mine]])
+    expected = np.max(scenes.WORLD.allgather(values), axis=0)
+    np.testing.assert_allclose(scenes.gather(result.array_r.reshape(-1, dim)), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(("background", "cell"), [*PAIRS, *SOLID], ids=scenes.name)
+def test_active_dofs_are_the_columns_of_T(background, cell):
+    particles = scene(background, cell)
+    columns = np.flatnonzero(np.abs(scenes.dense(particles.T)).max(axis=0))
+    bs = particles.V.dofmap.index_map_bs
+    first, last = np.array(particles.V.dofmap.index_map.local_range) * bs
+    mine = columns[(columns >= first) & (columns < last)]
+    assert np.array_equal(particles.active_dofs, mine)
+    if (background, cell) in PAIRS:
+        assert 0 < len(columns) < particles.T.getSize()[1]
+
+
+@pytest.mark.parametrize("cell", ALL, ids=scenes.name)
+def test_T_is_the_identity_where_particles_are_cells(cell):
+    V = scenes.vectors(scenes.bend(scenes.unit(3, cell), 0.04))
+    particles = mpm.Particles(scenes.bend(scenes.unit(3, cell), 0.04), V)
+    same = scenes.coordinates(particles.W)[:, None] == scenes.coordinates(V)[None]
+    identity = np.kron(same.all(axis=2), np.eye(V.mesh.geometry.dim))
+    np.testing.assert_allclose(scenes.dense(particles.T), identity, atol=1e-12)
+    assert scenes.WORLD.allreduce(len(particles.active_dofs)) == particles.T.getSize()[1]
