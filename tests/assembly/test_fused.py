@@ -177,7 +177,7 @@ class Friction(mpm.materials.ReturnMapping):
 
     def yield_function(self, stress, plastic_strain):
         trace = mpm.materials.mandel.trace(stress)
-        return self.plastic_potential(stress, plastic_strain) + 0.1 * trace - 40.0
+        return self.plastic_potential(stress, plastic_strain) + 0.03 * trace - 40.0
 
     def plastic_potential(self, stress, plastic_strain):
         return mpm.materials.mandel.norm(mpm.materials.mandel.deviator(stress))
