@@ -50,3 +50,8 @@ __all__ = [
     "materials",
     "plot",
 ]
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted(__all__)

@@ -172,7 +172,7 @@ class Energy:
         return self.kinetic + self.internal - self.external + self.lost
 
 
-@dataclass
+@dataclass(repr=False)
 class History:
     """The steps of a run; it grows as the run goes on and stays after an error.
 
@@ -193,6 +193,21 @@ class History:
     stopped: ParticleOutsideError | None = None
     statistics: Statistics = field(default_factory=Statistics)
     energies: list[Energy] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        return f"<History: {self.in_words()}>"
+
+    def in_words(self) -> str:
+        """Return how far the run is and what it took, in a few words."""
+        if not self.steps:
+            words = "no step yet"
+        else:
+            steps = f"{len(self.steps)} step{'s' if len(self.steps) > 1 else ''}"
+            end = f"time {self.time:g}" if self.energies else f"load {self.steps[-1].load:g}"
+            words = f"{steps} to {end}, {self.total_iterations} linear solves"
+        if self.cutbacks:
+            words += f", {self.cutbacks} cutback{'s' if self.cutbacks > 1 else ''}"
+        return words
 
     @property
     def iterations(self) -> list[int]:

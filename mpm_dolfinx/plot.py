@@ -25,6 +25,12 @@ from .particles.particles import Particles
 
 __all__ = ["background", "domains", "grid"]
 
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted(__all__)
+
+
 #: Straight pieces that an edge is drawn with where it is curved.
 PIECES = 8
 

@@ -14,3 +14,8 @@ error, a gap of ``strain h / penalty``, is far below that of the domains' displa
 from .supports import Support, fixed, plane, roller
 
 __all__ = ["Support", "fixed", "plane", "roller"]
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted(__all__)

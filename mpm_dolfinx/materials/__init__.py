@@ -44,3 +44,8 @@ __all__ = [
     "mandel",
     "per_row",
 ]
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted(__all__)

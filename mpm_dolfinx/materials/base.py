@@ -144,6 +144,10 @@ class Material(ABC):
     def parameters(self, values: Mapping[str, Parameter]) -> None:
         self._parameters = Parameters(values)
 
+    def __repr__(self) -> str:
+        values = (f"{name}={_in_words(value)}" for name, value in self.parameters.items())
+        return f"{type(self).__name__}({', '.join(values)})"
+
     @abstractmethod
     def initial_state(self, n: int, dim: int) -> State:
         """Return the state of ``n`` unstrained points of a body of dimension ``dim``.
@@ -213,6 +217,19 @@ class Material(ABC):
         if not arrays:
             return self
         return self.with_parameters(**{name: values[points] for name, values in arrays.items()})
+
+
+def _in_words(value: Any) -> str:
+    """Return a parameter as ``repr`` of its material shows it; no rank waits for others."""
+    if hasattr(value, "function_space"):
+        return f"<Function '{value.name}'>"
+    held = getattr(value, "value", value)
+    if np.ndim(held) == 0 and isinstance(held, float | int | np.ndarray | np.number):
+        return f"{float(held):g}"
+    if isinstance(held, np.ndarray):
+        ends = f" from {held.min():g} to {held.max():g}" if held.size else ""
+        return f"<{held.size} values{ends}>"
+    return repr(held)
 
 
 class Integration(NamedTuple):

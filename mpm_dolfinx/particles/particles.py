@@ -171,6 +171,19 @@ class Particles(MaterialDomains):
         if not sys.is_finalizing():
             vars(self).clear()
 
+    def __repr__(self) -> str:
+        return f"<Particles: {self.in_words()}>"
+
+    def in_words(self) -> str:
+        """Return what they are and what carries them, in a few words."""
+        cells, degree = self.V.mesh.topology, self.W.ufl_element().degree
+        points = f"{self.num_points} point{'s' if self.num_points > 1 else ''} each"
+        return (
+            f"{self.num_global} {self.mesh.basix_cell().name} domains ({self.method}, degree "
+            f"{degree}, {points}) in a background of {cells.index_map(cells.dim).size_global} "
+            f"{self.V.mesh.basix_cell().name}s of degree {self.V.ufl_element().degree}"
+        )
+
     def _settle(self, body: mesh.Mesh) -> None:
         """Live on a body mesh, undeformed: at the start and after each move (collective)."""
         family = "Lagrange" if METHODS[self.method].shares_nodes else "Discontinuous Lagrange"

@@ -56,6 +56,7 @@ from .arguments import (
     require_own_fields,
 )
 from .setup import Numerics
+from .summary import in_one_line, on_a_screen
 
 __all__ = ["Contribution", "Law", "ParticleProblem"]
 
@@ -340,6 +341,21 @@ class ParticleProblem:
         if hasattr(self, "_stepper"):
             self._release()
         vars(self).clear()
+
+    def __repr__(self) -> str:
+        return in_one_line(self)
+
+    def summary(self) -> str:
+        """Return what the problem is and what it did, a screen of text (collective).
+
+        Bodies with their materials, how far they have moved and yielded, background, solver, steps,
+        linear solves and seconds (mean of the ranks): ``print(problem.summary())``.
+        """
+        return on_a_screen(self, self._comm, self._numerics.in_words(), self._made_of())
+
+    def _made_of(self) -> list[str]:
+        """Return what each body is made of and loaded by, in words."""
+        return ["residual in UFL"] * len(self.bodies)
 
     def _release(self) -> None:
         """Let go of what was built for the present meshes."""

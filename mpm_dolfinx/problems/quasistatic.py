@@ -195,6 +195,13 @@ class QuasiStaticProblem(ParticleProblem):
         for body, stress in zip(self.bodies, self._stresses, strict=True):
             body.attach(stress)
 
+    def _made_of(self) -> list[str]:
+        """See :meth:`ParticleProblem._made_of`."""
+        more = ["body of revolution"] if self.setup.axisymmetric else []
+        if self.setup.f_bar != "none":
+            more.append(f"F-bar over each {self.setup.f_bar}")
+        return ["; ".join([body.in_words(), *more]) for body in self.setup.bodies]
+
     def _functions(self) -> list[fem.Function]:
         """Return the parameters of materials that are Functions."""
         return [f for body in self.setup.bodies for f in functions_of(body.material)]

@@ -16,12 +16,14 @@ import numpy as np
 
 import ufl
 
+from ..assembly.fused import is_fast
 from ..boundary.supports import Support
 from ..constitutive.averaging import F_BARS
 from ..errors import MPMError
 from ..particles.particles import Particles
 from ..system.term import Term
 from .arguments import carried, holds
+from .summary import counted
 
 __all__ = ["BodySetup", "Numerics", "Setup"]
 
@@ -54,6 +56,22 @@ class Numerics:
         if not isinstance(self.shift, float | int) or not 0.0 <= self.shift < 1.0:
             raise MPMError(f"shift must be at least 0 and below 1, not {self.shift!r}.")
 
+    def in_words(self) -> dict[str, str]:
+        """Return how the problem is solved, for a reader."""
+        words = {
+            "assembly": f"{'fast' if is_fast(self.assembly) else 'reference'}",
+            "shift": f"{self.shift:g}",
+            "line search": "on" if self.line_search else "off",
+            "predictor": "on" if self.predictor else "off",
+            "stabilisation": str(self.stabilisation),
+        }
+        if self.dependent_dofs == "remove":
+            words["dependent dofs"] = "removed"
+        kept = {name: value for name, value in self.petsc_options.items() if value is not None}
+        if kept:
+            words["PETSc"] = " ".join(f"{name}={value}" for name, value in kept.items())
+        return words
+
     @property
     def of_forms(self) -> dict[str, Any]:
         """Options with which forms are compiled."""
@@ -76,6 +94,23 @@ class BodySetup:
     cell_tags: Any
     facet_tags: Any
     supports: tuple[Support, ...]
+
+    def in_words(self) -> str:
+        """Return the laws, and what loads and holds the body."""
+        laws = self.material
+        if isinstance(laws, Mapping):
+            words = "; ".join(f"tag {tag}: {law!r}" for tag, law in laws.items())
+        else:
+            words = repr(laws)
+        acts = ["body force"] if self.body_force is not None else []
+        for count, noun in (
+            (len(self.tractions), "traction"),
+            (len(self.pressures), "pressure"),
+            (len(self.supports), "support"),
+        ):
+            if count:
+                acts.append(counted(count, noun))
+        return f"{words}; {', '.join(acts) or 'no loads'}"
 
     def carried(self) -> BodySetup:
         """Return the same on the present mesh of the particles (collective)."""

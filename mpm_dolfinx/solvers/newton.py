@@ -15,6 +15,7 @@ import numpy as np
 from .. import _compat
 from ..errors import ConvergenceError, MPMError
 from ..history import Statistics
+from ..log import NEWTON, tell
 from ..parallel.garbage import weakly
 from ..parallel.magnitudes import norm, sign_of_product
 from .line_search import LineSearch, stalled
@@ -404,6 +405,7 @@ class NewtonSolver:
         self._norm = size
         self._norms.append(size)
         self.residuals.append(size / scale if scale > 0 else size)
+        tell(self._comm, NEWTON, "  iteration %d: residual %.2e", iteration, self.residuals[-1])
         tolerance = max(rtol * scale, atol)
         small = size <= tolerance
         if small or (

@@ -23,6 +23,7 @@ from ..errors import (
     on_all_ranks,
 )
 from ..history import History, Step
+from ..log import STEPS, tell
 from ..parallel.garbage import Cleaner
 from ..parallel.interruption import Hold, Interrupted, held, interrupted, settle
 from ..particles.particles import Particles
@@ -263,6 +264,14 @@ class Stepper:
             no_equilibrium = self.newton.no_equilibrium
             if run.control.cut_back(no_equilibrium):
                 owner.history.cutbacks += 1
+                tell(
+                    self._comm,
+                    STEPS,
+                    "cutback %d: the step to %.6g failed after %d iterations, half of it is tried",
+                    owner.history.cutbacks,
+                    end,
+                    self.newton.iterations,
+                )
                 return None
             limit = run.limit if no_equilibrium else None
             told = placed(error, self._reduced, self.converged.parameter, limit)
@@ -419,6 +428,15 @@ class Stepper:
         newton = self.newton
         step = Step(parameter, newton.iterations, list(newton.residuals), displacement, time)
         owner.history.steps.append(step)
+        tell(
+            self._comm,
+            STEPS,
+            "step %d: %s, %d iterations, relative residual %.1e",
+            len(owner.history.steps),
+            f"time {time:.6g}" if displacement is None else f"displacement {displacement:.6g}",
+            step.iterations,
+            step.residuals[-1] if step.residuals else 0.0,
+        )
         return step
 
     def _end_step(self, owner: Owner) -> None:
