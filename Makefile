@@ -19,7 +19,7 @@ SETUP := sh scripts/setup_env.sh
 BENCHMARKS := $(wildcard $(patsubst %,benchmarks/%.py,assembly step skip solvers scaling ranks cantilever_reference))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-debian stress bench bench-smoke studies lint docs clean
+.PHONY: help demo demos test test-debian stress bench bench-smoke studies lint docs clean
 
 help: ## This list
 	@echo "make TARGET [VENV=path of an environment] [PYTHON=path of an interpreter]"
@@ -62,6 +62,10 @@ bench-smoke: ## Run all benchmarks at tiny sizes, in less than a minute
 studies: ## Make the tables of the docs again, say which no longer follow (ARGS="--check" runs few)
 	@$(SETUP) wheel plot test
 	"$(BIN)/python" docs/studies/make.py $(ARGS)
+
+demos: ## Run the demos (ARGS="footing collapse" some), keep their pictures and outputs for the docs
+	@$(SETUP) wheel plot
+	"$(BIN)/python" scripts/run_demos.py $(ARGS)
 
 lint: ## ruff check, ruff format --check, mypy
 	@$(SETUP) wheel plot test

@@ -1,5 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
+# Level: 1
 
 # # An elasto-plastic column between rollers
 #

@@ -1,9 +1,16 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""MkDocs hook: one page per demo, made from its script (jupytext, light) without running it."""
+"""MkDocs hook: one page per demo, made from its script (jupytext, light) without running it.
+
+What the script printed and drew is in ``images/demos``, kept by ``scripts/run_demos.py``; it comes
+before the exercises. Beside each page are the script and a notebook made of it. The gallery has the
+demos by the level that stands below their licence.
+"""
 
 from __future__ import annotations
 
+import html
+import logging
 import re
 from pathlib import Path
 
@@ -12,27 +19,73 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
-HEADER = re.compile(r"\A(?:#!.*\n)?(?:# (?:Copyright|SPDX-).*\n)+(?:#?\n)*")
+log = logging.getLogger("mkdocs.hooks.demos")
+
+HEADER = re.compile(r"\A(?:#!.*\n)?(?:# (?:Copyright|SPDX-|Level:).*\n)+(?:#?\n)*")
+LEVEL = re.compile(r"^# Level: ([123])$", re.MULTILINE)
+LEVELS = ("First steps", "Standard problems", "Further on")
+EXERCISES = "\n## Exercises\n"
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    folder = Path(config.config_file_path).parent / "demos"
-    pages, entries = [], []
-    for script in sorted(folder.glob("demo_*.py")):
+    root = Path(config.config_file_path).parent
+    levels: list[list[tuple[str, str]]] = [[] for _ in LEVELS]
+    for script in sorted((root / "demos").glob("demo_*.py")):
         source = script.read_text("utf-8")
-        title, text = page(script.name, source)
-        name = f"demos/{script.stem}.md"
-        files.append(File.generated(config, name, content=text))
+        level = LEVEL.search(source)
+        if level is None:
+            log.info("%s has no line '# Level: 1', 2 or 3 below its licence.", script.name)
+        name = script.stem.removeprefix("demo_")
+        title, text = page(script.name, source, results(root / "docs", name))
+        files.append(File.generated(config, f"demos/{script.stem}.md", content=text))
         files.append(File.generated(config, f"demos/{script.name}", content=source))
-        pages.append({title: name})
-        entries.append(f"- [{title}]({script.stem}.md)")
-    index = "# Demos\n\n" + ("\n".join(entries) or "There are none yet.") + "\n"
-    files.append(File.generated(config, "demos/index.md", content=index))
-    config.nav.append({"Demos": ["demos/index.md", *pages]})
+        notebook = jupytext.reads(HEADER.sub("", source), fmt="py:light")
+        notebook.metadata["kernelspec"] = {
+            "name": "python3",
+            "display_name": "Python 3",
+            "language": "python",
+        }
+        for number, cell in enumerate(notebook.cells):
+            cell["id"] = f"cell-{number}"
+        text = jupytext.writes(notebook, fmt="ipynb")
+        files.append(File.generated(config, f"demos/{script.stem}.ipynb", content=text))
+        levels[int(level[1]) - 1 if level else -1].append((title, name))
+    nav: list[object] = ["demos/index.md"]
+    parts = ["# Demos", "Each is a script that runs alone, and a notebook of the same text."]
+    for heading, entries in zip(LEVELS, levels, strict=True):
+        if not entries:
+            continue
+        parts.append(f"## {heading}")
+        cards = [
+            f'<a href="demo_{name}.html"><img src="../images/demos/{name}.png" alt="" '
+            f'loading="lazy"><strong>{html.escape(title)}</strong></a>'
+            for title, name in entries
+        ]
+        parts.append('<div class="gallery">\n' + "\n".join(cards) + "\n</div>")
+        nav.append({heading: [{title: f"demos/demo_{name}.md"} for title, name in entries]})
+    files.append(File.generated(config, "demos/index.md", content="\n\n".join(parts) + "\n"))
+    config.nav.append({"Demos": nav})
     return files
 
 
-def page(script: str, source: str) -> tuple[str, str]:
+def results(docs: Path, name: str) -> str:
+    """Return the part of a page with what the demo drew and printed."""
+    kept = docs / "images" / "demos"
+    picture, output = kept / f"{name}.png", kept / f"{name}.txt"
+    if not picture.exists() or not output.exists():
+        log.info("The demo %s has not been run: python scripts/run_demos.py %s", name, name)
+        return ""
+    movie = f"\n![The run as a movie](../images/demos/{name}.gif)\n"
+    parts = [
+        "\n## What it draws and prints\n",
+        f"![The picture that the script leaves](../images/demos/{name}.png)\n",
+        movie if (kept / f"{name}.gif").exists() else "",
+        f"```text\n{output.read_text('utf-8').rstrip()}\n```\n",
+    ]
+    return "\n".join(part for part in parts if part)
+
+
+def page(script: str, source: str, shown: str) -> tuple[str, str]:
     """Return a demo's title and its page."""
     blocks: list[str] = []
     last = ""
@@ -47,9 +100,12 @@ def page(script: str, source: str) -> tuple[str, str]:
         else:
             blocks.append(f"```python\n{text}\n```")
         last = cell.cell_type
-    body = "\n\n".join(blocks)
+    body = "\n\n".join(blocks) + "\n"
     title = re.match(r"# (.+)\n", body)
     if title is None:
         raise PluginError(f"{script} must start with a title: a comment '# # Title'.")
-    note = f"*The script: [{script}]({script}).*"
+    before, exercises, after = body.partition(EXERCISES)
+    body = before + shown + exercises + after
+    stem = script.removesuffix(".py")
+    note = f"*The script: [{script}]({script}); as a notebook: [{stem}.ipynb]({stem}.ipynb).*"
     return title[1].strip(), f"{title[0]}\n{note}\n{body[title.end() :]}\n"
