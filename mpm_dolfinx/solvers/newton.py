@@ -99,6 +99,12 @@ class ReducedProblem(Protocol):
     def extent(self) -> float:
         """Return the size of the positions of the body, in the same norm."""
 
+    def is_rigid(self, x: PETSc.Vec) -> bool:
+        """Return whether x moves each body as a rigid one."""
+
+    def one_sided(self) -> bool:
+        """Return whether something may let bodies go and hold them again, as contact does."""
+
 
 class NewtonSolver:
     """SNES with the proximal term and the line search that singular transfers need.
@@ -506,7 +512,8 @@ class NewtonSolver:
             return "go on"
         if left > FROZEN * forces and left > FROZEN * self._problem.internal_scale():
             share = left / forces if forces > 0.0 else np.inf
-            self._failure = _not_held(share) if self._is_mechanism(step) else _unbalanced(share)
+            loose = self._mechanism(step)
+            self._failure = _unbalanced(share) if loose is None else self._not_held(loose, share)
             return "failed"
         return "frozen"
 
@@ -580,14 +587,43 @@ class NewtonSolver:
         share = norm(y * self._factor.D) / scale
         if share <= LOOSE:
             return False
-        if self._is_mechanism(y):
-            self._failure = _not_held(share)
+        loose = self._mechanism(y)
+        if loose is not None:
+            self._failure = self._not_held(loose, share)
             return True
         self._refine()
         return False
 
-    def _is_mechanism(self, y: PETSc.Vec) -> bool:
-        """Whether of the motions that the proximal term holds in y one is held by nothing else.
+    def _not_held(self, mode: PETSc.Vec, share: float) -> MPMError:
+        """Say that forces act on a motion without stiffness.
+
+        A rigid motion has none whatever the step, unless something one-sided comes to hold it.
+        Other motions may get it from their own size, or have lost it to plastic flow: a smaller
+        step may do.
+        """
+        if not (self._problem.is_rigid(mode) or self._moves_rigidly()):
+            return _not_resisted(share)
+        return _let_go(share) if self._problem.one_sided() else _unsupported(share)
+
+    def _moves_rigidly(self) -> bool:
+        """Whether all bodies of a background can move as one rigid body."""
+        assert self.K is not None and self._factor.D is not None
+        motions = self._problem.rigid_motions().getVecs()
+        forces = [self.K * motion for motion in motions]
+        held = [motion * self._factor.D for motion in motions]
+        K = np.array([[motion.dot(force) for force in forces] for motion in motions])
+        D = np.array([[motion.dot(force) for force in held] for motion in motions])
+        size = np.linalg.inv(np.linalg.cholesky(D / D.trace()))
+        softest = size.T @ np.linalg.eigh(size @ ((K + K.T) / D.trace()) @ size.T)[1][:, 0]
+        softest = motions[0].comm.tompi4py().bcast(softest)
+        motion = motions[0].duplicate()
+        motion.set(0.0)
+        motion.maxpy(softest, motions)
+        resistance = motion.dot(motion * self._factor.D)
+        return bool(self._problem.stiffness(motion) <= MECHANISM * resistance)
+
+    def _mechanism(self, y: PETSc.Vec) -> PETSc.Vec | None:
+        """Return a motion that the proximal term holds in y and nothing else does, if there is one.
 
         Solving for the forces of that term, again and again, leaves what gives way to them most;
         the stiffness along it tells a soft body, or a stiff one on a soft one, from a motion
@@ -604,11 +640,11 @@ class NewtonSolver:
             force.pointwiseMult(mode, self._factor.D)
             ratio = self._problem.stiffness(mode) / mode.dot(force)
             if ratio <= MECHANISM:
-                return True
+                return mode
             if ratio > 0.95 * before:
-                return False
+                return None
             before = ratio
-        return False
+        return None
 
     def _uphill(self, F: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Return whether a step for the residual F is not that of a positive definite tangent."""
@@ -633,10 +669,27 @@ class NewtonSolver:
                 return
 
 
-def _not_held(share: float) -> MPMError:
+def _unsupported(share: float) -> MPMError:
     return MPMError(
         f"Forces ({share:.1e} of all) act where nothing holds the bodies; support each of them "
         "against all rigid motions, with conditions and supports that reach it where it is"
+    )
+
+
+def _let_go(share: float) -> ConvergenceError:
+    return ConvergenceError(
+        f"Forces ({share:.1e} of all) act where nothing holds the bodies once what only pushes has "
+        "let them go; support each of them against all rigid motions, or bring them into contact "
+        "by displacements before"
+    )
+
+
+def _not_resisted(share: float) -> ConvergenceError:
+    return ConvergenceError(
+        f"Forces ({share:.1e} of all) act on motions that are not rigid and that nothing resists: "
+        "hourglass motions of domains with one quadrature point, parts that the background moves "
+        "apart, or parts that nothing holds; use quadrature_degree=2, larger cells of the "
+        "background or smaller domains"
     )
 
 

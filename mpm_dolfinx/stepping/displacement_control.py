@@ -377,6 +377,14 @@ class ControlledSystem:
         """Return the size of the positions of all nodes."""
         return self._reduced.extent()
 
+    def is_rigid(self, x: PETSc.Vec) -> bool:
+        """Return whether x moves each body as a rigid one."""
+        return self._reduced.is_rigid(x)
+
+    def one_sided(self) -> bool:
+        """Return whether something may let bodies go and hold them again."""
+        return self._reduced.one_sided()
+
 
 def _norm(vectors: Sequence[PETSc.Vec]) -> float:
     return float(np.linalg.norm([vector.norm() for vector in vectors]))

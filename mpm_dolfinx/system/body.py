@@ -78,6 +78,11 @@ class BodyTerm(Term):
         self._low_rank: ReducedLowRank | None = None
 
     @property
+    def one_sided(self) -> bool:
+        """Whether it may let its bodies go: see :attr:`Term.one_sided`."""
+        return self._contact
+
+    @property
     def fused(self) -> Sequence[tuple[Particles, BodyForms]]:
         """See :attr:`Term.fused`."""
         forms = self.forms

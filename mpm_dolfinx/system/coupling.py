@@ -89,6 +89,11 @@ class Tie(Term):
         self._settle()
 
     @property
+    def one_sided(self) -> bool:
+        """Whether it may let its bodies go: see :attr:`Term.one_sided`."""
+        return False
+
+    @property
     def symmetric(self) -> bool:
         """See :attr:`Term.symmetric`."""
         return True

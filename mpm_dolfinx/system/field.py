@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import combinations
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -25,6 +26,9 @@ from .numbering import FreeDofs
 from .predictor import map_to_background
 
 __all__ = ["Field", "Motion"]
+
+#: What a rigid motion may leave of a motion that counts as one.
+RIGID = 1e-3
 
 
 class Motion:
@@ -76,6 +80,24 @@ class Motion:
         rows = self._work.getLocalSize()
         self._work.array_w[:] = self.particles.node_positions.ravel()[:rows]
         return norm(self._work)
+
+    def is_rigid(self, u: PETSc.Vec) -> bool:
+        """Return whether u moves the body as a rigid one, in small rotations (collective)."""
+        gdim = self.particles.mesh.geometry.dim
+        moved = np.array(self.of(u).array_r).reshape(-1, gdim)
+        x = self.particles.node_positions[: len(moved)]
+        comm: MPI.Comm = self.particles.mesh.comm
+        nodes = comm.allreduce(len(x))
+        x = x - comm.allreduce(x.sum(axis=0)) / max(nodes, 1)
+        motions = [np.broadcast_to(e, x.shape).ravel() for e in np.eye(gdim)]
+        for i, j in combinations(range(gdim), 2):
+            turn = np.zeros_like(x)
+            turn[:, i], turn[:, j] = -x[:, j], x[:, i]
+            motions.append(turn.ravel())
+        A = np.column_stack(motions)
+        normal, right = comm.allreduce(A.T @ A), comm.allreduce(A.T @ moved.ravel())
+        rest = moved.ravel() - A @ np.linalg.lstsq(normal, right, rcond=None)[0]
+        return joint_norm(rest, comm) <= RIGID * joint_norm(moved.ravel(), comm)
 
     def nodal_size(self, force: PETSc.Vec) -> NDArray[np.float64]:
         """Return the size of ``T f`` at this rank's nodes."""

@@ -102,6 +102,11 @@ class Inertia(Term):
         self._transferred: list[PETSc.Mat] = []
 
     @property
+    def one_sided(self) -> bool:
+        """Whether it may let its bodies go: see :attr:`Term.one_sided`."""
+        return False
+
+    @property
     def share(self) -> float:
         """What of the residual is the force: the mean over the step, with ``"midpoint"``."""
         return 0.5 if self.scheme == "midpoint" else 1.0

@@ -529,6 +529,20 @@ class ReducedSystem:
         """Return the size of the positions of all nodes."""
         return joint_norm([motion.extent() for _, motion in self._places])
 
+    def is_rigid(self, x: PETSc.Vec) -> bool:
+        """Return whether x moves each body as a rigid one (collective)."""
+        increments = [field.on_background(x) for field in self.fields]
+        return all(
+            [
+                motion.is_rigid(increments[self.fields.index(field)])
+                for field, motion in self._places
+            ]
+        )
+
+    def one_sided(self) -> bool:
+        """Return whether a term may let bodies go and hold them again."""
+        return any(term.one_sided for term in self._terms)
+
 
 def _updated(term: Term) -> BaseException | None:
     """Update a term; return why that cannot be, also where a user's code fails or wants to end."""

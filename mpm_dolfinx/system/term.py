@@ -56,6 +56,14 @@ class Term:
         return False
 
     @property
+    def one_sided(self) -> bool:
+        """Whether it may let its bodies go and hold them again, as contact does; taken for granted.
+
+        Only where no term does is a body with a free rigid motion beyond help by smaller steps.
+        """
+        return True
+
+    @property
     def fused(self) -> Sequence[tuple[Particles, BodyForms]]:
         """Forms whose tangent the compiled loops reduce domain by domain, with their bodies."""
         return ()
@@ -225,6 +233,11 @@ class UserTerm(Term):
     def __init__(self, hooks: Hooks) -> None:
         super().__init__()
         self._reference = weakref.ref(hooks)
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether it may let its bodies go: see :attr:`Term.one_sided`."""
+        return False
 
     @property
     def _hooks(self) -> Hooks:

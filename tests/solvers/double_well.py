@@ -67,6 +67,12 @@ class DoubleWell:
     def extent(self):
         return 1.0
 
+    def is_rigid(self, x):
+        return True
+
+    def one_sided(self):
+        return False
+
 
 def newton(**options):
     given = {"symmetric": True, "shift": 1e-13, "line_search": True, **options}

@@ -24,6 +24,35 @@ def test_a_body_that_nothing_holds(held):
     assert not problem.history.steps and not np.any(problem.particles.displacement.x.array)
 
 
+@pytest.mark.filterwarnings("ignore:The domains have one quadrature point")
+def test_a_motion_without_strain_that_is_not_rigid():
+    # Rolls hold the block, but nothing resists the hourglass motion that this background can take.
+    lines = scenes.box([0.0, 0.0], [2.1, 2.1], [7, 7], TRIANGLE, diagonal="crossed")
+    V = scenes.vectors(lines)
+    bcs = [scenes.fix(V, scenes.at(axis, 0.0), component=axis) for axis in (0, 1)]
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(scenes.unit(7, QUADRILATERAL), V),
+        mpm.materials.VonMises(1.0, 0.4, rho_y=0.0125),
+        bcs=bcs,
+        body_force=(0.0, -0.0178),
+        f_bar="patch",
+    )
+    raises(lambda: problem.solve(steps=10), mpm.ConvergenceError, r"not rigid and .* hourglass")
+    assert problem.history.cutbacks == 10 and not problem.history.steps
+
+
+def test_a_body_that_what_only_pushes_may_let_go():
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
+    particles = mpm.Particles(scenes.unit(4, TRIANGLE), V)
+    bcs = [scenes.fix(V, scenes.at(1, 0.0), component=1)]
+    wall = mpm.boundary.plane(particles, (1.2, 0.0), (-1.0, 0.0))
+    problem = mpm.QuasiStaticProblem(
+        particles, Hencky(1e3, 0.3), bcs=bcs, body_force=(1.0, 0.0), supports=[wall]
+    )
+    raises(lambda: problem.solve(steps=1), mpm.ConvergenceError, r"what only pushes has let")
+    assert problem.history.cutbacks == 10
+
+
 def test_what_is_held_softly_is_held():
     # Slender, one cell thick: bending has an eigenvalue some 1e-11 times that of a single cell.
     V = scenes.vectors(scenes.box([0.0, 0.0], [600.0, 3.0], [600, 3], QUADRILATERAL))
