@@ -27,7 +27,7 @@ from petsc4py import PETSc
 import basix
 import basix.ufl
 import ufl
-from dolfinx import fem, geometry, graph, io, la, mesh
+from dolfinx import fem, geometry, graph, io, mesh
 from dolfinx.fem import petsc as fem_petsc
 from ufl.algorithms import expand_derivatives
 from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
@@ -308,10 +308,15 @@ def _topology(
 
 
 def create_vector(V: fem.FunctionSpace) -> PETSc.Vec:
-    """Return a vector with ghosts for a space (0.9 makes it of a form)."""
-    if hasattr(la, "create_petsc_vector"):
-        return la.create_petsc_vector(V.dofmap.index_map, V.dofmap.index_map_bs)
-    return fem_petsc.create_vector(V)
+    """Return a vector with ghosts for a space, on the communicator of its mesh (collective).
+
+    DOLFINx makes it on the index map's own communicator, which is out of reach once the space is
+    gone; then PETSc could not free the vector any more, nor the communicator.
+    """
+    places, block = V.dofmap.index_map, V.dofmap.index_map_bs
+    sizes = (block * places.size_local, block * places.size_global)
+    ghosts = places.ghosts.astype(PETSc.IntType)
+    return PETSc.Vec().createGhost(ghosts, sizes, bsize=block, comm=V.mesh.comm)
 
 
 def interpolation_points(V: fem.FunctionSpace) -> NDArray[np.float64]:

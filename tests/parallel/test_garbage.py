@@ -5,8 +5,12 @@
 import gc
 import weakref
 
+from mpi4py import MPI
+
 import pytest
 import scenes
+
+import mpm_dolfinx as mpm
 
 
 def test_a_problem_ends_with_its_last_reference():
@@ -43,3 +47,60 @@ def test_problems_leave_nothing_that_grows():
 
     count(2)
     assert abs(count(4) - count(4)) < 50
+
+
+def free_communicators(enough=4000):
+    """Return how many communicators MPI would still make (collective)."""
+    made = []
+    try:
+        while len(made) < enough:
+            made.append(scenes.WORLD.Dup())
+    except MPI.Exception:
+        pass
+    for comm in made:
+        comm.Free()
+    return len(made)
+
+
+def loaded():
+    scenes.block().solve(1)
+
+
+def repartitioned():
+    problem = scenes.block()
+    problem.repartition(0.0)
+    problem.solve(1)
+
+
+def split():
+    problem = scenes.block(cell=scenes.QUADRILATERAL, force=(0.0, -1.0))
+    problem.split([0])
+    problem.solve(1)
+
+
+def on_reference_route():
+    scenes.block(f_bar="patch", tractions=[], assembly="reference").solve(1)
+
+
+def moving():
+    V = scenes.vectors(scenes.box([-0.5] * 2, [1.5] * 2, [4, 4], scenes.QUADRILATERAL))
+    body = mpm.Particles(scenes.unit(4, scenes.TRIANGLE), V)
+    law = mpm.materials.Hencky(1e3, 0.3)
+    mpm.DynamicProblem(body, law, density=2.0, body_force=(0.0, -1.0)).solve(1e-3, 1e-3)
+
+
+@pytest.mark.mpi
+@pytest.mark.filterwarnings("ignore:The domains have one quadrature point")
+def test_problems_leave_no_communicator():
+    kinds = [loaded, repartitioned, split, on_reference_route, moving]
+
+    def run(times):
+        for _ in range(times):
+            for kind in kinds:
+                kind()
+                gc.collect()
+
+    run(1)
+    before = free_communicators()
+    run(3)
+    assert free_communicators() == before
