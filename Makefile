@@ -5,8 +5,9 @@
 VENV ?= .venv
 # The interpreter to make it with (empty: look for one).
 PYTHON ?=
-# Numbers of ranks of the further runs of the tests (1: no further run), and arguments for pytest.
-NP ?= 2 3
+# Numbers of ranks of the further runs of the tests (1: no further run; empty: 2 3, of all tests
+# 2 3 4), and arguments for pytest.
+NP ?=
 ARGS ?=
 
 export PYTHON VENV NP
@@ -19,7 +20,7 @@ SETUP := sh scripts/setup_env.sh
 BENCHMARKS := $(wildcard $(patsubst %,benchmarks/%.py,assembly step skip solvers scaling ranks cantilever_reference))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo demos test test-debian stress bench bench-smoke studies lint docs clean
+.PHONY: help demo demos test test-all test-debian stress bench bench-smoke studies lint docs clean
 
 help: ## This list
 	@echo "make TARGET [VENV=path of an environment] [PYTHON=path of an interpreter]"
@@ -31,9 +32,14 @@ demo: ## Install what is needed, run the first demo, make its picture
 	cd output && "$(abspath $(BIN)/python)" ../demos/demo_column_roller.py
 	@echo "The picture is output/column_roller.png"
 
-test: ## Half an hour: the tests on 1, then on NP="2 3" ranks (ARGS=tests/materials: seconds)
+test: ## Minutes: the quick tests on 1, then on NP="2 3" ranks (ARGS=tests/materials: seconds)
 	@$(SETUP) wheel plot test
 	@bash scripts/run_tests.sh $(ARGS)
+
+test-all: ## An hour: all tests on 1, then on NP="2 3 4" ranks, and without ARGS the stress suite
+	@$(SETUP) wheel plot test
+	@bash scripts/run_tests.sh --all $(ARGS)
+	@$(if $(ARGS),,cd tests && "$(abspath $(BIN)/python)" -m stress.run)
 
 test-debian: ## As root: the tests with Debian's DOLFINx 0.9, in a root made by debootstrap
 	@bash scripts/test_debian.sh $(ARGS)

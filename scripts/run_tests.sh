@@ -2,12 +2,15 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
 #
-# usage: run_tests.sh [ARGUMENT OF PYTEST...]
+# usage: run_tests.sh [--all] [ARGUMENT OF PYTEST...]
 #
 # Run the tests of the environment $VENV on one rank, then on each number of ranks of the list
-# $NP (default: 2 3; 1 is no more than the first run). The first run that fails ends it. The last
-# line is pytest's summary, after launchers' messages too. $TEST_TIMEOUT is the time limit of each
-# run in seconds; $MPIRUN another launcher.
+# $NP (default: 2 3, with --all 2 3 4; 1 is no more than the first run). The first run that fails ends
+# it. The last line is pytest's summary, after launchers' messages too. $TEST_TIMEOUT is the time
+# limit of each run in seconds; $MPIRUN another launcher.
+#
+# Without --all, tests marked slow are left out, and more ranks than two run the folders where
+# ranks have most to do with each other. Arguments, such as a folder, are run on all ranks.
 set -uo pipefail
 
 cd "$(dirname "$0")/.." || exit 1
@@ -15,18 +18,31 @@ venv=${VENV:-.venv}
 limit=${TEST_TIMEOUT:-1800}
 export OMP_NUM_THREADS=1
 
-read -ra numbers <<<"${NP:-2 3}"
+# Which tests, besides those that are named; on more ranks than two; and not on several ranks:
+# there no rank hears of another, or programs run that the first run has had.
+which=() few=() alone=()
+default="2 3"
+if [[ ${1:-} == --all ]]; then
+    shift
+    which=(-m "")
+    default="2 3 4"
+elif (($# == 0)); then
+    few=(parallel particles problems system stepping transfer)
+    few=("${few[@]/#/tests/}" tests/io/test_checkpoint.py tests/physics/test_parallel.py)
+    echo "The quick tests. Those of one folder or file take seconds: make test ARGS=tests/materials," \
+        "NP=1 for one rank alone; make test-all runs all, also on four ranks."
+fi
+if (($# == 0)); then
+    alone=(--ignore=tests/materials --ignore=tests/benchmarks --ignore=tests/demos)
+fi
+
+read -ra numbers <<<"${NP:-$default}"
 for ranks in "${numbers[@]}"; do
     if [[ ! $ranks =~ ^[1-9][0-9]*$ ]]; then
         echo "NP=\"${NP}\" is no list of numbers of ranks, such as \"2 3\"." >&2
         exit 1
     fi
 done
-
-if (($# == 0)); then
-    echo "All tests on 1, ${NP:-2 3} ranks take about half an hour on two cores; those of one folder or" \
-        "file take seconds: make test ARGS=tests/materials, NP=1 for one rank alone."
-fi
 
 # pytest's last line, also with -q
 summary_line='^(=+ )?(no tests ran|[0-9]+ (passed|failed|skipped|deselected|xfailed|xpassed|warning|error)).* in [0-9.]+s'
@@ -55,7 +71,7 @@ run() {
     fi
 }
 
-MPM_DOLFINX_RANKS=1 run "$venv/bin/python" -m pytest "$@"
+MPM_DOLFINX_RANKS=1 run "$venv/bin/python" -m pytest "${which[@]}" "$@"
 
 # Open MPI refuses more ranks than cores unless it is told so.
 export PRTE_MCA_rmaps_default_mapping_policy=:oversubscribe
@@ -69,21 +85,14 @@ fi
 cores=$(env -u OMP_NUM_THREADS nproc) # which it would say instead
 for ranks in "${numbers[@]}"; do
     ((ranks > 1)) || continue
-    waiting=() without=()
+    waiting=() chosen=()
     if ((ranks > cores)); then
         # Ranks that wait leave the cores to the others. (MPICH's heavy yield makes any run with a
         # core to spare ten times slower.)
         waiting=(env MPIR_CVAR_CH4_PROGRESS_THROTTLE=1
             MPIR_CVAR_CH4_PROGRESS_THROTTLE_NO_PROGRESS_COUNT=20 OMPI_MCA_mpi_yield_when_idle=1)
-        # Where all tests run: no rank hears of another there, or programs run that other runs have.
-        (($# > 0)) || without=(--ignore=tests/materials --ignore=tests/benchmarks --ignore=tests/demos)
     fi
-    # Each problem on several ranks leaves a communicator of about 2000 to the end of its process, so
-    # all tests are two runs.
-    later=(physics problems solvers stabilisation stepping stress system transfer)
+    ((ranks == 2)) || chosen=("${few[@]}")
     MPM_DOLFINX_RANKS=$ranks run "${waiting[@]}" "${launcher[@]}" -n "$ranks" \
-        "$venv/bin/python" -m pytest -p no:cacheprovider "${without[@]}" \
-        $( (($# > 0)) || printf -- '--ignore=tests/%s ' "${later[@]}") "$@"
-    (($# > 0)) || MPM_DOLFINX_RANKS=$ranks run "${waiting[@]}" "${launcher[@]}" -n "$ranks" \
-        "$venv/bin/python" -m pytest -p no:cacheprovider "${later[@]/#/tests/}"
+        "$venv/bin/python" -m pytest -p no:cacheprovider "${which[@]}" "${alone[@]}" "${chosen[@]}" "$@"
 done

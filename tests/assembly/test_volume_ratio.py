@@ -7,6 +7,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import scenes
+from marks import thinned
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 
 import basix.ufl
@@ -70,7 +71,7 @@ def label(value):
     return scenes.name(value) or str(value)
 
 
-@pytest.mark.parametrize(("cell", "over", "rule"), CASES, ids=label)
+@pytest.mark.parametrize(("cell", "over", "rule"), thinned(2, CASES), ids=label)
 def test_is_the_f_bar_of_materials(cell, over, rule):
     particles, bcs = block(cell, rule)
     material = mpm.QuasiStaticProblem(
@@ -90,7 +91,7 @@ def test_is_the_f_bar_of_materials(cell, over, rule):
 
 @pytest.mark.parametrize(
     ("cell", "over", "rule"),
-    [*CASES[1:], (HEXAHEDRON, "domain", 2), (TETRAHEDRON, "patch", 1)],
+    thinned(2, [*CASES[1:], (HEXAHEDRON, "domain", 2), (TETRAHEDRON, "patch", 1)]),
     ids=label,
 )
 def test_tangent_is_exact_and_symmetric(cell, over, rule):

@@ -10,11 +10,18 @@ import sys
 from pathlib import Path
 
 import pytest
+from marks import all_but
 from scenes import WORLD
 
 import mpm_dolfinx as mpm
 
 CASES = Path(__file__).parents[2] / "benchmarks" / "cases"
+#: Programs that ``make test`` runs, and numbers that it leaves to ``make test-all``.
+SHORT = ("compaction", "column_free", "snap_through")
+LONG = {
+    *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
+    *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
+}
 COMMON = {"completed", "load", "iterations", "cutbacks", "failure"}
 
 RUNS = {
@@ -149,7 +156,7 @@ def run(name, arguments, capfd):
     return status, WORLD.bcast(capfd.readouterr().out)
 
 
-@pytest.mark.parametrize("case", RUNS)
+@pytest.mark.parametrize("case", all_but(RUNS.keys() - LONG, RUNS))
 def test_numbers(case, capfd):
     name, arguments, bounds = RUNS[case]
     if name == "gmsh_body":
@@ -231,7 +238,11 @@ def test_column_goes_on_from_its_checkpoint(mpi_tmp_path, capfd, monkeypatch):
         pytest.param("compaction", "--elements 4 --steps 10", marks=pytest.mark.skip_in_parallel),
         ("column_roller", "--elements 8 --steps 10"),
         ("column_free", "--cell 1 --steps 10 --g0 10e3"),
-        pytest.param("ufl_material", "--elements 4 --steps 4", marks=pytest.mark.skip_in_parallel),
+        pytest.param(
+            "ufl_material",
+            "--elements 4 --steps 4",
+            marks=[pytest.mark.skip_in_parallel, pytest.mark.slow],
+        ),
     ],
 )
 def test_picture(name, arguments, mpi_tmp_path, capfd):
@@ -265,7 +276,7 @@ def test_numbers_do_not_depend_on_the_number_of_ranks(capfd):
 
 
 @pytest.mark.skip_in_parallel
-@pytest.mark.parametrize("name", KEYS)
+@pytest.mark.parametrize("name", all_but(SHORT, KEYS))
 def test_case_is_a_program(name, tmp_path):
     # From another directory, in a process of its own, which leaves nothing behind.
     small = {

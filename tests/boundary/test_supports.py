@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 import scenes
+from marks import slow
 from scenes import QUADRILATERAL, TRIANGLE, WORLD
 
 import dolfinx
@@ -61,7 +62,7 @@ def inclined_column(case, ne, angle, cell, material, comm=WORLD, **options):
     return problem, supports, Q, error
 
 
-@pytest.mark.parametrize("angle", [0, 30, 77])
+@pytest.mark.parametrize("angle", [0, 30, *slow(77)])
 @pytest.mark.parametrize(("cell", "aligned"), [(QUADRILATERAL, 2.57e-3), (TRIANGLE, 6.16e-3)])
 def test_column_on_an_inclined_roller(angle, cell, aligned):
     case = scenes.A
@@ -91,7 +92,7 @@ def test_error_of_the_inclined_column_falls():
 
 @pytest.mark.filterwarnings("ignore:The run is complete, but")
 @pytest.mark.parametrize("kind", ["roller", "fixed"])
-@pytest.mark.parametrize("cell", [TRIANGLE, QUADRILATERAL], ids=scenes.name)
+@pytest.mark.parametrize("cell", [TRIANGLE, *slow(QUADRILATERAL)], ids=scenes.name)
 def test_support_is_the_penalty_of_finite_elements(kind, cell):
     # Where the background is the body's mesh, T is the identity and stock FEM the same problem.
     def grid():
@@ -142,7 +143,7 @@ def in_space(W, function):
     return rows[np.lexsort(np.round(rows[:, :2], 9).T)]
 
 
-@pytest.mark.parametrize("angle", [0, 25])
+@pytest.mark.parametrize("angle", [*slow(0), 25])
 def test_a_moving_plane_squeezes_a_block(angle):
     # Confined between smooth walls: Cauchy's stress is M ln(stretch) / stretch.
     markers = scenes.at(1, 0.0), scenes.at(0, 0.0, 1.0), scenes.at(1, 2.0)
@@ -192,6 +193,7 @@ def slump(angle, h=1.0, g0=20e3, comm=WORLD):
     return problem, supports, Q
 
 
+@pytest.mark.slow
 def test_a_column_spreads_on_an_inclined_plane():
     on_grid = scenes.slump(TRIANGLE, 20e3, h=1.0)
     on_grid.solve(steps=20)

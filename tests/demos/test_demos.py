@@ -9,9 +9,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from marks import all_but
 
 DEMOS = Path(__file__).parents[2] / "demos"
 NAMES = sorted(path.stem for path in DEMOS.glob("*.py"))
+#: Those of a second or two, which ``make test`` runs.
+SHORT = ("demo_column_roller", "demo_collapse", "demo_gmsh_body", "demo_snap_through")
 
 
 @pytest.mark.skip_in_parallel
@@ -40,7 +43,7 @@ def test_stands_alone(name):
 
 
 @pytest.mark.skip_in_parallel
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", all_but(SHORT, NAMES))
 def test_runs_and_meets_its_own_assertions(name, tmp_path):
     # In a process of its own, from a directory of its own, where it leaves its picture.
     if name == "demo_gmsh_body":

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import scenes
+from marks import slow
 from scenes import WORLD
 
 import mpm_dolfinx as mpm
@@ -49,7 +50,7 @@ print("and then", sorted(p.name for p in path.parent.iterdir()))
 
 @pytest.mark.skip_in_parallel
 @pytest.mark.parametrize(("method", "name"), [("save", "run.ckpt"), ("write", "run.pvd")])
-@pytest.mark.parametrize("limit", [1, 2000])
+@pytest.mark.parametrize("limit", [*slow(1), 2000])
 def test_a_file_that_a_limit_cuts_is_an_error(method, name, limit, tmp_path):
     path = tmp_path / name
     script = LIMITED.format(tests=TESTS, path=str(path), method=method, limit=limit)

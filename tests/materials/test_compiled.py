@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from marks import slow
 from materials.test_von_mises import random_path
 
 from mpm_dolfinx import DomainDistortionError
@@ -46,7 +47,7 @@ LAWS = {
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("size", [1e-10, 1e-3, 0.1])
+@pytest.mark.parametrize("size", [*slow(1e-10), 1e-3, 0.1])
 def test_compiled_update_is_that_of_numpy(law, dim, size):
     compiled, reference = LAWS[law], LAWS[law].with_parameters()
     reference.compiled = False

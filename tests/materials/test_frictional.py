@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Mohr-Coulomb, Tresca and Drucker-Prager against active sets, differences and closed forms."""
 
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 import pytest
+from marks import slow, thinned
 from materials.reference import moduli, rotation
 from materials.test_von_mises import random_path
 from scenes import QUADRILATERAL, at, box, fix, vectors
@@ -138,9 +139,7 @@ REGIONS = {
 EQUAL = {"plane": 3, "edge of compression": 2, "edge of extension": 2, "apex": 1}
 
 
-@pytest.mark.parametrize("m", [4, 6])
-@pytest.mark.parametrize("region", REGIONS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(("law", "region", "m"), thinned(7, product(LAWS, REGIONS, [4, 6])))
 def test_tangents_at_plane_edges_and_apex(law, region, m):
     """Against differences of the stress, with axes that are turned, at equal strains too."""
     material = LAWS[law]
@@ -161,7 +160,7 @@ def test_tangents_at_plane_edges_and_apex(law, region, m):
         np.testing.assert_allclose(answer.tangent[0], slope, atol=1e-6 * YOUNG)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dim", [*slow(2), 3])
 @pytest.mark.parametrize("law", LAWS)
 def test_a_thousand_random_paths(law, dim):
     material = LAWS[law]

@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from marks import slow
 from materials.reference import moduli
 
 from mpm_dolfinx.errors import ConvergenceError
@@ -192,7 +193,7 @@ def test_rounded_apex_returns(m, hardening):
     assert np.isfinite(answer.tangent).all()
 
 
-@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dim", [2, *slow(3)])
 @pytest.mark.parametrize("law", [DruckerPrager, LogarithmicDruckerPrager, AssociatedDruckerPrager])
 def test_drucker_prager_tangents(dim, law):
     assert check_tangent(law(apex=0.2), dim, strain=1e-2, points=8, steps=2) < 1e-7

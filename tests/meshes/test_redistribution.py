@@ -2,11 +2,14 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Meshes on other ranks, with their tags and Functions."""
 
+from itertools import product
+
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 import scenes
+from marks import thinned
 from scenes import ALL, PLANE, WORLD, anywhere
 
 import ufl
@@ -86,10 +89,12 @@ def moved_and_stretched(body):
     return carrier.then(Redistribution(carrier.mesh, anywhere(carrier.mesh, 2)))
 
 
-@pytest.mark.parametrize("cell", ALL, ids=scenes.name)
-@pytest.mark.parametrize("apart", [False, True], ids=["joined", "apart"])
-@pytest.mark.parametrize("way", [moved_once, moved_thrice, moved_and_stretched])
-def test_tags_and_functions_move(cell, apart, way):
+@pytest.mark.parametrize(
+    ("way", "apart", "cell"),
+    thinned(5, product([moved_once, moved_thrice, moved_and_stretched], [False, True], ALL)),
+    ids=scenes.name,
+)
+def test_tags_and_functions_move(way, apart, cell):
     body = scenes.unit(3, cell)
     if apart:
         body = pieces(body)

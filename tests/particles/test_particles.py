@@ -9,6 +9,7 @@ import pytest
 import scenes
 from bad_input import background, touching
 from compare import raises
+from marks import slow
 from scenes import ALL, HEXAHEDRON, PLANE, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 from scipy.linalg import logm, polar
 
@@ -94,7 +95,7 @@ def test_homogeneous_motion(cell):
     np.testing.assert_allclose(particles.initial_volume, V0, rtol=1e-14)
 
 
-@pytest.mark.parametrize("quadrature_degree", [None, 3])
+@pytest.mark.parametrize("quadrature_degree", [None, *slow(3)])
 @pytest.mark.parametrize("cell", ALL, ids=scenes.name)
 def test_inhomogeneous_motion(cell, quadrature_degree):
     particles = scene(cell, quadrature_degree=quadrature_degree)
@@ -233,8 +234,8 @@ def test_inverted_names_the_domains(cell):
     assert np.array_equal(particles.inverted(), particles.global_index)
 
 
-@pytest.mark.parametrize("quadrature_degree", [None, 2, 3])
-@pytest.mark.parametrize("shape", [(), (2,), (2, 3)])
+@pytest.mark.parametrize("quadrature_degree", [None, 2, *slow(3)])
+@pytest.mark.parametrize("shape", [(), *slow((2,)), (2, 3)])
 @pytest.mark.parametrize("cell", PLANE, ids=scenes.name)
 def test_quadrature_function_layout(cell, shape, quadrature_degree):
     particles = scene(cell, quadrature_degree=quadrature_degree)
@@ -254,16 +255,15 @@ def test_quadrature_function_layout(cell, shape, quadrature_degree):
 
     dx = ufl.dx(domain=particles.mesh, metadata={"quadrature_degree": degree})
     weight = X[0] * X[0] + 0.3
+    one = fem.assemble_scalar(fem.form((X[0] + 2 * X[1]) * weight * dx))
     for index in np.ndindex(shape):
         component = data[index] if shape else data
         injected = fem.assemble_scalar(fem.form(component * weight * particles.dx))
-        direct = fem.assemble_scalar(
-            fem.form(float(factors[index]) * (X[0] + 2 * X[1]) * weight * dx)
-        )
+        direct = factors[index] * one
         assert abs(injected - direct) < 1e-13 * max(1.0, abs(direct))
 
 
-@pytest.mark.parametrize("cell", ALL, ids=scenes.name)
+@pytest.mark.parametrize("cell", [TRIANGLE, *slow(QUADRILATERAL, TETRAHEDRON), HEXAHEDRON])
 def test_measures(cell):
     particles = scene(cell)
     u, v = ufl.TrialFunction(particles.W), ufl.TestFunction(particles.W)
