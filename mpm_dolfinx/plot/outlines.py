@@ -1,10 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Pictures of particle domains: by matplotlib in the plane, as a pyvista grid elsewhere.
-
-Both packages are optional (``pip install 'mpm-dolfinx[plot]'``) and imported on rank 0 only,
-when a picture is asked for. All functions are collective.
-"""
+"""Domains of particles: as polygons of matplotlib in the plane, as a pyvista grid anywhere."""
 
 from __future__ import annotations
 
@@ -19,16 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 import basix
 from dolfinx import fem, mesh
 
-from . import _compat
-from .errors import MPMError, agree
-from .particles.particles import Particles
+from .. import _compat
+from ..errors import MPMError, agree
+from ..particles.particles import Particles
 
-__all__ = ["background", "domains", "grid"]
-
-
-def __dir__() -> list[str]:
-    """Return the public names."""
-    return sorted(__all__)
+__all__ = ["background", "domains", "edges", "grid", "imported", "outlines"]
 
 
 #: Straight pieces that an edge is drawn with where it is curved.
@@ -85,12 +76,12 @@ def domains(
                 f"values must have the shape ({particles.num_local},), one value for each particle "
                 f"of the rank, not {shown.shape}."
             )
-    collections = _imported("matplotlib.collections", comm)
+    collections = imported("matplotlib.collections", comm)
     present = ~particles.deleted
     index = comm.gather(particles.global_index[present])
-    outlines = comm.gather(_outlines(particles, warp)[present])
+    polygons = comm.gather(outlines(particles, warp)[present])
     colours = comm.gather(None if shown is None else shown[present])
-    if index is None or outlines is None or colours is None:
+    if index is None or polygons is None or colours is None:
         return None
     order = np.argsort(np.concatenate(index))
     if shown is not None:
@@ -98,7 +89,7 @@ def domains(
     else:
         options = {"facecolors": facecolor, **options}
     artist = collections.PolyCollection(
-        np.concatenate(outlines)[order], edgecolors=edgecolor, linewidths=linewidth, **options
+        np.concatenate(polygons)[order], edgecolors=edgecolor, linewidths=linewidth, **options
     )
     if shown is not None:
         artist.set_clim(vmin, vmax)
@@ -132,18 +123,22 @@ def background(
     grid_mesh = V if isinstance(V, mesh.Mesh) else V.mesh
     comm: MPI.Comm = grid_mesh.comm
     _require_plane(grid_mesh)
-    collections = _imported("matplotlib.collections", comm)
-    own = grid_mesh.topology.index_map(grid_mesh.topology.dim).size_local
-    _, corners = _compat.vtk_cell(grid_mesh.basix_cell(), 1, 0)
-    nodes = _compat.geometry_dofmap(grid_mesh)[:own, corners]
-    cells = comm.gather(grid_mesh.geometry.x[nodes, :2])
+    collections = imported("matplotlib.collections", comm)
+    cells = edges(grid_mesh)
     if cells is None:
         return None
     options = {"facecolors": "none", "zorder": 0.5, **options}
-    artist = collections.PolyCollection(
-        np.concatenate(cells), edgecolors=color, linewidths=linewidth, **options
-    )
+    artist = collections.PolyCollection(cells, edgecolors=color, linewidths=linewidth, **options)
     return _added(artist, ax)
+
+
+def edges(grid_mesh: mesh.Mesh) -> NDArray[np.float64] | None:
+    """Return the cells of a grid in the plane as polygons ``(n, k, 2)`` on rank 0 (collective)."""
+    own = grid_mesh.topology.index_map(grid_mesh.topology.dim).size_local
+    _, corners = _compat.vtk_cell(grid_mesh.basix_cell(), 1, 0)
+    nodes = _compat.geometry_dofmap(grid_mesh)[:own, corners]
+    cells = grid_mesh.comm.gather(grid_mesh.geometry.x[nodes, :2])
+    return None if cells is None else np.concatenate(cells)
 
 
 def grid(particles: Particles) -> Any:
@@ -165,7 +160,7 @@ def grid(particles: Particles) -> Any:
         MPMError: pyvista is missing.
     """
     comm: MPI.Comm = particles.mesh.comm
-    pyvista = _imported("pyvista", comm)
+    pyvista = imported("pyvista", comm)
     cell_type, nodes = _compat.vtk_cell(
         particles.mesh.basix_cell(),
         particles.W.ufl_element().degree,
@@ -197,7 +192,7 @@ def grid(particles: Particles) -> Any:
     return result
 
 
-def _outlines(particles: Particles, warp: float) -> NDArray[np.float64]:
+def outlines(particles: Particles, warp: float) -> NDArray[np.float64]:
     """Return the boundaries of the owned domains as polygons, shape ``(n, m, 2)``."""
     cell = particles.mesh.basix_cell()
     corners = basix.geometry(cell)[_compat.vtk_cell(cell, 1, 0)[1]]
@@ -221,7 +216,7 @@ def _require_plane(domain: mesh.Mesh) -> None:
         raise MPMError("Only bodies in the plane are drawn by matplotlib; use plot.grid in space.")
 
 
-def _imported(module: str, comm: MPI.Comm) -> Any:
+def imported(module: str, comm: MPI.Comm) -> Any:
     """Import an optional module on rank 0; ranks agree where it is missing."""
     with agree(comm):
         try:

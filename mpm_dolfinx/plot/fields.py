@@ -1,0 +1,125 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Fields of particles by name, one value for each domain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dolfinx import fem
+
+from ..errors import MPMError, agree
+from ..particles.particles import Particles
+
+__all__ = ["LABELS", "bodies_of", "values_of"]
+
+#: What colour bars say.
+LABELS = {
+    "contact_pressure": "contact pressure",
+    "mises": "von Mises stress",
+    "plastic_strain": "plastic strain",
+    "volume_ratio": "volume ratio",
+}
+AXES = "xyz"
+
+type Field = str | ArrayLike | fem.Function | Sequence[ArrayLike | fem.Function] | None
+
+
+def bodies_of(problem: Any) -> list[Particles]:
+    """Return the bodies of a problem, of particles or of a list of them."""
+    if isinstance(problem, Particles):
+        return [problem]
+    bodies = getattr(problem, "bodies", problem)
+    if not isinstance(bodies, list | tuple) or not all(isinstance(b, Particles) for b in bodies):
+        raise MPMError(
+            f"Pictures are of a problem, of particles or of a list of them, not of {problem!r}."
+        )
+    return list(bodies)
+
+
+def values_of(
+    problem: Any, bodies: Sequence[Particles], field: Field
+) -> list[NDArray[np.float64]] | None:
+    """Return the values of a field in the owned domains of each body (collective).
+
+    Args:
+        problem: As given to the picture.
+        bodies: Its bodies.
+        field: See :func:`mpm_dolfinx.plot.scene`.
+
+    Returns:
+        An array ``(n,)`` for each body, or ``None`` for pictures without a field.
+
+    Raises:
+        MPMError: There is no such field.
+    """
+    if field is None or (isinstance(field, str) and field == "contact_pressure"):
+        return None
+    comm: MPI.Comm = bodies[0].mesh.comm
+    with agree(comm):
+        if isinstance(field, str):
+            return [_named(problem, bodies, number, field) for number in range(len(bodies))]
+        several = isinstance(field, list | tuple) and len(bodies) > 1
+        each: Sequence[Any] = field if several else [field]  # type: ignore[assignment]
+        if len(each) != len(bodies):
+            raise MPMError(f"field must have one entry for each of the {len(bodies)} bodies.")
+        return [_given(body, values) for body, values in zip(bodies, each, strict=True)]
+
+
+def _given(body: Particles, values: Any) -> NDArray[np.float64]:
+    """Return values that the user has given, one for each domain."""
+    if isinstance(values, fem.Function):
+        if values.function_space.mesh is not body.mesh:
+            raise MPMError(f"The Function {values.name!r} is not on the mesh of its body.")
+        return _of_function(body, values)
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (body.num_local,):
+        raise MPMError(
+            f"values must have the shape ({body.num_local},), one value for each particle "
+            f"of the rank, not {array.shape}."
+        )
+    return array
+
+
+def _of_function(body: Particles, function: fem.Function) -> NDArray[np.float64]:
+    """Return the mean of a Function's values in each domain, of vectors their length."""
+    dofmap = function.function_space.dofmap
+    values = function.x.array.reshape(-1, dofmap.bs)[dofmap.list[: body.num_local]].mean(axis=1)
+    return np.asarray(values[:, 0] if dofmap.bs == 1 else np.linalg.norm(values, axis=1))
+
+
+def _named(
+    problem: Any, bodies: Sequence[Particles], number: int, name: str
+) -> NDArray[np.float64]:
+    """Return the values of a field by its name."""
+    body = bodies[number]
+    gdim = body.mesh.geometry.dim
+    vectors = {"displacement": body.centroid - body.initial_centroid}
+    if hasattr(problem, "velocity"):
+        velocity = problem.velocity
+        function = velocity[number] if isinstance(velocity, list) else velocity
+        dofmap = function.function_space.dofmap
+        nodal = function.x.array.reshape(-1, dofmap.bs)
+        vectors["velocity"] = nodal[dofmap.list[: body.num_local]].mean(axis=1)
+    known: dict[str, NDArray[np.float64]] = {}
+    for key, values in vectors.items():
+        known[key] = np.linalg.norm(values, axis=1)
+        known |= {f"{key}_{AXES[i]}": values[:, i] for i in range(gdim)}
+    for key, values in body.fields().items():
+        if values.ndim == 1:
+            known[key] = values
+    if body.has_material:
+        stress = body.stress
+        for i, j in zip(*np.triu_indices(3), strict=True):
+            known[f"stress_{AXES[i]}{AXES[j]}"] = stress[:, i, j]
+        deviator = stress - np.trace(stress, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
+        known["mises"] = np.sqrt(1.5) * np.linalg.norm(deviator, axis=(1, 2))
+    if name not in known:
+        raise MPMError(f"There is no field {name!r}; there are {', '.join(sorted(known))}.")
+    return np.asarray(known[name], dtype=np.float64)

@@ -1,0 +1,397 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""All bodies of a problem in one picture, coloured by a field."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import MPMError, agree
+from ..particles.particles import Particles
+from .fields import LABELS, Field, bodies_of, values_of
+from .outlines import edges, grid, imported, outlines
+
+__all__ = ["Look", "Shot", "draw", "scene", "take"]
+
+#: Room around the bodies, relative to their extent, and pixels of a picture in space.
+MARGIN, PIXELS = 0.04, (1500, 1200)
+#: Height over width of what is shown, below which the colour bar lies beneath it.
+FLAT = 0.4
+#: Radius of the marks of contact points in points.
+MARK = 3.0
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a scene is drawn; see :func:`scene` for each.
+
+    Attributes:
+        limits: First and last value of the colours.
+        box: Corners of what is shown, shape ``(2, gdim)``; ``None``: the bodies.
+    """
+
+    label: str
+    cmap: Any = "viridis"
+    limits: tuple[float | None, float | None] | None = None
+    lines: bool | None = None
+    camera: Any = None
+    title: str | None = None
+    box: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
+class Shot:
+    """The bodies at one moment, on rank 0.
+
+    Attributes:
+        bodies: Polygons ``(n, k, 2)`` in the plane, grids of pyvista in space, one for each body.
+        values: One value for each domain of each body, ``None`` without a field.
+        cells: Polygons of the backgrounds in the plane.
+        marks: Points of contact ``(m, gdim)`` and their pressures ``(m,)``.
+        extent: Corners of the box around all domains, shape ``(2, gdim)``.
+        around: That around the backgrounds.
+    """
+
+    bodies: list[Any]
+    values: list[NDArray[np.float64]] | None
+    cells: list[NDArray[np.float64]]
+    marks: tuple[NDArray[np.float64], NDArray[np.float64]] | None
+    extent: NDArray[np.float64]
+    around: NDArray[np.float64]
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Smallest and largest value."""
+        arrays = [self.marks[1]] if self.marks is not None else (self.values or [])
+        shown = np.concatenate([a[np.isfinite(a)] for a in arrays]) if arrays else np.zeros(0)
+        return (float(shown.min()), float(shown.max())) if shown.size else (0.0, 1.0)
+
+
+def scene(
+    problem: Any,
+    field: Field = "displacement",
+    path: str | Path | None = None,
+    *,
+    ax: Any = None,
+    warp: float = 1.0,
+    background: bool = True,
+    label: str | None = None,
+    cmap: Any = "viridis",
+    limits: tuple[float | None, float | None] | None = None,
+    lines: bool | None = None,
+    camera: Any = None,
+    title: str | None = None,
+) -> Any:
+    """Draw all bodies of a problem as they are now, coloured by a field (collective).
+
+    In the plane the picture is matplotlib's, in space it is rendered by pyvista, off the screen;
+    the colour bar stands beside it.
+
+    Args:
+        problem: A problem, particles, or a list of particles.
+        field: ``"displacement"`` (its length), ``"displacement_x"`` and so on, ``"volume_ratio"``;
+            with a material ``"stress_xx"`` and so on, ``"mises"``, ``"pressure"``,
+            ``"plastic_strain"``; of a moving body ``"velocity"``; ``"contact_pressure"`` at points
+            of contact. Or values of your own, shape ``(n,)``, one for each particle that this rank
+            owns, or a Function on the body's mesh, of which each domain shows the mean; for several
+            bodies a list. ``None``: no colours.
+        path: Where to save it, e.g. ``"scene.png"``.
+        ax: Axes of matplotlib to draw on; only those of rank 0 count. A figure is made without.
+        warp: Factor on the displacement.
+        background: Whether the background is drawn: its cells in the plane, its box in space.
+        label: What the colour bar says; the field's name without.
+        cmap: Colour map.
+        limits: First and last value of the colours; ``None`` in a place is the smallest or
+            largest value.
+        lines: Whether edges of domains are drawn; by default where there are not too many.
+        camera: In space, where it is seen from: anything that pyvista takes as
+            ``camera_position``, such as ``"xz"`` or a vector towards the eye.
+        title: A line above it.
+
+    Returns:
+        The figure of matplotlib on rank 0, ``None`` elsewhere.
+
+    Raises:
+        MPMError: There is no such field, or a package for pictures is missing.
+    """
+    bodies = bodies_of(problem)
+    comm: MPI.Comm = bodies[0].mesh.comm
+    figures = imported("matplotlib.figure", comm)
+    name = field if isinstance(field, str) else ""
+    look = Look(LABELS.get(name, name.replace("_", " ")) if label is None else label)
+    look = replace(look, cmap=cmap, limits=limits, lines=lines, camera=camera, title=title)
+    shot = take(problem, bodies, field, warp, background)
+    with agree(comm):
+        if shot is None:
+            return None
+        figure = ax.figure if ax is not None else new_figure(figures, shot)
+        draw(shot, look, figure.add_subplot() if ax is None else ax)
+        if path is not None:
+            figure.savefig(path, dpi=160)
+        return figure
+
+
+def take(
+    problem: Any, bodies: Sequence[Particles], field: Field, warp: float, background: bool
+) -> Shot | None:
+    """Return the bodies at this moment on rank 0 (collective)."""
+    comm: MPI.Comm = bodies[0].mesh.comm
+    gdim = bodies[0].mesh.geometry.dim
+    planar = gdim == 2
+    values = values_of(problem, bodies, field)
+    shapes: list[Any] = []
+    shown: list[NDArray[np.float64]] = []
+    low, high = np.full(gdim, np.inf), np.full(gdim, -np.inf)
+    for number, body in enumerate(bodies):
+        kept = ~body.deleted
+        index = comm.gather(body.global_index)
+        mine = comm.gather(None if values is None else values[number])
+        there = comm.gather(kept)
+        polygons = comm.gather(outlines(body, warp)) if planar else None
+        whole = None if planar else grid(body)
+        if index is None or mine is None or there is None:
+            continue
+        order = np.argsort(np.concatenate(index))
+        order = order[np.concatenate(there)[order]]
+        if values is not None:
+            shown.append(np.concatenate(mine)[order])
+        if polygons is not None:
+            shape = np.concatenate(polygons)[order]
+            points = shape.reshape(-1, 2)
+        else:
+            shape = _kept(whole, np.concatenate(there)[np.argsort(np.concatenate(index))], warp)
+            points = shape.points
+        shapes.append(shape)
+        if len(points):
+            low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+    backgrounds = {id(body.V.mesh): body.V.mesh for body in bodies}
+    boxes = [_box(one, comm) for one in backgrounds.values()]
+    cells = [edges(one) for one in backgrounds.values()] if planar and background else []
+    marks = (
+        _marks(problem, comm) if isinstance(field, str) and field == "contact_pressure" else None
+    )
+    if comm.rank > 0:
+        return None
+    around = np.array(
+        [np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)]
+    )
+    return Shot(
+        shapes,
+        None if values is None else shown,
+        [cell for cell in cells if cell is not None],
+        marks,
+        np.array([low, high]),
+        around if background else np.array([low, high]),
+    )
+
+
+def _kept(whole: Any, there: NDArray[np.bool_], warp: float) -> Any:
+    """Return the grid of the domains that are there, displaced by more or less."""
+    if warp != 1.0:
+        whole.points = whole.points + (warp - 1.0) * whole.point_data["displacement"]
+    return whole if there.all() else whole.extract_cells(np.flatnonzero(there))
+
+
+def _box(domain: Any, comm: MPI.Comm) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the corners of the box around a mesh (collective)."""
+    gdim = domain.geometry.dim
+    x = domain.geometry.x[:, :gdim]
+    corners = np.array([x.min(axis=0), x.max(axis=0)]) if len(x) else np.zeros((0, gdim))
+    every = np.concatenate(comm.allgather(corners))
+    return every.min(axis=0), every.max(axis=0)
+
+
+def _marks(problem: Any, comm: MPI.Comm) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return points of contact and the pressures there on all ranks (collective)."""
+    terms = [
+        t
+        for t in getattr(problem, "terms", ())
+        if hasattr(type(t), "points") and hasattr(type(t), "pressure")
+    ]
+    with agree(comm):
+        if not terms:
+            raise MPMError("There is no contact pressure: the problem has no term of contact.")
+    points = [part for t in terms for part in comm.allgather(t.points)]
+    pressures = [part for t in terms for part in comm.allgather(t.pressure)]
+    where, what = np.concatenate(points), np.concatenate(pressures)
+    touching = what > 0.0
+    return where[touching], what[touching]
+
+
+def new_figure(figures: Any, shot: Shot) -> Any:
+    """Return an empty figure whose shape suits what is shown."""
+    if shot.extent.shape[1] == 3:
+        size = (8.0, 6.0)
+    else:
+        wide, high = np.maximum(shot.extent[1] - shot.extent[0], 1e-12)
+        size = (
+            8.0,
+            float(np.clip(8.0 * high / wide + (1.6 if high < FLAT * wide else 0.4), 2.4, 8.6)),
+        )
+    return figures.Figure(figsize=size, layout="constrained")
+
+
+def draw(shot: Shot, look: Look, ax: Any, bar: bool = True) -> Any:
+    """Draw a shot on axes of matplotlib, with a colour bar; return what has its colours."""
+    first, last = shot.range if look.limits is None else _filled(look.limits, shot.range)
+    coloured = shot.values is not None or shot.marks is not None
+    if shot.extent.shape[1] == 2:
+        artist = _draw_plane(shot, look, (first, last), ax)
+    else:
+        artist = _draw_space(shot, look, (first, last), ax)
+    if look.title is not None:
+        ax.set_title(look.title)
+    if coloured and bar:
+        flat = shot.extent.shape[1] == 2 and np.ptp(ax.get_ylim()) < FLAT * np.ptp(ax.get_xlim())
+        place = {"orientation": "horizontal", "shrink": 0.6} if flat else {"shrink": 0.8}
+        colorbar = ax.figure.colorbar(artist, ax=ax, label=look.label, aspect=28, **place)
+        colorbar.outline.set_linewidth(0.4)
+    return artist
+
+
+def _filled(
+    limits: tuple[float | None, float | None], found: tuple[float, float]
+) -> tuple[float, float]:
+    first, last = (b if a is None else float(a) for a, b in zip(limits, found, strict=True))
+    return first, last
+
+
+def _colours(look: Look, limits: tuple[float, float]) -> Any:
+    """Return what gives values their colours."""
+    normalise = import_module("matplotlib.colors").Normalize(*limits)
+    return import_module("matplotlib.cm").ScalarMappable(normalise, look.cmap)
+
+
+def _draw_plane(shot: Shot, look: Look, limits: tuple[float, float], ax: Any) -> Any:
+    collections = import_module("matplotlib.collections")
+    for cells in shot.cells:
+        ax.add_collection(
+            collections.PolyCollection(
+                cells, facecolors="none", edgecolors="0.88", linewidths=0.4, zorder=0.5
+            )
+        )
+    colours = _colours(look, limits)
+    count = sum(len(polygons) for polygons in shot.bodies)
+    lines = count < 20000 if look.lines is None else look.lines
+    for number, polygons in enumerate(shot.bodies):
+        filled = "0.8" if shot.values is None else colours.to_rgba(shot.values[number])
+        width = float(np.clip(12.0 / np.sqrt(max(count, 1)), 0.1, 0.5))
+        style = {"edgecolors": "0.2" if lines else "face", "linewidths": width}
+        ax.add_collection(collections.PolyCollection(polygons, facecolors=filled, **style))
+    if shot.marks is not None:
+        points, pressures = shot.marks
+        ax.scatter(*points.T, s=MARK**2, c=colours.to_rgba(pressures), zorder=3)
+    low, high = shot.extent if look.box is None else look.box
+    room = MARGIN * max(high - low)
+    ax.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
+    ax.set_aspect("equal")
+    return colours
+
+
+def _draw_space(shot: Shot, look: Look, limits: tuple[float, float], ax: Any) -> Any:
+    colours = _colours(look, limits)
+    ax.imshow(_rendered(shot, look, limits))
+    ax.set_axis_off()
+    return colours
+
+
+def _rendered(shot: Shot, look: Look, limits: tuple[float, float]) -> NDArray[np.uint8]:
+    """Return the picture of bodies in space, pixels ``(height, width, 3)``, cut out."""
+    pyvista = import_module("pyvista")
+    count = sum(grid.n_cells for grid in shot.bodies)
+    lines = count < 60000 if look.lines is None else look.lines
+    with _quiet():
+        plotter = pyvista.Plotter(off_screen=True, window_size=PIXELS, lighting="three lights")
+        for number, body in enumerate(shot.bodies):
+            body = body.copy()
+            colour: dict[str, Any] = {"color": "lightgrey"}
+            if shot.values is not None:
+                body.cell_data["shown"] = shot.values[number]
+                colour = {"scalars": "shown", "cmap": look.cmap, "clim": limits}
+            for data in (body.point_data, body.cell_data):
+                for name in [n for n in data.keys() if n != "shown"]:
+                    del data[name]
+            linear = int(body.celltypes.max(initial=0)) < LAGRANGE
+            surface = body.clean(tolerance=1e-9) if linear else body
+            surface = surface.extract_surface(
+                nonlinear_subdivision=0 if linear else 3, **_algorithm(pyvista)
+            )
+            plotter.add_mesh(
+                surface,
+                show_edges=lines and linear,
+                edge_color="#333333",
+                line_width=0.6,
+                show_scalar_bar=False,
+                ambient=0.45,
+                diffuse=0.6,
+                specular=0.0,
+                **colour,
+            )
+        if shot.marks is not None and len(shot.marks[0]):
+            cloud = pyvista.PolyData(shot.marks[0])
+            cloud["shown"] = shot.marks[1]
+            plotter.add_mesh(
+                cloud,
+                scalars="shown",
+                cmap=look.cmap,
+                clim=limits,
+                point_size=8.0,
+                render_points_as_spheres=True,
+                show_scalar_bar=False,
+            )
+        low, high = shot.around
+        box = pyvista.Box(np.column_stack([low, high]).ravel())
+        plotter.add_mesh(box, style="wireframe", color="#999999", line_width=1.0)
+        plotter.enable_parallel_projection()
+        if look.camera is None:
+            plotter.view_vector((1.0, -1.6, 0.8), viewup=(0.0, 0.0, 1.0))
+        else:
+            plotter.camera_position = look.camera
+        plotter.enable_anti_aliasing("msaa")
+        image = np.asarray(plotter.screenshot(return_img=True))
+        plotter.close()
+    if look.box is not None:  # frames of a movie have one size
+        return image
+    drawn = np.argwhere((image < 250).any(axis=2))
+    if not len(drawn):
+        return image
+    (top, left), (bottom, right) = drawn.min(axis=0), drawn.max(axis=0) + 1
+    return image[top:bottom, left:right]
+
+
+#: The first of VTK's cell types of any degree.
+LAGRANGE = 68
+
+
+def _algorithm(pyvista: Any) -> dict[str, Any]:
+    """Return how surfaces are found: pyvista warns of its new default unless it is named."""
+    import inspect
+
+    known = inspect.signature(pyvista.UnstructuredGrid.extract_surface).parameters
+    return {"algorithm": "dataset_surface"} if "algorithm" in known else {}
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep VTK from saying that there is no screen, which is not asked for."""
+    try:
+        logger = import_module("vtkmodules.vtkCommonCore").vtkLogger
+        before = logger.GetCurrentVerbosityCutoff()
+        logger.SetStderrVerbosity(logger.VERBOSITY_OFF)
+    except (ImportError, AttributeError):
+        yield
+        return
+    try:
+        yield
+    finally:
+        logger.SetStderrVerbosity(before)

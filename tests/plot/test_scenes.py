@@ -1,0 +1,154 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Scenes, histories and movies: what is drawn is what is there, and nothing overlaps."""
+
+import numpy as np
+import pytest
+import scenes
+from scenes import HEXAHEDRON, TRIANGLE, WORLD, at, block, box, fix, vectors
+
+from dolfinx import fem
+
+import mpm_dolfinx as mpm
+
+pytest.importorskip("matplotlib")
+
+
+def require_apart(figure):
+    """Check that no two axes overlap, labels and titles included."""
+    figure.draw_without_rendering()
+    boxes = [ax.get_tightbbox() for ax in figure.axes]
+    for i, one in enumerate(boxes):
+        for other in boxes[:i]:
+            wide = min(one.x1, other.x1) - max(one.x0, other.x0)
+            high = min(one.y1, other.y1) - max(one.y0, other.y0)
+            assert wide <= 0.0 or high <= 0.0
+
+
+@pytest.fixture
+def solved():
+    problem = block(cell=TRIANGLE)
+    problem.solve(steps=2)
+    return problem
+
+
+def test_domains_of_a_scene_are_those_of_the_particles(solved, tmp_path):
+    particles = solved.particles
+    path = WORLD.bcast(str(tmp_path / "scene.png"))
+    figure = mpm.plot.scene(solved, "displacement_y", path)
+    wanted = scenes.in_order(particles, particles.domains)
+    values = scenes.in_order(particles, (particles.centroid - particles.initial_centroid)[:, 1])
+    if WORLD.rank > 0:
+        assert figure is None
+        return
+    bodies = figure.axes[0].collections[-1]
+    drawn = np.array([p.vertices[:3] for p in bodies.get_paths()])
+    np.testing.assert_allclose(
+        np.sort(drawn.sum(axis=1), axis=0), np.sort(wanted.sum(axis=1), axis=0), atol=1e-12
+    )
+    bar = figure.axes[1]
+    np.testing.assert_allclose(bar.get_ylim(), (values.min(), values.max()), rtol=1e-12)
+    assert bar.get_ylabel() == "displacement y"
+    require_apart(figure)
+    with open(path, "rb") as file:
+        assert file.read(4) == b"\x89PNG"
+
+
+@pytest.mark.parametrize(
+    "field", ["mises", "stress_xy", "pressure", "plastic_strain", "volume_ratio", None]
+)
+def test_fields_by_name(solved, field):
+    figure = mpm.plot.scene(solved, field, background=False)
+    if WORLD.rank == 0:
+        assert len(figure.axes) == (1 if field is None else 2)
+
+
+def test_values_of_the_users_own(solved):
+    particles = solved.particles
+    height = particles.centroid[:, 1]
+    scalar = fem.Function(fem.functionspace(particles.mesh, ("Lagrange", 1)))
+    scalar.interpolate(lambda x: x[0])
+    limits = scenes.in_order(particles, particles.initial_centroid[:, 0])
+    for field, low, high in ((height, None, None), (scalar, limits.min(), limits.max())):
+        figure = mpm.plot.scene(particles, field, label="mine")
+        if WORLD.rank == 0:
+            assert figure.axes[1].get_ylabel() == "mine"
+            if low is not None:
+                np.testing.assert_allclose(figure.axes[1].get_ylim(), (low, high))
+
+
+def test_what_is_not_there_is_refused_in_one_sentence(solved):
+    with pytest.raises(mpm.MPMError, match=r"no field 'colour'; there are displacement, "):
+        mpm.plot.scene(solved, "colour")
+    with pytest.raises(mpm.MPMError, match="no term of contact"):
+        mpm.plot.scene(solved, "contact_pressure")
+    with pytest.raises(mpm.MPMError, match="must have the shape"):
+        mpm.plot.scene(solved, np.zeros(solved.particles.num_local + 1))
+    with pytest.raises(mpm.MPMError, match="a problem, of particles"):
+        mpm.plot.scene("slope")
+    with pytest.raises(mpm.MPMError, match=r"ends in \.gif or \.webp"):
+        mpm.plot.movie(solved, [], "run.avi")
+    with pytest.raises(mpm.MPMError, match="no step yet"):
+        mpm.plot.history(block())
+
+
+def test_scene_in_space_is_rendered_without_a_word(tmp_path, recwarn, capfd):
+    pytest.importorskip("pyvista")
+    V = vectors(box([0.0] * 3, [2.0, 2.0, 1.5], [2, 2, 2], HEXAHEDRON))
+    body = box([0.0] * 3, [1.0, 1.0, 1.0], [2, 2, 2], HEXAHEDRON)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(body, V),
+        mpm.materials.Hencky(1e3, 0.3),
+        body_force=(0.0, 0.0, -10.0),
+        bcs=[fix(V, at(i, 0.0), component=i) for i in range(3)],
+    )
+    problem.solve(1)
+    figure = mpm.plot.scene(problem, "displacement_z", camera=(1.0, -1.0, 1.0))
+    assert not [w for w in recwarn if "pyvista" in str(w.filename).lower()]
+    if WORLD.rank == 0:
+        assert "WARN" not in capfd.readouterr().err
+        image = figure.axes[0].images[0].get_array()
+        assert min(image.shape[:2]) > 300
+        assert (np.ptp(image[..., :3].astype(int), axis=2) > 50).mean() > 0.02  # something coloured
+        require_apart(figure)
+
+
+@pytest.mark.parametrize("every, frames", [(1, 6), (2, 4)])
+def test_movie_has_a_frame_for_each_step(tmp_path, every, frames):
+    image = pytest.importorskip("PIL.Image")
+    problem = block()
+    path = WORLD.bcast(str(tmp_path / "run.gif"))
+    mpm.plot.movie(problem, problem.steps(5), path, every=every, dpi=40)
+    assert len(problem.history.steps) == 5
+    if WORLD.rank == 0:
+        with image.open(path) as film:
+            assert film.n_frames == frames
+            first = np.asarray(film.convert("RGB")).astype(int)
+            film.seek(frames - 1)
+            last = np.asarray(film.convert("RGB")).astype(int)
+        assert first.shape == last.shape and np.abs(first - last).max() > 50
+
+
+def test_history_of_loads_and_of_a_curve(solved):
+    figure = mpm.plot.history(solved)
+    curve = mpm.plot.history(solved, curve={"sag, m": [0.0, 1.0], "force, N": [0.0, 3.0]})
+    if WORLD.rank == 0:
+        require_apart(figure)
+        heights = [bar.get_height() for bar in figure.axes[1].patches]
+        assert heights == solved.history.iterations
+        assert curve.axes[0].get_ylabel() == "force, N"
+
+
+def test_history_of_a_motion_shows_energies():
+    V = vectors(box([0.0, 0.0], [2.0, 2.0], [4, 4], TRIANGLE))
+    particles = mpm.Particles(box([0.5, 1.0], [1.0, 1.5], [2, 2], TRIANGLE), V)
+    problem = mpm.DynamicProblem(
+        particles, mpm.materials.Hencky(1e4, 0.3), density=1.0, body_force=(0.0, -1.0)
+    )
+    problem.solve(0.1, 0.05)
+    figure = mpm.plot.history(problem)
+    speed = mpm.plot.scene(problem, "velocity_y")
+    if WORLD.rank == 0:
+        labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+        assert labels[0] == "kinetic" and labels[-1] == "balance"
+        np.testing.assert_allclose(speed.axes[1].get_ylim(), (-0.1, -0.1), atol=1e-2)
