@@ -14,9 +14,10 @@ from .errors import (  # noqa: E402
     MPMError,
     ParticleOutsideError,
 )
-from .history import Energy, History, Loss, Statistics, Step  # noqa: E402
+from .history import Energy, History, Loss, Stage, Statistics, Step  # noqa: E402
 from .particles.particles import Particles  # noqa: E402
 from .problems.dynamic import DynamicProblem  # noqa: E402
+from .problems.initial_stress import geostatic  # noqa: E402
 from .problems.particle_problem import ParticleProblem  # noqa: E402
 from .problems.quasistatic import QuasiStaticProblem  # noqa: E402
 from .stepping.displacement_control import DisplacementControl  # noqa: E402
@@ -40,6 +41,7 @@ __all__ = [
     "ParticleProblem",
     "Particles",
     "QuasiStaticProblem",
+    "Stage",
     "Statistics",
     "Step",
     "Term",
@@ -47,6 +49,7 @@ __all__ = [
     "Weights",
     "__version__",
     "boundary",
+    "geostatic",
     "materials",
     "plot",
 ]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from .errors import ParticleOutsideError
 
-__all__ = ["Energy", "History", "Loss", "Statistics", "Step"]
+__all__ = ["Energy", "History", "Loss", "Stage", "Statistics", "Step"]
 
 PHASES = ("locate", "transfer", "constitutive", "assemble", "factorise", "solve", "commit")
 COUNTERS = (
@@ -126,6 +126,19 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Stage:
+    """The beginning of a stage that changed the problem: ``stage``, ``remove`` or ``add``.
+
+    Attributes:
+        name: Its name.
+        time: The time at which it begins.
+    """
+
+    name: str
+    time: float
+
+
+@dataclass(frozen=True)
 class Loss:
     """Particles of one body that a step took out of the background, and that are deleted.
 
@@ -184,6 +197,7 @@ class History:
         stopped: Why a run with ``outside="stop"`` ended before its whole load, else ``None``.
         statistics: Counters and seconds per phase.
         energies: Of a :class:`DynamicProblem`, at the beginning and after each step.
+        stages: Beginnings of stages that changed the problem.
     """
 
     steps: list[Step] = field(default_factory=list)
@@ -193,6 +207,7 @@ class History:
     stopped: ParticleOutsideError | None = None
     statistics: Statistics = field(default_factory=Statistics)
     energies: list[Energy] = field(default_factory=list)
+    stages: list[Stage] = field(default_factory=list)
 
     def __repr__(self) -> str:
         return f"<History: {self.in_words()}>"

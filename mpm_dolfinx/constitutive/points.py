@@ -5,7 +5,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from typing import Any, NamedTuple
+
+from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,6 +169,116 @@ class MaterialPoints:
                 changed = True
         if changed and self.averaging is not None:
             self.averaging.modulus = self._resistance()
+
+    # -- A stress that is there at first ---------------------------------------------------
+
+    def begin_with(self, cauchy_stress: NDArray[np.float64]) -> None:
+        """Let the points, which have not moved, carry a stress (collective).
+
+        Args:
+            cauchy_stress: Shape ``(n, nq, 3, 3)``.
+
+        Raises:
+            MPMError: A material cannot bear it; ``particles`` are global indices.
+        """
+        stress = cauchy_stress.reshape(self._points, 3, 3)
+        with agree(self._particles.mesh.comm):
+            states = [self._stressed(g, np.arange(len(g.points)), stress) for g in self._groups]
+        self._settle(states)
+
+    def take_over(self, before: MaterialPoints) -> None:
+        """Go on from the last converged step of the same points with other materials (collective).
+
+        Points whose material is the same object go on with its history; the others carry the
+        stress that they had, and no other history.
+
+        Args:
+            before: The points, on the same mesh.
+
+        Raises:
+            MPMError: A material cannot bear its stress; ``particles`` are global indices.
+        """
+        gradient = before.strain.gradient().reshape(-1, self.dim, self.dim)
+        kirchhoff = before.cauchy_stress().reshape(self._points, 3, 3)
+        kirchhoff *= np.linalg.det(np.eye(self.dim) + gradient)[:, None, None]
+        comm, histories = self._particles.mesh.comm, before.histories()
+        known = []
+        for given, group in zip(self._given, self._groups, strict=True):
+            there = np.zeros(self._points, dtype=bool)
+            state: State = {}
+            for material, points, its in histories:
+                if material is given.material and (not state or state.keys() == its.keys()):
+                    there[points] = True
+                    for name, values in its.items():
+                        shape = (self._points, *values.shape[1:])
+                        state.setdefault(name, np.zeros(shape, values.dtype))[points] = values
+            kept = there[group.points]
+            whole = bool(state) and bool(comm.allreduce(bool(kept.all()), MPI.LAND))
+            if not whole:
+                # a law without memory has none that could be mixed with that of other points
+                kept &= "displacement_gradient" in state
+            known.append((whole, kept, {name: v[group.points] for name, v in state.items()}))
+        with agree(comm):
+            states = [
+                state if whole else self._mixed(group, kept, state, kirchhoff, gradient)
+                for group, (whole, kept, state) in zip(self._groups, known, strict=True)
+            ]
+        self._settle(states)
+
+    def histories(self) -> list[tuple[Material, NDArray[np.int64], State]]:
+        """Return each material as given, its points and their last converged state."""
+        return [
+            (given.material, group.points, state)
+            for given, group, state in zip(self._given, self._groups, self._states, strict=True)
+        ]
+
+    def _mixed(
+        self,
+        group: _Group,
+        kept: NDArray[np.bool_],
+        known: State,
+        kirchhoff: NDArray[np.float64],
+        gradient: NDArray[np.float64],
+    ) -> State:
+        """Return the state of a group, which is known where it is kept, elsewhere of a stress."""
+        new = np.flatnonzero(~kept)
+        state = {}
+        for name, values in self._stressed(group, new, kirchhoff).items():
+            state[name] = np.empty((len(kept), *values.shape[1:]), values.dtype)
+            state[name][new] = values
+            if name == "displacement_gradient":
+                state[name][new] = gradient[group.points[new]]
+            if kept.any():
+                state[name][kept] = known[name][kept]
+        return state
+
+    def _stressed(
+        self, group: _Group, rows: NDArray[np.integer[Any]], stress: NDArray[np.float64]
+    ) -> State:
+        """Return the state of some points of a group under a stress."""
+        try:
+            return group.material.at(rows).stressed_state(stress[group.points[rows]], self.dim)
+        except MPMError as error:
+            part = _Group(group.material, group.points[rows])
+            raise self._named(error, part) from None
+        except Exception as error:
+            what = f"stressed_state of {type(group.material).__name__}"
+            raise as_ours(error, what) from error
+
+    def _settle(self, states: list[State]) -> None:
+        """Take states for those of the last converged step, at the present displacement."""
+        self._states = self._trial = states
+        with agree(self._particles.mesh.comm) if self.averaging is None else nullcontext():
+            self.update()
+        self._trial, self._gradient = self._states, self._trial_gradient
+        self._stress = self.first_piola.copy()
+        self._recover()
+
+    def _recover(self) -> None:
+        if self.averaging is not None:
+            with agree(self._particles.mesh.comm):
+                stress = self.strain.average(self.cauchy_stress())
+            self.recovery = self.averaging.recover(stress) - stress
 
     @property
     def symmetric(self) -> bool:
@@ -456,10 +569,7 @@ class MaterialPoints:
         self._trial, self._gradient = self._states, self._trial_gradient
         alone = len(self._groups) == 1 and _is_own(self._groups[0].material)
         self._stress = self.first_piola if alone else self.first_piola.copy()
-        if self.averaging is not None:
-            with agree(self._particles.mesh.comm):
-                stress = self.strain.average(self.cauchy_stress())
-            self.recovery = self.averaging.recover(stress) - stress
+        self._recover()
         return undo
 
     def roll_back(self) -> None:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -21,7 +21,17 @@ from ..parallel.exchange import RowExchange
 from ..particles.particles import Particles
 from .checkpoint import Snapshot, Table
 
-__all__ = ["Kept", "Taken", "adopt", "capture", "fill", "of_cells", "require_key", "spaces_of"]
+__all__ = [
+    "Kept",
+    "Taken",
+    "adopt",
+    "capture",
+    "fill",
+    "merged",
+    "of_cells",
+    "require_key",
+    "spaces_of",
+]
 
 
 class Kept:
@@ -182,6 +192,31 @@ def adopt(
             thing.require(source, its)
     for thing, its in zip(things, taken, strict=True):
         thing.restore(its)
+
+
+def merged(
+    before: Snapshot,
+    now: Snapshot,
+    bodies: tuple[int, int],
+    renewed: Callable[[int | None, str], bool],
+) -> Snapshot:
+    """Return a state of before, with what is new or renewed from one of now, on the same meshes.
+
+    Args:
+        before: The state of before.
+        now: The state of now, which may have more bodies and backgrounds.
+        bodies: Number of the bodies before and now.
+        renewed: Returns whether something that was there before is new too, by the number of its
+            body (``None``: a number) and its name.
+    """
+    old, new = bodies
+    numbers = now.numbers | {n: v for n, v in before.numbers.items() if not renewed(None, n)}
+    tables = []
+    for number, (earlier, present) in enumerate(zip(before.tables[:old], now.tables, strict=False)):
+        columns = {n: v for n, v in earlier.columns.items() if not renewed(number, n)}
+        tables.append(Table(present.rows, present.columns | columns))
+    tables += [*now.tables[old:new], *before.tables[old:]]
+    return Snapshot(numbers, tables + now.tables[len(tables) :])
 
 
 def require_key(key: str, things: Sequence[Kept], bodies: int) -> None:

@@ -58,6 +58,13 @@ class Domains:
         self.mass_share: fem.Function | None = None
         self.origin: fem.Function | None = None
 
+    def allow_deletion(self, allowed: bool) -> None:
+        """Let domains be deleted, or no longer, where none of them is (collective)."""
+        if not allowed:
+            self.deletion = None
+        elif self.deletion is None:
+            self.deletion = Deletion(self._geometry.mesh, self._geometry.W)
+
     # -- The mesh -------------------------------------------------------------------------
 
     @property

@@ -187,7 +187,8 @@ class Particles(MaterialDomains):
     def _settle(self, body: mesh.Mesh) -> None:
         """Live on a body mesh, undeformed: at the start and after each move (collective)."""
         family = "Lagrange" if METHODS[self.method].shares_nodes else "Discontinuous Lagrange"
-        self._live_on(Geometry(body, family, *self._degrees), self.outside == "delete")
+        deletable = self.outside == "delete" or getattr(self, "deletion", None) is not None
+        self._live_on(Geometry(body, family, *self._degrees), deletable)
         self._coordinates = Coordinates(body, "body")
         self.load = LoadFactor(body, 0.0)
         self.proportional = fem.Constant(body, 1.0)
@@ -408,7 +409,7 @@ class Particles(MaterialDomains):
         Raises:
             ParticleOutsideError: Some are outside and shall not be deleted, or all would be.
         """
-        if self.deletion is None:
+        if self.deletion is None or self.outside != "delete":
             self.locate()
             return np.zeros(0, dtype=np.int64)
         rows = self._method.rows(self._at_converged(), self._background)
@@ -433,6 +434,17 @@ class Particles(MaterialDomains):
         assert self.deletion is not None
         self.deletion.add(domains, self._of_domains(self._converged))
         self._transfer = self._transfer_by(self.transfer.rows)
+
+    def remove(self, domains: NDArray[np.int64]) -> None:
+        """Delete domains that the user takes away, whatever ``outside`` is (collective).
+
+        The rest is the business of :meth:`QuasiStaticProblem.remove`.
+
+        Args:
+            domains: Local indices of this rank's particles.
+        """
+        self.allow_deletion(True)
+        self.delete(domains)
 
     @property
     def T(self) -> PETSc.Mat:

@@ -121,6 +121,7 @@ class DynamicProblem(QuasiStaticProblem):
 
     def _build(self) -> None:
         """See :meth:`ParticleProblem._build`."""
+        self.inertia.join(self.bodies)
         super()._build()
         others = [*self.body_terms, *(term for term in self.terms if term is not self.inertia)]
         self.inertia.follow(others, weakly(self._mass_matrix))
@@ -139,6 +140,27 @@ class DynamicProblem(QuasiStaticProblem):
         fem_petsc.assemble_matrix(matrix, compiled)
         matrix.assemble()
         return matrix
+
+    _gradual = False
+
+    def add(self, particles: Particles, *args: Any, velocity: Any = None, **options: Any) -> None:
+        """Add a body: see :meth:`QuasiStaticProblem.add`; what changes does so at once.
+
+        Args:
+            particles: The body.
+            *args: As there.
+            velocity: As in the constructor.
+            **options: As there.
+        """
+        if not isinstance(particles, Particles):
+            raise MPMError(f"add() needs mpm.Particles, not a {type(particles).__name__}.")
+        start = _velocity(velocity, particles)
+        super().add(particles, *args, **options)
+        self.inertia.velocities[-1].x.array[:] = start.x.array
+
+    def _own_terms(self) -> list[Term]:
+        """See :meth:`QuasiStaticProblem.stage`."""
+        return [self.inertia]
 
     # -- Velocities ---------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from ..errors import MPMError, ParticleOutsideError
-from ..history import History, Loss, Statistics, Step
+from ..history import History, Loss, Stage, Statistics, Step
 from ..io.snapshot import Kept, Taken, fill, of_cells
 from ..meshes.remesh import Column
 from ..particles.particles import Particles
@@ -239,6 +239,7 @@ class Past(Kept):
             "cutbacks": history.cutbacks,
             "failed_iterations": history.failed_iterations,
             "losses": [vars(loss) for loss in history.losses],
+            "stages": [[stage.name, stage.time] for stage in history.stages],
             "stopped": None if history.stopped is None else history.stopped.__reduce__()[1],
             "statistics": _average(self._comm, history.statistics),
         }
@@ -254,6 +255,7 @@ class Past(Kept):
         history.cutbacks = numbers["cutbacks"]
         history.failed_iterations = numbers["failed_iterations"]
         history.losses[:] = [Loss(**entries) for entries in numbers["losses"]]
+        history.stages[:] = [Stage(*entries) for entries in numbers.get("stages", [])]
         stopped = numbers["stopped"]
         history.stopped = None if stopped is None else ParticleOutsideError(*stopped)
         history.statistics.update(numbers["statistics"])

@@ -7,7 +7,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -25,10 +25,10 @@ from ..assembly.rules import data_at_points
 from ..boundary.supports import Support
 from ..constitutive.averaging import Linearised
 from ..errors import MPMError, agree, warn
-from ..history import History, Step
+from ..history import History, Stage, Step
 from ..io import checkpoint, identity
 from ..io.series import Output, read_series
-from ..io.snapshot import Kept, adopt, capture, require_key, spaces_of
+from ..io.snapshot import Kept, adopt, capture, merged, require_key, spaces_of
 from ..parallel.garbage import Cleaner
 from ..parallel.given import require_same
 from ..particles.particles import Particles
@@ -40,10 +40,11 @@ from ..stepping.displacement_control import DisplacementControl
 from ..stepping.loading import Mender, Stepper
 from ..stepping.progress import with_bar
 from ..system.body import BodyTerm, PointHistory
-from ..system.conditions import force_at
+from ..system.conditions import fixed_dofs, force_at
 from ..system.field import Field
 from ..system.predictor import Predictor
 from ..system.reduced import ReducedSystem
+from ..system.release import Release
 from ..system.term import Term, UserTerm
 from . import kept
 from .arguments import (
@@ -58,7 +59,7 @@ from .arguments import (
 from .setup import Numerics
 from .summary import in_one_line, on_a_screen
 
-__all__ = ["Contribution", "Law", "ParticleProblem"]
+__all__ = ["Change", "Contribution", "Law", "ParticleProblem"]
 
 
 class Contribution(NamedTuple):
@@ -83,6 +84,33 @@ class Contribution(NamedTuple):
     material: PointHistory | None = None
     injected: tuple[fem.Function, fem.Function] | None = None
     contact: bool = False
+
+
+class Change(Protocol):
+    """What a stage changes of a problem. All calls are collective.
+
+    Attributes:
+        kind: What kind of change it is.
+    """
+
+    kind: str
+
+    def make(self) -> None:
+        """Change what the problem is made of."""
+
+    def settle(self) -> None:
+        """Give what is new its state; the system is built, the bodies are where they were."""
+
+    def renews(self, body: int | None, name: str) -> bool:
+        """Return whether something of a state is new, and not as it was.
+
+        Args:
+            body: Number of the body, or ``None`` for numbers.
+            name: What it is called in a state.
+        """
+
+    def undo(self) -> None:
+        """Take back what was changed."""
 
 
 type Law = tuple[str, dict[str, Any]]
@@ -240,12 +268,13 @@ class ParticleProblem:
         self._comm: MPI.Comm = self.bodies[0].V.mesh.comm
         self._background, self._numerics = background, numerics
         self._output = Output()
-        self._kept: list[Kept] = []
-        self._stepper = Stepper(self, mender)
+        self._kept: list[tuple[Term | None, Kept]] = []
+        self._held = Release()
+        self._stages: list[str] = []
+        self._first_identity: dict[str, Any] = {}
+        self._stepper = Stepper(self, self._held, mender)
         self._build()
-        for term in self.terms:
-            for thing in term.kept():
-                self.keep(thing)
+        self._keep_terms()
 
     def _build(self) -> None:
         """Make the system and its solver for the present meshes of the bodies (collective).
@@ -297,10 +326,11 @@ class ParticleProblem:
             for group, forms in zip(groups, on_backgrounds, strict=True)
         ]
         statistics = self.history.statistics
+        self._held.follow(self.bodies, spaces_of(self.bodies))
         reduced = ReducedSystem(
             self.bodies,
             fields,
-            [*self.body_terms, *self.terms, UserTerm(self)],
+            [*self.body_terms, *self.terms, UserTerm(self), self._held],
             statistics,
             Predictor() if numerics.predictor else None,
         )
@@ -382,6 +412,110 @@ class ParticleProblem:
         self._build()
         self._adopt(carry(snapshot), (), "The state before")
         self.history.statistics.update(seconds)
+
+    # -- Stages ---------------------------------------------------------------------------
+
+    def begin_stage(self, name: str, change: Change, sudden: bool) -> None:
+        """Change what the problem is, in the same state, and let the next run be a stage.
+
+        What acts at once is held back and goes over the next run, unless the stage is sudden. Where
+        it cannot be changed all stays as it was (collective).
+
+        Args:
+            name: Name of the stage.
+            change: What changes.
+            sudden: Whether nothing is held back.
+
+        Raises:
+            MPMError: What is to be changed does not go together.
+        """
+        self._require_governing()
+        if sudden and self._held.remaining > 0.0:
+            raise MPMError(
+                f"{100 * self._held.remaining:.3g} % of what the last stage changes is held back "
+                "yet; finish it with solve() before a sudden one."
+            )
+        first = self._first_identity if self._stages else identity.identity(self)
+        forces = None if sudden else self.reduced.nodal_forces()
+        apart = [] if forces is None else self._gathered(forces)
+        left = self._held.left()
+        reactions = self._stepper.converged.reactions
+        fixed = [fixed_dofs(field.conditions, field.V) for field in self.reduced.fields]
+        snapshot = self._snapshot()
+        seconds, kept = self.history.statistics.seconds, list(self._kept)
+        count = len(self.bodies)
+        self._release()
+        try:
+            change.make()
+            self._build()
+            self._keep_terms()
+            change.settle()
+            numbers = (count, len(self.bodies))
+            state = merged(snapshot, self._snapshot(), numbers, change.renews)
+            state.numbers.update({"past": [], "release remaining": 0.0})
+            self._adopt(state, (), "The state before")
+        except BaseException:
+            change.undo()
+            self._kept = kept
+            self._release()
+            self._build()
+            self._adopt(snapshot, (), "The state before")
+            raise
+        self.history.statistics.update(seconds)
+        self._stepper.begin_stage()
+        self._first_identity = first
+        self._stages.append(f"{change.kind} {name!r}")
+        self.history.stages.append(Stage(name, self.history.stage))
+        if forces is None:
+            return
+        after = self.reduced.nodal_forces()
+        freed = self._gathered(after)
+        for new, old in zip(freed, apart, strict=False):
+            new -= old
+        for new, old in zip(after, forces, strict=False):
+            new -= old
+        for body, new in zip(self.bodies, after, strict=True):
+            new *= body.shares_nodes
+        for number, (before, rest) in enumerate(zip(fixed, left, strict=True)):
+            field = self.reduced.fields[number]
+            dofs = before & ~fixed_dofs(field.conditions, field.V)
+            freed[number] += rest
+            if reactions is not None:
+                freed[number][dofs] += reactions[number][dofs]
+        self._held.hold(after, freed)
+
+    def _gathered(self, forces: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+        """Return forces on bodies whose nodes go with their cells, on the dofs of each background.
+
+        Where a cell is taken away its own nodes are of no use to hold its force.
+
+        Args:
+            forces: On this rank's own dofs of W of each body.
+        """
+        totals = []
+        for field in self.reduced.fields:
+            total = np.zeros(field.V.dofmap.index_map.size_local * field.V.dofmap.index_map_bs)
+            for body, force in zip(self.bodies, forces, strict=True):
+                if body.V is field.V and not body.shares_nodes:
+                    vector, part = body.T.createVecLeft(), body.T.createVecRight()
+                    vector.array_w[:] = force
+                    body.T.multTranspose(vector, part)
+                    total += part.array_r
+            totals.append(total)
+        return totals
+
+    def _hold_back(self) -> None:
+        """Hold the forces back that bodies are under now; they go as loads come (collective)."""
+        V = [field.V.dofmap for field in self.reduced.fields]
+        none = [np.zeros(m.index_map.size_local * m.index_map_bs) for m in V]
+        self._held.hold(self.reduced.nodal_forces(), none)
+
+    def _keep_terms(self) -> None:
+        """Let what terms keep go with the problem, if it does not yet."""
+        for term in [*self.terms, self._held]:
+            if all(owner is not term for owner, _ in self._kept):
+                for thing in term.kept():
+                    self._keep(thing, term)
 
     # -- PETSc objects --------------------------------------------------------------------
 
@@ -629,7 +763,8 @@ class ParticleProblem:
             )
         things, _ = self._all_kept(functions)
         snapshot = capture(things, self.bodies)
-        snapshot.numbers["identity"] = identity.identity(self)
+        known = self._first_identity if self._stages else identity.identity(self)
+        snapshot.numbers["identity"] = known | {"the stages": list(self._stages)}
         snapshot.numbers["series"] = self._output.written()
         return snapshot
 
@@ -649,7 +784,7 @@ class ParticleProblem:
             kept.Functions(functions, self.bodies, self.data_at_points()),
             kept.Increments(self.reduced, self.bodies),
             kept.Past(self.history, self.reduced, self._comm),
-            *self._kept,
+            *(thing for owner, thing in self._kept if self._is_mine(owner)),
             standing,
         ]
         return things, standing
@@ -676,9 +811,17 @@ class ParticleProblem:
         """
         if not isinstance(thing, Kept) or not isinstance(thing.key, str):
             raise MPMError(f"keep() needs an heir of mpm_dolfinx.io.Kept, not {thing!r}.")
+        self._keep(thing, None)
+
+    def _keep(self, thing: Kept, owner: Term | None) -> None:
+        """Let something go with the problem, as long as a term that owns it is one of its own."""
         things, _ = self._all_kept(tuple(self.data_at_points()))
         require_key(thing.key, things, len(self.bodies))
-        self._kept.append(thing)
+        self._kept.append((owner, thing))
+
+    def _is_mine(self, owner: Term | None) -> bool:
+        """Return whether a term acts in this problem; the user's own things have no owner."""
+        return owner is None or any(owner is term for term in [*self.terms, self._held])
 
     def restore(
         self, path: str | Path, functions: Sequence[fem.Function] = (), resume: bool = True
@@ -703,7 +846,16 @@ class ParticleProblem:
         """
         self._require_governing()
         snapshot, source = checkpoint.read(self._comm, Path(path)), f"The checkpoint '{path}'"
-        identity.require_same(identity.identity(self), snapshot, source, self._comm)
+        with agree(self._comm):
+            stages = snapshot.numbers["identity"].get("the stages", [])
+            if stages != self._stages:
+                raise MPMError(
+                    f"{source} was made after the stages {stages}, and this problem has gone "
+                    f"through {self._stages}; make it as at first and repeat the calls of stage, "
+                    "remove and add."
+                )
+        known = self._first_identity if self._stages else identity.identity(self)
+        identity.require_same(known, snapshot, source, self._comm)
         written = snapshot.numbers.get("series", {})
         series = read_series(self._comm, written)
         self.cut_as(snapshot, bool(functions), source)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,9 +28,11 @@ from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..system.term import Term
 from .arguments import as_bodies, as_terms
+from .initial_stress import initial_stress_at_points
 from .particle_problem import Contribution, Law, ParticleProblem
 from .remeshing import Remeshing, as_indices
 from .setup import BodySetup, Numerics, Setup
+from .stages import Addition, Given, Removal, chosen_cells
 
 __all__ = ["QuasiStaticProblem"]
 
@@ -81,6 +84,12 @@ class QuasiStaticProblem(ParticleProblem):
         form_compiler_options: As in :class:`ParticleProblem`.
         jit_options: As in :class:`ParticleProblem`.
         terms: As in :class:`ParticleProblem`.
+        initial_stress: Cauchy stress that the body carries before it has moved, which its material
+            must be able to bear: ``(3, 3)`` with the direction out of the plane (or around the
+            axis) at last, one for each owned particle or point ``(n, 3, 3)`` or
+            ``(n, nq, 3, 3)``, UFL of the shape ``(3, 3)`` on the body mesh, a function of
+            coordinates ``(3, n)`` that returns ``(3, 3, n)``, or :func:`mpm_dolfinx.geostatic`.
+            What it is not in equilibrium with goes in proportion, as loads come, in the first run.
 
     Raises:
         MPMError: Materials, loads or conditions that do not go together.
@@ -113,6 +122,7 @@ class QuasiStaticProblem(ParticleProblem):
         form_compiler_options: dict[str, Any] | None = None,
         jit_options: dict[str, Any] | None = None,
         terms: Sequence[Term] = (),
+        initial_stress: Any = None,
     ) -> None:
         bodies = as_bodies(particles)
         require_same(
@@ -140,6 +150,7 @@ class QuasiStaticProblem(ParticleProblem):
             stabilisation=stabilisation,
             form_compiler_options=form_compiler_options,
             jit_options=jit_options,
+            initial_stress=initial_stress,
         )
         supports = _as_supports(supports, bodies)
         count = len(bodies) if isinstance(particles, list | tuple) else 0
@@ -155,6 +166,7 @@ class QuasiStaticProblem(ParticleProblem):
             [tuple(s for s in supports if s.particles is body) for body in bodies],
             strict=True,
         )
+        stresses = _for_each(initial_stress, count)
         setup = Setup(
             tuple(BodySetup(*values) for values in given),
             axisymmetric,
@@ -181,8 +193,26 @@ class QuasiStaticProblem(ParticleProblem):
             stabilisation,
         )
         self._begin(particles, bcs, background, numerics, terms, self._remeshing)
+        self._carry_stress(stresses)
         for body in bodies:
             _warn_of_hourglass(body)
+
+    def _carry_stress(self, stresses: Sequence[Any]) -> None:
+        """Let bodies that have not moved carry a stress (collective).
+
+        Args:
+            stresses: For each body, or ``None``.
+        """
+        if all(stress is None for stress in stresses):
+            return
+        for body, points, stress in zip(self.bodies, self._stresses, stresses, strict=True):
+            if stress is not None:
+                points.begin_with(initial_stress_at_points(stress, body))
+        if self._gradual:
+            self._hold_back()
+
+    #: Whether loads and stages act little by little.
+    _gradual = True
 
     def _build(self) -> None:
         """See :meth:`ParticleProblem._build`."""
@@ -201,6 +231,214 @@ class QuasiStaticProblem(ParticleProblem):
         if self.setup.f_bar != "none":
             more.append(f"F-bar over each {self.setup.f_bar}")
         return ["; ".join([body.in_words(), *more]) for body in self.setup.bodies]
+
+    # -- Stages ---------------------------------------------------------------------------
+
+    def stage(
+        self,
+        name: str | None = None,
+        *,
+        material: Any = ...,
+        density: Any = ...,
+        body_force: Any = ...,
+        bcs: Any = ...,
+        tractions: Any = ...,
+        pressures: Any = ...,
+        cell_tags: Any = ...,
+        facet_tags: Any = ...,
+        supports: Any = ...,
+        terms: Any = ...,
+        sudden: bool = False,
+    ) -> None:
+        """Begin a stage: change what is given, and keep the rest, in the same state (collective).
+
+        What is taken away is unloaded over the next run, and what is new is loaded over it. Points
+        whose material is another object than before carry their stress on, and no other history.
+        All arguments but these are as in the constructor; ``...`` keeps what there is.
+
+        Args:
+            name: Name of the stage, for ``history.stages``.
+            material: As in the constructor.
+            density: As in the constructor.
+            body_force: As in the constructor.
+            bcs: As in the constructor, all that hold from now on.
+            tractions: As in the constructor, all that act from now on.
+            pressures: As in the constructor, all that act from now on.
+            cell_tags: On the present ``particles.mesh``.
+            facet_tags: On the present ``particles.mesh``.
+            supports: All that hold from now on.
+            terms: All that act from now on.
+            sudden: Whether the whole change acts from the first step on.
+
+        Raises:
+            MPMError: What does not go together. Nothing is changed then.
+        """
+        bodies = self.bodies
+        require_same(
+            self._comm,
+            name=name,
+            material=material,
+            density=density,
+            body_force=body_force,
+            bcs=self.bcs if bcs is ... else bcs,
+            tractions=tractions,
+            pressures=pressures,
+            supports=supports,
+            sudden=sudden,
+        )
+        count = len(bodies) if isinstance(self.particles, list | tuple) else 0
+        changes: list[dict[str, Any]] = [{} for _ in bodies]
+        for key, value, pairs in (
+            ("material", material, False),
+            ("density", density, False),
+            ("body_force", body_force, False),
+            ("tractions", tractions, True),
+            ("pressures", pressures, True),
+            ("cell_tags", cell_tags, False),
+            ("facet_tags", facet_tags, False),
+        ):
+            if value is not ...:
+                for own, part in zip(changes, _for_each(value, count, pairs), strict=True):
+                    own[key] = part
+        if supports is not ...:
+            every = _as_supports(supports, bodies)
+            for own, body in zip(changes, bodies, strict=True):
+                own["supports"] = tuple(s for s in every if s.particles is body)
+        own_terms = self._own_terms()
+        given = [term for term in self.terms if all(term is not mine for mine in own_terms)]
+        change = Given(
+            self,
+            changes,
+            self.bcs if bcs is ... else bcs,
+            given if terms is ... else terms,
+            own_terms,
+        )
+        self._go_on(name, change, sudden)
+
+    def remove(
+        self,
+        particles: Any = None,
+        *,
+        tags: Any = None,
+        body: int = 0,
+        name: str | None = None,
+        sudden: bool = False,
+    ) -> None:
+        """Begin a stage in which cells are taken away: an excavation (collective).
+
+        Their forces on the rest go over the next run. They are deleted then (``deleted``), but no
+        loss: what they weighed is not in ``history.losses``.
+
+        Args:
+            particles: Global indices, or a function of undeformed centroids ``(3, n)`` that returns
+                a bool for each.
+            tags: One tag of ``cell_tags`` or several, instead.
+            body: Number of the body, where there are several.
+            name: As in :meth:`stage`.
+            sudden: As in :meth:`stage`.
+
+        Raises:
+            MPMError: There are none of them, or nothing would be left. Nothing is changed then.
+        """
+        if body not in range(len(self.bodies)):
+            raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
+        require_same(self._comm, tags=tags, body=body, name=name, sudden=sudden)
+        own = self.setup.bodies[body]
+        cells = chosen_cells(self.bodies[body], particles, tags, own.cell_tags)
+        self._go_on(name, Removal(self, body, cells), sudden)
+
+    def add(
+        self,
+        particles: Particles,
+        material: Any,
+        density: Any = 1.0,
+        body_force: Any = None,
+        tractions: Sequence[Any] = (),
+        pressures: Sequence[Any] = (),
+        *,
+        cell_tags: Any = None,
+        facet_tags: Any = None,
+        supports: Sequence[Support] = (),
+        initial_stress: Any = None,
+        name: str | None = None,
+        sudden: bool = False,
+    ) -> None:
+        """Begin a stage in which a body comes: a lift, or a structure (collective).
+
+        It is undeformed where it is placed; on the same V it sticks to the bodies that it touches.
+        Its loads come over the next run. ``problem.particles`` is a list from then on.
+
+        Args:
+            particles: The body.
+            material: As in the constructor, as are all that follow.
+            density: See there.
+            body_force: See there.
+            tractions: See there.
+            pressures: See there.
+            cell_tags: See there.
+            facet_tags: See there.
+            supports: Supports on this body.
+            initial_stress: See there.
+            name: As in :meth:`stage`.
+            sudden: As in :meth:`stage`.
+
+        Raises:
+            MPMError: What does not go together. Nothing is changed then.
+        """
+        if not isinstance(particles, Particles):
+            raise MPMError(f"add() needs mpm.Particles, not a {type(particles).__name__}.")
+        require_same(
+            self._comm,
+            material=material,
+            density=density,
+            body_force=body_force,
+            tractions=tractions,
+            pressures=pressures,
+            supports=supports,
+            initial_stress=initial_stress,
+            name=name,
+            sudden=sudden,
+        )
+        given = BodySetup(
+            particles,
+            material,
+            density,
+            body_force,
+            tractions,
+            pressures,
+            cell_tags,
+            facet_tags,
+            tuple(_as_supports(supports, [particles])),
+        )
+        if particles.on_distortion == "split":
+            replace(self.setup, bodies=(*self.setup.bodies, given)).require_divisible()
+        np.copyto(particles.load.value, float(self.bodies[0].load.value))
+        np.copyto(particles.proportional.value, float(self.bodies[0].proportional.value))
+        self._go_on(name, self._addition(given, initial_stress), sudden)
+
+    def _addition(self, given: BodySetup, initial_stress: Any) -> Addition:
+        """Return what adds a body."""
+        return Addition(self, given, initial_stress)
+
+    def _own_terms(self) -> list[Term]:
+        """Return the terms that the problem itself has."""
+        return []
+
+    def _go_on(self, name: str | None, change: Any, sudden: bool) -> None:
+        """Begin a stage."""
+        known = self._parameters
+        number = len(self.history.stages) + 1
+        self.begin_stage(name or f"stage {number}", change, sudden or not self._gradual)
+        present = self._functions()
+        for function in known:
+            if all(function is not f for f in present):
+                self._left.pop(id(function), None)
+        self._parameters = present
+
+    @property
+    def points(self) -> list[MaterialPoints]:
+        """The materials at the points of each body."""
+        return self._stresses
 
     def _functions(self) -> list[fem.Function]:
         """Return the parameters of materials that are Functions."""

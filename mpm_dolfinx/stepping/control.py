@@ -145,6 +145,7 @@ class Run:
         goal: The controlled displacement at its end, ``None`` where the load is given.
         began: Time at its beginning: the number of the stages before it, unless it is through time.
         end: Time at its end, ``None`` unless it is through time.
+        held: How much of what a stage changes was held back at its beginning.
     """
 
     control: StepControl
@@ -154,6 +155,12 @@ class Run:
     goal: float | None = None
     began: float = 0.0
     end: float | None = None
+    held: float = 0.0
+
+    @property
+    def remaining(self) -> float:
+        """How much of what a stage changes is held back at the end of the step to try."""
+        return self.held * (1.0 - self.control.target)
 
     @property
     def time(self) -> float:
@@ -167,11 +174,17 @@ class Run:
     def parameter(self) -> float:
         """Load factor, parameter of the path or displacement at the end of the step to try.
 
-        The parameter of a path through time is the time.
+        The parameter of a path through time is the time; a run that begins at the whole load has
+        a parameter like a path.
         """
         if self.end is not None:
             return self.time
-        return self.control.target if self.path else self.aim
+        return self.control.target if self.shares else self.aim
+
+    @property
+    def shares(self) -> bool:
+        """Whether its parameter is how much of it is done, and no load or displacement."""
+        return self.path or (self.goal is None and self.start >= 1.0)
 
     @property
     def aim(self) -> float:
@@ -227,6 +240,7 @@ class Run:
             "goal": self.goal,
             "began": self.began,
             "end": self.end,
+            "held": self.held,
         }
 
     @classmethod
@@ -242,7 +256,8 @@ class Run:
         vars(control).update(numbers["control"])
         began = numbers.get("began", time - control.share)
         goal, end = numbers.get("goal"), numbers.get("end")
-        return cls(control, numbers["path"], numbers["start"], base, goal, began, end)
+        held = numbers.get("held", 0.0)
+        return cls(control, numbers["path"], numbers["start"], base, goal, began, end, held)
 
 
 @dataclass

@@ -47,7 +47,7 @@ def move_bodies(
     try:
         with history.statistics.phase("locate"):
             for body in bodies:
-                if body.deletion is not None or not last:
+                if body.outside == "delete" or not last:
                     leaving.append(body.leaving())
                 else:
                     leaving.append(np.zeros(0, dtype=np.int64))

@@ -30,6 +30,7 @@ from ..particles.particles import Particles
 from ..solvers.newton import NewtonSolver, ReducedProblem
 from ..system.conditions import dirichlet_values
 from ..system.reduced import ReducedSystem
+from ..system.release import Release
 from .control import Converged, Progress, Run, StepControl
 from .diagnosis import count_folded, placed
 from .displacement_control import ControlledSystem, DisplacementControl
@@ -87,6 +88,7 @@ class Stepper:
 
     Args:
         owner: The problem, which is not kept alive.
+        release: Holds back what a stage changes at once.
         mender: What changes meshes between steps, if anything.
 
     Attributes:
@@ -95,11 +97,12 @@ class Stepper:
         newton: What finds a root of the residual.
     """
 
-    def __init__(self, owner: Owner, mender: Mender | None = None) -> None:
+    def __init__(self, owner: Owner, release: Release, mender: Mender | None = None) -> None:
         self._owner = weakref.ref(owner)
+        self._release = release
         self._mender = mender
         self.run: Run | None = None
-        self._resumes = self._follows = False
+        self._resumes = self._follows = self._begins = False
 
     def follow(self, reduced: ReducedSystem, newton: NewtonSolver, clean_up: Cleaner) -> None:
         """Take what the problem is solved by, and its present load for that of a converged step.
@@ -162,6 +165,15 @@ class Stepper:
     def resume(self, run: Run | None) -> None:
         """Let the next run be one that was interrupted, or a new one."""
         self.run, self._resumes = run, run is not None
+
+    def begin_stage(self) -> None:
+        """Let the next run be one of a new stage, which may begin at the whole load."""
+        self.run, self._resumes, self._begins = None, False, True
+        for known, field in zip(self.converged.prescribed, self._reduced.fields, strict=True):
+            held = np.zeros(len(known), dtype=bool)
+            for bc in field.conditions:
+                held[bc.dof_indices()[0]] = True
+            known[~held] = 0.0
 
     def steps(
         self,
@@ -249,6 +261,7 @@ class Stepper:
         owner = self.owner
         t, end = run.control.target, run.parameter
         try:
+            self._release.aim(run.remaining)
             if control is None:
                 self._set_load(run.aim, update is None and self.converged.proportional)
             if update is not None:
@@ -357,14 +370,15 @@ class Stepper:
             self._resumes = False
             return self.run
         start = self.converged.load if control is None else control.present()
-        if control is None and update is None and self.converged.load >= 1.0:
+        done = self.converged.load >= 1.0 and self._release.remaining == 0.0
+        if control is None and update is None and done and not self._begins:
             raise MPMError(
                 "The whole load is applied already; go on with problem.step() or with a path "
                 "(update=...)."
             )
         if start == goal:
             raise MPMError("The controlled displacement has its value already.")
-        self.converged.parameter = self.converged.load if update is None else 0.0
+        self._begins = False
         if self._reduced.predictor is not None:
             self._reduced.predictor.clear()
         base = [values.copy() for values in self.converged.prescribed]
@@ -373,7 +387,18 @@ class Stepper:
         if span is not None:
             began, end = span
             self.converged.parameter = began
-        self.run = Run(StepControl(steps), update is not None, start, base, goal, began, end)
+        self.run = Run(
+            StepControl(steps),
+            update is not None,
+            start,
+            base,
+            goal,
+            began,
+            end,
+            self._release.remaining,
+        )
+        if span is None:
+            self.converged.parameter = 0.0 if self.run.shares else self.converged.load
         return self.run
 
     def _advance(

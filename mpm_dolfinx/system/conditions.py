@@ -16,7 +16,7 @@ from dolfinx import fem
 from .. import _compat
 from ..errors import MPMError
 
-__all__ = ["dirichlet_values", "force_at"]
+__all__ = ["dirichlet_values", "fixed_dofs", "force_at"]
 
 
 def dirichlet_values(bcs: Sequence[fem.DirichletBC], V: fem.FunctionSpace) -> NDArray[np.float64]:
@@ -31,6 +31,14 @@ def dirichlet_values(bcs: Sequence[fem.DirichletBC], V: fem.FunctionSpace) -> ND
     if not V.mesh.comm.allreduce(bool(np.isfinite(values).all()), MPI.LAND):
         raise MPMError("A Dirichlet condition has a value that is not finite")
     return values
+
+
+def fixed_dofs(bcs: Sequence[fem.DirichletBC], V: fem.FunctionSpace) -> NDArray[np.bool_]:
+    """Return whether a condition holds each of this rank's own dofs of V."""
+    fixed = np.zeros(V.dofmap.index_map.size_local * V.dofmap.index_map_bs, dtype=bool)
+    for bc in bcs:
+        fixed[_compat.own_dofs(bc, V)] = True
+    return fixed
 
 
 def force_at(

@@ -133,6 +133,18 @@ class Inertia(Term):
         self._others, self._mass = list(others), mass
         self._deleted = None
 
+    def join(self, bodies: Sequence[Particles]) -> None:
+        """Act on some more bodies, which are at rest, or on fewer of the last (collective).
+
+        Args:
+            bodies: All bodies, in the problem's order.
+        """
+        self.bodies = tuple(bodies)
+        for functions in (self.velocities, self._forces, self._external):
+            del functions[len(bodies) :]
+            for body in bodies[len(functions) :]:
+                functions.append(fem.Function(body.W, name="velocity"))
+
     # -- Mass and velocity ----------------------------------------------------------------
 
     def settle(self) -> None:

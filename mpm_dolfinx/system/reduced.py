@@ -278,6 +278,8 @@ class ReducedSystem:
                     self._add_outer(term)
                 else:
                     self._add(term, term.residuals())
+            for number, field in enumerate(self.fields):
+                self._outer[number] += self._add_on_background(field)
             for field in self.fields:
                 field.add_residual(partial(self._stiffness, field))
                 field.gather_extended(field.force)
@@ -292,6 +294,34 @@ class ReducedSystem:
         for number, (field, part) in enumerate(zip(self.fields, parts, strict=True)):
             self._outer[number] += norm(part)
             field.force.axpy(1.0, part)
+
+    def _add_on_background(self, field: Field) -> float:
+        """Add forces of terms on dofs of a background, and return their size."""
+        size = 0.0
+        for term in self._terms:
+            forces = term.background_forces(field.V)
+            if forces is not None:
+                field.force.array_w[:] += forces
+                size += joint_norm(forces, self._comm)
+        return size
+
+    def nodal_forces(self) -> list[NDArray[np.float64]]:
+        """Return the forces of all terms in the last converged state (collective).
+
+        Returns:
+            For each body, on this rank's own dofs of W.
+        """
+        bodies = [motion.particles for _, motion in self._places]
+        maps = [body.W.dofmap for body in bodies]
+        totals = [np.zeros(m.index_map.size_local * m.index_map_bs) for m in maps]
+        for term in self._terms:
+            term.roll_back()
+            term.begin()
+            forces = term.residuals()
+            for body, force in zip(term.bodies if forces else (), forces, strict=True):
+                number = next(i for i, known in enumerate(bodies) if known is body)
+                totals[number] += force.array_r
+        return totals
 
     def _zeros(self) -> list[PETSc.Vec]:
         vectors = [force.duplicate() for force in self.forces]

@@ -10,6 +10,11 @@ from typing import ClassVar, Protocol
 
 from petsc4py import PETSc
 
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
 from ..assembly.body_forms import BodyForms
 from ..errors import MPMError
 from ..io.snapshot import Kept
@@ -108,6 +113,13 @@ class Term:
     def residuals(self) -> Sequence[PETSc.Vec]:
         """Return the forces on W of each body, or nothing."""
         return ()
+
+    def background_forces(self, V: fem.FunctionSpace) -> NDArray[np.float64] | None:
+        """Return forces on this rank's own dofs of a background besides those on bodies, or none.
+
+        They stay through a step, and have no tangent.
+        """
+        return None
 
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
         """Return the derivatives of the forces on a body by the displacement of a body.

@@ -1,0 +1,154 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The stress that a body carries before anything has moved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ufl
+from dolfinx import fem
+
+from ..assembly.inputs import as_expression
+from ..errors import MPMError, agree, as_ours
+from ..meshes.quadrature import quadrature_rule
+from ..particles.particles import Particles
+
+__all__ = ["geostatic", "initial_stress_at_points"]
+
+type Array = NDArray[np.float64]
+
+
+def geostatic(
+    surface: float,
+    density: float | Sequence[tuple[float, float]],
+    K0: float | Sequence[float],
+    gravity: Sequence[float],
+    surcharge: float = 0.0,
+) -> Callable[[Array], Array]:
+    """Return the stress of level ground under its own weight, for ``initial_stress=``.
+
+    The vertical stress is the weight of what lies above, the horizontal one is K0 times it (the
+    K0 procedure). Under its body force, with sides and base that do not move, such ground is in
+    equilibrium as it is.
+
+    Args:
+        surface: Level of the ground, measured against gravity: ``x[1]`` for gravity ``(0, -g)``.
+        density: Mass per volume, or layers from the surface downwards: pairs of a thickness and a
+            density; the last layer goes on for ever.
+        K0: Horizontal over vertical stress, a number or one for each layer.
+        gravity: Force per mass, a vector, as it is given for ``body_force``.
+        surcharge: Pressure on the surface.
+
+    Returns:
+        A function of coordinates, shape ``(3, n)``, that returns Cauchy stresses ``(3, 3, n)``;
+        above the surface they are zero.
+
+    Raises:
+        MPMError: Values that are not finite, layers without thickness, or no gravity.
+    """
+    try:
+        g = np.zeros(3)
+        g[: len(gravity)] = np.asarray(gravity, dtype=np.float64)
+        layers = [(np.inf, float(density))] if np.ndim(density) == 0 else list(density)  # type: ignore[arg-type]
+        thickness, densities = np.array(layers, dtype=np.float64).T
+        ratios = np.broadcast_to(np.asarray(K0, dtype=np.float64), len(layers))
+        numbers = np.array([surface, surcharge], dtype=np.float64)
+    except (TypeError, ValueError):
+        raise MPMError(
+            "geostatic needs a level, a density or layers (pairs of a thickness and a density), "
+            "K0 as a number or one for each layer, and gravity as a vector."
+        ) from None
+    tops = np.concatenate([[0.0], np.cumsum(thickness[:-1])])
+    known = [g, densities, ratios, numbers, tops]
+    if not all(np.isfinite(values).all() for values in known) or (thickness <= 0.0).any():
+        raise MPMError("geostatic needs finite numbers, and layers with a positive thickness.")
+    strength = float(np.linalg.norm(g))
+    if strength == 0.0:
+        raise MPMError("geostatic needs gravity that is not zero.")
+    down = g / strength
+    loads = surcharge + np.concatenate([[0.0], np.cumsum(densities[:-1] * np.diff(tops))]) * (
+        strength
+    )
+
+    def stress(x: Array) -> Array:
+        depth = surface + down @ x
+        layer = np.clip(np.searchsorted(tops, depth, side="right") - 1, 0, None)
+        vertical = loads[layer] + densities[layer] * strength * (depth - tops[layer])
+        vertical = np.where(depth >= 0.0, vertical, 0.0)
+        across = np.eye(3) - np.outer(down, down)
+        return np.asarray(
+            -np.multiply.outer(np.outer(down, down), vertical)
+            - np.multiply.outer(across, ratios[layer] * vertical)
+        )
+
+    return stress
+
+
+def initial_stress_at_points(value: Any, particles: Particles) -> Array:
+    """Return an initial stress at the history's points (collective).
+
+    Args:
+        value: See :class:`QuasiStaticProblem`.
+        particles: The body, which has not moved.
+
+    Returns:
+        Cauchy stresses, shape ``(n, nq, 3, 3)``.
+
+    Raises:
+        MPMError: It is something else, of another shape, or not finite.
+    """
+    n, nq = particles.num_local, particles.num_points
+    if isinstance(value, ufl.core.expr.Expr):
+        made = as_expression(value, particles, "initial_stress", (3, 3))
+        made = fem.Constant(particles.mesh, 1.0) * made  # a constant one knows no ranks
+        points, _ = quadrature_rule(particles.mesh.basix_cell(), particles.quadrature_degree)
+        cells = np.arange(n, dtype=np.int32)
+        evaluated: Any = fem.Expression(made, points).eval(particles.mesh, cells)
+        values: Array = evaluated.reshape(n, nq, 3, 3)
+    else:
+        with agree(particles.mesh.comm):
+            values = _at_points(value, particles)
+    with agree(particles.mesh.comm):
+        bad = ~np.isfinite(values).all(axis=(1, 2, 3))
+        if bad.any():
+            raise MPMError(
+                "initial_stress is not finite at {particles}.", particles.global_index[bad]
+            )
+    return np.array(values, dtype=np.float64)
+
+
+def _at_points(value: Any, particles: Particles) -> Array:
+    n, nq = particles.num_local, particles.num_points
+    if callable(value):
+        x = np.zeros((3, n * nq))
+        points = particles.initial_points
+        x[: points.shape[-1]] = points.reshape(n * nq, -1).T
+        try:
+            found = np.asarray(value(x), dtype=np.float64)
+        except MPMError:
+            raise
+        except Exception as error:
+            raise as_ours(error, "The function that gives initial_stress") from error
+        if found.shape != (3, 3, n * nq):
+            raise MPMError(
+                "The function that gives initial_stress must return, for coordinates (3, n), "
+                f"stresses of the shape (3, 3, n), not {found.shape} for n = {n * nq}."
+            )
+        return np.moveaxis(found, -1, 0).reshape(n, nq, 3, 3)
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.shape not in ((3, 3), (n, 3, 3), (n, nq, 3, 3)):
+        raise MPMError(
+            "initial_stress must be a stress (3, 3), an array of them for each owned particle or "
+            "point, (n, 3, 3) or (n, nq, 3, 3), UFL of the shape (3, 3), a function of "
+            f"coordinates, or mpm.geostatic(...), not {type(value).__name__} of the shape "
+            f"{array.shape}."
+        )
+    return np.broadcast_to(array if array.ndim != 3 else array[:, None], (n, nq, 3, 3))

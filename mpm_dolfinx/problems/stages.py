@@ -1,0 +1,274 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What a stage changes: what is given for a problem, cells that are taken away, bodies that come.
+
+Each change is made in the same state: displacement, stress and history stay where they were
+(:meth:`ParticleProblem.begin_stage`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from ..constitutive.points import MaterialPoints
+from ..errors import MPMError, agree, as_ours
+from ..particles.particles import Particles
+from ..system.term import Term
+from .arguments import as_bodies, as_conditions, as_terms, by_space
+from .initial_stress import initial_stress_at_points
+from .setup import BodySetup, Setup
+
+__all__ = ["Addition", "Given", "Removal", "Staged", "chosen_cells"]
+
+
+class Staged(Protocol):
+    """A problem that goes through stages.
+
+    Attributes:
+        particles: Its body or bodies, as given.
+        bodies: Its bodies.
+        bcs: Its Dirichlet conditions.
+        terms: What else acts on the bodies.
+        setup: What the user has given for them.
+        points: The materials at the points of each body.
+    """
+
+    particles: Particles | Sequence[Particles]
+    bodies: list[Particles]
+    bcs: list[fem.DirichletBC]
+    terms: list[Term]
+    setup: Setup
+
+    @property
+    def points(self) -> list[MaterialPoints]:
+        """The materials at the points of each body."""
+
+
+class _Change:
+    """What all changes have in common: the problem as it was.
+
+    Args:
+        problem: The problem.
+    """
+
+    kind = ""
+
+    def __init__(self, problem: Staged) -> None:
+        self.problem = problem
+        self._was = problem.setup, problem.bcs, problem.terms, problem.bodies, problem.particles
+
+    def make(self) -> None:
+        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+
+    def settle(self) -> None:
+        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+
+    def renews(self, body: int | None, name: str) -> bool:
+        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        return False
+
+    def undo(self) -> None:
+        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        p = self.problem
+        p.setup, p.bcs, p.terms, p.bodies, p.particles = self._was
+
+
+class Given(_Change):
+    """Other materials, loads, conditions or terms.
+
+    Args:
+        problem: The problem.
+        bodies: What is given for each body that differs, by the names of :class:`BodySetup`.
+        bcs: The Dirichlet conditions.
+        terms: What else acts on the bodies, without what the problem itself has.
+        own: The terms that the problem itself has.
+    """
+
+    kind = "stage"
+
+    def __init__(
+        self,
+        problem: Staged,
+        bodies: Sequence[dict[str, Any]],
+        bcs: Any,
+        terms: Any,
+        own: Sequence[Term] = (),
+    ) -> None:
+        super().__init__(problem)
+        spaces = [group[0].V for group in by_space(problem.bodies)]
+        self._bodies, self._bcs = list(bodies), as_conditions(bcs, spaces)
+        self._terms = [*own, *as_terms(terms, problem.bodies)]
+        self._points = list(problem.points)
+
+    def make(self) -> None:
+        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        problem = self.problem
+        setups = [
+            replace(known, **changes)
+            for known, changes in zip(problem.setup.bodies, self._bodies, strict=True)
+        ]
+        problem.setup = replace(problem.setup, bodies=tuple(setups), terms=tuple(self._terms))
+        problem.bcs, problem.terms = self._bcs, self._terms
+
+    def settle(self) -> None:
+        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        for changes, points, before in zip(
+            self._bodies, self.problem.points, self._points, strict=True
+        ):
+            if changes.keys() & {"material", "cell_tags"}:
+                points.take_over(before)
+
+    def renews(self, body: int | None, name: str) -> bool:
+        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        if body is None:
+            return name == "moduli" and any("material" in changes for changes in self._bodies)
+        other = self._bodies[body].keys() & {"material", "cell_tags"}
+        return bool(other) and name.startswith("history ")
+
+
+class Removal(_Change):
+    """Cells that are taken away.
+
+    Args:
+        problem: The problem.
+        number: Number of their body.
+        cells: Their local indices on this rank.
+    """
+
+    kind = "remove"
+
+    def __init__(self, problem: Staged, number: int, cells: NDArray[np.int64]) -> None:
+        super().__init__(problem)
+        self._number, self._cells = number, cells
+        self._body = problem.bodies[number]
+        self._deletable = self._body.deletion is not None
+
+    def make(self) -> None:
+        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        self._body.remove(self._cells)
+
+    def renews(self, body: int | None, name: str) -> bool:
+        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        return body == self._number and name in ("deleted", "kept")
+
+    def undo(self) -> None:
+        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        super().undo()
+        self._body.allow_deletion(self._deletable)
+
+
+class Addition(_Change):
+    """A body that comes.
+
+    Args:
+        problem: The problem.
+        given: What it is made of and loaded by.
+        stress: The initial stress that it carries, or ``None``.
+    """
+
+    kind = "add"
+
+    def __init__(self, problem: Staged, given: BodySetup, stress: Any = None) -> None:
+        super().__init__(problem)
+        self._bodies = as_bodies([*problem.bodies, given.particles])
+        self._given, self._stress = given, stress
+
+    def make(self) -> None:
+        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        problem = self.problem
+        bodies = (*problem.setup.bodies, self._given)
+        problem.setup = replace(problem.setup, bodies=bodies)
+        problem.bodies = self._bodies
+        problem.particles = list(self._bodies)
+
+    def settle(self) -> None:
+        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        if self._stress is not None:
+            body, points = self._given.particles, self.problem.points[-1]
+            points.begin_with(initial_stress_at_points(self._stress, body))
+
+    def renews(self, body: int | None, name: str) -> bool:
+        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        return body is None and name in ("moduli", "cuts")
+
+
+def chosen_cells(particles: Particles, which: Any, tags: Any, cell_tags: Any) -> NDArray[np.int64]:
+    """Return the local indices of domains that are chosen, on this rank (collective).
+
+    Args:
+        particles: The body.
+        which: Global indices, or a function of undeformed centroids ``(3, n)`` that returns which
+            are meant, or ``None``.
+        tags: One tag of ``cell_tags`` or several, or ``None``.
+        cell_tags: Tags of the body's cells.
+
+    Raises:
+        MPMError: Both or none of them are given, something is not there, or nothing would be left.
+    """
+    if (which is None) == (tags is None):
+        raise MPMError("Give either particles= or tags= of what is to be removed.")
+    comm = particles.mesh.comm
+    with agree(comm):
+        if tags is not None:
+            chosen, unknown = _tagged(particles, tags, cell_tags)
+        elif callable(which):
+            chosen, unknown = _where(particles, which), []
+        else:
+            indices = np.asarray(which).ravel()
+            if indices.size and not np.issubdtype(indices.dtype, np.integer):
+                raise MPMError(
+                    "particles= are global indices, whole numbers, or a function of coordinates, "
+                    f"not {which!r}."
+                )
+            chosen = np.isin(particles.global_index, indices)
+            lost = (indices < 0) | (indices >= particles.num_global)
+            unknown = np.unique(indices[lost]).tolist()
+    count = comm.allreduce(int((chosen & ~particles.deleted).sum()))
+    rest = comm.allreduce(int((~chosen & ~particles.deleted).sum()))
+    unknown = sorted(set.intersection(*[set(u) for u in comm.allgather(unknown)]))
+    if unknown:
+        raise MPMError(f"There are no cells {', '.join(map(str, unknown))} to be removed.")
+    if count == 0:
+        raise MPMError("Nothing is to be removed, or it is removed already.")
+    if rest == 0:
+        raise MPMError("Nothing would be left of the body; a problem keeps a part of each body.")
+    return np.flatnonzero(chosen & ~particles.deleted)
+
+
+def _tagged(particles: Particles, tags: Any, cell_tags: Any) -> tuple[NDArray[np.bool_], list[int]]:
+    """Return which domains have a tag, and the tags that none has on this rank."""
+    if cell_tags is None:
+        raise MPMError("tags= are of cell_tags=, and the problem has none; give particles=.")
+    wanted = np.atleast_1d(np.asarray(tags))
+    if not np.issubdtype(wanted.dtype, np.integer):
+        raise MPMError(f"tags= are whole numbers, not {tags!r}.")
+    own = cell_tags.indices < particles.num_local
+    chosen = np.zeros(particles.num_local, dtype=bool)
+    chosen[cell_tags.indices[own & np.isin(cell_tags.values, wanted)]] = True
+    return chosen, np.setdiff1d(wanted, cell_tags.values).tolist()
+
+
+def _where(particles: Particles, which: Callable[[NDArray[np.float64]], Any]) -> NDArray[np.bool_]:
+    """Return in which domains a function of coordinates holds."""
+    x = np.zeros((3, particles.num_local))
+    centroid = particles.initial_centroid
+    x[: centroid.shape[1]] = centroid.T
+    try:
+        chosen = np.asarray(which(x))
+    except MPMError:
+        raise
+    except Exception as error:
+        raise as_ours(error, "The function that chooses particles") from error
+    if chosen.shape != (particles.num_local,) or chosen.dtype != np.bool_:
+        raise MPMError(
+            "The function that chooses particles must return one bool for each of the coordinates "
+            f"(3, n), not an array of shape {chosen.shape} and type {chosen.dtype}."
+        )
+    return chosen

@@ -1,0 +1,206 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Forces that keep bodies as they are where a stage begins, and that go over it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from ..io.snapshot import Kept, Taken, fill, of_cells
+from ..meshes.remesh import Column
+from ..particles.particles import Particles
+from .term import Term
+
+__all__ = ["Release"]
+
+type Array = NDArray[np.float64]
+
+
+class Release(Term):
+    """What a stage takes away or adds at once, held back at its beginning and let go over it.
+
+    Let r be the residual with the loads and bodies of the stage, and q what it differs by from that
+    of before, both in the state of before. The stage solves ``r - s q = 0``, where s goes from 1
+    to 0: it begins in equilibrium, and ends in that of the stage. q has values at the bodies' nodes
+    and, for Dirichlet conditions that are taken away, at dofs of the backgrounds.
+
+    Attributes:
+        remaining: s at the last converged step; 0 where nothing is held back.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.remaining = 0.0
+        self._factor = 0.0
+        self._nodal: list[fem.Function] = []
+        self._reactions: list[fem.Function] = []
+
+    @property
+    def symmetric(self) -> bool:
+        """See :attr:`Term.symmetric`."""
+        return True
+
+    def follow(self, bodies: Sequence[Particles], spaces: Sequence[fem.FunctionSpace]) -> None:
+        """Take bodies on their present meshes, without any force on them (collective).
+
+        Args:
+            bodies: The bodies.
+            spaces: Their backgrounds.
+        """
+        self.bodies, self._spaces = tuple(bodies), list(spaces)
+        self._let_go()
+
+    def left(self) -> list[Array]:
+        """Return what is held back now on this rank's own dofs of each background."""
+        found = []
+        for i, V in enumerate(self._spaces):
+            count = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
+            held = self._reactions[i].x.array[:count] if self._reactions else np.zeros(count)
+            found.append(np.asarray(self.remaining * held))
+        return found
+
+    def _let_go(self) -> None:
+        self.remaining = self._factor = 0.0
+        self._nodal, self._reactions = [], []
+
+    def hold(self, nodal: Sequence[Array], reactions: Sequence[Array]) -> None:
+        """Hold forces back, in place of those that were held before (collective).
+
+        Args:
+            nodal: q on this rank's own dofs of W of each body.
+            reactions: q on this rank's own dofs of each background.
+        """
+        self._nodal = [_function(b.W, f) for b, f in zip(self.bodies, nodal, strict=True)]
+        self._reactions = [_function(V, f) for V, f in zip(self._spaces, reactions, strict=True)]
+        some = any(np.any(f) for f in (*nodal, *reactions))
+        if self.bodies[0].mesh.comm.allreduce(some):
+            self.remaining = self._factor = 1.0
+        else:
+            self._let_go()
+
+    def aim(self, remaining: float) -> None:
+        """Take a value of s for the end of the step to try."""
+        self._factor = remaining if self._nodal else 0.0
+
+    # -- A step ---------------------------------------------------------------------------
+
+    def begin(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.begin`."""
+        return self.residuals()
+
+    def residuals(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.residuals`."""
+        if self._factor == 0.0:
+            return ()
+        forces = []
+        for function in self._nodal:
+            dofs = function.function_space.dofmap
+            vector = PETSc.Vec().createMPI(
+                (dofs.index_map.size_local * dofs.index_map_bs, None),
+                comm=function.function_space.mesh.comm,
+            )
+            vector.array_w[:] = -self._factor * function.x.array[: vector.getLocalSize()]
+            forces.append(vector)
+        return forces
+
+    def background_forces(self, V: fem.FunctionSpace) -> Array | None:
+        """See :meth:`Term.background_forces`."""
+        if self._factor == 0.0:
+            return None
+        function = next(f for f in self._reactions if f.function_space is V)
+        count = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
+        return np.asarray(-self._factor * function.x.array[:count])
+
+    def commit(self) -> Callable[[], None]:
+        """See :meth:`Term.commit`."""
+        before = self.remaining, self._nodal, self._reactions
+
+        def undo() -> None:
+            self.remaining, self._nodal, self._reactions = before
+
+        self.remaining = self._factor
+        if self.remaining == 0.0:
+            self._let_go()
+        return undo
+
+    def roll_back(self) -> None:
+        """See :meth:`Term.roll_back`."""
+        self._factor = self.remaining
+
+    # -- What goes with the problem -------------------------------------------------------
+
+    def kept(self) -> Sequence[Kept]:
+        """See :meth:`Term.kept`."""
+        return [_Held(self)]
+
+    def columns(self, body: int) -> dict[str, Column]:
+        """Return what is held back at the nodes of a body."""
+        return {"force": Column(of_cells(self._nodal[body]), "nodes")} if self._nodal else {}
+
+    def on_cells(self, number: int) -> dict[str, Column]:
+        """Return what is held back on a background."""
+        if not self._reactions:
+            return {}
+        return {"reaction": Column(of_cells(self._reactions[number]), "nodes")}
+
+    def take(self, taken: Taken) -> None:
+        """Take over what was once kept (collective)."""
+        self._let_go()
+        remaining = float(taken.numbers.get("remaining", 0.0))
+        if remaining == 0.0:
+            return
+        for body, columns in zip(self.bodies, taken.columns, strict=False):
+            self._nodal.append(fem.Function(body.W))
+            fill(self._nodal[-1], columns["force"])
+        for V, columns in zip(self._spaces, taken.backgrounds, strict=True):
+            self._reactions.append(fem.Function(V))
+            fill(self._reactions[-1], columns["reaction"])
+        self.remaining = self._factor = remaining
+
+
+class _Held(Kept):
+    """What is held back, and how much of it.
+
+    Args:
+        release: Has it.
+    """
+
+    key = "release"
+
+    def __init__(self, release: Release) -> None:
+        self._release = release
+
+    def numbers(self) -> dict[str, Any]:
+        """See :class:`Kept`."""
+        return {"remaining": self._release.remaining}
+
+    def columns(self, body: int | None) -> dict[str, Column]:
+        """See :class:`Kept`."""
+        return {} if body is None else self._release.columns(body)
+
+    def on_background(self, number: int) -> dict[str, Column]:
+        """See :class:`Kept`."""
+        return self._release.on_cells(number)
+
+    def require(self, source: str, taken: Taken) -> None:
+        """See :class:`Kept`; any state will do, one of before there were stages too."""
+
+    def restore(self, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        self._release.take(taken)
+
+
+def _function(space: fem.FunctionSpace, owned: Array) -> fem.Function:
+    """Return a Function with values on this rank's own dofs (collective)."""
+    function = fem.Function(space)
+    function.x.array[: len(owned)] = owned
+    function.x.scatter_forward()
+    return function

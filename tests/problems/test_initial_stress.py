@@ -1,0 +1,225 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Bodies that carry a stress before they move: the K0 procedure and what a user may give."""
+
+import numpy as np
+import pytest
+from scenes import (
+    HEXAHEDRON,
+    PLANE,
+    QUADRILATERAL,
+    TRIANGLE,
+    at,
+    box,
+    facet_tags,
+    fix,
+    in_order,
+    largest,
+    name,
+    vectors,
+)
+
+import ufl
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx import materials
+
+HEIGHT, DENSITY, GRAVITY = 5.0, 2.0, (0.0, -10.0)
+YOUNG = 1e4
+CAM_CLAY = materials.ModifiedCamClay(0.2, 0.04, 1.2, 3e3, 400.0, 50.0)
+LAWS = [
+    materials.LinearElastic(YOUNG, 0.3),
+    materials.Hencky(YOUNG, 0.3),
+    materials.VonMises(YOUNG, 0.3, rho_y=200.0),
+    materials.Tresca(YOUNG, 0.3, cohesion=60.0),
+    materials.MohrCoulomb(YOUNG, 0.3, cohesion=1.0, friction_angle=40.0),
+    materials.MohrCoulomb(YOUNG, 0.3, 1.0, 40.0, dilation_angle=10.0, tension_cutoff=0.0),
+    materials.DruckerPrager(YOUNG, 0.3, cohesion=1.0, friction_angle=40.0),
+    CAM_CLAY,
+]
+
+
+def ground(material, cell=QUADRILATERAL, stress=None, problem=mpm.QuasiStaticProblem, **options):
+    """Return level ground between smooth walls on a rough base, 4 wide and 5 high."""
+    V = vectors(box([0, 0], [4, 6], [4, 6], cell))
+    kind = {k: options.pop(k) for k in ("method", "quadrature_degree") if k in options}
+    body = mpm.Particles(box([0, 0], [4, HEIGHT], [8, 10], cell), V, **kind)
+    return problem(
+        body,
+        material,
+        density=DENSITY,
+        body_force=GRAVITY,
+        bcs=[fix(V, at(0, 0, 4), component=0), fix(V, at(1, 0), component=1)],
+        initial_stress=mpm.geostatic(HEIGHT, DENSITY, 0.5, GRAVITY) if stress is None else stress,
+        **options,
+    )
+
+
+def stays(problem):
+    """Assert that nothing has moved, and that the stress is the weight above."""
+    body = problem.bodies[0]
+    assert largest(np.abs(body.displacement.x.array)) <= 1e-12 * HEIGHT
+    depth = HEIGHT - body.initial_centroid[:, 1]
+    error = body.stress[:, 1, 1] + DENSITY * 10.0 * depth
+    assert largest(np.abs(error)) < 1e-11 * DENSITY * 10.0 * HEIGHT
+
+
+@pytest.mark.parametrize("K0", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: type(law).__name__)
+def test_level_ground_is_in_equilibrium(law, K0):
+    problem = ground(law, stress=mpm.geostatic(HEIGHT, DENSITY, K0, GRAVITY))
+    assert problem.solve(1).total_iterations <= 1
+    stays(problem)
+    body = problem.bodies[0]
+    np.testing.assert_allclose(body.stress[:, 0, 0], K0 * body.stress[:, 1, 1], rtol=1e-11)
+    np.testing.assert_allclose(body.stress[:, 2, 2], K0 * body.stress[:, 1, 1], rtol=1e-11)
+
+
+@pytest.mark.parametrize("cell", PLANE, ids=name)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"method": "gimp"},
+        {"method": "mpm"},
+        {"quadrature_degree": 2, "f_bar": "domain"},
+        {"f_bar": "patch"},
+        {"assembly": "reference"},
+        {"problem": mpm.DynamicProblem},
+    ],
+    ids=str,
+)
+def test_other_ways(cell, options):
+    if cell == TRIANGLE and {"method", "f_bar"} & options.keys() and options != {"method": "mpm"}:
+        cell = QUADRILATERAL  # gimp has boxes, F-bar is of quadrilaterals
+    problem = ground(LAWS[4], cell, **options)
+    if "problem" in options:
+        problem.solve(0.1, 0.05)
+    else:
+        problem.solve(3)
+    stays(problem)
+
+
+def test_in_space():
+    V = vectors(box([0, 0, 0], [1, 1, 4], [1, 1, 4], HEXAHEDRON))
+    body = mpm.Particles(box([0, 0, 0], [1, 1, 3], [2, 2, 6], HEXAHEDRON), V)
+    gravity = (0.0, 0.0, -10.0)
+    sides = [fix(V, at(i, 0, 1), component=i) for i in (0, 1)]
+    problem = mpm.QuasiStaticProblem(
+        body,
+        LAWS[4],
+        density=DENSITY,
+        body_force=gravity,
+        bcs=[*sides, fix(V, at(2, 0), component=2)],
+        initial_stress=mpm.geostatic(3.0, DENSITY, 0.6, gravity),
+    )
+    problem.solve()
+    assert largest(np.abs(body.displacement.x.array)) <= 1e-12
+    np.testing.assert_allclose(body.stress[:, 0, 0], 0.6 * body.stress[:, 2, 2], rtol=1e-11)
+
+
+def test_layers_and_surcharge():
+    layers, ratios, surcharge = [(2.0, 1.6), (1.0, 2.4), (9.0, 2.0)], [0.5, 0.8, 0.6], 30.0
+    stress = mpm.geostatic(HEIGHT, layers, ratios, GRAVITY, surcharge)
+    x = np.array([[0.0] * 5, [6.0, 4.0, 2.5, 1.0, 0.0], [0.0] * 5])
+    vertical = -np.array([0.0, 46.0, 30 + 32 + 12, 30 + 32 + 24 + 20, 30 + 32 + 24 + 40])
+    np.testing.assert_allclose(stress(x)[1, 1], vertical, rtol=1e-14)
+    np.testing.assert_allclose(stress(x)[0, 0], np.array([0.5, 0.5, 0.8, 0.6, 0.6]) * vertical)
+    np.testing.assert_allclose(stress(x)[0, 1], 0.0)
+
+    V = vectors(box([0, 0], [4, 6], [4, 6], QUADRILATERAL))
+    body = mpm.Particles(box([0, 0], [4, HEIGHT], [8, 10], QUADRILATERAL), V)
+    problem = mpm.QuasiStaticProblem(
+        body,
+        LAWS[4],
+        density=lambda mesh: ufl.conditional(
+            ufl.gt(ufl.SpatialCoordinate(mesh)[1], 3.0),
+            1.6,
+            ufl.conditional(ufl.gt(ufl.SpatialCoordinate(mesh)[1], 2.0), 2.4, 2.0),
+        ),
+        body_force=GRAVITY,
+        tractions=[((0.0, -surcharge), 1)],
+        facet_tags=facet_tags(body.mesh, at(1, HEIGHT)),
+        bcs=[fix(V, at(0, 0, 4), component=0), fix(V, at(1, 0), component=1)],
+        initial_stress=stress,
+    )
+    problem.solve()
+    assert largest(np.abs(body.displacement.x.array)) <= 1e-12 * HEIGHT
+
+
+def test_what_may_be_given():
+    given = [[-10.0, 2.0, 0.0], [2.0, -20.0, 0.0], [0.0, 0.0, -5.0]]
+    law = materials.Hencky(YOUNG, 0.3)
+
+    def stress(value):
+        problem = ground(law, stress=value)
+        return problem.bodies[0].stress
+
+    body = ground(law).bodies[0]
+    n, x = body.num_local, ufl.SpatialCoordinate(body.mesh)
+    for value in (
+        given,
+        np.tile(given, (n, 1, 1)),
+        np.tile(given, (n, 1, 1, 1)),
+        lambda x: np.multiply.outer(given, np.ones(x.shape[1])),
+        ufl.as_matrix(np.array(given)) + 0 * x[0] * ufl.Identity(3),
+    ):
+        if isinstance(value, ufl.core.expr.Expr):
+            V = body.V
+            problem = mpm.QuasiStaticProblem(mpm.Particles(body.mesh, V), law, initial_stress=value)
+            found = problem.bodies[0].stress
+        else:
+            found = stress(value)
+        np.testing.assert_allclose(found, np.tile(given, (n, 1, 1)), atol=1e-12)
+
+
+def test_what_is_refused():
+    law = LAWS[4]
+    with pytest.raises(mpm.MPMError, match="beyond yield") as caught:
+        ground(law, stress=mpm.geostatic(HEIGHT, DENSITY, 0.1, GRAVITY))
+    assert len(caught.value.particles) > 10
+    with pytest.raises(mpm.MPMError, match="initial_stress must be"):
+        ground(law, stress=np.zeros((2, 2)))
+    with pytest.raises(mpm.MPMError, match="shape"):
+        ground(law, stress=lambda x: np.zeros((2, 2, x.shape[1])))
+    with pytest.raises(mpm.MPMError, match="not finite"):
+        ground(law, stress=np.full((3, 3), np.nan))
+    with pytest.raises(mpm.MPMError, match="gravity"):
+        mpm.geostatic(0.0, 1.0, 0.5, (0.0, 0.0))
+    with pytest.raises(mpm.MPMError, match="thickness"):
+        mpm.geostatic(0.0, [(0.0, 1.0)], 0.5, GRAVITY)
+    with pytest.raises(mpm.MPMError, match="level"):
+        mpm.geostatic("top", 1.0, 0.5, GRAVITY)
+
+
+def test_what_is_not_in_equilibrium_goes_with_the_load():
+    """An elastic body under a stress of twice its weight heaves in proportion."""
+    twice = mpm.geostatic(HEIGHT, 2 * DENSITY, 3 / 7, GRAVITY)
+    problem = ground(materials.LinearElastic(1e9, 0.3), stress=twice)
+    body, modulus = problem.bodies[0], 1e9 * 0.7 / 1.3 / 0.4
+    heave = DENSITY * 10.0 * HEIGHT**2 / 2 / modulus
+    for step in problem.steps(4):
+        top = largest(body.displacement.x.array)
+        assert top == pytest.approx(step.load * heave, rel=1e-7)
+        weight = problem.reaction(problem.bcs[1])[1]
+        assert weight == pytest.approx(step.load * DENSITY * 10.0 * HEIGHT * 4, rel=1e-9)
+
+
+@pytest.mark.parametrize("law", [LAWS[4], CAM_CLAY, LAWS[0]], ids=lambda law: type(law).__name__)
+def test_goes_with_the_body(law, mpi_tmp_path):
+    problem = ground(law)
+    problem.solve()
+    problem.save(mpi_tmp_path / "ground.mpm")
+    other = ground(law)
+    other.restore(mpi_tmp_path / "ground.mpm")
+    stays(other)
+    plain = ground(law, stress=mpm.geostatic(HEIGHT, DENSITY, 1.0, GRAVITY))
+    plain.restore(mpi_tmp_path / "ground.mpm")
+    before = in_order(problem.bodies[0], problem.bodies[0].stress)
+    np.testing.assert_allclose(
+        in_order(plain.bodies[0], plain.bodies[0].stress), before, atol=1e-13
+    )
+    other.repartition(0.0)
+    stays(other)
+    other.split([3, 17])
+    other.step()
+    assert largest(np.abs(other.bodies[0].displacement.x.array)) <= 1e-12 * HEIGHT
