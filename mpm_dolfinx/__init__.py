@@ -6,7 +6,7 @@ from . import _compat
 
 _compat.require_supported()
 
-from . import boundary, materials, plot  # noqa: E402
+from . import boundary, contact, materials, plot  # noqa: E402
 from .assembly.volume_ratio import AveragedVolumeRatio  # noqa: E402
 from .errors import (  # noqa: E402
     ConvergenceError,
@@ -50,6 +50,7 @@ __all__ = [
     "__version__",
     "boundary",
     "geostatic",
+    "contact",
     "materials",
     "plot",
 ]

@@ -26,6 +26,7 @@ FLOORS = (
     ("assembly",),
     ("stabilisation", "boundary"),
     ("system",),
+    ("contact",),
     ("stepping",),
     ("problems",),
     ("",),  # the package's own face

@@ -21,6 +21,7 @@ from dolfinx.fem import petsc as fem_petsc
 from .. import _compat
 from ..assembly.inputs import as_expression
 from ..boundary.supports import Support
+from ..contact.contact import Contact
 from ..errors import MPMError, agree, as_ours, on_all_ranks
 from ..history import Energy, History, Step
 from ..parallel.garbage import weakly
@@ -350,14 +351,15 @@ class DynamicProblem(QuasiStaticProblem):
             pass
         return self.history.steps[-1]
 
-    def reaction(self, bc: fem.DirichletBC | Support) -> NDArray[np.float64]:
+    def reaction(self, bc: fem.DirichletBC | Support | Contact) -> NDArray[np.float64]:
         """Return the force of a support on the body: of a Dirichlet condition in the last step.
 
         That is the mean over the step with ``scheme="midpoint"``; supports of
-        :mod:`mpm_dolfinx.boundary` have that at its end. See :meth:`ParticleProblem.reaction`.
+        :mod:`mpm_dolfinx.boundary` and contacts have that at its end. See
+        :meth:`ParticleProblem.reaction`.
         """
         force = super().reaction(bc)
-        return force if isinstance(bc, Support) else self.inertia.share * force
+        return force if isinstance(bc, Support | Contact) else self.inertia.share * force
 
 
 def _for_each(value: Any, count: int) -> list[Any]:

@@ -24,6 +24,7 @@ from ..assembly.fused import is_fast
 from ..assembly.rules import data_at_points
 from ..boundary.supports import Support
 from ..constitutive.averaging import Linearised
+from ..contact.contact import Contact
 from ..errors import MPMError, agree, warn
 from ..history import History, Stage, Step
 from ..io import checkpoint, identity
@@ -314,6 +315,8 @@ class ParticleProblem:
             )
             for body, c in zip(self.bodies, contributions, strict=True)
         ]
+        for number, term in enumerate(self.terms):
+            term.join(number, self.bodies, [given.material for given in contributions])
         on_backgrounds = _on_backgrounds(self._background, groups, **options)
         remove = numerics.dependent_dofs == "remove"
         fields = [
@@ -648,15 +651,15 @@ class ParticleProblem:
 
     # -- Results --------------------------------------------------------------------------
 
-    def reaction(self, bc: fem.DirichletBC | Support) -> NDArray[np.float64]:
+    def reaction(self, bc: fem.DirichletBC | Support | Contact) -> NDArray[np.float64]:
         """Return the force of a support on the body at the last converged load.
 
         The force at each dof of the condition counts once, however often the condition names
         it; where two conditions share a dof, it is in the force of both.
 
         Args:
-            bc: One of the problem's Dirichlet conditions, or a support of
-                :mod:`mpm_dolfinx.boundary` on one of its bodies.
+            bc: One of the problem's Dirichlet conditions, a support of
+                :mod:`mpm_dolfinx.boundary` on one of its bodies, or one of its contacts.
 
         Returns:
             Force, shape ``(gdim,)``, the same on all ranks.
@@ -664,6 +667,10 @@ class ParticleProblem:
         Raises:
             MPMError: The condition is not one of the problem's.
         """
+        if isinstance(bc, Contact):
+            if all(bc is not term for term in self.terms):
+                raise MPMError("reaction() needs one of the contacts of this problem.")
+            return bc.reaction
         if isinstance(bc, Support):
             if all(bc.particles is not body for body in self.bodies):
                 raise MPMError("reaction() needs a support on one of the bodies of this problem.")

@@ -18,13 +18,13 @@ from ..assembly.body_forms import BodyForms
 from ..assembly.low_rank import ReducedLowRank
 from ..errors import MPMError
 from ..particles.particles import Particles
-from .term import Term, Transfer
+from .term import PointMaterial, Term, Transfer
 
 __all__ = ["BodyTerm", "PointHistory"]
 
 
-class PointHistory(Protocol):
-    """A material at a body's points, with its history. No call is collective."""
+class PointHistory(PointMaterial, Protocol):
+    """A material at a body's points, with its history. What is here is not collective."""
 
     def update(self) -> None:
         """Update stress and tangent for the present displacement, or raise an MPMError."""

@@ -20,11 +20,18 @@ from ..errors import MPMError
 from ..io.snapshot import Kept
 from ..particles.particles import Particles
 
-__all__ = ["Hooks", "Motion", "Term", "Transfer", "UserTerm"]
+__all__ = ["Hooks", "Motion", "PointMaterial", "Term", "Transfer", "UserTerm"]
 
 
 type Transfer = Callable[[Particles], PETSc.Mat]
 type Motion = Callable[[Particles], PETSc.Vec | None]
+
+
+class PointMaterial(Protocol):
+    """What a term may ask of the material at the points of a body."""
+
+    def initial_modulus(self) -> NDArray[np.float64]:
+        """Return the modulus of each undeformed domain in one direction, ``(n,)`` (collective)."""
 
 
 class Term:
@@ -77,6 +84,20 @@ class Term:
     def follows_load(self) -> bool:
         """Whether what the load factor does depends on the displacement."""
         return False
+
+    def join(
+        self,
+        number: int,
+        bodies: Sequence[Particles],
+        materials: Sequence[PointMaterial | None],
+    ) -> None:
+        """Take note of the problem, each time that this is built on meshes of its bodies.
+
+        Args:
+            number: Number of the term among the problem's.
+            bodies: All bodies of the problem.
+            materials: The material at the points of each, where the problem knows it.
+        """
 
     def begin(self) -> Sequence[PETSc.Vec]:
         """Prepare a step, or another try of it, from the last converged positions.

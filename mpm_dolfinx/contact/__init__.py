@@ -1,0 +1,35 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Contact: rigid obstacles that bodies may touch, stick to, slide on and leave.
+
+Contact acts at quadrature points on the body's own facets, so there is none before surfaces meet,
+whatever the background's cells. A contact is a term: give it to a problem as ``terms=[contact]``.
+"""
+
+from .law import Coulomb
+from .rigid import Rigid
+from .shapes import (
+    Shape,
+    box,
+    cavity,
+    cylinder,
+    disc,
+    plane,
+    polygon,
+    signed_distance,
+    sphere,
+)
+
+__all__ = [
+    "Coulomb",
+    "Rigid",
+    "Shape",
+    "box",
+    "cavity",
+    "cylinder",
+    "disc",
+    "plane",
+    "polygon",
+    "signed_distance",
+    "sphere",
+]

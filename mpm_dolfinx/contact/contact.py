@@ -1,0 +1,207 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What all contacts have in common: stiffness, what they remember, what they tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import MPMError, agree
+from ..particles.particles import Particles
+from ..system.term import PointMaterial, Term
+from .surface import Surface
+
+__all__ = ["Contact", "Outcome", "as_positive", "stiffness"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What acts on the points of a surface.
+
+    Attributes:
+        positions: Shape ``(m, nq, gdim)``.
+        gap: Shape ``(m, nq)``; infinite where nothing is near.
+        pressure: Shape ``(m, nq)``.
+        traction: Pressure and shear as a vector, shape ``(m, nq, gdim)``.
+        inside: Which points are in contact, shape ``(m, nq)``.
+        slips: Which of these slip.
+    """
+
+    positions: NDArray[np.float64]
+    gap: NDArray[np.float64]
+    pressure: NDArray[np.float64]
+    traction: NDArray[np.float64]
+    inside: NDArray[np.bool_]
+    slips: NDArray[np.bool_]
+
+
+class Contact(Term):
+    """Contact of bodies at points on their own facets.
+
+    Args:
+        bodies: The bodies.
+        axisymmetric: Whether ``x[0]`` is a radius.
+    """
+
+    def __init__(self, bodies: Sequence[Particles], axisymmetric: bool) -> None:
+        super().__init__(bodies)
+        self.axisymmetric = axisymmetric
+        self._materials: Sequence[PointMaterial | None] = [None] * len(self.bodies)
+        self._number = 0
+        self._places: list[int] = []
+
+    def join(
+        self,
+        number: int,
+        bodies: Sequence[Particles],
+        materials: Sequence[PointMaterial | None],
+    ) -> None:
+        """See :meth:`Term.join`."""
+        self._number = number
+        self._places = [
+            next(i for i, body in enumerate(bodies) if body is mine) for mine in self.bodies
+        ]
+        self._materials = [materials[place] for place in self._places]
+
+    @property
+    def one_sided(self) -> bool:
+        """See :attr:`Term.one_sided`: bodies may lift off."""
+        return True
+
+    @property
+    def _comm(self) -> MPI.Comm:
+        comm: MPI.Comm = self.bodies[0].mesh.comm
+        return comm
+
+    def require_movable(self, consequence: str) -> None:
+        """Raise nothing: contact goes with the facets of its bodies."""
+
+    def require_remeshable(self, consequence: str) -> None:
+        """Raise nothing: see :meth:`require_movable`."""
+
+    # -- What it tells, at the last converged step ---------------------------------------------
+
+    def _outcome(self) -> tuple[Surface, Outcome]:
+        """Return what there was at the last converged step."""
+        raise NotImplementedError
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """Positions of this rank's points, shape ``(n, gdim)``."""
+        surface, outcome = self._outcome()
+        return outcome.positions.reshape(-1, surface.gdim)
+
+    @property
+    def gap(self) -> NDArray[np.float64]:
+        """Gap at this rank's points, negative where they penetrate, shape ``(n,)``."""
+        return self._outcome()[1].gap.ravel()
+
+    @property
+    def pressure(self) -> NDArray[np.float64]:
+        """Pressure per undeformed area at this rank's points, shape ``(n,)``."""
+        return self._outcome()[1].pressure.ravel()
+
+    @property
+    def traction(self) -> NDArray[np.float64]:
+        """Traction on the body per undeformed area at this rank's points, shape ``(n, gdim)``."""
+        surface, outcome = self._outcome()
+        return outcome.traction.reshape(-1, surface.gdim)
+
+    @property
+    def area(self) -> NDArray[np.float64]:
+        """Undeformed area of this rank's points, shape ``(n,)``."""
+        return np.array(self._outcome()[0].weights.ravel())
+
+    @property
+    def touches(self) -> NDArray[np.bool_]:
+        """Whether each of this rank's points is in contact, shape ``(n,)``."""
+        return self._outcome()[1].inside.ravel()
+
+    @property
+    def sticks(self) -> NDArray[np.bool_]:
+        """Whether each of this rank's points is in contact and does not slip, shape ``(n,)``."""
+        outcome = self._outcome()[1]
+        return (outcome.inside & ~outcome.slips).ravel()
+
+    @property
+    def reaction(self) -> NDArray[np.float64]:
+        """Force on the (first) body, shape ``(gdim,)``, on all ranks (collective)."""
+        mine = self.area @ self.traction
+        return np.asarray(self._comm.allreduce(mine))
+
+    def moment(self, about: Any) -> NDArray[np.float64]:
+        """Return the moment of the tractions about a point (collective).
+
+        Args:
+            about: Shape ``(gdim,)``.
+
+        Returns:
+            Shape ``(1,)`` in the plane, or ``(3,)``, on all ranks.
+        """
+        gdim = self.bodies[0].mesh.geometry.dim
+        centre = np.asarray(about, dtype=np.float64)
+        if centre.shape != (gdim,):
+            raise MPMError(f"A moment is about {gdim} coordinates, not {about!r}.")
+        arm, force = self.points - centre, self.area[:, None] * self.traction
+        mine = np.atleast_1d(cross(arm, force).sum(axis=0))
+        return np.asarray(self._comm.allreduce(mine))
+
+
+def cross(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+    """Return the vector product of rows; in the plane its one component."""
+    if a.shape[-1] == 3:
+        return np.cross(a, b)
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
+
+def as_positive(value: Any, name: str) -> float:
+    """Return a positive number.
+
+    Raises:
+        MPMError: It is something else.
+    """
+    known = isinstance(value, float | int | np.number) and not isinstance(value, bool)
+    if not known or not 0.0 < value < np.inf:
+        raise MPMError(f"{name} must be a positive number, not {value!r}.")
+    return float(value)
+
+
+def stiffness(
+    surface: Surface, modulus: float | None, material: PointMaterial | None, what: str
+) -> NDArray[np.float64]:
+    """Return modulus over thickness of the domain behind each facet, shape ``(m,)`` (collective).
+
+    The thickness is over the square of the degree of the shape functions: so much stiffer is a
+    domain against what acts on its surface.
+
+    Args:
+        surface: The facets.
+        modulus: The modulus, if it is given.
+        material: The material otherwise.
+        what: What needs it.
+
+    Raises:
+        MPMError: It is not known, or not positive.
+    """
+    if modulus is None and material is None:
+        raise MPMError(
+            f"{what} needs modulus=, since no material says how stiff the body is; give the "
+            "confined modulus (lambda + 2 mu) or its like."
+        )
+    if modulus is not None:
+        moduli = np.full(len(surface.cells), modulus)
+    else:
+        assert material is not None
+        moduli = material.initial_modulus()[surface.cells]
+    with agree(surface.particles.mesh.comm):
+        if not (np.isfinite(moduli).all() and (moduli > 0.0).all()):
+            raise MPMError(f"{what} needs a positive modulus of the material at all its facets.")
+    degree = surface.particles.W.ufl_element().degree
+    return np.asarray(degree**2 * moduli / surface.thickness)

@@ -1,0 +1,208 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Tractions of contact at points: a penalty on the gap, and Coulomb friction with a memory.
+
+The pressure is ``p = <-k g>`` for a gap g, where a point has penetrated (g < 0). Friction remembers
+an anchor a, a place on the other body: the traction along the surface is ``t* = -k_t P (x - a)``
+with ``P = I - n n``, as long as its size stays within ``min(mu p + c, limit)``; beyond it slips,
+and has that size (the return mapping of Wriggers 2006, Computational Contact Mechanics, section
+5.2.3, with the anchor instead of a traction that would have to be turned and transported).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import MPMError
+
+__all__ = ["Coulomb", "Points", "Traction", "as_friction", "derivative", "traction"]
+
+
+@dataclass(frozen=True)
+class Coulomb:
+    """Friction that does not depend on the velocity: at most ``min(friction p + cohesion, limit)``.
+
+    Args:
+        friction: Coefficient of friction.
+        cohesion: Shear traction that is borne without pressure, where bodies touch.
+        limit: Largest shear traction, such as the undrained strength of clay on a pile.
+
+    Raises:
+        MPMError: A negative or no number.
+    """
+
+    friction: float = 0.0
+    cohesion: float = 0.0
+    limit: float = np.inf
+
+    def __post_init__(self) -> None:
+        """Say so where a number makes no sense."""
+        for name in ("friction", "cohesion", "limit"):
+            value = getattr(self, name)
+            known = isinstance(value, float | int | np.number) and not isinstance(value, bool)
+            if not known or not value >= 0.0 or (name != "limit" and not np.isfinite(value)):
+                raise MPMError(f"{name} must be a number from 0 on, not {value!r}.")
+
+    @property
+    def smooth(self) -> bool:
+        """Whether there is no friction at all."""
+        return self.limit == 0.0 or (self.friction == 0.0 and self.cohesion == 0.0)
+
+    def bound(self, p: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the largest shear traction at pressures, and its derivative, ``(n,)`` each."""
+        bound = self.friction * np.where(p.real > 0.0, p, 0.0) + self.cohesion
+        free = (bound.real < self.limit) & (p.real > 0.0)
+        return np.where(bound.real < self.limit, bound, self.limit), self.friction * free
+
+
+def as_friction(value: Any) -> Coulomb:
+    """Return a coefficient of friction, or a law, as a law.
+
+    Raises:
+        MPMError: It is neither.
+    """
+    return value if isinstance(value, Coulomb) else Coulomb(friction=value)
+
+
+class Points(NamedTuple):
+    """Some points, and what they remember of the last converged step.
+
+    Attributes:
+        stiffness: k of each, shape ``(n,)``.
+        tangential: k_t of each, shape ``(n,)``.
+        touched: Whether each was in contact, shape ``(n,)``.
+        anchor: The anchor where it was, where it was not its place at that time, ``(n, gdim)``.
+        gap: The gap at that time, shape ``(n,)``.
+    """
+
+    stiffness: NDArray[np.float64]
+    tangential: NDArray[np.float64]
+    touched: NDArray[np.bool_]
+    anchor: NDArray[np.float64]
+    gap: NDArray[np.float64]
+
+    def of(self, which: Any) -> Points:
+        """Return some of them."""
+        return Points(*(values[which] for values in self))
+
+
+class Traction(NamedTuple):
+    """What acts on points.
+
+    Attributes:
+        pressure: Shape ``(n,)``.
+        shear: Traction along the surface, shape ``(n, gdim)``.
+        inside: Which are in contact.
+        slips: Which of these slip.
+    """
+
+    pressure: NDArray[Any]
+    shear: NDArray[Any]
+    inside: NDArray[np.bool_]
+    slips: NDArray[np.bool_]
+
+
+def _since_touch(
+    points: Points, gap: NDArray[Any], touch: float
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return which share of its way a point has been in contact, and the derivative by the gap.
+
+    That is all of it where it was before, and the part behind the surface where it has come from
+    outside, on a straight line.
+    """
+    came = ~points.touched & (points.gap > 10.0 * touch) & (gap.real < 0.0)
+    span = np.where(came, points.gap - gap, 1.0)
+    share = np.where(came, -gap / span, 1.0)
+    return share, np.where(came, -points.gap / span**2, 0.0)
+
+
+def _trial(
+    points: Points, delta: NDArray[Any], gap: NDArray[Any], n: NDArray[Any], touch: float
+) -> NDArray[Any]:
+    """Return the shear traction ``-k_t s P delta`` of points that would all stick."""
+    share, _ = _since_touch(points, gap, touch)
+    along = delta - n * (n * delta).sum(axis=1)[:, None]
+    return np.asarray(-(points.tangential * share)[:, None] * along)
+
+
+def traction(
+    law: Coulomb,
+    points: Points,
+    delta: NDArray[Any],
+    gap: NDArray[Any],
+    n: NDArray[Any],
+    touch: float,
+) -> Traction:
+    """Return what acts on points.
+
+    Args:
+        law: The friction.
+        points: The points.
+        delta: From anchors to points, shape ``(n, gdim)``.
+        gap: Shape ``(n,)``.
+        n: Normals, towards the points, shape ``(n, gdim)``.
+        touch: Gap at which points touch: round-off of positions.
+    """
+    inside = gap.real <= touch
+    p = np.where(inside, -points.stiffness * gap, 0.0)
+    none = np.zeros(len(p), dtype=bool)
+    if law.smooth:
+        return Traction(p, np.zeros_like(n), inside, none)
+    shear = np.where(inside[:, None], _trial(points, delta, gap, n, touch), 0.0)
+    size = np.sqrt((shear * shear).sum(axis=1))
+    bound, _ = law.bound(p)
+    slips = inside & (size.real > bound.real + points.tangential * touch)
+    factor = np.where(slips, bound / np.where(slips, size, 1.0), 1.0)
+    return Traction(p, factor[:, None] * shear, inside, slips)
+
+
+def derivative(
+    law: Coulomb,
+    points: Points,
+    delta: NDArray[np.float64],
+    gap: NDArray[np.float64],
+    n: NDArray[np.float64],
+    H: NDArray[np.float64],
+    touch: float,
+) -> NDArray[np.float64]:
+    """Return the derivative of ``p n + t`` by positions of points that are all in contact.
+
+    Args:
+        law: As for :func:`traction`, as all that is not said here.
+        points: As there.
+        delta: As there.
+        gap: As there.
+        n: As there.
+        H: Derivatives of the normals, shape ``(n, gdim, gdim)``.
+        touch: As there.
+
+    Returns:
+        Shape ``(n, gdim, gdim)``.
+    """
+    acts = traction(law, points, delta, gap, n, touch)
+    dp = -points.stiffness[:, None] * n
+    D = n[:, :, None] * dp[:, None, :] + acts.pressure[:, None, None] * H
+    if law.smooth:
+        return D
+    share, slope = _since_touch(points, gap, touch)
+    depth = (n * delta).sum(axis=1)
+    along = delta - n * depth[:, None]
+    bent = np.einsum("nij,nj->ni", H, delta)
+    eye = np.eye(n.shape[1])
+    moved = eye - n[:, :, None] * n[:, None, :]
+    moved = moved - depth[:, None, None] * H - n[:, :, None] * bent[:, None, :]
+    dt = share[:, None, None] * moved + along[:, :, None] * (slope[:, None] * n)[:, None, :]
+    dt *= -points.tangential[:, None, None]
+    if acts.slips.any():
+        s = acts.slips
+        trial = _trial(points, delta, gap, n, touch)[s]
+        size = np.linalg.norm(trial, axis=1)
+        tau = trial / size[:, None]
+        bound, grows = law.bound(acts.pressure[s])
+        turned = (bound / size)[:, None, None] * (eye - tau[:, :, None] * tau[:, None, :])
+        dt[s] = turned @ dt[s] + tau[:, :, None] * (np.asarray(grows)[:, None] * dp[s])[:, None, :]
+    return np.asarray(D + dt)

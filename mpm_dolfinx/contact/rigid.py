@@ -1,0 +1,553 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Contact of a body with a rigid obstacle on a path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import mesh
+
+from ..errors import ConvergenceError, MPMError, agree, agreed, as_ours
+from ..io.snapshot import Kept, Taken
+from ..meshes.remesh import Column
+from ..parallel.given import require_same
+from ..particles.particles import Particles
+from ..system.term import PointMaterial
+from .contact import Contact, Outcome, as_positive, stiffness
+from .law import Coulomb, Points, as_friction, derivative, traction
+from .shapes import Shape
+from .surface import PointMatrix, Surface, global_dofs
+
+__all__ = ["Rigid"]
+
+#: Penetration, over the thickness of the domain behind, from which a body is in an obstacle
+#: rather than on it.
+DEEP = 1.0
+#: The same for a body as it is given.
+OVERLAP = 0.1
+#: Most places on the way of a point that are looked at.
+MOST_PLACES = 1000
+
+
+class _Pose(NamedTuple):
+    """Where a shape is: ``x = pivot + offset + Q (y - pivot)``.
+
+    Attributes:
+        offset: Shape ``(gdim,)``.
+        angle: Angle, ``(1,)``, or vector of rotation ``(3,)``.
+    """
+
+    offset: NDArray[np.float64]
+    angle: NDArray[np.float64]
+
+    @property
+    def Q(self) -> NDArray[np.float64]:
+        """The rotation (by Rodrigues' formula in space)."""
+        if len(self.angle) == 1:
+            c, s = np.cos(self.angle[0]), np.sin(self.angle[0])
+            return np.array([[c, -s], [s, c]])
+        size = float(np.linalg.norm(self.angle))
+        if size == 0.0:
+            return np.eye(3)
+        x, y, z = self.angle / size
+        W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        return np.asarray(np.eye(3) + np.sin(size) * W + (1.0 - np.cos(size)) * W @ W)
+
+
+@dataclass(frozen=True)
+class _Memory:
+    """What is known of the last converged step.
+
+    Attributes:
+        pose: Where the shape was.
+        touched: Which points were in contact, shape ``(m, nq)``.
+        anchor: Their anchors, or where points were, in the frame of the shape, ``(m, nq, gdim)``.
+        gap: Shape ``(m, nq)``.
+        normal: Normals, in the frame of the shape.
+        outcome: What acted.
+    """
+
+    pose: _Pose
+    touched: NDArray[np.bool_]
+    anchor: NDArray[np.float64]
+    gap: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    outcome: Outcome
+
+
+class Rigid(Contact):
+    """Contact of a body with a rigid obstacle, with friction.
+
+    Points on the body's facets may touch the obstacle, stick, slide and lift off. The pressure is
+    ``penalty M / h`` times the penetration, M a modulus of the material and h the thickness of the
+    domain behind the facet (over the square of its degree), so that ``penalty`` is a number
+    without unit. It makes the
+    body softer by about one layer of domains, and should stay near 1: where facets
+    are chords of a curved surface, a larger one puts all load on their ends. Friction
+    remembers where each point has stuck to the obstacle.
+
+    Give it to ``QuasiStaticProblem(..., terms=[contact])``, and move the obstacle along a path::
+
+        pile = mpm.contact.Rigid(soil, mpm.contact.polygon(corners, radius=0.05), friction=0.3)
+        problem = mpm.QuasiStaticProblem(soil, law, terms=[pile])
+        problem.solve(40, update=lambda t: pile.move((0.0, -0.5 * t)))
+
+    Args:
+        particles: The body.
+        shape: The obstacle, of :mod:`mpm_dolfinx.contact`, as it lies at the beginning.
+        friction: Coefficient of friction, or a :class:`Coulomb` with cohesion and a limit.
+        facet_tags: Tags of the body's facets, where not all of its boundary may touch.
+        tag: The tag of those that may.
+        modulus: Modulus of the body; that of the material by default.
+        penalty: Stiffness in the normal direction, without unit.
+        tangential_penalty: Stiffness of points that stick, without unit.
+        quadrature_degree: Degree of the rule on each facet; ``None`` is one more than twice the
+            degree of the shape functions.
+        axisymmetric: Whether ``x[0]`` is a radius.
+
+    Raises:
+        MPMError: What makes no sense.
+    """
+
+    def __init__(
+        self,
+        particles: Particles,
+        shape: Shape,
+        friction: float | Coulomb = 0.0,
+        *,
+        facet_tags: mesh.MeshTags | None = None,
+        tag: int | None = None,
+        modulus: float | None = None,
+        penalty: float = 1.0,
+        tangential_penalty: float = 1.0,
+        quadrature_degree: int | None = None,
+        axisymmetric: bool = False,
+    ) -> None:
+        if not isinstance(particles, Particles):
+            raise MPMError(f"A contact needs mpm.Particles, not {type(particles).__name__}.")
+        gdim = particles.mesh.geometry.dim
+        if not isinstance(shape, Shape):
+            raise MPMError(
+                f"A Rigid needs a shape of mpm.contact, such as plane(...) or disc(...), not "
+                f"{type(shape).__name__}."
+            )
+        if shape.dim != gdim:
+            raise MPMError(f"The shape is one in {shape.dim} dimensions, the body in {gdim}.")
+        law = as_friction(friction)
+        require_same(
+            particles.mesh.comm,
+            friction=[law.friction, law.cohesion, law.limit],
+            tag=tag,
+            modulus=modulus,
+            penalty=penalty,
+            tangential_penalty=tangential_penalty,
+            quadrature_degree=quadrature_degree,
+            axisymmetric=axisymmetric,
+        )
+        super().__init__([particles], axisymmetric)
+        self.shape = shape
+        self.friction = law
+        self._modulus = None if modulus is None else as_positive(modulus, "modulus")
+        self._penalty = as_positive(penalty, "penalty")
+        self._tangential = as_positive(tangential_penalty, "tangential_penalty")
+        self._surface = Surface(
+            particles, facet_tags, tag, quadrature_degree, axisymmetric, "A Rigid"
+        )
+        self._pose = _Pose(np.zeros(gdim), np.zeros(1 if gdim == 2 else 3))
+        self._memory: _Memory | None = None
+        self._trial: _Memory | None = None
+
+    # -- The path -------------------------------------------------------------------------------
+
+    def move(self, offset: Any, angle: Any = 0.0) -> None:
+        """Put the obstacle where it is to be at the end of the next step.
+
+        It turns about the pivot of its shape, and is shifted then. Both are counted from where it
+        was made, not from where it is.
+
+        Args:
+            offset: Shape ``(gdim,)``.
+            angle: Angle in radians, anticlockwise; in space the vector of rotation, shape ``(3,)``,
+                whose length is the angle.
+
+        Raises:
+            MPMError: No finite numbers of these shapes.
+        """
+        gdim = len(self._pose.offset)
+        count = len(self._pose.angle)
+        try:
+            to = np.array(offset, dtype=np.float64)
+            turn = np.atleast_1d(np.array(angle, dtype=np.float64))
+        except (TypeError, ValueError):
+            to = turn = np.zeros(0)
+        if count == 3 and turn.shape == (1,) and turn[0] == 0.0:
+            turn = np.zeros(3)
+        good = to.shape == (gdim,) and turn.shape == (count,)
+        if not good or not (np.isfinite(to).all() and np.isfinite(turn).all()):
+            raise MPMError(
+                f"An obstacle moves by an offset of {gdim} numbers and an angle of {count}, not "
+                f"{offset!r} and {angle!r}."
+            )
+        self._pose = _Pose(to, turn)
+
+    @property
+    def offset(self) -> NDArray[np.float64]:
+        """Offset of the obstacle now, shape ``(gdim,)``."""
+        return self._pose.offset.copy()
+
+    @property
+    def angle(self) -> NDArray[np.float64]:
+        """Angle of the obstacle now, shape ``(1,)``, or its vector of rotation, ``(3,)``."""
+        return self._pose.angle.copy()
+
+    def _framed(self, x: NDArray[Any], pose: _Pose) -> NDArray[Any]:
+        """Return positions in the frame of the shape."""
+        return (x - self.shape.pivot - pose.offset) @ pose.Q + self.shape.pivot
+
+    # -- The term -------------------------------------------------------------------------------
+
+    @property
+    def symmetric(self) -> bool:
+        """See :attr:`Term.symmetric`."""
+        return self.friction.smooth
+
+    def join(
+        self,
+        number: int,
+        bodies: Sequence[Particles],
+        materials: Sequence[PointMaterial | None],
+    ) -> None:
+        """See :meth:`Term.join`."""
+        super().join(number, bodies, materials)
+        first = self._memory is None
+        self._settle()
+        if first:
+            assert self._memory is not None
+            self._require_apart(self._memory)
+
+    def _settle(self) -> None:
+        """Take the present mesh of the body (collective)."""
+        if self._surface.settle():
+            k = stiffness(self._surface, self._modulus, self._materials[0], "A Rigid")
+            self._stiffness = np.repeat(k[:, None], self._surface.nq, axis=1)
+            self._new_pattern()
+            self._begin_anew(self._pose)
+
+    def _begin_anew(self, pose: _Pose) -> None:
+        """Take the converged positions for those of points that nothing has touched yet."""
+        x = self._surface.positions(converged=True)
+        m, nq, gdim = x.shape
+        with agree(self._comm):
+            y = self._framed(x, pose).reshape(-1, gdim)
+            phi, n = self.shape.distance(y)
+        none = np.zeros((m, nq), dtype=bool)
+        nothing = np.zeros((m, nq))
+        still = Outcome(x, phi.reshape(m, nq), nothing, np.zeros_like(x), none, none)
+        self._memory = self._trial = _Memory(
+            pose, none, y.reshape(x.shape), phi.reshape(m, nq), n.reshape(x.shape), still
+        )
+
+    def _new_pattern(self) -> None:
+        W = self.bodies[0].W
+        self._matrix = PointMatrix(W, W)
+
+    def _require_apart(self, memory: _Memory) -> None:
+        """Raise an error where the body is in the obstacle from the beginning (collective)."""
+        surface = self._surface
+        depth = -memory.gap / surface.thickness[:, None]
+        deep = (depth > OVERLAP) & (surface.weights > 0.0)
+        with agree(self._comm):
+            if deep.any():
+                place = np.unravel_index(np.argmax(np.where(deep, depth, 0.0)), depth.shape)
+                where = tuple(float(f"{x:.6g}") for x in memory.outcome.positions[place])
+                index = self.bodies[0].global_index[surface.cells[deep.any(axis=1)]]
+                raise MPMError(
+                    f"The body begins within the obstacle of a Rigid: {{particles}} are up to "
+                    f"{-float(memory.gap[place]):.3g} deep in it, at {where}; move one of them "
+                    "away.",
+                    index,
+                )
+
+    def begin(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.begin`."""
+        self._settle()
+        self._surface.look_at_deleted()
+        assert self._memory is not None
+        memory = self._memory
+        self._new_pattern()
+        with agree(self._comm):
+            x = memory.outcome.positions
+            if self._passes(memory, x, self._pose):
+                raise ConvergenceError(
+                    "The obstacle of a Rigid moves through the body in one step; take smaller steps"
+                )
+        return ()
+
+    def _passes(self, memory: _Memory, x: NDArray[np.float64], pose: _Pose) -> bool:
+        """Return whether points get deep into the obstacle on a straight way.
+
+        Args:
+            memory: Where they begin.
+            x: Where they end, shape ``(m, nq, gdim)``.
+            pose: Where the obstacle ends.
+        """
+        surface = self._surface
+        deep = DEEP * np.broadcast_to(surface.thickness[:, None], memory.gap.shape)
+        a = self._framed(memory.outcome.positions, memory.pose)
+        b = self._framed(x, pose)
+        way = np.linalg.norm(b - a, axis=2)
+        reached = memory.gap - way < -deep
+        for which in np.argwhere(reached & (surface.weights > 0.0)):
+            at = tuple(which)
+            count = min(int(np.ceil(2.0 * way[at] / deep[at])) + 1, MOST_PLACES)
+            share = np.linspace(0.0, 1.0, count + 1)[:, None]
+            phi, _ = self.shape.distance(a[at] + share * (b[at] - a[at]))
+            if phi.min() < -deep[at] - max(-memory.gap[at], 0.0):
+                return True
+        return False
+
+    def update(self) -> MPMError | None:
+        """See :meth:`Term.update`."""
+        try:
+            self._trial = self._evaluated()
+        except MPMError as error:
+            return error
+        return None
+
+    def _points(self, memory: _Memory) -> Points:
+        k = self._stiffness.ravel()
+        gdim = memory.anchor.shape[2]
+        return Points(
+            self._penalty * k,
+            self._tangential * k,
+            memory.touched.ravel(),
+            memory.anchor.reshape(-1, gdim),
+            memory.gap.ravel(),
+        )
+
+    def _evaluated(self) -> _Memory:
+        """Return what acts at the present positions."""
+        memory, pose = self._memory, self._pose
+        assert memory is not None
+        x = self._surface.positions()
+        m, nq, gdim = x.shape
+        y = self._framed(x, pose).reshape(-1, gdim)
+        try:
+            phi, n = self.shape.distance(y)
+        except MPMError:
+            raise
+        except Exception as error:
+            raise as_ours(error, "The shape of a Rigid") from error
+        points = self._points(memory)
+        acts = traction(self.friction, points, y - points.anchor, phi, n, self._surface.touch)
+        force = (acts.pressure[:, None] * n + acts.shear) @ pose.Q.T
+        shape = (m, nq)
+        outcome = Outcome(
+            x,
+            phi.reshape(shape),
+            acts.pressure.reshape(shape),
+            force.reshape(x.shape),
+            acts.inside.reshape(shape),
+            acts.slips.reshape(shape),
+        )
+        return _Memory(
+            pose,
+            outcome.inside,
+            self._anchors(points, y, phi, n, acts.shear, outcome).reshape(x.shape),
+            outcome.gap,
+            n.reshape(x.shape),
+            outcome,
+        )
+
+    def _anchors(
+        self,
+        points: Points,
+        y: NDArray[np.float64],
+        phi: NDArray[np.float64],
+        n: NDArray[np.float64],
+        shear: NDArray[np.float64],
+        outcome: Outcome,
+    ) -> NDArray[np.float64]:
+        """Return the anchors to be remembered, and where points were that touch nothing."""
+        inside, slips = outcome.inside.ravel(), outcome.slips.ravel()
+        foot = y - phi[:, None] * n + shear / points.tangential[:, None]
+        stays = inside & ~slips & points.touched
+        anchor = np.where(stays[:, None], points.anchor, foot)
+        return np.where(inside[:, None], anchor, y)
+
+    def smooth(self) -> bool:
+        """See :meth:`Term.smooth`: contact is not."""
+        assert self._trial is not None and self._memory is not None
+        return not bool(self._trial.touched.any() or self._memory.touched.any())
+
+    def residuals(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.residuals`."""
+        assert self._trial is not None
+        return [self._surface.force(self._trial.outcome.traction, -1.0)]
+
+    def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
+        """See :meth:`Term.tangents`."""
+        assert self._trial is not None and self._memory is not None
+        trial, memory, surface = self._trial, self._memory, self._surface
+        which = np.flatnonzero(
+            trial.touched.any(axis=1) & (surface.weights.max(axis=1, initial=0.0) > 0.0)
+        )
+        D = np.zeros((len(which), surface.nq, surface.gdim, surface.gdim))
+        inside = trial.touched[which]
+        flat = (which[:, None] * surface.nq + np.arange(surface.nq))[inside]
+        if len(flat):
+            gdim, Q = surface.gdim, trial.pose.Q
+            y = self._framed(trial.outcome.positions, trial.pose).reshape(-1, gdim)[flat]
+            n = trial.normal.reshape(-1, gdim)[flat]
+            points = self._points(memory).of(flat)
+            D[inside] = (
+                Q
+                @ derivative(
+                    self.friction,
+                    points,
+                    y - points.anchor,
+                    trial.gap.ravel()[flat],
+                    n,
+                    self.shape.curvature(y),
+                    surface.touch,
+                )
+                @ Q.T
+            )
+        N, w = surface.shapes[which], surface.weights[which]
+        k = N.shape[2] * surface.gdim
+        blocks = np.einsum("mq,mqa,mqb,mqij->maibj", -w, N, N, D, optimize=True)
+        dofs = global_dofs(self.bodies[0].W, surface.nodes[which])
+        K = self._matrix.of(which.tolist(), dofs, dofs, blocks.reshape(-1, k, k))
+        return {} if K is None else {(0, 0): K}
+
+    # -- What it remembers ------------------------------------------------------------------------
+
+    def commit(self) -> Callable[[], None]:
+        """See :meth:`Term.commit`.
+
+        Raises:
+            ConvergenceError: The body has gone through the obstacle.
+        """
+        before, trial = self._memory, self._trial
+        assert before is not None and trial is not None
+        failure: MPMError | None = None
+        turned = (before.normal * trial.normal).sum(axis=2) < -0.5
+        flipped = before.touched & trial.touched & turned
+        if flipped.any() or self._passes(before, trial.outcome.positions, trial.pose):
+            failure = ConvergenceError(
+                "A body goes through the obstacle of a Rigid in one step; take smaller steps"
+            )
+        if (failure := agreed(self._comm, failure)) is not None:
+            raise failure
+        self._memory = trial
+
+        def undo() -> None:
+            self._memory = before
+
+        return undo
+
+    def roll_back(self) -> None:
+        """See :meth:`Term.roll_back`."""
+        assert self._memory is not None
+        self._trial = self._memory
+        self._pose = self._memory.pose
+
+    def _outcome(self) -> tuple[Surface, Outcome]:
+        if self._memory is None:
+            raise MPMError("A contact belongs to no problem yet; give it as terms=[contact].")
+        return self._surface, self._memory.outcome
+
+    def kept(self) -> Sequence[Kept]:
+        """See :meth:`Term.kept`."""
+        return [_Anchors(self, f"contact{self._number}")]
+
+    def columns(self, body: int | None) -> dict[str, Column]:
+        """Return what is kept on a body, by its number in the problem."""
+        if body is None or body != self._places[0]:
+            return {}
+        assert self._memory is not None
+        memory, surface = self._memory, self._surface
+        return {
+            **surface.columns(),
+            "anchor": surface.column(memory.anchor),
+            "touches": surface.column(memory.touched),
+            "slips": surface.column(memory.outcome.slips),
+        }
+
+    def numbers(self) -> dict[str, Any]:
+        """Return where the obstacle was."""
+        assert self._memory is not None
+        pose = self._memory.pose
+        return {"offset": pose.offset.tolist(), "angle": pose.angle.tolist()}
+
+    def take(self, taken: Taken) -> None:
+        """Take what was kept (collective)."""
+        columns = taken.columns[self._places[0]]
+        pose = _Pose(*(np.array(taken.numbers[name]) for name in ("offset", "angle")))
+        surface = self._surface
+        self._settle()
+        surface.restore(columns)
+        k = stiffness(surface, self._modulus, self._materials[0], "A Rigid")
+        self._stiffness = np.repeat(k[:, None], surface.nq, axis=1)
+        self._pose = pose
+        self._begin_anew(pose)
+        assert self._memory is not None
+        touched = surface.of_column(columns["touches"])
+        anchor = np.where(
+            touched[:, :, None], surface.of_column(columns["anchor"]), self._memory.anchor
+        )
+        found = self._memory
+        self._memory = _Memory(pose, touched, anchor, found.gap, found.normal, found.outcome)
+        now = self._evaluated_at_converged()
+        outcome = Outcome(
+            now.outcome.positions,
+            now.outcome.gap,
+            now.outcome.pressure,
+            now.outcome.traction,
+            touched,
+            surface.of_column(columns["slips"]),
+        )
+        self._memory = self._trial = _Memory(
+            pose, touched, anchor, found.gap, found.normal, outcome
+        )
+
+    def _evaluated_at_converged(self) -> _Memory:
+        body = self.bodies[0]
+        present = body.displacement.x.array.copy()
+        body.displacement.x.array[:] = body.converged_displacement
+        try:
+            return self._evaluated()
+        finally:
+            body.displacement.x.array[:] = present
+
+
+class _Anchors(Kept):
+    """What a contact remembers.
+
+    Args:
+        contact: The contact.
+        key: See :class:`Kept`.
+    """
+
+    def __init__(self, contact: Rigid, key: str) -> None:
+        self._contact, self.key = contact, key
+
+    def numbers(self) -> dict[str, Any]:
+        """See :class:`Kept`."""
+        return self._contact.numbers()
+
+    def columns(self, body: int | None) -> dict[str, Column]:
+        """See :class:`Kept`."""
+        return self._contact.columns(body)
+
+    def restore(self, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        self._contact.take(taken)

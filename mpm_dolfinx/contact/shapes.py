@@ -1,0 +1,436 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Rigid shapes by their signed distance, positive outside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import MPMError, as_ours
+
+__all__ = [
+    "Shape",
+    "box",
+    "cavity",
+    "cylinder",
+    "disc",
+    "plane",
+    "polygon",
+    "signed_distance",
+    "sphere",
+]
+
+#: Steps of the differences of a user's distance, relative to the size of coordinates.
+FIRST, SECOND = 1e-6, 1e-4
+#: How far a gradient of a distance may be from a unit vector.
+UNIT = 1e-2
+#: What keeps a square root off zero, far below any square of a length.
+TINY = 1e-200
+
+
+class Shape:
+    """A rigid shape, in the place where it is before it moves.
+
+    Args:
+        dim: Dimension of space.
+        pivot: The point about which it turns, shape ``(dim,)``.
+
+    Attributes:
+        dim: As given.
+        pivot: As given.
+    """
+
+    def __init__(self, dim: int, pivot: Any) -> None:
+        self.dim = dim
+        self.pivot: NDArray[np.float64] = np.asarray(pivot, dtype=np.float64)
+
+    def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the signed distance of points and its gradient, ``(n,)`` and ``(n, dim)``.
+
+        Args:
+            y: Points, shape ``(n, dim)``.
+        """
+        raise NotImplementedError
+
+    def curvature(self, y: NDArray[Any]) -> NDArray[Any]:
+        """Return the second derivatives of the distance at points, shape ``(n, dim, dim)``."""
+        raise NotImplementedError
+
+
+class _Plane(Shape):
+    def __init__(self, point: NDArray[np.float64], normal: NDArray[np.float64]) -> None:
+        super().__init__(len(point), point)
+        self._normal = normal
+
+    def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        normals = np.broadcast_to(self._normal, y.shape)
+        return (y - self.pivot) @ self._normal, normals
+
+    def curvature(self, y: NDArray[Any]) -> NDArray[Any]:
+        return np.zeros((len(y), self.dim, self.dim), dtype=y.dtype)
+
+
+class _Round(Shape):
+    """A disc, a sphere, or a cylinder: what is nearer to a point or to an axis than a radius."""
+
+    def __init__(
+        self,
+        centre: NDArray[np.float64],
+        radius: float,
+        axis: NDArray[np.float64] | None = None,
+    ) -> None:
+        super().__init__(len(centre), centre)
+        self._radius = radius
+        self._across = np.eye(self.dim)
+        if axis is not None:
+            self._across -= np.outer(axis, axis)
+
+    def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        arm = (y - self.pivot) @ self._across
+        length = np.sqrt((arm * arm).sum(axis=1) + TINY)
+        return length - self._radius, arm / length[:, None]
+
+    def curvature(self, y: NDArray[Any]) -> NDArray[Any]:
+        phi, n = self.distance(y)
+        turn = self._across - n[:, :, None] * n[:, None, :]
+        return np.asarray(turn / (phi + self._radius)[:, None, None])
+
+
+class _Box(Shape):
+    """A box with rounded edges."""
+
+    def __init__(
+        self, lower: NDArray[np.float64], upper: NDArray[np.float64], radius: float
+    ) -> None:
+        super().__init__(len(lower), (lower + upper) / 2)
+        self._half = (upper - lower) / 2 - radius
+        self._radius = radius
+
+    def _beyond(
+        self, y: NDArray[Any]
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_], NDArray[np.int64]]:
+        """Return side and excess along each axis, which count, and the largest one."""
+        arm = y - self.pivot
+        side = np.where(arm.real < 0.0, -1.0, 1.0)
+        excess = side * arm - self._half
+        return side, excess, excess.real > 0.0, excess.real.argmax(axis=1)
+
+    def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        side, excess, out, most = self._beyond(y)
+        row = np.arange(len(y))
+        outside = out.any(axis=1)
+        arm = np.where(out, excess, 0.0)
+        length = np.sqrt((arm * arm).sum(axis=1) + TINY)
+        flat = np.zeros_like(arm)
+        flat[row, most] = 1.0
+        n = side * np.where(outside[:, None], arm / length[:, None], flat)
+        return np.where(outside, length, excess[row, most]) - self._radius, n
+
+    def curvature(self, y: NDArray[Any]) -> NDArray[Any]:
+        side, excess, out, _ = self._beyond(y)
+        arm = np.where(out, excess, 0.0)
+        length = np.sqrt((arm * arm).sum(axis=1) + TINY)
+        n = side * arm / length[:, None]
+        across = np.eye(self.dim) * out[:, :, None] - n[:, :, None] * n[:, None, :]
+        edge = np.count_nonzero(out, axis=1) > 1
+        return np.where(edge[:, None, None], across / length[:, None, None], 0.0)
+
+
+class _Polygon(Shape):
+    """A polygon with rounded corners: an inner polygon and all that is near to it."""
+
+    def __init__(self, corners: NDArray[np.float64], radius: float) -> None:
+        super().__init__(2, corners.mean(axis=0))
+        self._corners, self._radius = corners, radius
+        self._edges = np.roll(corners, -1, axis=0) - corners
+        self._squares = (self._edges**2).sum(axis=1)
+        lengths = np.sqrt(self._squares)[:, None]
+        self._normals = np.column_stack([self._edges[:, 1], -self._edges[:, 0]]) / lengths
+
+    def _nearest(
+        self, y: NDArray[Any]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the nearest edge of each point, its nearest corner, and which of both is near."""
+        x = y.real
+        arm = x[:, None] - self._corners
+        along = np.clip((arm * self._edges).sum(axis=2) / self._squares, 0.0, 1.0)
+        foot = arm - along[:, :, None] * self._edges
+        edge = (foot**2).sum(axis=2).argmin(axis=1)
+        place = along[np.arange(len(y)), edge]
+        corner = (edge + (place >= 1.0)) % len(self._corners)
+        return edge, corner, (place > 0.0) & (place < 1.0)
+
+    def _inside(self, x: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether points are in the inner polygon, by the even-odd rule."""
+        a, b = self._corners, self._corners + self._edges
+        across = (a[:, 1] > x[:, None, 1]) != (b[:, 1] > x[:, None, 1])
+        rise = np.where(self._edges[:, 1] == 0.0, 1.0, self._edges[:, 1])
+        at = a[:, 0] + (x[:, None, 1] - a[:, 1]) / rise * self._edges[:, 0]
+        return np.asarray(np.count_nonzero(across & (x[:, None, 0] < at), axis=1) % 2 == 1)
+
+    def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        edge, corner, on_edge = self._nearest(y)
+        normals = self._normals[edge]
+        flat = ((y - self._corners[edge]) * normals).sum(axis=1)
+        arm = y - self._corners[corner]
+        length = np.sqrt((arm * arm).sum(axis=1) + TINY)
+        sign = np.where(self._inside(y.real), -1.0, 1.0)
+        n = np.where(on_edge[:, None], normals, (sign / length)[:, None] * arm)
+        return np.where(on_edge, flat, sign * length) - self._radius, n
+
+    def curvature(self, y: NDArray[Any]) -> NDArray[Any]:
+        _, corner, on_edge = self._nearest(y)
+        arm = y - self._corners[corner]
+        length = np.sqrt((arm * arm).sum(axis=1) + TINY)
+        n = arm / length[:, None]
+        sign = np.where(self._inside(y.real), -1.0, 1.0)
+        across = (np.eye(2) - n[:, :, None] * n[:, None, :]) * (sign / length)[:, None, None]
+        return np.where(on_edge[:, None, None], 0.0, across)
+
+
+class _Cavity(Shape):
+    def __init__(self, shape: Shape) -> None:
+        super().__init__(shape.dim, shape.pivot)
+        self._shape = shape
+
+    def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        phi, n = self._shape.distance(y)
+        return -phi, -n
+
+    def curvature(self, y: NDArray[Any]) -> NDArray[Any]:
+        return -self._shape.curvature(y)
+
+
+class _Given(Shape):
+    """A shape by a user's distance, whose derivatives are differences."""
+
+    def __init__(self, function: Callable[..., Any], dim: int, pivot: Any) -> None:
+        super().__init__(dim, pivot)
+        self._function = function
+
+    def _values(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        try:
+            phi = np.asarray(self._function(y), dtype=np.float64)
+        except Exception as error:
+            raise as_ours(error, "The signed distance of a shape") from error
+        if phi.shape != (len(y),) or not np.isfinite(phi).all():
+            raise MPMError(
+                f"A signed distance must return {len(y)} finite numbers for points of the shape "
+                f"{y.shape}, not an array of the shape {phi.shape}."
+            )
+        return phi
+
+    def _slopes(self, y: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+        ahead = [self._values(y + step * e) for e in np.eye(self.dim)]
+        behind = [self._values(y - step * e) for e in np.eye(self.dim)]
+        return np.stack([(a - b) / (2 * step) for a, b in zip(ahead, behind, strict=True)], axis=1)
+
+    def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        phi = self._values(y)
+        n = self._slopes(y, FIRST * _size(y))
+        length = np.linalg.norm(n, axis=1)
+        near = np.abs(phi) <= FIRST ** (1 / 3) * _size(y)
+        if np.any(near & (np.abs(length - 1.0) > UNIT)):
+            wrong = length[near & (np.abs(length - 1.0) > UNIT)][0]
+            raise MPMError(
+                f"The gradient of a signed distance has the length {wrong:.3g} near the surface, "
+                "but that of a distance has 1; divide the function by the length of its gradient."
+            )
+        return phi, n / np.maximum(length, UNIT)[:, None]
+
+    def curvature(self, y: NDArray[Any]) -> NDArray[Any]:
+        step = SECOND * _size(y)
+        rows = [
+            (self._slopes(y + step * e, step) - self._slopes(y - step * e, step)) / (2 * step)
+            for e in np.eye(self.dim)
+        ]
+        H = np.stack(rows, axis=1)
+        return np.asarray((H + H.swapaxes(1, 2)) / 2)
+
+
+def _size(y: NDArray[np.float64]) -> float:
+    return float(np.abs(y).max(initial=1e-300))
+
+
+def plane(point: Any, normal: Any) -> Shape:
+    """Return the half-space behind a line or plane.
+
+    Args:
+        point: A point of it, shape ``(gdim,)``.
+        normal: Its normal, away from the obstacle, towards the body; any length.
+
+    Raises:
+        MPMError: No point and direction.
+    """
+    at = _vector(point, "point")
+    return _Plane(at, _direction(normal, "normal", len(at)))
+
+
+def disc(centre: Any, radius: float) -> Shape:
+    """Return a disc in the plane.
+
+    Args:
+        centre: Shape ``(2,)``.
+        radius: Positive.
+
+    Raises:
+        MPMError: No centre in the plane, or no radius.
+    """
+    return _Round(_vector(centre, "centre", 2), _positive(radius, "radius"))
+
+
+def sphere(centre: Any, radius: float) -> Shape:
+    """Return a ball in space; see :func:`disc`, with a centre of shape ``(3,)``."""
+    return _Round(_vector(centre, "centre", 3), _positive(radius, "radius"))
+
+
+def cylinder(point: Any, axis: Any, radius: float) -> Shape:
+    """Return a cylinder in space without ends.
+
+    Args:
+        point: A point of its axis, shape ``(3,)``.
+        axis: Direction of the axis, any length.
+        radius: Positive.
+
+    Raises:
+        MPMError: No axis in space, or no radius.
+    """
+    at = _vector(point, "point", 3)
+    return _Round(at, _positive(radius, "radius"), _direction(axis, "axis", 3))
+
+
+def box(lower: Any, upper: Any, radius: float = 0.0) -> Shape:
+    """Return a rectangle or a box along the axes, with rounded edges within its outline.
+
+    Args:
+        lower: Its lowest corner, shape ``(gdim,)``.
+        upper: Its highest corner.
+        radius: Of the edges. A sharp edge cuts in unseen between two points of a body; take
+            at least half the size of a domain.
+
+    Raises:
+        MPMError: No box, or a radius above half its smallest side.
+    """
+    low = _vector(lower, "lower")
+    high = _vector(upper, "upper", len(low))
+    if not np.all(high > low):
+        raise MPMError(f"A box needs lower below upper, not {lower!r} and {upper!r}.")
+    r = _radius(radius)
+    if 2.0 * r >= (high - low).min():
+        raise MPMError(f"The radius {r:g} of a box must be below half of its smallest side.")
+    return _Box(low, high, r)
+
+
+def polygon(corners: Any, radius: float = 0.0) -> Shape:
+    """Return a polygon in the plane, with corners rounded within its outline.
+
+    Args:
+        corners: One after the other, in either sense, shape ``(n, 2)``; edges must not cross.
+        radius: Of the outward corners; see :func:`box`.
+
+    Raises:
+        MPMError: No polygon, or one that is too small for the radius.
+    """
+    try:
+        given = np.asarray(corners, dtype=np.float64)
+    except (TypeError, ValueError):
+        given = np.zeros(0)
+    if given.ndim != 2 or given.shape[1] != 2 or len(given) < 3 or not np.isfinite(given).all():
+        raise MPMError(f"A polygon needs three corners (x, y) or more, not {corners!r}.")
+    ahead = np.roll(given, -1, axis=0)
+    area = float((given[:, 0] * ahead[:, 1] - given[:, 1] * ahead[:, 0]).sum()) / 2.0
+    extent = float(np.ptp(given, axis=0).max())
+    edges = ahead - given
+    lengths = np.linalg.norm(edges, axis=1)
+    if abs(area) <= 1e-12 * extent**2 or lengths.min() <= 1e-12 * extent:
+        raise MPMError("The corners of a polygon must enclose an area and differ from each other.")
+    if area < 0.0:
+        return polygon(given[::-1], radius)
+    r = _radius(radius)
+    if r == 0.0:
+        return _Polygon(given, 0.0)
+    inward = np.column_stack([-edges[:, 1], edges[:, 0]]) / lengths[:, None]
+    before = np.roll(inward, 1, axis=0)
+    share = 1.0 + (before * inward).sum(axis=1)
+    if share.min() <= 1e-9:
+        raise MPMError("A corner of a polygon turns back on itself and cannot be rounded.")
+    inner = given + r * (before + inward) / share[:, None]
+    left = ((np.roll(inner, -1, axis=0) - inner) * edges).sum(axis=1) / lengths
+    if left.min() <= 1e-9 * extent:
+        raise MPMError(f"The radius {r:g} is too large for the edges of this polygon.")
+    return _Polygon(inner, r)
+
+
+def cavity(shape: Shape) -> Shape:
+    """Return all that is outside of a shape, to hold bodies within it.
+
+    Args:
+        shape: The shape of the hole.
+
+    Raises:
+        MPMError: Something else than a shape.
+    """
+    if not isinstance(shape, Shape):
+        raise MPMError(f"A cavity needs a shape of mpm.contact, not {type(shape).__name__}.")
+    return _Cavity(shape)
+
+
+def signed_distance(function: Callable[..., Any], pivot: Any) -> Shape:
+    """Return a shape by its signed distance, positive outside.
+
+    Its derivatives are differences of second order, so the function must be as smooth as the
+    shape is, and a distance (a gradient of length one) near the surface.
+
+    Args:
+        function: Takes points of shape ``(n, gdim)``, as the shape lies before it moves, and
+            returns the distances, shape ``(n,)``.
+        pivot: The point about which the shape turns, shape ``(gdim,)``.
+
+    Raises:
+        MPMError: No function or no point.
+    """
+    if not callable(function):
+        raise MPMError(f"signed_distance needs a function of points, not {function!r}.")
+    at = _vector(pivot, "pivot")
+    return _Given(function, len(at), at)
+
+
+def _vector(value: Any, name: str, dim: int | None = None) -> NDArray[np.float64]:
+    try:
+        vector = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        vector = np.zeros(0)
+    dims = (2, 3) if dim is None else (dim,)
+    if vector.ndim != 1 or len(vector) not in dims or not np.isfinite(vector).all():
+        raise MPMError(
+            f"{name} must be {' or '.join(map(str, dims))} finite numbers, not {value!r}."
+        )
+    return vector
+
+
+def _direction(value: Any, name: str, dim: int) -> NDArray[np.float64]:
+    vector = _vector(value, name, dim)
+    length = float(np.linalg.norm(vector))
+    if length == 0.0:
+        raise MPMError(f"{name} must not be zero.")
+    return vector / length
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float | int | np.number) and not isinstance(value, bool)
+
+
+def _positive(value: Any, name: str) -> float:
+    if not _is_number(value) or not 0.0 < value < np.inf:
+        raise MPMError(f"{name} must be a positive number, not {value!r}.")
+    return float(value)
+
+
+def _radius(value: Any) -> float:
+    if not _is_number(value) or not 0.0 <= value < np.inf:
+        raise MPMError(f"radius must be a number from 0 on, not {value!r}.")
+    return float(value)

@@ -1,0 +1,376 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Points on facets of a body: where they are, what they weigh, forces and tangents on its nodes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+import basix
+from dolfinx import fem, la, mesh
+
+from .. import _compat
+from ..assembly.inputs import is_tag, known_tags
+from ..errors import MPMError
+from ..meshes.remesh import Column
+from ..particles.particles import Particles
+
+__all__ = ["Facets", "PointMatrix", "Surface"]
+
+#: Position, relative to the coordinates of a body, at which a point touches: their round-off.
+TOUCH = 1e-12
+
+
+class Facets:
+    """The facets of a body that may be in contact, on whatever mesh the body has.
+
+    Args:
+        particles: The body.
+        facet_tags: Tags of its facets, or ``None``.
+        tag: The tag of those that may be in contact; ``None``: the whole boundary.
+        what: What they are for, in a sentence.
+
+    Raises:
+        MPMError: Tags that are none.
+    """
+
+    def __init__(self, particles: Particles, facet_tags: Any, tag: Any, what: str) -> None:
+        body = particles.mesh
+        dim = body.topology.dim - 1
+        body.topology.create_connectivity(dim, dim + 1)
+        outer = mesh.exterior_facet_indices(body.topology)
+        if tag is not None or facet_tags is not None:
+            known = known_tags(particles, facet_tags, what)
+            if not is_tag(tag) or tag not in known:
+                raise MPMError(f"There is no facet tag {tag!r}; there are {sorted(known)}.")
+            known_tags(particles, facet_tags, what, [tag])
+            # (on any rank that knows the facet)
+            own = _marked(body, facet_tags.find(tag))
+            outer = np.intersect1d(_marked(body, outer), own)
+        else:
+            outer = _marked(body, outer)
+        # Tags are carried along where particles move; what a cut lays bare is none of them.
+        self.tags = mesh.meshtags(body, dim, outer, np.ones(len(outer), dtype=np.int32))
+        self._particles = particles
+
+    def settle(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return owned cells and their local facets, in the order of both (collective)."""
+        self.tags = self._particles.carry(self.tags)
+        body = self._particles.mesh
+        dim = body.topology.dim - 1
+        body.topology.create_connectivity(dim + 1, dim)
+        marked = np.zeros(_count(body, dim), dtype=bool)
+        marked[_marked(body, self.tags.indices)] = True
+        n = self._particles.num_local
+        of_cells = body.topology.connectivity(dim + 1, dim).array
+        of_cells = of_cells[: n * (len(of_cells) // max(_count(body, dim + 1), 1))]
+        cells, facets = (
+            np.nonzero(marked[of_cells.reshape(n, -1)]) if n else (np.zeros(0, int),) * 2
+        )
+        return cells.astype(np.int64), facets.astype(np.int64)
+
+
+def _count(domain: mesh.Mesh, dim: int) -> int:
+    index = domain.topology.index_map(dim)
+    return int(index.size_local + index.num_ghosts)
+
+
+def _marked(domain: mesh.Mesh, facets: NDArray[Any]) -> NDArray[np.int32]:
+    """Return facets that are marked on any rank, all that this one knows (collective)."""
+    dim = domain.topology.dim - 1
+    marks = la.vector(domain.topology.index_map(dim), 1)
+    marks.array[:] = 0.0
+    marks.array[facets] = 1.0
+    marks.scatter_reverse(la.InsertMode.add)
+    marks.scatter_forward()
+    return np.flatnonzero(marks.array > 0.0).astype(np.int32)
+
+
+class Surface:
+    """Quadrature points on facets of a body, in its undeformed shape and as it is displaced.
+
+    A body mesh never changes under it: :meth:`settle` is called where the body has another one.
+
+    Args:
+        particles: The body.
+        facet_tags: As for :class:`Facets`.
+        tag: As there.
+        degree: Degree of the rule on each facet; ``None`` is one more than twice the degree of
+            the shape functions.
+        axisymmetric: Whether ``x[0]`` is a radius.
+        what: As for :class:`Facets`.
+
+    Attributes:
+        particles: As given.
+        axisymmetric: As given.
+        nq: Number of points on each facet.
+        cells: Owned cell of each facet, shape ``(m,)``.
+        facets: Its local number in the cell, shape ``(m,)``.
+        nodes: Local nodes of W of each facet, shape ``(m, k)``.
+        shapes: Their shape functions at the points, shape ``(m, nq, k)``.
+        weights: Undeformed area of each point, all around the axis of a body of revolution,
+            shape ``(m, nq)``; 0 where deleted.
+        thickness: Undeformed volume over area of the domain behind each facet, shape ``(m,)``.
+        outward: Whether the normal that the facet's order of nodes gives points outwards, as
+            1 or -1, shape ``(m,)``.
+        extent: Largest coordinate of the undeformed body.
+    """
+
+    def __init__(
+        self,
+        particles: Particles,
+        facet_tags: Any,
+        tag: Any,
+        degree: int | None,
+        axisymmetric: bool,
+        what: str,
+    ) -> None:
+        if degree is None:
+            degree = 2 * int(particles.W.ufl_element().degree) + 1
+        if not isinstance(degree, int | np.integer) or degree < 0:
+            raise MPMError(
+                f"quadrature_degree of {what} must be a whole number from 0 on, not {degree!r}."
+            )
+        self.particles = particles
+        self.axisymmetric = axisymmetric
+        self._where = Facets(particles, facet_tags, tag, what)
+        self._degree = int(degree)
+        self._space: fem.FunctionSpace | None = None
+
+    def settle(self) -> bool:
+        """Take the present mesh of the body; return whether it is another one (collective)."""
+        body, W = self.particles.mesh, self.particles.W
+        if self._space is W:
+            return False
+        self._space = W
+        self.gdim = body.geometry.dim
+        self.cells, self.facets = self._where.settle()
+        element = self.particles.W.ufl_element().basix_element
+        cell, dim = body.basix_cell(), body.topology.dim - 1
+        corners, sides = basix.geometry(cell), basix.topology(cell)[dim]
+        count = len(sides)
+        kind = basix.cell.subentity_types(cell)[dim][0]
+        points, weights = map(np.asarray, basix.make_quadrature(kind, self._degree))
+        self.nq = len(weights)
+        x = W.tabulate_dof_coordinates()[:, : self.gdim]
+        m, k = len(self.cells), _nodes_of(kind, element.degree)
+        self.nodes = np.zeros((m, k), dtype=np.int64)
+        self.shapes = np.zeros((m, self.nq, k))
+        self.slopes = np.zeros((m, dim, self.nq, k))
+        for side in range(count):
+            here = self.facets == side
+            at = corners[sides[side]]
+            arms = at[1 : dim + 1] - at[0]
+            # (those of a discontinuous element belong to its cell; all others vanish here)
+            own = np.sort(
+                np.abs(element.tabulate(0, at[0] + _sample(kind) @ arms)[0, :, :, 0])
+                .max(axis=0)
+                .argsort(kind="stable")[-k:]
+            )
+            table = element.tabulate(1, at[0] + points @ arms)[:, :, own, 0]
+            self.nodes[here] = W.dofmap.list[self.cells[here]][:, own]
+            self.shapes[here] = table[0]
+            self.slopes[here] = np.einsum("ji,iqk->jqk", arms, table[1:])
+        edges = np.einsum("mjqk,mki->mqij", self.slopes, x[self.nodes])
+        area = np.sqrt(np.linalg.det(edges.swapaxes(2, 3) @ edges)) * weights
+        self._plain = area
+        middle = x[W.dofmap.list[self.cells]].mean(axis=1)
+        centre = np.einsum("mqk,mki->mi", self.shapes, x[self.nodes]) / self.nq
+        n = normals(edges).mean(axis=1)
+        self.outward = np.where(((centre - middle) * n).sum(axis=1) < 0.0, -1.0, 1.0)
+        self.thickness = self.particles.initial_volume[self.cells] / area.sum(axis=1)
+        extent = float(np.abs(self.particles.initial_domains).max(initial=0.0))
+        self.extent = float(body.comm.allreduce(extent, MPI.MAX))
+        self._around = np.ones_like(area)
+        if self.axisymmetric:
+            self._around = 2.0 * np.pi * self.undeformed()[:, :, 0]
+        self.look_at_deleted()
+        return True
+
+    def look_at_deleted(self) -> None:
+        """Take the weight from facets of domains that are deleted."""
+        there = ~self.particles.deleted[self.cells]
+        self.weights = self._plain * self._around * there[:, None]
+
+    @property
+    def touch(self) -> float:
+        """Gap at which points touch."""
+        return TOUCH * self.extent
+
+    def undeformed(self) -> NDArray[np.float64]:
+        """Return the points in the mesh, shape ``(m, nq, gdim)``."""
+        assert self._space is not None
+        x = self._space.tabulate_dof_coordinates()[:, : self.gdim]
+        return np.asarray(self.shapes @ x[self.nodes])
+
+    def node_positions(self, converged: bool = False) -> NDArray[np.float64]:
+        """Return positions of this rank's nodes of W, shape ``(N, gdim)``."""
+        if converged:
+            return self.particles.node_positions
+        assert self._space is not None
+        d = self.particles.displacement.x.array.reshape(-1, self.gdim)
+        return np.asarray(self._space.tabulate_dof_coordinates()[:, : self.gdim] + d)
+
+    def positions(self, converged: bool = False) -> NDArray[np.float64]:
+        """Return the points as the body is displaced, shape ``(m, nq, gdim)``."""
+        return np.asarray(self.shapes @ self.node_positions(converged)[self.nodes])
+
+    def force(self, tractions: NDArray[np.float64], sign: float = 1.0) -> PETSc.Vec:
+        """Return what tractions at the points do to the nodes of W (collective).
+
+        Args:
+            tractions: Per undeformed area, shape ``(m, nq, gdim)``.
+            sign: What they are multiplied by.
+        """
+        forces = np.einsum("mqk,mqi->mki", self.shapes, sign * self.weights[:, :, None] * tractions)
+        return nodal_vector(self.particles.W, self.nodes, forces)
+
+    # -- What is kept ---------------------------------------------------------------------------
+
+    def column(self, values: NDArray[Any]) -> Column:
+        """Return values at points ``(m, nq, ...)`` as a column on the facets of owned cells."""
+        body = self.particles.mesh
+        count = len(basix.topology(body.basix_cell())[body.topology.dim - 1])
+        shape = (self.particles.num_local, count, *values.shape[1:])
+        whole = np.zeros(shape, dtype=values.dtype)
+        whole[self.cells, self.facets] = values
+        return Column(whole, "facets")
+
+    def of_column(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the values at points that :meth:`column` was given."""
+        return np.asarray(values[self.cells, self.facets])
+
+    def columns(self) -> dict[str, Column]:
+        """Return undeformed areas and thicknesses, which another mesh does not show."""
+        thickness = np.repeat(self.thickness[:, None], self.nq, axis=1)
+        return {"area": self.column(self._plain), "thickness": self.column(thickness)}
+
+    def restore(self, columns: dict[str, NDArray[Any]]) -> None:
+        """Take the undeformed areas and thicknesses of before, where there are any."""
+        area = self.of_column(columns["area"])
+        known = area > 0.0
+        self._plain = np.where(known, area, self._plain)
+        thickness = self.of_column(columns["thickness"])[:, 0]
+        self.thickness = np.where(known.all(axis=1), thickness, self.thickness)
+        self.look_at_deleted()
+
+
+def _nodes_of(kind: basix.CellType, degree: int) -> int:
+    """Return the number of nodes of a facet."""
+    return int(basix.create_element(basix.ElementFamily.P, kind, degree).dim)
+
+
+def _sample(kind: basix.CellType) -> NDArray[np.float64]:
+    """Return points at which no shape function of a facet vanishes, for all of them together."""
+    return np.asarray(basix.make_quadrature(kind, 15)[0])
+
+
+def normals(edges: NDArray[Any]) -> NDArray[Any]:
+    """Return vectors normal to surfaces, of the size of their area element.
+
+    Args:
+        edges: Derivatives of positions, columns of ``(..., gdim, gdim - 1)``.
+    """
+    if edges.shape[-1] == 1:
+        return np.stack([edges[..., 1, 0], -edges[..., 0, 0]], axis=-1)
+    return np.cross(edges[..., 0], edges[..., 1])
+
+
+def nodal_vector(
+    W: fem.FunctionSpace, nodes: NDArray[np.int64], forces: NDArray[np.float64]
+) -> PETSc.Vec:
+    """Return the sum of forces on local nodes as a vector on W (collective).
+
+    Args:
+        W: Space of a body.
+        nodes: Local nodes, shape ``(...)``.
+        forces: Shape ``(..., gdim)``.
+    """
+    vector = _compat.create_vector(W)
+    gdim = forces.shape[-1]
+    with vector.localForm() as whole:
+        size = whole.getSize() // gdim
+        flat, part = nodes.ravel(), forces.reshape(-1, gdim)
+        sums = [np.bincount(flat, weights=part[:, i], minlength=size) for i in range(gdim)]
+        whole.array_w[:] = np.stack(sums, axis=1).ravel()
+    vector.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
+    return vector
+
+
+class PointMatrix:
+    """A matrix on W of bodies by dense blocks, whose pattern grows as blocks come up.
+
+    Args:
+        rows: Space of its rows.
+        columns: Space of its columns.
+    """
+
+    def __init__(self, rows: fem.FunctionSpace, columns: fem.FunctionSpace) -> None:
+        self._spaces = rows, columns
+        self._comm: MPI.Comm = rows.mesh.comm
+        self._matrix: PETSc.Mat | None = None
+        self._slots: dict[Any, int] = {}
+
+    def of(
+        self,
+        keys: list[Any],
+        rows: NDArray[np.int64],
+        columns: NDArray[np.int64],
+        blocks: NDArray[np.float64],
+    ) -> PETSc.Mat | None:
+        """Return the matrix of some blocks, the same object where no new ones have come.
+
+        Args:
+            keys: What each block is known by, ``n`` of them.
+            rows: Global dofs of their rows, shape ``(n, r)``; the same for the same key.
+            columns: Global dofs of their columns, shape ``(n, c)``.
+            blocks: Shape ``(n, r, c)``.
+
+        Returns:
+            ``None`` where no rank has had any.
+        """
+        new = [place for place, key in enumerate(keys) if key not in self._slots]
+        if self._comm.allreduce(len(new) > 0, MPI.LOR):
+            for place in new:
+                self._slots[keys[place]] = len(self._slots)
+            if self._matrix is None:
+                self._rows = np.zeros((0, rows.shape[1]), dtype=np.int64)
+                self._columns = np.zeros((0, columns.shape[1]), dtype=np.int64)
+            self._rows = np.concatenate([self._rows, rows[new]])
+            self._columns = np.concatenate([self._columns, columns[new]])
+            self._matrix = self._make()
+        if self._matrix is None:
+            return None
+        values = np.zeros((len(self._slots), rows.shape[1], columns.shape[1]))
+        slots = np.array([self._slots[key] for key in keys], dtype=np.int64)
+        np.add.at(values, slots, blocks)
+        _compat.set_entries(self._matrix, values.ravel())
+        return self._matrix
+
+    def _make(self) -> PETSc.Mat:
+        matrix = PETSc.Mat().create(self._comm)
+        sizes = []
+        for space in self._spaces:
+            index, bs = space.dofmap.index_map, space.dofmap.index_map_bs
+            sizes.append((index.size_local * bs, index.size_global * bs))
+        matrix.setSizes(tuple(sizes))
+        matrix.setType("aij")
+        shape = (len(self._rows), self._rows.shape[1], self._columns.shape[1])
+        i = np.broadcast_to(self._rows[:, :, None], shape).astype(PETSc.IntType).ravel()
+        j = np.broadcast_to(self._columns[:, None, :], shape).astype(PETSc.IntType).ravel()
+        _compat.set_entry_places(matrix, i, j)
+        return matrix
+
+
+def global_dofs(W: fem.FunctionSpace, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the global dofs of local nodes ``(n, k)`` of W, shape ``(n, k gdim)``."""
+    index, bs = W.dofmap.index_map, W.dofmap.index_map_bs
+    whole = np.asarray(index.local_to_global(nodes.ravel().astype(np.int32)), dtype=np.int64)
+    dofs = whole.reshape(nodes.shape)[:, :, None] * bs + np.arange(bs)
+    return np.asarray(dofs.reshape(len(nodes), nodes.shape[1] * bs))

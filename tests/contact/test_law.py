@@ -1,0 +1,92 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Tractions of contact at points: tangents against the complex step, and Coulomb's law."""
+
+import numpy as np
+import pytest
+
+from mpm_dolfinx import contact
+from mpm_dolfinx.contact import law as laws
+
+TOUCH = 1e-12
+
+
+def shape(dim):
+    if dim == 2:
+        return contact.disc((0.0, 0.0), 0.7)
+    return contact.box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5), 0.4)
+
+
+def scene(dim, seed=4, count=400):
+    """Return a shape and points in it, some of which have just come, with anchors around."""
+    some = np.random.default_rng(seed)
+    body = shape(dim)
+    y = some.uniform(-0.8, 0.8, (4 * count, dim))
+    phi, n = body.distance(y)
+    y = (y - (phi + some.uniform(0.0, 0.02, len(y)))[:, None] * n)[:count]
+    k = some.uniform(50.0, 150.0, count)
+    points = laws.Points(
+        k,
+        k * some.uniform(0.5, 2.0, count),
+        some.uniform(size=count) < 0.6,
+        y + some.normal(0.0, 0.01, y.shape),
+        some.uniform(0.0, 0.05, count),
+    )
+    return body, points, y
+
+
+def acting(law, body, points, y):
+    phi, n = body.distance(y)
+    acts = laws.traction(law, points, y - points.anchor, phi, n, TOUCH)
+    return acts, acts.pressure[:, None] * n + acts.shear
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize(
+    "law",
+    [
+        contact.Coulomb(),
+        contact.Coulomb(0.4),
+        contact.Coulomb(0.0, cohesion=0.3),
+        contact.Coulomb(0.5, cohesion=0.1, limit=0.7),
+    ],
+)
+def test_tangent_is_that_of_the_complex_step(law, dim):
+    body, points, y = scene(dim)
+    phi, n = body.distance(y)
+    D = laws.derivative(law, points, y - points.anchor, phi, n, body.curvature(y), TOUCH)
+    acts, _ = acting(law, body, points, y)
+    if not law.smooth:
+        assert 0.1 < acts.slips.mean() < 0.99
+    for i, e in enumerate(np.eye(dim)):
+        exact = acting(law, body, points, y + 1e-30j * e)[1].imag / 1e-30
+        assert np.abs(D[:, :, i] - exact).max() < 1e-12 * np.abs(D).max()
+
+
+def test_shear_stays_within_coulombs_cone():
+    law = contact.Coulomb(0.5, cohesion=0.1, limit=0.7)
+    acts, _ = acting(law, *scene(2))
+    size = np.linalg.norm(acts.shear, axis=1)
+    bound = np.minimum(0.5 * acts.pressure + 0.1, 0.7)
+    assert np.all(size <= bound * (1 + 1e-9))
+    assert np.allclose(size[acts.slips], bound[acts.slips], rtol=1e-14)
+    assert (bound == 0.7).any() and (bound < 0.7).any()
+
+
+def test_nothing_acts_at_a_gap():
+    body = contact.plane((0.0, 0.0), (0.0, 1.0))
+    one = np.ones(2)
+    points = laws.Points(one, one, one > 0, np.zeros((2, 2)), 0 * one)
+    acts, T = acting(contact.Coulomb(0.5), body, points, np.array([[0.3, 1e-9], [0.3, -1e-9]]))
+    assert acts.inside.tolist() == [False, True]
+    assert np.all(T[0] == 0.0) and T[1, 1] == 1e-9
+
+
+def test_a_point_that_touches_without_pressure_sticks():
+    body = contact.plane((0.0, 0.0), (0.0, 1.0))
+    one = np.ones(1)
+    points = laws.Points(one, one, one > 0, np.zeros((1, 2)), 0 * one)
+    y, H = np.zeros((1, 2)), np.zeros((1, 2, 2))
+    phi, n = body.distance(y)
+    D = laws.derivative(contact.Coulomb(0.5), points, y, phi, n, H, TOUCH)
+    assert np.allclose(D[0], -np.eye(2))

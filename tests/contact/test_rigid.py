@@ -1,0 +1,463 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Bodies against rigid obstacles, compared with exact solutions and Hertz's."""
+
+import itertools
+
+import numpy as np
+import pytest
+import scenes
+from compare import outcome, same_run
+from scenes import ALL, HEXAHEDRON, PLANE, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD, anywhere
+
+from dolfinx import fem
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx import contact
+from mpm_dolfinx.materials import Hencky, LinearElastic
+
+YOUNG, POISSON = 1e4, 0.3
+CONFINED = YOUNG * (1 - POISSON) / (1 + POISSON) / (1 - 2 * POISSON)
+
+
+def tilted(angle):
+    """Return direction along and normal of a plane that is inclined."""
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    return np.array([c, s]), np.array([-s, c])
+
+
+def on_plane(friction, cell=QUADRILATERAL, angle=0.0, n=3, comm=WORLD, material=None, **options):
+    """Return a block 1 x 0.5 that stands on a plane, its contact, and the force per mass."""
+    t, normal = tilted(angle)
+    body = scenes.box([0.0, 0.0], [1.0, 0.5], [2 * n, n], cell, comm)
+    body.geometry.x[:, :2] = body.geometry.x[:, :2] @ np.array([t, normal])
+    V = scenes.vectors(scenes.box([-1.1, -1.1], [1.7, 1.8], [9, 9], QUADRILATERAL, comm))
+    methods = {key: options.pop(key) for key in ("method", "outside") if key in options}
+    particles = mpm.Particles(body, V, **methods)
+    ground = contact.Rigid(particles, contact.plane((0.0, 0.0), normal), friction)
+    force = fem.Constant(body, np.zeros(2))
+    problem = mpm.QuasiStaticProblem(
+        particles,
+        material or LinearElastic(YOUNG, POISSON),
+        body_force=force,
+        terms=[ground],
+        **options,
+    )
+    return problem, ground, force
+
+
+def turning(force, angle, load):
+    """Return a path: weight that grows, then turns to where the angle goes."""
+    t, normal = tilted(angle)
+
+    def path(s, of=40.0):
+        weight, turn = min(4.0 * s, 1.0) / s, np.radians(of) * max(s - 0.25, 0.0)
+        path.angle = np.degrees(turn)
+        force.value[:] = -load * weight * (np.cos(turn) * normal + np.sin(turn) * t)
+
+    return path
+
+
+@pytest.mark.parametrize(
+    ("friction", "angle", "cell"), [(0.3, 0.0, QUADRILATERAL), (0.5, 20.0, TRIANGLE)]
+)
+def test_a_block_sticks_up_to_the_angle_of_friction(friction, angle, cell):
+    problem, ground, force = on_plane(friction, cell, angle)
+    path = turning(force, angle, 100.0)
+    last = 0.0
+    t, normal = tilted(angle)
+    with pytest.raises(mpm.MPMError, match=r"load|limit"):
+        for _ in problem.steps(40, update=path):
+            last = path.angle
+            reaction = problem.reaction(ground)
+            # equilibrium: the body is pushed back by what weighs it down
+            assert np.abs(reaction + 0.5 * problem.particles.load.value * force.value).max() < 1e-6
+    exact = np.degrees(np.arctan(friction))
+    assert exact - 0.02 < last <= exact + 1e-9
+    reaction = problem.reaction(ground)
+    assert reaction @ t / (reaction @ normal) == pytest.approx(friction, rel=2e-3)
+    assert problem.history.cutbacks > 0
+
+
+@pytest.mark.parametrize("cell", ALL, ids=scenes.name)
+def test_a_block_between_plates_is_compressed_evenly(cell):
+    # The stress is uniform, so the gap of the penalty is known: plates give way by p h / M each.
+    dim = 2 if cell in PLANE else 3
+    strain = 0.01
+    grid = QUADRILATERAL if dim == 2 else HEXAHEDRON
+    lower = np.append(np.zeros(dim - 1), -0.3)
+    V = scenes.vectors(scenes.box(lower, [1.5] * dim, [3] * dim, grid))
+    particles = mpm.Particles(scenes.unit(3, cell), V)
+    up = np.eye(dim)[-1]
+    below = contact.Rigid(particles, contact.plane(np.zeros(dim), up))
+    above = contact.Rigid(particles, contact.plane(up, -up))
+    problem = mpm.QuasiStaticProblem(
+        particles,
+        LinearElastic(YOUNG, POISSON),
+        bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in range(dim - 1)],
+        terms=[below, above],
+    )
+    p = strain * (YOUNG / (1 - POISSON**2) if dim == 2 else YOUNG)
+    h = 1 / {QUADRILATERAL: 3, HEXAHEDRON: 3, TRIANGLE: 6, TETRAHEDRON: 9}[cell]
+    shift = strain + 2.0 * p * h / CONFINED
+    problem.solve(2, update=lambda t: above.move(-t * shift * up))
+    assert np.abs(problem.reaction(above) + p * up).max() < 1e-8 * p
+    assert np.abs(problem.reaction(below) - p * up).max() < 1e-8 * p
+    wider = POISSON * p / YOUNG * (1 + POISSON if dim == 2 else 1.0)
+    middle = np.full(dim, 0.5 * (1 + wider))
+    assert np.abs(below.moment(middle)).max() < 1e-8 * p
+    stress = scenes.gather(particles.stress[:, dim - 1, dim - 1])
+    assert np.abs(stress + p).max() < 1e-8 * p
+    here = below.touches
+    assert WORLD.allreduce(below.area[here].sum()) == pytest.approx(1.0)
+    assert scenes.largest(below.pressure[here] - p) < 1e-8 * p
+    assert scenes.largest(below.gap[here] + p * h / CONFINED) < 1e-11
+
+
+def lines(h, fine, end):
+    """Return places from 0 to end, h apart up to ``fine`` and farther apart beyond."""
+    places = [h * i for i in range(round(fine / h) + 1)]
+    while places[-1] < end:
+        places.append(places[-1] + min(1.25 * (places[-1] - places[-2]), 0.4))
+    return np.array(places)
+
+
+def graded(x, y, parts):
+    """Return a mesh of quadrilaterals between lines, each interval in equal parts."""
+    domain = scenes.box(
+        [0.0, 0.0], [1.0, 1.0], [(len(x) - 1) * parts, (len(y) - 1) * parts], QUADRILATERAL
+    )
+    for i, places in enumerate((x, y)):
+        at = domain.geometry.x[:, i] * (len(places) - 1)
+        domain.geometry.x[:, i] = np.interp(at, np.arange(len(places)), places)
+    return domain
+
+
+def hertz(n, penalty, steps, depth=0.0108):
+    """Return a disc pressed on an elastic block, its contact, half width and largest pressure."""
+    radius, a = 6.0, 0.2
+    h = a / n
+    x = lines(h, 0.3, 3.0)
+    y = -lines(h, 0.3, 3.0)[::-1]
+    over = np.append(y, 0.4 * h)
+    wide = np.append(x, 2 * x[-1] - x[-2])
+    V = scenes.vectors(graded(wide, over, 1))
+    particles = mpm.Particles(graded(x, y, 2), V)
+    top = scenes.facet_tags(particles.mesh, scenes.at(1, 0.0))
+    die = contact.Rigid(
+        particles, contact.disc((0.0, radius), radius), facet_tags=top, tag=1, penalty=penalty
+    )
+    problem = mpm.QuasiStaticProblem(
+        particles,
+        LinearElastic(1e3, POISSON),
+        bcs=[scenes.fix(V, scenes.at(0, 0.0), component=0), scenes.fix(V, scenes.at(1, y[0]))],
+        terms=[die],
+    )
+    problem.solve(steps, update=lambda t: die.move((0.0, -depth * t)))
+    force = -2.0 * problem.reaction(die)[1]
+    stiff = 1e3 / (1 - POISSON**2)
+    half = np.sqrt(4 * force * radius / np.pi / stiff)
+    return problem, die, half, 2 * force / np.pi / half
+
+
+def test_pressure_under_a_disc_is_that_of_hertz():
+    problem, die, half, most = hertz(8, 1.0, 8)
+    assert half == pytest.approx(0.2, rel=0.1)
+    x, p, w = (scenes.gather(v) for v in (die.points[:, 0], die.pressure, die.area))
+    exact = most * np.sqrt(np.maximum(1 - (x / half) ** 2, 0.0))
+    # means over facets, each of which has two points
+    order = np.argsort(x)
+    mean = [(v * w)[order].reshape(-1, 2).sum(axis=1) for v in (p, exact)]
+    gap, size = np.sqrt(np.sum((mean[0] - mean[1]) ** 2)), np.sqrt(np.sum(mean[1] ** 2))
+    assert gap < 0.04 * size
+    assert p.max() == pytest.approx(most, rel=0.03)
+    assert problem.history.statistics["halvings"] <= 2
+    assert sum(problem.history.iterations) <= 30
+    assert problem.history.cutbacks == 0
+    # the half width by the second moment of the pressure
+    assert np.sqrt(8 * (w * p) @ x**2 / (2 * (w @ p))) == pytest.approx(half, rel=0.03)
+
+
+# -- A disc that is pressed into a block and dragged along it -----------------------------
+
+
+def dragged(
+    cell=QUADRILATERAL,
+    comm=WORLD,
+    method="cpdi2",
+    material=None,
+    degree=1,
+    friction=0.4,
+    n=8,
+    **options,
+):
+    """Return a block with a disc on it, the contact, and a path: down, then along."""
+    V = scenes.vectors(scenes.box([-0.3, -0.2], [2.3, 1.2], [13, 7], QUADRILATERAL, comm), degree)
+    base = fem.locate_dofs_geometrical(V, lambda x: x[1] < 0.01)
+    body = scenes.box([0.0, 0.0], [2.0, 1.0], [2 * n, n], cell, comm)
+    own = {key: options.pop(key) for key in ("on_distortion", "outside") if key in options}
+    particles = mpm.Particles(body, V, method=method, degree=degree, **own)
+    die = contact.Rigid(particles, contact.disc((0.7, 1.6), 0.6), friction)
+    problem = mpm.QuasiStaticProblem(
+        particles,
+        material or Hencky(1e3, POISSON),
+        bcs=[fem.dirichletbc(np.zeros(2), base, V)],
+        terms=[die],
+        **options,
+    )
+
+    def path(t):
+        die.move((0.5 * max(t - 0.3, 0.0), -0.1 * min(t, 0.3) / 0.3), -0.5 * max(t - 0.5, 0.0))
+
+    return problem, die, path
+
+
+def told(die):
+    """Return what a contact tells, in an order that does not depend on ranks."""
+    x, p, t = (scenes.gather(v) for v in (die.points, die.pressure, die.traction))
+    w, g, s = (scenes.gather(v) for v in (die.area, die.gap, die.sticks))
+    order = np.lexsort(np.round(x, 6).T)
+    return {
+        "points": x[order],
+        "pressure": p[order],
+        "traction": t[order],
+        "area": w[order],
+        "gap": g[order],
+        "sticks": s[order].astype(float),
+        "reaction": die.reaction,
+        "moment": die.moment((0.7, 1.0)),
+        "offset": die.offset,
+        "angle": die.angle,
+    }
+
+
+def close(one, other, bound=1e-9):
+    """Compare what contacts tell."""
+    for key in one:
+        size = np.abs(one[key]).max(initial=1e-300)
+        assert np.abs(one[key] - other[key]).max(initial=0.0) <= bound * size, key
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("cell", PLANE, ids=scenes.name)
+def test_a_dragged_disc_is_the_same_on_any_number_of_ranks(cell):
+    problem, die, path = dragged(cell)
+    problem.solve(10, update=path)
+    other, alone, path = dragged(cell, comm=scenes.MPI.COMM_SELF)
+    other.solve(10, update=path)
+    assert (
+        np.abs(problem.reaction(die) - other.reaction(alone)).max()
+        < 1e-9 * np.abs(other.reaction(alone)).max()
+    )
+    assert np.abs(die.moment((0, 0)) - alone.moment((0, 0))).max() < 1e-8
+    same_run(outcome(problem), outcome(other), 1e-9)
+    # some points stick, others slip, and none of these bears more or less than friction allows
+    p, t, s = die.pressure, die.traction, die.sticks
+    n = die.points - (die.offset + np.array([0.7, 1.6]))
+    n /= np.linalg.norm(n, axis=1)[:, None]
+    shear = np.linalg.norm(t - (t * n).sum(axis=1)[:, None] * n, axis=1)
+    slides = die.touches & ~s
+    assert np.allclose(shear[slides], 0.4 * p[slides], rtol=1e-9)
+    assert np.all(shear[s] <= 0.4 * p[s] + 1e-9)
+    assert WORLD.allreduce(int(slides.sum())) > 0
+    # what the base bears is what the disc brings
+    assert np.abs(problem.reaction(problem.bcs[0]) + die.reaction).max() < 1e-6
+
+
+def test_moment_is_that_of_the_reactions():
+    problem, die, path = dragged()
+    problem.solve(10, update=path)
+    field = problem.reduced.fields[0]
+    x = field.V.tabulate_dof_coordinates()[: len(field.force.array_r) // 2, :2]
+    # forces of supports on all dofs of V; the contact's among them are at nodes of V, which carry
+    # moments exactly, as T has linear functions
+    held = np.where(x[:, 1:] < 0.01, field.force.array_r.reshape(-1, 2), 0.0)
+    mine = (x[:, 0] * held[:, 1] - x[:, 1] * held[:, 0]).sum()
+    moment = WORLD.allreduce(mine)
+    # (x of the nodes is that of the step's beginning, the contact's that of its end)
+    assert moment == pytest.approx(-die.moment((0.0, 0.0))[0], rel=2e-2)
+
+
+def test_a_step_that_fails_leaves_everything_as_it_was():
+    problem, die, path = dragged()
+    steps = problem.steps(10, update=path)
+    for _ in itertools.islice(steps, 5):
+        pass
+    before = scenes.state(problem)
+    points = {key: value.copy() for key, value in told(die).items()}
+    columns = {key: c.values.copy() for key, c in die.columns(0).items()}
+    die.move((0.0, -1.9))
+    with pytest.raises(mpm.MPMError):
+        problem.step()
+    scenes.assert_same_state(before, scenes.state(problem))
+    for key, value in told(die).items():
+        assert np.array_equal(points[key], value), key
+    for key, column in die.columns(0).items():
+        assert np.array_equal(columns[key], column.values), key
+
+
+def test_a_checkpoint_goes_on_as_the_run_does(tmp_path):
+    problem, die, path = dragged()
+    for step in problem.steps(10, update=path):
+        if len(problem.history.steps) == 6:
+            problem.save(tmp_path / "half.ckpt")
+            before = told(die)
+    other, again, path = dragged()
+    other.restore(tmp_path / "half.ckpt")
+    close(before, told(again), 1e-11)
+    other.solve(10, update=path)
+    close(told(die), told(again), 1e-8)
+    same_run(outcome(problem), outcome(other), 1e-9)
+    third, _, _ = dragged(friction=0.0)
+    third.restore(tmp_path / "half.ckpt")  # another law is another run, not another state
+
+
+@pytest.mark.mpi
+def test_contact_moves_with_the_particles_to_other_ranks():
+    problem, die, path = dragged()
+    other, alone, still = dragged()
+    for number, _ in enumerate(problem.steps(10, update=path)):
+        before = told(die)
+        body = problem.particles
+        ranks = anywhere(body.mesh, number)
+        if number < 9:
+            problem.renew(lambda ranks=ranks, body=body: body.move(ranks), lambda state: state)
+            close(before, told(die), 1e-10)
+    other.solve(10, update=still)
+    close(told(die), told(alone), 1e-7)
+    same_run(outcome(problem), outcome(other), 1e-8)
+
+
+@pytest.mark.parametrize("what", ["split", "rebase"])
+def test_contact_follows_other_meshes_of_the_body(what):
+    problem, die, path = dragged()
+    for number, _ in enumerate(problem.steps(10, update=path)):
+        if number == 5:
+            before = told(die)
+            if what == "rebase":
+                problem.rebase()
+            else:
+                problem.split(np.arange(0, problem.particles.num_global, 2))
+            after = told(die)
+            close(before, after, 1e-10)
+    other, alone, path = dragged()
+    other.solve(10, update=path)
+    close({"reaction": die.reaction}, {"reaction": alone.reaction}, 3e-2)
+    if what == "rebase":
+        close(told(die), told(alone), 1e-6)
+
+
+@pytest.mark.parametrize("method", ["cpdi2", "cpdi", "gimp", "mpm"])
+def test_all_methods_feel_an_obstacle(method):
+    problem, die, path = dragged(method=method, friction=0.2)
+    problem.solve(10, update=path)
+    other, alone, path = dragged(n=12, friction=0.2)
+    other.solve(10, update=path)
+    base = problem.reaction(problem.bcs[0])
+    assert np.abs(base + die.reaction).max() < 1e-6 * np.abs(base).max()
+    assert die.reaction[1] == pytest.approx(alone.reaction[1], rel=0.25)
+    assert abs(die.reaction[0] / die.reaction[1]) == pytest.approx(0.2, abs=0.05)
+
+
+def test_domains_of_degree_two_are_curved():
+    problem, die, path = dragged(degree=2, n=4)
+    problem.solve(10, update=path)
+    other, alone, path = dragged(n=12)
+    other.solve(10, update=path)
+    assert die.reaction == pytest.approx(alone.reaction, rel=0.12)
+
+
+def test_a_sphere_pressed_into_a_cube_and_turned():
+    V = scenes.vectors(scenes.box([-0.2] * 3, [1.2] * 3, [4] * 3, HEXAHEDRON))
+    bottom = fem.locate_dofs_geometrical(V, lambda x: x[2] < 0.2)
+    particles = mpm.Particles(scenes.unit(4, TETRAHEDRON), V)
+    ball = contact.Rigid(particles, contact.sphere((0.5, 0.5, 1.5), 0.5), 0.5)
+    problem = mpm.QuasiStaticProblem(
+        particles,
+        Hencky(1e3, POISSON),
+        bcs=[fem.dirichletbc(np.zeros(3), bottom, V)],
+        terms=[ball],
+    )
+
+    def path(t):
+        ball.move((0.0, 0.0, -0.1 * min(2 * t, 1.0)), (0.0, 0.0, 0.3 * max(2 * t - 1, 0.0)))
+
+    problem.solve(8, update=path)
+    force, moment = problem.reaction(ball), ball.moment((0.5, 0.5, 1.0))
+    assert abs(force[2]) > 10 * np.abs(force[:2]).max()
+    # the ball turns anticlockwise, and takes the cube along
+    assert moment[2] > 0.0 and moment[2] > 3 * np.abs(moment[:2]).max()
+    assert np.abs(problem.reaction(problem.bcs[0]) + force).max() < 1e-6 * abs(force[2])
+
+
+# -- What cannot be ----------------------------------------------------------------------
+
+
+def test_a_body_that_begins_in_an_obstacle_is_refused():
+    particles = mpm.Particles(
+        scenes.unit(4, QUADRILATERAL),
+        scenes.vectors(scenes.box([-0.5, -0.5], [1.5, 1.5], [4, 4], QUADRILATERAL)),
+    )
+    ball = contact.Rigid(particles, contact.disc((0.5, 1.2), 0.3))
+    with pytest.raises(mpm.MPMError, match=r"begins within the obstacle.*0\.09"):
+        mpm.QuasiStaticProblem(particles, Hencky(1e3, 0.3), terms=[ball])
+
+
+def test_an_obstacle_does_not_jump_through_a_body():
+    problem, die, _ = dragged(n=4)
+    start = die.offset
+    problem.solve(2, update=lambda t: die.move((0.0, -0.4 * t)))  # 0.2 is less than a domain
+    assert np.abs(die.reaction[1]) > 0.0
+    die.move((0.0, -9.0))
+    with pytest.raises(mpm.ConvergenceError, match="moves through the body in one step"):
+        problem.step()
+    assert die.offset.tolist() == [0.0, -0.4] and start.tolist() == [0.0, 0.0]
+
+
+def test_a_body_that_nothing_holds_yet_is_no_false_verdict():
+    # It hangs over the plane: no step is small enough, and the sentence says so.
+    V = scenes.vectors(scenes.box([-0.5, -0.5], [1.5, 2.5], [4, 6], QUADRILATERAL))
+    body = scenes.box([0.0, 0.5], [1.0, 1.5], [4, 4], QUADRILATERAL)
+    particles = mpm.Particles(body, V)
+    ground = contact.Rigid(particles, contact.plane((0.0, 0.0), (0.0, 1.0)))
+    problem = mpm.QuasiStaticProblem(
+        particles, Hencky(1e3, 0.3), body_force=(0.0, -1.0), terms=[ground]
+    )
+    with pytest.raises(mpm.ConvergenceError, match="nothing holds the bodies once what only pushes"):
+        problem.solve(2)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"shape": contact.sphere((0, 0, 0), 1.0)}, "one in 3 dimensions, the body in 2"),
+        ({"shape": 1.0}, "needs a shape of mpm.contact"),
+        ({"friction": -0.1}, "friction must be a number from 0"),
+        ({"penalty": 0.0}, "penalty must be a positive number"),
+        ({"modulus": -1.0}, "modulus must be a positive number"),
+        ({"tangential_penalty": "1"}, "tangential_penalty must be a positive number"),
+        ({"quadrature_degree": -1}, "whole number from 0"),
+        ({"tag": 3}, "need facet_tags="),
+    ],
+)
+def test_what_makes_no_sense_is_refused(options, sentence):
+    particles = dragged(n=2)[0].particles
+    given = {"shape": contact.disc((0.5, 5.0), 0.3), **options}
+    with pytest.raises(mpm.MPMError, match=sentence):
+        contact.Rigid(particles, **given)
+
+
+def test_moves_and_questions_that_make_no_sense_are_refused():
+    problem, die, _ = dragged(n=2)
+    for offset, angle in [((0.0,), 0.0), ((0.0, np.nan), 0.0), ((0.0, 0.0), (0.0, 1.0)), (None, 0)]:
+        with pytest.raises(mpm.MPMError, match="offset of 2 numbers and an angle of 1"):
+            die.move(offset, angle)
+    with pytest.raises(mpm.MPMError, match="is about 2 coordinates"):
+        die.moment((0.0, 0.0, 0.0))
+    other = contact.Rigid(problem.particles, contact.disc((0.7, 5.0), 0.6))
+    with pytest.raises(mpm.MPMError, match="one of the contacts of this problem"):
+        problem.reaction(other)
+    with pytest.raises(mpm.MPMError, match="belongs to no problem yet"):
+        _ = other.gap
+    with pytest.raises(mpm.MPMError, match=r"needs mpm\.Particles"):
+        contact.Rigid(problem, die.shape)
