@@ -24,7 +24,7 @@ from ..system.term import PointMaterial
 from .contact import Contact, Outcome, as_positive, stiffness
 from .law import Coulomb, Points, as_friction, derivative, traction
 from .shapes import Shape
-from .surface import PointMatrix, Surface, global_dofs
+from .surface import Blocks, PointMatrix, Surface, global_dofs
 
 __all__ = ["Rigid"]
 
@@ -421,11 +421,11 @@ class Rigid(Contact):
                 )
                 @ Q.T
             )
-        N, w = surface.shapes[which], surface.weights[which]
-        k = N.shape[2] * surface.gdim
-        blocks = np.einsum("mq,mqa,mqb,mqij->maibj", -w, N, N, D, optimize=True)
+        N, w = surface.shapes, surface.weights[which]
+        k = N.shape[1] * surface.gdim
+        blocks = np.einsum("mq,qa,qb,mqij->maibj", -w, N, N, D, optimize=True)
         dofs = global_dofs(self.bodies[0].W, surface.nodes[which])
-        K = self._matrix.of(which.tolist(), dofs, dofs, blocks.reshape(-1, k, k))
+        K = self._matrix.of([Blocks(which[:, None], dofs, dofs, blocks.reshape(-1, k, k))])
         return {} if K is None else {(0, 0): K}
 
     # -- What it remembers ------------------------------------------------------------------------

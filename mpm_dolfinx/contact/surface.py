@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -21,7 +22,7 @@ from ..errors import MPMError
 from ..meshes.remesh import Column
 from ..particles.particles import Particles
 
-__all__ = ["Facets", "PointMatrix", "Surface"]
+__all__ = ["Blocks", "Facets", "PointMatrix", "Surface", "global_dofs", "nodal_vector", "normals"]
 
 #: Position, relative to the coordinates of a body, at which a point touches: their round-off.
 TOUCH = 1e-12
@@ -113,7 +114,9 @@ class Surface:
         cells: Owned cell of each facet, shape ``(m,)``.
         facets: Its local number in the cell, shape ``(m,)``.
         nodes: Local nodes of W of each facet, shape ``(m, k)``.
-        shapes: Their shape functions at the points, shape ``(m, nq, k)``.
+        element: The basix element of a facet.
+        shapes: Its shape functions at the points, shape ``(nq, k)``.
+        slopes: Their derivatives, shape ``(gdim - 1, nq, k)``.
         weights: Undeformed area of each point, all around the axis of a body of revolution,
             shape ``(m, nq)``; 0 where deleted.
         thickness: Undeformed volume over area of the domain behind each facet, shape ``(m,)``.
@@ -159,29 +162,24 @@ class Surface:
         points, weights = map(np.asarray, basix.make_quadrature(kind, self._degree))
         self.nq = len(weights)
         x = W.tabulate_dof_coordinates()[:, : self.gdim]
-        m, k = len(self.cells), _nodes_of(kind, element.degree)
+        self.element = basix.create_element(
+            basix.ElementFamily.P, kind, element.degree, element.lagrange_variant
+        )
+        table = self.element.tabulate(1, points)[:, :, :, 0]
+        m, k = len(self.cells), self.element.dim
         self.nodes = np.zeros((m, k), dtype=np.int64)
-        self.shapes = np.zeros((m, self.nq, k))
-        self.slopes = np.zeros((m, dim, self.nq, k))
+        self.shapes, self.slopes = table[0], table[1:]
         for side in range(count):
             here = self.facets == side
             at = corners[sides[side]]
-            arms = at[1 : dim + 1] - at[0]
-            # (those of a discontinuous element belong to its cell; all others vanish here)
-            own = np.sort(
-                np.abs(element.tabulate(0, at[0] + _sample(kind) @ arms)[0, :, :, 0])
-                .max(axis=0)
-                .argsort(kind="stable")[-k:]
-            )
-            table = element.tabulate(1, at[0] + points @ arms)[:, :, own, 0]
+            places = at[0] + self.element.points @ (at[1 : dim + 1] - at[0])
+            own = np.linalg.norm(places[:, None] - element.points, axis=2).argmin(axis=1)
             self.nodes[here] = W.dofmap.list[self.cells[here]][:, own]
-            self.shapes[here] = table[0]
-            self.slopes[here] = np.einsum("ji,iqk->jqk", arms, table[1:])
-        edges = np.einsum("mjqk,mki->mqij", self.slopes, x[self.nodes])
+        edges = np.einsum("jqk,mki->mqij", self.slopes, x[self.nodes])
         area = np.sqrt(np.linalg.det(edges.swapaxes(2, 3) @ edges)) * weights
         self._plain = area
         middle = x[W.dofmap.list[self.cells]].mean(axis=1)
-        centre = np.einsum("mqk,mki->mi", self.shapes, x[self.nodes]) / self.nq
+        centre = (self.shapes @ x[self.nodes]).mean(axis=1)
         n = normals(edges).mean(axis=1)
         self.outward = np.where(((centre - middle) * n).sum(axis=1) < 0.0, -1.0, 1.0)
         self.thickness = self.particles.initial_volume[self.cells] / area.sum(axis=1)
@@ -221,6 +219,12 @@ class Surface:
         """Return the points as the body is displaced, shape ``(m, nq, gdim)``."""
         return np.asarray(self.shapes @ self.node_positions(converged)[self.nodes])
 
+    def normals(self) -> NDArray[np.float64]:
+        """Return outward unit normals at the points, as the body is displaced, as positions."""
+        edges = np.einsum("jqk,mki->mqij", self.slopes, self.node_positions()[self.nodes])
+        n = self.outward[:, None, None] * normals(edges)
+        return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
+
     def force(self, tractions: NDArray[np.float64], sign: float = 1.0) -> PETSc.Vec:
         """Return what tractions at the points do to the nodes of W (collective).
 
@@ -228,7 +232,7 @@ class Surface:
             tractions: Per undeformed area, shape ``(m, nq, gdim)``.
             sign: What they are multiplied by.
         """
-        forces = np.einsum("mqk,mqi->mki", self.shapes, sign * self.weights[:, :, None] * tractions)
+        forces = self.shapes.T @ (sign * self.weights[:, :, None] * tractions)
         return nodal_vector(self.particles.W, self.nodes, forces)
 
     # -- What is kept ---------------------------------------------------------------------------
@@ -259,16 +263,6 @@ class Surface:
         thickness = self.of_column(columns["thickness"])[:, 0]
         self.thickness = np.where(known.all(axis=1), thickness, self.thickness)
         self.look_at_deleted()
-
-
-def _nodes_of(kind: basix.CellType, degree: int) -> int:
-    """Return the number of nodes of a facet."""
-    return int(basix.create_element(basix.ElementFamily.P, kind, degree).dim)
-
-
-def _sample(kind: basix.CellType) -> NDArray[np.float64]:
-    """Return points at which no shape function of a facet vanishes, for all of them together."""
-    return np.asarray(basix.make_quadrature(kind, 15)[0])
 
 
 def normals(edges: NDArray[Any]) -> NDArray[Any]:
@@ -303,6 +297,23 @@ def nodal_vector(
     return vector
 
 
+class Blocks(NamedTuple):
+    """Dense blocks of a matrix.
+
+    Attributes:
+        keys: What each block is known by, shape ``(n, ...)``: those of one key have the same rows
+            and columns.
+        rows: Global dofs of their rows, shape ``(n, r)``.
+        columns: Global dofs of their columns, shape ``(n, c)``.
+        values: Shape ``(n, r, c)``; those of one key add up.
+    """
+
+    keys: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    values: NDArray[np.float64]
+
+
 class PointMatrix:
     """A matrix on W of bodies by dense blocks, whose pattern grows as blocks come up.
 
@@ -315,42 +326,44 @@ class PointMatrix:
         self._spaces = rows, columns
         self._comm: MPI.Comm = rows.mesh.comm
         self._matrix: PETSc.Mat | None = None
-        self._slots: dict[Any, int] = {}
+        self._places: dict[tuple[int, ...], int] = {}
+        self._size = 0
+        self._i: list[NDArray[np.int64]] = []
+        self._j: list[NDArray[np.int64]] = []
 
-    def of(
-        self,
-        keys: list[Any],
-        rows: NDArray[np.int64],
-        columns: NDArray[np.int64],
-        blocks: NDArray[np.float64],
-    ) -> PETSc.Mat | None:
-        """Return the matrix of some blocks, the same object where no new ones have come.
+    def of(self, parts: Sequence[Blocks]) -> PETSc.Mat | None:
+        """Return the matrix of some blocks, the same object where no new ones come (collective).
 
         Args:
-            keys: What each block is known by, ``n`` of them.
-            rows: Global dofs of their rows, shape ``(n, r)``; the same for the same key.
-            columns: Global dofs of their columns, shape ``(n, c)``.
-            blocks: Shape ``(n, r, c)``.
+            parts: Blocks of some sizes, each list of them with keys of its own.
 
         Returns:
             ``None`` where no rank has had any.
         """
-        new = [place for place, key in enumerate(keys) if key not in self._slots]
-        if self._comm.allreduce(len(new) > 0, MPI.LOR):
-            for place in new:
-                self._slots[keys[place]] = len(self._slots)
-            if self._matrix is None:
-                self._rows = np.zeros((0, rows.shape[1]), dtype=np.int64)
-                self._columns = np.zeros((0, columns.shape[1]), dtype=np.int64)
-            self._rows = np.concatenate([self._rows, rows[new]])
-            self._columns = np.concatenate([self._columns, columns[new]])
+        before = self._size
+        begins = []
+        for number, part in enumerate(parts):
+            size = part.rows.shape[1] * part.columns.shape[1]
+            begin = np.zeros(len(part.keys), dtype=np.int64)
+            for block, key in enumerate(part.keys.tolist()):
+                name = (number, *key)
+                place = self._places.get(name)
+                if place is None:
+                    place = self._places[name] = self._size
+                    self._size += size
+                    self._i.append(np.repeat(part.rows[block], part.columns.shape[1]))
+                    self._j.append(np.tile(part.columns[block], part.rows.shape[1]))
+                begin[block] = place
+            begins.append(begin)
+        if self._comm.allreduce(self._size > before, MPI.LOR):
             self._matrix = self._make()
         if self._matrix is None:
             return None
-        values = np.zeros((len(self._slots), rows.shape[1], columns.shape[1]))
-        slots = np.array([self._slots[key] for key in keys], dtype=np.int64)
-        np.add.at(values, slots, blocks)
-        _compat.set_entries(self._matrix, values.ravel())
+        values = np.zeros(self._size)
+        for part, begin in zip(parts, begins, strict=True):
+            flat = part.values.reshape(len(begin), part.rows.shape[1] * part.columns.shape[1])
+            np.add.at(values, begin[:, None] + np.arange(flat.shape[1]), flat)
+        _compat.set_entries(self._matrix, values)
         return self._matrix
 
     def _make(self) -> PETSc.Mat:
@@ -361,9 +374,9 @@ class PointMatrix:
             sizes.append((index.size_local * bs, index.size_global * bs))
         matrix.setSizes(tuple(sizes))
         matrix.setType("aij")
-        shape = (len(self._rows), self._rows.shape[1], self._columns.shape[1])
-        i = np.broadcast_to(self._rows[:, :, None], shape).astype(PETSc.IntType).ravel()
-        j = np.broadcast_to(self._columns[:, None, :], shape).astype(PETSc.IntType).ravel()
+        none = np.zeros(0, dtype=PETSc.IntType)
+        i = np.concatenate([none, *self._i]).astype(PETSc.IntType)
+        j = np.concatenate([none, *self._j]).astype(PETSc.IntType)
         _compat.set_entry_places(matrix, i, j)
         return matrix
 
