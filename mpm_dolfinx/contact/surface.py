@@ -162,13 +162,14 @@ class Surface:
         points, weights = map(np.asarray, basix.make_quadrature(kind, self._degree))
         self.nq = len(weights)
         x = W.tabulate_dof_coordinates()[:, : self.gdim]
-        self.element = basix.create_element(
+        self.element: Any = basix.create_element(
             basix.ElementFamily.P, kind, element.degree, element.lagrange_variant
         )
-        table = self.element.tabulate(1, points)[:, :, :, 0]
+        table = np.asarray(self.element.tabulate(1, points)[:, :, :, 0], dtype=np.float64)
         m, k = len(self.cells), self.element.dim
         self.nodes = np.zeros((m, k), dtype=np.int64)
-        self.shapes, self.slopes = table[0], table[1:]
+        self.shapes: NDArray[np.float64] = table[0]
+        self.slopes: NDArray[np.float64] = table[1:]
         for side in range(count):
             here = self.facets == side
             at = corners[sides[side]]
