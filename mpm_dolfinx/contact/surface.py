@@ -165,7 +165,9 @@ class Surface:
         self.element: Any = basix.create_element(
             basix.ElementFamily.P, kind, element.degree, element.lagrange_variant
         )
-        table = np.asarray(self.element.tabulate(1, points)[:, :, :, 0], dtype=np.float64)
+        table = np.asarray(self.element.tabulate(1, np.asarray(points)), dtype=np.float64)[
+            :, :, :, 0
+        ]
         m, k = len(self.cells), self.element.dim
         self.nodes = np.zeros((m, k), dtype=np.int64)
         self.shapes: NDArray[np.float64] = table[0]
