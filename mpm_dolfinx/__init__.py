@@ -49,8 +49,8 @@ __all__ = [
     "Weights",
     "__version__",
     "boundary",
-    "geostatic",
     "contact",
+    "geostatic",
     "materials",
     "plot",
 ]
