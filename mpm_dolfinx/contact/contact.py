@@ -57,13 +57,13 @@ class Contact(Term):
         self._number = 0
         self._places: list[int] = []
 
-    def join(
+    def take_part(
         self,
         number: int,
         bodies: Sequence[Particles],
         materials: Sequence[PointMaterial | None],
     ) -> None:
-        """See :meth:`Term.join`."""
+        """See :meth:`Term.take_part`."""
         self._number = number
         self._places = [
             next(i for i, body in enumerate(bodies) if body is mine) for mine in self.bodies

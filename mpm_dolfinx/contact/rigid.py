@@ -219,14 +219,14 @@ class Rigid(Contact):
         """See :attr:`Term.symmetric`."""
         return self.friction.smooth
 
-    def join(
+    def take_part(
         self,
         number: int,
         bodies: Sequence[Particles],
         materials: Sequence[PointMaterial | None],
     ) -> None:
-        """See :meth:`Term.join`."""
-        super().join(number, bodies, materials)
+        """See :meth:`Term.take_part`."""
+        super().take_part(number, bodies, materials)
         first = self._memory is None
         self._settle()
         if first:

@@ -316,7 +316,7 @@ class ParticleProblem:
             for body, c in zip(self.bodies, contributions, strict=True)
         ]
         for number, term in enumerate(self.terms):
-            term.join(number, self.bodies, [given.material for given in contributions])
+            term.take_part(number, self.bodies, [given.material for given in contributions])
         on_backgrounds = _on_backgrounds(self._background, groups, **options)
         remove = numerics.dependent_dofs == "remove"
         fields = [

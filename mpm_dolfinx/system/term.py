@@ -85,7 +85,7 @@ class Term:
         """Whether what the load factor does depends on the displacement."""
         return False
 
-    def join(
+    def take_part(
         self,
         number: int,
         bodies: Sequence[Particles],
