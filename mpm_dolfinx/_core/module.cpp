@@ -327,20 +327,6 @@ NB_MODULE(_loops, m)
         "stress"_a.noconvert(),
         "Update Hencky's law; return the points whose domains are inverted.");
 
-  m.def("update_von_mises",
-        [](Reals gradient, Reals old_gradient, Reals old_c, Reals old_plastic_strain, Reals bulk,
-           Reals shear, Reals rho_y, Reals hardening, double tolerance, RealsOut P, RealsOut A,
-           RealsOut stress, RealsOut c, RealsOut plastic_strain) {
-    std::vector<RealsOut> variables{plastic_strain};
-    return update_with_history(Law::von_mises, gradient, old_gradient, old_c, {old_plastic_strain},
-                               {bulk, shear, rho_y, hardening}, tolerance, P, A, stress, c,
-                               variables);
-  },
-        "gradient"_a, "old_gradient"_a, "old_c"_a, "old_plastic_strain"_a, "bulk"_a, "shear"_a,
-        "rho_y"_a, "hardening"_a, "tolerance"_a, "P"_a.noconvert(), "A"_a.noconvert(),
-        "stress"_a.noconvert(), "c"_a.noconvert(), "plastic_strain"_a.noconvert(),
-        "Update von Mises' law; return the points whose domains are inverted.");
-
   m.def("update_plastic",
         [](const std::string& law, Reals gradient, Reals old_gradient, Reals old_c,
            const std::vector<Reals>& old_variables, const std::vector<Reals>& parameters,

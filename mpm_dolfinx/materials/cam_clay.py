@@ -17,11 +17,10 @@ from .base import (
     Integration,
     Parameter,
     State,
-    Update,
     check_parameter,
     per_row,
 )
-from .compiled import CompiledMaterial, update_plastic
+from .compiled import CompiledMaterial
 from .mandel import deviator, deviatoric_projector, identity, norm, trace
 
 __all__ = ["ModifiedCamClay"]
@@ -82,6 +81,7 @@ class ModifiedCamClay(CompiledMaterial):
         }
     )
     yield_tolerance: ClassVar[float] = 1e-13
+    _loop: ClassVar[str] = "cam_clay"
 
     def __init__(
         self,
@@ -202,17 +202,9 @@ class ModifiedCamClay(CompiledMaterial):
         D -= np.einsum("n,ni,j->nij", np.sqrt(2.0 / 3.0) * q_v, direction, one)
         return Integration(stress, D, elastic, new)
 
-    def _compiled_update(self, displacement_gradient: Array, state: State, tangent: bool) -> Update:
+    def _constants(self) -> tuple[Parameter, ...]:
         names = ("compression", "swelling", "critical_ratio", "shear_modulus", "reference_pressure")
-        return update_plastic(
-            "cam_clay",
-            tuple(self.parameters[name] for name in names),
-            tuple(self.internal_variables),
-            self.yield_tolerance,
-            displacement_gradient,
-            state,
-            tangent,
-        )
+        return tuple(self.parameters[name] for name in names)
 
 
 class _Law(NamedTuple):

@@ -4,9 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import cast
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,11 +12,13 @@ from .base import Parameter, State, StrainMaterial, Update
 from .kinematics import require_valid
 from .mandel import num_components
 
-__all__ = ["CompiledMaterial", "update_hencky", "update_plastic", "update_von_mises"]
+__all__ = ["CompiledMaterial"]
+
+type Array = NDArray[np.float64]
 
 
 class CompiledMaterial(StrainMaterial):
-    """A law that may have a compiled update: the method ``_compiled_update`` of its class.
+    """A law that may have a compiled update: its class names it in ``_loop``.
 
     Attributes:
         compiled: Whether a compiled update is used where the law itself (not a law derived from
@@ -29,139 +28,54 @@ class CompiledMaterial(StrainMaterial):
 
     compiled: bool = True
 
-    def update(
-        self, displacement_gradient: NDArray[np.float64], state: State, tangent: bool = True
-    ) -> Update:
+    def _constants(self) -> tuple[Parameter, ...]:
+        """Return what the compiled law has for parameters, as ``material.h`` lists them."""
+        raise NotImplementedError
+
+    def update(self, displacement_gradient: Array, state: State, tangent: bool = True) -> Update:
         """See :meth:`Material.update`."""
-        rule = vars(type(self)).get("_compiled_update")
-        if rule is None or loops is None or not self.compiled:
+        loop = vars(type(self)).get("_loop")
+        if loop is None or loops is None or not self.compiled:
             return super().update(displacement_gradient, state, tangent)
-        return cast(Update, rule(self, displacement_gradient, state, tangent))
+        H = np.ascontiguousarray(displacement_gradient)
+        n, dim, _ = H.shape
+        P, A = np.empty_like(H), np.empty((n if tangent else 0, dim, dim, dim, dim))
+        parameters = [_values(parameter) for parameter in self._constants()]
+        if "displacement_gradient" in state:
+            new, invalid = self._with_history(loop, parameters, H, state, P, A)
+        else:
+            new = {"stress": np.empty((n, num_components(dim)))}
+            invalid = loops.update_hencky(H, *parameters, P, A, new["stress"])
+        valid = np.ones(n, dtype=bool)
+        valid[invalid] = False
+        require_valid(valid)
+        return Update(P, A if tangent else None, new)
+
+    def _with_history(
+        self, loop: str, parameters: list[Array], H: Array, state: State, P: Array, A: Array
+    ) -> tuple[State, NDArray[np.int64]]:
+        """Set P and A; return the new state and the points that are impossible."""
+        n, dim, _ = H.shape
+        names, m = tuple(self.internal_variables), num_components(dim)
+        stress, b = np.empty((n, m)), np.empty((n, m))
+        variables = [np.empty(n) for _ in names]
+        invalid = loops.update_plastic(
+            loop,
+            H,
+            np.ascontiguousarray(state["displacement_gradient"]),
+            np.ascontiguousarray(state["elastic_b_minus_identity"]),
+            [np.ascontiguousarray(state[name]) for name in names],
+            parameters,
+            getattr(self, "yield_tolerance", 0.0),
+            P,
+            A,
+            stress,
+            b,
+            variables,
+        )
+        new = {"stress": stress, "displacement_gradient": H.copy(), "elastic_b_minus_identity": b}
+        return new | dict(zip(names, variables, strict=True)), invalid
 
 
-def _values(parameter: Parameter) -> NDArray[np.float64]:
+def _values(parameter: Parameter) -> Array:
     return np.ascontiguousarray(np.atleast_1d(parameter), dtype=np.float64)
-
-
-def _outputs(
-    gradient: NDArray[np.float64], tangent: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return arrays for first Piola stress, tangent (empty if not asked for) and stress."""
-    n, dim, _ = gradient.shape
-    A = np.empty((n if tangent else 0, dim, dim, dim, dim))
-    return np.empty_like(gradient), A, np.empty((n, num_components(dim)))
-
-
-def _check(invalid: NDArray[np.int64], count: int) -> None:
-    valid = np.ones(count, dtype=bool)
-    valid[invalid] = False
-    require_valid(valid)
-
-
-def update_hencky(
-    bulk: Parameter,
-    shear: Parameter,
-    displacement_gradient: NDArray[np.float64],
-    tangent: bool,
-) -> Update:
-    """Update Hencky's law.
-
-    Args:
-        bulk: Bulk modulus, a number or shape ``(n,)``, as all parameters.
-        shear: Shear modulus.
-        displacement_gradient: As for :meth:`Material.update`.
-        tangent: As there.
-    """
-    H = np.ascontiguousarray(displacement_gradient)
-    P, A, stress = _outputs(H, tangent)
-    invalid = loops.update_hencky(H, _values(bulk), _values(shear), P, A, stress)
-    _check(invalid, len(H))
-    return Update(P, A if tangent else None, {"stress": stress})
-
-
-def update_plastic(
-    law: str,
-    parameters: Sequence[Parameter],
-    variables: Sequence[str],
-    yield_tolerance: float,
-    displacement_gradient: NDArray[np.float64],
-    state: State,
-    tangent: bool,
-) -> Update:
-    """Update a law with a history at finite strain.
-
-    Args:
-        law: Name of the law in ``material.h``.
-        parameters: Bulk and shear modulus and the constants of the law, numbers or shape ``(n,)``.
-        variables: Names of its internal variables.
-        yield_tolerance: Excess of the yield function over the strength that counts as round-off.
-        displacement_gradient: As for :meth:`Material.update`.
-        state: As there.
-        tangent: As there.
-    """
-    H = np.ascontiguousarray(displacement_gradient)
-    P, A, stress = _outputs(H, tangent)
-    b, new_variables = np.empty_like(stress), [np.empty(len(H)) for _ in variables]
-    invalid = loops.update_plastic(
-        law,
-        H,
-        np.ascontiguousarray(state["displacement_gradient"]),
-        np.ascontiguousarray(state["elastic_b_minus_identity"]),
-        [np.ascontiguousarray(state[name]) for name in variables],
-        [_values(p) for p in parameters],
-        yield_tolerance,
-        P,
-        A,
-        stress,
-        b,
-        new_variables,
-    )
-    _check(invalid, len(H))
-    new = {"stress": stress, "displacement_gradient": H.copy(), "elastic_b_minus_identity": b}
-    new |= dict(zip(variables, new_variables, strict=True))
-    return Update(P, A if tangent else None, new)
-
-
-def update_von_mises(
-    elastic: tuple[Parameter, Parameter],
-    plastic: tuple[Parameter, Parameter],
-    yield_tolerance: float,
-    displacement_gradient: NDArray[np.float64],
-    state: State,
-    tangent: bool,
-) -> Update:
-    """Update von Mises' law at finite strain.
-
-    Args:
-        elastic: Bulk and shear modulus, numbers or shape ``(n,)``.
-        plastic: Norm of the stress deviator at first yield, and hardening.
-        yield_tolerance: Value of the yield function that counts as round-off.
-        displacement_gradient: As for :meth:`Material.update`.
-        state: As there.
-        tangent: As there.
-    """
-    H = np.ascontiguousarray(displacement_gradient)
-    P, A, stress = _outputs(H, tangent)
-    b, plastic_strain = np.empty_like(stress), np.empty(len(H))
-    invalid = loops.update_von_mises(
-        H,
-        *(
-            np.ascontiguousarray(state[name])
-            for name in ("displacement_gradient", "elastic_b_minus_identity", "plastic_strain")
-        ),
-        *(_values(p) for p in (*elastic, *plastic)),
-        yield_tolerance,
-        P,
-        A,
-        stress,
-        b,
-        plastic_strain,
-    )
-    _check(invalid, len(H))
-    new = {
-        "stress": stress,
-        "displacement_gradient": H.copy(),
-        "elastic_b_minus_identity": b,
-        "plastic_strain": plastic_strain,
-    }
-    return Update(P, A if tangent else None, new)

@@ -4,14 +4,13 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple, get_args
+from typing import ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
-from .base import Field, Integration, Parameter, State, Update
-from .compiled import update_plastic
+from .base import Field, Integration, Parameter, State
 from .mandel import deviator, deviatoric_projector, identity, norm, trace
 from .mohr_coulomb import FrictionalMaterial
 
@@ -42,6 +41,8 @@ class DruckerPrager(FrictionalMaterial):
 
     xi is eta/tan(phi), and eta_psi is eta with psi in place of phi, and of associated flow.
     """
+
+    _loop: ClassVar[str] = "drucker_prager"
 
     def __init__(
         self,
@@ -75,7 +76,7 @@ class DruckerPrager(FrictionalMaterial):
         self.match = match
 
     def _constants(self) -> tuple[Parameter, ...]:
-        """Return eta, eta_psi, the strength xi c, and the largest mean stress."""
+        """Return the moduli, eta, eta_psi, the strength xi c, and the largest mean stress."""
         friction, dilation, cosine = self._sines()
         if self.match == "plane_strain":
             flow = dilation / np.sqrt(1.0 + dilation**2 / 3.0)
@@ -90,14 +91,15 @@ class DruckerPrager(FrictionalMaterial):
         with np.errstate(divide="ignore", invalid="ignore"):
             apex = np.where(np.equal(eta, 0.0), np.inf, np.divide(strength, eta))
         top = np.minimum(apex, self._tension())
-        return eta, flow, strength, top if np.ndim(top) else float(top)
+        largest = top if np.ndim(top) else float(top)
+        return self.bulk, self.shear, eta, flow, strength, largest
 
     def yield_function(self, stress: Array, plastic_strain: Array) -> Array:
         """Return f, shape ``(n,)``, in units of stress, of stresses ``(n, m)``.
 
         The larger one of sqrt(J2) + eta p - xi c and p less the cut-off.
         """
-        eta, _, strength, _ = self._constants()
+        _, _, eta, _, strength, _ = self._constants()
         mean = trace(stress) / 3.0
         cone = np.sqrt(0.5) * norm(deviator(stress)) + eta * mean - strength
         return np.asarray(np.maximum(cone, mean - self._tension()))
@@ -107,9 +109,7 @@ class DruckerPrager(FrictionalMaterial):
         n, m = trial_strain.shape
         stress = self.elastic_stress(trial_strain)
         D = self.elastic_tangent(n, m) if tangent else None
-        constants = _Constants(
-            *(np.broadcast_to(c, n) for c in (self.bulk, self.shear, *self._constants()))
-        )
+        constants = _Constants(*(np.broadcast_to(c, n) for c in self._constants()))
         bulk, shear, eta, _, strength, top = constants
         mean = bulk * trace(trial_strain)
         root = np.sqrt(2.0) * shear * norm(deviator(trial_strain))
@@ -127,17 +127,6 @@ class DruckerPrager(FrictionalMaterial):
             D = D.copy()
             D[points] = D_plastic
         return Integration(stress, D, elastic, {"plastic_strain": kappa})
-
-    def _compiled_update(self, displacement_gradient: Array, state: State, tangent: bool) -> Update:
-        return update_plastic(
-            "drucker_prager",
-            (self.bulk, self.shear, *self._constants()),
-            ("plastic_strain",),
-            self.yield_tolerance,
-            displacement_gradient,
-            state,
-            tangent,
-        )
 
 
 class _Constants(NamedTuple):

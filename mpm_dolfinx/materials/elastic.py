@@ -16,11 +16,10 @@ from .base import (
     Integration,
     Parameter,
     State,
-    Update,
     check_parameter,
     per_row,
 )
-from .compiled import CompiledMaterial, update_hencky, update_plastic
+from .compiled import CompiledMaterial
 from .mandel import deviator, deviatoric_projector, identity, trace
 
 __all__ = ["Hencky", "IsotropicElastic", "LinearElastic"]
@@ -102,11 +101,7 @@ class Hencky(IsotropicElastic):
     """
 
     kinematics: ClassVar[Literal["small", "logarithmic"]] = "logarithmic"
+    _loop: ClassVar[str] = "hencky"
 
-    def _compiled_update(
-        self, displacement_gradient: NDArray[np.float64], state: State, tangent: bool
-    ) -> Update:
-        if "displacement_gradient" not in state:
-            return update_hencky(self.bulk, self.shear, displacement_gradient, tangent)
-        moduli = (self.bulk, self.shear)
-        return update_plastic("hencky", moduli, (), 0.0, displacement_gradient, state, tangent)
+    def _constants(self) -> tuple[Parameter, ...]:
+        return self.bulk, self.shear

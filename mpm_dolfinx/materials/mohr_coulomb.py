@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
-from .base import Field, Integration, Parameter, State, Update, check_parameter
-from .compiled import update_plastic
+from .base import Field, Integration, Parameter, State, check_parameter
 from .elastic import IsotropicElastic
 from .mandel import to_tensor
 from .principal import axes_in_order, from_axes, shear_quotients, tangent_from_axes
@@ -146,6 +145,8 @@ class MohrCoulomb(FrictionalMaterial):
     is returned to along the hydrostatic axis too.
     """
 
+    _loop: ClassVar[str] = "mohr_coulomb"
+
     def yield_function(self, stress: Array, plastic_strain: Array) -> Array:
         """Return f, shape ``(n,)``, in units of stress, of stresses ``(n, m)``.
 
@@ -160,10 +161,10 @@ class MohrCoulomb(FrictionalMaterial):
         )
 
     def _constants(self) -> tuple[Parameter, ...]:
-        """Return what the return needs: sin(phi), sin(psi), 2 c cos(phi), and the cut-off."""
+        """Return the moduli, sin(phi), sin(psi), 2 c cos(phi), and the cut-off."""
         friction, dilation, cosine = self._sines()
         strength = 2.0 * self.parameters["cohesion"] * cosine
-        return friction, dilation, strength, self._tension()
+        return self.bulk, self.shear, friction, dilation, strength, self._tension()
 
     def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
         """See :meth:`StrainMaterial.integrate`."""
@@ -171,7 +172,7 @@ class MohrCoulomb(FrictionalMaterial):
         stress = self.elastic_stress(trial_strain)
         D = self.elastic_tangent(n, m) if tangent else None
         strain, axes = axes_in_order(trial_strain)
-        law = _Law.of((self.bulk, self.shear, *self._constants()), n)
+        law = _Law.of(self._constants(), n)
         points = np.flatnonzero(law.yields(strain, self.yield_tolerance))
         if len(points) == 0:
             return Integration(stress, D, trial_strain, variables)
@@ -187,17 +188,6 @@ class MohrCoulomb(FrictionalMaterial):
             D[points] = tangent_from_axes(answer.normal, quotients, axes, m)
         return Integration(stress, D, elastic, {"plastic_strain": kappa})
 
-    def _compiled_update(self, displacement_gradient: Array, state: State, tangent: bool) -> Update:
-        return update_plastic(
-            "mohr_coulomb",
-            (self.bulk, self.shear, *self._constants()),
-            ("plastic_strain",),
-            self.yield_tolerance,
-            displacement_gradient,
-            state,
-            tangent,
-        )
-
 
 class Tresca(MohrCoulomb):
     """:class:`MohrCoulomb` without friction and dilation: (s1 - s3)/2 = c."""
@@ -205,6 +195,7 @@ class Tresca(MohrCoulomb):
     limits: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType(
         {**MohrCoulomb.limits, "cohesion": {"above": 0.0}}
     )
+    _loop: ClassVar[str] = "mohr_coulomb"
 
     def __init__(
         self,
@@ -225,9 +216,6 @@ class Tresca(MohrCoulomb):
             MPMError: A value is out of range.
         """
         super().__init__(young, poisson, cohesion, 0.0, 0.0, tension_cutoff)
-
-    def _compiled_update(self, displacement_gradient: Array, state: State, tangent: bool) -> Update:
-        return super()._compiled_update(displacement_gradient, state, tangent)
 
 
 class _Answer(NamedTuple):

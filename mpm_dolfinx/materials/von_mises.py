@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
-from .base import Field, Integration, Parameter, State, Update, check_parameter
-from .compiled import update_von_mises
+from .base import Field, Integration, Parameter, State, check_parameter
 from .elastic import IsotropicElastic
 from .mandel import deviator, deviatoric_projector, identity, norm, trace
 
@@ -48,6 +47,7 @@ class VonMises(IsotropicElastic):
         }
     )
     yield_tolerance: ClassVar[float] = 1e-13
+    _loop: ClassVar[str] = "von_mises"
 
     def __init__(
         self,
@@ -124,17 +124,8 @@ class VonMises(IsotropicElastic):
             D = np.moveaxis(everywhere, -1, 0)
         return Integration(stress, D, elastic_strain, {"plastic_strain": plastic_strain})
 
-    def _compiled_update(
-        self, displacement_gradient: NDArray[np.float64], state: State, tangent: bool
-    ) -> Update:
-        return update_von_mises(
-            (self.bulk, self.shear),
-            (self.rho_y, self.parameters["hardening"]),
-            self.yield_tolerance,
-            displacement_gradient,
-            state,
-            tangent,
-        )
+    def _constants(self) -> tuple[Parameter, ...]:
+        return self.bulk, self.shear, self.rho_y, self.parameters["hardening"]
 
 
 class SmallStrainVonMises(VonMises):
