@@ -161,8 +161,7 @@ class Loss:
 class Energy:
     """Energies of a motion at one time, of all bodies; sums are over the steps up to it.
 
-    :attr:`balance` stays what it was at the beginning, but for the work of Dirichlet values that
-    move and of a ghost penalty, and for stress that deleted particles take away.
+    :attr:`balance` stays what it was at the beginning, to round-off.
 
     Attributes:
         time: The time.
@@ -171,6 +170,17 @@ class Energy:
         external: Work of body forces and tractions.
         lost: Kinetic energy that was lost as no motion of the background could follow it, to
             backward Euler, with deleted particles, and to other meshes of a body.
+        strain: Elastic energy stored in the bodies at the time (not in supports); not a number
+            where a material does not know its own.
+        dissipated: Work done against stress that is not stored in it: plastic work, what deleted
+            particles took away, and what the scheme makes of elastic bodies, which is nothing with
+            ``scheme="conserving"`` and positive or negative with others; not a number where
+            :attr:`strain` is none.
+        damping: Work done against Rayleigh damping and dashpots.
+        stabilisation: Work done against a ghost penalty.
+        prescribed: Work of Dirichlet values that move.
+        residual: Work done against what Newton's method left: its tolerance, and the proximal term
+            in motions that hardly move a node.
     """
 
     time: float
@@ -178,11 +188,18 @@ class Energy:
     internal: float
     external: float
     lost: float
+    strain: float = math.nan
+    dissipated: float = math.nan
+    damping: float = 0.0
+    stabilisation: float = 0.0
+    prescribed: float = 0.0
+    residual: float = 0.0
 
     @property
     def balance(self) -> float:
         """What stays: kinetic energy, less work of loads, plus what was stored, used and lost."""
-        return self.kinetic + self.internal - self.external + self.lost
+        used = self.internal + self.damping + self.stabilisation + self.residual + self.lost
+        return self.kinetic + used - self.external - self.prescribed
 
 
 @dataclass(repr=False)

@@ -36,12 +36,14 @@ class PointStress(Protocol):
     """Stress at a body's quadrature points, of which the compiled loops make forces.
 
     Attributes:
-        first_piola: First Piola stress, shape ``(n nq, dim, dim)``.
-        tangent: Its pointwise derivative by F, shape ``(n nq, dim, dim, dim, dim)``.
+        tangent: Pointwise derivative of the stress by F, shape ``(n nq, dim, dim, dim, dim)``.
     """
 
-    first_piola: NDArray[np.float64]
     tangent: NDArray[np.float64]
+
+    @property
+    def first_piola(self) -> NDArray[np.float64]:
+        """First Piola stress, shape ``(n nq, dim, dim)``."""
 
     @property
     def symmetric(self) -> bool:

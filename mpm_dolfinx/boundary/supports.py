@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 import ufl
 from dolfinx import fem
+from ufl.algorithms.analysis import extract_coefficients, extract_constants
 
 from ..assembly.inputs import as_expression, is_tag, known_tags
 from ..errors import MPMError, agree
@@ -89,7 +90,11 @@ class Support:
             self.scale(as_expression(modulus, particles, "modulus", ()))
         self._traction = -self._stiffness * gap
         self._turn: Any = 1.0
+        self._whole_step = False
+        self._scale = fem.Constant(body, 1.0)
+        self._share = 1.0
         self._sums: list[fem.Form] | None = None
+        self._power: fem.Form | None = None
 
     @property
     def has_modulus(self) -> bool:
@@ -130,14 +135,20 @@ class Support:
         """
         self._turn = turn
 
-    def at_body(self, moduli: Callable[[], NDArray[np.float64]], turn: Any) -> ufl.Form:
+    def at_body(
+        self, moduli: Callable[[], NDArray[np.float64]], turn: Any, whole_step: bool = False
+    ) -> ufl.Form:
         """Return minus the virtual work of the support on a body with a material (collective).
 
         Args:
             moduli: Returns the modulus of each domain this rank owns, shape ``(n,)``; asked where
                 none was given.
             turn: As for :meth:`revolve`.
+            whole_step: Whether it may be that of a whole step of a motion, as that of its end would
+                add energy.
         """
+        self._whole_step = whole_step and self._has_whole_step()
+        self._power = None
         if not self._modulus:
             each = fem.Function(self._stiffness.function_space)
             cells = each.function_space.dofmap.list[: self.particles.num_local, 0]
@@ -159,8 +170,48 @@ class Support:
                 "the confined modulus (lambda + 2 mu) or its like."
             )
         test = ufl.TestFunction(self.particles.W)
-        form: ufl.Form = -self._turn * ufl.inner(self._traction, test) * self._ds
+        traction = self._scale * self._of_step() if self._whole_step else self._traction
+        form: ufl.Form = -self._turn * ufl.inner(traction, test) * self._ds
         return form
+
+    # -- In a motion ----------------------------------------------------------------------
+
+    def _has_whole_step(self) -> bool:
+        """Whether there is a traction of a whole step."""
+        return False
+
+    def _of_step(self) -> Any:
+        """Return the traction of a whole step, UFL."""
+        raise NotImplementedError
+
+    def pace(self, dt: float, share: float) -> None:
+        """See :meth:`mpm_dolfinx.Term.pace`."""
+        self._share = share
+        np.copyto(self._scale.value, 1.0 / share)
+
+    def mute(self, muted: bool) -> None:
+        """Leave out, or take in again, what belongs to the whole step."""
+        np.copyto(self._scale.value, 0.0 if muted else 1.0 / self._share)
+
+    def settle(self) -> None:
+        """Take the present state for the beginning of the next step (collective)."""
+
+    def step_work(self) -> tuple[float, float]:
+        """Return this rank's work done in the last step against the traction of the whole step.
+
+        Returns:
+            What is internal, and what is damping.
+        """
+        return 0.0, 0.0
+
+    def _step_power(self, motion: Any) -> float:
+        """Return this rank's work done by a motion, UFL, against the traction of the whole step."""
+        if self._power is None:
+            form = -self._turn * ufl.inner(self._of_step(), motion) * self._ds
+            if self.particles.deletion is not None:
+                form = self.particles.deletion.present_only(form)
+            self._power = fem.form(form)
+        return float(np.real(fem.assemble_scalar(self._power)))
 
     @property
     def reaction(self) -> NDArray[np.float64]:
@@ -173,6 +224,85 @@ class Support:
             self._sums = [fem.form(form) for form in forms]
         mine = np.array([fem.assemble_scalar(form) for form in self._sums])
         return np.asarray(self.particles.mesh.comm.allreduce(mine))
+
+
+class Plane(Support):
+    """A one-sided support, made by :func:`plane`.
+
+    In a motion its force over a step is the discrete gradient of its energy,
+    ``(W(g_1) - W(g_0)) / (g_1 - g_0)`` with ``W = k/2 min(g, 0)^2`` of the gap g at the step's ends
+    (Gonzalez 2000), so that impacts neither add energy nor take any. The mean of the forces at the
+    ends would add much.
+
+    Args:
+        particles: The body.
+        gap: How far the boundary is off the plane, UFL; negative beyond it.
+        normal: The plane's normal, UFL, shape ``(gdim,)``.
+        facet_tags: As for :class:`Support`.
+        tag: As for :class:`Support`.
+        modulus: As for :func:`roller`.
+        penalty: As for :func:`roller`.
+    """
+
+    one_sided = True
+
+    def __init__(
+        self,
+        particles: Particles,
+        gap: Any,
+        normal: Any,
+        facet_tags: Any,
+        tag: int | None,
+        modulus: Any,
+        penalty: float,
+    ) -> None:
+        self._gap, self._normal = gap, normal
+        self._touch = TOUCH * _extent(particles)
+        super().__init__(particles, self._within(gap) * normal, facet_tags, tag, modulus, penalty)
+        self._before: list[tuple[Any, Any]] = []
+
+    def _within(self, gap: Any) -> Any:
+        """Return a gap where the plane is touched, or 0."""
+        return ufl.conditional(ufl.le(gap, self._touch), gap, 0.0)
+
+    def _has_whole_step(self) -> bool:
+        return True
+
+    def _of_step(self) -> Any:
+        gap = self._gap
+        if not self._before:
+            given = [*extract_coefficients(gap), *extract_constants(gap)]
+            self._before = [(value, _copy_of(value)) for value in given]
+            self.settle()
+        start = ufl.replace(gap, dict(self._before))
+        ends = [self._within(g) for g in (start, gap)]
+        touched = [ufl.le(g, self._touch) for g in (start, gap)]
+        change = ufl.conditional(ufl.And(*touched), 1.0, (ends[1] - ends[0]) / (gap - start))
+        some = ufl.conditional(ufl.Or(*touched), 0.5 * (ends[0] + ends[1]) * change, 0.0)
+        return -self._stiffness * some * self._normal
+
+    def settle(self) -> None:
+        """See :meth:`Support.settle`."""
+        for value, before in self._before:
+            if isinstance(value, fem.Function):
+                before.x.array[:] = value.x.array
+            else:
+                np.copyto(before.value, value.value)
+
+    def step_work(self) -> tuple[float, float]:
+        """See :meth:`Support.step_work`."""
+        if not self._whole_step:
+            return 0.0, 0.0
+        d = self.particles.displacement
+        before = next(copy for value, copy in self._before if value is d)
+        return self._step_power(d - before), 0.0
+
+
+def _copy_of(value: Any) -> Any:
+    """Return a Function or Constant that has another's values now."""
+    if isinstance(value, fem.Function):
+        return fem.Function(value.function_space)
+    return fem.Constant(value.ufl_domain(), np.array(value.value))
 
 
 def roller(
@@ -280,10 +410,7 @@ def plane(
     g = as_expression(value, particles, "value", ())
     x = ufl.SpatialCoordinate(particles.mesh) + particles.displacement
     gap = ufl.dot(n, x - origin) - _reached(particles) * g
-    within = ufl.conditional(ufl.le(gap, TOUCH * _extent(particles)), gap, 0.0)
-    support = Support(particles, within * n, facet_tags, tag, modulus, penalty)
-    support.one_sided = True
-    return support
+    return Plane(particles, gap, n, facet_tags, tag, modulus, penalty)
 
 
 def _extent(particles: Particles) -> float:

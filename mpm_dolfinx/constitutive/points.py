@@ -385,6 +385,49 @@ class MaterialPoints:
                 result[group.points] = np.einsum("niiii->ni", tangent).max(axis=1, initial=0.0)
         return result.reshape(self._particles.num_local, -1).mean(axis=1)
 
+    def undeformed_tangent(self) -> NDArray[np.float64]:
+        """Return dP/dF of all points where nothing is strained, ``(n nq, dim, dim, dim, dim)``."""
+        result = np.zeros(self.tangent.shape)
+        for group in self._groups:
+            result[group.points] = self._undeformed_tangent(group)
+        return result
+
+    def strain_energy(self, trial: bool = False) -> NDArray[np.float64]:
+        """Return the elastic energy per undeformed volume of all points, shape ``(n nq,)``.
+
+        Args:
+            trial: Whether it is that of the last update, not of the last converged step.
+
+        Returns:
+            Not a number where a material does not know it.
+        """
+        result = np.full(self._points, np.nan)
+        for group, state in zip(self._groups, self._trial if trial else self._states, strict=True):
+            energy = group.material.strain_energy(state)
+            if energy is not None:
+                self._require(group, "strain energy", energy, (len(group.points),))
+                result[group.points] = energy
+        return result
+
+    @property
+    def has_small_strain(self) -> NDArray[np.bool_]:
+        """Which points have a law of small strains, shape ``(n nq,)``."""
+        return self._where(lambda law: getattr(law, "kinematics", None) == "small")
+
+    @property
+    def is_hyperelastic(self) -> NDArray[np.bool_]:
+        """Which points have a stress that derives from the energy of F alone, ``(n nq,)``."""
+        if self.averaging is not None:
+            return np.zeros(self._points, dtype=bool)
+        elastic = self._where(lambda law: not getattr(law, "inelastic", True))
+        return elastic & np.isfinite(self.strain_energy())
+
+    def _where(self, holds: Callable[[Material], bool]) -> NDArray[np.bool_]:
+        result = np.zeros(self._points, dtype=bool)
+        for group in self._groups:
+            result[group.points] = holds(group.material)
+        return result
+
     def update(self) -> None:
         """Update all points for the present displacement; the history stays as it is.
 
@@ -416,13 +459,19 @@ class MaterialPoints:
         They differ from :attr:`first_piola` and :attr:`tangent` where the mesh is not the
         undeformed body: ``P G^T / det G`` where it has G behind it.
         """
+        return self.taken_to_mesh(self.first_piola, self.tangent)
+
+    def taken_to_mesh(
+        self, stress: NDArray[np.float64], tangent: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return a first Piola stress at all points and its tangent as :meth:`on_mesh` does."""
         if not self._particles.rebased:
-            return self.first_piola, self.tangent
+            return stress, tangent
         gdim = self._particles.mesh.geometry.dim
         G = (np.eye(gdim) + self._particles.reference.gradient).reshape(-1, gdim, gdim)
         volume = np.linalg.det(G)[:, None, None]
-        stress = np.einsum("niJ,nMJ->niM", self.first_piola, G) / volume
-        tangent = np.einsum("niJkL,nMJ,nNL->niMkN", self.tangent, G, G, optimize=True)
+        stress = np.einsum("niJ,nMJ->niM", stress, G) / volume
+        tangent = np.einsum("niJkL,nMJ,nNL->niMkN", tangent, G, G, optimize=True)
         return stress, tangent / volume[:, :, :, None, None]
 
     def _update_materials(self, gradient: NDArray[np.float64]) -> None:

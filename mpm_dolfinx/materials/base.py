@@ -186,6 +186,19 @@ class Material(ABC):
             state: The state that belongs to it.
         """
 
+    def strain_energy(self, state: State) -> NDArray[np.float64] | None:
+        """Return the elastic energy per undeformed volume of points, shape ``(n,)``.
+
+        Args:
+            state: Their state.
+
+        Returns:
+            The energy; ``None``, as here, where the law does not know it. A law without other
+            internal variables than the stress that knows it keeps the energy of a motion to
+            round-off (``DynamicProblem(scheme="conserving")``).
+        """
+        return None
+
     def stressed_state(self, cauchy_stress: NDArray[np.float64], dim: int) -> State:
         """Return the state of points that carry a stress where their body is undeformed.
 

@@ -156,6 +156,19 @@ class ModifiedCamClay(CompiledMaterial):
         strain[:, :3] -= (volume / 3.0)[:, None]
         return np.asarray(strain)
 
+    def strain_energy(self, state: State) -> Array:
+        """Return the elastic energy per undeformed volume, from the reference pressure on.
+
+        It is ``kappa (p - p_r) + s : s / 4 G``, with the deviator s, as the pressure p derives from
+        ``kappa p_r exp(-tr eps / kappa)``.
+        """
+        pressure = -trace(state["stress"]) / 3.0
+        volumetric = self.parameters["swelling"] * (
+            pressure - self.parameters["reference_pressure"]
+        )
+        square = norm(deviator(state["stress"])) ** 2
+        return np.asarray(volumetric + square / (4.0 * self.parameters["shear_modulus"]))
+
     def yield_function(
         self, stress: Array, plastic_strain: Array, preconsolidation: Array
     ) -> Array:

@@ -72,6 +72,11 @@ class IsotropicElastic(CompiledMaterial):
         strain[:, :3] += (trace(stress) / (9.0 * self.bulk))[:, None]
         return strain
 
+    def strain_energy(self, state: State) -> NDArray[np.float64]:
+        """Return the elastic energy per undeformed volume, ``1/2 stress : strain``."""
+        stress = state["stress"]
+        return np.asarray(0.5 * np.einsum("nm,nm->n", stress, self.elastic_strain(stress)))
+
     def elastic_tangent(self, n: int, m: int) -> NDArray[np.float64]:
         """Return the elastic stiffness of ``n`` points, shape ``(n, m, m)``, read-only."""
         bulk, shear = (np.reshape(p, (-1, 1, 1)) for p in (self.bulk, self.shear))

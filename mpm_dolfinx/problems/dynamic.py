@@ -21,6 +21,8 @@ from dolfinx.fem import petsc as fem_petsc
 from .. import _compat
 from ..assembly.inputs import as_expression
 from ..boundary.supports import Support
+from ..constitutive.points import MaterialPoints
+from ..constitutive.step_stress import StepStress
 from ..contact.contact import Contact
 from ..errors import MPMError, agree, as_ours, on_all_ranks
 from ..history import Energy, History, Step
@@ -28,9 +30,11 @@ from ..parallel.garbage import weakly
 from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..stepping.progress import with_bar
-from ..system.inertia import Inertia
+from ..system.body import StepForce
+from ..system.inertia import Followed, Inertia
 from ..system.term import Term
 from .arguments import as_bodies, as_terms
+from .particle_problem import Contribution
 from .quasistatic import QuasiStaticProblem
 
 __all__ = ["DynamicProblem"]
@@ -59,9 +63,13 @@ class DynamicProblem(QuasiStaticProblem):
             ``(gdim, n)``, a Function, or a UFL expression on the body mesh; ``None``: at rest. A
             list has one for each body.
         scheme: ``"midpoint"``: second order; the force of a step is the mean of those at its
-            ends. ``"euler"``: first order, with much loss of energy, for motions that shall come
-            to rest, and for one-sided supports.
-        out_of_range: ``"project"`` or ``"reflect"``, with ``scheme="midpoint"``.
+            ends. ``"conserving"``: second order; stress is one of the whole step, by which angular
+            momentum is kept to round-off, and the energy of elastic materials too; for what
+            spins fast or long. ``"euler"``: first order, with much loss of energy, for motions
+            that shall come to rest.
+        out_of_range: ``"project"`` or ``"reflect"``; no matter with ``scheme="euler"``.
+        rayleigh: Damping ``(alpha, beta)`` in proportion to mass (one over a time) and to the
+            stiffness of the undeformed bodies (a time); not negative.
         terms: As in :class:`QuasiStaticProblem`.
         **options: All else that :class:`QuasiStaticProblem` has but ``background`` and
             ``predictor``: ``body_force``, ``bcs``, ``tractions``, ``supports``, ``f_bar``, ...
@@ -82,13 +90,19 @@ class DynamicProblem(QuasiStaticProblem):
         velocity: Any = None,
         scheme: str = "midpoint",
         out_of_range: str = "project",
+        rayleigh: tuple[float, float] = (0.0, 0.0),
         terms: Sequence[Term] = (),
         **options: Any,
     ) -> None:
         bodies = as_bodies(particles)
         require_same(
-            bodies[0].V.mesh.comm, velocity=velocity, scheme=scheme, out_of_range=out_of_range
+            bodies[0].V.mesh.comm,
+            velocity=velocity,
+            scheme=scheme,
+            out_of_range=out_of_range,
+            rayleigh=rayleigh,
         )
+        alpha, self._viscosity = _rayleigh(rayleigh)
         if options.get("background") is not None:
             raise MPMError(
                 "A form on the background has no past, so it cannot act in a DynamicProblem; "
@@ -98,16 +112,11 @@ class DynamicProblem(QuasiStaticProblem):
             raise MPMError(
                 "A DynamicProblem starts each step from the velocities; leave predictor= out."
             )
-        supports = options.get("supports") or ()
-        if scheme == "midpoint" and any(getattr(s, "one_sided", False) for s in supports):
-            raise MPMError(
-                "One-sided supports would add energy with scheme='midpoint'; use scheme='euler'."
-            )
         count = len(bodies) if isinstance(particles, list | tuple) else 0
         velocities = _for_each(velocity, count)
         start = [_velocity(v, body) for v, body in zip(velocities, bodies, strict=True)]
         self._energies: list[Energy] = []
-        self.inertia = Inertia(bodies, start, scheme, out_of_range, self._energies)
+        self.inertia = Inertia(bodies, start, scheme, out_of_range, alpha, self._energies)
         given = as_terms(terms, bodies)
         super().__init__(
             particles,
@@ -125,7 +134,51 @@ class DynamicProblem(QuasiStaticProblem):
         self.inertia.join(self.bodies)
         super()._build()
         others = [*self.body_terms, *(term for term in self.terms if term is not self.inertia)]
-        self.inertia.follow(others, weakly(self._mass_matrix))
+        followed = Followed(
+            others,
+            weakly(self._mass_matrix),
+            weakly(self._works),
+            weakly(self._stored),
+            weakly(self._changes),
+            weakly(self._driven),
+        )
+        self.inertia.follow(followed)
+
+    def _in_time(
+        self, history: MaterialPoints, supports: Sequence[Support]
+    ) -> tuple[StepStress, Sequence[StepForce]]:
+        """See :meth:`QuasiStaticProblem._in_time`."""
+        stress = StepStress(history, self.inertia.scheme == "conserving", self._viscosity)
+        self._step_stresses.append(stress)
+        return stress, (stress, *supports)
+
+    def _contributions(self) -> list[Contribution]:
+        """See :meth:`ParticleProblem._contributions`."""
+        self._step_stresses: list[StepStress] = []
+        return super()._contributions()
+
+    @property
+    def _has_mean(self) -> bool:
+        """See :meth:`QuasiStaticProblem._has_mean`."""
+        return self.inertia.share < 1.0
+
+    def _works(self) -> NDArray[np.float64]:
+        """Return the works of the last increment on the backgrounds (collective)."""
+        return self.reduced.works()
+
+    def _changes(self) -> list[NDArray[np.float64]]:
+        """Return the changes of Dirichlet values in the step, on own dofs of each background."""
+        return self.reduced.changes()
+
+    def _driven(self, particles: Particles, values: Sequence[NDArray[np.float64]]) -> PETSc.Vec:
+        """Return how Dirichlet values move a body (collective)."""
+        return self.reduced.driven(particles, values)
+
+    def _stored(self) -> tuple[float, float]:
+        """Return elastic energy, and the work done against stress in the last step (collective)."""
+        own = [(s.strain_energy(), s.stress_work) for s in self._step_stresses]
+        energy, work = self._comm.allreduce(np.sum(own, axis=0))
+        return float(energy), float(work)
 
     def _mass_matrix(self, number: int) -> PETSc.Mat:
         """Return the consistent mass of a body on its W (collective)."""
@@ -354,7 +407,7 @@ class DynamicProblem(QuasiStaticProblem):
     def reaction(self, bc: fem.DirichletBC | Support | Contact) -> NDArray[np.float64]:
         """Return the force of a support on the body: of a Dirichlet condition in the last step.
 
-        That is the mean over the step with ``scheme="midpoint"``; supports of
+        That is the mean over the step, but with ``scheme="euler"``; supports of
         :mod:`mpm_dolfinx.boundary` and contacts have that at its end. See
         :meth:`ParticleProblem.reaction`.
         """
@@ -369,6 +422,21 @@ def _for_each(value: Any, count: int) -> list[Any]:
     if len(value) != count:
         raise MPMError(f"There are {count} bodies, but a list of {len(value)} velocities.")
     return value
+
+
+def _rayleigh(values: Any) -> tuple[float, float]:
+    """Return alpha and beta of Rayleigh damping.
+
+    Raises:
+        MPMError: They are not two numbers, or negative.
+    """
+    try:
+        alpha, beta = map(float, values)
+    except (TypeError, ValueError):
+        raise MPMError(f"rayleigh must be (alpha, beta), two numbers, not {values!r}.") from None
+    if not (0.0 <= alpha < math.inf and 0.0 <= beta < math.inf):
+        raise MPMError(f"rayleigh must have finite numbers that are not negative, not {values!r}.")
+    return alpha, beta
 
 
 def _velocity(value: Any, body: Particles) -> fem.Function:

@@ -40,7 +40,7 @@ from ..stepping.diagnosis import crossed
 from ..stepping.displacement_control import DisplacementControl
 from ..stepping.loading import Mender, Stepper
 from ..stepping.progress import with_bar
-from ..system.body import BodyTerm, PointHistory
+from ..system.body import BodyTerm, PointHistory, StepForce
 from ..system.conditions import fixed_dofs, force_at
 from ..system.field import Field
 from ..system.predictor import Predictor
@@ -75,6 +75,7 @@ class Contribution(NamedTuple):
         material: The material at its points, if the above hold one.
         injected: Functions in the forms for stress and tangent of the material, or ``None``.
         contact: Whether the forms have one-sided supports.
+        of_step: What among its forces may be of a whole step in time.
     """
 
     residual: ufl.Form | None
@@ -85,6 +86,7 @@ class Contribution(NamedTuple):
     material: PointHistory | None = None
     injected: tuple[fem.Function, fem.Function] | None = None
     contact: bool = False
+    of_step: Sequence[StepForce] = ()
 
 
 class Change(Protocol):
@@ -312,6 +314,7 @@ class ParticleProblem:
                 c.material,
                 c.injected,
                 c.contact,
+                c.of_step,
             )
             for body, c in zip(self.bodies, contributions, strict=True)
         ]

@@ -21,11 +21,13 @@ from ..assembly.rules import depends_on
 from ..boundary.supports import Support
 from ..constitutive.groups import background_cells
 from ..constitutive.points import MaterialPoints
+from ..constitutive.step_stress import StepStress
 from ..constitutive.strain import strain_of
 from ..errors import DomainDistortionError, MPMError, agree, agreed, warn
 from ..io.checkpoint import Snapshot
 from ..parallel.given import require_same
 from ..particles.particles import Particles
+from ..system.body import StepForce
 from ..system.term import Term
 from .arguments import as_bodies, as_terms
 from .initial_stress import initial_stress_at_points
@@ -465,14 +467,17 @@ class QuasiStaticProblem(ParticleProblem):
         mass = density.value
         if body.mass_share is not None:
             mass = mass * body.mass_share
-        symmetric = history.symmetric and not given.pressures
+        acting, of_step = self._in_time(history, given.supports)
+        symmetric = acting.symmetric and not given.pressures
         loads: list[ufl.Form] = []
         if given.body_force is not None:
             loads.append(-work.body_force(mass, given.body_force))
         if given.tractions:
             loads.append(-work.tractions(given.tractions, given.facet_tags))
             symmetric = symmetric and not depends_on(loads[-1], body.displacement)
-        loads += [s.at_body(history.initial_modulus, strain.turn) for s in given.supports]
+        loads += [
+            s.at_body(history.initial_modulus, strain.turn, self._has_mean) for s in given.supports
+        ]
         if given.pressures:
             loads.append(work.pressures(given.pressures, given.facet_tags))
         slopes = [
@@ -489,13 +494,25 @@ class QuasiStaticProblem(ParticleProblem):
         return Contribution(
             sum(loads[1:], loads[0]) if loads else None,
             sum(slopes[1:], slopes[0]) if slopes else None,
-            history if self._compiled else None,
+            acting if self._compiled else None,
             history.averaging,
             symmetric,
-            history,
+            acting,
             injected,
             any(support.one_sided for support in given.supports),
+            of_step,
         )
+
+    def _in_time(
+        self, history: MaterialPoints, supports: Sequence[Support]
+    ) -> tuple[MaterialPoints | StepStress, Sequence[StepForce]]:
+        """Return what stress acts on a body, and what among its forces is of a whole step."""
+        return history, ()
+
+    @property
+    def _has_mean(self) -> bool:
+        """Whether forces are means over a step in time."""
+        return False
 
     def begin_step(self) -> None:
         """See :meth:`ParticleProblem.begin_step`; parameters of materials have new values then."""

@@ -20,7 +20,7 @@ from ..errors import MPMError
 from ..particles.particles import Particles
 from .term import PointMaterial, Term, Transfer
 
-__all__ = ["BodyTerm", "PointHistory"]
+__all__ = ["BodyTerm", "PointHistory", "StepForce"]
 
 
 class PointHistory(PointMaterial, Protocol):
@@ -42,6 +42,22 @@ class PointHistory(PointMaterial, Protocol):
         """Return stress and tangent at the points, in the dimension of the forms."""
 
 
+class StepForce(Protocol):
+    """A part of a body's forces that may be one of a whole step; see :meth:`Term.pace`."""
+
+    def pace(self, dt: float, share: float) -> None:
+        """Take notice that a step begins."""
+
+    def mute(self, muted: bool) -> None:
+        """Leave out, or take in again, what belongs to the whole step."""
+
+    def settle(self) -> None:
+        """Take the present state for the beginning of the next step."""
+
+    def step_work(self) -> tuple[float, float]:
+        """Return this rank's work in the last step, internal and damping."""
+
+
 class BodyTerm(Term):
     """The forms on one body's mesh, and the material at its points.
 
@@ -52,6 +68,7 @@ class BodyTerm(Term):
         injected: Functions in the forms for the material's stress and its tangent, if they take
             these by Functions.
         contact: Whether one-sided supports act on it.
+        of_step: What among its forces may be of a whole step.
 
     Attributes:
         particles: As given.
@@ -67,8 +84,10 @@ class BodyTerm(Term):
         material: PointHistory | None = None,
         injected: tuple[fem.Function, fem.Function] | None = None,
         contact: bool = False,
+        of_step: Sequence[StepForce] = (),
     ) -> None:
         super().__init__([particles])
+        self._of_step = tuple(of_step)
         self.particles = particles
         self.forms = forms
         self._material = material
@@ -97,6 +116,29 @@ class BodyTerm(Term):
         """See :meth:`Term.begin`."""
         self.forms.assemble_external()
         return [self.forms.external]
+
+    def pace(self, dt: float, share: float) -> None:
+        """See :meth:`Term.pace`."""
+        for part in self._of_step:
+            part.pace(dt, share)
+
+    def end_forces(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.end_forces`."""
+        for part in self._of_step:
+            part.mute(True)
+        self._inject()
+        force = self.forms.assemble_residual().copy()
+        for part in self._of_step:
+            part.mute(False)
+            part.settle()
+        self._inject()
+        return [force]
+
+    def step_work(self) -> tuple[float, float]:
+        """See :meth:`Term.step_work`."""
+        works = np.array([part.step_work() for part in self._of_step]).reshape(-1, 2)
+        total = self.particles.mesh.comm.allreduce(works.sum(axis=0))
+        return float(total[0]), float(total[1])
 
     def update(self) -> MPMError | None:
         """See :meth:`Term.update`."""

@@ -296,7 +296,15 @@ class Field:
 
     def lift(self) -> PETSc.Vec:
         """Return the increment that the step's Dirichlet values are."""
-        self.u.array_w[:] = self._lifts()
+        return self.driven(self._lifts())
+
+    def changes(self) -> NDArray[np.float64]:
+        """Return the change of the Dirichlet values in the step, zero at other own dofs of V."""
+        return self._lifts()
+
+    def driven(self, values: NDArray[np.float64]) -> PETSc.Vec:
+        """Return the increment with values at the fixed dofs, on own dofs of V, and no unknowns."""
+        self.u.array_w[:] = np.where(self._fixed, values, 0.0)
         self._extend(self.u)
         return self.u
 
@@ -322,6 +330,29 @@ class Field:
         """Return the norm of the last residual at Dirichlet conditions."""
         forces = np.where(self._fixed, self.force.array_r, 0.0)
         return joint_norm(forces, self._comm)
+
+    def works(self, stiffness: Callable[[], list[float]]) -> NDArray[np.float64]:
+        """Return what acts on the background does over the last increment (collective).
+
+        Args:
+            stiffness: Returns the shear modulus of each body.
+
+        Returns:
+            Work done against what acts on the background itself, work of the residual at Dirichlet
+            conditions, and work of the residual at the unknowns.
+        """
+        assert self.free is not None
+        own = self.u.duplicate()
+        own.set(0.0)
+        if self._sizes[1] > 0 and norm(self.u) > 0.0:
+            self.add_product(self.u, own, stiffness)
+        work = self.u.array_r * self.force.array_r
+        found = [
+            self.u.array_r @ own.array_r,
+            work[self._fixed].sum(),
+            work[self.dofs].sum(),
+        ]
+        return np.asarray(self._comm.allreduce(np.array(found)))
 
     def resultant(self) -> float:
         """Return the size of the sum of the last residual over the free dofs."""

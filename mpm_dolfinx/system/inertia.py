@@ -4,23 +4,28 @@
 
 Velocities live on W, where a body has its displacement; no acceleration is kept. A step can follow
 what is in the range of T: let P be the projector on it that is orthogonal in M, the consistent
-mass. With ``w = T u``, ``"midpoint"`` solves
+mass. With ``w = T u``, ``"midpoint"`` and ``"conserving"`` solve
 
     T^T [ (2/dt) M (w/dt - v_n) + (f_n + f_1)/2 ] = 0,    v_1 = 2 w/dt - P v_n
 
-or ``- v_n`` (reflect), f being the forces of all other terms at the step's ends; ``"euler"`` solves
-``T^T [ M (w/dt - v_n)/dt + f_1 ] = 0`` and has ``v_1 = w/dt``. Whatever T is, with L the loss
+or ``- v_n`` (reflect), f being the forces of all other terms at the step's ends, besides those that
+some terms have for the step as a whole (:meth:`Term.pace`), which ``"conserving"`` asks of stress;
+``"euler"`` solves ``T^T [ M (w/dt - v_n)/dt + f_1 ] = 0`` and has ``v_1 = w/dt``. Whatever T is,
+with ``q = (I - P) v_n`` and L the loss
 
-    1/2 |v_1|^2 - 1/2 |v_n|^2 = - f . w - L,    L = 1/2 |(I - P) v_n|^2,  0  or  1/2 |v_1 - v_n|^2,
+    1/2 |v_1|^2 - 1/2 |v_n|^2 = - f . w - L,    L = 1/2 |q|^2 - q . v_1,  0  or  1/2 |v_1 - v_n|^2,
 
-f being the mean of the ends or that of the last end, norms those of M.
+f being the force of the step, norms and products those of M. ``q . v_1`` is round-off but where
+Dirichlet values move.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -30,26 +35,62 @@ from dolfinx import fem
 
 from ..errors import ConvergenceError, MPMError
 from ..history import Energy
-from ..io.snapshot import Kept, Taken, fill, of_cells
+from ..io.snapshot import Kept, Taken, fill, of_cells, spaces_of
 from ..meshes.remesh import Column
 from ..particles.particles import Particles
 from .term import Motion, Term, Transfer
 
 __all__ = ["OUT_OF_RANGE", "SCHEMES", "Inertia"]
 
-SCHEMES = ("midpoint", "euler")
+SCHEMES = ("midpoint", "conserving", "euler")
 OUT_OF_RANGE = ("project", "reflect")
 #: What the residual of a projection falls to, and the most iterations and refinements of it.
 PROJECTED, MOST_ITERATIONS, REFINEMENTS = 1e-13, 300, 6
 #: The same for one that has come to the end of what round-off lets it do.
 AT_ROUND_OFF = 1e-10
+#: How often what the shift holds back is let go.
+RELEASES = 3
 #: Diagonal shift in a projection, relative to the diagonal.
 SHIFT = 1e-13
 #: What is added to it in turn where the factor is at round-off.
 RAISES = (0.0, 1e-12, 1e-11, 1e-10)
 
+#: What is summed over steps: attributes of Energy.
+TOTALS = (
+    "internal", "external", "lost", "damping", "stabilisation", "prescribed", "residual",
+)  # fmt: skip
+
 type MassMatrix = Callable[[int], PETSc.Mat]
 """Assembles the consistent mass of a body on its W, by its number."""
+type Works = Callable[[], NDArray[np.float64]]
+"""Returns the works of the last increment on the backgrounds; see :meth:`Field.works`."""
+type Changes = Callable[[], list[NDArray[np.float64]]]
+"""Returns the changes of Dirichlet values in the step, on own dofs of each background."""
+type Driven = Callable[[Particles, Sequence[NDArray[np.float64]]], PETSc.Vec]
+"""Returns how such values move a body."""
+type Stored = Callable[[], tuple[float, float]]
+"""Returns the elastic energy of all bodies, and the work done against stress in the last step."""
+
+
+class Followed(NamedTuple):
+    """What inertia must know of the rest of a problem, on the present meshes.
+
+    Attributes:
+        terms: All other terms.
+        mass: Assembles the mass.
+        works: Returns the works of the last increment on the backgrounds.
+        stored: Returns the elastic energy at the last converged step, and the work done against
+            stress in the last step.
+        changes: Returns the changes of Dirichlet values in the step.
+        driven: Returns how such values move a body.
+    """
+
+    terms: Sequence[Term]
+    mass: MassMatrix
+    works: Works
+    stored: Stored
+    changes: Changes
+    driven: Driven
 
 
 class Inertia(Term):
@@ -61,8 +102,9 @@ class Inertia(Term):
     Args:
         bodies: The bodies.
         velocities: At the beginning, on W of each body.
-        scheme: ``"midpoint"`` or ``"euler"``.
+        scheme: One of :data:`SCHEMES`.
         out_of_range: ``"project"`` or ``"reflect"``; of no meaning to ``"euler"``.
+        damping: Damping in proportion to the mass, one over a time.
         energies: Where the account is kept, one entry for each step.
 
     Attributes:
@@ -79,6 +121,7 @@ class Inertia(Term):
         velocities: Sequence[fem.Function],
         scheme: str,
         out_of_range: str,
+        damping: float,
         energies: list[Energy],
     ) -> None:
         if scheme not in SCHEMES:
@@ -89,17 +132,22 @@ class Inertia(Term):
             )
         super().__init__(bodies)
         self.scheme, self.out_of_range = scheme, out_of_range
+        self._damping = damping
         self.velocities = list(velocities)
         self.dt, self.time = 1.0, 0.0
         self._end = 1.0
         self._energies = energies
         self._kinetic = 0.0
-        self._totals = np.zeros(3)  # internal, external, lost
+        self._totals = np.zeros(len(TOTALS))
+        self._stress_work = 0.0
+        self._strain = math.nan  # at the beginning
         self._forces = [fem.Function(body.W) for body in bodies]
         self._external = [fem.Function(body.W) for body in bodies]
         self._others: list[Term] = []
         self._deleted: list[int] | None = None
         self._transferred: list[PETSc.Mat] = []
+        self._rates: list[NDArray[np.float64]] = []  # of Dirichlet values, in the last step
+        self._rates_dt = 0.0
 
     @property
     def one_sided(self) -> bool:
@@ -108,29 +156,25 @@ class Inertia(Term):
 
     @property
     def share(self) -> float:
-        """What of the residual is the force: the mean over the step, with ``"midpoint"``."""
-        return 0.5 if self.scheme == "midpoint" else 1.0
+        """What of the residual is the force: the mean over the step, but with ``"euler"``."""
+        return 1.0 if self.scheme == "euler" else 0.5
 
     @property
     def _factors(self) -> tuple[float, float, float]:
         """Factors of M w, of M v_n and of the forces at the step's beginning."""
-        if self.scheme == "midpoint":
-            return 4.0 / self.dt**2, 4.0 / self.dt, 1.0
-        return 1.0 / self.dt**2, 1.0 / self.dt, 0.0
+        damping = self._damping / self.dt
+        if self.scheme == "euler":
+            return 1.0 / self.dt**2 + damping, 1.0 / self.dt, 0.0
+        return 4.0 / self.dt**2 + 2.0 * damping, 4.0 / self.dt, 1.0
 
     @property
     def symmetric(self) -> bool:
         """See :attr:`Term.symmetric`."""
         return True
 
-    def follow(self, others: Sequence[Term], mass: MassMatrix) -> None:
-        """Take over what else acts on the bodies, and what assembles their mass.
-
-        Args:
-            others: The other terms, on the present meshes.
-            mass: Assembles the mass.
-        """
-        self._others, self._mass = list(others), mass
+    def follow(self, followed: Followed) -> None:
+        """Take over the rest of the problem on the present meshes."""
+        self._followed, self._others = followed, list(followed.terms)
         self._deleted = None
 
     def join(self, bodies: Sequence[Particles]) -> None:
@@ -159,12 +203,12 @@ class Inertia(Term):
         if deleted == self._deleted:
             return
         self._deleted = deleted
-        self.masses = [self._mass(number) for number in range(len(self.bodies))]
+        self.masses = [self._followed.mass(number) for number in range(len(self.bodies))]
         for body, M in zip(self.bodies, self.masses, strict=True):
             _require_mass(body, M)
         kinetic = self.kinetic()
         if self._energies:
-            self._totals[2] += self._kinetic - kinetic
+            self._totals[TOTALS.index("lost")] += self._kinetic - kinetic
         self._kinetic = kinetic
 
     def _vectors(self, functions: Sequence[fem.Function]) -> list[PETSc.Vec]:
@@ -232,7 +276,17 @@ class Inertia(Term):
         self._note_forces()
         if not self._energies:
             self._kinetic = self.kinetic()
-            self._energies.append(Energy(time, self._kinetic, 0.0, 0.0, 0.0))
+            self._strain, _ = self._followed.stored()
+            self._note_energy()
+
+    def _note_energy(self) -> None:
+        """Add an entry to the account, of the last converged step."""
+        strain, _ = self._followed.stored()
+        sums = {name: float(total) for name, total in zip(TOTALS, self._totals, strict=True)}
+        dissipated = self._stress_work - (strain - self._strain)
+        self._energies.append(
+            Energy(self.time, self._kinetic, strain=strain, dissipated=dissipated, **sums)
+        )
 
     def _note_forces(self) -> None:
         """Keep the forces of all other terms, as they are now."""
@@ -241,7 +295,7 @@ class Inertia(Term):
                 function.x.array[:] = 0.0
         for term in self._others:
             self._gather(term, term.begin(), self._external)
-            self._gather(term, term.residuals(), self._forces)
+            self._gather(term, term.end_forces(), self._forces)
         for function in (*self._forces, *self._external):
             function.x.scatter_forward()
 
@@ -262,6 +316,8 @@ class Inertia(Term):
     def begin(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.begin`."""
         self.settle()
+        for term in self._others:
+            term.pace(self.dt, self.share)
         _, b, share = self._factors
         self._v = self._vectors(self.velocities)
         self._staying = self._times_mass(self._v)
@@ -288,26 +344,39 @@ class Inertia(Term):
         ):
             self._transferred = Ts
             self._reduce(Ts)
-        if self.scheme != "midpoint" or self.out_of_range != "project":
+        if self.scheme == "euler" or self.out_of_range != "project":
             return None
-        if any(prescribed(body) is not None for body in self.bodies):
-            raise MPMError(
-                "Dirichlet values that change in time do not go with out_of_range='project', which "
-                "does not know their velocity; move a support on the body "
-                "(mpm.boundary.fixed(value=)), or use 'reflect'"
-            )
+        driven = self._driven()
+        v = [v.copy() for v in self._v]
+        for part, own in zip(v, driven or (), strict=False):
+            part.axpy(-1.0, own)
         right = self._A.createVecLeft()
         right.set(0.0)
-        for T, force in zip(Ts, self._times_mass(self._v), strict=True):
+        for T, force in zip(Ts, self._times_mass(v), strict=True):
             T.multTransposeAdd(force, right, right)
         y = right.duplicate()
         if y.getSize() > 0:
             self._solve(right, y)
-        self._projected = [v.duplicate() for v in self._v]
+        self._projected = [v.duplicate() for v in self._v] if driven is None else driven
         for T, part in zip(Ts, self._projected, strict=True):
-            T.mult(y, part)
+            T.multAdd(y, part, part) if driven else T.mult(y, part)
         y.scale(self.dt)
         return y
+
+    def _driven(self) -> list[PETSc.Vec] | None:
+        """Return velocities by Dirichlet values that move, ``None`` where none does (collective).
+
+        Their rates at the step's beginning are those of a parabola through their last three values.
+        """
+        comm = self.bodies[0].V.mesh.comm
+        rates = [change / self.dt for change in self._followed.changes()]
+        if self._rates_dt > 0.0:
+            part = self.dt / (self.dt + self._rates_dt)
+            before = zip(self._rates, rates, strict=True)
+            rates = [part * last + (1.0 - part) * now for last, now in before]
+        if not comm.allreduce(any(bool(np.any(rate)) for rate in rates), MPI.LOR):
+            return None
+        return [self._followed.driven(body, rates) for body in self.bodies]
 
     def _reduce(self, Ts: Sequence[PETSc.Mat]) -> None:
         """Reduce the mass by T, and prepare to solve with it."""
@@ -326,31 +395,54 @@ class Inertia(Term):
         values = diagonal.array_w
         values[:] = np.where(values > 0.0, SHIFT, 1.0)
         shifted.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
-        self._shifted = shifted
+        self._shifted, self._held = shifted, diagonal
         self._factor: PETSc.KSP | None = None
         self._iterates = max(body.V.ufl_element().degree for body in self.bodies) == 1
 
-    def _solve(self, right: PETSc.Vec, y: PETSc.Vec) -> None:
+    def _solve(self, right: PETSc.Vec, result: PETSc.Vec) -> None:
         """Solve for the unknowns of a projection (collective).
 
-        Combinations of unknowns that hardly move the bodies' nodes are kept small by a shift, as
-        in Newton's method, for which this is the start.
+        Combinations of unknowns that hardly move the bodies' nodes are held by a shift, and let go
+        as far as they can be, as in Newton's method, for which this is the start.
 
         Raises:
             ConvergenceError: That failed.
         """
-        scaled = right.duplicate()
+        scaled, y = right.duplicate(), right.duplicate()
         scaled.pointwiseMult(right, self._unit)
-        if scaled.norm() > 0.0:
-            self._solve_scaled(scaled, y)
-            y.pointwiseMult(y, self._unit)
+        size = scaled.norm()
+        if size > 0.0:
+            self._solve_scaled(scaled, y, size)
+            rest = self._rest(scaled, y)
+            for _ in range(RELEASES):
+                if rest.norm() <= 2.0 * PROJECTED * size:
+                    break
+                part = y.duplicate()
+                self._solve_scaled(rest, part, size)
+                part.axpy(1.0, y)
+                left = self._rest(scaled, part)
+                if not left.norm() <= 0.5 * rest.norm():
+                    break
+                y, rest = part, left
+            result.pointwiseMult(y, self._unit)
 
-    def _solve_scaled(self, right: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Solve with the matrix of unit diagonal: by iterations, or where they fail by a factor."""
-        size = right.norm()
+    def _rest(self, right: PETSc.Vec, y: PETSc.Vec) -> PETSc.Vec:
+        """Return what y leaves of the right-hand side, without the shift."""
+        rest, held = right.duplicate(), right.duplicate()
+        self._shifted.mult(y, rest)
+        held.pointwiseMult(self._held, y)
+        rest.axpby(1.0, -1.0, right)
+        rest.axpy(1.0, held)
+        return rest
+
+    def _solve_scaled(self, right: PETSc.Vec, y: PETSc.Vec, size: float) -> None:
+        """Solve with the matrix of unit diagonal: by iterations, or where they fail by a factor.
+
+        What is left is judged by a size.
+        """
         if self._iterates:
             ksp = _solver(self._shifted, "cg", "none")
-            ksp.setTolerances(rtol=PROJECTED, atol=0.0, max_it=MOST_ITERATIONS)
+            ksp.setTolerances(rtol=0.0, atol=PROJECTED * size, max_it=MOST_ITERATIONS)
             ksp.solve(right, y)
             if ksp.getConvergedReason() > 0:
                 return
@@ -358,6 +450,7 @@ class Inertia(Term):
         for more in RAISES:
             if self._factor is None:
                 self._shifted.shift(more)
+                self._held.shift(more)
                 self._factor = _solver(self._shifted, "preonly", "cholesky")
                 self._factor.getPC().setFactorSolverType("mumps")
             y.set(0.0)
@@ -420,8 +513,9 @@ class Inertia(Term):
             force.scale(self._factors[0])
         return forces
 
-    def commit(self) -> None:
+    def commit(self) -> Callable[[], None]:
         """See :meth:`Term.commit`: take the new velocities, forces and energies."""
+        undo = self._undo()
         if self.scheme == "euler":
             taken = [v.duplicate() for v in self._v]
             factor = 1.0
@@ -436,24 +530,59 @@ class Inertia(Term):
             v.scale(factor / self.dt)
             v.axpy(-1.0, before)
             out.axpy(-1.0, v if self.scheme == "euler" else before)
-        self._totals[2] += 0.5 * _dot(lost, self._times_mass(lost))
+        out_of_range = self._times_mass(lost)
+        loss = 0.5 * _dot(lost, out_of_range)
+        if self.scheme != "euler":
+            loss -= _dot(new, out_of_range)
+        damped = self._damping / self.dt * _dot(self._w, self._times_mass(self._w))
         kinetic = 0.5 * _dot(new, self._times_mass(new))
+        on_background, prescribed, left = self.share * self._followed.works()
+        whole, resisted = np.sum([term.step_work() for term in self._others], axis=0)
         parts = [self._forces, self._external]
         before = [self._vectors(functions) for functions in parts]
         self._note_forces()
-        begin, end = (0.5, 0.5) if self.scheme == "midpoint" else (0.0, 1.0)
-        works = [
+        begin, end = (0.0, 1.0) if self.scheme == "euler" else (0.5, 0.5)
+        ends, loads = (
             begin * _dot(self._w, old) + end * _dot(self._w, self._vectors(functions))
             for old, functions in zip(before, parts, strict=True)
-        ]
-        self._totals[:2] += works[0] - works[1], -works[1]
+        )
+        works = {
+            "internal": ends - loads + whole,
+            "external": -loads,
+            "lost": loss,
+            "damping": damped + resisted,
+            "stabilisation": on_background,
+            "prescribed": prescribed,
+            "residual": -left,
+        }
+        self._totals += [works[name] for name in TOTALS]
         for function, v in zip(self.velocities, new, strict=True):
             function.x.array[: v.getLocalSize()] = v.array_r
             function.x.scatter_forward()
         self.time, self._kinetic = self._end, kinetic
+        self._rates = [change / self.dt for change in self._followed.changes()]
+        self._rates_dt = self.dt
         self._transferred = []
+        self._stress_work += self._followed.stored()[1]
         self.settle()
-        self._energies.append(Energy(self.time, self._kinetic, *map(float, self._totals)))
+        self._note_energy()
+        return undo
+
+    def _undo(self) -> Callable[[], None]:
+        """Return what takes a commit back."""
+        functions = [*self.velocities, *self._forces, *self._external]
+        values = [function.x.array.copy() for function in functions]
+        account = self.time, self._kinetic, self._stress_work, self._totals.copy()
+        rates, entries = (self._rates, self._rates_dt), len(self._energies)
+
+        def undo() -> None:
+            for function, before in zip(functions, values, strict=True):
+                function.x.array[:] = before
+            self.time, self._kinetic, self._stress_work, self._totals = account
+            self._rates, self._rates_dt = rates
+            del self._energies[entries:]
+
+        return undo
 
     # -- What goes with the problem -------------------------------------------------------
 
@@ -473,7 +602,9 @@ class Inertia(Term):
             "scheme": [self.scheme, self.out_of_range],
             "time": self.time,
             "energies": [list(vars(energy).values()) for energy in self._energies],
-            "totals": [*self._totals.tolist(), self._kinetic],
+            "totals": self._totals.tolist(),
+            "stress": [self._kinetic, self._stress_work, self._strain],
+            "rates": self._rates_dt,
         }
 
     def columns(self, body: int) -> dict[str, Column]:
@@ -484,6 +615,15 @@ class Inertia(Term):
             "external": self._external,
         }
         return {name: Column(of_cells(f[body]), "nodes") for name, f in named.items()}
+
+    def rates(self, number: int) -> dict[str, Column]:
+        """Return the rates of Dirichlet values on a background in the last step."""
+        V = spaces_of(self.bodies)[number]
+        function = fem.Function(V)
+        if self._rates_dt > 0.0:
+            function.x.array[: len(self._rates[number])] = self._rates[number]
+            function.x.scatter_forward()
+        return {"rates": Column(of_cells(function), "nodes")}
 
     def take(self, taken: Taken) -> None:
         """Take over what :meth:`numbers` and :meth:`columns` returned (collective)."""
@@ -499,7 +639,14 @@ class Inertia(Term):
                 fill(functions[number], columns[name])
         self.time = taken.numbers["time"]
         self._energies[:] = [Energy(*entries) for entries in taken.numbers["energies"]]
-        *self._totals[:], self._kinetic = taken.numbers["totals"]
+        self._totals = np.array(taken.numbers["totals"], dtype=np.float64)
+        self._kinetic, self._stress_work, self._strain = taken.numbers["stress"]
+        self._rates_dt, self._rates = taken.numbers["rates"], []
+        for V, columns in zip(spaces_of(self.bodies), taken.backgrounds, strict=True):
+            function = fem.Function(V)
+            fill(function, columns["rates"])
+            owned = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
+            self._rates.append(np.array(function.x.array[:owned]))
         self._transferred = []
 
 
@@ -521,7 +668,11 @@ class _Velocities(Kept):
 
     def columns(self, body: int | None) -> dict[str, Column]:
         """See :class:`Kept`."""
-        return {} if body is None else self._inertia.columns(body)
+        return self._inertia.rates(0) if body is None else self._inertia.columns(body)
+
+    def on_background(self, number: int) -> dict[str, Column]:
+        """See :class:`Kept`."""
+        return self._inertia.rates(number)
 
     def require(self, source: str, taken: Taken) -> None:
         """See :class:`Kept`."""

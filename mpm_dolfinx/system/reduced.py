@@ -521,6 +521,20 @@ class ReducedSystem:
                 self._add(term, term.absolute_contributions(), totals)
             return [norm(total) for total in totals]
 
+    def changes(self) -> list[NDArray[np.float64]]:
+        """Return :meth:`Field.changes` of each field."""
+        return [field.changes() for field in self.fields]
+
+    def driven(self, particles: Particles, values: Sequence[NDArray[np.float64]]) -> PETSc.Vec:
+        """Return how values at the fixed dofs of each V move a body (collective)."""
+        field, motion = self._place(particles)
+        return motion.of(field.driven(values[self.fields.index(field)])).copy()
+
+    def works(self) -> NDArray[np.float64]:
+        """Return :meth:`Field.works` of all fields."""
+        found = [field.works(partial(self._stiffness, field)) for field in self.fields]
+        return np.asarray(np.sum(found, axis=0))
+
     def resultant(self) -> float:
         """Return the size of the sum of the last residual over the unknowns.
 

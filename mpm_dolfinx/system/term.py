@@ -120,6 +120,39 @@ class Term:
         """
         return None
 
+    def pace(self, dt: float, share: float) -> None:
+        """Take notice that a step of a motion begins, before its first residuals.
+
+        The scheme of a DynamicProblem takes the mean of a step's end forces: its residual is the
+        sum of :meth:`end_forces` at the beginning (if ``share`` is 0.5) and :meth:`residuals`, and
+        ``share`` of that is force. A term whose force is one of the whole step, such as that of a
+        damper, or of contact with an energy that is to be kept, returns nothing as its
+        :meth:`end_forces`, ``1 / share`` times the force as its :meth:`residuals`, and the work
+        done against it as its :meth:`step_work`.
+
+        Args:
+            dt: Duration of the step.
+            share: 0.5, or 1 where the scheme takes forces at the step's end alone.
+        """
+
+    def end_forces(self) -> Sequence[PETSc.Vec]:
+        """Return the residuals at the last converged step, but for what is of a whole step.
+
+        Called once when a motion begins and after each of its steps, with loads as they are then;
+        forces of whole steps take note of where the next one begins.
+        """
+        return self.residuals()
+
+    def step_work(self) -> tuple[float, float]:
+        """Return the work done in the last step against its forces of the whole step (collective).
+
+        Called before or after :meth:`commit`, with the displacements at the step's end.
+
+        Returns:
+            What counts as internal, and what as damping.
+        """
+        return 0.0, 0.0
+
     def update(self) -> MPMError | None:
         """Update what the forces depend on; return why that cannot be. It must not be kept yet.
 

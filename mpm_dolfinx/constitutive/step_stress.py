@@ -1,0 +1,283 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Stress at the points of a body that moves: what acts over a step in time, and its work.
+
+With F_m the mean of the deformation gradients at a step's ends, and S = F^-1 P, ``"conserving"``
+has
+
+    P* = F_m S*,     S* = (S_n + S_1)/2 + c (E_1 - E_n),
+
+c = 0 (Simo & Tarnow 1992), or, where the stress derives from an energy W of the strain E,
+
+    c = (W_1 - W_n - (S_n + S_1)/2 : (E_1 - E_n)) / |E_1 - E_n|^2
+
+(Gonzalez 2000), so that the work P* : (F_1 - F_n) is W_1 - W_n. As S* is symmetric, angular
+momentum is kept. A law of small strains takes the mean of its stresses, which has the same two
+merits as far as they go there. Damping in proportion to the stiffness C of the undeformed body is
+``P_v = F_m (beta C : (E_1 - E_n) / dt)``: it resists no rotation and never gives energy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ConvergenceError
+from .points import MaterialPoints
+
+__all__ = ["StepStress"]
+
+#: Change of strain below which Gonzalez' correction, a quotient of small numbers, is faded out.
+SMALL = 1e-6
+
+type Array = NDArray[np.float64]
+
+
+class StepStress:
+    """The stress of which the forces of a step in time are made, at a body's points.
+
+    Stress at the step's end counts once, as its mean with that at the beginning is left to who sums
+    up the ends; what belongs to the whole step counts ``1 / share`` times (see
+    :meth:`system.term.Term.pace`).
+
+    Args:
+        points: The material with its history.
+        conserving: Whether the stress is that of the whole step; otherwise it is that of its end.
+        viscosity: beta, of damping in proportion to stiffness; a time.
+
+    Attributes:
+        first_piola: Shape ``(n nq, dim, dim)``.
+        tangent: Its derivative by F, shape ``(n nq, dim, dim, dim, dim)``.
+        symmetric: Whether that is symmetric.
+    """
+
+    def __init__(self, points: MaterialPoints, conserving: bool, viscosity: float) -> None:
+        self._points = points
+        self._conserving, self._viscosity = conserving, viscosity
+        self._dt, self._share = 1.0, 1.0
+        self._muted = False
+        self._work = (0.0, 0.0)
+        self._undeformed: Array | None = None
+        self._small = points.has_small_strain
+        self._exact = points.is_hyperelastic & ~self._small
+        plain = not conserving and viscosity == 0.0
+        self.symmetric: bool = points.symmetric and (plain or bool(self._small.all()))
+        self.settle()
+        self._tried: Array = self._F
+        self._stress = points.first_piola
+        self._viscous: Array | None = None
+        self.tangent = points.tangent
+
+    @property
+    def weights(self) -> Array:
+        """Undeformed volume of each point, shape ``(n, nq)``; 0 where deleted."""
+        return self._points.weights
+
+    @property
+    def hoop(self) -> Array | None:
+        """Hoop strains of a body of revolution's nodes, or ``None``."""
+        return self._points.hoop
+
+    @property
+    def first_piola(self) -> Array:
+        """First Piola stress."""
+        if self._muted:
+            points = self._points.first_piola
+            return np.zeros_like(points) if self._conserving else points
+        return self._stress
+
+    # -- The course of a step -------------------------------------------------------------
+
+    def pace(self, dt: float, share: float) -> None:
+        """See :meth:`system.term.Term.pace`."""
+        self._dt, self._share = dt, share
+
+    def mute(self, muted: bool) -> None:
+        """Leave out, or take in again, what belongs to the whole step."""
+        self._muted = muted
+
+    def settle(self) -> None:
+        """Take the last converged step for the beginning of the next."""
+        points = self._points
+        self._F = self._gradient()
+        self._P = points.first_piola.copy()
+        self._energy = points.strain_energy()
+        if self._viscosity > 0.0:
+            self._undeformed = points.undeformed_tangent()
+
+    def _gradient(self) -> Array:
+        """Return F at the points at the present displacement."""
+        dim = self._points.dim
+        gradient: Array = np.eye(dim) + self._points.strain.gradient().reshape(-1, dim, dim)
+        return gradient
+
+    def update(self) -> None:
+        """Update stress and tangent for the present displacement.
+
+        Raises:
+            MPMError: The material's update fails, or F is singular.
+        """
+        points = self._points
+        points.update()
+        self._stress, self.tangent = points.first_piola, points.tangent
+        if not self._conserving and self._viscosity == 0.0:
+            return
+        self._tried = self._gradient()
+        if self._conserving:
+            try:
+                stress, tangent = self._mean()
+            except np.linalg.LinAlgError as error:
+                raise ConvergenceError(f"A deformation gradient is singular ({error})") from error
+            self._stress, self.tangent = stress / self._share, tangent / self._share
+        if self._viscosity > 0.0:
+            viscous, tangent = self._resisting()
+            self._viscous = viscous
+            self._stress = self._stress + viscous / self._share
+            self.tangent = self.tangent + tangent / self._share
+
+    def _mean(self) -> tuple[Array, Array]:
+        """Return P* and its derivative by F at the step's end."""
+        points, small = self._points, self._small
+        if small.all():
+            return 0.5 * (self._P + points.first_piola), 0.5 * points.tangent
+        F, F_n = self._tried, self._F
+        inverse = np.linalg.inv(F)
+        S, S_n = inverse @ points.first_piola, np.linalg.solve(F_n, self._P)
+        dS = _times(inverse, points.tangent)
+        dS -= np.einsum("nIk,nLJ->nIJkL", inverse, S)
+        S_mean, dS_mean = 0.5 * (S + S_n), 0.5 * dS
+        if self._exact.any():
+            self._correct(S, S_mean, dS_mean)
+        F_mean = 0.5 * (F + F_n)
+        stress = F_mean @ S_mean
+        tangent = _times(F_mean, dS_mean)
+        for i in range(points.dim):
+            tangent[:, i, :, i, :] += 0.5 * S_mean.swapaxes(1, 2)
+        if small.any():
+            stress[small] = 0.5 * (self._P[small] + points.first_piola[small])
+            tangent[small] = 0.5 * points.tangent[small]
+        return stress, tangent
+
+    def _correct(self, S: Array, S_mean: Array, dS_mean: Array) -> None:
+        """Add Gonzalez' correction to S* and its derivative, in place."""
+        where = self._exact
+        F, S, mean = self._tried[where], S[where], S_mean[where]
+        change, slope = self._strain(F, self._F[where])
+        size = np.einsum("nIJ,nIJ->n", change, change) + SMALL**2
+        energy = self._points.strain_energy(trial=True)[where] - self._energy[where]
+        c = (energy - np.einsum("nIJ,nIJ->n", mean, change)) / size
+        dc = np.einsum("nIJ,nIJkL->nkL", S - mean - 2.0 * c[:, None, None] * change, slope)
+        dc -= np.einsum("nIJ,nIJkL->nkL", change, dS_mean[where])
+        dc /= size[:, None, None]
+        S_mean[where] += c[:, None, None] * change
+        dS_mean[where] += c[:, None, None, None, None] * slope
+        dS_mean[where] += change[:, :, :, None, None] * dc[:, None, None]
+
+    @staticmethod
+    def _strain(F: Array, F_n: Array) -> tuple[Array, Array]:
+        """Return the change of Green's strain, and its derivative by F."""
+        H = F - F_n
+        mean = 0.5 * (F + F_n)
+        half = mean.swapaxes(1, 2) @ H
+        dim = F.shape[-1]
+        slope = np.zeros((len(F), dim, dim, dim, dim))
+        for J in range(dim):
+            slope[:, :, J, :, J] += 0.5 * F.swapaxes(1, 2)
+            slope[:, J, :, :, J] += 0.5 * F.swapaxes(1, 2)
+        return 0.5 * (half + half.swapaxes(1, 2)), slope
+
+    def _resisting(self) -> tuple[Array, Array]:
+        """Return the viscous stress P_v and its derivative by F at the step's end."""
+        assert self._undeformed is not None
+        F, F_n, small = self._tried, self._F, self._small
+        factor = self._viscosity / self._dt
+        C = factor * self._undeformed
+        change, slope = self._strain(F, F_n)
+        H = F - F_n
+        change[small] = 0.5 * (H + H.swapaxes(1, 2))[small]
+        S = np.einsum("nIJKL,nKL->nIJ", C, change)
+        mean = 0.5 * (F + F_n)
+        mean[small] = np.eye(self._points.dim)
+        n, dim = len(F), self._points.dim
+        flat = (n, dim * dim, dim * dim)
+        dS = (C.reshape(flat) @ slope.reshape(flat)).reshape(C.shape)
+        dS[small] = C[small]
+        tangent = _times(mean, dS)
+        large = ~small
+        for i in range(dim):
+            tangent[large, i, :, i, :] += 0.5 * S[large].swapaxes(1, 2)
+        return mean @ S, tangent
+
+    def elastic(self) -> bool:
+        """Return whether the history stays as it is in the last update."""
+        return self._points.elastic()
+
+    def on_mesh(self) -> tuple[Array, Array]:
+        """Return stress and tangent with respect to the body mesh, as MaterialPoints does."""
+        return self._points.taken_to_mesh(self.first_piola, self.tangent)
+
+    def commit(self) -> Callable[[], None]:
+        """Make the last update the history, and take note of the work done in the step.
+
+        Returns:
+            A function that takes it back.
+        """
+        points = self._points
+        before = self._F, self._P, self._energy, self._work
+        H = self._gradient() - self._F
+        viscous = 0.0 if self._viscous is None else self._viscous
+        if self._conserving:
+            stress = self._share * self._stress - viscous
+        elif self._share < 1.0:
+            stress = 0.5 * (self._P + points.first_piola)
+        else:
+            stress = points.first_piola
+        weights = points.weights.ravel()
+        power = np.einsum("niJ,niJ->n", stress, H)
+        damped = np.einsum("niJ,niJ->n", np.broadcast_to(viscous, H.shape), H)
+        self._work = float(weights @ power), float(weights @ damped)
+        taken = points.commit()
+        self.settle()
+
+        def undo() -> None:
+            taken()
+            self._F, self._P, self._energy, self._work = before
+
+        return undo
+
+    def roll_back(self) -> None:
+        """Return to the stress of the last converged step."""
+        self._points.roll_back()
+        self.settle()
+        self._stress, self.tangent = self._points.first_piola, self._points.tangent
+        if self._conserving:
+            self._stress = self._stress / self._share
+
+    # -- Energies -------------------------------------------------------------------------
+
+    def step_work(self) -> tuple[float, float]:
+        """Return this rank's work in the last step against what is of the whole step.
+
+        Returns:
+            That against stress, and that against damping.
+        """
+        return self._work[0] if self._conserving else 0.0, self._work[1]
+
+    @property
+    def stress_work(self) -> float:
+        """This rank's work done in the last step against stress, of the whole step or not."""
+        return self._work[0]
+
+    def strain_energy(self) -> float:
+        """Return this rank's elastic energy at the last converged step; perhaps not a number."""
+        weights = self._points.weights.ravel()
+        present = weights > 0.0
+        return float(weights[present] @ self._energy[present])
+
+
+def _times(factor: Array, tangent: Array) -> Array:
+    """Return ``factor_Ii tangent_iJkL`` at all points."""
+    n, dim = factor.shape[:2]
+    return np.asarray((factor @ tangent.reshape(n, dim, dim**3)).reshape(tangent.shape))

@@ -1,0 +1,149 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Stress of a whole step: its tangent against differences, its work against the energy."""
+
+import numpy as np
+import pytest
+from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, box, vectors
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.constitutive.points import MaterialPoints
+from mpm_dolfinx.constitutive.step_stress import StepStress
+from mpm_dolfinx.constitutive.strain import strain_of
+from mpm_dolfinx.materials import Hencky, LinearElastic, ModifiedCamClay, VonMises
+
+LAWS = {
+    "Hencky": Hencky(10.0, 0.3),
+    "von Mises": VonMises(10.0, 0.3, rho_y=0.4),
+    "linear": LinearElastic(10.0, 0.3),
+}
+
+
+def moving(x, amount, wave):
+    """Return a smooth displacement of coordinates ``(n, dim)`` that turns and strains."""
+    dim = x.shape[1]
+    turn = np.eye(dim)
+    c, s = np.cos(amount), np.sin(amount)
+    turn[:2, :2] = [[c, -s], [s, c]]
+    return x @ (turn - np.eye(dim)).T + 0.1 * amount * np.sin(wave * x[:, ::-1])
+
+
+def body_of(cell):
+    dim = 3 if cell == HEXAHEDRON else 2
+    V = vectors(box([-1.0] * dim, [2.0] * dim, [3] * dim, cell))
+    return mpm.Particles(box([0.0] * dim, [1.0] * dim, [2] * dim, cell), V)
+
+
+def stepped(cell, law, conserving=True, viscosity=0.0, axisymmetric=False):
+    """Return the stress over a step between two displacements, and how to set the second."""
+    body = body_of(cell)
+    points = MaterialPoints(strain_of(body, axisymmetric), law, None)
+    stress = StepStress(points, conserving, viscosity)
+    stress.pace(0.25, 0.5)
+    dim = body.mesh.geometry.dim
+    x = body.W.tabulate_dof_coordinates()[:, :dim]
+    bump = x[:, :1] if axisymmetric else 1.0  # the axis stays where it is
+
+    def put(amount, wave, change=0.0):
+        motion = bump * moving(x, amount, wave)
+        body.displacement.x.array[:] = (motion + change).ravel()
+
+    put(0.1, 2.0)
+    stress.update()
+    stress.commit()
+    return body, points, stress, put
+
+
+CASES = [
+    (TRIANGLE, "Hencky", True, 0.0, False),
+    (QUADRILATERAL, "Hencky", True, 0.2, True),
+    (HEXAHEDRON, "Hencky", True, 0.0, False),
+    (QUADRILATERAL, "Hencky", False, 0.2, False),
+    (TRIANGLE, "von Mises", True, 0.0, False),
+    (TRIANGLE, "linear", True, 0.2, False),
+]
+
+
+@pytest.mark.parametrize(("cell", "law", "conserving", "viscosity", "axisymmetric"), CASES)
+def test_the_tangent_is_the_derivative(cell, law, conserving, viscosity, axisymmetric):
+    body, points, stress, put = stepped(cell, LAWS[law], conserving, viscosity, axisymmetric)
+    generator = np.random.default_rng(3)
+    count = len(body.displacement.x.array) // body.mesh.geometry.dim
+    direction = generator.normal(size=(count, body.mesh.geometry.dim))
+    if axisymmetric:
+        direction[:, 0] *= body.W.tabulate_dof_coordinates()[:, 0]
+    size = 1e-6
+    values, gradients = [], []
+    for sign in (-1.0, 1.0):
+        put(0.25, 2.5, sign * size * direction)
+        stress.update()
+        values.append(stress.first_piola.copy())
+        gradients.append(points.strain.gradient().reshape(values[0].shape).copy())
+    put(0.25, 2.5)
+    stress.update()
+    change = np.einsum("niJkL,nkL->niJ", stress.tangent, gradients[1] - gradients[0])
+    found = values[1] - values[0]
+    np.testing.assert_allclose(change, found, atol=2e-6 * np.abs(found).max(initial=1e-30))
+
+
+@pytest.mark.parametrize("cell", [TRIANGLE, QUADRILATERAL, HEXAHEDRON])
+@pytest.mark.parametrize("law", ["Hencky", "linear"])
+def test_the_work_of_an_elastic_body_is_its_energy(cell, law):
+    _, _, stress, put = stepped(cell, LAWS[law])
+    before = stress.strain_energy()
+    put(0.6, 3.0)
+    stress.update()
+    symmetric = stress.first_piola.copy()
+    stress.commit()
+    assert stress.stress_work == pytest.approx(stress.strain_energy() - before, rel=1e-9)
+    assert symmetric.shape == stress.first_piola.shape
+
+
+def test_a_commit_is_taken_back_and_a_trial_forgotten():
+    _, points, stress, put = stepped(TRIANGLE, LAWS["von Mises"])
+    put(0.2, 2.0)
+    stress.update()
+    expected = stress.first_piola.copy()
+    undo = stress.commit()
+    undo()
+    put(0.5, 4.0)
+    stress.update()
+    put(0.2, 2.0)
+    stress.update()
+    np.testing.assert_array_equal(stress.first_piola, expected)
+    put(0.1, 2.0)
+    stress.roll_back()
+    np.testing.assert_array_equal(stress.first_piola, 2.0 * points.first_piola)
+
+
+def test_no_rotation_is_resisted():
+    body, points, stress, _ = stepped(TRIANGLE, LAWS["Hencky"], False, 0.5)
+    x = body.W.tabulate_dof_coordinates()[:, :2] + moving(
+        body.W.tabulate_dof_coordinates()[:, :2], 0.1, 2.0
+    )
+    turn = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+    body.displacement.x.array[:] += (x @ turn.T - x).ravel()
+    stress.update()
+    difference = np.abs(stress.first_piola - points.first_piola).max(initial=0.0)
+    assert difference < 1e-12
+
+
+def test_energies_of_laws_have_their_stress_as_derivative():
+    laws = [
+        Hencky(10.0, 0.3),
+        ModifiedCamClay(
+            shear_modulus=500.0,
+            swelling=0.02,
+            compression=0.1,
+            critical_ratio=1.2,
+            preconsolidation=100.0,
+            reference_pressure=20.0,
+        ),
+    ]
+    stress = -30.0 * np.array([[1.0, 1.2, 0.9, 0.1]])
+    change = np.array([[0.1, -0.05, 0.02, 0.3]])
+    for law in laws:
+        ends = [law.strain_energy({"stress": stress + s * 1e-4 * change})[0] for s in (-1, 1)]
+        strains = [law.elastic_strain(stress + s * 1e-4 * change) for s in (-1, 1)]
+        work = np.sum(stress * (strains[1] - strains[0]))
+        assert ends[1] - ends[0] == pytest.approx(work, rel=1e-6)
