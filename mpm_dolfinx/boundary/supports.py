@@ -29,7 +29,7 @@ from ..assembly.inputs import as_expression, is_tag, known_tags
 from ..errors import MPMError, agree
 from ..particles.particles import Particles
 
-__all__ = ["Support", "fixed", "plane", "roller"]
+__all__ = ["Dashpot", "Plane", "Support", "dashpot", "fixed", "plane", "roller"]
 
 #: Stiffness of a support in units of the modulus over the thickness of a domain.
 PENALTY = 1e3
@@ -136,7 +136,10 @@ class Support:
         self._turn = turn
 
     def at_body(
-        self, moduli: Callable[[], NDArray[np.float64]], turn: Any, whole_step: bool = False
+        self,
+        moduli: Callable[[], NDArray[np.float64]],
+        turn: Any,
+        share: float | None = None,
     ) -> ufl.Form:
         """Return minus the virtual work of the support on a body with a material (collective).
 
@@ -144,10 +147,9 @@ class Support:
             moduli: Returns the modulus of each domain this rank owns, shape ``(n,)``; asked where
                 none was given.
             turn: As for :meth:`revolve`.
-            whole_step: Whether it may be that of a whole step of a motion, as that of its end would
-                add energy.
+            share: In a motion, as in :meth:`mpm_dolfinx.Term.pace`; ``None`` where there is none.
         """
-        self._whole_step = whole_step and self._has_whole_step()
+        self._whole_step = self._has_whole_step(share)
         self._power = None
         if not self._modulus:
             each = fem.Function(self._stiffness.function_space)
@@ -176,8 +178,8 @@ class Support:
 
     # -- In a motion ----------------------------------------------------------------------
 
-    def _has_whole_step(self) -> bool:
-        """Whether there is a traction of a whole step."""
+    def _has_whole_step(self, share: float | None) -> bool:
+        """Return whether the traction is one of a whole step; see :meth:`at_body`."""
         return False
 
     def _of_step(self) -> Any:
@@ -259,22 +261,18 @@ class Plane(Support):
         self._gap, self._normal = gap, normal
         self._touch = TOUCH * _extent(particles)
         super().__init__(particles, self._within(gap) * normal, facet_tags, tag, modulus, penalty)
-        self._before: list[tuple[Any, Any]] = []
+        self._start = _Start()
 
     def _within(self, gap: Any) -> Any:
         """Return a gap where the plane is touched, or 0."""
         return ufl.conditional(ufl.le(gap, self._touch), gap, 0.0)
 
-    def _has_whole_step(self) -> bool:
-        return True
+    def _has_whole_step(self, share: float | None) -> bool:
+        return share is not None and share < 1.0
 
     def _of_step(self) -> Any:
         gap = self._gap
-        if not self._before:
-            given = [*extract_coefficients(gap), *extract_constants(gap)]
-            self._before = [(value, _copy_of(value)) for value in given]
-            self.settle()
-        start = ufl.replace(gap, dict(self._before))
+        start = self._start.of(gap)
         ends = [self._within(g) for g in (start, gap)]
         touched = [ufl.le(g, self._touch) for g in (start, gap)]
         change = ufl.conditional(ufl.And(*touched), 1.0, (ends[1] - ends[0]) / (gap - start))
@@ -283,25 +281,110 @@ class Plane(Support):
 
     def settle(self) -> None:
         """See :meth:`Support.settle`."""
-        for value, before in self._before:
-            if isinstance(value, fem.Function):
-                before.x.array[:] = value.x.array
-            else:
-                np.copyto(before.value, value.value)
+        self._start.settle()
 
     def step_work(self) -> tuple[float, float]:
         """See :meth:`Support.step_work`."""
         if not self._whole_step:
             return 0.0, 0.0
         d = self.particles.displacement
-        before = next(copy for value, copy in self._before if value is d)
-        return self._step_power(d - before), 0.0
+        return self._step_power(d - self._start.of(d)), 0.0
+
+
+class Dashpot(Support):
+    """A quiet boundary, made by :func:`dashpot`.
+
+    Args:
+        particles: The body.
+        facet_tags: As for :class:`Support`.
+        tag: As for :class:`Support`.
+        normal: As for :func:`dashpot`.
+        tangential: As for :func:`dashpot`.
+    """
+
+    def __init__(
+        self, particles: Particles, facet_tags: Any, tag: int | None, normal: Any, tangential: Any
+    ) -> None:
+        gdim = particles.mesh.geometry.dim
+        nothing = fem.Constant(particles.mesh, np.zeros(gdim))
+        super().__init__(particles, nothing, facet_tags, tag, 1.0, 1.0)
+        self._start = _Start()
+        self._dt = fem.Constant(particles.mesh, 1.0)
+        n = ufl.FacetNormal(particles.mesh)
+        d = particles.displacement
+        velocity = (d - self._start.of(d)) / self._dt
+        along = ufl.dot(velocity, n) * n
+        self._damping = -normal * along - tangential * (velocity - along)
+        self._traction = self._damping
+        self._last = np.zeros(gdim)
+
+    def _has_whole_step(self, share: float | None) -> bool:
+        if share is None:
+            raise MPMError(
+                "A dashpot resists velocities, which a problem of equilibrium has none of; give it "
+                "to a DynamicProblem."
+            )
+        return True
+
+    @property
+    def residual(self) -> ufl.Form:
+        """See :attr:`Support.residual`."""
+        if not self._whole_step:
+            self._has_whole_step(None)
+        return super().residual
+
+    def _of_step(self) -> Any:
+        return self._damping
+
+    def pace(self, dt: float, share: float) -> None:
+        """See :meth:`Support.pace`."""
+        super().pace(dt, share)
+        np.copyto(self._dt.value, dt)
+
+    def settle(self) -> None:
+        """See :meth:`Support.settle`."""
+        self._start.settle()
+
+    def step_work(self) -> tuple[float, float]:
+        """See :meth:`Support.step_work`."""
+        d = self.particles.displacement
+        self._last = super().reaction
+        return 0.0, self._step_power(d - self._start.of(d))
+
+    @property
+    def reaction(self) -> NDArray[np.float64]:
+        """Mean force on the body over the last step, shape ``(gdim,)``, on all ranks."""
+        return self._last.copy()
+
+
+class _Start:
+    """What Functions and Constants were at the beginning of a step."""
+
+    def __init__(self) -> None:
+        self._copies: list[tuple[Any, Any]] = []
+
+    def of(self, expression: Any) -> Any:
+        """Return an expression as it was; all that it has is followed from now on."""
+        for value in (*extract_coefficients(expression), *extract_constants(expression)):
+            if all(value is not known for known, _ in self._copies):
+                self._copies.append((value, _copy_of(value)))
+        return ufl.replace(expression, dict(self._copies))
+
+    def settle(self) -> None:
+        """Take the present values."""
+        for value, before in self._copies:
+            if isinstance(value, fem.Function):
+                before.x.array[:] = value.x.array
+            else:
+                np.copyto(before.value, value.value)
 
 
 def _copy_of(value: Any) -> Any:
     """Return a Function or Constant that has another's values now."""
     if isinstance(value, fem.Function):
-        return fem.Function(value.function_space)
+        copy = fem.Function(value.function_space)
+        copy.x.array[:] = value.x.array
+        return copy
     return fem.Constant(value.ufl_domain(), np.array(value.value))
 
 
@@ -411,6 +494,43 @@ def plane(
     x = ufl.SpatialCoordinate(particles.mesh) + particles.displacement
     gap = ufl.dot(n, x - origin) - _reached(particles) * g
     return Plane(particles, gap, n, facet_tags, tag, modulus, penalty)
+
+
+def dashpot(
+    particles: Particles,
+    facet_tags: Any,
+    tag: int,
+    normal: Any,
+    tangential: Any,
+) -> Support:
+    """Let waves leave a body through facets: a quiet boundary, in a DynamicProblem.
+
+    The traction is ``-(normal n n + tangential (I - n n)) v`` per undeformed area, n being the
+    normal of the undeformed facets. With ``normal = density c_p``, ``tangential = density c_s``,
+    the speeds of waves of compression and of shear, waves that arrive along n leave nothing behind
+    (Lysmer & Kuhlemeyer 1969). A wave of velocity g that comes in from behind is a traction of
+    twice what that boundary would bear at g.
+
+    Args:
+        particles: The body.
+        facet_tags: Tags of its facets.
+        tag: The tag of those that are quiet.
+        normal: Resistance to normal velocities, a number, Constant, Function or UFL.
+        tangential: Resistance to tangential velocities.
+
+    Returns:
+        The boundary, for ``supports=[...]``.
+
+    Raises:
+        MPMError: Tags or numbers that make no sense.
+    """
+    _require(particles)
+    resistances = []
+    for name, value in (("normal", normal), ("tangential", tangential)):
+        if isinstance(value, float | int) and value < 0.0:
+            raise MPMError(f"{name} must not be negative, not {value!r}.")
+        resistances.append(as_expression(value, particles, name, ()))
+    return Dashpot(particles, facet_tags, tag, *resistances)
 
 
 def _extent(particles: Particles) -> float:

@@ -80,8 +80,11 @@ def _first(ax: Any, run: History, curve: Mapping[str, Sequence[float]] | None) -
         return
     if run.energies:
         times = [energy.time for energy in run.energies]
-        for name in ("kinetic", "internal", "external", "lost"):
-            ax.plot(times, [getattr(energy, name) for energy in run.energies], label=name)
+        always = ("kinetic", "internal", "external", "lost")
+        for name in (*always, "strain", "damping", "stabilisation", "prescribed"):
+            values = np.array([getattr(energy, name) for energy in run.energies])
+            if name in always or np.any(values[np.isfinite(values)] != 0.0):
+                ax.plot(times, values, label=name)
         ax.plot(times, [energy.balance for energy in run.energies], "k--", label="balance")
         ax.set(xlabel="time", ylabel="energy")
         ax.legend(fontsize="small")

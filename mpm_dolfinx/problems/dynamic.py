@@ -158,9 +158,9 @@ class DynamicProblem(QuasiStaticProblem):
         return super()._contributions()
 
     @property
-    def _has_mean(self) -> bool:
-        """See :meth:`QuasiStaticProblem._has_mean`."""
-        return self.inertia.share < 1.0
+    def _force_share(self) -> float:
+        """See :attr:`QuasiStaticProblem._force_share`."""
+        return self.inertia.share
 
     def _works(self) -> NDArray[np.float64]:
         """Return the works of the last increment on the backgrounds (collective)."""

@@ -475,9 +475,8 @@ class QuasiStaticProblem(ParticleProblem):
         if given.tractions:
             loads.append(-work.tractions(given.tractions, given.facet_tags))
             symmetric = symmetric and not depends_on(loads[-1], body.displacement)
-        loads += [
-            s.at_body(history.initial_modulus, strain.turn, self._has_mean) for s in given.supports
-        ]
+        share = self._force_share
+        loads += [s.at_body(history.initial_modulus, strain.turn, share) for s in given.supports]
         if given.pressures:
             loads.append(work.pressures(given.pressures, given.facet_tags))
         slopes = [
@@ -510,9 +509,9 @@ class QuasiStaticProblem(ParticleProblem):
         return history, ()
 
     @property
-    def _has_mean(self) -> bool:
-        """Whether forces are means over a step in time."""
-        return False
+    def _force_share(self) -> float | None:
+        """What of the forces at a step's end is force, in a motion; ``None`` in none."""
+        return None
 
     def begin_step(self) -> None:
         """See :meth:`ParticleProblem.begin_step`; parameters of materials have new values then."""

@@ -23,7 +23,7 @@ import ufl
 from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.boundary import fixed, plane
+from mpm_dolfinx.boundary import dashpot, fixed, plane
 from mpm_dolfinx.errors import ConvergenceError
 from mpm_dolfinx.materials import Hencky, LinearElastic, VonMises
 
@@ -249,6 +249,44 @@ def test_a_bar_bounces_off_a_plane(scheme, out):
     assert whole.max() <= whole[0] * (1.0 + 1e-9)
     assert whole[-1] >= whole[0] * (1.0 - (1e-3 if out == "reflect" else 0.05))
     assert change_of_balance(history) < 1e-11
+
+
+@pytest.mark.parametrize("scheme", ["midpoint", "euler"])
+def test_a_quiet_boundary_lets_a_pulse_go(scheme):
+    # A pulse that runs to the left (v = c d') leaves the bar of wave speed 1 through its end.
+    V = vectors(box([0.0, 0.0], [1.6, 3 / 32], [51, 3], QUADRILATERAL))
+    body = box([0.3, 1 / 32], [1.3, 2 / 32], [64, 2], QUADRILATERAL)
+    particles = mpm.Particles(body, V)
+    end = mesh.locate_entities_boundary(body, 1, at(0, 0.3))
+    tags = mesh.meshtags(body, 1, np.sort(end), np.full(len(end), 1, dtype=np.int32))
+    quiet = dashpot(particles, tags, 1, 1.0, 0.0)
+    problem = mpm.DynamicProblem(
+        particles,
+        LinearElastic(1.0, 0.0),
+        1.0,
+        velocity=lambda x: np.stack([-0.01 * np.exp(-(((x[0] - 0.6) / 0.06) ** 2)), 0.0 * x[0]]),
+        supports=[quiet],
+        scheme=scheme,
+    )
+    momentum = problem.momentum[0]
+    impulse = 0.0
+    for _ in problem.steps(0.6, 0.01):
+        impulse += 0.01 * problem.reaction(quiet)[0]
+    history = problem.history
+    # Half of it runs to the right, with half of the energy.
+    np.testing.assert_allclose(problem.momentum[0], 0.5 * momentum, rtol=0.02)
+    np.testing.assert_allclose(impulse, -0.5 * momentum, rtol=0.02)
+    assert change_of_balance(history) < 1e-11
+    if scheme == "midpoint":
+        half = 0.5 * history.energies[0].kinetic
+        assert history.energies[-1].damping == pytest.approx(half, rel=0.04)
+    law = LinearElastic(1.0, 0.0)
+    raises(
+        lambda: mpm.QuasiStaticProblem(particles, law, supports=[quiet]),
+        mpm.MPMError,
+        "give it to a DynamicProblem",
+    )
+    raises(lambda: dashpot(particles, tags, 1, -1.0, 0.0), mpm.MPMError, "must not be negative")
 
 
 def test_a_plane_that_moves_throws_a_body():
