@@ -210,6 +210,10 @@ class StepStress:
             tangent[large, i, :, i, :] += 0.5 * S[large].swapaxes(1, 2)
         return mean @ S, tangent
 
+    def initial_modulus(self) -> Array:
+        """Return :meth:`MaterialPoints.initial_modulus` (collective)."""
+        return self._points.initial_modulus()
+
     def elastic(self) -> bool:
         """Return whether the history stays as it is in the last update."""
         return self._points.elastic()
