@@ -15,6 +15,7 @@ from .errors import (  # noqa: E402
     ParticleOutsideError,
 )
 from .history import Energy, History, Loss, Stage, Statistics, Step  # noqa: E402
+from .particles.field import ParticleField  # noqa: E402
 from .particles.particles import Particles  # noqa: E402
 from .problems.dynamic import DynamicProblem  # noqa: E402
 from .problems.initial_stress import geostatic  # noqa: E402
@@ -37,6 +38,7 @@ __all__ = [
     "History",
     "Loss",
     "MPMError",
+    "ParticleField",
     "ParticleOutsideError",
     "ParticleProblem",
     "Particles",

@@ -56,3 +56,34 @@ def raises(build, error, sentence):
     with pytest.raises(error, match=sentence):
         raise caught
     return caught
+
+
+def error_of_blocks(problem, step=1e-5, size=1e-3):
+    """Return the largest relative error of any block of a tangent, against differences.
+
+    The state is one near the last converged step, in which all unknowns differ from it.
+    """
+    reduced = problem.reduced
+    none = [np.zeros(len(field.bodies[0].increment.x.array)) for field in reduced.fields]
+    reduced.begin(none, 1.0)
+    x = reduced.restricted(reduced.forces)
+    places = np.arange(*x.getOwnershipRange())
+    x.array_w[:] = size * np.sin(37.0 * places)
+    F, G, direction = x.duplicate(), x.duplicate(), x.duplicate()
+    direction.array_w[:] = np.cos(23.0 * places)
+    worst = 0.0
+    for moved in reduced.unknowns:
+        along = direction.duplicate()
+        along.set(0.0)
+        along.array_w[moved] = direction.array_r[moved]
+        assert reduced.residual(x + step * along, F) is None
+        assert reduced.residual(x - step * along, G) is None
+        differences = (F - G) * (0.5 / step)
+        assert reduced.residual(x, F) is None
+        product = reduced.tangent() * along
+        whole = scenes.largest(product.array_r)
+        for part in reduced.unknowns:
+            own = max(scenes.largest(product.array_r[part]), 1e-6 * whole)
+            error = scenes.largest(product.array_r[part] - differences.array_r[part])
+            worst = max(worst, error / own)
+    return worst

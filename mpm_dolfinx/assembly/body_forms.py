@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -70,6 +71,7 @@ class BodyForms:
         low_rank: What the tangent has besides the forms and the pointwise one of ``internal``;
             that of an averaged volume ratio in R is known.
         fast: Whether :attr:`fused` forms are left to the compiled loops.
+        others: Unknowns of the body besides the displacement.
         **options: Passed on to ``dolfinx.fem.form``.
 
     Attributes:
@@ -92,6 +94,7 @@ class BodyForms:
         internal: PointStress | None = None,
         low_rank: Linearised | None = None,
         fast: bool = False,
+        others: Sequence[fem.Function] = (),
         **options: Any,
     ) -> None:
         self._options = options
@@ -103,11 +106,11 @@ class BodyForms:
         self._average = average_in(R)
         if R is not None and (internal is None or not is_zero(R)):
             (self._test,) = form_of_rank(R, 1, particles.W, "the residual R", "particles.W")
-            parts = split_by_rule(R, d)
+            parts = split_by_rule(R, d, *others)
         if particles.deletion is not None:
             parts = [particles.deletion.present_only(part) for part in parts]
-        live = [p for p in parts if follows(p, d)]
-        dead = [p for p in parts if not follows(p, d)]
+        live = [p for p in parts if follows(p, d, *others)]
+        dead = [p for p in parts if not follows(p, d, *others)]
         tangents: list[ufl.Form]
         if J is None or (internal is not None and is_zero(J)):
             tangents = [ufl.derivative(p, d) for p in live if depends_on(p, d)]

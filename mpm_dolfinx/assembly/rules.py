@@ -59,12 +59,13 @@ def depends_on(form: ufl.Form, function: fem.Function) -> bool:
     return any(c is function for c in form.coefficients())
 
 
-def follows(form: ufl.Form, displacement: fem.Function) -> bool:
+def follows(form: ufl.Form, *unknowns: fem.Function) -> bool:
     """Return whether a form changes during a step.
 
-    It does where it has the displacement, or data injected at quadrature points.
+    It does where it has the displacement or another unknown, or data injected at quadrature
+    points.
     """
-    return depends_on(form, displacement) or bool(data_at_points(form))
+    return any(depends_on(form, f) for f in unknowns) or bool(data_at_points(form))
 
 
 def data_at_points(form: ufl.Form) -> set[fem.Function]:
@@ -83,19 +84,21 @@ def _rule(integral: Any) -> tuple[int, str]:
     degree = metadata.get("quadrature_degree", -1)
     scheme = str(metadata.get("quadrature_rule", "default"))
     for terminal in traverse_unique_terminals(integral.integrand()):
-        element = (
-            terminal.function_space.ufl_element() if isinstance(terminal, fem.Function) else None
-        )
-        if element is None or not element.has_custom_quadrature:
+        if not isinstance(terminal, fem.Function | ufl.Argument):
+            continue
+        space: Any = terminal.ufl_function_space()  # type: ignore[no-untyped-call]
+        element = space.ufl_element()
+        if not element.has_custom_quadrature:
             continue
         points = element.custom_quadrature()[0]
         if degree == -1:
             degree = element.degree
-        cell = terminal.function_space.mesh.basix_cell()
+        cell = space.mesh.basix_cell()
         rule, _ = quadrature_rule(cell, degree)
         if points.shape != rule.shape or not np.allclose(points, rule):
+            name = getattr(terminal, "name", "a test function")
             raise MPMError(
-                f"The form integrates '{terminal.name}', known at {len(points)} quadrature "
+                f"The form integrates '{name}', known at {len(points)} quadrature "
                 f"point(s) of a domain, with a rule of {len(rule)} point(s); integrate it with "
                 "particles.dx."
             )
@@ -105,7 +108,7 @@ def _rule(integral: Any) -> tuple[int, str]:
     return int(degree), scheme
 
 
-def split_by_rule(form: ufl.Form, displacement: fem.Function) -> list[ufl.Form]:
+def split_by_rule(form: ufl.Form, *unknowns: fem.Function) -> list[ufl.Form]:
     """Split a form so that each part has one rule, one kind of dependence and one set of tags.
 
     Integrals that are zero are left out.
@@ -115,7 +118,7 @@ def split_by_rule(form: ufl.Form, displacement: fem.Function) -> list[ufl.Form]:
 
     Args:
         form: Any UFL form on the body mesh.
-        displacement: The displacement of the body.
+        *unknowns: The displacement of the body, and its other unknowns.
 
     Returns:
         The parts, whose sum is ``form``.
@@ -132,7 +135,7 @@ def split_by_rule(form: ufl.Form, displacement: fem.Function) -> list[ufl.Form]:
         metadata = dict(integral.metadata())
         metadata.update(quadrature_degree=degree, quadrature_rule=scheme)
         one = integral.reconstruct(metadata=metadata)
-        constant = not follows(ufl.Form([one]), displacement)
+        constant = not follows(ufl.Form([one]), *unknowns)
         tags = integral.subdomain_data()
         seen = [i for i, known in enumerate(markers) if known is tags]
         if not seen:

@@ -22,6 +22,7 @@ from ..materials.compiled import CompiledMaterial
 from ..materials.mandel import num_components
 from ..meshes.remesh import Column
 from .averaging import VolumeAveraging
+from .pressure import MeanStress, require_split, without_bulk
 from .strain import Strain
 
 __all__ = ["MaterialPoints"]
@@ -36,6 +37,7 @@ class _Group(NamedTuple):
 
     material: Material
     points: NDArray[np.int64]
+    law: Material  # what is evaluated: the material, or it without its bulk modulus
 
 
 class _Given(NamedTuple):
@@ -79,10 +81,12 @@ class MaterialPoints:
         cell_tags: Tags of the body's cells.
         f_bar: Kind of average of the volume ratio, or ``"none"``.
         compiled: Whether materials may use their compiled updates.
+        pressure: A Function at the points that takes the place of the mean stress, if any.
 
     Attributes:
         dim: Dimension of stress and strain, 2 in plane strain.
         strain: As given.
+        mean_stress: The pressure in place of the mean stress, or ``None``.
         averaging: F-bar, or ``None``; the material then sees Fbar, and what follows is what
             does work on F.
         first_piola: First Piola stress of the last update, shape ``(n nq, dim, dim)``.
@@ -102,6 +106,7 @@ class MaterialPoints:
         cell_tags: mesh.MeshTags | None,
         f_bar: str = "none",
         compiled: bool = True,
+        pressure: fem.Function | None = None,
     ) -> None:
         self._particles = particles = strain.particles
         self._compiled = compiled
@@ -109,6 +114,9 @@ class MaterialPoints:
         self.dim = strain.dim
         self._points = particles.num_local * particles.num_points
         self._given: list[_Given] = []
+        self.mean_stress = None
+        if pressure is not None:
+            self.mean_stress = MeanStress(pressure, (self._points, self.dim))
         with agree(particles.mesh.comm):
             self._groups = self._group(assignment, cell_tags)
             self._states = [self._initial_state(group) for group in self._groups]
@@ -165,7 +173,7 @@ class MaterialPoints:
                 not np.array_equal(present.parameters[name], group.material.parameters[name])
                 for name, _ in given.live()
             ):
-                self._groups[number] = _Group(present, group.points)
+                self._groups[number] = self._governing(present, group.points)
                 changed = True
         if changed and self.averaging is not None:
             self.averaging.modulus = self._resistance()
@@ -259,7 +267,7 @@ class MaterialPoints:
         try:
             return group.material.at(rows).stressed_state(stress[group.points[rows]], self.dim)
         except MPMError as error:
-            part = _Group(group.material, group.points[rows])
+            part = _Group(group.material, group.points[rows], group.law)
             raise self._named(error, part) from None
         except Exception as error:
             what = f"stressed_state of {type(group.material).__name__}"
@@ -299,7 +307,7 @@ class MaterialPoints:
         if isinstance(assignment, Material):
             everywhere = np.arange(self._points)
             self._given = [_Given(assignment, dict(assignment.parameters))]
-            return [_Group(self._resolve(assignment, everywhere), everywhere)]
+            return [self._governing(self._resolve(assignment, everywhere), everywhere)]
         if not isinstance(assignment, Mapping) or not all(
             isinstance(m, Material) for m in assignment.values()
         ):
@@ -328,9 +336,18 @@ class MaterialPoints:
         groups = []
         for tag, material in assignment.items():
             points = np.flatnonzero(tags == tag)
-            groups.append(_Group(self._resolve(material, points), points))
+            groups.append(self._governing(self._resolve(material, points), points))
             self._given.append(_Given(material, dict(material.parameters)))
         return groups
+
+    def _governing(self, material: Material, points: NDArray[np.int64]) -> _Group:
+        """Return a material with its points, without its mean stress where a pressure is that."""
+        if self.mean_stress is None:
+            return _Group(material, points, material)
+        require_split(material)
+        law, bulk, soft = without_bulk(material)
+        self.mean_stress.follow(points, material, bulk, soft)
+        return _Group(material, points, law)
 
     def _resolve(self, material: Material, points: NDArray[np.int64]) -> Material:
         """Return the material with its parameters at the points."""
@@ -438,7 +455,10 @@ class MaterialPoints:
         """
         gradient = self.strain.gradient()
         if self.averaging is None:
-            self._update_materials(gradient.reshape(-1, self.dim, self.dim))
+            gradient = gradient.reshape(-1, self.dim, self.dim)
+            self._update_materials(gradient)
+            if self.mean_stress is not None:
+                self._take_pressure(gradient)
             return
         gradient = self.averaging.average(gradient)
         try:
@@ -473,6 +493,20 @@ class MaterialPoints:
         stress = np.einsum("niJ,nMJ->niM", stress, G) / volume
         tangent = np.einsum("niJkL,nMJ,nNL->niMkN", tangent, G, G, optimize=True)
         return stress, tangent / volume[:, :, :, None, None]
+
+    def _take_pressure(self, gradient: NDArray[np.float64]) -> None:
+        """Let the pressure take the place of the mean stress in the last update."""
+        assert self.mean_stress is not None
+        stresses = [
+            (group.points, state["stress"])
+            for group, state in zip(self._groups, self._trial, strict=True)
+        ]
+        self.first_piola, self.tangent, own = self.mean_stress.replace(
+            gradient, self.first_piola, self.tangent, stresses
+        )
+        self._trial = [
+            {**state, "stress": stress} for state, stress in zip(self._trial, own, strict=True)
+        ]
 
     def _update_materials(self, gradient: NDArray[np.float64]) -> None:
         trial = []
@@ -527,7 +561,7 @@ class MaterialPoints:
         law = type(group.material).__name__
         received = {name: _read_only(values) for name, values in state.items()}
         try:
-            answer = group.material.update(_read_only(gradient), received)
+            answer = group.law.update(_read_only(gradient), received)
         except MPMError as error:
             raise self._named(error, group) from None
         except np.linalg.LinAlgError as error:
@@ -678,6 +712,8 @@ class MaterialPoints:
                 for name, value in group.material.parameters.items()
             }
             parameters["points"] = (where, np.ones(len(where)))
+            if self.mean_stress is not None:
+                parameters["mixed"] = "pressure"
             parameters["f_bar"] = "none" if self.averaging is None else self.averaging.kind
             laws.append((type(group.material).__name__, parameters))
         return laws

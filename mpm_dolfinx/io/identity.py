@@ -16,6 +16,7 @@ from dolfinx import mesh
 
 from .. import _compat
 from ..errors import MPMError, agree
+from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from .checkpoint import Snapshot
 from .snapshot import spaces_of
@@ -40,6 +41,10 @@ class Identifiable(Protocol):
 
     bodies: list[Particles]
     identity: dict[str, Any] | None
+
+    @property
+    def carried(self) -> list[CarriedField]:
+        """The unknowns besides displacements."""
 
     def laws(self) -> list[list[tuple[str, dict[str, Any]]]]:
         """Return name and parameters of each body's materials."""
@@ -70,6 +75,17 @@ def identity(problem: Identifiable) -> dict[str, Any]:
         found[f"the material{of}"] = [
             [name, {key: _parameter(body, value) for key, value in parameters.items()}]
             for name, parameters in law
+        ]
+    for one in problem.carried:
+        field, element = one.field, one.V.ufl_element()
+        number = next(i for i, body in enumerate(problem.bodies) if body.mesh is one.mesh)
+        found[f"the field {field.name} of body {number}"] = [
+            field.at,
+            field.kind,
+            element.family_name,
+            element.degree,
+            list(element.reference_value_shape),
+            _mesh(one.V.mesh),
         ]
     return found
 

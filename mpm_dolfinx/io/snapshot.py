@@ -120,12 +120,17 @@ def spaces_of(bodies: Sequence[Particles]) -> list[fem.FunctionSpace]:
     return spaces
 
 
-def capture(things: Sequence[Kept], bodies: Sequence[Particles]) -> Snapshot:
+def capture(
+    things: Sequence[Kept],
+    bodies: Sequence[Particles],
+    spaces: Sequence[fem.FunctionSpace] | None = None,
+) -> Snapshot:
     """Return the state at the last converged step (collective).
 
     Args:
         things: What is kept.
         bodies: The bodies, on whose cells it lives.
+        spaces: All background spaces; ``None``: those of the bodies.
 
     Raises:
         MPMError: Something does not say where it lives, or has not one row for each cell.
@@ -136,7 +141,7 @@ def capture(things: Sequence[Kept], bodies: Sequence[Particles]) -> Snapshot:
         columns = _columns(things, (number, None), body.num_local, comm)
         values = {name: column.values for name, column in columns.items()}
         tables.append(Table(body.global_index, values, {name: c.at for name, c in columns.items()}))
-    for number, V in enumerate(spaces_of(bodies)):
+    for number, V in enumerate(spaces_of(bodies) if spaces is None else spaces):
         index = _compat.input_cell_index(V.mesh)
         columns = _columns(things, (None, number), len(index), comm)
         some = np.zeros(len(index), dtype=bool)
@@ -150,7 +155,11 @@ def capture(things: Sequence[Kept], bodies: Sequence[Particles]) -> Snapshot:
 
 
 def adopt(
-    things: Sequence[Kept], bodies: Sequence[Particles], snapshot: Snapshot, source: str
+    things: Sequence[Kept],
+    bodies: Sequence[Particles],
+    snapshot: Snapshot,
+    source: str,
+    spaces: Sequence[fem.FunctionSpace] | None = None,
 ) -> None:
     """Let all that is kept take what a state holds for it (collective).
 
@@ -161,6 +170,7 @@ def adopt(
         bodies: The bodies, on whose cells it lives.
         snapshot: The state, its rows on any ranks.
         source: What to call the state in an error.
+        spaces: All background spaces; ``None``: those of the bodies.
 
     Raises:
         MPMError: The state is that of another problem.
@@ -174,7 +184,7 @@ def adopt(
                 lost = body.global_index[~exchange.found]
                 raise MPMError(f"{source} does not know {{particles}}.", lost)
         found.append({name: exchange(values) for name, values in table.columns.items()})
-    spaces = spaces_of(bodies)
+    spaces = spaces_of(bodies) if spaces is None else spaces
     for V, table in zip(spaces, snapshot.tables[len(bodies) :], strict=True):
         exchange = RowExchange(comm, table.rows, _compat.input_cell_index(V.mesh))
         found.append({name: exchange(values) for name, values in table.columns.items()})

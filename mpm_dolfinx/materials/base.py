@@ -125,6 +125,9 @@ class Material(ABC):
 
     Attributes:
         symmetric: Whether the tangent has major symmetry, dP_iJ/dF_kL = dP_kL/dF_iJ, always.
+        linear_in_volume: Whether the mean stress is the bulk modulus times the elastic volume
+            strain, and nothing else in the law depends on either; each class says so for itself,
+            as ``mixed="pressure"`` needs it (with ``young``, ``poisson``, ``bulk``, ``shear``).
         limits: What the values of a parameter must be: keywords of ``check_parameter`` by name.
         parameters: Parameters by name: numbers, or arrays ``(n,)`` with one value per point.
             A piecewise constant Function or a Constant may stand here; the problem works with
@@ -132,6 +135,7 @@ class Material(ABC):
     """
 
     symmetric: bool
+    linear_in_volume: ClassVar[bool] = False
     limits: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType({})
     _parameters: Parameters = Parameters({})
 

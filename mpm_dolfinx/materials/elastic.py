@@ -95,6 +95,7 @@ class IsotropicElastic(CompiledMaterial):
 class LinearElastic(IsotropicElastic):
     """Linear elasticity of small strains."""
 
+    linear_in_volume: ClassVar[bool] = True
     kinematics: ClassVar[Literal["small", "logarithmic"]] = "small"
 
 
@@ -105,6 +106,7 @@ class Hencky(IsotropicElastic):
     unit of undeformed volume (Hencky 1928; Anand 1979).
     """
 
+    linear_in_volume: ClassVar[bool] = True
     kinematics: ClassVar[Literal["small", "logarithmic"]] = "logarithmic"
     _loop: ClassVar[str] = "hencky"
 

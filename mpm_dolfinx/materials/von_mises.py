@@ -35,6 +35,7 @@ class VonMises(IsotropicElastic):
 
     kinematics: ClassVar[Literal["small", "logarithmic"]] = "logarithmic"
     inelastic: ClassVar[bool] = True
+    linear_in_volume: ClassVar[bool] = True
     internal_variables: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType(
         {"plastic_strain": ()}
     )
@@ -131,6 +132,7 @@ class VonMises(IsotropicElastic):
 class SmallStrainVonMises(VonMises):
     """:class:`VonMises` with infinitesimal strain and the Cauchy stress."""
 
+    linear_in_volume: ClassVar[bool] = True
     kinematics: ClassVar[Literal["small", "logarithmic"]] = "small"
 
 

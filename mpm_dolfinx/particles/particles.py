@@ -27,6 +27,7 @@ from ..transfer.method import CornerBasis, DomainState, ParticleState
 from ..transfer.methods import METHODS
 from ..transfer.transfer import Transfer
 from ..transfer.weights import Weights, domain_weights, sum_by_particle
+from .field import ParticleField
 from .geometry import Geometry
 from .options import (
     Coordinates,
@@ -194,6 +195,7 @@ class Particles(MaterialDomains):
         self.proportional = fem.Constant(body, 1.0)
         self._converged = np.zeros_like(self._geometry.nodes)
         self._transfer: Transfer | None = None
+        self._vectors: tuple[fem.FunctionSpace, fem.FunctionSpace] | None = None
 
     @classmethod
     def from_points(
@@ -394,6 +396,61 @@ class Particles(MaterialDomains):
                     f"{tuple(float(f'{c:.6g}') for c in where)}; {advice}",
                     self.global_index[lost],
                 )
+
+    def field(
+        self, V: fem.FunctionSpace, at: str = "points", kind: str = "total", name: str = "field"
+    ) -> ParticleField:
+        """Return another unknown on this body, for ``ParticleProblem(..., fields=[...])``.
+
+        Its values are those of a background space where the body is: ``p = T_p x``. The space may
+        have another degree, shape and mesh than that of the displacement.
+
+        Args:
+            V: Background space: scalar, vector or tensor Lagrange elements, continuous or not.
+            at: Where the body has values: at the ``"points"`` of ``particles.dx``, for forms
+                without the gradient of the field, or at the ``"nodes"`` of a Lagrange space of
+                the same degree on the body mesh, for those with it.
+            kind: ``"total"``: the background has the values themselves; ``"increment"``: it has
+                the change in each step, ``p = p_n + T_p x``, for what does not diffuse;
+                ``"body"``: T_p is that of the undeformed body in all steps.
+            name: Its name: an identifier, another one for each field of a body.
+
+        Raises:
+            MPMError: A space or options that do not go together.
+        """
+        return ParticleField(self, V, at, kind, name)
+
+    def converged_points(self) -> NDArray[np.float64]:
+        """Return positions of all history's points, last converged, ``(n, nq, gdim)``."""
+        corners = self._converged_corners()
+        return np.asarray(np.einsum("qk,nki->nqi", self.quadrature.shapes, corners))
+
+    def converged_nodes(self, W: fem.FunctionSpace) -> NDArray[np.float64]:
+        """Return positions of the nodes of a Lagrange space on the body mesh, last converged.
+
+        Args:
+            W: The space, of any shape (collective).
+
+        Returns:
+            Positions of its local nodes, shape ``(N, gdim)``.
+        """
+        gdim = self._geometry.gdim
+        before, moved = fem.Function(self.W), fem.Function(self._vectors_on(W))
+        before.x.array[:] = self._converged.ravel()
+        moved.interpolate(before)
+        moved.x.scatter_forward()
+        x = W.tabulate_dof_coordinates()[:, :gdim]
+        return np.asarray(x + moved.x.array.reshape(-1, gdim))
+
+    def _vectors_on(self, W: fem.FunctionSpace) -> fem.FunctionSpace:
+        """Return the space of vectors with the nodes of a space, made once for each."""
+        if self._vectors is None or self._vectors[0] is not W:
+            shape = (self._geometry.gdim,)
+            space = fem.functionspace(W.mesh, ("Lagrange", W.ufl_element().degree, shape))
+            if not np.array_equal(space.dofmap.list, W.dofmap.list):
+                raise MPMError("DOLFINx numbers nodes of scalars and vectors differently here.")
+            self._vectors = W, space
+        return self._vectors[1]
 
     def converged_gradient(self) -> NDArray[np.float64]:
         """Return ``F - I`` at the history's points, last converged, ``(n, nq, gdim, gdim)``."""

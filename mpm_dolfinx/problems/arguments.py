@@ -20,12 +20,14 @@ from .. import _compat
 from ..assembly.inputs import is_tag
 from ..errors import MPMError
 from ..materials.base import Material
+from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import LoadFactor, Particles
 from ..system.term import Term
 
 __all__ = [
     "as_bodies",
     "as_conditions",
+    "as_fields",
     "as_terms",
     "by_space",
     "carried",
@@ -33,6 +35,7 @@ __all__ = [
     "one_for_each",
     "require_background_fields",
     "require_own_fields",
+    "residuals_of",
 ]
 
 #: Names of the measures of integrals, and how many dimensions less than the mesh they have.
@@ -72,7 +75,69 @@ def as_bodies(particles: Particles | Sequence[Particles]) -> list[Particles]:
     return list(bodies)
 
 
-def require_own_fields(form: Any, number: int, bodies: Sequence[Particles], what: str) -> None:
+def as_fields(fields: Any, bodies: Sequence[Particles]) -> list[ParticleField]:
+    """Return unknowns besides displacements as a list.
+
+    Raises:
+        MPMError: Something else, fields of other bodies, or names that are not their own.
+    """
+    known = isinstance(fields, list | tuple) and all(isinstance(f, ParticleField) for f in fields)
+    if not known:
+        raise MPMError("fields must be a list of fields made by particles.field().")
+    if len({id(field) for field in fields}) < len(fields):
+        raise MPMError("The same field is given twice.")
+    for body in bodies:
+        names = [field.name for field in fields if field.particles is body]
+        if len(set(names)) < len(names):
+            raise MPMError(f"Fields are known by their names, which must differ, not {names}.")
+    for field in fields:
+        if all(field.particles is not body for body in bodies):
+            raise MPMError(f"The field '{field.name}' is of particles that this problem has not.")
+        if any(field.background is body.V for body in bodies):
+            raise MPMError(
+                f"The field '{field.name}' is on the V of a displacement; give it a space of its "
+                "own, on the same mesh if you like."
+            )
+        for other in fields:
+            alike = (field.kind == "increment") == (other.kind == "increment")
+            if other.background is field.background and not alike:
+                raise MPMError("Fields on one background space must be of the same kind.")
+    return list(fields)
+
+
+def residuals_of(
+    R: Any, bodies: Sequence[Particles], fields: Sequence[ParticleField]
+) -> tuple[list[Any], list[ufl.Form]]:
+    """Return the residuals of bodies and those of fields.
+
+    Raises:
+        MPMError: More or less of them than bodies and fields, or not forms.
+    """
+    if not fields:
+        return one_for_each(R, bodies, "residual R"), []
+    given = list(R) if isinstance(R, list | tuple) else [R]
+    count = len(bodies)
+    if len(given) != count + len(fields):
+        raise MPMError(
+            f"There are {count} bodies and {len(fields)} fields; give R as a list with one "
+            "residual for each body, then one for each field."
+        )
+    for field, form in zip(fields, given[count:], strict=True):
+        if not isinstance(form, ufl.Form):
+            raise MPMError(f"The residual of the field '{field.name}' must be a UFL form.")
+    for number, body in enumerate(bodies):
+        if given[number] is None and all(field.particles is not body for field in fields):
+            raise MPMError(f"Body {number} has neither a residual nor fields.")
+    return given[:count], given[count:]
+
+
+def require_own_fields(
+    form: Any,
+    number: int,
+    bodies: Sequence[Particles],
+    what: str,
+    fields: Sequence[ParticleField] = (),
+) -> None:
     """Raise an error where a form of a body holds what its tangent or its steps do not see.
 
     Args:
@@ -80,9 +145,11 @@ def require_own_fields(form: Any, number: int, bodies: Sequence[Particles], what
         number: Number of its body.
         bodies: The bodies of the problem.
         what: What it is called in a sentence.
+        fields: The unknowns of the problem besides displacements.
 
     Raises:
-        MPMError: A displacement or load factor of another body, or something of another mesh.
+        MPMError: A field that is no unknown, a displacement or load factor of another body, or
+            something of another mesh.
     """
     if not isinstance(form, ufl.Form):
         return
@@ -94,6 +161,13 @@ def require_own_fields(form: Any, number: int, bodies: Sequence[Particles], what
                 f"The {name} holds the displacement of body {other}, whose change it would feel a "
                 "step late; a residual knows its own body alone, and bodies of one problem act on "
                 "each other by the background that they share, or by terms=."
+            )
+    for function in form.coefficients():
+        known = any(function is field for field in fields)
+        if isinstance(function, ParticleField) and not known:
+            raise MPMError(
+                f"The {name} holds the field '{function.name}', which is no unknown of the "
+                "problem; give it in fields=, or use its .previous."
             )
     _require_own_load(form, body, name)
     _require_mesh(form, body.mesh, name, "particles.mesh")
@@ -207,9 +281,9 @@ def one_for_each(forms: Any, bodies: Sequence[Particles], what: str) -> list[Any
     return given
 
 
-def by_space(bodies: Sequence[Particles]) -> list[list[Particles]]:
+def by_space[Moved: (Particles, CarriedField)](bodies: Sequence[Moved]) -> list[list[Moved]]:
     """Return the bodies on each background space, in the order in which the spaces come first."""
-    groups: list[list[Particles]] = []
+    groups: list[list[Moved]] = []
     for body in bodies:
         known = [group for group in groups if group[0].V is body.V]
         if known:

@@ -118,6 +118,8 @@ class DynamicProblem(QuasiStaticProblem):
         self._energies: list[Energy] = []
         self.inertia = Inertia(bodies, start, scheme, out_of_range, alpha, self._energies)
         given = as_terms(terms, bodies)
+        if options.get("mixed") is not None:
+            raise MPMError("mixed= is for mpm.QuasiStaticProblem; use f_bar= in dynamics.")
         super().__init__(
             particles,
             material,

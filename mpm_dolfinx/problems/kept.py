@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 from mpi4py import MPI
 
@@ -20,11 +20,12 @@ from ..errors import MPMError, ParticleOutsideError
 from ..history import History, Loss, Stage, Statistics, Step
 from ..io.snapshot import Kept, Taken, fill, of_cells
 from ..meshes.remesh import Column
+from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..stepping.control import Converged, Progress, Run
 from ..system.reduced import ReducedSystem
 
-__all__ = ["Bodies", "Functions", "Increments", "Material", "Past", "Standing"]
+__all__ = ["Bodies", "Functions", "Increments", "Material", "Past", "Standing", "Values"]
 
 
 class Bodies(Kept):
@@ -178,13 +179,62 @@ class Functions(Kept):
                 fill(function, columns[function.name])
 
 
+class Values(Kept):
+    """The values of fields that are no displacements, and the units of their unknowns.
+
+    Args:
+        carried: The fields of each body.
+        reduced: The system.
+    """
+
+    key = "fields"
+
+    def __init__(self, carried: Sequence[Sequence[CarriedField]], reduced: ReducedSystem) -> None:
+        self._carried, self._reduced = carried, reduced
+
+    def numbers(self) -> dict[str, Any]:
+        """See :class:`Kept`."""
+        return {"units": self._reduced.units}
+
+    def columns(self, body: int | None) -> dict[str, Column]:
+        """See :class:`Kept`."""
+        own = [] if body is None else self._carried[body]
+        return {one.field.name: Column(of_cells(one.field.previous), one.place) for one in own}
+
+    def restore(self, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        for own, columns in zip(self._carried, taken.columns, strict=False):
+            for one in own:
+                fill(one.field.previous, columns[one.field.name])
+                one.roll_back()
+        self._reduced.units = taken.numbers.get("units") or self._reduced.units
+
+
 class Increments(Kept):
-    """The last increments, which predict the next."""
+    """The last increments, which predict the next.
+
+    Args:
+        reduced: The system.
+        bodies: All bodies.
+        carried: The fields of each body that are no displacements.
+    """
 
     key = "past"
 
-    def __init__(self, reduced: ReducedSystem, bodies: Sequence[Particles]) -> None:
-        self._predictor, self._bodies = reduced.predictor, bodies
+    def __init__(
+        self,
+        reduced: ReducedSystem,
+        bodies: Sequence[Particles],
+        carried: Sequence[Sequence[CarriedField]],
+    ) -> None:
+        self._predictor, self._moved = reduced.predictor, reduced.bodies
+        self._of: list[dict[str, Particles | CarriedField]] = []
+        for body, fields in zip(bodies, carried, strict=True):
+            own: dict[str, Particles | CarriedField] = {f" {one.field.name}": one for one in fields}
+            self._of.append(own | {"": body} if self._number(body) >= 0 else own)
+
+    def _number(self, moved: Particles | CarriedField) -> int:
+        return next((i for i, other in enumerate(self._moved) if other is moved), -1)
 
     def numbers(self) -> dict[str, Any]:
         """Return the sizes of their steps."""
@@ -194,10 +244,12 @@ class Increments(Kept):
         """See :class:`Kept`."""
         if body is None:
             return {}
-        W = self._bodies[body].W
         return {
-            str(i): Column(of_cells(_function(W, increments[body])), "nodes")
+            f"{i}{name}": Column(
+                of_cells(_function(one.W, increments[self._number(one)])), _place(one)
+            )
             for i, (_, increments) in enumerate(self._past())
+            for name, one in self._of[body].items()
         }
 
     def require(self, source: str, taken: Taken) -> None:
@@ -207,19 +259,23 @@ class Increments(Kept):
         """See :class:`Kept`."""
         if self._predictor is None:
             return
-        self._predictor.past = [
-            (
-                size,
-                [
-                    _owned(_filled(body.W, columns[str(i)]))
-                    for body, columns in zip(self._bodies, taken.columns, strict=False)
-                ],
-            )
-            for i, size in enumerate(taken.numbers[""])
-        ]
+        past = []
+        for i, size in enumerate(taken.numbers[""]):
+            increments = [np.zeros(0)] * len(self._moved)
+            for own, columns in zip(self._of, taken.columns, strict=False):
+                for name, one in own.items():
+                    values = _filled(one.W, columns[f"{i}{name}"])
+                    increments[self._number(one)] = _owned(values)
+            past.append((size, increments))
+        self._predictor.past = past
 
     def _past(self) -> list[tuple[float, Any]]:
         return [] if self._predictor is None else self._predictor.past
+
+
+def _place(one: Particles | CarriedField) -> Literal["points", "nodes"]:
+    """Return where values live: at the points or the nodes of domains."""
+    return one.place if isinstance(one, CarriedField) else "nodes"
 
 
 class Past(Kept):

@@ -20,6 +20,7 @@ from dolfinx import fem
 
 from ..assembly.background_forms import BackgroundForms
 from ..assembly.body_forms import BodyForms, PointStress
+from ..assembly.field_forms import FieldForms
 from ..assembly.fused import is_fast
 from ..assembly.rules import data_at_points
 from ..boundary.supports import Support
@@ -32,6 +33,7 @@ from ..io.series import Output, read_series
 from ..io.snapshot import Kept, adopt, capture, merged, require_key, spaces_of
 from ..parallel.garbage import Cleaner
 from ..parallel.given import require_same
+from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
 from ..solvers.newton import NewtonSolver
 from ..stabilisation.choice import stabilisation_of
@@ -42,20 +44,23 @@ from ..stepping.loading import Mender, Stepper
 from ..stepping.progress import with_bar
 from ..system.body import BodyTerm, PointHistory, StepForce
 from ..system.conditions import fixed_dofs, force_at
-from ..system.field import Field
+from ..system.field import Field, ValueField
 from ..system.predictor import Predictor
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
 from ..system.term import Term, UserTerm
+from ..system.values import FieldTerm, FormsTerm
 from . import kept
 from .arguments import (
     as_bodies,
     as_conditions,
+    as_fields,
     as_terms,
     by_space,
     one_for_each,
     require_background_fields,
     require_own_fields,
+    residuals_of,
 )
 from .setup import Numerics
 from .summary import in_one_line, on_a_screen
@@ -127,13 +132,19 @@ class ParticleProblem:
     lives in the background space: ``d = d_n + T u``, residual ``T^T R`` and tangent
     ``T^T J T``.
 
+    With ``fields`` there are more unknowns than the displacement, each with a residual and a
+    background space of its own: ``ParticleProblem([R_u, R_p], particles, fields=[p])``. All are
+    solved for together; the blocks of the tangent are derivatives of the residuals.
+
     Args:
         R: Residual in ``particles.displacement`` and a test function of ``particles.W``; for
-            several bodies one for each.
+            several bodies one for each; then one for each of the fields, with a test function of
+            the field's ``W``. ``None`` for a body with fields alone, which does not move by itself.
         particles: The body, or a list of bodies. Those on the same V do not slip where they touch;
             those on a V of their own meet by ``terms`` alone.
         J: Tangent; ``None`` is ``ufl.derivative(R, particles.displacement)``.
-        bcs: Dirichlet conditions on V (any of them); their values are totals at full load.
+        bcs: Dirichlet conditions on V (any of them, also those of fields); their values are
+            totals at full load.
         background: Form in ``particles.increment`` (of the first body on V) and a test function
             of V, added to R; a list where there are several V.
         petsc_options_prefix: Prefix of the PETSc options.
@@ -162,6 +173,8 @@ class ParticleProblem:
             the bodies have hardly more nodes than the background (not beside ``background=``
             or ``dependent_dofs="remove"``).
         terms: What else acts on the bodies: a list of :class:`mpm_dolfinx.Term`.
+        fields: Unknowns besides displacements, made by :meth:`Particles.field`. Those on the same
+            background space are one there, where bodies touch.
 
     Attributes:
         particles: The body or bodies, as given.
@@ -170,6 +183,7 @@ class ParticleProblem:
         history: Steps, counters and seconds; filled as a run goes on.
         bcs: The Dirichlet conditions.
         terms: As given.
+        fields: As given.
         body_terms: What each body is made of and loaded by.
 
     Raises:
@@ -196,8 +210,10 @@ class ParticleProblem:
         predictor: bool = True,
         stabilisation: str | None = "auto",
         terms: Sequence[Term] = (),
+        fields: Sequence[ParticleField] = (),
     ) -> None:
         bodies = as_bodies(particles)
+        fields = as_fields(fields, bodies)
         require_same(
             bodies[0].V.mesh.comm,
             R=R,
@@ -217,6 +233,7 @@ class ParticleProblem:
             predictor=predictor,
             stabilisation=stabilisation,
             terms=len(terms),
+            fields=[field.name for field in fields],
         )
         numerics = Numerics(
             petsc_options_prefix,
@@ -230,7 +247,9 @@ class ParticleProblem:
             predictor,
             stabilisation,
         )
-        residuals = one_for_each(R, bodies, "residual R")
+        residuals, self._of_fields = residuals_of(R, bodies, fields)
+        if fields and J is not None:
+            raise MPMError("With fields= the tangent is the derivative of R; leave J away.")
         tangents = [None] * len(bodies) if J is None else one_for_each(J, bodies, "J")
         if any(body.on_distortion == "split" for body in bodies):
             raise MPMError(
@@ -241,6 +260,7 @@ class ParticleProblem:
             Contribution(r, j, None, None, symmetric)
             for r, j in zip(residuals, tangents, strict=True)
         ]
+        self.fields = fields
         self._begin(particles, bcs, background, numerics, terms)
 
     def _begin(
@@ -264,7 +284,8 @@ class ParticleProblem:
         """
         self.particles = particles
         self.bodies = as_bodies(particles)
-        self.bcs = as_conditions(bcs, [group[0].V for group in by_space(self.bodies)])
+        spaces = [*spaces_of(self.bodies), *self._spaces_of_fields()]
+        self.bcs = as_conditions(bcs, spaces)
         self.terms = as_terms(terms, self.bodies)
         self.history = History()
         self.identity: dict[str, Any] | None = None
@@ -304,20 +325,36 @@ class ParticleProblem:
         numerics = self._numerics
         contributions = self._contributions()
         for number, given in enumerate(contributions):
-            require_own_fields(given.residual, number, self.bodies, "residual R")
-            require_own_fields(given.tangent, number, self.bodies, "tangent J")
+            require_own_fields(given.residual, number, self.bodies, "residual R", self.fields)
+            require_own_fields(given.tangent, number, self.bodies, "tangent J", self.fields)
         fast, options = is_fast(numerics.assembly), numerics.of_forms
         self.body_terms = [
             BodyTerm(
                 body,
-                BodyForms(c.residual, c.tangent, body, c.internal, c.low_rank, fast, **options),
+                BodyForms(
+                    c.residual,
+                    c.tangent,
+                    body,
+                    c.internal,
+                    c.low_rank,
+                    fast,
+                    [field for field in self.fields if field.particles is body],
+                    **options,
+                ),
                 c.material,
                 c.injected,
                 c.contact,
                 c.of_step,
             )
             for body, c in zip(self.bodies, contributions, strict=True)
+            if self._moves(c)
         ]
+        self._field_terms = self._couplings(contributions)
+        carried = self.carried
+        moving = [
+            body for body, c in zip(self.bodies, contributions, strict=True) if self._moves(c)
+        ]
+        groups = by_space(moving)
         for number, term in enumerate(self.terms):
             term.take_part(number, self.bodies, [given.material for given in contributions])
         on_backgrounds = _on_backgrounds(self._background, groups, **options)
@@ -331,12 +368,13 @@ class ParticleProblem:
             )
             for group, forms in zip(groups, on_backgrounds, strict=True)
         ]
+        fields += [ValueField(group, self.bcs) for group in by_space(carried)]
         statistics = self.history.statistics
         self._held.follow(self.bodies, spaces_of(self.bodies))
         reduced = ReducedSystem(
-            self.bodies,
+            [*moving, *carried],
             fields,
-            [*self.body_terms, *self.terms, UserTerm(self), self._held],
+            [*self.body_terms, *self._field_terms, *self.terms, UserTerm(self), self._held],
             statistics,
             Predictor() if numerics.predictor else None,
         )
@@ -345,14 +383,15 @@ class ParticleProblem:
             numerics.petsc_options_prefix,
             numerics.petsc_options,
             all(given.symmetric for given in contributions)
-            and all(term.symmetric for term in self.terms),
+            and all(term.symmetric for term in (*self._field_terms, *self.terms)),
             numerics.shift,
             numerics.line_search,
             statistics,
-            groups[0][0].V.mesh.geometry.dim,
+            self.bodies[0].V.mesh.geometry.dim,
         )
         self._stepper.follow(reduced, newton, clean_up)
         forms = [f for given in contributions for f in (given.residual, given.tangent) if f]
+        forms += self._of_fields
         every = [*forms, *_as_list(self._background)]
         loads = [constant for body in self.bodies for constant in (body.load, body.proportional)]
         self._constants = [
@@ -361,11 +400,54 @@ class ParticleProblem:
             for constant in form.constants()
             if not any(constant is load for load in loads)
         ]
-        self._data = set().union(*map(data_at_points, forms))
+        own = {function for field in self.fields for function in (field, field.previous)}
+        self._data = set().union(*map(data_at_points, forms)) - own
 
     def _contributions(self) -> list[Contribution]:
         """Return what each body adds to the system, on its present mesh (collective)."""
         return self._given
+
+    fields: Sequence[ParticleField] = ()
+    #: Residuals of the fields.
+    _of_fields: Sequence[ufl.Form] = ()
+    _field_terms: Sequence[FieldTerm] = ()
+
+    def _moves(self, given: Contribution) -> bool:
+        """Return whether the displacement of a body is an unknown."""
+        return given.residual is not None or given.internal is not None or not self._of_fields
+
+    def _spaces_of_fields(self) -> list[fem.FunctionSpace]:
+        """Return the background spaces of fields, in the order in which they come first."""
+        spaces: list[fem.FunctionSpace] = []
+        for field in self.fields:
+            if all(field.background is not V for V in spaces):
+                spaces.append(field.background)
+        return spaces
+
+    def _couplings(self, contributions: Sequence[Contribution]) -> list[FieldTerm]:
+        """Return what has unknowns besides displacements (collective).
+
+        Args:
+            contributions: What each body adds to the system.
+        """
+        found: list[FieldTerm] = []
+        for number, (body, given) in enumerate(zip(self.bodies, contributions, strict=True)):
+            own = [
+                (field, form)
+                for field, form in zip(self.fields, self._of_fields, strict=True)
+                if field.particles is body
+            ]
+            for _, form in own:
+                require_own_fields(form, number, self.bodies, "residual of a field", self.fields)
+            if not own:
+                continue
+            fields = [field for field, _ in own]
+            options = self._numerics.of_forms
+            forms = FieldForms(body, fields, given.residual, [form for _, form in own], **options)
+            moving = body if self._moves(given) else None
+            carried = [CarriedField(field) for field in fields]
+            found.append(FormsTerm(moving, carried, forms, given.symmetric))
+        return found
 
     def __del__(self) -> None:
         """Leave PETSc's objects to the next clean-up; at the program's end PETSc drops them.
@@ -397,7 +479,11 @@ class ParticleProblem:
         """Let go of what was built for the present meshes."""
         for body in self.bodies:
             body.forget_transfer()
+        for term in self._field_terms:
+            for field in term.fields:
+                field.forget_transfer()
         self.body_terms = []
+        self._field_terms = []
         self._stepper.release()
 
     def renew(
@@ -433,9 +519,14 @@ class ParticleProblem:
             sudden: Whether nothing is held back.
 
         Raises:
-            MPMError: What is to be changed does not go together.
+            MPMError: What is to be changed does not go together, or there are fields.
         """
         self._require_governing()
+        if self.carried:
+            raise MPMError(
+                "Stages do not go together with fields=, nor with mixed='pressure'; use steps with "
+                "a path (update=...), or f_bar= in place of mixed=."
+            )
         if sudden and self._held.remaining > 0.0:
             raise MPMError(
                 f"{100 * self._held.remaining:.3g} % of what the last stage changes is held back "
@@ -772,7 +863,7 @@ class ParticleProblem:
                 "be restored; save the state without them."
             )
         things, _ = self._all_kept(functions)
-        snapshot = capture(things, self.bodies)
+        snapshot = capture(things, self.bodies, self._spaces())
         known = self._first_identity if self._stages else identity.identity(self)
         snapshot.numbers["identity"] = known | {"the stages": list(self._stages)}
         snapshot.numbers["series"] = self._output.written()
@@ -787,24 +878,37 @@ class ParticleProblem:
         Raises:
             MPMError: Functions that cannot be kept, or that are missing.
         """
-        standing = kept.Standing(self._stepper.progress(), spaces_of(self.bodies), self.history)
+        standing = kept.Standing(
+            self._stepper.progress(), [field.V for field in self.reduced.fields], self.history
+        )
+        carried = [[one for one in self.carried if one.mesh is body.mesh] for body in self.bodies]
         things = [
             kept.Bodies(self.bodies),
             kept.Material(self.converged_state, self.set_converged_state, self._history_at),
             kept.Functions(functions, self.bodies, self.data_at_points()),
-            kept.Increments(self.reduced, self.bodies),
+            kept.Values(carried, self.reduced),
+            kept.Increments(self.reduced, self.bodies, carried),
             kept.Past(self.history, self.reduced, self._comm),
             *(thing for owner, thing in self._kept if self._is_mine(owner)),
             standing,
         ]
         return things, standing
 
+    @property
+    def carried(self) -> list[CarriedField]:
+        """The unknowns besides displacements, as the system moves them."""
+        return [one for term in self._field_terms for one in term.fields]
+
+    def _spaces(self) -> list[fem.FunctionSpace]:
+        """Return all background spaces."""
+        return [field.V for field in self.reduced.fields]
+
     def _adopt(
         self, snapshot: checkpoint.Snapshot, functions: Sequence[fem.Function], source: str
     ) -> Run | None:
         """Go to a state, and return the run that was going on (collective)."""
         things, standing = self._all_kept(functions)
-        adopt(things, self.bodies, snapshot, source)
+        adopt(things, self.bodies, snapshot, source, self._spaces())
         self._stepper.take(standing.progress)
         return standing.progress.run
 

@@ -26,9 +26,12 @@ from ..constitutive.strain import strain_of
 from ..errors import DomainDistortionError, MPMError, agree, agreed, warn
 from ..io.checkpoint import Snapshot
 from ..parallel.given import require_same
+from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
 from ..system.body import StepForce
+from ..system.pressure import PressureTerm
 from ..system.term import Term
+from ..system.values import FieldTerm
 from .arguments import as_bodies, as_terms
 from .initial_stress import initial_stress_at_points
 from .particle_problem import Contribution, Law, ParticleProblem
@@ -92,6 +95,14 @@ class QuasiStaticProblem(ParticleProblem):
             ``(n, nq, 3, 3)``, UFL of the shape ``(3, 3)`` on the body mesh, a function of
             coordinates ``(3, n)`` that returns ``(3, 3, n)``, or :func:`mpm_dolfinx.geostatic`.
             What it is not in equilibrium with goes in proportion, as loads come, in the first run.
+        mixed: ``"pressure"``: the pressure is an unknown besides the displacement, continuous and
+            of one degree less on the same background mesh (the pair of Taylor & Hood 1973), so that
+            nothing locks however little volume changes; for laws that are linear in the volume
+            (Hencky, von Mises), backgrounds and particles of degree 2 or 3, instead of ``f_bar``.
+
+    Attributes:
+        pressure: With ``mixed``, the pressure of each body: a :class:`mpm_dolfinx.ParticleField` at
+            its points. It is the mean of the laws' own stress, positive in tension.
 
     Raises:
         MPMError: Materials, loads or conditions that do not go together.
@@ -125,11 +136,13 @@ class QuasiStaticProblem(ParticleProblem):
         jit_options: dict[str, Any] | None = None,
         terms: Sequence[Term] = (),
         initial_stress: Any = None,
+        mixed: str | None = None,
     ) -> None:
         bodies = as_bodies(particles)
         require_same(
             bodies[0].V.mesh.comm,
             particles=particles,
+            mixed=mixed,
             material=material,
             density=density,
             body_force=body_force,
@@ -169,16 +182,25 @@ class QuasiStaticProblem(ParticleProblem):
             strict=True,
         )
         stresses = _for_each(initial_stress, count)
+        if mixed is not None and any(stress is not None for stress in stresses):
+            raise MPMError("initial_stress= does not go with mixed='pressure'; use f_bar=.")
         setup = Setup(
             tuple(BodySetup(*values) for values in given),
             axisymmetric,
             f_bar,
             tuple(as_terms(terms, bodies)),
+            mixed,
         )
         if any(body.on_distortion == "split" for body in bodies):
             setup.require_divisible()
         self.setup = setup
         self._parameters = self._functions()
+        self._spaces_of_pressure = [
+            fem.functionspace(body.V.mesh, ("Lagrange", body.V.ufl_element().degree - 1))
+            for body in bodies
+            if mixed is not None
+        ]
+        self.pressure: list[ParticleField] = []
         self._left: dict[int, tuple[fem.Function, NDArray[np.float64]]] = {}
         self._remeshing = Remeshing(self)
         self._compiled = is_fast(assembly)
@@ -450,6 +472,10 @@ class QuasiStaticProblem(ParticleProblem):
         """See :meth:`ParticleProblem._contributions`."""
         self._stresses: list[MaterialPoints] = []
         self._density: list[tuple[VirtualWork, Density]] = []
+        self.pressure = [
+            given.particles.field(V, at="points", name="pressure")
+            for given, V in zip(self.setup.bodies, self._spaces_of_pressure, strict=False)
+        ]
         return [self._contribution(given) for given in self.setup.bodies]
 
     def _contribution(self, given: BodySetup) -> Contribution:
@@ -457,7 +483,12 @@ class QuasiStaticProblem(ParticleProblem):
         body = given.particles
         strain = strain_of(body, self.setup.axisymmetric)
         history = MaterialPoints(
-            strain, given.material, given.cell_tags, self.setup.f_bar, self._compiled
+            strain,
+            given.material,
+            given.cell_tags,
+            self.setup.f_bar,
+            self._compiled,
+            next((field for field in self.pressure if field.particles is body), None),
         )
         self._stresses.append(history)
         work = VirtualWork(strain)
@@ -512,6 +543,15 @@ class QuasiStaticProblem(ParticleProblem):
     def _force_share(self) -> float | None:
         """What of the forces at a step's end is force, in a motion; ``None`` in none."""
         return None
+
+    def _couplings(self, contributions: Sequence[Contribution]) -> list[FieldTerm]:
+        """See :meth:`ParticleProblem._couplings`."""
+        if self.setup.mixed is None:
+            return []
+        return [
+            PressureTerm(body, CarriedField(field), history)
+            for body, field, history in zip(self.bodies, self.pressure, self._stresses, strict=True)
+        ]
 
     def begin_step(self) -> None:
         """See :meth:`ParticleProblem.begin_step`; parameters of materials have new values then."""

@@ -268,8 +268,8 @@ class Remeshing:
             given.require_movable_nodes(consequence)
         for term in setup.terms:
             term.require_remeshable(consequence)
-        if setup.f_bar != "none" or setup.axisymmetric:
-            raise MPMError(f"With f_bar or axisymmetric=True {consequence}.")
+        if setup.f_bar != "none" or setup.axisymmetric or setup.mixed is not None:
+            raise MPMError(f"With f_bar, mixed or axisymmetric=True {consequence}.")
         for body in problem.bodies:
             linear = body.W.ufl_element().degree == _compat.geometry_degree(body.mesh) == 1
             if not body.shares_nodes or not linear:

@@ -166,6 +166,7 @@ class Setup:
         axisymmetric: Whether ``x[0]`` is the radius of a body of revolution.
         f_bar: Average of the volume ratio that materials see.
         terms: What else acts on the bodies.
+        mixed: What else is an unknown: ``None`` or ``"pressure"``.
 
     Raises:
         MPMError: An average that there is not, or a term that takes the bodies for others.
@@ -175,6 +176,7 @@ class Setup:
     axisymmetric: bool
     f_bar: str
     terms: tuple[Term, ...] = ()
+    mixed: str | None = None
 
     def __post_init__(self) -> None:
         """Say so where something is unknown."""
@@ -182,11 +184,28 @@ class Setup:
             raise MPMError(
                 f"Unknown f_bar={self.f_bar!r}; choose one of {', '.join(map(repr, F_BARS))}."
             )
+        if self.mixed is not None:
+            self._require_mixed()
         for term in self.terms:
             if term.axisymmetric not in (None, self.axisymmetric):
                 raise MPMError(
                     f"A {type(term).__name__} was made with axisymmetric={term.axisymmetric}, but "
                     f"the problem has axisymmetric={self.axisymmetric}; give both the same."
+                )
+
+    def _require_mixed(self) -> None:
+        """Raise an error unless a pressure can be an unknown of all bodies."""
+        if self.mixed != "pressure":
+            raise MPMError(f"Unknown mixed={self.mixed!r}; choose 'pressure' or None.")
+        if self.f_bar != "none":
+            raise MPMError("mixed='pressure' takes the place of f_bar; leave f_bar='none'.")
+        for body in (given.particles for given in self.bodies):
+            degrees = [space.ufl_element().degree for space in (body.V, body.W)]
+            if min(degrees) < 2:
+                raise MPMError(
+                    "mixed='pressure' needs a background and particles of degree 2 or 3 "
+                    f"(degree=2), not {degrees[0]} and {degrees[1]}: with displacements of degree "
+                    "1 the pressure would oscillate; use f_bar='patch' there."
                 )
 
     def carried(self) -> Setup:
@@ -214,6 +233,8 @@ class Setup:
             MPMError: They may not.
         """
         self.require_movable("domains cannot be split")
+        if self.mixed is not None:
+            raise MPMError("Domains cannot be split or rebased with mixed='pressure'.")
         for term in self.terms:
             term.require_remeshable("domains cannot be split")
         if self.f_bar != "none":

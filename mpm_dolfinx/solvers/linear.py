@@ -25,6 +25,8 @@ FACTORS = ("lu", "cholesky")
 KRYLOV, REFINEMENTS = 60, 4
 #: Options of MUMPS unless others are given: K scaled by its diagonal, as the shift is.
 MUMPS = {"mat_mumps_icntl_8": 1}
+#: The same where the diagonal says nothing of the size of a row: rows and columns in turn.
+SADDLE = {"mat_mumps_icntl_8": 7}
 #: PORD orders plane graphs three times as fast as METIS and no worse, in space worse; from that
 #: many unknowns on, as it ends the process where all unknowns are neighbours of each other.
 PORD, PORD_FROM = {"mat_mumps_icntl_7": 4}, 10000
@@ -53,6 +55,7 @@ class ShiftedFactor:
         P: What was factorised; K itself without a shift.
         D: The shift of the step, or ``None`` before its first factorisation and without a shift.
         shift: As given.
+        num_negative: Number of unknowns, of all ranks, with a negative shift.
     """
 
     def __init__(
@@ -69,6 +72,7 @@ class ShiftedFactor:
         self.K: PETSc.Mat | None = None
         self.P: Any = None
         self.D: PETSc.Vec | None = None
+        self.num_negative = 0
         self._symmetric = symmetric
         self._statistics = statistics
         self._refining: PETSc.KSP | None = None
@@ -92,7 +96,8 @@ class ShiftedFactor:
         """Put the options into PETSc's database, for what reads them inside the block."""
         database = PETSc.Options()
         plane = self._dim == 2 and size >= PORD_FROM
-        defaults = {self._prefix + k: v for k, v in (MUMPS | (PORD if plane else {})).items()}
+        chosen = (SADDLE if self.num_negative else MUMPS) | (PORD if plane else {})
+        defaults = {self._prefix + k: v for k, v in chosen.items()}
         options = {k: v for k, v in defaults.items() if not database.hasName(k)} | self._options
         for key, value in options.items():
             database[key] = value
@@ -111,12 +116,17 @@ class ShiftedFactor:
         self.K = None
 
     def set(
-        self, K: PETSc.Mat, rigid_motions: Callable[[], PETSc.NullSpace], damping: float = 0.0
+        self,
+        K: PETSc.Mat,
+        sizes: Callable[[PETSc.Mat], PETSc.Vec],
+        rigid_motions: Callable[[], PETSc.NullSpace],
+        damping: float = 0.0,
     ) -> bool:
         """Factorise K with the step's shift, or with a larger one (collective).
 
         Args:
             K: The tangent.
+            sizes: Returns the sizes of its diagonal with the signs of the shift, none zero.
             rigid_motions: Makes what multigrid must know.
             damping: Relative shift, if larger.
 
@@ -125,8 +135,10 @@ class ShiftedFactor:
         """
         new = self.K is not K
         if self.shift > 0.0 and self.D is None:
-            self.D = _shift(K, self.shift)
-        diagonal = _shift(K, damping) if damping > self.shift else self.D
+            self.D = self.shift * sizes(K)
+            negative = int(np.count_nonzero(self.D.array_r < 0.0))
+            self.num_negative = K.comm.tompi4py().allreduce(negative)
+        diagonal = damping * sizes(K) if damping > self.shift else self.D
         if diagonal is None:
             self.P = K
         elif new:
@@ -268,14 +280,3 @@ def _product(K: PETSc.Mat, x: PETSc.Vec, exponent: int, result: PETSc.Vec) -> No
     scaled = x.copy()
     scaled.array_w[:] = np.ldexp(x.array_r, -exponent)
     K.mult(scaled, result)
-
-
-def _shift(K: PETSc.Mat, relative: float) -> PETSc.Vec:
-    """Return a share of ``|diag K|``, of its largest entry where it is zero (collective)."""
-    diagonal = K.getDiagonal()
-    diagonal.abs()
-    largest = diagonal.max()[1]
-    values = diagonal.array_w
-    values[values == 0.0] = largest
-    diagonal.scale(relative)
-    return diagonal

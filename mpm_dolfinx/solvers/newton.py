@@ -57,6 +57,12 @@ class ReducedProblem(Protocol):
     def tangent(self) -> PETSc.Mat:
         """Return the tangent at the x of the last residual, always the same object."""
 
+    def diagonal(self, K: PETSc.Mat) -> PETSc.Vec:
+        """Return sizes of the diagonal of a tangent, with signs that make a shift regularise it.
+
+        They are negative for unknowns that enforce a constraint, as a pressure does.
+        """
+
     def constrain(
         self, y: PETSc.Vec, x: PETSc.Vec | None, solve: Callable[[PETSc.Vec, PETSc.Vec], None]
     ) -> int:
@@ -117,6 +123,10 @@ class NewtonSolver:
     ``shift`` times the identity. Where the residual itself is not small enough at the end, it is
     solved for by the last factor, unless more than a tenth of it would stay: that is in unknowns
     that move next to nothing.
+
+    Where the unknowns have others among them that enforce constraints, as a pressure does, D is
+    negative for these, as the diagonal of their Schur complement is, and K is to have as many
+    negative pivots as there are of them.
 
     The line search halves a Newton step while a domain inverts, or while both the work of the
     residual on the step stays above 0.8 of its start and the residual's norm grows, unless the
@@ -536,7 +546,8 @@ class NewtonSolver:
         self.F.copy(self._R)
 
     def _set_tangent(self, K: PETSc.Mat, damping: float = 0.0) -> None:
-        if self._factor.set(K, self._problem.rigid_motions, damping):
+        problem = self._problem
+        if self._factor.set(K, problem.diagonal, problem.rigid_motions, damping):
             self.snes.setJacobian(self._callback(self._jacobian), K, self._factor.P)
 
     def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
@@ -638,7 +649,11 @@ class NewtonSolver:
             self._factor.solve(force, mode)
             mode.scale(1.0 / norm(mode))
             force.pointwiseMult(mode, self._factor.D)
-            ratio = self._problem.stiffness(mode) / mode.dot(force)
+            if self._factor.num_negative:
+                force.array_w[:] = np.copysign(force.array_r, mode.array_r)
+                ratio = abs(self._problem.stiffness(mode)) / mode.dot(force)
+            else:
+                ratio = self._problem.stiffness(mode) / mode.dot(force)
             if ratio <= MECHANISM:
                 return mode
             if ratio > 0.95 * before:
@@ -650,7 +665,9 @@ class NewtonSolver:
         """Return whether a step for the residual F is not that of a positive definite tangent."""
         if not self._symmetric or self._factor.shift == 0.0:
             return False
-        return sign_of_product(F, y) <= 0.0 or self._factor.negative_pivots() > self._negative
+        expected = self._negative + self._factor.num_negative
+        uphill = self._factor.num_negative == 0 and sign_of_product(F, y) <= 0.0
+        return uphill or self._factor.negative_pivots() > expected
 
     def _redirect(self, F: PETSc.Vec, y: PETSc.Vec) -> None:
         """Solve for the step with a damped tangent that is positive definite.

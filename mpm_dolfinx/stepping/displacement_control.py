@@ -322,6 +322,10 @@ class ControlledSystem:
         """Return the tangent at the x and the load factor of the last residual."""
         return self._reduced.tangent()
 
+    def diagonal(self, K: PETSc.Mat) -> PETSc.Vec:
+        """Return sizes of the diagonal of a tangent, with signs that make a shift regularise it."""
+        return self._reduced.diagonal(K)
+
     def smooth(self) -> bool:
         """Return whether no history changes in the last residual, nor contact."""
         return self._reduced.smooth()

@@ -420,7 +420,7 @@ class Stepper:
         if control is not None:
             size = abs(parameter - control.present())
         before = self.converged.prescribed
-        reduced.begin([new - old for new, old in zip(values, before, strict=True)], size)
+        reduced.begin([new - old for new, old in zip(values, before, strict=True)], size, before)
         system: ReducedProblem = reduced
         displacement = None
         if control is not None:

@@ -19,13 +19,20 @@ from .. import _compat
 from ..assembly.background_forms import BackgroundForms
 from ..assembly.fused import Restriction
 from ..parallel.magnitudes import joint_norm, norm
+from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..stabilisation.cure import Cure
 from ..transfer.touched import TouchedNodes, TransferRows
 from .numbering import FreeDofs
 from .predictor import map_to_background
 
-__all__ = ["Field", "Motion"]
+__all__ = ["Field", "Motion", "ValueField"]
+
+#: Change of values, relative to themselves, that counts as none: a residual that is small beside
+#: what it does is round-off.
+NOTHING = 1e-5
+#: Change of the residual to which the values of the background are found that the body's are.
+PROJECTED = 1e-13
 
 #: What a rigid motion may leave of a motion that counts as one.
 RIGID = 1e-3
@@ -41,7 +48,7 @@ class Motion:
         particles: As given.
     """
 
-    def __init__(self, particles: Particles) -> None:
+    def __init__(self, particles: Particles | CarriedField) -> None:
         self.particles = particles
 
     def begin(self) -> None:
@@ -70,13 +77,19 @@ class Motion:
         d = self.particles.displacement.x.array[:rows]
         return np.asarray(d - self._before)
 
+    def change(self) -> NDArray[np.float64]:
+        """Return sizes of the last change on own dofs of W, at least a share of the values'."""
+        increment = self.increment()
+        values = self.particles.displacement.x.array[: len(increment)]
+        return np.asarray(np.abs(increment) + NOTHING * np.abs(values))
+
     def of(self, u: PETSc.Vec) -> PETSc.Vec:
         """Return ``T u``, in a vector that the next call changes."""
         self.particles.T.mult(u, self._work)
         return self._work
 
     def extent(self) -> float:
-        """Return the norm of the positions of the body's nodes."""
+        """Return the norm of the positions of the body's nodes, or of a field's values."""
         rows = self._work.getLocalSize()
         self._work.array_w[:] = self.particles.node_positions.ravel()[:rows]
         return norm(self._work)
@@ -101,8 +114,8 @@ class Motion:
 
     def nodal_size(self, force: PETSc.Vec) -> NDArray[np.float64]:
         """Return the size of ``T f`` at this rank's nodes."""
-        gdim = self.particles.mesh.geometry.dim
-        return np.asarray(np.linalg.norm(self.of(force).array_r.reshape(-1, gdim), axis=1))
+        bs = self.particles.W.dofmap.index_map_bs
+        return np.asarray(np.linalg.norm(self.of(force).array_r.reshape(-1, bs), axis=1))
 
 
 class Field:
@@ -126,11 +139,14 @@ class Field:
         dofs: Their local numbers.
         touched: The nodes of V that bodies touch.
         prescribes: Whether Dirichlet values change in the step that has begun.
+        factor: Value on V of an unknown of size 1.
     """
+
+    factor: float = 1.0
 
     def __init__(
         self,
-        bodies: Sequence[Particles],
+        bodies: Sequence[Particles | CarriedField],
         conditions: Sequence[fem.DirichletBC] = (),
         background: BackgroundForms | None = None,
         cure: Cure | None = None,
@@ -157,9 +173,15 @@ class Field:
         """What was found about badly supported dofs, by the names of the statistics."""
         return self._cure.counts
 
-    def begin(self, change: NDArray[np.float64]) -> None:
-        """Take over the change of the Dirichlet values in a step, on the local dofs of V."""
+    def begin(self, change: NDArray[np.float64], before: NDArray[np.float64] | None = None) -> None:
+        """Take over the Dirichlet values of a step, on the local dofs of V.
+
+        Args:
+            change: Their change in the step.
+            before: Their totals at its beginning; ``None``: zero.
+        """
         self._change = change[: self._owned]
+        self._totals = np.zeros(self._owned) if before is None else before[: self._owned]
         self._imposed = False
         self.prescribes = bool(self._comm.allreduce(bool(np.any(change)), MPI.LOR))
 
@@ -230,7 +252,7 @@ class Field:
             csr = (
                 np.cumsum(offsets, dtype=PETSc.IntType),
                 self._numbers.astype(PETSc.IntType),
-                np.ones(len(self.dofs)),
+                np.full(len(self.dofs), self.factor),
             )
             sizes = (self.u.getSizes(), self._sizes)
             matrix = PETSc.Mat().createAIJ(sizes, csr=csr, comm=self._comm)
@@ -256,7 +278,7 @@ class Field:
     def _set(self, u: PETSc.Vec, x: PETSc.Vec, values: NDArray[np.float64]) -> None:
         """Set u to the unknowns x, and to values at other dofs; dofs that follow others do."""
         assert self.free is not None
-        values[self.dofs] = self.free.spread(x.array_r[self._part_of_x])
+        values[self.dofs] = self.factor * self.free.spread(x.array_r[self._part_of_x])
         u.array_w[:] = values
         self._extend(u)
 
@@ -275,7 +297,7 @@ class Field:
     def collect(self, force: PETSc.Vec, F: PETSc.Vec) -> None:
         """Set the unknowns' part of F to a force on all dofs of V."""
         assert self.free is not None
-        F.array_w[self._part_of_x] = self.free.collect(force.array_r[self.dofs])
+        F.array_w[self._part_of_x] = self.factor * self.free.collect(force.array_r[self.dofs])
 
     def residual_at_unknowns(self) -> PETSc.Vec | None:
         """Return the last residual at the free dofs, zero elsewhere, if these are known."""
@@ -317,14 +339,14 @@ class Field:
     def on_bodies(self, x: PETSc.Vec) -> list[float]:
         """Return the size of the displacement that the unknowns x cause on each body."""
         u = self.on_background(x)
-        return [norm(motion.of(u)) for motion in self.motions]
+        return [norm(motion.of(u)) / abs(self.factor) for motion in self.motions]
 
     def predict(self, increments: list[NDArray[np.float64]], x: PETSc.Vec) -> None:
         """Set the unknowns' part of x to what increments of the bodies' nodes are on V."""
         assert self.free is not None
         u = map_to_background([body.T for body in self.bodies], increments)
         self._cure.stand_in(u)
-        x.array_w[self._part_of_x] = self.free.collect(u[self.dofs])
+        x.array_w[self._part_of_x] = self.free.collect(u[self.dofs]) / self.factor
 
     def reactions(self) -> float:
         """Return the norm of the last residual at Dirichlet conditions."""
@@ -402,3 +424,94 @@ class Field:
             assert matrix is not None
             self._penalty = matrix, matrix.ptap(self.prolongation)
         return self._penalty
+
+
+class ValueField(Field):
+    """The background space of values on bodies that are no displacements.
+
+    Where the background has the values themselves, ``p = T x``, the unknowns are what these differ
+    by from ``x_0``, the values on the background that fit those of the bodies at the last
+    converged step best (least squares, weighted by volume). These are not those that the
+    background had then: where a body moves, nodes get weight that had none, and others' values
+    weigh elsewhere.
+
+    Unknowns are counted in a unit (:attr:`factor`) with which their tangent has the size of the
+    displacement's, so that norms of all unknowns and residuals mean something.
+
+    Args:
+        bodies: The fields on this space.
+        conditions: Dirichlet conditions, of which those on this space count.
+
+    Attributes:
+        carried: As given as ``bodies``.
+        unit: The factor, ``None`` until it is known.
+    """
+
+    def __init__(
+        self, bodies: Sequence[CarriedField], conditions: Sequence[fem.DirichletBC] = ()
+    ) -> None:
+        super().__init__(bodies, conditions)
+        self.carried = list(bodies)
+        self.unit: float | None = None
+
+    @property
+    def factor(self) -> float:  # type: ignore[override]
+        """Value on V of an unknown of size 1."""
+        return 1.0 if self.unit is None else self.unit
+
+    def find(self) -> FreeDofs:
+        """See :meth:`Field.find`; look for the values that the step starts from."""
+        found = super().find()
+        for carried in self.carried:
+            carried.converged_displacement = carried.field.previous.x.array.copy()
+        if self.carried[0].total:
+            self._start()
+        return found
+
+    def _start(self) -> None:
+        """Let values start from those of the background that fit them best (collective)."""
+        start = self.force.duplicate()
+        start.array_w[:] = np.where(self._fixed, self._totals, 0.0)
+        scaled, right = [], start.duplicate()
+        right.set(0.0)
+        for carried in self.carried:
+            rows = carried.T.createVecLeft()
+            weight = rows.duplicate()
+            bs = carried.W.dofmap.index_map_bs
+            weight.array_w[:] = np.sqrt(np.repeat(carried.weights, bs))
+            carried.T.mult(start, rows)
+            before = carried.field.previous.x.array[: rows.getLocalSize()]
+            rows.array_w[:] = weight.array_r**2 * (before - rows.array_r)
+            carried.T.multTransposeAdd(rows, right, right)
+            scaled.append(carried.T.copy())
+            scaled[-1].diagonalScale(L=weight)
+        if norm(right) > 0.0:
+            self._fit(scaled, right, start)
+        for carried in self.carried:
+            rows = carried.T.createVecLeft()
+            carried.T.mult(start, rows)
+            base = carried.converged_displacement
+            base[: rows.getLocalSize()] = rows.array_r
+            values = fem.Function(carried.W)
+            values.x.array[:] = base
+            values.x.scatter_forward()
+            base[:] = values.x.array
+
+    def _fit(self, scaled: Sequence[PETSc.Mat], right: PETSc.Vec, start: PETSc.Vec) -> None:
+        """Add to the start what solves the normal equations at the free dofs (collective)."""
+        normal = scaled[0].transposeMatMult(scaled[0])
+        for one in scaled[1:]:
+            normal = normal + one.transposeMatMult(one)
+        first = start.getOwnershipRange()[0]
+        free = PETSc.IS().createGeneral((first + self.dofs).astype(PETSc.IntType), comm=self._comm)
+        block, part = normal.createSubMatrix(free, free), right.getSubVector(free)
+        change = part.duplicate()
+        ksp = PETSc.KSP().create(self._comm)
+        ksp.setType("cg")
+        ksp.getPC().setType("jacobi")
+        ksp.setOperators(block)
+        ksp.setTolerances(rtol=PROJECTED, max_it=1000)
+        ksp.solve(part, change)
+        if np.isfinite(norm(change)):
+            start.array_w[self.dofs] = start.array_r[self.dofs] + change.array_r
+        right.restoreSubVector(free, part)

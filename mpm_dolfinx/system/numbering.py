@@ -89,8 +89,13 @@ class FreeDofs:
         return result
 
     def rigid_motions(self) -> list[NDArray[np.float64]]:
-        """Return the rigid motions of the background at this rank's unknowns (collective)."""
+        """Return the rigid motions of the background at this rank's unknowns (collective).
+
+        Values that are no displacements have none.
+        """
         gdim = self._V.mesh.geometry.dim
+        if self._V.dofmap.index_map_bs != gdim:
+            return []
         x = self._V.tabulate_dof_coordinates()[: self._V.dofmap.index_map.size_local, :gdim]
         motions = [np.broadcast_to(e, x.shape) for e in np.eye(gdim)]
         for i, j in combinations(range(gdim), 2):

@@ -21,9 +21,10 @@ from ..history import Statistics
 from ..parallel.balance import imbalance
 from ..parallel.interruption import Interrupted, note, noted
 from ..parallel.magnitudes import joint_norm, norm
+from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..transfer.touched import TransferRows
-from .field import Field, Motion
+from .field import Field, Motion, ValueField
 from .numbering import Numbering
 from .predictor import Predictor
 from .term import Term
@@ -40,13 +41,14 @@ class ReducedSystem:
     """``sum_b T_b^T r_b(d_n + T u) = 0`` in the unknowns of all fields, as the solver sees it.
 
     Args:
-        bodies: All bodies, in the problem's order.
+        bodies: All bodies, in the problem's order, then their other fields.
         fields: The background spaces that move them.
         terms: What acts on them.
         statistics: Where to count.
         predictor: Says what increment to expect; ``None`` for none.
 
     Attributes:
+        bodies: As given.
         fields: As given.
         fused: The tangents that the compiled loops reduce: one of all fields together, and one of
             each field in which dofs follow others.
@@ -55,12 +57,13 @@ class ReducedSystem:
 
     def __init__(
         self,
-        bodies: Sequence[Particles],
+        bodies: Sequence[Particles | CarriedField],
         fields: Sequence[Field],
         terms: Sequence[Term],
         statistics: Statistics,
         predictor: Predictor | None = None,
     ) -> None:
+        self.bodies = list(bodies)
         self.fields = list(fields)
         self.predictor = predictor
         self._terms = list(terms)
@@ -86,7 +89,7 @@ class ReducedSystem:
         every = [pair for term in self._terms for pair in term.fused]
         return [pair for pair in every if any(pair[0] is body for body in field.bodies)]
 
-    def _place(self, particles: Particles) -> tuple[Field, Motion]:
+    def _place(self, particles: Particles | CarriedField) -> tuple[Field, Motion]:
         """Return the field that moves a body, and how."""
         return next(place for place in self._places if place[1].particles is particles)
 
@@ -95,6 +98,12 @@ class ReducedSystem:
         """Number of unknowns of this rank and of all ranks."""
         assert self._numbering is not None
         return self._numbering.sizes
+
+    @property
+    def unknowns(self) -> list[slice]:
+        """Where each field's unknowns are among this rank's."""
+        assert self._numbering is not None
+        return self._numbering.parts
 
     @property
     def forces(self) -> list[PETSc.Vec]:
@@ -133,18 +142,25 @@ class ReducedSystem:
 
     # -- A step ---------------------------------------------------------------------------
 
-    def begin(self, changes: Sequence[NDArray[np.float64]], size: float) -> None:
+    def begin(
+        self,
+        changes: Sequence[NDArray[np.float64]],
+        size: float,
+        before: Sequence[NDArray[np.float64] | None] | None = None,
+    ) -> None:
         """Prepare a step, or another try of the same.
 
         Args:
             changes: Change of the Dirichlet values, on the local dofs of V, for each field.
             size: Size of the step, in load factor or parameter of the path.
+            before: Totals of the Dirichlet values at its beginning, for each field; ``None``: zero.
 
         Raises:
             ParticleOutsideError: Where the last step left a domain outside the background.
         """
-        for field, change in zip(self.fields, changes, strict=True):
-            field.begin(change)
+        totals = [None] * len(self.fields) if before is None else before
+        for field, change, total in zip(self.fields, changes, totals, strict=True):
+            field.begin(change, total)
         self._size = size
         with self._statistics.phase("locate"):
             for _, motion in self._places:
@@ -157,8 +173,45 @@ class ReducedSystem:
             for term in self._terms:
                 self._add(term, term.begin())
             self._external = [norm(field.force) for field in self.fields]
+            if any(field.unit is None for field in self._value_fields):
+                self._find_units()
             starts = [term.start(self._free_T, self._prescribed) for term in self._terms]
             self._start = next((x for x in starts if x is not None), None)
+
+    @property
+    def _value_fields(self) -> list[ValueField]:
+        """The fields that are no displacements; they come last."""
+        return [field for field in self.fields if isinstance(field, ValueField)]
+
+    @property
+    def units(self) -> list[float | None]:
+        """Values of unknowns of size 1 of the fields that are no displacements."""
+        return [field.unit for field in self._value_fields]
+
+    @units.setter
+    def units(self, values: Sequence[float | None]) -> None:
+        for field, value in zip(self._value_fields, values, strict=True):
+            field.unit = value
+
+    def _find_units(self) -> None:
+        """Choose units of unknowns, powers of two, in which all have tangents of the same size."""
+        assert self._numbering is not None
+        x = self._numbering.vector()
+        if self.residual(x, x.duplicate()) is not None:
+            return
+        diagonal = self.diagonal(self.tangent()).array_r
+        sizes = [
+            self._comm.allreduce(float(np.abs(diagonal[part]).max(initial=0.0)), MPI.MAX)
+            for part in self._numbering.parts
+        ]
+        given = [
+            s for s, f in zip(sizes, self.fields, strict=True) if not isinstance(f, ValueField)
+        ]
+        whole = max(given, default=sizes[0])
+        for field, size in zip(self.fields, sizes, strict=True):
+            if isinstance(field, ValueField) and size > 0.0 and whole > 0.0:
+                field.unit = float(2.0 ** np.round(0.5 * np.log2(whole / size)))
+        self._find_unknowns()
 
     def _prescribed(self, particles: Particles) -> PETSc.Vec | None:
         """Return how the step's Dirichlet values move a body, ``None``: not at all."""
@@ -206,9 +259,11 @@ class ReducedSystem:
         ):
             field.number(part, numbers, numbering.sizes)
         self._sum = MatrixSum()
+        self._zeros_on_diagonal: PETSc.Mat | None = None
         self._products: dict[tuple[int, int, int], tuple[PETSc.Mat | None, ...]] = {}
         self._extended: list[PETSc.Mat | None] = [None] * len(self.fused)
         self._tangents: list[Tangents] = []
+        self._sizes_of: dict[tuple[int, int, int], PETSc.Mat] = {}
         for fused, (group, pairs) in zip(self.fused, self._groups, strict=True):
             found = [
                 field.restriction([_rows(field, body) for body, _ in own])
@@ -391,6 +446,7 @@ class ReducedSystem:
         with self._statistics.phase("assemble"):
             parts = [self._fused_tangent(number) for number in range(len(self.fused))]
             self._tangents = [term.tangents() for term in self._terms]
+            self._sizes_of = {}
             parts += [
                 self._product(term, number, pair, K)
                 for number, (term, tangents) in enumerate(
@@ -402,7 +458,64 @@ class ReducedSystem:
                 parts += term.reduced_tangents(self._free_T)
             for field in self.fields:
                 parts += field.tangents(partial(self._stiffness, field))
+            if self._value_fields:
+                parts.append(self._entries_on_diagonal)
             return self._sum.of(parts)
+
+    @property
+    def _entries_on_diagonal(self) -> PETSc.Mat:
+        """Zeros on the diagonal, where a shift has its place though a block may be empty."""
+        if self._zeros_on_diagonal is None:
+            assert self._numbering is not None
+            count, whole = self.sizes
+            start = self._numbering.vector().getOwnershipRange()[0]
+            csr = (
+                np.arange(count + 1, dtype=PETSc.IntType),
+                np.arange(start, start + count, dtype=PETSc.IntType),
+                np.zeros(count),
+            )
+            sizes = ((count, whole), (count, whole))
+            self._zeros_on_diagonal = PETSc.Mat().createAIJ(sizes, csr=csr, comm=self._comm)
+        return self._zeros_on_diagonal
+
+    def diagonal(self, K: PETSc.Mat) -> PETSc.Vec:
+        """Return sizes of the diagonal of a tangent, with signs that make a shift regularise it.
+
+        It is ``|diag K|`` for displacements. For other fields, one after the other, it is the
+        diagonal of ``K_ii - sum_j K_ij D_j^-1 K_ji`` with the sizes D_j of those before: that of
+        the Schur complement if these were diagonal. A pressure that enforces a constraint has it
+        negative, whether or not K_ii is empty. Zeros are replaced by the largest of their field.
+        """
+        assert self._numbering is not None
+        found = K.getDiagonal()
+        values = found.array_w
+        for field, part in zip(self.fields, self._numbering.parts, strict=True):
+            if isinstance(field, ValueField):
+                values[part] -= self._schur(K, found, part)
+            else:
+                values[part] = np.abs(values[part])
+            own = np.abs(values[part])
+            largest = self._comm.allreduce(float(own.max(initial=0.0)), MPI.MAX)
+            sums = self._comm.allreduce(float(np.sign(values[part]).sum()))
+            values[part] = np.where(own == 0.0, np.copysign(largest, sums), values[part])
+        return found
+
+    def _schur(self, K: PETSc.Mat, sizes: PETSc.Vec, part: slice) -> NDArray[np.float64]:
+        """Return what unknowns of the fields before take from the diagonal of some (collective)."""
+        first = K.getOwnershipRange()[0]
+        stop = part.start
+        before, own = (
+            PETSc.IS().createStride(b - a, first=first + a, step=1, comm=self._comm)
+            for a, b in ((0, stop), (part.start, part.stop))
+        )
+        if self._comm.allreduce(stop) == 0:
+            return np.zeros(part.stop - part.start)
+        left, right = K.createSubMatrix(own, before), K.createSubMatrix(before, own)
+        inverse = right.createVecLeft()
+        inverse.array_w[:] = sizes.array_r[:stop]
+        inverse.reciprocal()
+        right.diagonalScale(L=inverse)
+        return np.asarray(left.matMult(right).getDiagonal().array_r)
 
     def _fused_tangent(self, number: int) -> PETSc.Mat:
         fused, (group, _) = self.fused[number], self._groups[number]
@@ -428,7 +541,7 @@ class ReducedSystem:
         self._products[key] = K, half, result
         return result
 
-    def _free_T(self, particles: Particles) -> PETSc.Mat:
+    def _free_T(self, particles: Particles | CarriedField) -> PETSc.Mat:
         field, motion = self._place(particles)
         return motion.free_T(field.prolongation)
 
@@ -493,7 +606,7 @@ class ReducedSystem:
                 largest of the fields' own ratios, so that each has to converge by itself.
         """
         scales = [
-            max(external, field.reactions(), outer)
+            field.factor * max(external, field.reactions(), outer, self._changed(field))
             for field, external, outer in zip(self.fields, self._external, self._outer, strict=True)
         ]
         if len(scales) == 1:
@@ -510,6 +623,30 @@ class ReducedSystem:
         ]
         return norm(F) / max(ratios) if ratios else joint_norm(scales)
 
+    def _changed(self, field: Field) -> float:
+        """Return what the step's changes of all unknowns add to a field's residual, in sizes.
+
+        The residual of a constraint has no forces to be compared with: what is to vanish, as the
+        change of volume at each point, is a sum of terms that do not.
+        """
+        if not isinstance(field, ValueField):
+            return 0.0
+        total = field.force.duplicate()
+        total.set(0.0)
+        for number, (term, tangents) in enumerate(zip(self._terms, self._tangents, strict=False)):
+            for (a, b), K in tangents.items():
+                its, motion = self._place(term.bodies[a])
+                if its is not field:
+                    continue
+                key = number, a, b
+                if key not in self._sizes_of:
+                    self._sizes_of[key] = _absolute(K)
+                force, change = K.createVecLeft(), K.createVecRight()
+                change.array_w[:] = self._place(term.bodies[b])[1].change()
+                self._sizes_of[key].mult(change, force)
+                motion.particles.T.multTransposeAdd(force, total, total)
+        return norm(total)
+
     def internal_scale(self) -> float:
         """Return the size of what all domains add to the residual, in absolute values."""
         return joint_norm(self._internal_scales())
@@ -519,7 +656,7 @@ class ReducedSystem:
             totals = self._zeros()
             for term in self._terms:
                 self._add(term, term.absolute_contributions(), totals)
-            return [norm(total) for total in totals]
+            return [f.factor * norm(total) for f, total in zip(self.fields, totals, strict=True)]
 
     def changes(self) -> list[NDArray[np.float64]]:
         """Return :meth:`Field.changes` of each field."""
@@ -541,7 +678,7 @@ class ReducedSystem:
         It is what loads and supports, as computed, differ by: the stress of a domain adds
         nothing to it, nor does round-off of the stress.
         """
-        return joint_norm([field.resultant() for field in self.fields])
+        return joint_norm([field.factor * field.resultant() for field in self.fields])
 
     def stiffness(self, x: PETSc.Vec) -> float:
         """Return ``x . K x``, summed domain by domain: nothing, for a rigid motion.
@@ -571,7 +708,7 @@ class ReducedSystem:
 
     def extent(self) -> float:
         """Return the size of the positions of all nodes."""
-        return joint_norm([motion.extent() for _, motion in self._places])
+        return joint_norm([motion.extent() / field.factor for field, motion in self._places])
 
     def is_rigid(self, x: PETSc.Vec) -> bool:
         """Return whether x moves each body as a rigid one (collective)."""
@@ -601,6 +738,13 @@ def _updated(term: Term) -> BaseException | None:
         return as_ours(error, term.evaluation)
     except BaseException as error:
         return error
+
+
+def _absolute(matrix: PETSc.Mat) -> PETSc.Mat:
+    """Return a matrix with the absolute values of another (collective)."""
+    indptr, columns, values = matrix.getValuesCSR()
+    csr = indptr, columns, np.abs(values)
+    return PETSc.Mat().createAIJ(matrix.getSizes(), csr=csr, comm=matrix.comm)
 
 
 def _rows(field: Field, particles: Particles) -> TransferRows:

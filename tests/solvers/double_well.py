@@ -37,6 +37,13 @@ class DoubleWell:
     def smooth(self):
         return True
 
+    def diagonal(self, K):
+        sizes = K.getDiagonal()
+        sizes.abs()
+        largest = sizes.max()[1]
+        sizes.array_w[sizes.array_r == 0.0] = largest
+        return sizes
+
     def rigid_motions(self):
         raise AssertionError("for multigrid only")
 

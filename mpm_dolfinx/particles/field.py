@@ -1,0 +1,325 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Fields on a body besides its displacement, each with a background space of its own."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, Protocol
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ufl
+from dolfinx import fem, mesh
+
+from ..background.basis import BackgroundBasis, PointBasis
+from ..errors import MPMError, ParticleOutsideError, agree
+from ..parallel.given import require_same
+from ..transfer.matrix import transfer_matrix
+from ..transfer.transfer import Transfer
+
+__all__ = ["CarriedField", "ParticleField"]
+
+KINDS = ("total", "increment", "body")
+PLACES = ("nodes", "points")
+
+
+class Body(Protocol):
+    """What a field asks of its body."""
+
+    @property
+    def mesh(self) -> mesh.Mesh:
+        """The body mesh."""
+
+    @property
+    def V(self) -> fem.FunctionSpace:
+        """The background space of the displacement."""
+
+    @property
+    def domain_nodes(self) -> NDArray[np.int32]:
+        """Local nodes of W of each owned domain."""
+
+    @property
+    def global_index(self) -> NDArray[np.int64]:
+        """Input index of each owned particle."""
+
+    @property
+    def deletion(self) -> object | None:
+        """Which domains are deleted, if any may be."""
+
+    @property
+    def dx(self) -> ufl.Measure:
+        """Measure with the rule that carries the history."""
+
+    @property
+    def transfer(self) -> Transfer:
+        """T and what follows from it, at the last converged positions."""
+
+    @property
+    def shares_nodes(self) -> bool:
+        """Whether neighbours share their nodes."""
+
+    @property
+    def deleted(self) -> NDArray[np.bool_]:
+        """Whether each owned domain is deleted."""
+
+    @property
+    def num_local(self) -> int:
+        """Number of particles this rank owns."""
+
+    @property
+    def num_points(self) -> int:
+        """Number of quadrature points of each domain."""
+
+    def quadrature_function(self, name: str, shape: tuple[int, ...] = ()) -> fem.Function:
+        """Return a Function for data at the history's points."""
+
+    def converged_points(self) -> NDArray[np.float64]:
+        """Return positions of all history's points, last converged, ``(n, nq, gdim)``."""
+
+    def converged_nodes(self, W: fem.FunctionSpace) -> NDArray[np.float64]:
+        """Return positions of the nodes of a Lagrange space, last converged, ``(N, gdim)``."""
+
+
+class ParticleField(fem.Function):
+    """An unknown on a body, such as a pressure or a temperature; :meth:`Particles.field` makes it.
+
+    It is a Function on the body mesh, and stands in UFL as such. Its values are those of a
+    background space at the body's points or nodes: ``p = T_p x``, or ``p = p_n + T_p x`` for
+    ``kind="increment"``.
+
+    Attributes:
+        particles: The body.
+        background: The background space of the unknowns x.
+        at: ``"points"`` or ``"nodes"``.
+        kind: ``"total"``, ``"increment"`` or ``"body"``.
+        previous: The values at the last converged step, a Function on the same space. Set them
+            (and the field's own) before the first step to begin with others than zero.
+        W: Space of test functions, on the body mesh.
+        dx: A measure whose rule knows the values: ``particles.dx``.
+    """
+
+    def __init__(
+        self, particles: Body, V: fem.FunctionSpace, at: str, kind: str, name: str
+    ) -> None:
+        comm = particles.mesh.comm
+        require_same(comm, V=V, at=at, kind=kind, name=name)
+        _validate(particles, V, at, kind, name)
+        shape = tuple(V.ufl_element().reference_value_shape)
+        if at == "points":
+            W = particles.quadrature_function(name, shape).function_space
+        else:
+            degree = max(V.ufl_element().degree, 1)
+            W = fem.functionspace(particles.mesh, ("Lagrange", degree, shape))
+        super().__init__(W, name=name)
+        self.particles, self.background, self.at, self.kind = particles, V, at, kind
+        self.previous = fem.Function(W, name=f"{name} before")
+
+    @property
+    def W(self) -> fem.FunctionSpace:
+        """Space of test functions, on the body mesh."""
+        return self.function_space
+
+    def set(self, values: Any) -> None:
+        """Set present and converged values, before the first step.
+
+        Args:
+            values: A number for all, or an array for the local dofs.
+        """
+        for function in (self, self.previous):
+            function.x.array[:] = values
+            function.x.scatter_forward()
+
+
+def _validate(particles: Body, V: Any, at: str, kind: str, name: str) -> None:
+    if not isinstance(V, fem.FunctionSpace):
+        raise MPMError(f"A field needs a dolfinx FunctionSpace, not {type(V).__name__}.")
+    if at not in PLACES:
+        raise MPMError(f"Unknown at={at!r} of a field; choose 'nodes' or 'points'.")
+    if kind not in KINDS:
+        raise MPMError(f"Unknown kind={kind!r} of a field; choose {', '.join(map(repr, KINDS))}.")
+    if not isinstance(name, str) or not name.isidentifier() or name == "displacement":
+        raise MPMError(f"The name of a field must be an identifier of its own, not {name!r}.")
+    if V is particles.V:
+        raise MPMError(
+            "A field needs a background space of its own, not the V of the displacement; make "
+            "another one, on the same mesh if you like."
+        )
+    if V.mesh.geometry.dim != particles.mesh.geometry.dim:
+        raise MPMError("The space of a field must be on a mesh of the body's dimension.")
+    if V.mesh is particles.mesh and kind != "body":
+        raise MPMError("A field whose space is on the body mesh needs kind='body'.")
+    if V.ufl_element().family_name != "P":
+        raise MPMError("A field needs a Lagrange space, continuous or not.")
+    if at == "nodes" and not particles.shares_nodes:
+        raise MPMError(
+            "Fields at nodes need particles that hang together, as with method='cpdi2'; use "
+            "at='points'."
+        )
+    if at == "nodes" and particles.deletion is not None:
+        raise MPMError(
+            "Fields at nodes cannot follow particles with outside='delete'; use at='points'."
+        )
+
+
+class CarriedField:
+    """A field of a body as the system moves it: as it moves a body, with values for displacement.
+
+    What has the names of a body's attributes is what fields and terms of the system ask for.
+
+    Args:
+        field: The field.
+
+    Attributes:
+        field: As given.
+        V: Its background space.
+        W: Its space on the body mesh.
+        displacement: The field, whose values change.
+        increment: The change of the background's values in the step, on V.
+        converged_displacement: What the values change from in the step that has begun, on the
+            local dofs of W: those of the last converged step, or what the background makes of them.
+    """
+
+    def __init__(self, field: ParticleField) -> None:
+        self.field = field
+        self.V, self.W = field.background, field.W
+        self.displacement: fem.Function = field
+        self.increment = fem.Function(self.V, name=f"increment of {field.name}")
+        self.converged_displacement: NDArray[Any] = field.previous.x.array.copy()
+        self._basis = BackgroundBasis(self.V)
+        self._at: Transfer | None = None
+        self._rows: PointBasis | None = None
+        self._T: PETSc.Mat | None = None
+
+    @property
+    def total(self) -> bool:
+        """Whether the background has the values themselves, not their change."""
+        return self.field.kind != "increment"
+
+    @property
+    def place(self) -> Literal["points", "nodes"]:
+        """Where the values live."""
+        return "points" if self.field.at == "points" else "nodes"
+
+    @property
+    def mesh(self) -> mesh.Mesh:
+        """The body mesh."""
+        return self.field.particles.mesh
+
+    @property
+    def num_local(self) -> int:
+        """Number of particles that are a field's own: none."""
+        return 0
+
+    @property
+    def domain_nodes(self) -> NDArray[np.int32]:
+        """Local nodes of W of each owned domain, shape ``(n, k)``."""
+        return np.asarray(self.W.dofmap.list[: self.field.particles.num_local])
+
+    @property
+    def global_index(self) -> NDArray[np.int64]:
+        """Input index of each owned particle, shape ``(n,)``."""
+        return self.field.particles.global_index
+
+    @property
+    def node_positions(self) -> NDArray[np.float64]:
+        """The converged values on the local dofs of W: what round-off of changes is judged by."""
+        return np.asarray(self.field.previous.x.array)
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Undeformed volume of each own point, or 1 at each node, shape ``(N,)``."""
+        count = self.W.dofmap.index_map.size_local
+        if self.field.at == "nodes":
+            return np.ones(count)
+        test = ufl.TestFunction(self.field.particles.quadrature_function("one").function_space)
+        volumes = fem.assemble_vector(fem.form(test * self.field.particles.dx)).array
+        return np.asarray(volumes[:count])
+
+    def inverted(self) -> NDArray[np.int64]:
+        """Return no particles: values cannot turn a domain inside out."""
+        return np.zeros(0, dtype=np.int64)
+
+    def locate(self) -> None:
+        """Find the background cells of all points, unless that is done (collective).
+
+        Raises:
+            ParticleOutsideError: A point is outside the mesh of the background space.
+        """
+        body = self.field.particles
+        if self._rows is not None and (self.field.kind == "body" or self._at is body.transfer):
+            return
+        self._at = body.transfer
+        frozen = self.field.kind == "body"
+        count = self.W.dofmap.index_map.size_local
+        if self.field.at == "points":
+            points = self._undeformed_points() if frozen else body.converged_points()
+            rows = self._basis.at(points.reshape(-1, points.shape[-1]))
+            gone = np.repeat(body.deleted, body.num_points)
+        else:
+            x = self.W.tabulate_dof_coordinates()[:, : self.mesh.geometry.dim]
+            rows = self._basis.at((x if frozen else body.converged_nodes(self.W))[:count])
+            gone = np.zeros(count, dtype=bool)
+        lost = ~rows.found & ~gone
+        with agree(self.mesh.comm):
+            if lost.any():
+                raise ParticleOutsideError(
+                    f"Points of {{particles}} are outside the mesh of the field "
+                    f"'{self.field.name}'; make it larger or the load smaller.",
+                    self._particles_at(lost),
+                )
+        rows.values[gone] = 0.0
+        self._rows, self._T = rows, None
+
+    def _undeformed_points(self) -> NDArray[np.float64]:
+        """Return the undeformed positions of the history's points, ``(n, nq, gdim)``."""
+        gdim = self.mesh.geometry.dim
+        x = self.field.particles.quadrature_function("x", (gdim,))
+        where = fem.Expression(
+            ufl.SpatialCoordinate(self.mesh), x.function_space.ufl_element().custom_quadrature()[0]
+        )
+        x.interpolate(where)
+        count = self.W.dofmap.index_map.size_local
+        return np.asarray(x.x.array[: count * gdim]).reshape(
+            -1, self.field.particles.num_points, gdim
+        )
+
+    def _particles_at(self, rows: NDArray[np.bool_]) -> NDArray[np.int64]:
+        touched = np.isin(self.domain_nodes, np.flatnonzero(rows)).any(axis=1)
+        return np.asarray(self.global_index[touched])
+
+    @property
+    def node_basis(self) -> PointBasis:
+        """The background basis at this rank's own nodes of W, at the last converged positions."""
+        self.locate()
+        assert self._rows is not None
+        return self._rows
+
+    @property
+    def T(self) -> PETSc.Mat:
+        """The transfer: all dofs of W by all dofs of V (collective)."""
+        self.locate()
+        if self._T is None:
+            self._T = transfer_matrix(self.node_basis, self.W, self.V)
+        return self._T
+
+    def forget_transfer(self) -> None:
+        """Drop T, which is made anew when it is needed."""
+        self._rows = self._T = self._at = None
+
+    def commit(self) -> NDArray[np.float64]:
+        """Make the present values the converged ones; return what these were before."""
+        before = self.field.previous.x.array.copy()
+        self.field.previous.x.array[:] = self.field.x.array
+        return np.asarray(before)
+
+    def restore(self, values: NDArray[np.float64]) -> None:
+        """Set the converged values, on the local dofs of W."""
+        self.field.previous.x.array[:] = values
+
+    def roll_back(self) -> None:
+        """Return to the converged values."""
+        self.field.x.array[:] = self.field.previous.x.array
+        self.increment.x.array[:] = 0.0

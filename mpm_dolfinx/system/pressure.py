@@ -1,0 +1,139 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The pressure of a nearly incompressible body as an unknown, beside its displacement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..particles.field import CarriedField
+from ..particles.particles import Particles
+from .values import FieldTerm
+
+__all__ = ["PressureTerm", "VolumeStrain"]
+
+
+class VolumeStrain(Protocol):
+    """The volume strain at a body's points, as its material saw it last."""
+
+    volume: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    compliance: NDArray[np.float64]
+
+
+class PressurePoints(Protocol):
+    """A material whose mean stress is a pressure of its own."""
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Undeformed volume of each point, shape ``(n, nq)``; 0 where deleted."""
+
+    @property
+    def hoop(self) -> NDArray[np.float64] | None:
+        """Hoop strains of a body of revolution's nodes, shape ``(n, nq, k)``, or ``None``."""
+
+    @property
+    def mean_stress(self) -> VolumeStrain | None:
+        """Volume strain, its derivative and the compliance."""
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the tangents of all materials are symmetric."""
+
+
+class PressureTerm(FieldTerm):
+    """The constraint ``int q (theta - p / K) dX = 0`` on the volume strain theta of a body.
+
+    The work of p on theta is in the stress of the material; what is added here is the constraint,
+    and the blocks of the tangent besides that of the displacement.
+
+    Args:
+        particles: The body.
+        pressure: p, at its points.
+        material: The material at its points.
+    """
+
+    def __init__(
+        self, particles: Particles, pressure: CarriedField, material: PressurePoints
+    ) -> None:
+        super().__init__(particles, [pressure])
+        self._particles, self._pressure, self._material = particles, pressure, material
+        nodes = particles.domain_nodes
+        gdim = particles.mesh.geometry.dim
+        n, nq = particles.num_local, particles.num_points
+        numbers = particles.W.dofmap.index_map.local_to_global(nodes.ravel()).reshape(nodes.shape)
+        self._order = np.argsort(numbers, axis=1)
+        columns = np.take_along_axis(numbers, self._order, axis=1)[:, :, None] * gdim
+        columns = (columns + np.arange(gdim)).reshape(n, 1, -1)
+        self._columns = np.repeat(columns, nq, axis=1).ravel().astype(PETSc.IntType)
+        width = nodes.shape[1] * gdim
+        self._offsets = (width * np.arange(n * nq + 1)).astype(PETSc.IntType)
+        none, force = particles.T.createVecLeft(), pressure.T.createVecLeft()
+        none.set(0.0)
+        self._none, self._force = none, force
+        assert material.mean_stress is not None
+        self._strain: VolumeStrain = material.mean_stress
+        self._mats: tuple[PETSc.Mat, PETSc.Mat, PETSc.Mat] | None = None
+
+    @property
+    def symmetric(self) -> bool:
+        """See :attr:`Term.symmetric`."""
+        return self._material.symmetric
+
+    def residuals(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.residuals`."""
+        found = self._strain
+        p = self._pressure.displacement.x.array[: len(found.volume)]
+        weights = self._material.weights.ravel()
+        gap = np.where(weights > 0.0, found.volume - found.compliance * p, 0.0)
+        self._force.array_w[:] = weights * gap
+        return [self._none, self._force]
+
+    def absolute_contributions(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.absolute_contributions`."""
+        size = self.residuals()[1].copy()
+        size.abs()
+        return [self._none, size]
+
+    def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
+        """See :meth:`Term.tangents`."""
+        weights = self._material.weights
+        found = self._strain
+        n, nq = weights.shape
+        gradients = self._particles.quadrature.gradients
+        gdim = gradients.shape[-1]
+        slope = found.slope.reshape(n, nq, *found.slope.shape[1:])
+        strains = np.einsum("nqkJ,nqiJ->nqki", gradients, slope[:, :, :gdim, :gdim])
+        hoop = self._material.hoop
+        if hoop is not None:
+            strains[:, :, :, 0] += slope[:, :, 2, 2, None] * hoop
+        strains *= np.where(weights > 0.0, weights, 0.0)[:, :, None, None]
+        if self._particles.deletion is not None:
+            strains[weights == 0.0] = 0.0
+        rows = np.take_along_axis(strains, self._order[:, None, :, None], axis=2).ravel()
+        diagonal = self._force.duplicate()
+        diagonal.array_w[:] = -weights.ravel() * found.compliance
+        if self._mats is None:
+            points, nodes = self._force.getSizes(), self._none.getSizes()
+            comm = self._particles.mesh.comm
+            csr = self._offsets, self._columns, rows
+            by_nodes = PETSc.Mat().createAIJ((points, nodes), csr=csr, comm=comm)
+            first = by_nodes.getOwnershipRange()[0]
+            own = np.arange(first, first + points[0], dtype=PETSc.IntType)
+            ones = np.arange(points[0] + 1, dtype=PETSc.IntType), own, np.zeros(points[0])
+            alone = PETSc.Mat().createAIJ((points, points), csr=ones, comm=comm)
+            self._mats = by_nodes, by_nodes.transpose(PETSc.Mat()), alone
+        else:
+            by_nodes, by_points, _ = self._mats
+            by_nodes.setValuesCSR(self._offsets, self._columns, rows)
+            by_nodes.assemble()
+            by_nodes.transpose(by_points)
+        by_nodes, by_points, alone = self._mats
+        alone.setDiagonal(diagonal)
+        return {(0, 1): by_points, (1, 0): by_nodes, (1, 1): alone}
