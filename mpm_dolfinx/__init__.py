@@ -17,7 +17,7 @@ from .errors import (  # noqa: E402
 from .history import Energy, History, Loss, Stage, Statistics, Step  # noqa: E402
 from .particles.field import ParticleField  # noqa: E402
 from .particles.particles import Particles  # noqa: E402
-from .problems.dynamic import DynamicProblem  # noqa: E402
+from .problems.dynamic import DynamicParticleProblem, DynamicProblem  # noqa: E402
 from .problems.initial_stress import geostatic  # noqa: E402
 from .problems.particle_problem import ParticleProblem  # noqa: E402
 from .problems.quasistatic import QuasiStaticProblem  # noqa: E402
@@ -33,6 +33,7 @@ __all__ = [
     "ConvergenceError",
     "DisplacementControl",
     "DomainDistortionError",
+    "DynamicParticleProblem",
     "DynamicProblem",
     "Energy",
     "History",

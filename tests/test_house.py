@@ -37,7 +37,12 @@ FREE_FACES = ("_core",)
 #: The one module that may look into DOLFINx's own objects.
 BRIDGE = "_compat"
 #: Their keywords are those of a problem's user, and are held in dataclasses.
-PUBLIC_PROBLEMS = ("DynamicProblem", "ParticleProblem", "QuasiStaticProblem")
+PUBLIC_PROBLEMS = (
+    "DynamicParticleProblem",
+    "DynamicProblem",
+    "ParticleProblem",
+    "QuasiStaticProblem",
+)
 MOST_PARAMETERS = 12
 #: Public in spite of their underscore, so that names of fields cannot hide them.
 OF_NAMED_TUPLES = ("_asdict", "_fields", "_make", "_replace")

@@ -57,6 +57,7 @@ class Support:
     """
 
     one_sided = False
+    stiffness_name = "stiffness of a support"
 
     def __init__(
         self,
@@ -83,7 +84,9 @@ class Support:
             self._ds = ufl.Measure(
                 "ds", domain=body, subdomain_data=facet_tags, subdomain_id=tag, metadata=metadata
             )
-        self._stiffness = fem.Function(fem.functionspace(body, ("Discontinuous Lagrange", 0)))
+        self._stiffness = fem.Function(
+            fem.functionspace(body, ("Discontinuous Lagrange", 0)), name=self.stiffness_name
+        )
         self._penalty = float(penalty)
         self._modulus = modulus is not None
         if modulus is not None:
@@ -247,6 +250,7 @@ class Plane(Support):
     """
 
     one_sided = True
+    stiffness_name = "stiffness of a one-sided support"
 
     def __init__(
         self,
@@ -377,6 +381,12 @@ class _Start:
                 before.x.array[:] = value.x.array
             else:
                 np.copyto(before.value, value.value)
+
+
+def is_one_sided(form: Any) -> bool:
+    """Return whether a form has the traction of a one-sided support, or of a dashpot."""
+    found = form.coefficients() if isinstance(form, ufl.Form) else ()
+    return any(coefficient.name == Plane.stiffness_name for coefficient in found)
 
 
 def _copy_of(value: Any) -> Any:

@@ -4,7 +4,8 @@
 
 :class:`~mpm_dolfinx.problems.particle_problem.ParticleProblem` is written in UFL,
 :class:`~mpm_dolfinx.problems.quasistatic.QuasiStaticProblem` in materials and loads,
-:class:`~mpm_dolfinx.problems.dynamic.DynamicProblem` is that one with inertia. A problem
+:class:`~mpm_dolfinx.problems.dynamic.DynamicParticleProblem` and
+:class:`~mpm_dolfinx.problems.dynamic.DynamicProblem` are the same with inertia. A problem
 holds bodies, a system, a solver and a stepper, and lets them go by when its bodies are split,
 rebased or moved to other ranks (:mod:`~mpm_dolfinx.problems.remeshing`).
 """

@@ -18,6 +18,7 @@ from ufl.domain import extract_unique_domain
 
 from .. import _compat
 from ..assembly.inputs import is_tag
+from ..boundary.supports import Support
 from ..errors import MPMError
 from ..materials.base import Material
 from ..particles.field import CarriedField, ParticleField
@@ -28,6 +29,7 @@ __all__ = [
     "as_bodies",
     "as_conditions",
     "as_fields",
+    "as_supports",
     "as_terms",
     "by_space",
     "carried",
@@ -344,3 +346,16 @@ def holds(value: Any, kind: Any) -> bool:
     if isinstance(value, list | tuple):
         return any(holds(entry, kind) for entry in value)
     return isinstance(value, kind)
+
+
+def as_supports(supports: Any, bodies: Sequence[Particles]) -> list[Support]:
+    """Return supports as a list.
+
+    Raises:
+        MPMError: Something else, or supports on other bodies.
+    """
+    if not isinstance(supports, list | tuple) or not all(isinstance(s, Support) for s in supports):
+        raise MPMError("supports must be a list of supports made by mpm.boundary.")
+    if any(all(s.particles is not body for body in bodies) for s in supports):
+        raise MPMError("A support was made with other particles than those of this problem.")
+    return list(supports)

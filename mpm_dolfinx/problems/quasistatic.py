@@ -32,7 +32,7 @@ from ..system.body import StepForce
 from ..system.pressure import PressureTerm
 from ..system.term import Term
 from ..system.values import FieldTerm
-from .arguments import as_bodies, as_terms
+from .arguments import as_bodies, as_supports, as_terms
 from .initial_stress import initial_stress_at_points
 from .particle_problem import Contribution, Law, ParticleProblem
 from .remeshing import Remeshing, as_indices
@@ -167,7 +167,7 @@ class QuasiStaticProblem(ParticleProblem):
             jit_options=jit_options,
             initial_stress=initial_stress,
         )
-        supports = _as_supports(supports, bodies)
+        supports = as_supports(supports, bodies)
         count = len(bodies) if isinstance(particles, list | tuple) else 0
         given = zip(
             bodies,
@@ -325,7 +325,7 @@ class QuasiStaticProblem(ParticleProblem):
                 for own, part in zip(changes, _for_each(value, count, pairs), strict=True):
                     own[key] = part
         if supports is not ...:
-            every = _as_supports(supports, bodies)
+            every = as_supports(supports, bodies)
             for own, body in zip(changes, bodies, strict=True):
                 own["supports"] = tuple(s for s in every if s.particles is body)
         own_terms = self._own_terms()
@@ -432,7 +432,7 @@ class QuasiStaticProblem(ParticleProblem):
             pressures,
             cell_tags,
             facet_tags,
-            tuple(_as_supports(supports, [particles])),
+            tuple(as_supports(supports, [particles])),
         )
         if particles.on_distortion == "split":
             replace(self.setup, bodies=(*self.setup.bodies, given)).require_divisible()
@@ -753,16 +753,3 @@ def _warn_of_hourglass(particles: Particles) -> None:
             f"motions without strain (hourglass) meet no resistance; {cure}.",
             stacklevel=4,
         )
-
-
-def _as_supports(supports: Any, bodies: Sequence[Particles]) -> list[Support]:
-    """Return supports as a list.
-
-    Raises:
-        MPMError: Something else, or supports on other bodies.
-    """
-    if not isinstance(supports, list | tuple) or not all(isinstance(s, Support) for s in supports):
-        raise MPMError("supports must be a list of supports made by mpm.boundary.")
-    if any(all(s.particles is not body for body in bodies) for s in supports):
-        raise MPMError("A support was made with other particles than those of this problem.")
-    return list(supports)

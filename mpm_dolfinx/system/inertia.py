@@ -279,6 +279,11 @@ class Inertia(Term):
             self._strain, _ = self._followed.stored()
             self._note_energy()
 
+    def resume(self) -> None:
+        """Let forces of whole steps take note of where a restored run is (collective)."""
+        for term in self._others:
+            term.end_forces()
+
     def _note_energy(self) -> None:
         """Add an entry to the account, of the last converged step."""
         strain, _ = self._followed.stored()
@@ -370,7 +375,7 @@ class Inertia(Term):
         """
         comm = self.bodies[0].V.mesh.comm
         rates = [change / self.dt for change in self._followed.changes()]
-        if self._rates_dt > 0.0:
+        if self._rates_dt > 0.0 and len(self._rates) == len(rates):
             part = self.dt / (self.dt + self._rates_dt)
             before = zip(self._rates, rates, strict=True)
             rates = [part * last + (1.0 - part) * now for last, now in before]
@@ -620,7 +625,7 @@ class Inertia(Term):
         """Return the rates of Dirichlet values on a background in the last step."""
         V = spaces_of(self.bodies)[number]
         function = fem.Function(V)
-        if self._rates_dt > 0.0:
+        if self._rates_dt > 0.0 and number < len(self._rates):
             function.x.array[: len(self._rates[number])] = self._rates[number]
             function.x.scatter_forward()
         return {"rates": Column(of_cells(function), "nodes")}

@@ -758,6 +758,91 @@ def test_particles_that_leave_take_their_momentum_with_them():
     assert history.energies[-1].lost == pytest.approx(0.5 * left, rel=1e-8)
 
 
+# -- A residual in UFL ----------------------------------------------------------------------------
+
+
+def elastic(particles, young=100.0, poisson=0.3):
+    """Return the residual of small strains, in UFL."""
+    mu, lame = young / (2 * (1 + poisson)), young * poisson / (1 + poisson) / (1 - 2 * poisson)
+
+    def strain(w):
+        return ufl.sym(ufl.grad(w))
+
+    e = strain(particles.displacement)
+    stress = 2 * mu * e + lame * ufl.tr(e) * ufl.Identity(2)
+    return ufl.inner(stress, strain(ufl.TestFunction(particles.W))) * particles.dx
+
+
+@pytest.mark.parametrize(("scheme", "out"), [("midpoint", "project"), ("euler", "project")])
+def test_a_residual_in_ufl_moves_as_its_material(scheme, out, tmp_path):
+    def both(kind):
+        particles = square()
+        floor = plane(particles, (0.0, 1.45), (0.0, 1.0), modulus=100.0)
+        options = {
+            "velocity": lambda x: 0.2 * spin(x),
+            "scheme": scheme,
+            "out_of_range": out,
+            "supports": [floor],
+            "petsc_options": {"snes_rtol": 1e-12},
+        }
+        if kind == "material":
+            law = LinearElastic(100.0, 0.3)
+            return mpm.DynamicProblem(
+                particles, law, 2.0, body_force=(0.0, -1.0), rayleigh=(0.1, 0.0), **options
+            )
+        weight = fem.Constant(particles.mesh, (0.0, -2.0))
+        test = ufl.TestFunction(particles.W)
+        R = elastic(particles) - ufl.inner(weight, test) * particles.dx_exact
+        return mpm.DynamicParticleProblem(R, particles, 2.0, damping=0.1, **options)
+
+    runs = []
+    for kind in ("material", "UFL"):
+        problem = both(kind)
+        momentum = problem.momentum
+        for _ in problem.steps(0.6, 0.03):
+            if kind == "UFL" and len(problem.history.steps) == 10:
+                problem.save(WORLD.bcast(tmp_path) / "run.ckpt")
+        assert change_of_balance(problem.history) < 1e-11
+        runs.append((problem, momentum))
+    (one, p), (two, q) = runs
+    np.testing.assert_allclose(p, q, rtol=1e-12)
+    d, e = (nodal(problem.particles.displacement) for problem in (one, two))
+    assert largest(d - e) < 1e-9
+    v, w = (nodal(problem.velocity) for problem in (one, two))
+    assert largest(v - w) < 1e-7
+    ends = [problem.history.energies[-1] for problem in (one, two)]
+    for name in ("kinetic", "internal", "external", "lost", "damping"):
+        assert getattr(ends[1], name) == pytest.approx(getattr(ends[0], name), rel=1e-6, abs=1e-9)
+    assert np.isnan(ends[1].strain)
+    assert ends[0].internal > ends[0].strain > 0.0  # the floor has a share
+    again = both("UFL")
+    again.restore(WORLD.bcast(tmp_path) / "run.ckpt")
+    again.solve(0.6, 0.03)
+    assert largest(nodal(again.particles.displacement) - e) == 0.0
+
+
+def test_what_a_residual_in_ufl_cannot_do_in_motion_is_refused():
+    particles = square()
+    floor = plane(particles, (0.0, 1.45), (0.0, 1.0), modulus=100.0)
+    R = elastic(particles)
+    for sentence, form, options in (
+        ("needs the stress at points", R, {"scheme": "conserving"}),
+        ("has a one-sided support or a dashpot", R + floor.residual, {}),
+        ("leave predictor= out", R, {"predictor": True}),
+        ("needs modulus=", R, {"supports": [plane(particles, (0.0, 1.45), (0.0, 1.0))]}),
+        ("rayleigh must have finite numbers", R, {"damping": -1.0}),
+        ("a list of 2 densities", R, {"density": [1.0, 1.0]}),
+    ):
+        density = options.pop("density", 1.0)
+        raises(
+            lambda form=form, density=density, options=options: mpm.DynamicParticleProblem(
+                form, particles, density, **options
+            ),
+            mpm.MPMError,
+            sentence,
+        )
+
+
 def test_what_does_not_go_with_inertia_is_refused():
     def refused(sentence, density=1.0, law=None, **options):
         law = Hencky(100.0, 0.3) if law is None else law
