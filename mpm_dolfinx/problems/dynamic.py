@@ -179,8 +179,8 @@ class DynamicParticleProblem(MovingProblem):
         supports: Supports with a modulus, of :mod:`mpm_dolfinx.boundary`. One-sided ones and
             dashpots must be given here, not be written into R.
         terms: As in :class:`ParticleProblem`.
-        **options: All else that :class:`ParticleProblem` has but ``background`` and
-            ``predictor``.
+        **options: All else that :class:`ParticleProblem` has but ``background``,
+            ``fields`` and ``predictor``.
 
     Raises:
         MPMError: As there; and what does not go with inertia.

@@ -330,6 +330,8 @@ def require_motion(name: str, options: dict[str, Any]) -> None:
             f"A form on the background has no past, so it cannot act in a {name}; write it as a "
             "term on the bodies."
         )
+    if options.get("fields"):
+        raise MPMError(f"fields= are for mpm.ParticleProblem; a {name} has displacements alone.")
     if "predictor" in options:
         raise MPMError(f"A {name} starts each step from the velocities; leave predictor= out.")
 
