@@ -86,6 +86,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
             scheme=scheme,
             out_of_range=out_of_range,
             rayleigh=rayleigh,
+            terms=terms,
         )
         alpha, self._viscosity = rayleigh_of(rayleigh)
         require_motion("DynamicProblem", options)

@@ -232,7 +232,7 @@ class ParticleProblem:
             dependent_dofs=dependent_dofs,
             predictor=predictor,
             stabilisation=stabilisation,
-            terms=len(terms),
+            terms=terms,
             fields=[field.name for field in fields],
         )
         numerics = Numerics(

@@ -166,6 +166,7 @@ class QuasiStaticProblem(ParticleProblem):
             form_compiler_options=form_compiler_options,
             jit_options=jit_options,
             initial_stress=initial_stress,
+            terms=terms,
         )
         supports = as_supports(supports, bodies)
         count = len(bodies) if isinstance(particles, list | tuple) else 0
@@ -307,7 +308,10 @@ class QuasiStaticProblem(ParticleProblem):
             bcs=self.bcs if bcs is ... else bcs,
             tractions=tractions,
             pressures=pressures,
+            cell_tags=cell_tags,
+            facet_tags=facet_tags,
             supports=supports,
+            terms=terms,
             sudden=sudden,
         )
         count = len(bodies) if isinstance(self.particles, list | tuple) else 0

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import EXACT, outcome, same_run
+from laws import Brittle
 from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD
 from stress import kills
 
@@ -21,26 +22,6 @@ from mpm_dolfinx.io import checkpoint, files
 from mpm_dolfinx.materials import Hencky, VonMises
 
 SELF = MPI.COMM_SELF
-
-
-class Brittle(VonMises):
-    """Von Mises' law, whose update fails where a step strains a point too much."""
-
-    def __init__(self, limit):
-        super().__init__(1e3, 0.3, rho_y=30.0, hardening=200.0)
-        self.limit = limit
-
-    def initial_state(self, n, dim):
-        return {**super().initial_state(n, dim), "before": np.zeros((n, dim, dim))}
-
-    def update(self, displacement_gradient, state, tangent=True):
-        change = np.abs(displacement_gradient - state["before"]).max(axis=(1, 2))
-        failed = np.flatnonzero(change > self.limit)
-        if len(failed):
-            raise mpm.ConvergenceError("The step is too large for the law", failed)
-        answer = super().update(displacement_gradient, state, tangent)
-        new = {**answer.state, "before": displacement_gradient.copy()}
-        return answer._replace(state=new)
 
 
 def whole_outcome(problem):
@@ -77,7 +58,8 @@ def test_flowing_column(mpi_tmp_path):
 @pytest.mark.parametrize("after", [1, 4])
 def test_within_cutbacks(after, mpi_tmp_path):
     path = mpi_tmp_path / "block.ckpt"
-    problem = interrupt(lambda: scenes.block(Brittle(0.02), force=(0.0, -14.0)), 3, path, after)
+    law = Brittle(0.02, 30.0, 200.0)
+    problem = interrupt(lambda: scenes.block(law, force=(0.0, -14.0)), 3, path, after)
     sizes = np.diff([0.0, *problem.history.load])
     assert problem.history.cutbacks > 2 and sizes.min() < 0.5 * sizes.max()
     assert scenes.largest(problem.particles.plastic_strain) > 0.01
@@ -176,7 +158,7 @@ def test_path(mpi_tmp_path):
         value = fem.Constant(V.mesh, np.zeros(2))
         bcs = [scenes.fix(V, scenes.at(0, 0.0)), fem.dirichletbc(value, grip, V)]
         problem = mpm.QuasiStaticProblem(
-            mpm.Particles(body, V), Brittle(0.2), bcs=bcs, body_force=(0.0, -3.0)
+            mpm.Particles(body, V), Brittle(0.2, 30.0, 200.0), bcs=bcs, body_force=(0.0, -3.0)
         )
         problem.grip = value
         return problem

@@ -103,6 +103,18 @@ def residual():
     mpm.ParticleProblem(R, p)
 
 
+def terms(kind):
+    """Make a problem with a term that the last rank does not give."""
+    V = scenes.vectors(scenes.box([0.0, -1.0], [2.0, 2.0], [4, 6], QUADRILATERAL))
+    p = mpm.Particles(scenes.unit(2, QUADRILATERAL), V, quadrature_degree=2)
+    given = {"terms": differing([mpm.Term([p])], [])}
+    if kind is mpm.ParticleProblem:
+        R = ufl.inner(ufl.grad(p.displacement), ufl.grad(ufl.TestFunction(p.W))) * p.dx
+        kind(R, p, **given)
+    else:
+        kind(p, Hencky(1e3, 0.3), 1.0, **given)
+
+
 DIFFERENT = {
     "method": (lambda: made(method=differing("cpdi2", "cpdi"), quadrature_degree=None), "^method"),
     "points": (lambda: made(quadrature_degree=differing(2, 3)), "^quadrature_degree .* 2.* 3"),
@@ -124,6 +136,10 @@ DIFFERENT = {
     "load": (loaded, "^load differs .*0.5.*0.25"),
     "constant": (constant, "constants.* differs .*-1.0.*-2.0"),
     "residual": (residual, "^R differs .*form"),
+    **{
+        kind.__name__: (partial(terms, kind), "^The number of terms differs .* 1 on rank 0, 0 on")
+        for kind in (mpm.ParticleProblem, mpm.QuasiStaticProblem, mpm.DynamicProblem)
+    },
 }
 
 

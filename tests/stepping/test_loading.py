@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import raises
+from laws import Brittle, Sulky
 from scenes import PLANE, QUADRILATERAL, TRIANGLE, WORLD, pulled
 
 from dolfinx import fem
@@ -50,32 +51,6 @@ def test_path_that_fails_on_one_rank(error):
     assert problem.history.load == [0.5] and problem.particles.load.value == 0.5
     problem.solve(2)
     assert problem.history.load[-1] == 1.0
-
-
-class Brittle(Hencky):
-    """Hencky's law, whose update fails where a step strains a point too much.
-
-    It makes steps fail at will: the strain of a step that is still allowed is ``limit``.
-    """
-
-    inelastic = True
-    internal_variables = {"plastic_strain": ()}
-
-    def __init__(self, limit, log=None, where=None):
-        super().__init__(1e3, 0.3)
-        self.limit, self.log, self.where = limit, log, where
-
-    def initial_state(self, n, dim):
-        return {**super().initial_state(n, dim), "before": np.zeros((n, dim, dim))}
-
-    def update(self, displacement_gradient, state, tangent=True):
-        change = np.abs(displacement_gradient - state["before"]).max(axis=(1, 2))
-        failed = np.flatnonzero(change > self.limit)
-        if len(failed):
-            raise mpm.ConvergenceError("The step is too large for the law", failed)
-        answer = super().update(displacement_gradient, state, tangent)
-        new = {**answer.state, "before": displacement_gradient.copy()}
-        return answer._replace(state=new)
 
 
 def right_side(problem):
@@ -154,17 +129,8 @@ def test_control_tries_larger_steps_of_hard_ones():
 def test_hard_steps_grow_again_after_a_cutback():
     # The tangent is too stiff, so small steps take nine to twelve linear solves and large ones
     # nineteen; the first tries fail down to 1/1024 of the full step.
-    failures = []
-
-    class Sulky(Hencky):
-        def update(self, displacement_gradient, state, tangent=True):
-            if len(failures) < 10:
-                failures.append(1)
-                raise mpm.ConvergenceError("Not yet", [0] if len(displacement_gradient) else [])
-            answer = super().update(displacement_gradient, state, tangent)
-            return answer._replace(tangent=1.8 * answer.tangent)
-
-    problem, _ = pulled(Sulky(1e3, 0.3), end=0.1, line_search=False, predictor=False)
+    law = Sulky(range(1, 11), factor=1.8)
+    problem, _ = pulled(law, end=0.1, line_search=False, predictor=False)
     history = problem.solve(steps=10)
     assert history.cutbacks == 10 and history.load[-1] == 1.0
     assert np.median(history.iterations) > 8

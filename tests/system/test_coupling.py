@@ -338,3 +338,6 @@ def test_ties_that_cannot_be():
         mpm.QuasiStaticProblem([left, right], Hencky(1e3, 0.3), axisymmetric=True, terms=[tie])
     with pytest.raises(mpm.MPMError, match="terms must be a list"):
         mpm.QuasiStaticProblem(left, Hencky(1e3, 0.3), terms=tie)
+    R = ufl.inner(ufl.grad(left.displacement), ufl.grad(ufl.TestFunction(left.W))) * left.dx
+    with pytest.raises(mpm.MPMError, match="terms must be a list"):
+        mpm.ParticleProblem(R, left, terms=tie)

@@ -7,6 +7,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import scenes
+from laws import Sulky
 from scenes import HEXAHEDRON, PLANE, QUADRILATERAL, TRIANGLE, WORLD, A, B
 
 from dolfinx import fem
@@ -139,20 +140,6 @@ def test_imposed_displacements():
     assert history.statistics["predictions"] >= 8
     without = gripped(False)
     assert history.total_iterations <= without.solve(steps=10).total_iterations
-
-
-class Sulky(Hencky):
-    """Hencky's law, whose updates fail at the given calls."""
-
-    def __init__(self, calls):
-        super().__init__(1e3, 0.3)
-        self.calls, self.count = calls, 0
-
-    def update(self, displacement_gradient, state, tangent=True):
-        self.count += 1
-        if self.count in self.calls:
-            raise mpm.ConvergenceError("Not now", [0] if len(displacement_gradient) else [])
-        return super().update(displacement_gradient, state, tangent)
 
 
 def test_cutback_and_growth():

@@ -1,0 +1,51 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Laws whose updates fail at will, for tests of what becomes of the step."""
+
+import numpy as np
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.materials import Hencky, VonMises
+
+
+class Brittle(VonMises):
+    """Von Mises' law, whose update fails where a step strains a point by more than ``limit``.
+
+    Without a strength it stays elastic.
+    """
+
+    def __init__(self, limit, rho_y=1e9, hardening=0.0):
+        super().__init__(1e3, 0.3, rho_y=rho_y, hardening=hardening)
+        self.limit = limit
+
+    def initial_state(self, n, dim):
+        return {**super().initial_state(n, dim), "before": np.zeros((n, dim, dim))}
+
+    def update(self, displacement_gradient, state, tangent=True):
+        change = np.abs(displacement_gradient - state["before"]).max(axis=(1, 2))
+        failed = np.flatnonzero(change > self.limit)
+        if len(failed):
+            raise mpm.ConvergenceError("The step is too large for the law", failed)
+        answer = super().update(displacement_gradient, state, tangent)
+        new = {**answer.state, "before": displacement_gradient.copy()}
+        return answer._replace(state=new)
+
+
+class Sulky(Hencky):
+    """Hencky's law, whose updates fail at some calls, with a tangent that is ``factor`` of its own.
+
+    Attributes:
+        calls: Numbers of the calls that fail; the first one is 1.
+        count: How many there were.
+    """
+
+    def __init__(self, calls, factor=1.0):
+        super().__init__(1e3, 0.3)
+        self.calls, self.factor, self.count = calls, factor, 0
+
+    def update(self, displacement_gradient, state, tangent=True):
+        self.count += 1
+        if self.count in self.calls:
+            raise mpm.ConvergenceError("Not now", [0] if len(displacement_gradient) else [])
+        answer = super().update(displacement_gradient, state, tangent)
+        return answer._replace(tangent=self.factor * answer.tangent)
