@@ -29,6 +29,8 @@ COUNTERS = (
     "predictions",
     "rejected_predictions",
     "factorisations",
+    "krylov_iterations",
+    "multigrid_failures",
     "halvings",
     "trusted_steps",
     "withdrawn_steps",
@@ -59,7 +61,9 @@ class Statistics(dict[str, float]):
     ``particle_imbalance`` and ``dof_imbalance`` (largest number on a rank over the mean),
     ``repartitions`` (how often particles moved to other ranks),
     ``residuals`` and
-    ``factorisations``, ``predictions`` (steps that began at the extrapolated increment) and
+    ``factorisations`` (or levels of multigrid made for a tangent), ``krylov_iterations`` (of solves
+    with multigrid), ``multigrid_failures`` (how often a factorisation took over),
+    ``predictions`` (steps that began at the extrapolated increment) and
     ``rejected_predictions``, ``halvings`` (of Newton steps by the line search), ``trusted_steps``
     (series of them taken although the residual grew) and ``withdrawn_steps`` (where that came to
     nothing),

@@ -172,6 +172,10 @@ class ParticleProblem:
             cut is small, on backgrounds of degree 2 or more and, on those of degree 1, while
             the bodies have hardly more nodes than the background (not beside ``background=``
             or ``dependent_dofs="remove"``).
+        linear_solver: ``"direct"``: a factorisation by MUMPS; ``"multigrid"``: conjugate gradients
+            (generalised minimal residuals where the tangent is not symmetric) with multigrid on
+            boxes of the background; ``"auto"``: multigrid from as many unknowns on as it takes less
+            time, unless ``petsc_options`` has a ``ksp_type`` or ``pc_type``.
         terms: What else acts on the bodies: a list of :class:`mpm_dolfinx.Term`.
         fields: Unknowns besides displacements, made by :meth:`Particles.field`. Those on the same
             background space are one there, where bodies touch.
@@ -209,6 +213,7 @@ class ParticleProblem:
         dependent_dofs: str = "shift",
         predictor: bool = True,
         stabilisation: str | None = "auto",
+        linear_solver: str = "auto",
         terms: Sequence[Term] = (),
         fields: Sequence[ParticleField] = (),
     ) -> None:
@@ -232,6 +237,7 @@ class ParticleProblem:
             dependent_dofs=dependent_dofs,
             predictor=predictor,
             stabilisation=stabilisation,
+            linear_solver=linear_solver,
             terms=terms,
             fields=[field.name for field in fields],
         )
@@ -246,6 +252,7 @@ class ParticleProblem:
             dependent_dofs,
             predictor,
             stabilisation,
+            linear_solver,
         )
         residuals, self._of_fields = residuals_of(R, bodies, fields)
         if fields and J is not None:
@@ -388,6 +395,7 @@ class ParticleProblem:
             numerics.line_search,
             statistics,
             self.bodies[0].V.mesh.geometry.dim,
+            numerics.linear_solver,
         )
         self._stepper.follow(reduced, newton, clean_up)
         forms = [f for given in contributions for f in (given.residual, given.tangent) if f]

@@ -86,6 +86,7 @@ class QuasiStaticProblem(ParticleProblem):
         dependent_dofs: As in :class:`ParticleProblem`.
         predictor: As in :class:`ParticleProblem`.
         stabilisation: As in :class:`ParticleProblem`.
+        linear_solver: As in :class:`ParticleProblem`.
         form_compiler_options: As in :class:`ParticleProblem`.
         jit_options: As in :class:`ParticleProblem`.
         terms: As in :class:`ParticleProblem`.
@@ -132,6 +133,7 @@ class QuasiStaticProblem(ParticleProblem):
         dependent_dofs: str = "shift",
         predictor: bool = True,
         stabilisation: str | None = "auto",
+        linear_solver: str = "auto",
         form_compiler_options: dict[str, Any] | None = None,
         jit_options: dict[str, Any] | None = None,
         terms: Sequence[Term] = (),
@@ -163,6 +165,7 @@ class QuasiStaticProblem(ParticleProblem):
             dependent_dofs=dependent_dofs,
             predictor=predictor,
             stabilisation=stabilisation,
+            linear_solver=linear_solver,
             form_compiler_options=form_compiler_options,
             jit_options=jit_options,
             initial_stress=initial_stress,
@@ -216,6 +219,7 @@ class QuasiStaticProblem(ParticleProblem):
             dependent_dofs,
             predictor,
             stabilisation,
+            linear_solver,
         )
         self._begin(particles, bcs, background, numerics, terms, self._remeshing)
         self._carry_stress(stresses)

@@ -21,6 +21,7 @@ from ..boundary.supports import Support
 from ..constitutive.averaging import F_BARS
 from ..errors import MPMError
 from ..particles.particles import Particles
+from ..solvers.linear import LINEAR_SOLVERS
 from ..system.term import Term
 from .arguments import carried, holds
 from .summary import counted
@@ -46,12 +47,18 @@ class Numerics:
     dependent_dofs: str
     predictor: bool
     stabilisation: str | None
+    linear_solver: str
 
     def __post_init__(self) -> None:
         """Say so where something is unknown."""
         if self.dependent_dofs not in ("shift", "remove"):
             raise MPMError(
                 f"Unknown dependent_dofs={self.dependent_dofs!r}; choose 'shift' or 'remove'."
+            )
+        if self.linear_solver not in LINEAR_SOLVERS:
+            raise MPMError(
+                f"Unknown linear_solver={self.linear_solver!r}; choose one of "
+                f"{', '.join(map(repr, LINEAR_SOLVERS))}."
             )
         if not isinstance(self.shift, float | int) or not 0.0 <= self.shift < 1.0:
             raise MPMError(f"shift must be at least 0 and below 1, not {self.shift!r}.")

@@ -4,9 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Protocol
 
 from petsc4py import PETSc
 
@@ -15,8 +15,14 @@ import numpy as np
 from ..errors import MPMError
 from ..history import Statistics
 from ..parallel.magnitudes import unit_sized
+from .multigrid import Multigrid
 
-__all__ = ["ShiftedFactor"]
+__all__ = ["LINEAR_SOLVERS", "ShiftedFactor"]
+
+#: Values of ``linear_solver``.
+LINEAR_SOLVERS = ("auto", "direct", "multigrid")
+#: Unknowns from which on multigrid takes less time than a factorisation, by dimension of space.
+CROSSOVER = {2: 40000, 3: 2000}
 
 #: Values of MUMPS's INFOG(1) that more workspace cures.
 OUT_OF_WORKSPACE = (-8, -9)
@@ -30,9 +36,41 @@ SADDLE = {"mat_mumps_icntl_8": 7}
 #: PORD orders plane graphs three times as fast as METIS and no worse, in space worse; from that
 #: many unknowns on, as it ends the process where all unknowns are neighbours of each other.
 PORD, PORD_FROM = {"mat_mumps_icntl_7": 4}, 10000
+#: Relative residual of what multigrid solves besides Newton's steps, and its most iterations.
+ACCURATE, ITERATIONS = 1e-6, 200
+#: Relative residuals of the first and the roughest of Newton's steps by multigrid (Eisenstat &
+#: Walker 1996), and what is left of a residual's tolerance by one that is to meet it.
+FIRST, ROUGHEST, FINAL = 1e-2, 0.1, 0.2
+#: Tries of a step that end where a tangent is indefinite, before it is solved with all the same.
+PATIENCE = 3
+GOLDEN = 0.5 * (1.0 + 5.0**0.5)
+#: Relative shift of a tangent with zeros on its diagonal, where no other is asked for.
+TINY = 1e-13
+#: By which conjugate gradients say that a tangent is not positive definite.
+INDEFINITE = (
+    PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT,
+    PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC,
+)
 #: PETSc's error numbers for what an option asks for: not supported, out of range, an unknown
 #: type, and a package that is missing.
 REFUSALS = (56, 63, 86, 92)
+
+
+class Indefinite(Exception):
+    """A tangent is not positive definite, for which a smaller step is the best cure."""
+
+
+class Levels(Protocol):
+    """What a linear solver must know of the unknowns. All calls are collective."""
+
+    def diagonal(self, K: PETSc.Mat) -> PETSc.Vec:
+        """Return sizes of a tangent's diagonal with the signs of the shift, none zero."""
+
+    def rigid_motions(self) -> PETSc.NullSpace:
+        """Return the rigid motions in the unknowns."""
+
+    def interpolations(self) -> Sequence[PETSc.Mat]:
+        """Return what gives the unknowns of each level from those of the next coarser one."""
 
 
 class ShiftedFactor:
@@ -46,16 +84,18 @@ class ShiftedFactor:
         shift: Relative shift.
         dim: Dimension of space.
         statistics: Where to count.
+        linear_solver: ``"auto"``, ``"direct"`` or ``"multigrid"``.
 
     Raises:
-        MPMError: PETSc refuses an option.
+        MPMError: PETSc refuses an option, or a PC is given beside multigrid.
 
     Attributes:
         K: The tangent that was factorised last.
-        P: What was factorised; K itself without a shift.
+        P: What was factorised; K itself without a shift, and with multigrid.
         D: The shift of the step, or ``None`` before its first factorisation and without a shift.
         shift: As given.
         num_negative: Number of unknowns, of all ranks, with a negative shift.
+        iterates: Whether multigrid solves in the step that has begun.
     """
 
     def __init__(
@@ -67,8 +107,16 @@ class ShiftedFactor:
         shift: float,
         dim: int,
         statistics: Statistics,
+        linear_solver: str = "auto",
     ) -> None:
         self.shift = shift
+        self.iterates = False
+        self._gave_up = self._own_rtol = self._own_type = False
+        self._multigrid: Multigrid | None = None
+        self._levels: Levels | None = None
+        self._told: tuple[Any, Any] = None, None
+        self._linear_solver = linear_solver
+        self._negative = False
         self.K: PETSc.Mat | None = None
         self.P: Any = None
         self.D: PETSc.Vec | None = None
@@ -86,10 +134,18 @@ class ShiftedFactor:
         with _options_refused(), self._own_options() as database:
             snes.setFromOptions()
             own = database.hasName(f"{prefix}pc_factor_mat_solver_type")
+            self._own_rtol = database.hasName(f"{prefix}ksp_rtol")
+            self._own_type = any(database.hasName(prefix + key) for key in ("pc_type", "ksp_type"))
+            if self._own_type and linear_solver == "multigrid":
+                raise MPMError(
+                    "linear_solver='multigrid' chooses ksp_type and pc_type; leave them out of "
+                    "petsc_options=."
+                )
             if pc.getType() in FACTORS:
                 if not own:
                     pc.setFactorSolverType("mumps")  # changing the type had dropped it
                 _require_factor(pc)
+        self._direct = ksp.getType(), pc.getType(), pc.getFactorSolverType()
 
     @contextmanager
     def _own_options(self, size: int = 0) -> Iterator[PETSc.Options]:
@@ -107,38 +163,76 @@ class ShiftedFactor:
             for key in options:
                 database.delValue(key)
 
-    def begin(self) -> None:
-        """Begin a step (collective)."""
+    def begin(self, size: int) -> None:
+        """Begin a step (collective).
+
+        Args:
+            size: Number of all unknowns.
+        """
         self.D = None
+        iterates = self._prefers_multigrid(size)
+        if iterates != self.iterates:
+            self._choose(iterates)
+
+    def _prefers_multigrid(self, size: int) -> bool:
+        if self._own_type or self._gave_up or self._linear_solver != "auto":
+            return self._linear_solver == "multigrid"
+        return self._symmetric and size >= CROSSOVER.get(self._dim, np.inf)
+
+    def _choose(self, iterates: bool) -> None:
+        """Set up the KSP for multigrid or for a factorisation (collective)."""
+        self.iterates = iterates
+        ksp, pc = self._ksp, self._ksp.getPC()
+        ksp.reset()
+        self._multigrid = self._flexible = self._refining = self.K = None
+        if iterates:
+            ksp.setType("cg" if self._symmetric else "fgmres")
+            ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+            ksp.setTolerances(rtol=ACCURATE, atol=0.0, max_it=ITERATIONS)
+            ksp.setGMRESRestart(KRYLOV)
+            pc.setType("mg")
+            with _options_refused(), self._own_options():
+                ksp.setFromOptions()
+            return
+        kind, factor, package = self._direct
+        ksp.setType(kind)
+        ksp.setNormType(PETSc.KSP.NormType.NORM_DEFAULT)
+        pc.setType(factor)
+        pc.setFactorSolverType(package)
 
     def forget(self) -> None:
         """Take the next tangent for a new one, since SNES knows none any more."""
         self.K = None
 
-    def set(
-        self,
-        K: PETSc.Mat,
-        sizes: Callable[[PETSc.Mat], PETSc.Vec],
-        rigid_motions: Callable[[], PETSc.NullSpace],
-        damping: float = 0.0,
-    ) -> bool:
+    def set(self, K: PETSc.Mat, levels: Levels, damping: float = 0.0) -> bool:
         """Factorise K with the step's shift, or with a larger one (collective).
 
         Args:
             K: The tangent.
-            sizes: Returns the sizes of its diagonal with the signs of the shift, none zero.
-            rigid_motions: Makes what multigrid must know.
+            levels: What multigrid must know of the unknowns.
             damping: Relative shift, if larger.
 
         Returns:
-            Whether K and P are new objects.
+            Whether K and P are other objects than at the last call.
         """
-        new = self.K is not K
+        self._levels = levels
         if self.shift > 0.0 and self.D is None:
-            self.D = self.shift * sizes(K)
+            self.D = self.shift * levels.diagonal(K)
             negative = int(np.count_nonzero(self.D.array_r < 0.0))
             self.num_negative = K.comm.tompi4py().allreduce(negative)
-        diagonal = damping * sizes(K) if damping > self.shift else self.D
+        self._negative = False
+        if self.iterates:
+            self._make_levels(K, levels, damping)
+        else:
+            self._factorise(K, levels, damping)
+        self._statistics.count("factorisations")
+        before, self._told = self._told, (K, self.P)
+        return before[0] is not K or before[1] is not self.P
+
+    def _factorise(self, K: PETSc.Mat, levels: Levels, damping: float = 0.0) -> None:
+        """Make a factor of K with a shift (collective)."""
+        new = self.K is not K
+        diagonal = damping * levels.diagonal(K) if damping > self.shift else self.D
         if diagonal is None:
             self.P = K
         elif new:
@@ -153,7 +247,7 @@ class ShiftedFactor:
             if self._symmetric:
                 self.P.setOption(PETSc.Mat.Option.SYMMETRIC, True)
             if self._ksp.getPC().getType() not in FACTORS:
-                self.P.setNearNullSpace(rigid_motions())
+                self.P.setNearNullSpace(levels.rigid_motions())
         if self._ksp.getPC().getFailedReason():
             self._ksp.getPC().reset()  # MUMPS does not factorise again where it failed
         self._ksp.setOperators(K, self.P)
@@ -161,8 +255,117 @@ class ShiftedFactor:
             with _options_refused():
                 self._ksp.setUp()  # where the factor is made, which reads options of its own
             self._give_workspace()
-        self._statistics.count("factorisations")
-        return new
+
+    def _make_levels(self, K: PETSc.Mat, levels: Levels, damping: float) -> None:
+        """Make the levels of multigrid for K; the shift, which is none of them, matters little."""
+        known = self.K is K
+        damped = damping > self.shift
+        matrix = K
+        with self._statistics.phase("factorise"), self._own_options(), _options_refused():
+            if not known:
+                self._refining = self._flexible = self._shifted = None
+                self._multigrid = Multigrid(
+                    self._ksp.getPC(), levels.interpolations(), self._symmetric
+                )
+                self._ksp.getPC().setFromOptions()
+            if damped or _has_zeros(K):
+                matrix = self._shifted_copy(K, (damping if damped else TINY) * levels.diagonal(K))
+            if self._symmetric:
+                matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            assert self._multigrid is not None
+            self._ksp.setOperators(matrix, matrix)
+            self._multigrid.set(matrix)
+            self._ksp.setUp()
+        self.K, self.P = K, matrix
+
+    def _shifted_copy(self, K: PETSc.Mat, diagonal: PETSc.Vec) -> PETSc.Mat:
+        """Return K with more on its diagonal, the same object for the same K."""
+        matrix = self._shifted
+        if matrix is None:
+            matrix = self._shifted = K.copy()
+        else:
+            K.copy(matrix, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        matrix.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
+        return matrix
+
+    def aim(self, norms: Sequence[float], tolerance: float) -> None:
+        """Say how exactly the next of Newton's steps is needed, where multigrid finds it.
+
+        That is Eisenstat & Walker's (1996) second choice: what the last iteration has made of the
+        residual, to the power of the golden ratio; no more than its tolerance asks for.
+
+        Args:
+            norms: Norms of the residuals so far.
+            tolerance: That which is small enough.
+        """
+        if not self.iterates or self._own_rtol:
+            return
+        rtol: float = FIRST
+        if len(norms) > 1 and norms[-2] > 0.0:
+            rtol = min((norms[-1] / norms[-2]) ** GOLDEN, ROUGHEST)
+            if self._rtol**GOLDEN > ROUGHEST:
+                rtol = max(rtol, min(self._rtol**GOLDEN, ROUGHEST))
+        if norms and norms[-1] > 0.0:
+            rtol = max(rtol, min(FINAL * tolerance / norms[-1], ROUGHEST))
+        self._rtol = rtol
+        self._ksp.setTolerances(rtol=rtol)
+
+    def end(self) -> None:
+        """End a step that has converged."""
+        self._indefinite = 0
+
+    def finish(self, b: PETSc.Vec, x: PETSc.Vec, shorten: bool = False) -> bool:
+        """Look at what SNES has solved; return whether it is a solution (collective).
+
+        Where the method of conjugate gradients has found the tangent indefinite, that of
+        generalised minimal residuals solves, if no smaller step is to be tried. Where multigrid
+        comes to nothing and was not asked for, a factor solves, from then on.
+
+        Args:
+            b: The right-hand side.
+            x: The solution; replaced by a better one.
+            shorten: Whether a step that fails is tried again with less load.
+
+        Raises:
+            Indefinite: The tangent is, and a smaller step may do better.
+        """
+        if not self.iterates:
+            return True
+        self._statistics["krylov_iterations"] += self._ksp.getIterationNumber()
+        reason = self._ksp.getConvergedReason()
+        if reason in INDEFINITE:
+            self._negative = True
+            if shorten and self._indefinite < PATIENCE:
+                self._indefinite += 1
+                raise Indefinite
+            if self._solve_indefinite(b, x, self._ksp.getTolerances()[0]):
+                return True
+        elif reason >= 0:
+            return True
+        if self._linear_solver != "auto":
+            return False
+        K, levels = self.K, self._levels
+        assert K is not None and levels is not None
+        self._gave_up = True
+        self._choose(False)
+        self._factorise(K, levels)
+        self._statistics.count("multigrid_failures")
+        self._ksp.solve(b, x)
+        return True
+
+    def _solve_indefinite(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
+        ksp = self._flexible
+        if ksp is None:
+            ksp = self._flexible = PETSc.KSP().create(b.comm)
+            ksp.setType("fgmres")
+            ksp.setGMRESRestart(KRYLOV)
+            ksp.setPC(self._ksp.getPC())
+        ksp.setOperators(self.P, self.P)
+        ksp.setTolerances(rtol=rtol, atol=0.0, max_it=ITERATIONS)
+        x.set(0.0)
+        ksp.solve(b, x)
+        self._statistics["krylov_iterations"] += ksp.getIterationNumber()
+        return bool(ksp.getConvergedReason() > 0)
 
     def _give_workspace(self) -> None:
         """Factorise again with more workspace where MUMPS ran out of it."""
@@ -180,9 +383,24 @@ class ShiftedFactor:
             self._statistics.count("workspace_retries")
 
     def solve(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Solve with the last factor (collective)."""
+        """Solve with the last factor, or to a relative residual of 1e-6 (collective)."""
         with self._statistics.phase("solve"):
-            self._ksp.solve(b, x)
+            if not self.iterates:
+                self._ksp.solve(b, x)
+                return
+            before = self._ksp.getTolerances()[0]
+            if not self._own_rtol:
+                self._ksp.setTolerances(rtol=ACCURATE)
+            if self._negative or not self._solved(b, x):
+                self._solve_indefinite(b, x, self._ksp.getTolerances()[0])
+            self._ksp.setTolerances(rtol=before)
+
+    def _solved(self, b: PETSc.Vec, x: PETSc.Vec) -> bool:
+        """Solve; return whether the tangent is not found to be indefinite."""
+        self._ksp.solve(b, x)
+        self._statistics["krylov_iterations"] += self._ksp.getIterationNumber()
+        self._negative = self._ksp.getConvergedReason() in INDEFINITE
+        return not self._negative
 
     def refine(self, b: PETSc.Vec, x: PETSc.Vec, tolerance: float) -> float:
         """Improve a solution of ``(K + D) x = b`` to one of ``K x = b`` (collective).
@@ -232,7 +450,12 @@ class ShiftedFactor:
         return float(best)
 
     def negative_pivots(self) -> int:
-        """Return how many pivots of the last factor are negative, where it says so."""
+        """Return how many pivots of the last factor are negative, where it says so.
+
+        Of multigrid is known only whether there would be any.
+        """
+        if self.iterates:
+            return int(self._negative)
         pc = self._ksp.getPC()
         if pc.getType() != "cholesky" or pc.getFactorSolverType() != "mumps":
             return 0
@@ -270,6 +493,13 @@ def _require_factor(pc: PETSc.PC) -> None:
     trial.setFactorSolverType(pc.getFactorSolverType())
     trial.setOperators(one, one)
     trial.setFactorSetUpSolverType()
+
+
+def _has_zeros(K: PETSc.Mat) -> bool:
+    """Return whether the diagonal of a matrix has zeros (collective)."""
+    diagonal = K.getDiagonal()
+    diagonal.abs()
+    return bool(diagonal.min()[1] == 0.0)
 
 
 def _product(K: PETSc.Mat, x: PETSc.Vec, exponent: int, result: PETSc.Vec) -> None:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from mpi4py import MPI
@@ -19,7 +19,7 @@ from ..log import NEWTON, tell
 from ..parallel.garbage import weakly
 from ..parallel.magnitudes import norm, sign_of_product
 from .line_search import LineSearch, stalled
-from .linear import ShiftedFactor
+from .linear import Indefinite, ShiftedFactor
 
 __all__ = ["NewtonSolver", "ReducedProblem"]
 
@@ -51,6 +51,10 @@ DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 class ReducedProblem(Protocol):
     """What the solver asks of a problem. All calls are collective."""
 
+    @property
+    def softens(self) -> bool:
+        """Whether tangents may be indefinite where ``constrain`` permits no such direction."""
+
     def residual(self, x: PETSc.Vec, F: PETSc.Vec) -> MPMError | None:
         """Evaluate the residual at x, or say why that cannot be."""
 
@@ -80,6 +84,9 @@ class ReducedProblem(Protocol):
 
     def rigid_motions(self) -> PETSc.NullSpace:
         """Return the rigid motions in the unknowns, which multigrid must know."""
+
+    def interpolations(self) -> Sequence[PETSc.Mat]:
+        """Return what gives the unknowns of each level of multigrid from the next coarser one."""
 
     def impose(self) -> bool:
         """Impose the step's Dirichlet values from now on; return whether there are any."""
@@ -141,6 +148,7 @@ class NewtonSolver:
         line_search: Whether to search.
         statistics: Where to count.
         dim: Dimension of space.
+        linear_solver: ``"auto"``, ``"direct"`` or ``"multigrid"``.
 
     Attributes:
         snes: The PETSc SNES.
@@ -161,6 +169,7 @@ class NewtonSolver:
         line_search: bool,
         statistics: Statistics,
         dim: int,
+        linear_solver: str = "auto",
     ) -> None:
         self._comm = comm
         self._symmetric = symmetric
@@ -192,14 +201,16 @@ class NewtonSolver:
         self.snes.setType("newtonls")
         _compat.use_basic_line_search(self.snes)
         self.snes.setTolerances(rtol=1e-9, atol=0.0, stol=0.0, max_it=30)
-        self._factor = ShiftedFactor(self.snes, prefix, options, symmetric, shift, dim, statistics)
+        self._factor = ShiftedFactor(
+            self.snes, prefix, options, symmetric, shift, dim, statistics, linear_solver
+        )
 
     @property
     def K(self) -> PETSc.Mat | None:
         """The reduced tangent."""
         return self._factor.K
 
-    def solve(self, problem: ReducedProblem, sizes: tuple[int, int]) -> None:
+    def solve(self, problem: ReducedProblem, sizes: tuple[int, int], shorten: bool = False) -> None:
         """Find a root of the residual, starting from zero or from the prediction.
 
         The prediction is kept only where its residual is small beside that of a start from zero.
@@ -209,12 +220,13 @@ class NewtonSolver:
         Args:
             problem: Residual and tangent.
             sizes: Local and global number of unknowns.
+            shorten: Whether a step that fails is tried again with less load.
 
         Raises:
             MPMError: Why there is none; ``x`` and ``F`` are the last evaluated then.
             BaseException: What a user's code has raised inside a call of PETSc's, as it is.
         """
-        self._problem = problem
+        self._problem, self._shorten = problem, shorten
         self.residuals = []
         self.iterations = 0
         self._motion = (0.0, 0.0)
@@ -227,7 +239,10 @@ class NewtonSolver:
         self.no_equilibrium = False
         if self._search is not None:
             self._search.begin()
-        self._factor.begin()
+        self._factor.begin(sizes[1])
+        # What an iterative solve that fails means is for _pre_check to say.
+        self.snes.setMaxLinearSolveFailures(1000 if self._factor.iterates else 1)
+        self._tolerance = 0.0
         self._centre = None
         x = self._start(sizes)
         if sizes[1] == 0:
@@ -237,6 +252,7 @@ class NewtonSolver:
             self._iterate(x)
         if self._failure is not None:
             raise self._failure
+        self._factor.end()
 
     def _start(self, sizes: tuple[int, int]) -> PETSc.Vec:
         """Return the zero vector of unknowns, with vectors and SNES of its size."""
@@ -422,7 +438,7 @@ class NewtonSolver:
         self._norms.append(size)
         self.residuals.append(size / scale if scale > 0 else size)
         tell(self._comm, NEWTON, "  iteration %d: residual %.2e", iteration, self.residuals[-1])
-        tolerance = max(rtol * scale, atol)
+        self._tolerance = tolerance = max(rtol * scale, atol)
         small = size <= tolerance
         if small or (
             iteration > 0
@@ -546,19 +562,25 @@ class NewtonSolver:
         self.F.copy(self._R)
 
     def _set_tangent(self, K: PETSc.Mat, damping: float = 0.0) -> None:
-        problem = self._problem
-        if self._factor.set(K, problem.diagonal, problem.rigid_motions, damping):
+        if self._factor.set(K, self._problem, damping):
             self.snes.setJacobian(self._callback(self._jacobian), K, self._factor.P)
 
     def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
         if not self._fresh:
             self._set_tangent(self._problem.tangent())
         self._fresh = False
+        self._factor.aim(self._norms, self._tolerance)
         self.iterations += 1
 
     def _pre_check(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         before, self._motion = self._motion, (0.0, 0.0)
         self._origin = x
+        self._failure = self._finished(y)
+        if self._failure is not None:
+            self._trial.waxpy(-1.0, y, x)
+            self._R.set(np.nan)
+            self._known = True
+            return False
         refined = self._refines
         if refined:
             self._solve(self._R, y)
@@ -586,6 +608,20 @@ class NewtonSolver:
         self._shrinks = self._motion[0] <= 0.25 * before[0]
         self._known = True
         return changed or self._refines
+
+    def _finished(self, y: PETSc.Vec) -> MPMError | None:
+        """Finish a linear solve of SNES; return why that cannot be."""
+        try:
+            if self._factor.finish(self._R, y, self._shorten and not self._problem.softens):
+                return None
+        except Indefinite:
+            return ConvergenceError(
+                f"The tangent was not positive definite after {self.iterations} linear solves"
+            )
+        return ConvergenceError(
+            f"Multigrid did not solve for a Newton step after {self.iterations} linear solves; "
+            "use linear_solver='direct'"
+        )
 
     def _smooth(self) -> bool:
         return self._problem.smooth()

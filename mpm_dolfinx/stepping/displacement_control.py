@@ -267,6 +267,11 @@ class ControlledSystem:
         self._slope = self._reduced.restricted(self._on_all)
 
     @property
+    def softens(self) -> bool:
+        """Whether tangents may be indefinite: they are, where the load falls."""
+        return True
+
+    @property
     def load(self) -> float:
         """The load factor of the last residual."""
         return float(self._bodies[0].load.value)
@@ -376,6 +381,10 @@ class ControlledSystem:
     def rigid_motions(self) -> PETSc.NullSpace:
         """Return the rigid motions in the unknowns."""
         return self._reduced.rigid_motions()
+
+    def interpolations(self) -> Sequence[PETSc.Mat]:
+        """Return what gives the unknowns of each level of multigrid from the next coarser one."""
+        return self._reduced.interpolations()
 
     def extent(self) -> float:
         """Return the size of the positions of all nodes."""

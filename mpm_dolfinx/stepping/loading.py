@@ -427,7 +427,7 @@ class Stepper:
             system = ControlledSystem(reduced, control, parameter, owner.bodies)
             displacement = parameter
         experience = self.newton.experience
-        self.newton.solve(system, reduced.sizes)
+        self.newton.solve(system, reduced.sizes, shorten=self.run is not None)
         if (failure := owner.improper()) is not None:
             raise failure
         if control is not None:

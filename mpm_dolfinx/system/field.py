@@ -18,11 +18,13 @@ from dolfinx import fem
 from .. import _compat
 from ..assembly.background_forms import BackgroundForms
 from ..assembly.fused import Restriction
+from ..background.grids import cell_lines, coarser
 from ..parallel.magnitudes import joint_norm, norm
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..stabilisation.cure import Cure
 from ..transfer.touched import TouchedNodes, TransferRows
+from .hierarchy import FieldDofs
 from .numbering import FreeDofs
 from .predictor import map_to_background
 
@@ -157,6 +159,7 @@ class Field:
         self.motions = [Motion(body) for body in bodies]
         self.moduli: list[float] | None = None
         self.free: FreeDofs | None = None
+        self._lines: list[NDArray[np.float64]] | None = None
         self._background = background
         self._cure = Cure() if cure is None else cure
         self._comm: MPI.Comm = V.mesh.comm
@@ -260,6 +263,18 @@ class Field:
                 matrix = self._extension.matMult(matrix)
             self._prolongation = matrix
         return self._prolongation
+
+    def level(self) -> FieldDofs:
+        """Return this rank's unknowns as the finest level of multigrid (collective)."""
+        assert self.free is not None
+        if self._lines is None:
+            lines = cell_lines(self.V)
+            self._lines = lines if self.V.ufl_element().degree > 1 else coarser(lines)
+        nodes, components = np.divmod(self.dofs, self._bs)
+        gdim = self.V.mesh.geometry.dim
+        points = self.free.collect(self.V.tabulate_dof_coordinates()[nodes, :gdim])
+        numbers = np.arange(self._part_of_x.start, self._part_of_x.stop)
+        return FieldDofs(numbers, points, self.free.collect(components), self._lines, self._bs)
 
     # -- Vectors --------------------------------------------------------------------------
 

@@ -25,6 +25,7 @@ from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..transfer.touched import TransferRows
 from .field import Field, Motion, ValueField
+from .hierarchy import interpolations
 from .numbering import Numbering
 from .predictor import Predictor
 from .term import Term
@@ -92,6 +93,11 @@ class ReducedSystem:
     def _place(self, particles: Particles | CarriedField) -> tuple[Field, Motion]:
         """Return the field that moves a body, and how."""
         return next(place for place in self._places if place[1].particles is particles)
+
+    @property
+    def softens(self) -> bool:
+        """Whether tangents may be indefinite in a direction that :meth:`constrain` forbids."""
+        return False
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -565,6 +571,14 @@ class ReducedSystem:
         """Return the rigid motions of each background in the unknowns (collective)."""
         assert self._numbering is not None
         return self._numbering.rigid_motions()
+
+    def interpolations(self) -> Sequence[PETSc.Mat]:
+        """Return what gives the unknowns of each level of multigrid from the next coarser one.
+
+        See :func:`.hierarchy.interpolations` (collective).
+        """
+        dofs = [field.level() for field in self.fields]
+        return interpolations(self._comm, self.sizes[0], dofs)
 
     def impose(self) -> bool:
         """Impose the step's Dirichlet values from now on; return whether there are any."""

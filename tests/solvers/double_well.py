@@ -20,6 +20,8 @@ class DoubleWell:
         self.K = PETSc.Mat().createAIJ((n, n), nnz=1, comm=MPI.COMM_SELF)
         self.x = np.zeros(n)
 
+    softens = False
+
     def residual(self, x, F):
         self.x = x.array_r + self.start
         F.array_w[:] = self.c * (self.x**3 - self.x) - self.g
@@ -46,6 +48,9 @@ class DoubleWell:
 
     def rigid_motions(self):
         raise AssertionError("for multigrid only")
+
+    def interpolations(self):
+        return []
 
     def prediction(self):
         return None

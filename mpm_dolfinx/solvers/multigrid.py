@@ -1,0 +1,90 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Geometric multigrid as a preconditioner: Galerkin levels below a tangent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from petsc4py import PETSc
+
+__all__ = ["Multigrid"]
+
+#: Shift of the coarsest level's diagonal, relative to it: boxes may have more dofs than the body
+#: can tell apart.
+SHIFT = 1e-11
+
+
+class Multigrid:
+    """Makes a PETSc PC a V cycle over given levels.
+
+    Coarse tangents are Galerkin products, which keep their sparsity as long as the finest one is
+    the same object. One symmetric sweep of successive over-relaxation smooths before and after; on
+    several ranks each sweeps over its own unknowns.
+
+    Args:
+        pc: The preconditioner (collective).
+        interpolations: What gives the unknowns of each level from those of the next coarser one,
+            from the finest level on.
+        symmetric: Whether tangents are symmetric.
+    """
+
+    def __init__(self, pc: PETSc.PC, interpolations: Sequence[PETSc.Mat], symmetric: bool) -> None:
+        self._pc, self._interpolations = pc, list(interpolations)
+        self._products: list[PETSc.Mat] = []
+        self._finest: PETSc.Mat | None = None
+        self._symmetric = symmetric
+        count = len(self._interpolations) + 1
+        pc.reset()
+        pc.setType("none")  # what an earlier hierarchy has left goes
+        pc.setType("mg")
+        pc.setMGLevels(count)
+        for number, matrix in enumerate(self._interpolations):
+            pc.setMGInterpolation(count - 1 - number, matrix)
+        for level in range(1, count):
+            smoother = pc.getMGSmoother(level)
+            smoother.setType("richardson")
+            smoother.setTolerances(max_it=1)
+            smoother.getPC().setType("sor")
+        coarse = pc.getMGCoarseSolve()
+        coarse.setType("preonly")
+        inner = coarse.getPC()
+        kind = "cholesky" if symmetric else "lu"
+        inner.setType(kind)
+        inner.setFactorSolverType("mumps")
+
+    def set(self, K: PETSc.Mat) -> None:
+        """Take over the values of a tangent (collective)."""
+        fresh = self._finest is not K
+        if fresh:
+            self._products, self._finest = [], K
+        fine = K
+        for number, P in enumerate(self._interpolations):
+            if fresh:
+                self._products.append(fine.ptap(P))
+                if self._symmetric:
+                    self._products[-1].setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            else:
+                fine.ptap(P, result=self._products[number])
+            fine = self._products[number]
+            _fill_diagonal(fine)
+        if self._products:
+            diagonal = fine.getDiagonal()
+            diagonal.abs()
+            diagonal.scale(SHIFT)
+            fine.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
+        for number, matrix in enumerate(reversed([K, *self._products])):
+            solver = self._pc.getMGSmoother(number) if number else self._pc.getMGCoarseSolve()
+            solver.setOperators(matrix, matrix)
+
+
+def _fill_diagonal(matrix: PETSc.Mat) -> None:
+    """Put the largest entry of a diagonal where it is zero, as nothing moves there (collective)."""
+    diagonal = matrix.getDiagonal()
+    zero = diagonal.array_r == 0.0
+    largest = diagonal.max()[1]
+    if matrix.comm.tompi4py().allreduce(int(zero.sum())) == 0:
+        return
+    values = diagonal.array_w
+    values[zero] = largest if largest > 0.0 else 1.0
+    matrix.setDiagonal(diagonal)
