@@ -376,6 +376,11 @@ class ParticleProblem:
             for group, forms in zip(groups, on_backgrounds, strict=True)
         ]
         fields += [ValueField(group, self.bcs) for group in by_space(carried)]
+        if carried and numerics.linear_solver == "multigrid":
+            raise MPMError(
+                "linear_solver='multigrid' solves for displacements alone; leave it out beside "
+                "other fields, such as a pressure."
+            )
         statistics = self.history.statistics
         self._held.follow(self.bodies, spaces_of(self.bodies))
         reduced = ReducedSystem(

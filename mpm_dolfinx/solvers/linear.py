@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
@@ -15,7 +16,7 @@ import numpy as np
 from ..errors import MPMError
 from ..history import Statistics
 from ..parallel.magnitudes import unit_sized
-from .multigrid import Multigrid
+from .multigrid import COARSEST, SHIFT, Multigrid
 
 __all__ = ["LINEAR_SOLVERS", "ShiftedFactor"]
 
@@ -30,12 +31,15 @@ FACTORS = ("lu", "cholesky")
 #: Most iterations of a refinement, and how often it begins anew.
 KRYLOV, REFINEMENTS = 60, 4
 #: Options of MUMPS unless others are given: K scaled by its diagonal, as the shift is.
-MUMPS = {"mat_mumps_icntl_8": 1}
+MUMPS = {"mat_mumps_icntl_8": 1, "mg_coarse_mat_mumps_icntl_8": 1}
 #: The same where the diagonal says nothing of the size of a row: rows and columns in turn.
 SADDLE = {"mat_mumps_icntl_8": 7}
 #: PORD orders plane graphs three times as fast as METIS and no worse, in space worse; from that
 #: many unknowns on, as it ends the process where all unknowns are neighbours of each other.
 PORD, PORD_FROM = {"mat_mumps_icntl_7": 4}, 10000
+#: Unknowns up to which a factorisation takes over where multigrid comes to nothing, and steps in
+#: a row in which it may before no step begins with multigrid.
+TAKEN_OVER, ENDURED = {2: 500000, 3: 50000}, 3
 #: Relative residual of what multigrid solves besides Newton's steps, and its most iterations.
 ACCURATE, ITERATIONS = 1e-6, 200
 #: Relative residuals of the first and the roughest of Newton's steps by multigrid (Eisenstat &
@@ -43,13 +47,18 @@ ACCURATE, ITERATIONS = 1e-6, 200
 FIRST, ROUGHEST, FINAL = 1e-2, 0.1, 0.2
 #: Tries of a step that end where a tangent is indefinite, before it is solved with all the same.
 PATIENCE = 3
-GOLDEN = 0.5 * (1.0 + 5.0**0.5)
+GOLDEN = 0.5 * (1.0 + math.sqrt(5.0))
 #: Relative shift of a tangent with zeros on its diagonal, where no other is asked for.
 TINY = 1e-13
 #: By which conjugate gradients say that a tangent is not positive definite.
 INDEFINITE = (
     PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT,
     PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC,
+)
+#: By which they say that of the preconditioner, as where sweeps divide by what is round-off.
+SINGULAR = (
+    PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC,
+    PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED,
 )
 #: PETSc's error numbers for what an option asks for: not supported, out of range, an unknown
 #: type, and a package that is missing.
@@ -111,12 +120,15 @@ class ShiftedFactor:
     ) -> None:
         self.shift = shift
         self.iterates = False
-        self._gave_up = self._own_rtol = self._own_type = False
+        self._own_rtol = self._own_type = False
+        self._failures = 0  # steps in a row
+        self._shifts = False  # what multigrid sweeps over
         self._multigrid: Multigrid | None = None
         self._levels: Levels | None = None
         self._told: tuple[Any, Any] = None, None
         self._linear_solver = linear_solver
         self._negative = False
+        self._indefinite = 0
         self.K: PETSc.Mat | None = None
         self.P: Any = None
         self.D: PETSc.Vec | None = None
@@ -163,19 +175,25 @@ class ShiftedFactor:
             for key in options:
                 database.delValue(key)
 
-    def begin(self, size: int) -> None:
+    def begin(self, size: int, constrained: bool = False) -> None:
         """Begin a step (collective).
 
         Args:
             size: Number of all unknowns.
+            constrained: Whether there are others than displacements, as such that enforce
+                constraints, which multigrid does not solve for.
         """
         self.D = None
-        iterates = self._prefers_multigrid(size)
+        iterates = self._prefers_multigrid(size) and not constrained
         if iterates != self.iterates:
             self._choose(iterates)
 
     def _prefers_multigrid(self, size: int) -> bool:
-        if self._own_type or self._gave_up or self._linear_solver != "auto":
+        if size <= COARSEST:
+            return False  # a factor is all that its levels would be
+        if self._own_type or self._failures >= ENDURED:
+            return False
+        if self._linear_solver != "auto":
             return self._linear_solver == "multigrid"
         return self._symmetric and size >= CROSSOVER.get(self._dim, np.inf)
 
@@ -268,12 +286,13 @@ class ShiftedFactor:
                     self._ksp.getPC(), levels.interpolations(), self._symmetric
                 )
                 self._ksp.getPC().setFromOptions()
-            if damped or _has_zeros(K):
-                matrix = self._shifted_copy(K, (damping if damped else TINY) * levels.diagonal(K))
+            assert self._multigrid is not None
+            relative = damping if damped else SHIFT if self._shifts else TINY
+            if damped or self._shifts or not self._multigrid.levels or _has_zeros(K):
+                matrix = self._shifted_copy(K, relative * levels.diagonal(K))
             if self._symmetric:
                 matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-            assert self._multigrid is not None
-            self._ksp.setOperators(matrix, matrix)
+            self._ksp.setOperators(matrix if damped else K, matrix)
             self._multigrid.set(matrix)
             self._ksp.setUp()
         self.K, self.P = K, matrix
@@ -302,24 +321,24 @@ class ShiftedFactor:
             return
         rtol: float = FIRST
         if len(norms) > 1 and norms[-2] > 0.0:
-            rtol = min((norms[-1] / norms[-2]) ** GOLDEN, ROUGHEST)
-            if self._rtol**GOLDEN > ROUGHEST:
-                rtol = max(rtol, min(self._rtol**GOLDEN, ROUGHEST))
+            rtol = min(float((norms[-1] / norms[-2]) ** GOLDEN), ROUGHEST)
         if norms and norms[-1] > 0.0:
             rtol = max(rtol, min(FINAL * tolerance / norms[-1], ROUGHEST))
-        self._rtol = rtol
         self._ksp.setTolerances(rtol=rtol)
 
     def end(self) -> None:
         """End a step that has converged."""
         self._indefinite = 0
+        if self.iterates:
+            self._failures = 0
 
     def finish(self, b: PETSc.Vec, x: PETSc.Vec, shorten: bool = False) -> bool:
         """Look at what SNES has solved; return whether it is a solution (collective).
 
         Where the method of conjugate gradients has found the tangent indefinite, that of
         generalised minimal residuals solves, if no smaller step is to be tried. Where multigrid
-        comes to nothing and was not asked for, a factor solves, from then on.
+        comes to nothing a factor takes over for the rest of the step, and after three steps in a
+        row for good, unless there are so many unknowns that it would take far longer.
 
         Args:
             b: The right-hand side.
@@ -332,7 +351,16 @@ class ShiftedFactor:
         if not self.iterates:
             return True
         self._statistics["krylov_iterations"] += self._ksp.getIterationNumber()
+        K, levels = self.K, self._levels
+        assert K is not None and levels is not None
+        if self._ksp.getConvergedReason() in SINGULAR and not self._shifts:
+            self._shifts = True
+            self._make_levels(K, levels, 0.0)
+            self._ksp.solve(b, x)
+            self._statistics["krylov_iterations"] += self._ksp.getIterationNumber()
         reason = self._ksp.getConvergedReason()
+        if reason >= 0 or self._does(b):
+            return True
         if reason in INDEFINITE:
             self._negative = True
             if shorten and self._indefinite < PATIENCE:
@@ -340,18 +368,24 @@ class ShiftedFactor:
                 raise Indefinite
             if self._solve_indefinite(b, x, self._ksp.getTolerances()[0]):
                 return True
-        elif reason >= 0:
-            return True
-        if self._linear_solver != "auto":
+        if K.getSize()[0] > TAKEN_OVER.get(self._dim, 0):
             return False
-        K, levels = self.K, self._levels
-        assert K is not None and levels is not None
-        self._gave_up = True
+        self._failures += 1
         self._choose(False)
         self._factorise(K, levels)
         self._statistics.count("multigrid_failures")
         self._ksp.solve(b, x)
         return True
+
+    def _does(self, b: PETSc.Vec) -> bool:
+        """Return whether a solve that round-off has ended leaves a residual that does for Newton.
+
+        Near the floor of round-off a tangent with directions that nothing holds looks indefinite.
+        """
+        reason = self._ksp.getConvergedReason()
+        limit = FIRST if reason in INDEFINITE else ROUGHEST
+        done = reason in INDEFINITE or reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT
+        return done and bool(self._ksp.getResidualNorm() <= limit * b.norm())
 
     def _solve_indefinite(self, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> bool:
         ksp = self._flexible

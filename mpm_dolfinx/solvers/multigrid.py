@@ -8,11 +8,14 @@ from collections.abc import Sequence
 
 from petsc4py import PETSc
 
-__all__ = ["Multigrid"]
+__all__ = ["COARSEST", "SHIFT", "Multigrid"]
 
-#: Shift of the coarsest level's diagonal, relative to it: boxes may have more dofs than the body
+#: Most unknowns of a coarsest level, which is factorised.
+COARSEST = 600
+
+#: Shift of the coarse levels' diagonals, relative to them: boxes may have more dofs than the body
 #: can tell apart.
-SHIFT = 1e-11
+SHIFT = 1e-8
 
 
 class Multigrid:
@@ -27,12 +30,15 @@ class Multigrid:
         interpolations: What gives the unknowns of each level from those of the next coarser one,
             from the finest level on.
         symmetric: Whether tangents are symmetric.
+
+    Attributes:
+        levels: Number of levels below the finest.
     """
 
     def __init__(self, pc: PETSc.PC, interpolations: Sequence[PETSc.Mat], symmetric: bool) -> None:
         self._pc, self._interpolations = pc, list(interpolations)
+        self.levels = len(self._interpolations)
         self._products: list[PETSc.Mat] = []
-        self._finest: PETSc.Mat | None = None
         self._symmetric = symmetric
         count = len(self._interpolations) + 1
         pc.reset()
@@ -55,9 +61,7 @@ class Multigrid:
 
     def set(self, K: PETSc.Mat) -> None:
         """Take over the values of a tangent (collective)."""
-        fresh = self._finest is not K
-        if fresh:
-            self._products, self._finest = [], K
+        fresh = not self._products
         fine = K
         for number, P in enumerate(self._interpolations):
             if fresh:
@@ -67,24 +71,19 @@ class Multigrid:
             else:
                 fine.ptap(P, result=self._products[number])
             fine = self._products[number]
-            _fill_diagonal(fine)
-        if self._products:
-            diagonal = fine.getDiagonal()
-            diagonal.abs()
-            diagonal.scale(SHIFT)
-            fine.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
+            _shift_diagonal(fine)
         for number, matrix in enumerate(reversed([K, *self._products])):
             solver = self._pc.getMGSmoother(number) if number else self._pc.getMGCoarseSolve()
             solver.setOperators(matrix, matrix)
 
 
-def _fill_diagonal(matrix: PETSc.Mat) -> None:
-    """Put the largest entry of a diagonal where it is zero, as nothing moves there (collective)."""
+def _shift_diagonal(matrix: PETSc.Mat) -> None:
+    """Make a singular tangent definite (collective): by the largest entry where nothing moves."""
     diagonal = matrix.getDiagonal()
-    zero = diagonal.array_r == 0.0
+    diagonal.abs()
     largest = diagonal.max()[1]
-    if matrix.comm.tompi4py().allreduce(int(zero.sum())) == 0:
-        return
     values = diagonal.array_w
+    zero = values == 0.0
+    values *= SHIFT
     values[zero] = largest if largest > 0.0 else 1.0
-    matrix.setDiagonal(diagonal)
+    matrix.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)

@@ -55,6 +55,10 @@ class ReducedProblem(Protocol):
     def softens(self) -> bool:
         """Whether tangents may be indefinite where ``constrain`` permits no such direction."""
 
+    @property
+    def constrained(self) -> bool:
+        """Whether there are unknowns besides displacements."""
+
     def residual(self, x: PETSc.Vec, F: PETSc.Vec) -> MPMError | None:
         """Evaluate the residual at x, or say why that cannot be."""
 
@@ -239,7 +243,7 @@ class NewtonSolver:
         self.no_equilibrium = False
         if self._search is not None:
             self._search.begin()
-        self._factor.begin(sizes[1])
+        self._factor.begin(sizes[1], problem.constrained)
         # What an iterative solve that fails means is for _pre_check to say.
         self.snes.setMaxLinearSolveFailures(1000 if self._factor.iterates else 1)
         self._tolerance = 0.0

@@ -272,6 +272,11 @@ class ControlledSystem:
         return True
 
     @property
+    def constrained(self) -> bool:
+        """Whether there are unknowns besides displacements."""
+        return self._reduced.constrained
+
+    @property
     def load(self) -> float:
         """The load factor of the last residual."""
         return float(self._bodies[0].load.value)

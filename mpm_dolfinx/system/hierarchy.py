@@ -20,11 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..background.grids import box_weights, coarser
+from ..solvers.multigrid import COARSEST
 
-__all__ = ["COARSEST", "FieldDofs", "interpolations"]
+__all__ = ["FieldDofs", "interpolations"]
 
-#: Dofs of the coarsest level, which is factorised.
-COARSEST = 600
 #: Dofs up to which a level lives on one rank.
 GATHERED = 3000
 #: Share of the dofs above which a coarser level is not worth its while.

@@ -100,6 +100,11 @@ class ReducedSystem:
         return False
 
     @property
+    def constrained(self) -> bool:
+        """Whether there are unknowns besides displacements."""
+        return bool(self._value_fields)
+
+    @property
     def sizes(self) -> tuple[int, int]:
         """Number of unknowns of this rank and of all ranks."""
         assert self._numbering is not None

@@ -20,7 +20,7 @@ class DoubleWell:
         self.K = PETSc.Mat().createAIJ((n, n), nnz=1, comm=MPI.COMM_SELF)
         self.x = np.zeros(n)
 
-    softens = False
+    softens = constrained = False
 
     def residual(self, x, F):
         self.x = x.array_r + self.start

@@ -1,0 +1,163 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Multigrid on boxes of the background, compared with factorisations."""
+
+import numpy as np
+import pytest
+import scenes
+from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.errors import MPMError
+from mpm_dolfinx.materials import Hencky, MohrCoulomb, VonMises
+from mpm_dolfinx.solvers import linear
+
+TIGHT = {"snes_rtol": 1e-12}
+PLASTIC = VonMises(1e6, 0.3, rho_y=20e3)
+
+
+def heavy(n, cell=QUADRILATERAL, degree=1, material=PLASTIC, weight=8e3, bent=0.0, **options):
+    """Return a column, half as large as its background, with n background cells over its width."""
+    dim = 3 if cell in (TETRAHEDRON, HEXAHEDRON) else 2
+    grid = scenes.box([0.0] * dim, [1.0] * dim, [2 * n] * dim, cell)
+    grid = scenes.bend(grid, bent)
+    grid.geometry.x[:, :dim] *= 8.0
+    V = scenes.vectors(grid, degree)
+    finer = 2 if degree == 1 else 1
+    domains = cell if degree == 1 else TRIANGLE
+    body = scenes.box([0.0] * dim, [4.0] * dim, [finer * n] * dim, domains)
+    bcs = [scenes.fix(V, scenes.at(axis, 0.0), component=axis) for axis in range(dim)]
+    options.setdefault("petsc_options", TIGHT)
+    return mpm.QuasiStaticProblem(
+        mpm.Particles(body, V, degree=degree),
+        material,
+        density=1.0,
+        body_force=(*[0.0] * (dim - 1), -weight),
+        bcs=bcs,
+        **options,
+    )
+
+
+def assert_same(direct, multigrid, failures=0):
+    """Compare the runs of two problems, of which the second one has used multigrid."""
+    a, b = (scenes.own(run.particles.displacement) for run in (direct, multigrid))
+    assert scenes.largest(a - b) < 1e-9 * scenes.largest(a)
+    assert direct.history.statistics["krylov_iterations"] == 0
+    statistics = multigrid.history.statistics
+    assert statistics["krylov_iterations"] > 0
+    assert (statistics["multigrid_failures"] > 0) == (failures > 0)
+
+
+@pytest.mark.parametrize(
+    ("n", "options"),
+    [
+        (20, {}),
+        (20, {"cell": TRIANGLE}),
+        (20, {"bent": 0.004}),
+        (20, {"stabilisation": None}),
+        (20, {"stabilisation": "aggregate"}),
+        (9, {"degree": 2}),
+        (9, {"degree": 2, "cell": TRIANGLE}),
+        (6, {"degree": 3}),
+        (5, {"cell": HEXAHEDRON}),
+        (5, {"cell": TETRAHEDRON}),
+        (20, {"material": VonMises(1e6, 0.49, rho_y=20e3)}),
+        (20, {"material": MohrCoulomb(1e6, 0.3, 2e4, 0.5, 0.1), "weight": 4e3}),
+    ],
+    ids=lambda given: "-".join(f"{k}" for k in given) if isinstance(given, dict) else str(given),
+)
+def test_displacements_are_those_of_a_factorisation(n, options):
+    runs = [heavy(n, linear_solver=name, **options) for name in ("direct", "multigrid")]
+    for run in runs:
+        run.solve(steps=2)
+    assert_same(*runs)
+
+
+def test_iterations_do_not_grow_with_the_number_of_unknowns():
+    counts = []
+    for n in (18, 36, 54):
+        run = heavy(n, material=Hencky(1e6, 0.3), linear_solver="multigrid", petsc_options={})
+        run.solve(steps=1)
+        statistics = run.history.statistics
+        counts.append(statistics["krylov_iterations"] / run.history.total_iterations)
+    assert counts[2] <= 1.3 * counts[0] + 1.0
+
+
+def test_bodies_on_backgrounds_of_their_own():
+    moved = []
+    for name in ("direct", "multigrid"):
+        bodies, bcs = [], []
+        for low, n in ((0.0, 37), (2.0, 34)):
+            V = scenes.vectors(scenes.box([0.0, 0.0], [4.0, 6.0], [n, n], QUADRILATERAL))
+            body = scenes.box([0.0, low], [2.0, low + 2.0], [n] * 2, QUADRILATERAL)
+            bodies.append(mpm.Particles(body, V))
+            bcs.append(scenes.fix(V, scenes.at(0, 0.0), component=0))
+        bcs.append(scenes.fix(bodies[0].V, scenes.at(1, 0.0), component=1))
+        tags = scenes.facet_tags(bodies[1].mesh, scenes.at(1, 2.0))
+        run = mpm.QuasiStaticProblem(
+            bodies,
+            Hencky(1e5, 0.3),
+            density=1.0,
+            body_force=(0.0, -5e3),
+            bcs=bcs,
+            terms=[mpm.Tie(bodies[1], bodies[0], tags, 1, 1e7)],
+            linear_solver=name,
+            petsc_options=TIGHT,
+        )
+        run.solve(steps=1)
+        moved.append(run)
+    a, b = ([scenes.own(body.displacement) for body in run.bodies] for run in moved)
+    assert max(scenes.largest(x - y) for x, y in zip(a, b, strict=True)) < 1e-9
+    assert moved[1].history.statistics["krylov_iterations"] > 0
+
+
+def test_a_factorisation_takes_over_where_multigrid_comes_to_nothing():
+    runs = [
+        heavy(20, linear_solver="direct"),
+        heavy(20, linear_solver="multigrid", petsc_options={**TIGHT, "ksp_max_it": 1}),
+    ]
+    for run in runs:
+        run.solve(steps=4)
+    assert_same(*runs, failures=1)
+    assert runs[1].history.statistics["multigrid_failures"] == linear.ENDURED
+
+
+def test_many_unknowns_are_for_multigrid(monkeypatch):
+    monkeypatch.setattr(linear, "CROSSOVER", {2: 700})
+    for n, used in ((12, False), (20, True)):
+        run = heavy(n, linear_solver="auto")
+        run.solve(steps=1)
+        assert (run.history.statistics["krylov_iterations"] > 0) == used
+    run = heavy(20, linear_solver="auto", petsc_options={"pc_type": "lu"})
+    run.solve(steps=1)
+    assert run.history.statistics["krylov_iterations"] == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"linear_solver": "magic"}, "Unknown linear_solver='magic'; choose one of 'auto'"),
+        (
+            {"linear_solver": "multigrid", "petsc_options": {"pc_type": "gamg"}},
+            "linear_solver='multigrid' chooses ksp_type and pc_type",
+        ),
+        (
+            {"linear_solver": "multigrid", "degree": 2, "mixed": "pressure"},
+            "linear_solver='multigrid' solves for displacements alone",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused(options, sentence):
+    with pytest.raises(MPMError, match=sentence):
+        heavy(2, **options)
+
+
+def test_the_pivot_of_an_unstable_body_is_passed_by_smaller_steps():
+    # The tangent is indefinite on the way, which conjugate gradients find out.
+    runs = [heavy(20, weight=25e3, linear_solver=name) for name in ("direct", "multigrid")]
+    for run in runs:
+        run.solve(steps=2)
+    assert runs[0].history.statistics["redirections"] > 0 or runs[0].history.cutbacks > 0
+    a, b = (scenes.own(run.particles.displacement) for run in runs)
+    assert scenes.largest(a - b) < 0.02 * scenes.largest(a)
+    assert np.isfinite(b).all()
