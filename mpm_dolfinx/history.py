@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from .errors import ParticleOutsideError
 
-__all__ = ["Energy", "History", "Loss", "Stage", "Statistics", "Step"]
+__all__ = ["Attempt", "Energy", "History", "Loss", "Stage", "Statistics", "Step"]
 
 PHASES = ("locate", "transfer", "constitutive", "assemble", "factorise", "solve", "commit")
 COUNTERS = (
@@ -28,6 +28,7 @@ COUNTERS = (
     "residuals",
     "predictions",
     "rejected_predictions",
+    "rejected_steps",
     "factorisations",
     "krylov_iterations",
     "multigrid_failures",
@@ -64,7 +65,8 @@ class Statistics(dict[str, float]):
     ``factorisations`` (or levels of multigrid made for a tangent), ``krylov_iterations`` (of solves
     with multigrid), ``multigrid_failures`` (how often a factorisation took over),
     ``predictions`` (steps that began at the extrapolated increment) and
-    ``rejected_predictions``, ``halvings`` (of Newton steps by the line search), ``trusted_steps``
+    ``rejected_predictions``, ``rejected_steps`` (which converged, and were taken back for their
+    error), ``halvings`` (of Newton steps by the line search), ``trusted_steps``
     (series of them taken although the residual grew) and ``withdrawn_steps`` (where that came to
     nothing),
     ``redirections`` (of Newton steps that a tangent which is not positive definite led uphill),
@@ -120,6 +122,8 @@ class Step:
         residuals: Relative residual before each of Newton's iterations and at the end.
         displacement: The controlled displacement at its end, under displacement control.
         time: Time at its end: the number of stages before it, and how much of its own is done.
+        output: Whether it ends at one of the levels that were asked for (``output_at``), or at the
+            end of the run.
     """
 
     load: float
@@ -127,6 +131,24 @@ class Step:
     residuals: list[float]
     displacement: float | None = None
     time: float = 0.0
+    output: bool = False
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A step that was taken back.
+
+    Attributes:
+        load: Load factor (parameter of a path, controlled displacement) at which it was to end.
+        size: How much of that it was.
+        iterations: Linear solves it took.
+        reason: Why it was taken back.
+    """
+
+    load: float
+    size: float
+    iterations: int
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -213,7 +235,8 @@ class History:
     Attributes:
         steps: The converged steps.
         cutbacks: How often a step was halved.
-        failed_iterations: Linear solves of attempts that did not converge.
+        failed_iterations: Linear solves of attempts that did not converge, or were rejected.
+        taken_back: These attempts, and why.
         losses: What ``outside="delete"`` has deleted.
         stopped: Why a run with ``outside="stop"`` ended before its whole load, else ``None``.
         statistics: Counters and seconds per phase.
@@ -229,6 +252,7 @@ class History:
     statistics: Statistics = field(default_factory=Statistics)
     energies: list[Energy] = field(default_factory=list)
     stages: list[Stage] = field(default_factory=list)
+    taken_back: list[Attempt] = field(default_factory=list)
 
     def __repr__(self) -> str:
         return f"<History: {self.in_words()}>"

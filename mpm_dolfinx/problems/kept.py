@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from ..errors import MPMError, ParticleOutsideError
-from ..history import History, Loss, Stage, Statistics, Step
+from ..history import Attempt, History, Loss, Stage, Statistics, Step
 from ..io.snapshot import Kept, Taken, fill, of_cells
 from ..meshes.remesh import Column
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
+from ..stepping.automatic import control_of
 from ..stepping.control import Converged, Progress, Run
 from ..system.reduced import ReducedSystem
 
@@ -211,7 +212,7 @@ class Values(Kept):
 
 
 class Increments(Kept):
-    """The last increments, which predict the next.
+    """The last increments, which predict the next, and their sum where errors are measured.
 
     Args:
         reduced: The system.
@@ -237,18 +238,24 @@ class Increments(Kept):
         return next((i for i, other in enumerate(self._moved) if other is moved), -1)
 
     def numbers(self) -> dict[str, Any]:
-        """Return the sizes of their steps."""
-        return {"": [size for size, _ in self._past()]}
+        """Return the sizes of their steps, and whether and of what there is a sum."""
+        moved = self._predictor.moved
+        sizes = [size for size, _ in self._predictor.past]
+        return {"": sizes, "measures": moved is not None, "moved": bool(moved)}
 
     def columns(self, body: int | None) -> dict[str, Column]:
         """See :class:`Kept`."""
         if body is None:
             return {}
+        past = self._predictor.past
+        every = {str(i): increments for i, (_, increments) in enumerate(past)}
+        if self._predictor.moved:
+            every["moved"] = self._predictor.moved
         return {
-            f"{i}{name}": Column(
+            f"{key}{name}": Column(
                 of_cells(_function(one.W, increments[self._number(one)])), _place(one)
             )
-            for i, (_, increments) in enumerate(self._past())
+            for key, increments in every.items()
             for name, one in self._of[body].items()
         }
 
@@ -257,20 +264,19 @@ class Increments(Kept):
 
     def restore(self, taken: Taken) -> None:
         """See :class:`Kept`."""
-        if self._predictor is None:
-            return
-        past = []
-        for i, size in enumerate(taken.numbers[""]):
-            increments = [np.zeros(0)] * len(self._moved)
+        numbers = taken.numbers
+
+        def increments(key: str) -> list[NDArray[np.float64]]:
+            found = [np.zeros(0)] * len(self._moved)
             for own, columns in zip(self._of, taken.columns, strict=False):
                 for name, one in own.items():
-                    values = _filled(one.W, columns[f"{i}{name}"])
-                    increments[self._number(one)] = _owned(values)
-            past.append((size, increments))
-        self._predictor.past = past
+                    found[self._number(one)] = _owned(_filled(one.W, columns[f"{key}{name}"]))
+            return found
 
-    def _past(self) -> list[tuple[float, Any]]:
-        return [] if self._predictor is None else self._predictor.past
+        self._predictor.clear(numbers.get("measures", False))
+        self._predictor.past = [(size, increments(str(i))) for i, size in enumerate(numbers[""])]
+        if numbers.get("moved", False):
+            self._predictor.moved = increments("moved")
 
 
 def _place(one: Particles | CarriedField) -> Literal["points", "nodes"]:
@@ -290,8 +296,10 @@ class Past(Kept):
         return {
             "moduli": self._reduced.moduli,
             "steps": [
-                [s.load, s.iterations, s.residuals, s.displacement, s.time] for s in history.steps
+                [s.load, s.iterations, s.residuals, s.displacement, s.time, s.output]
+                for s in history.steps
             ],
+            "taken_back": [vars(attempt) for attempt in history.taken_back],
             "cutbacks": history.cutbacks,
             "failed_iterations": history.failed_iterations,
             "losses": [vars(loss) for loss in history.losses],
@@ -310,6 +318,7 @@ class Past(Kept):
         history.steps[:] = _steps(numbers["steps"])
         history.cutbacks = numbers["cutbacks"]
         history.failed_iterations = numbers["failed_iterations"]
+        history.taken_back[:] = [Attempt(**entries) for entries in numbers.get("taken_back", [])]
         history.losses[:] = [Loss(**entries) for entries in numbers["losses"]]
         history.stages[:] = [Stage(*entries) for entries in numbers.get("stages", [])]
         stopped = numbers["stopped"]
@@ -383,7 +392,7 @@ class Standing(Kept):
         run = None
         if numbers["run"] is not None:
             base = [np.asarray(f.x.array) for f in totals["base"]]
-            run = Run.of(numbers["run"], base, self._history.time)
+            run = Run.of(numbers["run"], base, self._history.time, control_of)
         self.progress = Progress(converged, tuple(numbers["experience"]), run)
 
 

@@ -37,6 +37,7 @@ from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
 from ..solvers.newton import NewtonSolver
 from ..stabilisation.choice import stabilisation_of
+from ..stepping.automatic import ErrorControl
 from ..stepping.control import Run
 from ..stepping.diagnosis import crossed
 from ..stepping.displacement_control import DisplacementControl
@@ -66,6 +67,9 @@ from .setup import Numerics
 from .summary import in_one_line, on_a_screen
 
 __all__ = ["Change", "Contribution", "Law", "ParticleProblem"]
+
+#: What goes with automatic steps, and is of no meaning to others.
+AUTOMATIC = {"tolerance": 1e-2, "output_at": (), "first_step": 0.05, "length": None}
 
 
 class Contribution(NamedTuple):
@@ -388,7 +392,7 @@ class ParticleProblem:
             fields,
             [*self.body_terms, *self._field_terms, *self.terms, UserTerm(self), self._held],
             statistics,
-            Predictor() if numerics.predictor else None,
+            Predictor(numerics.predictor),
         )
         newton = NewtonSolver(
             self._comm,
@@ -674,16 +678,23 @@ class ParticleProblem:
 
     def solve(
         self,
-        steps: int = 1,
+        steps: int | str = 1,
         update: Callable[[float], None] | None = None,
         progress: bool = False,
         repartition: float | None = None,
         control: DisplacementControl | None = None,
+        *,
+        tolerance: float = 1e-2,
+        output_at: Sequence[float] = (),
+        first_step: float = 0.05,
+        length: float | None = None,
     ) -> History:
         """Apply the whole load.
 
         Args:
-            steps: Number of equal load steps; a step that fails is halved, none is larger.
+            steps: Number of equal load steps; a step that fails is halved, none is larger. With
+                ``"auto"`` their sizes are chosen by an estimate of their error, and steps
+                with too large a one are taken back.
             update: The user's path: ``update(t)`` sets values of Dirichlet conditions,
                 Constants and Functions to their totals at t in (0, 1]. It may be called again
                 with a smaller t after a failure. The load factor goes from its present value
@@ -691,8 +702,15 @@ class ParticleProblem:
             progress: Whether rank 0 shows a progress bar.
             repartition: Share of the particles that makes them move to other ranks after a
                 step (:meth:`QuasiStaticProblem.repartition`); ``None`` leaves them.
-            control: A displacement of a body that goes to a value in equal steps; the load
+            control: A displacement of a body that goes to a value in these steps; the load
                 factor is found for each, which may fall again. Dirichlet values stay.
+            tolerance: With ``"auto"``: error of the displacement at the end that is aimed at,
+                relative to the motion of the run, as root mean squares over the nodes.
+            output_at: With ``"auto"``: shares t of the run in (0, 1] at which a step is to end, to
+                the last bit; ``step.output`` says so.
+            first_step: With ``"auto"``: size of the first step, at most 0.05 of the run.
+            length: With ``"auto"``: a motion to be expected, by which the error is measured instead
+                of the motion so far.
 
         Returns:
             The history of the run.
@@ -702,17 +720,32 @@ class ParticleProblem:
                 ``outside="stop"`` a particle that leaves the background is no error: the run
                 ends, ``history.stopped`` and a warning say why.
         """
-        path = self.steps(steps, update, repartition, control)
-        for _ in with_bar(path, steps, self._share) if progress and self._comm.rank == 0 else path:
+        path = self.steps(
+            steps,
+            update,
+            repartition,
+            control,
+            tolerance=tolerance,
+            output_at=output_at,
+            first_step=first_step,
+            length=length,
+        )
+        number = 1 if isinstance(steps, str) else steps
+        for _ in with_bar(path, number, self._share) if progress and self._comm.rank == 0 else path:
             pass
         return self.history
 
     def steps(
         self,
-        steps: int,
+        steps: int | str,
         update: Callable[[float], None] | None = None,
         repartition: float | None = None,
         control: DisplacementControl | None = None,
+        *,
+        tolerance: float = 1e-2,
+        output_at: Sequence[float] = (),
+        first_step: float = 0.05,
+        length: float | None = None,
     ) -> Iterator[Step]:
         """Apply the whole load, one converged step at a time.
 
@@ -723,6 +756,10 @@ class ParticleProblem:
             update: As in :meth:`solve`.
             repartition: As in :meth:`solve`.
             control: As in :meth:`solve`.
+            tolerance: As in :meth:`solve`.
+            output_at: As in :meth:`solve`.
+            first_step: As in :meth:`solve`.
+            length: As in :meth:`solve`.
 
         Yields:
             Each converged step.
@@ -731,10 +768,30 @@ class ParticleProblem:
             MPMError: As in :meth:`solve`.
         """
         self._require_governing()
+        automatic = {
+            "tolerance": tolerance,
+            "output_at": output_at,
+            "first_step": first_step,
+            "length": length,
+        }
         require_same(
-            self._comm, steps=steps, update=update, repartition=repartition, control=control
+            self._comm,
+            steps=steps,
+            update=update,
+            repartition=repartition,
+            control=control,
+            **automatic,
         )
-        return self._stepper.steps(steps, update, repartition, control)
+        if isinstance(steps, str) and steps == "auto":
+            chosen: Any = ErrorControl(tolerance, output_at, first_step, length)
+        elif automatic != AUTOMATIC:
+            raise MPMError(
+                "tolerance=, output_at=, first_step= and length= are for steps='auto', not for "
+                f"steps={steps!r}."
+            )
+        else:
+            chosen = steps
+        return self._stepper.steps(chosen, update, repartition, control)
 
     def _share(self, _: Step) -> float:
         """Return how much of the run is done."""

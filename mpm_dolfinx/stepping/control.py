@@ -4,15 +4,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
 
-__all__ = ["Converged", "Progress", "Run", "StepControl"]
+__all__ = ["Control", "Converged", "Progress", "Run", "StepControl"]
 
 #: How often a step may be halved, and the linear solves of a step that is easy.
 MOST_HALVINGS = 10
@@ -24,6 +25,45 @@ PATIENCE = 3
 #: over counts as a limit.
 LIMIT_HALVINGS = 6
 LIMIT_WIDTH = 1e-3
+
+
+class Control(Protocol):
+    """Chooses the end of the next step between 0 and 1.
+
+    Attributes:
+        steps: What :meth:`ParticleProblem.solve` was given.
+    """
+
+    steps: Any
+
+    @property
+    def asked(self) -> list[Any]:
+        """What a run that goes on from a checkpoint must have in common with it."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether the whole load is reached."""
+
+    @property
+    def share(self) -> float:
+        """How much is done."""
+
+    @property
+    def target(self) -> float:
+        """End of the step to try."""
+
+    @property
+    def lands(self) -> bool:
+        """Whether the step to try ends at a level that was asked for."""
+
+    def accept(self, iterations: int) -> None:
+        """Go to the target, in so many linear solves."""
+
+    def begin_anew(self) -> None:
+        """Begin anew, after what made steps fail has changed."""
+
+    def cut_back(self, no_equilibrium: bool = False) -> bool:
+        """Make the step smaller; return False where it is at its smallest, or a limit is found."""
 
 
 class StepControl:
@@ -48,6 +88,20 @@ class StepControl:
         self._failed: int | None = None
         self._moved = self._wary = self._trying = False
         self._taken, self._patience = 0, PATIENCE
+
+    @property
+    def asked(self) -> list[Any]:
+        """What a run that goes on from a checkpoint must have in common with it."""
+        return [self.steps]
+
+    def __str__(self) -> str:
+        """Return how many steps there are, for a sentence."""
+        return f"{self.steps} steps"
+
+    @property
+    def lands(self) -> bool:
+        """Whether the step to try ends at a level that was asked for: at the end."""
+        return self.target == 1.0
 
     @property
     def finished(self) -> bool:
@@ -148,7 +202,7 @@ class Run:
         held: How much of what a stage changes was held back at its beginning.
     """
 
-    control: StepControl
+    control: Control
     path: bool
     start: float
     base: list[NDArray[np.float64]]
@@ -193,6 +247,16 @@ class Run:
         return self.start + (goal - self.start) * self.control.target
 
     @property
+    def size(self) -> float:
+        """How much the step to try is of the load, the time or the controlled displacement."""
+        share = self.control.target - self.control.share
+        if self.end is not None:
+            return share * (self.end - self.began)
+        if self.shares:
+            return share
+        return share * ((1.0 if self.goal is None else self.goal) - self.start)
+
+    @property
     def limit(self) -> str:
         """What it means, and what to do, if there is no equilibrium up to the end of this step."""
         found = "no equilibrium was found up to"
@@ -220,14 +284,17 @@ class Run:
         t = self.control.target
         return [base + (total - base) * t for base, total in zip(self.base, totals, strict=True)]
 
-    def require(self, steps: int, path: bool, goal: float | None, end: float | None = None) -> None:
-        """Raise an error unless this run has so many steps, and such a path, control or end."""
-        if (steps, path, goal, end) != (self.control.steps, self.path, self.goal, self.end):
+    def require(
+        self, control: Control, path: bool, goal: float | None, end: float | None = None
+    ) -> None:
+        """Raise an error unless this run has such steps, and such a path, control or end."""
+        asked = control.asked, path, goal, end
+        if asked != (self.control.asked, self.path, self.goal, self.end):
             kind = "update=..." if self.path else "no path (update=None)"
             if self.goal is not None:
                 kind = f"displacement control to {self.goal:g}"
             raise MPMError(
-                f"The checkpoint was made in a run of {self.control.steps} steps with {kind}; "
+                f"The checkpoint was made in a run of {self.control!s} with {kind}; "
                 "go on with these, or restore it with resume=False to begin a new run."
             )
 
@@ -244,16 +311,22 @@ class Run:
         }
 
     @classmethod
-    def of(cls, numbers: dict[str, Any], base: list[NDArray[np.float64]], time: float) -> Self:
+    def of(
+        cls,
+        numbers: dict[str, Any],
+        base: list[NDArray[np.float64]],
+        time: float,
+        make: Callable[[dict[str, Any]], Control],
+    ) -> Self:
         """Return the run that gave these numbers.
 
         Args:
             numbers: What :meth:`numbers` returned.
             base: The Dirichlet values, for each field.
             time: Time of its last step, from which files of before must tell when it began.
+            make: Makes the control of its attributes.
         """
-        control = StepControl(numbers["control"]["steps"])
-        vars(control).update(numbers["control"])
+        control = make(numbers["control"])
         began = numbers.get("began", time - control.share)
         goal, end = numbers.get("goal"), numbers.get("end")
         held = numbers.get("held", 0.0)

@@ -22,7 +22,7 @@ from ..errors import (
     agree,
     on_all_ranks,
 )
-from ..history import History, Step
+from ..history import Attempt, History, Step
 from ..log import STEPS, tell
 from ..parallel.garbage import Cleaner
 from ..parallel.interruption import Hold, Interrupted, held, interrupted, settle
@@ -31,7 +31,8 @@ from ..solvers.newton import NewtonSolver, ReducedProblem
 from ..system.conditions import dirichlet_values
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
-from .control import Converged, Progress, Run, StepControl
+from .automatic import ErrorControl, error_of_step
+from .control import Control, Converged, Progress, Run, StepControl
 from .diagnosis import count_folded, placed
 from .displacement_control import ControlledSystem, DisplacementControl
 from .leaving import may_stop, move_bodies
@@ -177,7 +178,7 @@ class Stepper:
 
     def steps(
         self,
-        steps: int,
+        steps: int | ErrorControl,
         update: Path | None,
         repartition: float | None,
         control: DisplacementControl | None,
@@ -186,7 +187,7 @@ class Stepper:
         """Apply the whole load: see :meth:`ParticleProblem.steps`.
 
         Args:
-            steps: As there.
+            steps: As there; ``"auto"`` with what goes with it is an :class:`ErrorControl`.
             update: As there; through time it is called with the time.
             repartition: As there.
             control: As there.
@@ -202,14 +203,18 @@ class Stepper:
     def _steps(
         self,
         owner: Owner,  # which the iterator keeps alive
-        steps: int,
+        steps: int | ErrorControl,
         update: Path | None,
         repartition: float | None,
         control: DisplacementControl | None,
         span: tuple[float, float] | None,
     ) -> Iterator[Step]:
-        if not isinstance(steps, int | np.integer) or steps < 1:
-            raise MPMError(f"The number of steps must be a whole number from 1 on, not {steps!r}.")
+        if isinstance(steps, int | np.integer) and steps >= 1:
+            chosen: Control = StepControl(int(steps))
+        elif isinstance(steps, ErrorControl):
+            chosen = steps
+        else:
+            raise MPMError(f"steps must be a whole number from 1 on or 'auto', not {steps!r}.")
         if update is not None:
             update = on_all_ranks(self._comm, update)
         if control is not None and not isinstance(control, DisplacementControl):
@@ -219,7 +224,7 @@ class Stepper:
         # them out of what the others go on with.
         with held() if comm.size > 1 else nullcontext(Hold()) as hold:
             last = Hold()
-            run = self._begin(int(steps), update, control, span)
+            run = self._begin(chosen, update, control, span)
             may_split = any(body.on_distortion == "split" for body in owner.bodies)
             if control is not None and (repartition is not None or may_split):
                 control.require_movable()
@@ -267,13 +272,12 @@ class Stepper:
             if update is not None:
                 update(t if run.end is None else run.time)
             values = run.dirichlet_values(self._totals())
-            step = self._advance(end, values, run.time, t == 1.0, control)
+            step = self._advance(end, values, run, control)
         except Interrupted:
             self.go_back()
             self._leave(update)
         except (ConvergenceError, DomainDistortionError) as error:
-            self.go_back()
-            owner.history.failed_iterations += self.newton.iterations
+            self._take_back(run.size, end, str(error))
             no_equilibrium = self.newton.no_equilibrium
             if run.control.cut_back(no_equilibrium):
                 owner.history.cutbacks += 1
@@ -300,8 +304,43 @@ class Stepper:
         except BaseException:
             self.go_back()
             raise
-        run.control.accept(step.iterations)
+        if step is not None:
+            run.control.accept(step.iterations)
         return step
+
+    def _take_back(self, size: float, end: float, reason: str) -> None:
+        """Return to the last converged step, and take note of what is lost (collective)."""
+        self.go_back()
+        history, iterations = self.owner.history, self.newton.iterations
+        history.failed_iterations += iterations
+        history.taken_back.append(Attempt(end, size, iterations, reason))
+
+    def _reject(self, run: Run, size: float, end: float) -> bool:
+        """Take a converged step back whose error is too large, if steps are chosen by it.
+
+        Args:
+            run: The run.
+            size: Size of the step, as it was begun.
+            end: Load factor, parameter or displacement at its end.
+        """
+        control = run.control
+        if not isinstance(control, ErrorControl):
+            return False
+        ratio = control.judge(error_of_step(self._reduced, size, self._comm))
+        tried = run.size
+        if not control.reject():
+            return False
+        self._take_back(tried, end, f"its error was estimated {ratio:.3g} times the allowed one")
+        self.owner.history.statistics.count("rejected_steps")
+        tell(
+            self._comm,
+            STEPS,
+            "rejected: the step of %.6g to %.6g, with %.3g times the allowed error",
+            tried,
+            end,
+            ratio,
+        )
+        return True
 
     def _leave(self, update: Path | None = None) -> NoReturn:
         """Obey Ctrl-C on all ranks, at the last converged step (collective)."""
@@ -318,7 +357,8 @@ class Stepper:
             try:
                 load = float(owner.bodies[0].load.value)
                 self._set_load(load, self.converged.proportional)
-                step = self._advance(load, self._totals(), owner.history.stage + 1.0, last=True)
+                step = self._advance(load, self._totals())
+                assert step is not None
             except Interrupted:
                 self.go_back()
                 self._leave()
@@ -355,7 +395,7 @@ class Stepper:
 
     def _begin(
         self,
-        steps: int,
+        steps: Control,
         update: Path | None,
         control: DisplacementControl | None,
         span: tuple[float, float] | None,
@@ -379,8 +419,7 @@ class Stepper:
         if start == goal:
             raise MPMError("The controlled displacement has its value already.")
         self._begins = False
-        if self._reduced.predictor is not None:
-            self._reduced.predictor.clear()
+        self._reduced.predictor.clear(isinstance(steps, ErrorControl))
         base = [values.copy() for values in self.converged.prescribed]
         began = self.owner.history.stage
         end = None
@@ -388,7 +427,7 @@ class Stepper:
             began, end = span
             self.converged.parameter = began
         self.run = Run(
-            StepControl(steps),
+            steps,
             update is not None,
             start,
             base,
@@ -405,14 +444,13 @@ class Stepper:
         self,
         parameter: float,
         values: list[NDArray[np.float64]],
-        time: float,
-        last: bool,
+        run: Run | None = None,
         control: DisplacementControl | None = None,
-    ) -> Step:
-        """Solve one step to Dirichlet totals, and commit it.
+    ) -> Step | None:
+        """Solve one step to Dirichlet totals, and commit it, or return ``None``: it is rejected.
 
-        Unless it is the last one it must leave all particles inside the background. Under
-        displacement control the parameter is the displacement.
+        Unless it is the last one of a run, or alone, it must leave all particles inside the
+        background. Under displacement control the parameter is the displacement.
         """
         owner, reduced = self.owner, self._reduced
         owner.begin_step()
@@ -430,9 +468,15 @@ class Stepper:
         self.newton.solve(system, reduced.sizes, shorten=self.run is not None)
         if (failure := owner.improper()) is not None:
             raise failure
+        if run is not None and self._reject(run, size, parameter):
+            self.newton.experience = experience
+            return None
         if control is not None:
             parameter = float(owner.bodies[0].load.value)
         before = [body.converged_displacement for body in owner.bodies]
+        last = run is None or run.control.target == 1.0
+        time = owner.history.stage + 1.0 if run is None else run.time
+        output = run is None or run.control.lands
         move_bodies(owner.bodies, owner.history, owner.masses, parameter, last)
         with owner.history.statistics.phase("commit"):
             try:
@@ -451,7 +495,8 @@ class Stepper:
             count_folded(owner.bodies, owner.history.statistics)
             self._clean_up()
         newton = self.newton
-        step = Step(parameter, newton.iterations, list(newton.residuals), displacement, time)
+        residuals = list(newton.residuals)
+        step = Step(parameter, newton.iterations, residuals, displacement, time, output)
         owner.history.steps.append(step)
         tell(
             self._comm,

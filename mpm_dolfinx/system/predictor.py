@@ -23,10 +23,19 @@ class Predictor:
     The increment over the size of its step is a velocity at the middle of the step; two of them
     give the next by a straight line, one by a constant. All of it lives on the bodies' nodes:
     the background is another one in each step.
+
+    Args:
+        predicts: Whether it does; else it takes notes only for those who measure errors by them.
+
+    Attributes:
+        moved: Sum of the increments since :meth:`clear`, if that was asked for: empty before the
+            first.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, predicts: bool = True) -> None:
+        self._predicts = predicts
         self._past: list[tuple[float, Increments]] = []
+        self.moved: Increments | None = None
 
     @property
     def past(self) -> list[tuple[float, Increments]]:
@@ -37,9 +46,14 @@ class Predictor:
     def past(self, steps: list[tuple[float, Increments]]) -> None:
         self._past = list(steps)
 
-    def clear(self) -> None:
-        """Forget the past."""
+    def clear(self, measures: bool = False) -> None:
+        """Forget the past.
+
+        Args:
+            measures: Whether to note the motion from now on, for steps chosen by their errors.
+        """
         self._past = []
+        self.moved = [] if measures else None
 
     def record(self, size: float, increments: Increments) -> None:
         """Take note of a converged step.
@@ -48,9 +62,12 @@ class Predictor:
             size: Its size, in load factor or parameter of the path.
             increments: Change of displacement on this rank's own dofs of W, for each body.
         """
+        if self.moved is not None:
+            before = self.moved or [np.zeros_like(u) for u in increments]
+            self.moved = [d + u for d, u in zip(before, increments, strict=True)]
         if size <= 0.0:
-            self.clear()
-        else:
+            self._past = []
+        elif self._predicts or self.moved is not None:
             self._past = [*self._past[-1:], (size, increments)]
 
     def increments(self, size: float) -> Increments | None:
@@ -59,7 +76,7 @@ class Predictor:
         Args:
             size: Size of the step.
         """
-        if not self._past or size <= 0.0:
+        if not self._predicts or not self._past or size <= 0.0:
             return None
         last, now = self._past[-1]
         velocities = [d / last for d in now]

@@ -46,7 +46,7 @@ class ReducedSystem:
         fields: The background spaces that move them.
         terms: What acts on them.
         statistics: Where to count.
-        predictor: Says what increment to expect; ``None`` for none.
+        predictor: Says what increment to expect.
 
     Attributes:
         bodies: As given.
@@ -62,7 +62,7 @@ class ReducedSystem:
         fields: Sequence[Field],
         terms: Sequence[Term],
         statistics: Statistics,
-        predictor: Predictor | None = None,
+        predictor: Predictor,
     ) -> None:
         self.bodies = list(bodies)
         self.fields = list(fields)
@@ -232,9 +232,11 @@ class ReducedSystem:
     def end(self) -> None:
         """Take note of the increments; forget the unknowns, since the bodies have moved."""
         self.forget()
-        if self.predictor is not None:
-            increments = [motion.increment() for _, motion in self._places]
-            self.predictor.record(self._size, increments)
+        self.predictor.record(self._size, self.increments())
+
+    def increments(self) -> list[NDArray[np.float64]]:
+        """Return the last change of displacement of each body, on this rank's own dofs of W."""
+        return [motion.increment() for _, motion in self._places]
 
     def forget(self) -> None:
         """Forget the unknowns."""
@@ -560,8 +562,6 @@ class ReducedSystem:
         """Return the unknowns to expect at the step's end, if a term or the past says any."""
         if self._start is not None:
             return self._start.copy()
-        if self.predictor is None:
-            return None
         increments = self.predictor.increments(self._size)
         if increments is None:
             return None

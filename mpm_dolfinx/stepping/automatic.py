@@ -1,0 +1,258 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Load steps chosen by an estimate of their error, and taken back where it is too large."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+
+from ..errors import MPMError
+from ..parallel.magnitudes import joint_norm
+from ..particles.particles import Particles
+from ..system.reduced import ReducedSystem
+from .control import LIMIT_HALVINGS, LIMIT_WIDTH, MOST_HALVINGS, Control, StepControl
+
+__all__ = ["ErrorControl", "StepError", "control_of", "error_of_step"]
+
+#: The largest first step: one that walks from the elastic range into flow leaves an error that
+#: nothing repairs.
+FIRST = 0.05
+#: Factor to the next step, at least and at most, and share of the one that would just do.
+LEAST, MOST, SAFETY = 0.2, 2.0, 0.9
+#: Exponents of a step's error and of that of the step before, in a PI controller of order two.
+PROPORTIONAL, INTEGRAL = 0.35, 0.2
+#: Error over the allowed one from which a step is taken back.
+REJECTED = 4.0
+#: What the error of a step counts in which nothing yields: what is left of it in the end.
+ELASTIC = 0.02
+#: Factor of the tolerance where errors are compared with the motion so far, or with a length.
+OF_MOTION, OF_LENGTH = 8.0, 5.0
+#: Share of what is left to the next level from which a step covers half of it.
+HALF = 0.5
+
+
+@dataclass(frozen=True)
+class StepError:
+    """What is estimated of a step that has converged and is not committed yet.
+
+    Attributes:
+        error: Its error, the root mean square over the nodes of all bodies.
+        motion: Motion of the run up to its end, likewise.
+        smooth: Whether no history has changed in it, nor contact.
+    """
+
+    error: float
+    motion: float
+    smooth: bool
+
+
+def error_of_step(reduced: ReducedSystem, size: float, comm: MPI.Comm) -> StepError:
+    """Estimate the error of the step that was solved last, in displacements (collective).
+
+    The second difference ``D^2 / (D + D') |u / D - u' / D'|`` of its increment u and that of the
+    step before, of sizes D and D'; half of the increment in the first step.
+
+    Args:
+        reduced: The system, its last residual that of the solution.
+        size: Size of the step.
+        comm: The ranks.
+    """
+    past = reduced.predictor
+    bodies = [i for i, moved in enumerate(reduced.bodies) if isinstance(moved, Particles)]
+    every = reduced.increments()
+    increments = [every[i] for i in bodies]
+    error = [0.5 * u for u in increments]
+    if past.past:
+        last, before = past.past[-1]
+        weight = size / (size + last)
+        error = [
+            weight * (u - size / last * before[i]) for i, u in zip(bodies, increments, strict=True)
+        ]
+    moved = increments
+    if past.moved:
+        moved = [past.moved[i] + u for i, u in zip(bodies, increments, strict=True)]
+    gdim = reduced.bodies[bodies[0]].W.mesh.geometry.dim
+    nodes = comm.allreduce(sum(len(u) for u in increments)) / gdim
+    rms = [joint_norm(np.concatenate(values), comm) / math.sqrt(nodes) for values in (error, moved)]
+    return StepError(rms[0], rms[1], reduced.smooth())
+
+
+class ErrorControl:
+    """Chooses the end of the next step between 0 and 1 by the errors of the steps before.
+
+    With ``q = w e / ((8 tolerance)^2 |d|)`` of a step's error e and the motion |d| of the run so
+    far, or ``w e / ((5 tolerance)^2 length)``, the next step is larger by
+    ``0.9 q^-0.35 q_before^0.2`` (a PI controller: Gustafsson 1991), and one with q > 4 is taken
+    back; w is 1, or 0.02 where nothing yields. The error of the run is then in proportion to the
+    tolerance.
+
+    Args:
+        tolerance: Error allowed in the end, relative to the motion.
+        output_at: Shares of the run at which a step is to end.
+        first_step: The first step.
+        length: Compare with it, and not with the motion so far.
+
+    Attributes:
+        steps: ``"auto"``.
+
+    Raises:
+        MPMError: Numbers that make no sense.
+    """
+
+    def __init__(
+        self,
+        tolerance: float = 1e-2,
+        output_at: Sequence[float] = (),
+        first_step: float = FIRST,
+        length: float | None = None,
+    ) -> None:
+        given = {"tolerance": (tolerance, 1.0), "first_step": (first_step, FIRST)}
+        if length is not None:
+            given["length"] = (length, math.inf)
+        for name, (value, most) in given.items():
+            known = isinstance(value, float | int | np.number) and not isinstance(value, bool)
+            if not (known and 0.0 < value <= most and math.isfinite(value)):
+                bound = "" if most == math.inf else f" up to {most:g}"
+                raise MPMError(f"{name} must be a positive number{bound}, not {value!r}.")
+        try:
+            levels = sorted({float(t) for t in output_at} - {1.0})
+        except (TypeError, ValueError):
+            levels = [math.nan]
+        if not all(0.0 < t < 1.0 for t in levels):
+            raise MPMError(
+                "output_at must be a list of shares of the run, larger than 0 and up to 1, not "
+                f"{output_at!r}."
+            )
+        self.steps: Any = "auto"
+        self._tolerance, self._first = float(tolerance), float(first_step)
+        self._length = None if length is None else float(length)
+        self._levels = [*levels, 1.0]
+        self._now = 0.0
+        self._size = self._first
+        self._before: float | None = None
+        self._ratio = 0.0
+        self._holds = False
+
+    @property
+    def asked(self) -> list[Any]:
+        """What a run that goes on from a checkpoint must have in common with it."""
+        return [self.steps, self._tolerance, self._first, self._length, self._levels]
+
+    def __str__(self) -> str:
+        """Return how the steps are chosen, for a sentence."""
+        levels = ", ".join(f"{t:g}" for t in self._levels[:-1])
+        return (
+            f"steps chosen by tolerance={self._tolerance:g}, first_step={self._first:g}, "
+            f"length={self._length}, output_at=[{levels}]"
+        )
+
+    @property
+    def finished(self) -> bool:
+        """Whether the whole load is reached."""
+        return self._now == 1.0
+
+    @property
+    def share(self) -> float:
+        """How much is done."""
+        return self._now
+
+    @property
+    def lands(self) -> bool:
+        """Whether the step to try ends at one of the levels that were asked for."""
+        return self.target in self._levels
+
+    @property
+    def _level(self) -> float:
+        return next(t for t in self._levels if t > self._now)
+
+    @property
+    def _least(self) -> float:
+        return self._first / float(2**MOST_HALVINGS)
+
+    @property
+    def target(self) -> float:
+        """End of the step to try: a level, or no further than halfway to the next."""
+        level = self._level
+        left = level - self._now
+        if self._size >= left * (1.0 - 1e-9):
+            return level
+        return self._now + min(self._size, HALF * left)
+
+    def judge(self, found: StepError) -> float:
+        """Return the error of the step that was tried, over the allowed one.
+
+        Args:
+            found: What is estimated.
+        """
+        if self._length is None:
+            allowed = (OF_MOTION * self._tolerance) ** 2 * found.motion
+        else:
+            allowed = (OF_LENGTH * self._tolerance) ** 2 * self._length
+        error = found.error * (ELASTIC if found.smooth else 1.0)
+        self._ratio = error / allowed if error > 0.0 else 0.0
+        return self._ratio
+
+    def reject(self) -> bool:
+        """Make the step smaller that was judged last, if its error is too large; tell whether.
+
+        The first one is not, nor the smallest.
+        """
+        tried = self.target - self._now
+        first = self._before is None
+        if self._ratio <= REJECTED or first or tried <= self._least:
+            return False
+        self._size = max(tried * max(LEAST, SAFETY / math.sqrt(self._ratio)), self._least)
+        return True
+
+    def accept(self, iterations: int) -> None:
+        """Go to the target, and choose the next step by the error that was judged last."""
+        now = self.target
+        tried = now - self._now
+        ratio = max(self._ratio, 1e-12)
+        factor = SAFETY * float(ratio**-PROPORTIONAL)
+        if self._before is None:
+            factor = SAFETY / math.sqrt(ratio)
+        else:
+            factor *= float(self._before**INTEGRAL)
+        factor = min(max(factor, LEAST), 1.0 if self._holds else MOST)
+        size = tried * factor
+        # A step that was shortened says nothing against one of the size before.
+        shortened = tried < self._size / 1.2
+        self._size = max(size, self._size) if shortened and factor >= 1.0 else size
+        self._size = max(self._size, self._least)
+        self._now, self._before, self._holds = now, ratio, False
+
+    def begin_anew(self) -> None:
+        """Try a step as at the beginning, after what made smaller ones fail has changed."""
+        self._size, self._before, self._holds = self._first, None, False
+
+    def cut_back(self, no_equilibrium: bool = False) -> bool:
+        """Halve the step; return False where it is at its smallest, or a limit is found.
+
+        Args:
+            no_equilibrium: As in :meth:`StepControl.cut_back`.
+        """
+        tried = self.target - self._now
+        limit = tried <= self._first / 2**LIMIT_HALVINGS and tried <= LIMIT_WIDTH * self._now
+        if tried <= self._least or (no_equilibrium and limit):
+            return False
+        self._size, self._holds = max(0.5 * tried, self._least), True
+        return True
+
+
+def control_of(attributes: dict[str, Any]) -> Control:
+    """Return the control that has these attributes, for a run from a checkpoint."""
+    control: Control
+    if "_tolerance" in attributes:
+        control = ErrorControl()
+    else:
+        control = StepControl(attributes["steps"])
+    vars(control).update(attributes)
+    return control

@@ -1,0 +1,267 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Load steps chosen by a tolerance: their sizes, their errors, and what is taken back."""
+
+import numpy as np
+import pytest
+import scenes
+from compare import EXACT, outcome, raises, same_run
+from scenes import QUADRILATERAL, TRIANGLE, WORLD, pulled
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.materials import Hencky
+from mpm_dolfinx.stepping.automatic import ErrorControl, StepError
+
+LEVELS = (0.3, 0.55)
+
+
+def column(weight=20e3, cell=QUADRILATERAL, **options):
+    """Return a column of 4 x 8 m that flows under its weight, on cells of 1 m."""
+    return scenes.slump(cell, weight, h=1.0, **options)
+
+
+def distance(a, b):
+    """Return the root mean square of a difference at the nodes, over that of b."""
+    return np.sqrt(np.sum((a - b) ** 2) / np.sum(b**2))
+
+
+def walk(control, ratio):
+    """Accept steps whose error over the allowed one a function of (start, end) gives."""
+    ends = []
+    while not control.finished:
+        start, end = control.share, control.target
+        control.judge(StepError(ratio(start, end), (8.0 * control.asked[1]) ** -2, False))
+        if not control.reject():
+            control.accept(5)
+            ends.append(end)
+    return ends
+
+
+def test_steps_land_on_levels():
+    ends = walk(ErrorControl(0.01, [0.7, 0.1, 1.0, 1 / 3]), lambda start, end: 0.0)
+    # Twice as large each time; no further than half of what is left to a level.
+    assert ends[:2] == [0.05, 0.1] and ends[-1] == 1.0
+    assert 1 / 3 in ends and 0.7 in ends
+    halves = [b - a for a, b in zip([0.1, *ends[2:]], ends[2:], strict=False)]
+    assert halves[:2] == pytest.approx([0.1, 1 / 3 - 0.2])
+
+
+def test_steps_go_on_after_a_level_as_before():
+    ends = walk(ErrorControl(0.01, [0.3001]), lambda start, end: ((end - start) / 0.1) ** 2)
+    sizes = np.diff([0.0, *ends])
+    after = ends.index(0.3001) + 1
+    # (ratio = 0.5 is where 0.9 ratio^-0.35 ratio^0.2 is 1: steps of 0.07)
+    assert sizes[after - 2] == sizes[after - 1] < 0.05 and sizes[after] > 0.065
+    assert sizes[after:-2] == pytest.approx(0.07, rel=0.13)
+
+
+def test_a_step_with_too_large_an_error_is_taken_back():
+    control = ErrorControl(0.01)
+    tried = []
+
+    def ratio(start, end):
+        tried.append((start, end))
+        return 1.0 if start < 0.05 else 9.0 if end - start > 0.03 else 1.0
+
+    ends = walk(control, ratio)
+    assert tried[1] == (0.05, pytest.approx(0.095))
+    assert tried[2] == (0.05, pytest.approx(0.05 + 0.9 / 3.0 * 0.045))
+    assert all(start != tried[i + 1][0] or i == 1 for i, (start, _) in enumerate(tried[:2], 0))
+    assert ends[0] == 0.05
+
+
+def test_a_step_that_failed_is_halved_and_does_not_grow_at_once():
+    control = ErrorControl(0.01)
+    assert control.cut_back() and control.target == 0.025
+    control.judge(StepError(0.0, 1.0, True))
+    control.accept(3)
+    assert control.target == 0.05
+    control.accept(3)
+    assert control.target == pytest.approx(0.1)
+    while control.cut_back():
+        pass
+    assert control.target - 0.05 == pytest.approx(0.05 / 1024)
+    control.begin_anew()
+    assert control.target == pytest.approx(0.1)
+
+
+def test_sizes_follow_the_second_difference():
+    # The same, from displacements alone: e = D^2 / (D + D') |u / D - u' / D'|.
+    tolerance = 0.06
+    problem = column()
+    d, ends, yielded = [np.zeros_like(nodal(problem))], [0.0], []
+    before = 0.0
+    for step in problem.steps("auto", tolerance=tolerance):
+        d.append(nodal(problem))
+        ends.append(step.load)
+        now = float(np.sum(problem.particles.plastic_strain))
+        yielded.append(WORLD.allreduce(now) > before)
+        before = WORLD.allreduce(now)
+    u, D = np.diff(d, axis=0), np.diff(ends)
+    ratio = [1.0 if yielded[0] else 0.02]
+    ratio[0] *= 0.5 / (8 * tolerance) ** 2
+    for k in range(1, len(D)):
+        e = D[k] ** 2 / (D[k] + D[k - 1]) * (u[k] / D[k] - u[k - 1] / D[k - 1])
+        weight = 1.0 if yielded[k] else 0.02
+        motion = (8 * tolerance) ** 2 * np.linalg.norm(d[k + 1])
+        ratio.append(weight * np.linalg.norm(e) / motion)
+    assert max(ratio[1:]) <= 4.0
+    checked = 0
+    starts = [attempt.load - attempt.size for attempt in problem.history.taken_back]
+    for k in range(1, len(D) - 1):
+        expected = D[k] * np.clip(0.9 * ratio[k] ** -0.35 * ratio[k - 1] ** 0.2, 0.2, 2.0)
+        if np.isclose(starts, ends[k + 1]).any() or expected > 0.5 * (1.0 - ends[k + 1]):
+            continue  # what was tried first was larger
+        assert D[k + 1] == pytest.approx(expected, rel=1e-6)
+        checked += 1
+    assert checked >= 8
+
+
+def nodal(problem):
+    """Return the displacements of all nodes, of all ranks, in the order of their numbers."""
+    W = problem.particles.W
+    own = problem.particles.converged_displacement[: W.dofmap.index_map.size_local * 2]
+    return np.concatenate(WORLD.allgather(own))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("weight", "cell"), [(20e3, QUADRILATERAL), (80e3, TRIANGLE)])
+def test_the_error_is_within_the_tolerance(weight, cell):
+    width = weight / 1e3
+    reference = column(weight, cell, width=width)
+    reference.solve(steps=320)
+    exact = nodal(reference)
+    for tolerance in (0.04, 0.02):
+        problem = column(weight, cell, width=width)
+        history = problem.solve("auto", tolerance=tolerance)
+        assert distance(nodal(problem), exact) <= tolerance
+        assert history.load[-1] == 1.0 and len(history.steps) < 80
+
+
+def test_output_and_what_was_taken_back():
+    problem = column()
+    for step in problem.steps("auto", tolerance=0.06, output_at=LEVELS):
+        assert step.output == (step.load in (*LEVELS, 1.0))
+    history = problem.history
+    assert {*LEVELS, 1.0} <= set(history.load)
+    rejected = [a for a in history.taken_back if "times the allowed" in a.reason]
+    assert len(rejected) == history.statistics["rejected_steps"] >= 1
+    assert history.failed_iterations == sum(a.iterations for a in history.taken_back)
+    for attempt in rejected:
+        start = attempt.load - attempt.size
+        k = int(np.argmin(np.abs(np.array(history.load) - start)))
+        assert history.load[k] == pytest.approx(start) and history.load[k + 1] < attempt.load
+
+
+def test_a_rejected_step_leaves_no_trace():
+    # A run from the state before it goes the same way.
+    problem = column()
+    states = []
+    for _ in problem.steps("auto", tolerance=0.06):
+        states.append(nodal(problem))
+    other = column()
+    loads = [0.0, *problem.history.load]
+    assert problem.history.statistics["rejected_steps"] >= 1
+    for load, expected in zip(loads[1:], states, strict=True):
+        other.particles.load.value = load
+        other.step()
+        np.testing.assert_allclose(nodal(other), expected, rtol=0, atol=1e-7 * np.ptp(expected))
+
+
+def test_failures_are_cut_back():
+    failures = []
+
+    class Sulky(Hencky):
+        def update(self, displacement_gradient, state, tangent=True):
+            if len(failures) < 3:
+                failures.append(1)
+                raise mpm.ConvergenceError("Not yet", [0] if len(displacement_gradient) else [])
+            return super().update(displacement_gradient, state, tangent)
+
+    problem, _ = pulled(Sulky(1e3, 0.3), end=0.1, line_search=False)
+    history = problem.solve("auto")
+    assert history.cutbacks == 3 and len(history.taken_back) == 3
+    assert all("Not yet" in attempt.reason for attempt in history.taken_back)
+    assert [a.size for a in history.taken_back] == [0.05, 0.025, 0.0125]
+    # What follows a failure is no larger, and what follows that at most twice as large.
+    assert history.load[0] == 0.00625 and history.load[-1] == 1.0
+    assert history.load[1] <= 0.0125 and history.load[2] <= 0.025
+
+
+@pytest.mark.parametrize("predictor", [True, False])
+def test_a_run_goes_on_from_a_checkpoint(mpi_tmp_path, predictor):
+    options = {"tolerance": 0.1, "output_at": LEVELS}
+    problem = column(predictor=predictor)
+    for number, _ in enumerate(problem.steps("auto", **options)):
+        if number == 5:
+            problem.save(mpi_tmp_path / "state")
+    resumed = column(predictor=predictor)
+    resumed.restore(mpi_tmp_path / "state")
+    raises(
+        lambda: resumed.solve("auto", tolerance=0.02, output_at=LEVELS),
+        mpm.MPMError,
+        r"steps chosen by tolerance=0.1, .*output_at=\[0.3, 0.55\]",
+    )
+    raises(lambda: resumed.solve(10), mpm.MPMError, r"steps chosen by tolerance=0.1")
+    resumed.solve("auto", **options)
+    assert resumed.history.load == problem.history.load
+    assert resumed.history.taken_back == problem.history.taken_back
+    assert resumed.history.steps == problem.history.steps
+    same_run(outcome(resumed), outcome(problem), EXACT)
+
+
+def test_displacement_control_and_paths():
+    problem, value = pulled(Hencky(1e3, 0.3), end=0.0)
+
+    def path(t):
+        value.value[0] = 0.2 * t
+
+    loads = [step.load for step in problem.steps("auto", path, output_at=[0.5])]
+    assert 0.5 in loads and loads[-1] == 1.0
+    other = scenes.block(force=(0.0, -1.0))
+    top = mpm.DisplacementControl(other.particles, -0.01, point=(1.0, 1.0), direction=(0.0, 1.0))
+    shares = [s.displacement for s in other.steps("auto", control=top, output_at=[0.5])]
+    assert -0.005 in shares and shares[-1] == -0.01 and top.present() == pytest.approx(-0.01)
+
+
+def test_a_second_stage_is_measured_by_its_own_motion():
+    # After a first stage that moves the block by 100 the errors of 1e-3 count all the same.
+    def second(first):
+        problem, value = pulled(mpm.materials.VonMises(1e3, 0.3, rho_y=2.0), end=0.0)
+        if first:
+            value.value[0] = 0.05
+            problem.step()
+        begin = value.value[0]
+
+        def path(t):
+            value.value[1] = 0.02 * t
+            value.value[0] = begin
+
+        return [step.load for step in problem.steps("auto", path)]
+
+    assert 0.4 < len(second(True)) / len(second(False)) < 2.5
+
+
+def test_a_length_instead_of_the_motion():
+    few, many = (column().solve("auto", tolerance=0.1, length=length) for length in (9.0, 0.5))
+    assert len(few.steps) < len(many.steps)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"steps": "automatic"}, r"steps must be a whole number from 1 on or 'auto'"),
+        ({"steps": 3, "output_at": [0.5]}, r"are for steps='auto', not for steps=3"),
+        ({"steps": 3, "tolerance": 0.1}, r"are for steps='auto', not for steps=3"),
+        ({"tolerance": 0.0}, r"tolerance must be a positive number up to 1, not 0.0"),
+        ({"tolerance": "small"}, r"tolerance must be a positive number"),
+        ({"first_step": 0.2}, r"first_step must be a positive number up to 0.05, not 0.2"),
+        ({"length": -1.0}, r"length must be a positive number, not -1.0"),
+        ({"output_at": [0.0, 0.5]}, r"output_at must be a list of shares of the run"),
+        ({"output_at": 0.5}, r"output_at must be a list of shares of the run"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(options, told):
+    problem = scenes.block(force=(0.0, -1.0))
+    raises(lambda: problem.solve(**{"steps": "auto", **options}), mpm.MPMError, told)
+    assert not problem.history.steps
