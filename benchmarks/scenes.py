@@ -121,10 +121,12 @@ def column_free(
     degree: int = 1,
     steps: int = 40,
     f_bar: str = "none",
+    weight: float = 20e3,
 ) -> Scene:
-    """Case C, `cases/column_free.py` at 20 kN/m3: `size` is that of a cell, m; `y_mean`."""
-    cells = [round(20.0 / size), round(10.0 / size)]
-    background = kit.box([20.0, 10.0], cells, kit.DOMAINS["quad"])
+    """Case C, `cases/column_free.py`: `size` is that of a cell, m; `weight` in N/m3; `y_mean`."""
+    width = max(20.0, weight / 1e3)
+    cells = [round(width / size), round(10.0 / size)]
+    background = kit.box([width, 10.0], cells, kit.DOMAINS["quad"])
     V = fem.functionspace(background, ("Lagrange", degree, (2,)))
     body = kit.box([4.0, 8.0], [round(8.0 / size), round(16.0 / size)], kit.DOMAINS[domain])
     rule = 2 if f_bar == "domain" else None
@@ -132,7 +134,7 @@ def column_free(
     problem = mpm.QuasiStaticProblem(
         particles,
         mpm.materials.VonMises(1e6, 0.3, rho_y=20e3),
-        body_force=(0.0, -20e3),
+        body_force=(0.0, -weight),
         bcs=_rollers(V, (0, 0.0), (1, 0.0)),
         petsc_options_prefix="collapse_",
         f_bar=f_bar,

@@ -35,6 +35,7 @@ class Study(NamedTuple):
 
 
 STUDIES = {
+    "load-steps": Study("load_steps", "load-steps"),
     "step-size": Study("step_size", "step-size", cases=("column_roller", "column_free")),
     "locking": Study("locking", "locking", cases=("cantilever",)),
     "methods": Study("methods", "methods", ("crossing", "compaction"), cases=("compaction",)),

@@ -58,6 +58,7 @@ FEATURES = {
     "repartition": {"repartition": True},
     "checkpoint": {"checkpoint": True},
     "delete": {"delete": True},
+    "automatic steps": {"automatic": True},
 }
 
 
@@ -235,14 +236,17 @@ class Scene:
             if self.supports:
                 self.grip.value[-1] = down + 0.01 * t
 
-        if stage == "path":
-            return self.problem.steps(2, update=path)
+        count, options = 2, {}
+        if "automatic" in self.wanted:
+            count, options = "auto", {"tolerance": 0.5, "output_at": [0.5]}
+        if stage == "path" or (stage is None and "automatic" in self.wanted):
+            return self.problem.steps(count, update=path, **options)
         if stage == "control":
             point, direction = corner(body), [*[0.0] * (self.dim - 1), 1.0]
             control = mpm.DisplacementControl(body, 0.0, point=point, direction=direction)
             self.goal = control.present() - 0.002 if goal is None else goal
             control = mpm.DisplacementControl(body, self.goal, point=point, direction=direction)
-            return self.problem.steps(2, control=control)
+            return self.problem.steps(count, control=control, **options)
         return self.step(body)
 
     def step(self, body):
@@ -312,7 +316,7 @@ def run(wanted, directory):
     if "checkpoint" not in wanted:
         finish(scene, steps)
         return
-    if "stage" in wanted:
+    if "stage" in wanted or "automatic" in wanted:
         next(steps)
     scene.problem.save(directory / "state")
     finish(scene, steps)

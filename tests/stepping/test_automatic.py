@@ -51,7 +51,8 @@ def test_steps_go_on_after_a_level_as_before():
     sizes = np.diff([0.0, *ends])
     after = ends.index(0.3001) + 1
     # (ratio = 0.5 is where 0.9 ratio^-0.35 ratio^0.2 is 1: steps of 0.07)
-    assert sizes[after - 2] == sizes[after - 1] < 0.05 and sizes[after] > 0.065
+    assert sizes[after - 2 : after] == pytest.approx(0.047, abs=1e-4)
+    assert sizes[after] > 0.065
     assert sizes[after:-2] == pytest.approx(0.07, rel=0.13)
 
 
@@ -114,7 +115,7 @@ def test_sizes_follow_the_second_difference():
             continue  # what was tried first was larger
         assert D[k + 1] == pytest.approx(expected, rel=1e-6)
         checked += 1
-    assert checked >= 8
+    assert checked >= 5
 
 
 def nodal(problem):
@@ -140,7 +141,7 @@ def test_the_error_is_within_the_tolerance(weight, cell):
 
 def test_output_and_what_was_taken_back():
     problem = column()
-    for step in problem.steps("auto", tolerance=0.06, output_at=LEVELS):
+    for step in problem.steps("auto", tolerance=0.04, output_at=LEVELS):
         assert step.output == (step.load in (*LEVELS, 1.0))
     history = problem.history
     assert {*LEVELS, 1.0} <= set(history.load)
@@ -157,7 +158,7 @@ def test_a_rejected_step_leaves_no_trace():
     # A run from the state before it goes the same way.
     problem = column()
     states = []
-    for _ in problem.steps("auto", tolerance=0.06):
+    for _ in problem.steps("auto", tolerance=0.04):
         states.append(nodal(problem))
     other = column()
     loads = [0.0, *problem.history.load]
@@ -243,8 +244,11 @@ def test_a_second_stage_is_measured_by_its_own_motion():
 
 
 def test_a_length_instead_of_the_motion():
-    few, many = (column().solve("auto", tolerance=0.1, length=length) for length in (9.0, 0.5))
-    assert len(few.steps) < len(many.steps)
+    runs = []
+    for length in (None, 1.0, 1e-4):
+        problem = scenes.block(force=(0.0, -1.0))
+        runs.append(len(problem.solve("auto", length=length).steps))
+    assert runs[1] < runs[0] < runs[2]
 
 
 @pytest.mark.parametrize(
