@@ -205,9 +205,12 @@ def test_a_run_goes_on_from_a_checkpoint(mpi_tmp_path, predictor):
     )
     raises(lambda: resumed.solve(10), mpm.MPMError, r"steps chosen by tolerance=0.1")
     resumed.solve("auto", **options)
-    assert resumed.history.load == problem.history.load
-    assert resumed.history.taken_back == problem.history.taken_back
-    assert resumed.history.steps == problem.history.steps
+    one, two = resumed.history, problem.history
+    assert one.iterations == two.iterations and one.total_iterations == two.total_iterations
+    if WORLD.size == 1:  # else sums over ranks differ in their last digits
+        assert one.steps == two.steps and one.taken_back == two.taken_back
+    np.testing.assert_allclose(one.load, two.load, rtol=EXACT)
+    assert [step.output for step in one.steps] == [step.output for step in two.steps]
     same_run(outcome(resumed), outcome(problem), EXACT)
 
 
