@@ -21,6 +21,7 @@ from .problems.dynamic import DynamicParticleProblem, DynamicProblem  # noqa: E4
 from .problems.initial_stress import geostatic  # noqa: E402
 from .problems.particle_problem import ParticleProblem  # noqa: E402
 from .problems.quasistatic import QuasiStaticProblem  # noqa: E402
+from .problems.strength import StrengthReduction, strength_reduction  # noqa: E402
 from .stepping.displacement_control import DisplacementControl  # noqa: E402
 from .system.coupling import Tie  # noqa: E402
 from .system.term import Term  # noqa: E402
@@ -47,6 +48,7 @@ __all__ = [
     "Stage",
     "Statistics",
     "Step",
+    "StrengthReduction",
     "Term",
     "Tie",
     "Weights",
@@ -56,6 +58,7 @@ __all__ = [
     "geostatic",
     "materials",
     "plot",
+    "strength_reduction",
 ]
 
 

@@ -117,6 +117,7 @@ class MaterialPoints:
         self.mean_stress = None
         if pressure is not None:
             self.mean_stress = MeanStress(pressure, (self._points, self.dim))
+        self._weakening = 1.0
         with agree(particles.mesh.comm):
             self._groups = self._group(assignment, cell_tags)
             self._states = [self._initial_state(group) for group in self._groups]
@@ -177,6 +178,19 @@ class MaterialPoints:
                 changed = True
         if changed and self.averaging is not None:
             self.averaging.modulus = self._resistance()
+
+    def weaken(self, factor: float) -> None:
+        """Divide the strength of all materials by a factor from now on, 1 at first (collective).
+
+        Raises:
+            MPMError: A material does not say what its strength is.
+        """
+        self._weakening = factor
+        with agree(self._particles.mesh.comm):
+            self._groups = [
+                self._governing(self._resolve(given.material, group.points), group.points)
+                for given, group in zip(self._given, self._groups, strict=True)
+            ]
 
     # -- A stress that is there at first ---------------------------------------------------
 
@@ -367,6 +381,8 @@ class MaterialPoints:
             replaced[name] = _read_only(np.repeat(values, self._particles.num_points))
         if replaced:
             material = material.with_parameters(**replaced).at(points)
+        if self._weakening != 1.0:
+            material = material.weakened(self._weakening)
         if not self._compiled and isinstance(material, CompiledMaterial):
             material = material.with_parameters()
             material.compiled = False

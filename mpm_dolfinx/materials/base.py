@@ -225,6 +225,19 @@ class Material(ABC):
         other.parameters = {**self.parameters, **parameters}
         return other
 
+    def weakened(self, factor: float) -> Self:
+        """Return this material with its strength divided by a factor, and all else the same.
+
+        Args:
+            factor: Positive.
+
+        Raises:
+            MPMError: The material does not say what its strength is.
+        """
+        raise MPMError(
+            f"The strength of a {type(self).__name__} cannot be reduced; give it a method weakened."
+        )
+
     def at(self, points: NDArray[np.integer[Any]]) -> Self:
         """Return this material restricted to points, given by their numbers.
 

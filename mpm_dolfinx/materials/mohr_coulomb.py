@@ -100,6 +100,23 @@ class FrictionalMaterial(IsotropicElastic):
             other.symmetric = False
         return other
 
+    def weakened(self, factor: float) -> Self:
+        """See :meth:`Material.weakened`.
+
+        c, tan(phi) and a cut-off are divided; psi stays what it is, up to phi.
+        """
+        friction, dilation = (self.parameters[angle] for angle in _ANGLES)
+        reduced = np.degrees(np.arctan(np.tan(np.radians(friction)) / factor))
+        values: dict[str, Any] = {
+            "cohesion": self.parameters["cohesion"] / factor,
+            "friction_angle": reduced,
+            "dilation_angle": np.minimum(dilation, reduced),
+        }
+        if "tension_cutoff" in self.parameters:
+            values["tension_cutoff"] = self.parameters["tension_cutoff"] / factor
+        known = {n: v if isinstance(v, np.ndarray) else float(v) for n, v in values.items()}
+        return self.with_parameters(**known)
+
     def initial_state(self, n: int, dim: int) -> State:
         """See :meth:`Material.initial_state`."""
         _require_less_dilation(*(self.parameters[angle] for angle in _ANGLES))

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -80,6 +80,11 @@ class VonMises(IsotropicElastic):
             name: check_parameter(name, strength, **self.limits[name]),
             "hardening": check_parameter("hardening", hardening, **self.limits["hardening"]),
         }
+
+    def weakened(self, factor: float) -> Self:
+        """See :meth:`Material.weakened`."""
+        names = [name for name in ("rho_y", "yield_stress", "hardening") if name in self.parameters]
+        return self.with_parameters(**{name: self.parameters[name] / factor for name in names})
 
     @property
     def rho_y(self) -> Parameter:

@@ -598,6 +598,11 @@ class ParticleProblem:
                 freed[number][dofs] += reactions[number][dofs]
         self._held.hold(after, freed)
 
+    @property
+    def held_back(self) -> float:
+        """How much of what the last stage changes is held back yet, from 1 to 0."""
+        return self._held.remaining
+
     def _gathered(self, forces: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
         """Return forces on bodies whose nodes go with their cells, on the dofs of each background.
 
@@ -938,6 +943,14 @@ class ParticleProblem:
         snapshot.numbers["identity"] = known | {"the stages": list(self._stages)}
         snapshot.numbers["series"] = self._output.written()
         return snapshot
+
+    def capture(self) -> checkpoint.Snapshot:
+        """Return the state at the last converged step, for :meth:`return_to` (collective)."""
+        return self._snapshot()
+
+    def return_to(self, snapshot: checkpoint.Snapshot) -> None:
+        """Return to a state of this problem on the present meshes (collective)."""
+        self._adopt(snapshot, (), "The state before")
 
     def _all_kept(self, functions: Sequence[fem.Function]) -> tuple[list[Kept], kept.Standing]:
         """Return all that goes with the problem, and what knows how far it is.

@@ -1,0 +1,141 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Factors of safety by one call, against a published slope and a bound of limit analysis."""
+
+import numpy as np
+import pytest
+from scenes import QUADRILATERAL, at, box, fix, in_order, vectors
+
+from dolfinx import mesh
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx import materials
+
+H = 10.0
+
+
+def slope(cell=1.0):
+    """Return the slope of Griffiths & Lane (1999), example 1: 2:1, phi 20, c/(gamma H) 0.05."""
+    crest, width, weight = 1.2 * H, 2 * H, 20.0
+    n, k = (2 * round(length / cell) for length in (crest + width, H))
+    body = box([0, 0], [crest + width, H], [n, k], QUADRILATERAL)
+    x = body.geometry.x
+    x[:, 0] *= (crest + width * (1 - x[:, 1] / H)) / (crest + width)
+    cells = [round((crest + width) / cell) + 4, round(H / cell) + 1]
+    V = vectors(box([0, 0], [cell * c for c in cells], cells, QUADRILATERAL))
+    return mpm.QuasiStaticProblem(
+        mpm.Particles(body, V),
+        materials.MohrCoulomb(1e5, 0.3, cohesion=0.05 * weight * H, friction_angle=20.0),
+        density=weight,
+        body_force=(0.0, -1.0),
+        bcs=[fix(V, at(0, 0), component=0), fix(V, at(1, 0))],
+        f_bar="patch",
+    )
+
+
+def cut(cell=0.125, weight=3.0):
+    """Return a cut of height 1 beside a half space of undrained strength 1."""
+    full = box([0, 0], [2.5, 1.5], [round(5 / cell), round(3 / cell)], QUADRILATERAL)
+    own = np.arange(full.topology.index_map(2).size_local, dtype=np.int32)
+    x = mesh.compute_midpoints(full, 2, own)
+    body = mesh.create_submesh(full, 2, own[(x[:, 0] < 1.5) | (x[:, 1] < 0.5)])[0]
+    cells = [round(2.5 / cell), round(1.5 / cell) + 1]
+    V = vectors(box([0, 0], [cell * c for c in cells], cells, QUADRILATERAL))
+    return mpm.QuasiStaticProblem(
+        mpm.Particles(body, V),
+        materials.Tresca(1e5, 0.49, cohesion=1.0),
+        density=weight,
+        body_force=(0.0, -1.0),
+        bcs=[fix(V, at(0, 0, 2.5), component=0), fix(V, at(1, 0))],
+        f_bar="patch",
+    )
+
+
+@pytest.mark.slow
+def test_slope_of_griffiths_and_lane():
+    problem = slope()
+    problem.solve(2)
+    law = problem.points[0]
+    found = mpm.strength_reduction(problem)
+    assert found.factor == pytest.approx(1.40, abs=0.06)  # cells of H/10; see benchmarks/cases
+    assert 0 < found.above - found.factor <= 0.01
+    assert found.factors == sorted(found.factors) and found.factors[-1] == found.factor
+    assert found.displacements == sorted(found.displacements)
+    assert problem.history.steps[-1].load == 1.0 and problem.points[0] is law
+    assert found.displacements[-1] > 5 * found.displacements[1]
+    problem.step()  # with the strength that was given: nothing moves on
+
+
+@pytest.mark.slow
+def test_vertical_cut():
+    problem = cut()
+    problem.solve(2)
+    found = mpm.strength_reduction(problem, step=0.08)
+    assert 3.775 < 3.0 * found.factor < 1.07 * 3.786  # the bounds; cells of H/8
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        materials.VonMises(1e4, 0.3, rho_y=6.0, hardening=10.0),
+        materials.VonMises(1e4, 0.3, yield_stress=6.0),
+        materials.Tresca(1e4, 0.3, cohesion=6.0),
+        materials.DruckerPrager(1e4, 0.3, 6.0, 20.0, 5.0, tension_cutoff=3.0),
+        materials.MohrCoulomb(1e4, 0.3, 6.0, 20.0, 20.0, tension_cutoff=3.0),
+    ],
+    ids=lambda law: type(law).__name__,
+)
+def test_strength_is_divided(law):
+    half = law.weakened(2.0)
+    assert half.symmetric == law.symmetric and type(half) is type(law)
+    for name, value in law.parameters.items():
+        now = half.parameters[name]
+        if name in ("young", "poisson"):
+            assert now == value
+        elif name == "friction_angle":
+            ratio = np.tan(np.radians(value)) / np.tan(np.radians(now))
+            assert value == 0.0 or ratio == pytest.approx(2.0)
+        elif name == "dilation_angle":
+            assert now == min(value, half.parameters["friction_angle"])
+        else:
+            assert now == pytest.approx(value / 2.0)
+
+
+def test_stops_where_the_body_moves_too_far():
+    """A block that stands on its base yields, and stays in the state before it went too far."""
+    V = vectors(box([0, 0], [3, 3], [3, 3], QUADRILATERAL))
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(box([0, 0], [2, 2], [4, 4], QUADRILATERAL), V),
+        materials.Tresca(1e3, 0.3, cohesion=6.0),
+        density=1.0,
+        body_force=(0.0, -4.0),
+        bcs=[fix(V, at(0, 0), component=0), fix(V, at(1, 0), component=1)],
+    )
+    with pytest.raises(mpm.MPMError, match="whole load"):
+        mpm.strength_reduction(problem)
+    problem.solve(2)
+    start = in_order(problem.particles, problem.particles.centroid)
+    found = mpm.strength_reduction(problem, displacement=0.2)
+    moved = in_order(problem.particles, problem.particles.centroid) - start
+    assert 0 < np.linalg.norm(moved, axis=1).max() <= 0.2 and found.displacements[-1] <= 0.2
+    assert 1.5 < found.factor < 4.0
+    assert found.above - found.factor <= 0.01
+    yields = problem.points[0].yield_function().max()
+    assert yields < 0.0  # of the strength that was given
+    with pytest.raises(mpm.MPMError, match="positive"):
+        mpm.strength_reduction(problem, step=0.0)
+    with pytest.raises(mpm.MPMError, match="QuasiStatic"):
+        mpm.strength_reduction(problem.particles)
+
+
+def test_a_law_without_strength_is_refused():
+    V = vectors(box([0, 0], [1, 1], [1, 1], QUADRILATERAL))
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(box([0, 0], [1, 0.5], [2, 1], QUADRILATERAL), V),
+        materials.Hencky(1e3, 0.3),
+        body_force=(0.0, -1.0),
+        bcs=[fix(V, at(1, 0))],
+    )
+    problem.solve()
+    with pytest.raises(mpm.MPMError, match="strength of a Hencky cannot be reduced"):
+        mpm.strength_reduction(problem)
