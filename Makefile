@@ -20,7 +20,7 @@ SETUP := sh scripts/setup_env.sh
 BENCHMARKS := $(wildcard $(patsubst %,benchmarks/%.py,assembly step skip solvers scaling ranks cantilever_reference))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo demos test test-all test-debian stress bench bench-smoke studies lint docs clean
+.PHONY: help demo demos test test-all test-debian stress bench bench-smoke studies lint docs serve clean
 
 help: ## This list
 	@echo "make TARGET [VENV=path of an environment] [PYTHON=path of an interpreter]"
@@ -83,6 +83,10 @@ docs: ## Build the documentation into site/
 	@$(SETUP) docs
 	NO_MKDOCS_2_WARNING=1 "$(BIN)/python" -m mkdocs build --strict
 	@echo "The documentation starts at site/index.html"
+
+serve: ## Show the documentation, with its search, at http://127.0.0.1:8000
+	@$(SETUP) docs
+	NO_MKDOCS_2_WARNING=1 "$(BIN)/python" -m mkdocs serve
 
 clean: ## Remove what the targets made, except the environment
 	rm -rf build dist output site .mypy_cache .pytest_cache .ruff_cache

@@ -96,20 +96,22 @@ SMOKE: dict[str, dict[str, list[float]]] = {
 }
 REFERENCE = {"kind": "fbar", "size": 0.125, "smoke": 1.0}  # of C
 
+#: How much faster AMPLE would be in MATLAB, which it is written for: an estimate.
+MATLAB = 12.0
 # Other codes: CPU seconds of the whole process, error.
 PEERS: dict[str, dict[str, list[tuple[float, float]]]] = {
     "A": {
-        "AMPLE, GIMP": [(13.8, 3.66e-3), (50, 4.36e-4), (263, 1.03e-4)],
+        "AMPLE in Octave, GIMP": [(13.8, 3.66e-3), (50, 4.36e-4), (263, 1.03e-4)],
         "AMPLE, point MPM": [(18, 8.7e-2), (81, 8.3e-2)],
         "GeoWarp, GIMP (and 105 s once)": [(4.4, 3.66e-3), (7.8, 4.36e-4), (24.6, 1.03e-4)],
         "Kratos, point MPM": [(0.45, 7.3e-2), (0.87, 8.1e-2), (3.0, 8.1e-2)],
     },
     "B": {
-        "AMPLE, GIMP": [(19, 3.84e-3), (35, 1.49e-3), (75, 5.19e-4)],
+        "AMPLE in Octave, GIMP": [(19, 3.84e-3), (35, 1.49e-3), (75, 5.19e-4)],
         "AMPLE, point MPM": [(18, 1.1e-1), (69, 1.0e-1)],
     },
     "C": {},
-    "E": {"AMPLE, GIMP, ghost penalty": [(81, 1.01e-2), (314, 4.7e-3), (1255, 1.6e-3)]},
+    "E": {"AMPLE in Octave, GIMP, ghost penalty": [(81, 1.01e-2), (314, 4.7e-3), (1255, 1.6e-3)]},
 }
 
 
@@ -334,6 +336,10 @@ def panel(ax: Any, rows: list[dict[str, Any]], case: str, key: str) -> None:
         for name, points in PEERS[case].items():
             ax.loglog(*zip(*points, strict=True), "o-", color=GREY, ms=6, lw=1.5, zorder=1)
             names.append((name, points, GREY))
+            if name.startswith("AMPLE") and "point" not in name:
+                faster = [(seconds / MATLAB, error) for seconds, error in points]
+                ax.loglog(*zip(*faster, strict=True), ":", color=GREY, lw=1.5, zorder=1)
+                names.append(("the same in MATLAB, estimated", faster, GREY))
     for name, kind in KINDS.items():
         points = [(row[key], row["error"]) for row in curve(rows, case, name)]
         if points:

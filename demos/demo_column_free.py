@@ -52,13 +52,10 @@
 #
 # instead, while the residual stays the true one.
 #
-# *The reset.* The old equilibrium is none in the new space of increments: $T_{n+1}$ is not
-# $T_n$, so the first residual is a good part of the load, however small the step is. Cutting
-# the step back cannot help; a line search does: a Newton step is halved while a domain turns
-# inside out, or while both the residual's norm and its work on the step stay large.
-#
-# Both are on by default (`shift=1e-13`, `line_search=True`). Without them the run stops as
-# the paper's did.
+# *The reset.* The old equilibrium is none in the new space of increments: the first residual is a
+# good part of the load, however small the step is. A line search helps: a Newton step is halved
+# while a domain turns inside out, or while both the residual's norm and its work on the step stay
+# large. Both cures are on by default (`shift=1e-13`, `line_search=True`).
 #
 # What is left is hourglass: quadrilaterals with one point have motions without strain, which are
 # mild with two of them each way in a cell, and stop the run with one.
@@ -70,7 +67,6 @@
 
 from mpi4py import MPI
 
-import matplotlib.pyplot as plt
 import numpy as np
 
 from dolfinx import fem, mesh
@@ -137,20 +133,14 @@ if comm.rank == 0:
     print(f"{history.total_iterations} linear solves, {history.cutbacks} cutbacks")
     print(f"top {top:.3f} m, toe {toe:.2f} m, mean height {y_mean:.4f} m")
 
-# The picture: the body at first and now, its domains coloured by plastic strain.
+mpm.plot.scene(problem, "plastic_strain", "column_free.png")
 
-fig, ax = plt.subplots(figsize=(14, 5), layout="constrained") if comm.rank == 0 else (None, None)
-mpm.plot.background(V, ax=ax, color="0.9")
-mpm.plot.domains(particles, ax=ax, warp=0.0, facecolor="0.97", edgecolor="0.8")
-colours = mpm.plot.domains(particles, particles.plastic_strain, ax=ax, cmap="YlGnBu", vmin=0.0)
-if comm.rank == 0:
-    ax.set(xlim=(0.0, 1.02 * toe), ylim=(0.0, 1.03 * height), xlabel="x, m", ylabel="y, m")
-    fig.colorbar(colours, ax=ax, label="plastic strain", shrink=0.8)
-    fig.savefig("column_free.png", dpi=160)
-
-# The numbers are known (the mean height changes little with the mesh).
-
-assert history.load[-1] == 1.0 and history.cutbacks <= 2
-assert abs(toe / 12.23 - 1.0) < 0.01
-assert abs(y_mean / 1.3307 - 1.0) < 0.005
+assert abs(toe / 12.23 - 1.0) < 0.01 and abs(y_mean / 1.3307 - 1.0) < 0.005
 assert yield_violation < 1e-8
+
+# ## Exercises
+#
+# 1. Use quadrilaterals, then `on_distortion="split"`, then `quadrature_degree=2` with
+#    `f_bar="domain"`. Which domains fold?
+# 2. Turn the cures off, `shift=0.0` or `line_search=False`. Where does the run stop?
+# 3. Four times the weight needs a background four times as wide. How far does the toe get?

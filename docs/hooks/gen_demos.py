@@ -34,7 +34,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         source = script.read_text("utf-8")
         level = LEVEL.search(source)
         if level is None:
-            log.info("%s has no line '# Level: 1', 2 or 3 below its licence.", script.name)
+            log.warning("%s has no line '# Level: 1', 2 or 3 below its licence.", script.name)
         name = script.stem.removeprefix("demo_")
         title, text = page(script.name, source, results(root / "docs", name))
         files.append(File.generated(config, f"demos/{script.stem}.md", content=text))
@@ -73,7 +73,7 @@ def results(docs: Path, name: str) -> str:
     kept = docs / "images" / "demos"
     picture, output = kept / f"{name}.png", kept / f"{name}.txt"
     if not picture.exists() or not output.exists():
-        log.info("The demo %s has not been run: python scripts/run_demos.py %s", name, name)
+        log.warning("The demo %s has not been run: python scripts/run_demos.py %s", name, name)
         return ""
     movie = f"\n![The run as a movie](../images/demos/{name}.gif)\n"
     parts = [

@@ -178,11 +178,13 @@ class Particles(MaterialDomains):
     def in_words(self) -> str:
         """Return what they are and what carries them, in a few words."""
         cells, degree = self.V.mesh.topology, self.W.ufl_element().degree
+        kind = self.V.mesh.basix_cell().name
+        kinds = kind.removesuffix("on") + "a" if kind.endswith("hedron") else kind + "s"
         points = f"{self.num_points} point{'s' if self.num_points > 1 else ''} each"
         return (
             f"{self.num_global} {self.mesh.basix_cell().name} domains ({self.method}, degree "
             f"{degree}, {points}) in a background of {cells.index_map(cells.dim).size_global} "
-            f"{self.V.mesh.basix_cell().name}s of degree {self.V.ufl_element().degree}"
+            f"{kinds} of degree {self.V.ufl_element().degree}"
         )
 
     def _settle(self, body: mesh.Mesh) -> None:

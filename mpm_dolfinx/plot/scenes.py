@@ -137,7 +137,7 @@ def scene(
         figure = ax.figure if ax is not None else new_figure(figures, shot)
         draw(shot, look, figure.add_subplot() if ax is None else ax)
         if path is not None:
-            figure.savefig(path, dpi=160)
+            figure.savefig(path, dpi=160, bbox_inches="tight")
         return figure
 
 
@@ -238,7 +238,7 @@ def new_figure(figures: Any, shot: Shot) -> Any:
             8.0,
             float(np.clip(8.0 * high / wide + (1.6 if high < FLAT * wide else 0.4), 2.4, 8.6)),
         )
-    return figures.Figure(figsize=size, layout="constrained")
+    return figures.Figure(figsize=size, layout="compressed")
 
 
 def draw(shot: Shot, look: Look, ax: Any, bar: bool = True) -> Any:

@@ -25,7 +25,11 @@ NAMES, WIDTH = 12, 79
 
 def counted(number: int, noun: str) -> str:
     """Return how many there are of something: ``1 body``, ``2 bodies``."""
-    many = noun[:-1] + "ies" if noun.endswith("y") else noun + "s"
+    many = noun + "s"
+    if noun.endswith("y"):
+        many = noun[:-1] + "ies"
+    elif noun.endswith("hedron"):
+        many = noun[:-2] + "a"
     return f"{number} {noun if number == 1 else many}"
 
 

@@ -4,6 +4,8 @@
 
 import ast
 import os
+import re
+import statistics
 import subprocess
 import sys
 from pathlib import Path
@@ -17,13 +19,34 @@ NAMES = sorted(path.stem for path in DEMOS.glob("*.py"))
 SHORT = ("demo_column_roller", "demo_collapse", "demo_gmsh_body", "demo_snap_through")
 
 
+KEPT = DEMOS.parent / "docs" / "images" / "demos"
+NUMBER = re.compile(r"-?\d+(?:\.\d*)?(?:e[+-]?\d+)?")
+
+
 @pytest.mark.skip_in_parallel
 @pytest.mark.parametrize("name", NAMES)
 def test_text_is_a_lecture_note(name):
     text = (DEMOS / f"{name}.py").read_text()
+    assert re.search(r"^# Level: [123]$", text, re.MULTILINE)
     assert "# It illustrates how to:\n" in text
-    assert r"\tag{1}" in text
-    assert "assert " in text[-2000:]
+    assert "\nassert " in text and "\n# ## Exercises\n" in text
+    assert "argparse" not in text
+    assert len(text.splitlines()) <= 180
+
+
+@pytest.mark.skip_in_parallel
+def test_demos_are_short():
+    lines = [len((DEMOS / f"{name}.py").read_text().splitlines()) for name in NAMES]
+    assert statistics.median(lines) < 120
+
+
+def agrees(found, kept):
+    """Return whether two outputs have the same words, and numbers that differ by less than 5 %."""
+    if NUMBER.sub("#", found).split() != NUMBER.sub("#", kept).split():
+        return False
+    pairs = zip(NUMBER.findall(found), NUMBER.findall(kept), strict=True)
+    numbers = [(float(a), float(b)) for a, b in pairs]
+    return all(abs(a - b) <= 0.05 * abs(b) or max(abs(a), abs(b)) < 1e-7 for a, b in numbers)
 
 
 @pytest.mark.skip_in_parallel
@@ -63,4 +86,6 @@ def test_runs_and_meets_its_own_assertions(name, tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() and "Exception ignored" not in done.stderr
     picture = (tmp_path / f"{name.removeprefix('demo_')}.png").read_bytes()
+    kept = (KEPT / f"{name.removeprefix('demo_')}.txt").read_text("utf-8")
+    assert agrees(done.stdout, kept), f"python scripts/run_demos.py {name[5:]}, and look at it"
     assert picture[:8] == b"\x89PNG\r\n\x1a\n" and len(picture) > 5000
