@@ -23,6 +23,7 @@ parser.add_argument("--poisson", type=float, default=0.2, help="Poisson's ratio"
 parser.add_argument("--offset", type=float, default=0.0, help="of the beam, downwards, m")
 parser.add_argument("--steps", type=kit.whole, default=50, help="load steps")
 parser.add_f_bar()
+parser.add_mixed()
 parser.add_order()
 args = parser.parse()
 if not -0.5 <= args.offset <= 1.0:
@@ -78,6 +79,7 @@ problem = mpm.QuasiStaticProblem(
     tractions=[((0.0, -load / depth), 1)],
     facet_tags=tags,
     f_bar=args.f_bar,
+    mixed=None if args.mixed == "none" else args.mixed,
     petsc_options_prefix="cantilever_",
     stabilisation=kit.stabilisation(args),
 )
@@ -120,6 +122,7 @@ numbers = {
     "deflection": deflection,
     "error": error if failure is None and np.isfinite(error) else None,
     "particles": particles.num_global,
+    "most_solves": max((step.iterations for step in problem.history.steps), default=0),
     "ghost_facets": problem.history.statistics["ghost_facets"],
 }
 degrees = f"degree {args.domain_degree or args.degree} on {args.degree}"

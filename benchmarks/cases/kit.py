@@ -40,6 +40,15 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--json", action="store_true", help="print one JSON object, no more")
         self.add_argument("--plot", metavar="FILE.png", help="make a picture")
 
+    def add_mixed(self) -> None:
+        """Add the unknowns besides displacements."""
+        self.add_argument(
+            "--mixed",
+            choices=("none", "pressure"),
+            default="none",
+            help="the pressure as an unknown, of one degree less",
+        )
+
     def add_f_bar(self, default: str = "none") -> None:
         """The options of the domains' rule and of averages of the volume ratio."""
         self.add_argument(
