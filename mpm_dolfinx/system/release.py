@@ -48,6 +48,11 @@ class Release(Term):
         """See :attr:`Term.symmetric`."""
         return True
 
+    @property
+    def one_sided(self) -> bool:
+        """Whether it may let its bodies go: see :attr:`Term.one_sided`."""
+        return False
+
     def follow(self, bodies: Sequence[Particles], spaces: Sequence[fem.FunctionSpace]) -> None:
         """Take bodies on their present meshes, without any force on them (collective).
 

@@ -38,6 +38,11 @@ class FieldTerm(Term):
         self.bodies = cast("tuple[Particles, ...]", (*own, *fields))
         self.fields = list(fields)
 
+    @property
+    def one_sided(self) -> bool:
+        """Whether it may let its bodies go: see :attr:`Term.one_sided`."""
+        return False
+
     def commit(self) -> Callable[[], None]:
         """See :meth:`Term.commit`."""
         before = [field.commit() for field in self.fields]
