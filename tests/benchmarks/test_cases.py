@@ -36,6 +36,11 @@ RUNS = {
         "--degree 2 --offset 0.05 --steps 25",
         {"error": 3e-4, "iterations": 140, "cutbacks": 0},
     ),
+    "cantilever-mixed": (
+        "cantilever",
+        "--degree 2 --mixed pressure --poisson 0.4999 --steps 10",
+        {"error": 5e-4, "iterations": 50, "cutbacks": 0},
+    ),
     "compaction-tri": (
         "compaction",
         "--elements 8 --domain tri",

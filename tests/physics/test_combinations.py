@@ -59,6 +59,7 @@ FEATURES = {
     "checkpoint": {"checkpoint": True},
     "delete": {"delete": True},
     "automatic steps": {"automatic": True},
+    "mixed pressure": {"mixed": "pressure", "degree": 2},
 }
 
 
@@ -194,7 +195,7 @@ class Scene:
         if "background" in wanted:
             u, v = first.increment, ufl.TestFunction(first.V)
             background = 1e-3 * ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx
-        names = ("f_bar", "axisymmetric", "stabilisation", "dependent_dofs")
+        names = ("f_bar", "axisymmetric", "stabilisation", "dependent_dofs", "mixed")
         return mpm.QuasiStaticProblem(
             bodies if two else first,
             wanted.get("law", Hencky(YOUNG, POISSON)),
