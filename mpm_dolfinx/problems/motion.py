@@ -55,6 +55,7 @@ class MovingProblem(ParticleProblem):
         """See :meth:`ParticleProblem._build`."""
         self.inertia.join(self.bodies)
         super()._build()
+        self._stepper.newton.lets_go = True
         others = [*self.body_terms, *(term for term in self.terms if term is not self.inertia)]
         followed = Followed(
             others,

@@ -161,6 +161,8 @@ class NewtonSolver:
         x: The solution of the last attempt.
         F: Its residual, without the proximal term.
         no_equilibrium: Whether the last attempt's iterations came to nothing.
+        lets_go: Whether what the proximal term holds back is let go once however little it is: in
+            a motion it is a viscosity, and the same in each step.
     """
 
     def __init__(
@@ -194,6 +196,7 @@ class NewtonSolver:
         self.no_equilibrium = False
         self.x: PETSc.Vec | None = None
         self.F: PETSc.Vec | None = None
+        self.lets_go = False
         self._centre: PETSc.Vec | None = None
         self._failure: MPMError | None = None
         self._raised: BaseException | None = None
@@ -500,7 +503,9 @@ class NewtonSolver:
         assert self.F is not None
         left = norm(self.F)
         step = x.duplicate()
-        while left > tolerance and self._factor.D is not None:
+        always = self.lets_go and self.iterations > 0
+        while (left > tolerance or always) and self._factor.D is not None:
+            always = False
             self._factor.solve(self.F, step)
             if norm(step * self._factor.D) > HELD * left:
                 self._factor.refine(self.F, step, 0.5 * tolerance / left)

@@ -19,6 +19,7 @@ CASES = Path(__file__).parents[2] / "benchmarks" / "cases"
 #: Programs that ``make test`` runs, and numbers that it leaves to ``make test-all``.
 SHORT = ("compaction", "column_free", "snap_through")
 LONG = {
+    *("vortex", "discs", "column"),
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
     *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
 }
@@ -123,7 +124,26 @@ RUNS = {
         "--size 0.25 --body-size 0.2 --steps 8",
         {"error_reaction": 1e-6, "error_area": 2e-2},
     ),
+    "bar": (
+        "flying_bar",
+        "--steps 100 --out-of-range reflect",
+        {"energy_largest": 1e-11, "momentum_error": 1e-12, "balance_error": 1e-12},
+    ),
+    "block": (
+        "spinning_block",
+        "--turn 0.8 --cell 0.2",
+        {"energy_largest": 1e-11, "angular_momentum_change": 1e-11, "iterations_per_step": 4.0},
+    ),
+    "discs": (
+        "colliding_discs",
+        "--steps 10",
+        {"energy_largest": 1e-11, "momentum_error": 1e-12, "balance_error": 1e-12},
+    ),
+    "vortex": ("vortex", "", {"displacement_error": 4.6e-2, "velocity_error": 1.26e-1}),
+    "column": ("column_dynamic", "--time 0.4", {"cutbacks": 0, "balance_error": 1e-12}),
 }
+#: Cases that go through time, whose load is that.
+IN_TIME = {"flying_bar", "spinning_block", "colliding_discs", "column_dynamic"}
 KEYS = {
     "compaction": {"error", "error_position", "particles"},
     "cantilever": {"shortening", "deflection", "error"},
@@ -141,6 +161,11 @@ KEYS = {
     "gmsh_body": {"error_reaction", "error_area"},
     "collapse": {"u_top", "u_toe"},
     "footing": {"pressure", "limit", "ratio", "plateau", "drop"},
+    "flying_bar": {"energy_change", "displacement_error", "velocity_error", "momentum_error"},
+    "spinning_block": {"energy_change", "angular_momentum_change", "iterations_per_step"},
+    "colliding_discs": {"energy_change", "rebound", "momentum_error"},
+    "vortex": {"displacement_error", "velocity_error"},
+    "column_dynamic": {"toe", "top"},
     "snap_through": {"limit", "valley", "crown", "error"},
 }
 
@@ -172,7 +197,7 @@ def test_numbers(case, capfd):
     assert COMMON | KEYS[name] <= numbers.keys()
     assert not any("time" in key or "seconds" in key for key in numbers)
     assert numbers["completed"] == 1 and numbers["failure"] is None
-    assert numbers["load"] == 1.0 or name == "snap_through"  # where it is found
+    assert numbers["load"] == 1.0 or name in {"snap_through", *IN_TIME}
     assert (numbers["iterations"] > 0) == (name != "domain_distortion")  # there all is prescribed
     for key, bound in bounds.items():
         assert numbers[key] <= bound, key
@@ -294,6 +319,11 @@ def test_case_is_a_program(name, tmp_path):
         "footing": "--cell 0.5 --steps 4",
         "gmsh_body": "--size 0.3 --body-size 0.3 --steps 2",
         "snap_through": "--cell 1 --steps 4",
+        "flying_bar": "--steps 4",
+        "spinning_block": "--cell 0.25 --steps 4",
+        "colliding_discs": "--steps 4",
+        "vortex": "--steps 8",
+        "column_dynamic": "--cell 1 --steps 20",
     }.get(name, "--elements 4 --steps 4")
     done = subprocess.run(
         [sys.executable, str(CASES / f"{name}.py"), *small.split(), "--json"],
