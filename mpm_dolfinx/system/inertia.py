@@ -60,6 +60,9 @@ TOTALS = (
     "internal", "external", "lost", "damping", "stabilisation", "prescribed", "residual",
 )  # fmt: skip
 
+#: Those among them that are given to the bodies.
+GIVEN = ("external", "prescribed")
+
 type MassMatrix = Callable[[int], PETSc.Mat]
 """Assembles the consistent mass of a body on its W, by its number."""
 type Works = Callable[[], NDArray[np.float64]]
@@ -196,10 +199,7 @@ class Inertia(Term):
 
         What kinetic energy changes by that is lost, or won.
         """
-        deleted = [
-            0 if body.deletion is None else body.mesh.comm.allreduce(int(body.deletion.mask.sum()))
-            for body in self.bodies
-        ]
+        deleted = self._present_deleted()
         if deleted == self._deleted:
             return
         self._deleted = deleted
@@ -210,6 +210,13 @@ class Inertia(Term):
         if self._energies:
             self._totals[TOTALS.index("lost")] += self._kinetic - kinetic
         self._kinetic = kinetic
+
+    def _present_deleted(self) -> list[int]:
+        """Return how many particles of each body are deleted (collective)."""
+        return [
+            0 if body.deletion is None else body.mesh.comm.allreduce(int(body.deletion.mask.sum()))
+            for body in self.bodies
+        ]
 
     def _vectors(self, functions: Sequence[fem.Function]) -> list[PETSc.Vec]:
         """Return values of Functions on W of each body as vectors."""
@@ -560,6 +567,11 @@ class Inertia(Term):
             "prescribed": prescribed,
             "residual": -left,
         }
+        if self._present_deleted() != self._deleted:
+            # Forces of particles that the step's end has deleted are in its balance, but gone now.
+            used = sum(work for name, work in works.items() if name not in GIVEN)
+            given = sum(works[name] for name in GIVEN)
+            works["lost"] += given - used - (kinetic - self._kinetic)
         self._totals += [works[name] for name in TOTALS]
         for function, v in zip(self.velocities, new, strict=True):
             function.x.array[: v.getLocalSize()] = v.array_r

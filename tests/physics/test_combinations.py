@@ -13,6 +13,7 @@ from petsc4py import PETSc
 import numpy as np
 import pytest
 import scenes
+from marks import all_but
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 
 import ufl
@@ -115,6 +116,8 @@ class Scene:
         wanted: Options of the features.
     """
 
+    kind = mpm.QuasiStaticProblem
+
     def __init__(self, wanted):
         self.wanted = wanted
         self.dim = wanted.get("dim", 2)
@@ -196,7 +199,7 @@ class Scene:
             u, v = first.increment, ufl.TestFunction(first.V)
             background = 1e-3 * ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx
         names = ("f_bar", "axisymmetric", "stabilisation", "dependent_dofs", "mixed")
-        return mpm.QuasiStaticProblem(
+        return self.kind(
             bodies if two else first,
             wanted.get("law", Hencky(YOUNG, POISSON)),
             body_force=(*[0.0] * up, -GRAVITY),
@@ -359,7 +362,8 @@ def test_the_page_has_each_pair():
     assert list(table) == list(FEATURES)
     cells = np.array(list(table.values()))
     assert np.array_equal(cells, cells.T)
-    assert set(cells.ravel()) == {"+", "-", *sentences}
+    used = {*cells.ravel(), *(cell for row in motions().values() for cell in row)}
+    assert used == {"+", "-", *sentences}
     assert (cells.diagonal() == "+").all()
     for row, wanted in zip(cells, FEATURES.values(), strict=True):
         for cell, other in zip(row, FEATURES.values(), strict=True):
@@ -383,3 +387,88 @@ def test_a_feature_with_those_before_it(feature, mpi_tmp_path):
             raise
         if other == feature:
             break
+
+
+# -- In motion ---------------------------------------------------------------------------
+
+#: What is the same in motion, has no sense there, or is refused for the same reason as at rest.
+STILL = ("path", "control", "automatic steps")
+
+
+class Moving(Scene):
+    """The same scene, let go: it begins with a velocity and full weight.
+
+    Args:
+        wanted: Options of the features.
+        scheme: Of the motion.
+    """
+
+    def __init__(self, wanted, scheme):
+        self.scheme = scheme
+        super().__init__(wanted)
+
+    def kind(self, bodies, law, **options):
+        """Return the problem."""
+        start = (*[0.0] * (self.dim - 1), -0.1)
+        return mpm.DynamicProblem(
+            bodies, law, 1.0, velocity=start, scheme=self.scheme, rayleigh=(0.5, 1e-3), **options
+        )
+
+
+def move(wanted, scheme, directory):
+    """Run a scene in motion: two steps, what changes its meshes, two more, perhaps from a file."""
+
+    def path(t):
+        scene.wall.value[-1] = -3.0 * min(t, 0.1) if "delete" in wanted else 0.02 * t
+
+    scene = Moving(wanted, scheme)
+    dt = 0.1 if "delete" in wanted else 0.01
+    scene.problem.solve(2 * dt, dt, path)
+    if "delete" in wanted:
+        assert scene.problem.history.statistics["lost_particles"] > 0
+    scene.change()
+    if "checkpoint" in wanted:
+        scene.problem.save(directory / "state")
+    scene.problem.solve(4 * dt, dt, path)
+    energies = scene.problem.history.energies
+    size = max(max(energy.kinetic, abs(energy.external)) for energy in energies)
+    assert np.ptp([energy.balance for energy in energies]) < 1e-9 * size
+    assert energies[-1].damping > 0.0
+    if "checkpoint" in wanted:
+        whole, scene = scene, Moving(wanted, scheme)
+        scene.problem.restore(directory / "state")
+        scene.problem.solve(4 * dt, dt, path)
+        one, two = (s.problem.bodies[0] for s in (whole, scene))
+        assert np.array_equal(one.centroid, two.centroid)
+
+
+def motions():
+    """Return the rows of the page's table of motions by feature."""
+    text = PAGE.read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([^|]+?) \| ([^|]+) \| ([^|]+) \| ([^|]+) \|$", text, re.MULTILINE)
+    rows = [row for row in rows if row[0] not in ("---", "in motion")]
+    return {feature.replace("`", ""): cells for feature, *cells in rows}
+
+
+def test_the_page_has_each_feature_in_motion():
+    table, sentences = motions(), page()[1]
+    assert list(table) == [feature for feature in FEATURES if feature not in STILL]
+    assert {cell for cells in table.values() for cell in cells} <= {"+", *sentences}
+
+
+@pytest.mark.parametrize(
+    "feature", all_but(("Tie", "support"), [f for f in FEATURES if f not in STILL])
+)
+@pytest.mark.filterwarnings("ignore:The run is complete, but the domains")
+def test_a_feature_in_motion(feature, mpi_tmp_path):
+    sentences = page()[1]
+    for cell, scheme in zip(motions()[feature], ("midpoint", "conserving", "euler"), strict=True):
+        try:
+            if cell == "+":
+                move(FEATURES[feature], scheme, mpi_tmp_path)
+            else:
+                with pytest.raises(mpm.MPMError, match=re.escape(sentences[cell])):
+                    move(FEATURES[feature], scheme, mpi_tmp_path)
+        except BaseException as error:
+            error.add_note(f"{feature} with scheme={scheme!r}: {cell}")
+            raise
