@@ -1,12 +1,13 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Contact: rigid obstacles that bodies may touch, stick to, slide on and leave.
+"""Contact: rigid obstacles and other bodies, to touch, stick to, slide on and leave.
 
 Contact acts at quadrature points on the body's own facets, so there is none before surfaces meet,
 whatever the background's cells. A contact is a term: give it to a problem as ``terms=[contact]``.
 """
 
 from .law import Coulomb
+from .pair import Pair
 from .rigid import Rigid
 from .shapes import (
     Shape,
@@ -22,6 +23,7 @@ from .shapes import (
 
 __all__ = [
     "Coulomb",
+    "Pair",
     "Rigid",
     "Shape",
     "box",

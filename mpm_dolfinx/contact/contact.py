@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError, agree
+from ..io.snapshot import Kept, Taken
+from ..meshes.remesh import Column
 from ..particles.particles import Particles
 from ..system.term import PointMaterial, Term
 from .surface import Surface
@@ -75,6 +77,18 @@ class Contact(Term):
         """See :attr:`Term.one_sided`: bodies may lift off."""
         return True
 
+    def pace(self, dt: float, share: float) -> None:
+        """See :meth:`Term.pace`.
+
+        Raises:
+            MPMError: The scheme takes the mean of forces, to which contact would add energy.
+        """
+        if share != 1.0:
+            raise MPMError(
+                f"A {type(self).__name__} takes its forces at the end of a step, which would add "
+                "energy to a mean of forces; use scheme='euler'."
+            )
+
     @property
     def _comm(self) -> MPI.Comm:
         comm: MPI.Comm = self.bodies[0].mesh.comm
@@ -85,6 +99,24 @@ class Contact(Term):
 
     def require_remeshable(self, consequence: str) -> None:
         """Raise nothing: see :meth:`require_movable`."""
+
+    # -- What is kept -------------------------------------------------------------------------
+
+    def kept(self) -> Sequence[Kept]:
+        """See :meth:`Term.kept`."""
+        return [_Anchors(self, f"contact{self._number}")]
+
+    def numbers(self) -> dict[str, Any]:
+        """Return what is kept besides columns; see :class:`Kept`."""
+        return {}
+
+    def columns(self, body: int | None) -> dict[str, Column]:
+        """Return what is kept on a body, by its number in the problem."""
+        raise NotImplementedError
+
+    def take(self, taken: Taken) -> None:
+        """Take what was kept (collective)."""
+        raise NotImplementedError
 
     # -- What it tells, at the last converged step ---------------------------------------------
 
@@ -145,13 +177,45 @@ class Contact(Term):
         Returns:
             Shape ``(1,)`` in the plane, or ``(3,)``, on all ranks.
         """
+        return self._moment([self.points], [self.area[:, None] * self.traction], about)
+
+    def _moment(
+        self,
+        points: Sequence[NDArray[np.float64]],
+        forces: Sequence[NDArray[np.float64]],
+        about: Any,
+    ) -> NDArray[np.float64]:
+        """Return the moment of forces at points of this rank, summed over ranks (collective)."""
         gdim = self.bodies[0].mesh.geometry.dim
         centre = np.asarray(about, dtype=np.float64)
         if centre.shape != (gdim,):
             raise MPMError(f"A moment is about {gdim} coordinates, not {about!r}.")
-        arm, force = self.points - centre, self.area[:, None] * self.traction
-        mine = np.atleast_1d(cross(arm, force).sum(axis=0))
-        return np.asarray(self._comm.allreduce(mine))
+        parts = [cross(x - centre, f).sum(axis=0) for x, f in zip(points, forces, strict=True)]
+        return np.asarray(self._comm.allreduce(np.atleast_1d(np.sum(parts, axis=0))))
+
+
+class _Anchors(Kept):
+    """What a contact remembers.
+
+    Args:
+        contact: The contact.
+        key: See :class:`Kept`.
+    """
+
+    def __init__(self, contact: Contact, key: str) -> None:
+        self._contact, self.key = contact, key
+
+    def numbers(self) -> dict[str, Any]:
+        """See :class:`Kept`."""
+        return self._contact.numbers()
+
+    def columns(self, body: int | None) -> dict[str, Column]:
+        """See :class:`Kept`."""
+        return self._contact.columns(body)
+
+    def restore(self, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        self._contact.take(taken)
 
 
 def cross(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:

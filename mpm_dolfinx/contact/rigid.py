@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dolfinx import mesh
 
 from ..errors import ConvergenceError, MPMError, agree, agreed, as_ours
-from ..io.snapshot import Kept, Taken
+from ..io.snapshot import Taken
 from ..meshes.remesh import Column
 from ..parallel.given import require_same
 from ..particles.particles import Particles
@@ -465,10 +465,6 @@ class Rigid(Contact):
             raise MPMError("A contact belongs to no problem yet; give it as terms=[contact].")
         return self._surface, self._memory.outcome
 
-    def kept(self) -> Sequence[Kept]:
-        """See :meth:`Term.kept`."""
-        return [_Anchors(self, f"contact{self._number}")]
-
     def columns(self, body: int | None) -> dict[str, Column]:
         """Return what is kept on a body, by its number in the problem."""
         if body is None or body != self._places[0]:
@@ -527,27 +523,3 @@ class Rigid(Contact):
             return self._evaluated()
         finally:
             body.displacement.x.array[:] = present
-
-
-class _Anchors(Kept):
-    """What a contact remembers.
-
-    Args:
-        contact: The contact.
-        key: See :class:`Kept`.
-    """
-
-    def __init__(self, contact: Rigid, key: str) -> None:
-        self._contact, self.key = contact, key
-
-    def numbers(self) -> dict[str, Any]:
-        """See :class:`Kept`."""
-        return self._contact.numbers()
-
-    def columns(self, body: int | None) -> dict[str, Column]:
-        """See :class:`Kept`."""
-        return self._contact.columns(body)
-
-    def restore(self, taken: Taken) -> None:
-        """See :class:`Kept`."""
-        self._contact.take(taken)

@@ -222,9 +222,15 @@ class Surface:
         """Return the points as the body is displaced, shape ``(m, nq, gdim)``."""
         return np.asarray(self.shapes @ self.node_positions(converged)[self.nodes])
 
-    def normals(self) -> NDArray[np.float64]:
+    @property
+    def sizes(self) -> NDArray[np.float64]:
+        """Size of each undeformed facet, shape ``(m,)``."""
+        return np.asarray(self._plain.sum(axis=1) ** (1.0 / (self.gdim - 1)))
+
+    def normals(self, converged: bool = False) -> NDArray[np.float64]:
         """Return outward unit normals at the points, as the body is displaced, as positions."""
-        edges = np.einsum("jqk,mki->mqij", self.slopes, self.node_positions()[self.nodes])
+        x = self.node_positions(converged)[self.nodes]
+        edges = np.einsum("jqk,mki->mqij", self.slopes, x)
         n = self.outward[:, None, None] * normals(edges)
         return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
 

@@ -1,0 +1,316 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Facets of one body near points of another: copies of them on the points' ranks, and the closest.
+
+Facets are known by a number that is the same on any ranks. They are looked for in boxes of a grid,
+so that the cost grows with the number of points and facets, not with its square.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+import basix
+
+from ..parallel.exchange import swap
+from .surface import Surface, global_dofs, normals
+
+__all__ = ["Closest", "NearFacets"]
+
+#: Cosine of the angle of two normals below which surfaces face each other.
+FACING = -0.1
+#: Most Newton steps of a projection, and the step that ends them.
+PROJECTIONS, CLOSE = 20, 1e-14
+
+
+class Closest(NamedTuple):
+    """The facet that is closest to each of some points.
+
+    Attributes:
+        facet: Its place among those that are known, -1 where there is none, shape ``(n,)``.
+        place: Reference coordinates of the projection, which may lie beyond its edges, ``(n, e)``.
+        gap: Distance along the normal, negative behind it; infinite where there is none.
+        near: Whether the points may touch: a facet is near, and they are not off its end.
+        beside: How far projections are beyond the edges, over the facet's size, ``(n,)``.
+    """
+
+    facet: NDArray[np.int64]
+    place: NDArray[np.float64]
+    gap: NDArray[np.float64]
+    near: NDArray[np.bool_]
+    beside: NDArray[np.float64]
+
+
+class NearFacets:
+    """Facets of a surface on the ranks where points are near to them.
+
+    Args:
+        surface: The facets.
+        number: A number of each facet that this rank owns, the same on any ranks, shape ``(m,)``.
+        points: This rank's points as they are, shape ``(n, gdim)``.
+        around: How near a facet must be.
+        nodes: Positions of this rank's nodes of the surface's W as they are, shape ``(N, gdim)``.
+
+    Attributes:
+        number: Numbers of the facets that this rank knows, sorted.
+        dofs: Their global dofs, shape ``(f, k gdim)``.
+        outward: As that of :class:`Surface`.
+        middle: Their middles in the undeformed body, shape ``(f, gdim)``.
+        present: Whether the domain behind is there.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        number: NDArray[np.int64],
+        points: NDArray[np.float64],
+        around: float,
+        nodes: NDArray[np.float64],
+    ) -> None:
+        self._surface = surface
+        self._comm: MPI.Comm = surface.particles.mesh.comm
+        self.gdim, self.element = surface.gdim, surface.element
+        empty = np.full((1, self.gdim), np.inf)
+        low = np.append(points, empty, axis=0).min(axis=0) - around
+        high = np.append(points, -empty, axis=0).max(axis=0) + around
+        boxes = np.array(self._comm.allgather([low, high]))
+        x = nodes[surface.nodes]
+        lower, upper = x.min(axis=1, initial=np.inf), x.max(axis=1, initial=-np.inf)
+        self._given = [
+            np.flatnonzero((upper >= box[0]).all(axis=1) & (lower <= box[1]).all(axis=1))
+            for box in boxes
+        ]
+        W = surface.particles.W
+        dofs = global_dofs(W, surface.nodes)
+        middle = surface.undeformed().mean(axis=1).reshape(-1, self.gdim)
+        there = (surface.weights > 0.0).any(axis=1)
+        whole = np.column_stack([number, dofs, there])
+        told = np.concatenate(swap(self._comm, [whole[which] for which in self._given]))
+        floats = np.column_stack([surface.outward, middle])
+        also = np.concatenate(swap(self._comm, [floats[which] for which in self._given]))
+        self._order = np.argsort(told[:, 0], kind="stable")
+        told, also = told[self._order], also[self._order]
+        self.number, self.dofs, self.present = told[:, 0], told[:, 1:-1], told[:, -1] > 0
+        self.outward, self.middle = also[:, 0], also[:, 1:]
+
+    def positions(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the nodes of the facets, shape ``(f, k, gdim)`` (collective).
+
+        Args:
+            x: Positions of this rank's nodes of the surface's W, shape ``(N, gdim)``.
+        """
+        mine = x[self._surface.nodes]
+        parts = swap(self._comm, [mine[which] for which in self._given])
+        return np.concatenate(parts)[self._order]
+
+    def find(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the places of facets by their numbers, -1 where they are not known."""
+        if len(self.number) == 0:
+            return np.full(len(numbers), -1, dtype=np.int64)
+        place = np.minimum(np.searchsorted(self.number, numbers), len(self.number) - 1)
+        return np.where(self.number[place] == numbers, place, -1)
+
+    def tabulate(
+        self, place: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return shape functions with first and second derivatives at reference points ``(n, e)``.
+
+        Returns:
+            Shapes ``(n, k)``, ``(n, e, k)`` and ``(n, e, e, k)``.
+        """
+        n, e = place.shape
+        k = self.element.dim
+        if n == 0:
+            return np.zeros((0, k)), np.zeros((0, e, k)), np.zeros((0, e, e, k))
+        table = self.element.tabulate(2, place)[:, :, :, 0]
+        first = [1 + i for i in range(e)]
+        if e == 1:
+            second = [[2]]
+        else:
+            second = [
+                [basix.index(2, 0), basix.index(1, 1)],
+                [basix.index(1, 1), basix.index(0, 2)],
+            ]
+        return table[0], table[first].swapaxes(0, 1), np.moveaxis(table[np.array(second)], 2, 0)
+
+    def project(
+        self, points: NDArray[np.float64], nodes: NDArray[np.float64], place: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return where points project onto facets, by Newton's method from a place.
+
+        Args:
+            points: Shape ``(n, gdim)``.
+            nodes: Nodes of the facet of each, shape ``(n, k, gdim)``.
+            place: Where to begin, shape ``(n, e)``.
+        """
+        place = place.copy()
+        left = np.arange(len(points))
+        for _ in range(PROJECTIONS):
+            N, dN, ddN = self.tabulate(place[left])
+            x, X = points[left], nodes[left]
+            r = x - np.einsum("nk,nki->ni", N, X)
+            A = np.einsum("nek,nki->nei", dN, X)
+            B = np.einsum("nefk,nki,ni->nef", ddN, X, r)
+            G = A @ A.swapaxes(1, 2)
+            # where a curved facet bends towards the point too much, its plane has to do
+            bent = G - B
+            good = np.linalg.det(bent) > 0.1 * np.linalg.det(G)
+            G = np.where(good[:, None, None], bent, G)
+            step = np.linalg.solve(G, np.einsum("nei,ni->ne", A, r)[:, :, None])[:, :, 0]
+            step = np.clip(step, -1.0, 1.0)
+            place[left] = np.clip(place[left] + step, -3.0, 4.0)
+            left = left[np.abs(step).max(axis=1, initial=0.0) > CLOSE]
+            if len(left) == 0:
+                break
+        return place
+
+    def clamped(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return places within the reference facet."""
+        inner = np.clip(place, 0.0, 1.0)
+        if self.element.cell_type == basix.CellType.triangle:
+            inner = inner / np.maximum(inner.sum(axis=1), 1.0)[:, None]
+        return inner
+
+    def _start(self, count: int) -> NDArray[np.float64]:
+        middle = basix.geometry(self.element.cell_type).mean(axis=0)
+        return np.tile(middle, (count, 1))
+
+    def closest(
+        self,
+        points: NDArray[np.float64],
+        outward: NDArray[np.float64] | None,
+        nodes: NDArray[np.float64],
+        reach: float,
+        apart: tuple[NDArray[np.float64], float] | None = None,
+    ) -> Closest:
+        """Return the closest facet of each point.
+
+        Args:
+            points: Shape ``(n, gdim)``.
+            outward: Normals of the surface that the points are on: facets must face them. ``None``
+                takes facets as they come.
+            nodes: Nodes of the facets, of :meth:`positions`.
+            reach: How near a facet must be.
+            apart: On the same body, undeformed points and how far a facet must be from them there.
+        """
+        n, e = len(points), self.gdim - 1
+        facet = np.full(n, -1, dtype=np.int64)
+        place, gap = np.zeros((n, e)), np.full(n, np.inf)
+        near, beside = np.zeros(n, dtype=bool), np.zeros(n)
+        which, facets = self._candidates(points, nodes, reach)
+        which, facets = self._facing(points, outward, nodes, which, facets, reach)
+        if apart is not None:
+            away = np.linalg.norm(apart[0][which] - self.middle[facets], axis=1) > apart[1]
+            which, facets = which[away], facets[away]
+        if len(which) == 0:
+            return Closest(facet, place, gap, near, beside)
+        x, X = points[which], nodes[facets]
+        s = self.project(x, X, self._start(len(which)))
+        inner = self.clamped(s)
+        N, dN, _ = self.tabulate(inner)
+        r = x - np.einsum("nk,nki->ni", N, X)
+        far = np.linalg.norm(r, axis=1)
+        n_of = self.outward[facets][:, None] * normals(np.einsum("nek,nki->nie", dN, X))
+        n_of = n_of / np.linalg.norm(n_of, axis=1)[:, None]
+        ok = far <= reach
+        if outward is not None:
+            ok &= (outward[which] * n_of).sum(axis=1) < FACING
+        which, facets, s, inner, far = which[ok], facets[ok], s[ok], inner[ok], far[ok]
+        # the nearest, and among equals that with the lowest number
+        order = np.lexsort((facets, np.round(far / reach, 12), which))
+        first = order[np.diff(which[order], prepend=-1) != 0]
+        who = which[first]
+        facet[who], place[who] = facets[first], s[first]
+        N, dN, _ = self.tabulate(s[first])
+        X = nodes[facets[first]]
+        n_of = self.outward[facets[first]][:, None] * normals(np.einsum("nek,nki->nie", dN, X))
+        n_of = n_of / np.linalg.norm(n_of, axis=1)[:, None]
+        g = ((points[who] - np.einsum("nk,nki->ni", N, X)) * n_of).sum(axis=1)
+        gap[who] = g
+        # A point behind the end of an open surface, or beside an edge, touches nothing.
+        size = np.linalg.norm(np.einsum("nek,nki->nei", dN, X), axis=2).max(axis=1)
+        over = np.abs(s[first] - inner[first]).max(axis=1) * size
+        off = (g < 0.0) & (over > np.maximum(1e-9 * size, 0.2 * np.abs(g)))
+        off &= far[first] > 2.0 * np.abs(g) + 1e-12 * size
+        near[who] = ~off
+        beside[who] = over / size
+        return Closest(facet, place, gap, near, beside)
+
+    def _facing(
+        self,
+        points: NDArray[np.float64],
+        outward: NDArray[np.float64] | None,
+        nodes: NDArray[np.float64],
+        which: NDArray[np.int64],
+        facets: NDArray[np.int64],
+        reach: float,
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the pairs of points and facets that may be near, by the planes of the facets."""
+        if len(which) == 0:
+            return which, facets
+        _, dN, _ = self.tabulate(self._start(1))
+        n = self.outward[:, None] * normals(np.einsum("ek,fki->fie", dN[0], nodes))
+        n = n / np.maximum(np.linalg.norm(n, axis=1), 1e-300)[:, None]
+        middle = nodes.mean(axis=1)
+        curved = self.element.degree > 1 or self.element.dim == 4
+        away = ((points[which] - middle[facets]) * n[facets]).sum(axis=1)
+        size = np.linalg.norm(nodes - middle[:, None], axis=2).max(axis=1, initial=0.0)
+        good = np.abs(away) <= reach + (0.5 * size[facets] if curved else 0.0)
+        good &= np.linalg.norm(points[which] - middle[facets], axis=1) <= reach + size[facets]
+        if outward is not None:
+            facing = (outward[which] * n[facets]).sum(axis=1)
+            good &= facing < (0.5 if curved else FACING)
+        return which[good], facets[good]
+
+    def _candidates(
+        self, points: NDArray[np.float64], nodes: NDArray[np.float64], reach: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return pairs of points and facets whose boxes, made larger by the reach, hold them."""
+        none = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        if len(points) == 0 or len(nodes) == 0:
+            return none
+        low, high = nodes.min(axis=1) - reach, nodes.max(axis=1) + reach
+        there = self.present & np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
+        if not there.any():
+            return none
+        edge = max(float(np.median((high - low)[there])), 1e-300)
+        base = low[there].min(axis=0)
+        top = high[there].max(axis=0)
+        inside = ((points >= base) & (points <= top)).all(axis=1)
+        who = np.flatnonzero(inside)
+        if len(who) == 0:
+            return none
+        count = np.minimum((top - base) / edge + 1.0, 2.0**20).astype(np.int64)
+        edges = (top - base) / count
+        edges[edges == 0.0] = 1.0
+
+        def tile(x: NDArray[np.float64]) -> NDArray[np.int64]:
+            return np.asarray(np.clip((x - base) / edges, 0, count - 1).astype(np.int64))
+
+        facets = np.flatnonzero(there)
+        first, last = tile(low[facets]), tile(high[facets])
+        most = (last - first).max(axis=0) + 1
+        tiles, owners = [], []
+        for shift in product(*(range(m) for m in most)):
+            at = first + shift
+            good = (at <= last).all(axis=1)
+            tiles.append(np.ravel_multi_index(tuple(at[good].T), tuple(count)))
+            owners.append(facets[good])
+        all_tiles, all_owners = np.concatenate(tiles), np.concatenate(owners)
+        order = np.argsort(all_tiles, kind="stable")
+        all_tiles, all_owners = all_tiles[order], all_owners[order]
+        mine = np.ravel_multi_index(tuple(tile(points[who]).T), tuple(count))
+        begin = np.searchsorted(all_tiles, mine)
+        size = np.searchsorted(all_tiles, mine, side="right") - begin
+        which = np.repeat(who, size)
+        offset = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
+        facet = all_owners[np.repeat(begin, size) + offset]
+        x = points[which]
+        good = ((x >= low[facet]) & (x <= high[facet])).all(axis=1)
+        return which[good], facet[good]

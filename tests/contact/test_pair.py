@@ -1,0 +1,326 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Two bodies that touch: patch test, balance, derivatives, sliding, and no false gap."""
+
+import numpy as np
+import pytest
+import scenes
+from compare import outcome, same_run
+from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD, anywhere
+
+from dolfinx import fem
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx import contact
+from mpm_dolfinx.materials import Hencky, LinearElastic
+
+YOUNG, POISSON = 1e3, 0.3
+
+
+def turned(domain, angle, origin=(0.0, 0.0)):
+    """Turn and shift a mesh."""
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    domain.geometry.x[:, :2] = domain.geometry.x[:, :2] @ np.array([[c, s], [-s, c]]) + origin
+    return domain
+
+
+def spaces(lower, upper, n, count=2, comm=WORLD, degree=1):
+    """Return spaces on one mesh, each of them a field of its own."""
+    kind = QUADRILATERAL if len(n) == 2 else HEXAHEDRON
+    domain = scenes.box(lower, upper, n, kind, comm)
+    return [scenes.vectors(domain, degree) for _ in range(count)]
+
+
+def patch(passes, degree, tilt=30.0, cells=(QUADRILATERAL, QUADRILATERAL), n=(9, 5)):
+    """Return two blocks, one on the other, under a uniform pressure; the largest stress error."""
+    origin = (0.53, 0.31)
+    Va, Vb = spaces([-1.0, -1.0], [4.0, 4.0], [20, 20])
+    upper = scenes.box([0.0, 0.53], [1.0, 1.0], [n[0], n[0] // 2], cells[0])
+    lower = scenes.box([0.0, 0.0], [1.0, 0.53], [n[1], n[1] // 2], cells[1])
+    tags = [
+        scenes.facet_tags(upper, scenes.at(1, 0.53), scenes.at(0, 0.0), scenes.at(1, 1.0)),
+        scenes.facet_tags(lower, scenes.at(1, 0.53), scenes.at(0, 0.0), scenes.at(1, 0.0)),
+    ]
+    a, b = (
+        mpm.Particles(turned(body, tilt, origin), V, quadrature_degree=2)
+        for body, V in ((upper, Va), (lower, Vb))
+    )
+    c, s = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
+    touch = contact.Pair(
+        a, b, facet_tags=tags, tags=(1, 1), passes=passes, quadrature_degree=degree
+    )
+    problem = mpm.QuasiStaticProblem(
+        [a, b],
+        LinearElastic(YOUNG, POISSON),
+        tractions=[[((s, -c), 3)], []],
+        facet_tags=tags,
+        supports=[
+            mpm.boundary.roller(a, tags[0], 2, (c, s)),
+            mpm.boundary.roller(b, tags[1], 2, (c, s)),
+            mpm.boundary.roller(b, tags[1], 3, (-s, c)),
+        ],
+        terms=[touch],
+    )
+    problem.solve(1)
+    Q = np.array([[c, -s], [s, c]])
+    exact = Q @ np.diag([0.0, -1.0]) @ Q.T
+    error = max(scenes.largest(p.stress[:, :2, :2] - exact) for p in (a, b))
+    return problem, touch, error, Q
+
+
+@pytest.mark.parametrize(
+    ("passes", "degree", "cells", "bound"),
+    [
+        (1, 9, (QUADRILATERAL, QUADRILATERAL), 1e-3),
+        (2, 29, (QUADRILATERAL, QUADRILATERAL), 1e-3),
+        (2, 9, (TRIANGLE, QUADRILATERAL), 1e-2),
+    ],
+)
+def test_pressure_goes_through_facets_that_do_not_match(passes, degree, cells, bound):
+    problem, touch, error, Q = patch(passes, degree, cells=cells)
+    assert error < bound
+    assert np.abs(problem.reaction(touch) - Q[:, 1]).max() < 1e-7
+    p = scenes.gather(touch.pressure[touch.touches])
+    assert np.abs(p - 1.0).max() < 30 * bound
+    assert sum(problem.history.iterations) <= 3
+
+
+def two(cells=(QUADRILATERAL, TRIANGLE), friction=0.3, comm=WORLD, degree=1, tilt=0.0, **options):
+    """Return a small block that is pressed on a large one and dragged along it."""
+    Va, Vb = spaces([-0.4, -0.2], [2.4, 1.8], [14, 10], comm=comm, degree=degree)
+    a = mpm.Particles(
+        scenes.box([0.2, 1.0], [0.83, 1.5], [5, 4], cells[0], comm), Va, degree=degree
+    )
+    b = mpm.Particles(
+        scenes.box([0.0, 0.0], [2.0, 1.0], [16, 8], cells[1], comm), Vb, degree=degree
+    )
+    touch = contact.Pair(a, b, friction, **options)
+    top = fem.locate_dofs_geometrical(Va, lambda x: x[1] > 1.39)
+    base = fem.locate_dofs_geometrical(Vb, lambda x: x[1] < 0.01)
+    motion = fem.Constant(Va.mesh, np.zeros(2))
+    bcs = [fem.dirichletbc(motion, top, Va), fem.dirichletbc(np.zeros(2), base, Vb)]
+    problem = mpm.QuasiStaticProblem([a, b], Hencky(YOUNG, POISSON), bcs=bcs, terms=[touch])
+
+    def path(t):
+        motion.value[:] = [0.5 * max(t - 0.25, 0.0), -0.04 * min(4 * t, 1.0)]
+
+    return problem, touch, path
+
+
+def balance(problem, touch):
+    """Return the sums of contact forces and of their moments on both bodies."""
+    forces = touch.residuals()
+    total, moment = np.zeros(2), 0.0
+    for body, force in zip(problem.bodies, forces, strict=True):
+        f = force.array_r.reshape(-1, 2)
+        x = scenes.own(body.displacement).reshape(-1, 2)
+        x = x + body.W.tabulate_dof_coordinates()[: len(x), :2]
+        total += WORLD.allreduce(f.sum(axis=0))
+        moment += WORLD.allreduce((x[:, 0] * f[:, 1] - x[:, 1] * f[:, 0]).sum())
+    return total, moment
+
+
+def test_forces_and_moments_of_friction_balance():
+    problem, touch, path = two()
+    for _ in problem.steps(8, update=path):
+        total, moment = balance(problem, touch)
+        size = np.abs(problem.reaction(touch)).max()
+        assert np.abs(total).max() < 1e-12 * size
+        assert abs(moment) < 1e-12 * size
+    force = problem.reaction(touch)
+    assert np.abs(problem.reaction(problem.bcs[0]) + force).max() < 1e-6 * np.abs(force).max()
+    assert np.abs(problem.reaction(problem.bcs[1]) - force).max() < 1e-6 * np.abs(force).max()
+    assert force[0] / force[1] == pytest.approx(-0.3, abs=0.03)
+    assert not touch.sticks.all() and touch.touches.any()
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_tangent_is_the_derivative_of_the_forces(degree):
+    problem, touch, path = two(degree=degree)
+    steps = problem.steps(8, update=path)
+    for _ in range(5):
+        next(steps)
+    bodies = problem.bodies
+    # (in the middle of a step: at its end points that slip are about to stick)
+    start = [body.displacement.x.array.copy() for body in bodies]
+    start[0].reshape(-1, 2)[:] += (0.01, -0.002)
+    some = np.random.default_rng(7)
+    X = [body.W.tabulate_dof_coordinates()[:, :2] for body in bodies]
+    ways = [1e-8 * np.sin(x @ some.uniform(3, 9, (2, 2)) + i).ravel() for i, x in enumerate(X)]
+    touch.begin()
+
+    def forces(factor):
+        for body, d, way in zip(bodies, start, ways, strict=True):
+            body.displacement.x.array[:] = d + factor * way
+        assert touch.update() is None
+        return np.concatenate([f.array_r.copy() for f in touch.residuals()])
+
+    numeric = (8 * (forces(1.0) - forces(-1.0)) - (forces(2.0) - forces(-2.0))) / 12.0
+    forces(0.0)
+    motions = []
+    for body, way in zip(bodies, ways, strict=True):
+        vector = body.T.createVecLeft()
+        vector.array_w[:] = way[: vector.getLocalSize()]
+        motions.append(vector)
+    exact = np.concatenate([f.array_r.copy() for f in touch.stiffness_force(motions)])
+    for body, d in zip(bodies, start, strict=True):
+        body.displacement.x.array[:] = d
+    size = scenes.largest(exact)
+    assert size > 0.0
+    assert scenes.largest(exact - numeric) < 1e-6 * size
+
+
+def test_bodies_with_fields_of_their_own_meet_where_their_facets_do():
+    Va, Vb = spaces([-0.4, -0.2], [2.4, 2.0], [14, 11])
+    a = mpm.Particles(scenes.box([0.2, 1.1], [0.83, 1.6], [5, 4], QUADRILATERAL), Va)
+    b = mpm.Particles(scenes.box([0.0, 0.0], [2.0, 1.0], [16, 8], QUADRILATERAL), Vb)
+    touch = contact.Pair(a, b)
+    top = fem.locate_dofs_geometrical(Va, lambda x: x[1] > 1.39)
+    base = fem.locate_dofs_geometrical(Vb, lambda x: x[1] < 0.01)
+    motion = fem.Constant(Va.mesh, np.zeros(2))
+    bcs = [fem.dirichletbc(motion, top, Va), fem.dirichletbc(np.zeros(2), base, Vb)]
+    problem = mpm.QuasiStaticProblem([a, b], Hencky(YOUNG, POISSON), bcs=bcs, terms=[touch])
+
+    def path(t):
+        motion.value[:] = [0.0, -0.12 * t]
+
+    # cells are 0.2 in size; with one field the bodies would feel each other from there on
+    for step in problem.steps(24, update=path):
+        gap = 0.1 - 0.12 * step.load
+        force = problem.reaction(touch)[1]
+        assert (force > 1e-9) == (gap < -1e-9), gap
+        near = WORLD.allreduce(touch.gap.min(initial=np.inf), scenes.MPI.MIN)
+        if gap >= 0.0:
+            assert near == pytest.approx(gap, abs=1e-9)
+
+
+@pytest.mark.mpi
+def test_a_dragged_block_is_the_same_on_any_number_of_ranks():
+    problem, touch, path = two(cells=(TRIANGLE, QUADRILATERAL))
+    other, alone, same = two(cells=(TRIANGLE, QUADRILATERAL), comm=scenes.MPI.COMM_SELF)
+    problem.solve(8, update=path)
+    other.solve(8, update=same)
+    force = other.reaction(alone)
+    assert np.abs(problem.reaction(touch) - force).max() < 1e-9 * np.abs(force).max()
+    assert abs(touch.moment((0, 0)) - alone.moment((0, 0)))[0] < 1e-9 * np.abs(force).max()
+    same_run(outcome(problem), outcome(other), 1e-9)
+
+
+def test_a_step_that_fails_leaves_everything_as_it_was():
+    problem, touch, path = two()
+    steps = problem.steps(8, update=path)
+    for _ in range(5):
+        next(steps)
+    before = [{k: c.values.copy() for k, c in touch.columns(i).items()} for i in (0, 1)]
+    force, d = problem.reaction(touch), [b.displacement.x.array.copy() for b in problem.bodies]
+    problem.bcs[0].g.value[:] = [0.0, -0.9]
+    with pytest.raises(mpm.MPMError):
+        problem.step()
+    assert np.array_equal(force, problem.reaction(touch))
+    for body, array in zip(problem.bodies, d, strict=True):
+        assert np.array_equal(array, body.displacement.x.array)
+    for number, columns in enumerate(before):
+        for key, column in touch.columns(number).items():
+            assert np.array_equal(columns[key], column.values), key
+
+
+def test_a_checkpoint_goes_on_as_the_run_does(tmp_path):
+    problem, touch, path = two()
+    for _ in problem.steps(8, update=path):
+        if len(problem.history.steps) == 5:
+            problem.save(tmp_path / "half.ckpt")
+            force = problem.reaction(touch)
+    other, again, path = two()
+    other.restore(tmp_path / "half.ckpt")
+    assert np.abs(other.reaction(again) - force).max() < 1e-9 * np.abs(force).max()
+    other.solve(8, update=path)
+    end = problem.reaction(touch)
+    assert np.abs(other.reaction(again) - end).max() < 1e-7 * np.abs(end).max()
+
+
+@pytest.mark.parametrize("what", ["move", "rebase", "split"])
+def test_contact_follows_other_meshes_of_the_bodies(what):
+    problem, touch, path = two(cells=(QUADRILATERAL, QUADRILATERAL))
+    other, alone, same = two(cells=(QUADRILATERAL, QUADRILATERAL))
+    for number, _ in enumerate(problem.steps(8, update=path)):
+        if number != 4:
+            continue
+        before = problem.reaction(touch)
+        if what == "move":
+            ranks = [anywhere(body.mesh, number) for body in problem.bodies]
+
+            def change(ranks=ranks):
+                for body, to in zip(problem.bodies, ranks, strict=True):
+                    body.move(to)
+
+            problem.renew(change, lambda state: state)
+        elif what == "rebase":
+            problem.rebase()
+        else:
+            problem.split(np.arange(0, 128, 2), body=1)
+        after = problem.reaction(touch)
+        assert np.abs(after - before).max() < 1e-8 * np.abs(before).max()
+    other.solve(8, update=same)
+    end = other.reaction(alone)
+    bound = 5e-2 if what == "split" else 1e-6
+    assert np.abs(problem.reaction(touch) - end).max() < bound * np.abs(end).max()
+
+
+@pytest.mark.parametrize("cell", [TETRAHEDRON, HEXAHEDRON], ids=scenes.name)
+def test_a_cube_is_dragged_on_another(cell):
+    Va, Vb = spaces([-0.3, -0.3, -0.3], [1.3, 1.3, 2.1], [4, 4, 6])
+    a = mpm.Particles(scenes.box([0.2, 0.2, 1.0], [0.8, 0.8, 1.5], [2, 2, 2], cell), Va)
+    b = mpm.Particles(scenes.box([0.0] * 3, [1.0] * 3, [4, 4, 4], cell), Vb)
+    touch = contact.Pair(a, b, 0.3)
+    top = fem.locate_dofs_geometrical(Va, lambda x: x[2] > 1.25)
+    base = fem.locate_dofs_geometrical(Vb, lambda x: x[2] < 0.15)
+    motion = fem.Constant(Va.mesh, np.zeros(3))
+    bcs = [fem.dirichletbc(motion, top, Va), fem.dirichletbc(np.zeros(3), base, Vb)]
+    problem = mpm.QuasiStaticProblem([a, b], Hencky(YOUNG, POISSON), bcs=bcs, terms=[touch])
+
+    def path(t):
+        motion.value[:] = [0.06 * max(2 * t - 1, 0.0), 0.0, -0.04 * min(2 * t, 1.0)]
+
+    problem.solve(2, update=path)
+    force = problem.reaction(touch)
+    assert force[2] > 0.0 > force[0]
+    assert force[0] / force[2] == pytest.approx(-0.3, abs=0.05)
+    assert np.abs(problem.reaction(problem.bcs[0]) + force).max() < 1e-6 * force[2]
+    assert np.abs(problem.reaction(problem.bcs[1]) - force).max() < 1e-6 * force[2]
+    # what the points tell is what acts on both bodies, also of moments
+    on_b = problem.reaction(problem.bcs[1])
+    assert np.abs(on_b - force).max() < 1e-6 * force[2]
+
+
+def test_bodies_that_overlap_at_the_beginning_are_refused():
+    Va, Vb = spaces([-0.5, -0.5], [1.5, 2.0], [8, 10])
+    a = mpm.Particles(scenes.box([0.2, 0.9], [0.8, 1.5], [4, 4], QUADRILATERAL), Va)
+    b = mpm.Particles(scenes.unit(6, QUADRILATERAL), Vb)
+    with pytest.raises(mpm.MPMError, match=r"overlap at the beginning: particles .* up to 0\.1"):
+        mpm.QuasiStaticProblem([a, b], Hencky(1e3, 0.3), terms=[contact.Pair(a, b)])
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"friction": -1.0}, "friction must be a number from 0"),
+        ({"passes": 3}, "has 1 or 2 passes"),
+        ({"tags": 1}, "tags of a Pair must be two"),
+        ({"moduli": (1.0, -1.0)}, "modulus must be a positive number"),
+        ({"penalty": 0}, "penalty must be a positive number"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(options, sentence):
+    bodies = two()[0].bodies
+    with pytest.raises(mpm.MPMError, match=sentence):
+        contact.Pair(*bodies, **options)
+
+
+def test_bodies_on_one_space_are_refused():
+    (V,) = spaces([-0.5, -0.5], [1.5, 2.5], [4, 6], 1)
+    a = mpm.Particles(scenes.unit(2, TRIANGLE), V)
+    b = mpm.Particles(scenes.box([0.0, 1.0], [1.0, 2.0], [2, 2], TRIANGLE), V)
+    with pytest.raises(mpm.MPMError, match="on the same V, which makes them stick"):
+        contact.Pair(a, b)
+    with pytest.raises(mpm.MPMError, match="needs two bodies"):
+        contact.Pair(a, a)
