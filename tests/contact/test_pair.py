@@ -224,14 +224,14 @@ def test_a_step_that_fails_leaves_everything_as_it_was():
             assert np.array_equal(columns[key], column.values), key
 
 
-def test_a_checkpoint_goes_on_as_the_run_does(tmp_path):
+def test_a_checkpoint_goes_on_as_the_run_does(mpi_tmp_path):
     problem, touch, path = two()
     for _ in problem.steps(8, update=path):
         if len(problem.history.steps) == 5:
-            problem.save(tmp_path / "half.ckpt")
+            problem.save(mpi_tmp_path / "half.ckpt")
             force = problem.reaction(touch)
     other, again, path = two()
-    other.restore(tmp_path / "half.ckpt")
+    other.restore(mpi_tmp_path / "half.ckpt")
     assert np.abs(other.reaction(again) - force).max() < 1e-9 * np.abs(force).max()
     other.solve(8, update=path)
     end = problem.reaction(touch)

@@ -296,20 +296,20 @@ def test_a_step_that_fails_leaves_everything_as_it_was():
         assert np.array_equal(columns[key], column.values), key
 
 
-def test_a_checkpoint_goes_on_as_the_run_does(tmp_path):
+def test_a_checkpoint_goes_on_as_the_run_does(mpi_tmp_path):
     problem, die, path = dragged()
     for step in problem.steps(10, update=path):
         if len(problem.history.steps) == 6:
-            problem.save(tmp_path / "half.ckpt")
+            problem.save(mpi_tmp_path / "half.ckpt")
             before = told(die)
     other, again, path = dragged()
-    other.restore(tmp_path / "half.ckpt")
+    other.restore(mpi_tmp_path / "half.ckpt")
     close(before, told(again), 1e-11)
     other.solve(10, update=path)
     close(told(die), told(again), 1e-8)
     same_run(outcome(problem), outcome(other), 1e-9)
     third, _, _ = dragged(friction=0.0)
-    third.restore(tmp_path / "half.ckpt")  # another law is another run, not another state
+    third.restore(mpi_tmp_path / "half.ckpt")  # another law is another run, not another state
 
 
 @pytest.mark.mpi
