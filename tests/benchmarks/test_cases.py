@@ -21,6 +21,7 @@ SHORT = ("compaction", "column_free", "snap_through")
 LONG = {
     *("vortex", "discs", "column"),
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
+    *("slope", "vertical-cut", "footing-friction"),
     *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
 }
 COMMON = {"completed", "load", "iterations", "cutbacks", "failure"}
@@ -108,6 +109,13 @@ RUNS = {
         "--cell 0.25 --steps 16",
         {"ratio": 1.04, "plateau": 0.005, "drop": 3e-3},
     ),
+    "slope": ("strength", "--case slope --cell 0.2", {"ratio": 1.06}),
+    "vertical-cut": ("strength", "--case vertical_cut --cell 0.125", {"ratio": 1.08}),
+    "footing-friction": (
+        "strength",
+        "--case footing --cell 0.5 --steps 10",
+        {"ratio": 1.2, "cutbacks": 0},
+    ),
     "snap-through": ("snap_through", "--steps 12", {"error": 5e-3, "cutbacks": 0}),
     "roller-patch": (
         "column_roller",
@@ -166,6 +174,7 @@ KEYS = {
     "colliding_discs": {"energy_change", "rebound", "momentum_error"},
     "vortex": {"displacement_error", "velocity_error"},
     "column_dynamic": {"toe", "top"},
+    "strength": {"factor", "exact", "ratio", "particles"},
     "snap_through": {"limit", "valley", "crown", "error"},
 }
 
@@ -205,6 +214,8 @@ def test_numbers(case, capfd):
         assert numbers["error"] > 6e-2 and numbers["iterations"] <= 170
     if name == "block3d":
         assert abs(numbers["height"] - 1.2) < 1e-3
+    if name == "strength":
+        assert numbers["ratio"] > 0.9
     if name in ("compaction", "column_roller") and "--elements 8" in arguments:
         each = 2 if "tri" in arguments or "hex" in arguments else 1
         assert numbers["particles"] == 32 * each
