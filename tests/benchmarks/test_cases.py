@@ -38,6 +38,11 @@ RUNS = {
         "--degree 2 --offset 0.05 --steps 25",
         {"error": 3e-4, "iterations": 140, "cutbacks": 0},
     ),
+    "consolidation": (
+        "consolidation",
+        "--settlement 0.3",
+        {"error": 7.5e-3, "error_degree": 5e-3, "iterations": 16},
+    ),
     "cantilever-mixed": (
         "cantilever",
         "--degree 2 --mixed pressure --poisson 0.4999 --steps 10",

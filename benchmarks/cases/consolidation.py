@@ -1,0 +1,152 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""A column of soil that settles as the water leaves its pores (Terzaghi 1943, Biot 1941).
+
+docs/porous.md has the equations. Lengths are over the height, stresses over the load, and times
+over `H^2 / c_v`.
+"""
+
+from mpi4py import MPI
+
+import kit
+import numpy as np
+
+import ufl
+from dolfinx import fem, mesh
+
+import mpm_dolfinx as mpm
+
+parser = kit.Parser("Consolidation of a column, drained at its top.")
+parser.add_argument("--cells", type=kit.whole, default=8, help="background cells over the height")
+parser.add_argument("--steps", type=kit.whole, default=16, help="steps of time")
+parser.add_argument("--offset", type=float, default=0.37, help="of the column, in cells")
+parser.add_argument("--settlement", type=kit.positive, default=0.1, help="at the end of all time")
+parser.add_argument("--time", type=kit.positive, default=0.1, help="at the end of the run")
+args = parser.parse()
+if not 0.0 <= args.offset <= 1.0:
+    parser.error("argument --offset: from 0 to 1 cells")
+
+comm = MPI.COMM_WORLD
+n, h = args.cells, 1.0 / args.cells
+low = args.offset * h
+
+background = mesh.create_rectangle(
+    comm,
+    [[0.0, -(2 + np.ceil(args.settlement * n)) * h], [2 * h, 1 + 2 * h]],
+    [2, n + 4 + int(np.ceil(args.settlement * n))],
+    mesh.CellType.quadrilateral,
+)
+body = mesh.create_rectangle(
+    comm, [[0.0, low], [2 * h, 1.0 + low]], [4, 2 * n], mesh.CellType.quadrilateral
+)
+V = fem.functionspace(background, ("Lagrange", 2, (2,)))
+particles = mpm.Particles(body, V, degree=2, quadrature_degree=4)
+p = particles.field(fem.functionspace(background, ("Lagrange", 1)), at="nodes", name="pressure")
+
+# The skeleton: linear elastic, of the oedometric modulus that gives the settlement. Terzaghi's
+# effective stress, and the mass of the water over a step. The top is drained by Nitsche's method,
+# and the bottom held by a penalty, as both lie on the body.
+
+modulus, poisson = 1.0 / args.settlement, 0.25
+shear = modulus * (1.0 - 2.0 * poisson) / 2.0 / (1.0 - poisson)
+permeability = args.settlement
+
+d, v, q = particles.displacement, ufl.TestFunction(particles.W), ufl.TestFunction(p.W)
+d_n, dt = fem.Function(particles.W), fem.Constant(body, args.time / args.steps)
+ends = mesh.locate_entities_boundary(
+    body, 1, lambda x: np.isclose(x[1], 1.0 + low) | np.isclose(x[1], low)
+)
+ends.sort()
+middle = mesh.compute_midpoints(body, 1, ends)[:, 1]
+tags = mesh.meshtags(body, 1, ends, np.where(middle > 0.5 + low, 1, 2).astype(np.int32))
+ds, normal = ufl.Measure("ds", domain=body, subdomain_data=tags), ufl.FacetNormal(body)
+
+strain = ufl.sym(ufl.grad(d))
+stress = 2.0 * shear * strain
+stress += ((modulus - 2.0 * shear) * ufl.tr(strain) - p) * ufl.Identity(2)
+R_u = ufl.inner(stress, ufl.grad(v)) * particles.dx + v[1] * ds(1)
+R_u += 1e4 * modulus / h * d[1] * v[1] * ds(2)
+flow = dt * permeability
+R_p = -(q * ufl.div(d - d_n) + flow * ufl.dot(ufl.grad(p), ufl.grad(q))) * particles.dx
+R_p += flow * (ufl.dot(ufl.grad(p), normal) * q + ufl.dot(ufl.grad(q), normal) * p) * ds(1)
+R_p -= flow * 10.0 / h * p * q * ds(1)
+
+side = mesh.locate_entities_boundary(
+    background, 1, lambda x: np.isclose(x[0], 0.0) | np.isclose(x[0], 2 * h)
+)
+bc = fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(0), 1, side), V.sub(0))
+problem = mpm.ParticleProblem(
+    [R_u, R_p],
+    particles,
+    bcs=[bc],
+    fields=[p],
+    symmetric=True,
+    petsc_options_prefix="consolidation_",
+)
+
+
+def terzaghi(z: np.ndarray, time: float) -> np.ndarray:
+    """Pressure over the load, z below the drained top."""
+    M = (2.0 * np.arange(2000) + 1.0) * np.pi / 2.0
+    return (2.0 / M * np.sin(np.outer(z, M)) * np.exp(-M * M * time)).sum(axis=1)
+
+
+particles.load.value = 1.0  # all of it from the start
+failure = None
+depth = 1.0 + low - p.W.tabulate_dof_coordinates()[:, 1]
+profiles = []
+try:
+    for number in range(args.steps):
+        problem.step()
+        d_n.x.array[:] = d.x.array
+        if args.plot and (number + 1) % max(1, args.steps // 4) == 0:
+            profile = np.column_stack([depth, p.x.array])[: p.W.dofmap.index_map.size_local]
+            profiles.append(((number + 1) * float(dt.value), kit.gathered(profile)))
+except mpm.MPMError as told:
+    failure = told
+
+# The error of the pressure in the L2 norm, and the settlement of the top over that at the end of
+# all time, less Terzaghi's.
+
+exact = fem.Function(p.W)
+exact.x.array[:] = terzaghi(depth, args.time)
+squares = [
+    kit.total(fem.assemble_scalar(fem.form(f**2 * particles.dx))) for f in (p - exact, exact)
+]
+error = float(np.sqrt(squares[0] / squares[1]))
+area = kit.total(fem.assemble_scalar(fem.form(fem.Constant(body, 1.0) * ds(1))))
+sunk = -kit.total(fem.assemble_scalar(fem.form(d[1] * ds(1)))) / area / args.settlement
+M = (2.0 * np.arange(2000) + 1.0) * np.pi / 2.0
+degree = 1.0 - float((2.0 / M**2 * np.exp(-M * M * args.time)).sum())
+numbers = {
+    **kit.outcome(problem.history, failure),
+    "error": error if failure is None else None,
+    "degree": sunk,
+    "error_degree": abs(sunk - degree),
+    "particles": particles.num_global,
+}
+rows = [
+    ("particles", f"{particles.num_global}, {n} cells over the height"),
+    ("linear solves", f"{numbers['iterations']} in {args.steps} steps"),
+    ("pressure, error", f"{error:.2e}"),
+    ("degree of consolidation", f"{sunk:.4f} (exact {degree:.4f})"),
+]
+
+if args.plot:
+    fig, axes = kit.figure(7.0, 5.0)
+    if comm.rank == 0:
+        ax, z = axes["main"], np.linspace(0.0, 1.0, 200)
+        for time, points in profiles:
+            ax.plot(terzaghi(z, time), z, color="0.6", lw=1.0)
+            ax.plot(points[:, 1], points[:, 0], ".", color=kit.COLOURS["blue"], ms=3)
+        ax.set(xlabel="pressure over load", ylabel="depth over height", ylim=(1.0, 0.0))
+        ax.set_title("Nodes of the body, and Terzaghi's series")
+    kit.save(fig, args)
+
+kit.report(args, numbers, rows, failure)
+
+# With the default arguments the numbers are known.
+
+if args.default:
+    assert failure is None, failure
+    assert error < 7.5e-3 and numbers["iterations"] == args.steps
