@@ -20,7 +20,8 @@ SETUP := sh scripts/setup_env.sh
 BENCHMARKS := $(wildcard $(patsubst %,benchmarks/%.py,assembly step skip solvers scaling ranks cantilever_reference))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo demos test test-all test-debian stress bench bench-smoke studies lint docs serve clean
+.PHONY: help demo demos test test-all test-debian stress bench bench-smoke studies lint docs serve dist
+.PHONY: test-dist clean
 
 help: ## This list
 	@echo "make TARGET [VENV=path of an environment] [PYTHON=path of an interpreter]"
@@ -72,6 +73,13 @@ studies: ## Make the tables of the docs again, say which no longer follow (ARGS=
 demos: ## Run the demos (ARGS="footing collapse" some), keep their pictures and outputs for the docs
 	@$(SETUP) wheel plot
 	"$(BIN)/python" scripts/run_demos.py $(ARGS)
+
+dist: ## Source distribution and wheel in dist/, looked at by twine and auditwheel
+	@$(SETUP) dist
+	@bash scripts/make_dist.sh
+
+test-dist: dist ## The wheel of dist/ in an environment of its own, outside of this tree
+	@bash scripts/test_wheel.sh
 
 lint: ## ruff check, ruff format --check, mypy
 	@$(SETUP) wheel plot test

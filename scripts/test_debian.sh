@@ -10,14 +10,17 @@
 #
 #   DEBIAN_ROOT    where the root is      (default: /var/tmp/mpm-dolfinx-SUITE)
 #   DEBIAN_SUITE   Debian's release       (default: trixie, with DOLFINx 0.9 and PETSc 3.22)
-#   DEBIAN_MIRROR  where it comes from    (default: http://deb.debian.org/debian)
+#   DEBIAN_MIRROR  where it comes from    (default: where this machine's apt has Debian from, else
+#                                          debootstrap's own)
 #   NP, TEST_TIMEOUT                      as for run_tests.sh
 set -euo pipefail
 
 cd "$(dirname "$0")/.."
 suite=${DEBIAN_SUITE:-trixie}
 root=${DEBIAN_ROOT:-/var/tmp/mpm-dolfinx-$suite}
-mirror=${DEBIAN_MIRROR:-http://deb.debian.org/debian}
+# The first of apt's sources that is Debian itself, which others may stand before.
+mirror=${DEBIAN_MIRROR:-$(apt-get indextargets --format '$(ORIGIN)|$(LABEL)|$(REPO_URI)' 2>/dev/null |
+    sed -n 's/^Debian|Debian|//p' | head -n 1)}
 venv=/opt/mpm-dolfinx
 packages="python3-dolfinx-real python3-gmsh python3-matplotlib python3-pyvista python3-scipy
 python3-tqdm python3-pip python3-venv python3-dev python3-nanobind nanobind-dev
@@ -55,10 +58,10 @@ enter() {
 if [ ! -e "$root" ]; then
     command -v debootstrap >/dev/null ||
         fail "make test-debian needs the command debootstrap: apt-get install debootstrap, or name a Debian root that exists with DEBIAN_ROOT=."
-    echo "Making a root of Debian $suite in $root from $mirror"
+    echo "Making a root of Debian $suite in $root from ${mirror:-where debootstrap finds it}"
     rm -rf "$root.part"
-    debootstrap --variant=minbase "$suite" "$root.part" "$mirror" >"$root.log" 2>&1 ||
-        fail "debootstrap failed; see $root.log. Is $mirror reached from here? Name another with DEBIAN_MIRROR=."
+    debootstrap --variant=minbase "$suite" "$root.part" ${mirror:+"$mirror"} >"$root.log" 2>&1 ||
+        fail "debootstrap failed; see $root.log. Is ${mirror:-its mirror} reached from here? Name another with DEBIAN_MIRROR=."
     mv "$root.part" "$root"
     rm -f "$root.log"
 fi
