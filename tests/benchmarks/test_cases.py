@@ -180,6 +180,7 @@ KEYS = {
     "vortex": {"displacement_error", "velocity_error"},
     "column_dynamic": {"toe", "top"},
     "strength": {"factor", "exact", "ratio", "particles"},
+    "consolidation": {"error", "degree", "error_degree", "particles"},
     "snap_through": {"limit", "valley", "crown", "error"},
 }
 
