@@ -16,12 +16,14 @@ import numpy as np
 from ..errors import MPMError
 from ..history import Statistics
 from ..parallel.magnitudes import unit_sized
-from .multigrid import COARSEST, SHIFT, Multigrid
+from .multigrid import SHIFT, Multigrid
 
 __all__ = ["LINEAR_SOLVERS", "ShiftedFactor"]
 
 #: Values of ``linear_solver``.
 LINEAR_SOLVERS = ("auto", "direct", "multigrid")
+#: Most unknowns of the coarsest level of multigrid, which is factorised.
+COARSEST = 600
 #: Unknowns from which on multigrid takes less time than a factorisation, by dimension of space.
 CROSSOVER = {2: 40000, 3: 2000}
 
@@ -78,8 +80,12 @@ class Levels(Protocol):
     def rigid_motions(self) -> PETSc.NullSpace:
         """Return the rigid motions in the unknowns."""
 
-    def interpolations(self) -> Sequence[PETSc.Mat]:
-        """Return what gives the unknowns of each level from those of the next coarser one."""
+    def interpolations(self, coarsest: int) -> Sequence[PETSc.Mat]:
+        """Return what gives the unknowns of each level from those of the next coarser one.
+
+        Args:
+            coarsest: Number of unknowns below which no coarser level is made.
+        """
 
 
 class ShiftedFactor:
@@ -283,7 +289,7 @@ class ShiftedFactor:
             if not known:
                 self._refining = self._flexible = self._shifted = None
                 self._multigrid = Multigrid(
-                    self._ksp.getPC(), levels.interpolations(), self._symmetric
+                    self._ksp.getPC(), levels.interpolations(COARSEST), self._symmetric
                 )
                 self._ksp.getPC().setFromOptions()
             assert self._multigrid is not None

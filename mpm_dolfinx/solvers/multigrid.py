@@ -8,10 +8,8 @@ from collections.abc import Sequence
 
 from petsc4py import PETSc
 
-__all__ = ["COARSEST", "SHIFT", "Multigrid"]
+__all__ = ["SHIFT", "Multigrid"]
 
-#: Most unknowns of a coarsest level, which is factorised.
-COARSEST = 600
 
 #: Shift of the coarse levels' diagonals, relative to them: boxes may have more dofs than the body
 #: can tell apart.

@@ -89,7 +89,7 @@ class ReducedProblem(Protocol):
     def rigid_motions(self) -> PETSc.NullSpace:
         """Return the rigid motions in the unknowns, which multigrid must know."""
 
-    def interpolations(self) -> Sequence[PETSc.Mat]:
+    def interpolations(self, coarsest: int) -> Sequence[PETSc.Mat]:
         """Return what gives the unknowns of each level of multigrid from the next coarser one."""
 
     def impose(self) -> bool:

@@ -387,9 +387,9 @@ class ControlledSystem:
         """Return the rigid motions in the unknowns."""
         return self._reduced.rigid_motions()
 
-    def interpolations(self) -> Sequence[PETSc.Mat]:
+    def interpolations(self, coarsest: int) -> Sequence[PETSc.Mat]:
         """Return what gives the unknowns of each level of multigrid from the next coarser one."""
-        return self._reduced.interpolations()
+        return self._reduced.interpolations(coarsest)
 
     def extent(self) -> float:
         """Return the size of the positions of all nodes."""

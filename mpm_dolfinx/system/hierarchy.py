@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..background.grids import box_weights, coarser
-from ..solvers.multigrid import COARSEST
 
 __all__ = ["FieldDofs", "interpolations"]
 
@@ -88,7 +87,7 @@ class _Entries(NamedTuple):
 
 
 def interpolations(
-    comm: MPI.Comm, count: int, fields: Sequence[FieldDofs], coarsest: int = COARSEST
+    comm: MPI.Comm, count: int, fields: Sequence[FieldDofs], coarsest: int
 ) -> list[PETSc.Mat]:
     """Return what gives the dofs of each level from those of the next coarser one (collective).
 

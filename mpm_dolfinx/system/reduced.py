@@ -577,13 +577,13 @@ class ReducedSystem:
         assert self._numbering is not None
         return self._numbering.rigid_motions()
 
-    def interpolations(self) -> Sequence[PETSc.Mat]:
+    def interpolations(self, coarsest: int) -> Sequence[PETSc.Mat]:
         """Return what gives the unknowns of each level of multigrid from the next coarser one.
 
         See :func:`.hierarchy.interpolations` (collective).
         """
         dofs = [field.level() for field in self.fields]
-        return interpolations(self._comm, self.sizes[0], dofs)
+        return interpolations(self._comm, self.sizes[0], dofs, coarsest)
 
     def impose(self) -> bool:
         """Impose the step's Dirichlet values from now on; return whether there are any."""

@@ -49,7 +49,7 @@ class DoubleWell:
     def rigid_motions(self):
         raise AssertionError("for multigrid only")
 
-    def interpolations(self):
+    def interpolations(self, coarsest):
         return []
 
     def prediction(self):

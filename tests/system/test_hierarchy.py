@@ -87,4 +87,4 @@ def test_fields_have_levels_of_their_own():
 
 
 def test_few_unknowns_have_no_levels():
-    assert begun(QUADRILATERAL, 1, 4).reduced.interpolations() == []
+    assert begun(QUADRILATERAL, 1, 4).reduced.interpolations(600) == []
