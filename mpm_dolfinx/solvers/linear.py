@@ -369,7 +369,8 @@ class ShiftedFactor:
             return True
         if reason in INDEFINITE:
             self._negative = True
-            if shorten and self._indefinite < PATIENCE:
+            matrix = reason == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
+            if matrix and shorten and self._indefinite < PATIENCE:
                 self._indefinite += 1
                 raise Indefinite
             if self._solve_indefinite(b, x, self._ksp.getTolerances()[0]):

@@ -8,12 +8,17 @@ from collections.abc import Sequence
 
 from petsc4py import PETSc
 
+import numpy as np
+
 __all__ = ["SHIFT", "Multigrid"]
 
 
 #: Shift of the coarse levels' diagonals, relative to them: boxes may have more dofs than the body
 #: can tell apart.
 SHIFT = 1e-8
+#: Power iterations that look for the largest correction of a sweep, what it may fall short of it,
+#: and what it may be, relative to the right one: below 2.
+POWERS, MARGIN, OVERSHOOT = 12, 1.15, 1.8
 
 
 class Multigrid:
@@ -73,6 +78,38 @@ class Multigrid:
         for number, matrix in enumerate(reversed([K, *self._products])):
             solver = self._pc.getMGSmoother(number) if number else self._pc.getMGCoarseSolve()
             solver.setOperators(matrix, matrix)
+            if number and fresh and K.comm.size > 1:
+                _damp(solver, matrix)
+
+
+def _damp(smoother: PETSc.KSP, matrix: PETSc.Mat) -> None:
+    """Shorten the sweeps of several ranks where together they would overshoot (collective).
+
+    Each rank corrects its own unknowns as if the others stood still. Where that is more than twice
+    what it should be, the cycle is not positive definite. How much it is, is the largest eigenvalue
+    of the sweep times the matrix, found by power iterations.
+    """
+    smoother.setUp()
+    sweep = smoother.getPC()
+    x, force = matrix.createVecRight(), matrix.createVecLeft()
+    first = x.getOwnershipRange()[0]
+    x.array_w[:] = np.sin(1.0 + 1.7 * (first + np.arange(x.getLocalSize())))
+    size = 1.0
+    for _ in range(POWERS):
+        x.scale(1.0 / x.norm())
+        matrix.mult(x, force)
+        sweep.apply(force, x)
+        size = x.norm()
+        if not 0.0 < size < np.inf:
+            return
+    scale = min(1.0, OVERSHOOT / (MARGIN * size))
+    key = f"{smoother.getOptionsPrefix()}ksp_richardson_scale"
+    options = PETSc.Options()
+    if options.hasName(key):
+        return
+    options[key] = scale
+    smoother.setFromOptions()
+    options.delValue(key)
 
 
 def _shift_diagonal(matrix: PETSc.Mat) -> None:
