@@ -45,7 +45,7 @@ def assert_same(direct, multigrid, failures=0):
     assert direct.history.statistics["krylov_iterations"] == 0
     statistics = multigrid.history.statistics
     assert statistics["krylov_iterations"] > 0
-    assert (statistics["multigrid_failures"] > 0) == (failures > 0)
+    assert statistics["multigrid_failures"] >= failures
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def assert_same(direct, multigrid, failures=0):
     [
         (20, {}),
         (20, {"cell": TRIANGLE}),
-        (20, {"bent": 0.004}),
+        (20, {"bent": 0.004, "stabilisation": "ghost"}),
         (20, {"stabilisation": None}),
         (20, {"stabilisation": "aggregate"}),
         (9, {"degree": 2}),
