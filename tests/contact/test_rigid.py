@@ -114,6 +114,30 @@ def test_a_block_between_plates_is_compressed_evenly(cell):
     assert scenes.largest(below.gap[here] + p * h / CONFINED) < 1e-11
 
 
+@pytest.mark.parametrize("f_bar", ["none", "domain"])
+def test_a_cylinder_between_plates(f_bar):
+    strain = 0.01
+    V = scenes.vectors(scenes.box([0.0, -0.3], [1.5, 1.5], [3, 4], QUADRILATERAL))
+    particles = mpm.Particles(scenes.unit(4, QUADRILATERAL), V, quadrature_degree=2)
+    options = {"axisymmetric": True, "quadrature_degree": 3}
+    below = contact.Rigid(particles, contact.plane((0.0, 0.0), (0.0, 1.0)), **options)
+    above = contact.Rigid(particles, contact.plane((0.0, 1.0), (0.0, -1.0)), **options)
+    problem = mpm.QuasiStaticProblem(
+        particles,
+        LinearElastic(YOUNG, POISSON),
+        bcs=[scenes.fix(V, scenes.at(0, 0.0), component=0)],
+        axisymmetric=True,
+        f_bar=f_bar,
+        terms=[below, above],
+    )
+    p = strain * YOUNG
+    shift = strain + 2.0 * p * 0.25 / CONFINED
+    problem.solve(2, update=lambda t: above.move((0.0, -t * shift)))
+    assert problem.reaction(below)[1] == pytest.approx(np.pi * p, rel=1e-8)
+    assert problem.reaction(above)[1] == pytest.approx(-np.pi * p, rel=1e-8)
+    assert scenes.largest(particles.stress[:, 1, 1] + p) < 1e-7 * p
+
+
 def lines(h, fine, end):
     """Return places from 0 to end, h apart up to ``fine`` and farther apart beyond."""
     places = [h * i for i in range(round(fine / h) + 1)]
@@ -388,6 +412,36 @@ def test_a_sphere_pressed_into_a_cube_and_turned():
     # the ball turns anticlockwise, and takes the cube along
     assert moment[2] > 0.0 and moment[2] > 3 * np.abs(moment[:2]).max()
     assert np.abs(problem.reaction(problem.bcs[0]) + force).max() < 1e-6 * abs(force[2])
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.6])
+def test_a_block_slides_down_an_incline_or_stays(friction):
+    t, normal = tilted(30.0)
+    body = scenes.box([0.0, 0.0], [1.0, 0.5], [6, 3], QUADRILATERAL)
+    body.geometry.x[:, :2] = body.geometry.x[:, :2] @ np.array([t, normal])
+    V = scenes.vectors(scenes.box([-1.1, -1.1], [1.7, 1.8], [9, 9], QUADRILATERAL))
+    particles = mpm.Particles(body, V)
+    ground = contact.Rigid(particles, contact.plane((0.0, 0.0), normal), friction)
+    problem = mpm.DynamicProblem(
+        particles,
+        LinearElastic(YOUNG, POISSON),
+        1.0,
+        scheme="euler",
+        body_force=(0.0, -10.0),
+        terms=[ground],
+    )
+    speeds = [problem.momentum @ -t / 0.5 for _ in problem.steps(0.2, 0.01)]
+    exact = 10.0 * max(0.5 - friction * np.sqrt(0.75), 0.0)
+    if exact > 0.0:
+        assert np.diff(speeds)[10:].mean() / 0.01 == pytest.approx(exact, rel=1e-4)
+        reaction = problem.reaction(ground)
+        assert reaction @ t / (reaction @ normal) == pytest.approx(friction, rel=1e-9)
+    else:
+        assert abs(speeds[-1]) < 1e-3
+    other = contact.Rigid(particles, contact.plane((0.0, 0.0), normal))
+    refused = mpm.DynamicProblem(particles, LinearElastic(YOUNG, POISSON), 1.0, terms=[other])
+    with pytest.raises(mpm.MPMError, match="use scheme='euler'"):
+        refused.step(0.01)
 
 
 # -- What cannot be ----------------------------------------------------------------------
