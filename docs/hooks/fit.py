@@ -9,14 +9,17 @@ have lines of up to 100 columns; what a page shows of them is formatted anew.
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
 
 COLUMNS = 80
+RUFF = shutil.which("ruff", path=str(Path(sys.executable).parent)) or "ruff"
 FENCE = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 ITEM = re.compile(r"(?:[-*]|\d+\.) ")
 TEXT = re.compile(r"[^\s#|>`$<!]")
@@ -48,7 +51,7 @@ def fitted(code: str) -> str:
     if all(len(line) <= COLUMNS for line in code.split("\n")):
         return code
     done = subprocess.run(
-        [sys.executable, "-m", "ruff", "format", "--isolated", f"--line-length={COLUMNS}", "-"],
+        [RUFF, "format", "--isolated", f"--line-length={COLUMNS}", "-"],
         input=code,
         capture_output=True,
         text=True,

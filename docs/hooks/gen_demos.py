@@ -57,8 +57,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             continue
         parts.append(f"## {heading}")
         cards = [
-            f'<a href="demo_{name}.html"><img src="../images/demos/{name}.png" alt="" '
-            f'loading="lazy"><strong>{html.escape(title)}</strong></a>'
+            f'<a href="demo_{name}.html">{thumbnail(root / "docs", name)}'
+            f"<strong>{html.escape(title)}</strong></a>"
             for title, name in entries
         ]
         parts.append('<div class="gallery">\n' + "\n".join(cards) + "\n</div>")
@@ -68,12 +68,19 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
+def thumbnail(docs: Path, name: str) -> str:
+    """Return a demo's picture for the gallery, if it is kept."""
+    if not (docs / "images" / "demos" / f"{name}.png").exists():
+        return ""
+    return f'<img src="../images/demos/{name}.png" alt="" loading="lazy">'
+
+
 def results(docs: Path, name: str) -> str:
     """Return the part of a page with what the demo drew and printed."""
     kept = docs / "images" / "demos"
     picture, output = kept / f"{name}.png", kept / f"{name}.txt"
     if not picture.exists() or not output.exists():
-        log.warning("The demo %s has not been run: python scripts/run_demos.py %s", name, name)
+        log.info("The demo %s has not been run: python scripts/run_demos.py %s", name, name)
         return ""
     movie = f"\n![The run as a movie](../images/demos/{name}.gif)\n"
     parts = [
