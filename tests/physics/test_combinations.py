@@ -8,6 +8,7 @@
 import re
 from pathlib import Path
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -472,3 +473,43 @@ def test_a_feature_in_motion(feature, mpi_tmp_path):
         except BaseException as error:
             error.add_note(f"{feature} with scheme={scheme!r}: {cell}")
             raise
+
+
+# -- Stages ------------------------------------------------------------------------------
+
+
+#: What does not go together with a stage that takes cells away, and why.
+NO_STAGES = {
+    "rebase": "are concave or deleted, so the body cannot be rebased",
+    "mixed pressure": "Stages do not go together with fields=, nor with mixed='pressure'",
+}
+
+
+def stages(wanted):
+    """Run a scene: its weight, a corner that is taken away, other meshes, another load."""
+    scene = Scene(wanted)
+    problem, up = scene.problem, scene.dim - 1
+    problem.solve()
+    body = problem.bodies[-1]
+    top = WORLD.allreduce(float(body.initial_centroid[:, -1].max(initial=-1.0)), MPI.MAX) - 0.3
+    problem.remove(lambda x: (x[up] > top) & (x[0] > 0.5), body=len(problem.bodies) - 1)
+    problem.solve(2)
+    scene.require_equilibrium()
+    scene.change()
+    problem.stage(body_force=(*[0.0] * up, -GRAVITY))
+    problem.solve(1)
+    scene.require_equilibrium()
+    assert problem.history.time == 3.0
+
+
+@pytest.mark.parametrize(
+    "feature",
+    all_but(("f_bar patch", "MohrCoulomb", "repartition"), [f for f in FEATURES if f not in STILL]),
+)
+@pytest.mark.filterwarnings("ignore:The run is complete, but the domains")
+def test_a_feature_with_stages(feature):
+    if feature in NO_STAGES:
+        with pytest.raises(mpm.MPMError, match=re.escape(NO_STAGES[feature])):
+            stages(FEATURES[feature])
+    else:
+        stages(FEATURES[feature])
