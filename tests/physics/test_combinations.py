@@ -23,6 +23,7 @@ from dolfinx import fem, la
 import mpm_dolfinx as mpm
 from mpm_dolfinx.io import Kept
 from mpm_dolfinx.materials import DruckerPrager, Hencky, MohrCoulomb, VonMises
+from mpm_dolfinx.solvers import linear
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "combinations.md"
 EXACT = {"quadrature_degree": 8}
@@ -62,6 +63,7 @@ FEATURES = {
     "delete": {"delete": True},
     "automatic steps": {"automatic": True},
     "mixed pressure": {"mixed": "pressure", "degree": 2},
+    "multigrid": {"linear_solver": "multigrid"},
 }
 
 
@@ -199,7 +201,14 @@ class Scene:
         if "background" in wanted:
             u, v = first.increment, ufl.TestFunction(first.V)
             background = 1e-3 * ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx
-        names = ("f_bar", "axisymmetric", "stabilisation", "dependent_dofs", "mixed")
+        names = (
+            "f_bar",
+            "axisymmetric",
+            "stabilisation",
+            "dependent_dofs",
+            "mixed",
+            "linear_solver",
+        )
         return self.kind(
             bodies if two else first,
             wanted.get("law", Hencky(YOUNG, POISSON)),
@@ -373,7 +382,8 @@ def test_the_page_has_each_pair():
 
 @pytest.mark.parametrize("feature", FEATURES)
 @pytest.mark.filterwarnings("ignore:The run is complete, but the domains")
-def test_a_feature_with_those_before_it(feature, mpi_tmp_path):
+def test_a_feature_with_those_before_it(feature, mpi_tmp_path, monkeypatch):
+    monkeypatch.setattr(linear, "COARSEST", 12)
     table, sentences = page()
     for cell, (other, options) in zip(table[feature], FEATURES.items(), strict=False):
         wanted = FEATURES[feature] | options
@@ -461,7 +471,8 @@ def test_the_page_has_each_feature_in_motion():
     "feature", all_but(("Tie", "support"), [f for f in FEATURES if f not in STILL])
 )
 @pytest.mark.filterwarnings("ignore:The run is complete, but the domains")
-def test_a_feature_in_motion(feature, mpi_tmp_path):
+def test_a_feature_in_motion(feature, mpi_tmp_path, monkeypatch):
+    monkeypatch.setattr(linear, "COARSEST", 12)
     sentences = page()[1]
     for cell, scheme in zip(motions()[feature], ("midpoint", "conserving", "euler"), strict=True):
         try:
