@@ -20,6 +20,10 @@ __all__ = ["LineSearch", "stalled"]
 #: Most halvings of a Newton step, and the drop in work that needs none.
 HALVINGS = 8
 SUFFICIENT = 0.8
+#: Share of its start that the work may keep where a potential is followed, and most evaluations
+#: that look for such a step.
+SHARP = 0.3
+SECANTS = 4
 #: Steps that may follow one which is taken on trust until the residual is below that before it.
 TRUST = 7
 #: Iterations within which the smallest residual must fall, and to what share of itself.
@@ -74,6 +78,11 @@ class LineSearch:
     search withdraws to where it was (the watchdog of Chamberlain, Powell, Lemarechal & Pedersen
     1982), once in a solve. What is left is halved.
 
+    Where the residual is the gradient of a potential and points yield, the step then goes on to
+    where the work is at most 0.3 of its start, by the secants of regula falsi: the potential of a
+    body that flows has kinks, and Newton steps that are only just accepted go to and fro over
+    them.
+
     Args:
         evaluate: Evaluates the residual at unknowns into ``F``; returns a failure or ``None``.
         uphill: Says whether the step for a residual is not that of a positive definite tangent.
@@ -97,8 +106,13 @@ class LineSearch:
         self._statistics = statistics
         self.begin()
 
-    def begin(self) -> None:
-        """Begin a solve."""
+    def begin(self, potential: bool = False) -> None:
+        """Begin a solve.
+
+        Args:
+            potential: Whether the residual is the gradient of a potential.
+        """
+        self._potential = potential
         self._trusted: _Step | None = None
         self._since = 0  # iterations
         self._may_trust = True
@@ -121,7 +135,7 @@ class LineSearch:
             self._trusted = None
         start = F.copy()
         if self._reduces(step, F, trial) and not self._overdue(F):
-            return False
+            return self._sharpen(step, 1.0, F, trial)
         if self._trusted is None and self._uphill(start, y):
             self._redirect(start, y)
             self._statistics.count("redirections")
@@ -177,11 +191,58 @@ class LineSearch:
 
     def _halve(self, step: _Step, F: PETSc.Vec, trial: PETSc.Vec) -> None:
         """Halve the step until norm or work fall far enough."""
-        for _ in range(HALVINGS):
+        for halvings in range(HALVINGS):
             step = step.halved()
             self._statistics.count("halvings")
             if self._reduces(step, F, trial):
+                self._sharpen(step, 2.0 ** (halvings + 1), F, trial)
                 break
+
+    def _sharpen(self, step: _Step, longest: float, F: PETSc.Vec, trial: PETSc.Vec) -> bool:
+        """Go on to where the work has fallen far enough, where there is a potential.
+
+        Args:
+            step: The step that is accepted; changed.
+            longest: The whole Newton step, as a multiple of it.
+            F: The residual at its end; replaced.
+            trial: Its end; replaced.
+
+        Returns:
+            Whether the step has changed.
+        """
+        work = F.dot(step.direction)
+        far = abs(work) > SHARP * abs(step.work)
+        if not (self._potential and far and step.work > 0.0 and self._trusted is None):
+            return False
+        if self._smooth():
+            return False
+        low, high = (0.0, step.work), None
+        share, found = 1.0, (abs(work), 1.0)
+        for _ in range(SECANTS):
+            if work < 0.0:
+                high = share, work
+            else:
+                low = share, work
+            if high is not None:
+                width = high[0] - low[0]
+                inner = width * low[1] / (low[1] - high[1])
+                share = low[0] + min(max(inner, 0.1 * width), 0.9 * width)
+            elif share < longest:
+                share = min(2.0 * share, longest)
+            else:
+                break
+            trial.waxpy(-share, step.y, step.x)
+            failed = self._evaluate(trial) is not None
+            work = -step.work if failed else F.dot(step.direction)
+            if not failed and abs(work) < found[0]:
+                found = abs(work), share
+            if not failed and abs(work) <= SHARP * step.work:
+                break
+        if share != found[1]:
+            trial.waxpy(-found[1], step.y, step.x)
+            self._evaluate(trial)
+        step.y.scale(found[1])
+        return found[1] != 1.0
 
 
 def stalled(norms: Sequence[float]) -> bool:

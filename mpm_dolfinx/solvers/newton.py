@@ -122,6 +122,9 @@ class ReducedProblem(Protocol):
     def one_sided(self) -> bool:
         """Return whether something may let bodies go and hold them again, as contact does."""
 
+    def has_potential(self) -> bool:
+        """Return whether a symmetric K means that equilibrium makes a potential least."""
+
 
 class NewtonSolver:
     """SNES with the proximal term and the line search that singular transfers need.
@@ -245,7 +248,7 @@ class NewtonSolver:
         self._norms: list[float] = []
         self.no_equilibrium = False
         if self._search is not None:
-            self._search.begin()
+            self._search.begin(self._symmetric and problem.has_potential())
         self._factor.begin(sizes[1], problem.constrained)
         # What an iterative solve that fails means is for _pre_check to say.
         self.snes.setMaxLinearSolveFailures(1000 if self._factor.iterates else 1)

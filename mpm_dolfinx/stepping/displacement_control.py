@@ -399,6 +399,10 @@ class ControlledSystem:
         """Return whether x moves each body as a rigid one."""
         return self._reduced.is_rigid(x)
 
+    def has_potential(self) -> bool:
+        """Return that the residual is no gradient, since the load factor follows the unknowns."""
+        return False
+
     def one_sided(self) -> bool:
         """Return whether something may let bodies go and hold them again."""
         return self._reduced.one_sided()

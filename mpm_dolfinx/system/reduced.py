@@ -739,6 +739,13 @@ class ReducedSystem:
             ]
         )
 
+    def has_potential(self) -> bool:
+        """Return whether the residual is the gradient of a potential that equilibrium makes least.
+
+        That is if the tangent is symmetric; with fields besides displacements it is a saddle.
+        """
+        return all(isinstance(body, Particles) for body in self.bodies)
+
     def one_sided(self) -> bool:
         """Return whether a term may let bodies go and hold them again."""
         return any(term.one_sided for term in self._terms)

@@ -82,6 +82,9 @@ class DoubleWell:
     def is_rigid(self, x):
         return True
 
+    def has_potential(self):
+        return True
+
     def one_sided(self):
         return False
 
