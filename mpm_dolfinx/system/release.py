@@ -44,11 +44,6 @@ class Release(Term):
         self._reactions: list[fem.Function] = []
 
     @property
-    def one_sided(self) -> bool:
-        """Whether it may let its bodies go: see :attr:`Term.one_sided`."""
-        return False
-
-    @property
     def symmetric(self) -> bool:
         """See :attr:`Term.symmetric`."""
         return True
