@@ -18,7 +18,7 @@ from ..errors import MPMError, agree, as_ours
 from ..meshes.quadrature import quadrature_rule
 from ..particles.particles import Particles
 
-__all__ = ["geostatic", "initial_stress_at_points"]
+__all__ = ["geostatic", "initial_stress_at_points", "of_all_ranks"]
 
 type Array = NDArray[np.float64]
 
@@ -87,6 +87,13 @@ def geostatic(
         )
 
     return stress
+
+
+def of_all_ranks(value: Any) -> Any:
+    """Return what ranks must have in common of an initial stress, or of a list of them."""
+    if isinstance(value, list) and not np.isscalar(value[0] if value else 0.0):
+        return [of_all_ranks(entry) for entry in value]
+    return "its own part" if isinstance(value, np.ndarray) and value.ndim > 2 else value
 
 
 def initial_stress_at_points(value: Any, particles: Particles) -> Array:

@@ -33,7 +33,7 @@ from ..system.pressure import PressureTerm
 from ..system.term import Term
 from ..system.values import FieldTerm
 from .arguments import as_bodies, as_supports, as_terms
-from .initial_stress import initial_stress_at_points
+from .initial_stress import initial_stress_at_points, of_all_ranks
 from .particle_problem import Contribution, Law, ParticleProblem
 from .remeshing import Remeshing, as_indices
 from .setup import BodySetup, Numerics, Setup
@@ -168,7 +168,7 @@ class QuasiStaticProblem(ParticleProblem):
             linear_solver=linear_solver,
             form_compiler_options=form_compiler_options,
             jit_options=jit_options,
-            initial_stress=initial_stress,
+            initial_stress=of_all_ranks(initial_stress),
             terms=terms,
         )
         supports = as_supports(supports, bodies)
@@ -427,7 +427,7 @@ class QuasiStaticProblem(ParticleProblem):
             tractions=tractions,
             pressures=pressures,
             supports=supports,
-            initial_stress=initial_stress,
+            initial_stress=of_all_ranks(initial_stress),
             name=name,
             sudden=sudden,
         )
