@@ -27,7 +27,7 @@ if [[ ${1:-} == --all ]]; then
     which=(-m "")
     default="2 3 4"
 elif (($# == 0)); then
-    few=(contact parallel particles problems system stepping transfer)
+    few=(parallel particles problems system stepping transfer)
     few=("${few[@]/#/tests/}" tests/io/test_checkpoint.py tests/physics/test_parallel.py)
     echo "The quick tests. Those of one folder or file take seconds: make test ARGS=tests/materials," \
         "NP=1 for one rank alone; make test-all runs all, also on four ranks."
