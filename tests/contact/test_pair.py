@@ -185,7 +185,7 @@ def test_bodies_with_fields_of_their_own_meet_where_their_facets_do():
         motion.value[:] = [0.0, -0.12 * t]
 
     # cells are 0.2 in size; with one field the bodies would feel each other from there on
-    for step in problem.steps(24, update=path):
+    for step in problem.steps(12, update=path):
         gap = 0.1 - 0.12 * step.load
         force = problem.reaction(touch)[1]
         assert (force > 1e-9) == (gap < -1e-9), gap
@@ -238,6 +238,7 @@ def test_a_checkpoint_goes_on_as_the_run_does(mpi_tmp_path):
     assert np.abs(other.reaction(again) - end).max() < 1e-7 * np.abs(end).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["move", "rebase", "split"])
 def test_contact_follows_other_meshes_of_the_bodies(what):
     problem, touch, path = two(cells=(QUADRILATERAL, QUADRILATERAL))
@@ -266,6 +267,7 @@ def test_contact_follows_other_meshes_of_the_bodies(what):
     assert np.abs(problem.reaction(touch) - end).max() < bound * np.abs(end).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cell", [TETRAHEDRON, HEXAHEDRON], ids=scenes.name)
 def test_a_cube_is_dragged_on_another(cell):
     Va, Vb = spaces([-0.3, -0.3, -0.3], [1.3, 1.3, 2.1], [4, 4, 6])
