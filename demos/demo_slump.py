@@ -97,13 +97,8 @@ figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4), layout="constrained"
 mpm.plot.background(V, ax=left, color="0.92")
 mpm.plot.domains(still, ax=left, facecolor="none", edgecolor="C1", linewidth=0.4)
 mpm.plot.domains(moving, moving.plastic_strain, ax=left, cmap="YlGnBu", vmin=0.0)
-left.set(
-    xlim=(0, 14),
-    ylim=(0, 8.2),
-    xlabel="x, m",
-    ylabel="y, m",
-    title="After 2 s; orange: in equilibrium",
-)
+left.set(xlim=(0, 14), ylim=(0, 8.2), xlabel="x, m", ylabel="y, m")
+left.set_title("After 2 s; orange: in equilibrium")
 for name, label in kinds.items():
     right.plot(times, [getattr(energy, name) / 1e3 for energy in energies], label=label)
 right.set(xlabel="time, s", ylabel="kJ/m")

@@ -356,10 +356,16 @@ class Field:
         u = self.on_background(x)
         return [norm(motion.of(u)) / abs(self.factor) for motion in self.motions]
 
-    def predict(self, increments: list[NDArray[np.float64]], x: PETSc.Vec) -> None:
-        """Set the unknowns' part of x to what increments of the bodies' nodes are on V."""
+    def predict(self, increments: list[NDArray[np.float64]], x: PETSc.Vec, fit: bool) -> None:
+        """Set the unknowns' part of x to what increments of the bodies' nodes are on V.
+
+        Args:
+            increments: Change of displacement on this rank's own dofs of W, for each body.
+            x: The unknowns.
+            fit: As for :func:`map_to_background`.
+        """
         assert self.free is not None
-        u = map_to_background([body.T for body in self.bodies], increments)
+        u = map_to_background([body.T for body in self.bodies], increments, fit)
         self._cure.stand_in(u)
         x.array_w[self._part_of_x] = self.free.collect(u[self.dofs]) / self.factor
 

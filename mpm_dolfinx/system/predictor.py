@@ -94,7 +94,7 @@ class Predictor:
 
 
 def map_to_background(
-    transfers: Sequence[PETSc.Mat], increments: Increments
+    transfers: Sequence[PETSc.Mat], increments: Increments, fit: bool = True
 ) -> NDArray[np.float64]:
     """Map increments of the bodies' nodes to the background, so that it gives them back.
 
@@ -107,6 +107,8 @@ def map_to_background(
     Args:
         transfers: T of each body.
         increments: w of each body, on this rank's own dofs of W.
+        fit: Whether to lower the gap. Where bodies touch something with a few nodes, an increment
+            that is met to the last node carries them through it, and the smooth one does not.
 
     Returns:
         u on this rank's own dofs of V, zero without weight.
@@ -130,7 +132,8 @@ def map_to_background(
     inverse = np.zeros(len(seen))
     inverse[seen] = 1.0 / weight.array_r[seen]
     u.array_w[:] = inverse * total.array_r
-    _fit(transfers, increments, inverse, u)
+    if fit:
+        _fit(transfers, increments, inverse, u)
     return np.array(u.array_r)
 
 

@@ -569,7 +569,7 @@ class ReducedSystem:
         x = self._numbering.vector()
         for field in self.fields:
             own = [i for i, (its, _) in zip(increments, self._places, strict=True) if its is field]
-            field.predict(own, x)
+            field.predict(own, x, fit=not self.one_sided())
         return x
 
     def rigid_motions(self) -> PETSc.NullSpace:
