@@ -362,9 +362,11 @@ class Field:
         Args:
             increments: Change of displacement on this rank's own dofs of W, for each body.
             x: The unknowns.
-            fit: As for :func:`map_to_background`.
+            fit: As for :func:`map_to_background`; not done for particles that are alone, whose
+                increments the background meets with any motion between them.
         """
         assert self.free is not None
+        fit = fit and all(body.shares_nodes for body in self.bodies)
         u = map_to_background([body.T for body in self.bodies], increments, fit)
         self._cure.stand_in(u)
         x.array_w[self._part_of_x] = self.free.collect(u[self.dofs]) / self.factor

@@ -64,6 +64,7 @@ FEATURES = {
     "automatic steps": {"automatic": True},
     "mixed pressure": {"mixed": "pressure", "degree": 2},
     "multigrid": {"linear_solver": "multigrid"},
+    "contact": {"contact": True},
 }
 
 
@@ -197,6 +198,16 @@ class Scene:
         if "term" in wanted:
             self.springs = Springs(first)
             terms.append(self.springs)
+        self.contact = None
+        if "contact" in wanted:
+            inward = np.eye(self.dim)[0]
+            self.contact = mpm.contact.Rigid(
+                first,
+                mpm.contact.plane(inward, -inward),
+                0.3,
+                axisymmetric="axisymmetric" in wanted,
+            )
+            terms.append(self.contact)
         background = None
         if "background" in wanted:
             u, v = first.increment, ufl.TestFunction(first.V)
@@ -276,6 +287,8 @@ class Scene:
             masses = problem.masses(number)[~body.deleted]
             weight += GRAVITY * float(body.load.value) * WORLD.allreduce(masses.sum())
         held = sum(problem.reaction(s)[-1] for s in (*self.bases, *self.supports))
+        if self.contact is not None:
+            held += problem.reaction(self.contact)[-1]
         if "pressure" in self.wanted:
             held += self.pressed()
         if self.springs is not None:
