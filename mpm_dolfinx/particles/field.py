@@ -209,6 +209,11 @@ class CarriedField:
         return self.field.particles.mesh
 
     @property
+    def shares_nodes(self) -> bool:
+        """Whether the values of neighbours are values at the same nodes."""
+        return self.place == "nodes" and self.field.particles.shares_nodes
+
+    @property
     def num_local(self) -> int:
         """Number of particles that are a field's own: none."""
         return 0

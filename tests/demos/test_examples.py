@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """The examples of README and documentation run, each page from top to bottom."""
 
+import logging
 import re
 from pathlib import Path
 
@@ -16,9 +17,20 @@ PAGES = {
 }
 
 
+@pytest.fixture
+def logging_as_before():
+    """Take back what an example does to the program's logging."""
+    loggers = [logging.getLogger(), *map(logging.getLogger, logging.root.manager.loggerDict)]
+    before = [(logger, logger.level, logger.handlers[:]) for logger in loggers]
+    yield
+    for logger, level, handlers in before:
+        logger.setLevel(level)
+        logger.handlers[:] = handlers
+
+
 @pytest.mark.skip_in_parallel
 @pytest.mark.parametrize("page", PAGES)
-def test_examples_of_a_page_run(page, tmp_path, monkeypatch):
+def test_examples_of_a_page_run(page, tmp_path, monkeypatch, logging_as_before):
     monkeypatch.chdir(tmp_path)
     names = {"__name__": "__main__"}
     for example in EXAMPLE.finditer(PAGES[page]):
