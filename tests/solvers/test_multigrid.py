@@ -45,7 +45,7 @@ def assert_same(direct, multigrid, failures=0):
     assert direct.history.statistics["krylov_iterations"] == 0
     statistics = multigrid.history.statistics
     assert statistics["krylov_iterations"] > 0
-    assert statistics["multigrid_failures"] >= failures
+    assert statistics["multigrid_failures"] == failures
 
 
 @pytest.mark.parametrize(
@@ -118,8 +118,7 @@ def test_a_factorisation_takes_over_where_multigrid_comes_to_nothing():
     ]
     for run in runs:
         run.solve(steps=4)
-    assert_same(*runs, failures=1)
-    assert runs[1].history.statistics["multigrid_failures"] == linear.ENDURED
+    assert_same(*runs, failures=linear.ENDURED)
 
 
 def test_many_unknowns_are_for_multigrid(monkeypatch):
