@@ -219,11 +219,6 @@ class CarriedField:
         return 0
 
     @property
-    def shares_nodes(self) -> bool:
-        """Whether neighbours in the body share their nodes, so that it hangs together."""
-        return self.field.particles.shares_nodes
-
-    @property
     def domain_nodes(self) -> NDArray[np.int32]:
         """Local nodes of W of each owned domain, shape ``(n, k)``."""
         return np.asarray(self.W.dofmap.list[: self.field.particles.num_local])
