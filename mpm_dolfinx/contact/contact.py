@@ -18,6 +18,7 @@ from ..io.snapshot import Kept, Taken
 from ..meshes.remesh import Column
 from ..particles.particles import Particles
 from ..system.term import PointMaterial, Term
+from .law import Coulomb
 from .surface import Surface
 
 __all__ = ["Contact", "Outcome", "as_positive", "stiffness"]
@@ -49,11 +50,13 @@ class Contact(Term):
 
     Args:
         bodies: The bodies.
+        friction: The law of friction.
         axisymmetric: Whether ``x[0]`` is a radius.
     """
 
-    def __init__(self, bodies: Sequence[Particles], axisymmetric: bool) -> None:
+    def __init__(self, bodies: Sequence[Particles], friction: Coulomb, axisymmetric: bool) -> None:
         super().__init__(bodies)
+        self.friction = friction
         self.axisymmetric = axisymmetric
         self._materials: Sequence[PointMaterial | None] = [None] * len(self.bodies)
         self._number = 0
@@ -71,6 +74,11 @@ class Contact(Term):
             next(i for i, body in enumerate(bodies) if body is mine) for mine in self.bodies
         ]
         self._materials = [materials[place] for place in self._places]
+
+    @property
+    def symmetric(self) -> bool:
+        """See :attr:`Term.symmetric`."""
+        return self.friction.smooth
 
     @property
     def one_sided(self) -> bool:

@@ -580,8 +580,7 @@ class Pair(Contact):
             quadrature_degree=quadrature_degree,
             axisymmetric=axisymmetric,
         )
-        super().__init__([a, b], axisymmetric)
-        self.friction = law
+        super().__init__([a, b], law, axisymmetric)
         self._moduli = [None if m is None else as_positive(m, "modulus") for m in moduli]
         penalties = (
             as_positive(penalty, "penalty"),
@@ -600,11 +599,6 @@ class Pair(Contact):
         self._last: list[Outcome] | None = None
 
     # -- The term -------------------------------------------------------------------------------
-
-    @property
-    def symmetric(self) -> bool:
-        """See :attr:`Term.symmetric`."""
-        return self.friction.smooth
 
     def take_part(
         self,

@@ -152,9 +152,8 @@ class Rigid(Contact):
             quadrature_degree=quadrature_degree,
             axisymmetric=axisymmetric,
         )
-        super().__init__([particles], axisymmetric)
+        super().__init__([particles], law, axisymmetric)
         self.shape = shape
-        self.friction = law
         self._modulus = None if modulus is None else as_positive(modulus, "modulus")
         self._penalty = as_positive(penalty, "penalty")
         self._tangential = as_positive(tangential_penalty, "tangential_penalty")
@@ -213,11 +212,6 @@ class Rigid(Contact):
         return (x - self.shape.pivot - pose.offset) @ pose.Q + self.shape.pivot
 
     # -- The term -------------------------------------------------------------------------------
-
-    @property
-    def symmetric(self) -> bool:
-        """See :attr:`Term.symmetric`."""
-        return self.friction.smooth
 
     def take_part(
         self,
