@@ -18,7 +18,7 @@ from ..history import Statistics
 from ..parallel.magnitudes import unit_sized
 from .multigrid import SHIFT, Multigrid
 
-__all__ = ["LINEAR_SOLVERS", "ShiftedFactor"]
+__all__ = ["LINEAR_SOLVERS", "Indefinite", "Levels", "ShiftedFactor"]
 
 #: Values of ``linear_solver``.
 LINEAR_SOLVERS = ("auto", "direct", "multigrid")

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from mpi4py import MPI
@@ -19,7 +19,8 @@ from ..log import NEWTON, tell
 from ..parallel.garbage import weakly
 from ..parallel.magnitudes import norm, sign_of_product
 from .line_search import LineSearch, stalled
-from .linear import Indefinite, ShiftedFactor
+from .linear import Indefinite, Levels, ShiftedFactor
+from .mechanism import Resisting, mechanism, not_held
 
 __all__ = ["NewtonSolver", "ReducedProblem"]
 
@@ -34,11 +35,6 @@ HELD = 0.1
 FROZEN = 1e-8
 #: Share of the forces that the proximal term may bear in the first step.
 LOOSE = 1e-3
-#: Stiffness along a motion, relative to that of its unknowns one by one and to the shift, up to
-#: which nothing holds it.
-MECHANISM = 1e-5
-#: Most inverse iterations that look for such a motion.
-INVERSE_ITERATIONS = 100
 #: Newton increment, relative to the step's, from which on a refined one needs no line search, and
 #: is at the floor of round-off where it does not fall to a quarter of that before.
 SETTLED = 1e-9
@@ -48,7 +44,7 @@ REFINED = 1e-6
 DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 
 
-class ReducedProblem(Protocol):
+class ReducedProblem(Levels, Resisting, Protocol):
     """What the solver asks of a problem. All calls are collective."""
 
     @property
@@ -65,12 +61,6 @@ class ReducedProblem(Protocol):
     def tangent(self) -> PETSc.Mat:
         """Return the tangent at the x of the last residual, always the same object."""
 
-    def diagonal(self, K: PETSc.Mat) -> PETSc.Vec:
-        """Return sizes of the diagonal of a tangent, with signs that make a shift regularise it.
-
-        They are negative for unknowns that enforce a constraint, as a pressure does.
-        """
-
     def constrain(
         self, y: PETSc.Vec, x: PETSc.Vec | None, solve: Callable[[PETSc.Vec, PETSc.Vec], None]
     ) -> int:
@@ -85,12 +75,6 @@ class ReducedProblem(Protocol):
 
     def prediction(self) -> PETSc.Vec | None:
         """Return unknowns to expect at the step's end, if the past says any."""
-
-    def rigid_motions(self) -> PETSc.NullSpace:
-        """Return the rigid motions in the unknowns, which multigrid must know."""
-
-    def interpolations(self, coarsest: int) -> Sequence[PETSc.Mat]:
-        """Return what gives the unknowns of each level of multigrid from the next coarser one."""
 
     def impose(self) -> bool:
         """Impose the step's Dirichlet values from now on; return whether there are any."""
@@ -107,20 +91,11 @@ class ReducedProblem(Protocol):
     def resultant(self) -> float:
         """Return the size of the sum of the last residual over the unknowns."""
 
-    def stiffness(self, x: PETSc.Vec) -> float:
-        """Return ``x . K x`` for the last tangent, without cancellation in rigid motions."""
-
     def motion(self, x: PETSc.Vec) -> float:
         """Return the size of the displacement that x causes on the body."""
 
     def extent(self) -> float:
         """Return the size of the positions of the body, in the same norm."""
-
-    def is_rigid(self, x: PETSc.Vec) -> bool:
-        """Return whether x moves each body as a rigid one."""
-
-    def one_sided(self) -> bool:
-        """Return whether something may let bodies go and hold them again, as contact does."""
 
     def has_potential(self) -> bool:
         """Return whether a symmetric K means that equilibrium makes a potential least."""
@@ -550,8 +525,12 @@ class NewtonSolver:
             return "go on"
         if left > FROZEN * forces and left > FROZEN * self._problem.internal_scale():
             share = left / forces if forces > 0.0 else np.inf
-            loose = self._mechanism(step)
-            self._failure = _unbalanced(share) if loose is None else self._not_held(loose, share)
+            loose = mechanism(self._problem, self._factor, step)
+            self._failure = (
+                _unbalanced(share)
+                if loose is None
+                else not_held(self._problem, self._factor, loose, share)
+            )
             return "failed"
         return "frozen"
 
@@ -646,68 +625,12 @@ class NewtonSolver:
         share = norm(y * self._factor.D) / scale
         if share <= LOOSE:
             return False
-        loose = self._mechanism(y)
+        loose = mechanism(self._problem, self._factor, y)
         if loose is not None:
-            self._failure = self._not_held(loose, share)
+            self._failure = not_held(self._problem, self._factor, loose, share)
             return True
         self._refine()
         return False
-
-    def _not_held(self, mode: PETSc.Vec, share: float) -> MPMError:
-        """Say that forces act on a motion without stiffness.
-
-        A rigid motion has none whatever the step, unless something one-sided comes to hold it.
-        Other motions may get it from their own size, or have lost it to plastic flow: a smaller
-        step may do.
-        """
-        if not (self._problem.is_rigid(mode) or self._moves_rigidly()):
-            return _not_resisted(share)
-        return _let_go(share) if self._problem.one_sided() else _unsupported(share)
-
-    def _moves_rigidly(self) -> bool:
-        """Whether all bodies of a background can move as one rigid body."""
-        assert self.K is not None and self._factor.D is not None
-        motions = self._problem.rigid_motions().getVecs()
-        forces = [self.K * motion for motion in motions]
-        held = [motion * self._factor.D for motion in motions]
-        K = np.array([[motion.dot(force) for force in forces] for motion in motions])
-        D = np.array([[motion.dot(force) for force in held] for motion in motions])
-        size = np.linalg.inv(np.linalg.cholesky(D / D.trace()))
-        softest = size.T @ np.linalg.eigh(size @ ((K + K.T) / D.trace()) @ size.T)[1][:, 0]
-        softest = motions[0].comm.tompi4py().bcast(softest)
-        motion = motions[0].duplicate()
-        motion.set(0.0)
-        motion.maxpy(softest, motions)
-        resistance = motion.dot(motion * self._factor.D)
-        return bool(self._problem.stiffness(motion) <= MECHANISM * resistance)
-
-    def _mechanism(self, y: PETSc.Vec) -> PETSc.Vec | None:
-        """Return a motion that the proximal term holds in y and nothing else does, if there is one.
-
-        Solving for the forces of that term, again and again, leaves what gives way to them most;
-        the stiffness along it tells a soft body, or a stiff one on a soft one, from a motion
-        without any.
-        """
-        assert self._factor.D is not None
-        mode, force = y.copy(), y.duplicate()
-        before = np.inf
-        for _ in range(INVERSE_ITERATIONS):
-            force.pointwiseMult(mode, self._factor.D)
-            force.scale(1.0 / norm(force))
-            self._factor.solve(force, mode)
-            mode.scale(1.0 / norm(mode))
-            force.pointwiseMult(mode, self._factor.D)
-            if self._factor.num_negative:
-                force.array_w[:] = np.copysign(force.array_r, mode.array_r)
-                ratio = abs(self._problem.stiffness(mode)) / mode.dot(force)
-            else:
-                ratio = self._problem.stiffness(mode) / mode.dot(force)
-            if ratio <= MECHANISM:
-                return mode
-            if ratio > 0.95 * before:
-                return None
-            before = ratio
-        return None
 
     def _uphill(self, F: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Return whether a step for the residual F is not that of a positive definite tangent."""
@@ -732,30 +655,6 @@ class NewtonSolver:
             self.iterations += 1
             if not self._uphill(F, y):
                 return
-
-
-def _unsupported(share: float) -> MPMError:
-    return MPMError(
-        f"Forces ({share:.1e} of all) act where nothing holds the bodies; support each of them "
-        "against all rigid motions, with conditions and supports that reach it where it is"
-    )
-
-
-def _let_go(share: float) -> ConvergenceError:
-    return ConvergenceError(
-        f"Forces ({share:.1e} of all) act where nothing holds the bodies once what only pushes has "
-        "let them go; support each of them against all rigid motions, or bring them into contact "
-        "by displacements before"
-    )
-
-
-def _not_resisted(share: float) -> ConvergenceError:
-    return ConvergenceError(
-        f"Forces ({share:.1e} of all) act on motions that are not rigid and that nothing resists: "
-        "hourglass motions of domains with one quadrature point, parts that the background moves "
-        "apart, or parts that nothing holds; use quadrature_degree=2, larger cells of the "
-        "background or smaller domains"
-    )
 
 
 def _unbalanced(share: float) -> ConvergenceError:

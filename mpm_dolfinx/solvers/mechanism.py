@@ -1,0 +1,133 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Motions that nothing holds: which they are, and what is said of them."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from petsc4py import PETSc
+
+import numpy as np
+
+from ..errors import ConvergenceError, MPMError
+from ..parallel.magnitudes import norm
+from .linear import ShiftedFactor
+
+__all__ = ["Resisting", "mechanism", "not_held"]
+
+#: Stiffness along a motion, relative to that of its unknowns one by one and to the shift, up to
+#: which nothing holds it.
+MECHANISM = 1e-5
+#: Most inverse iterations that look for such a motion.
+INVERSE_ITERATIONS = 100
+
+
+class Resisting(Protocol):
+    """What must be known of a system. All calls are collective."""
+
+    def rigid_motions(self) -> PETSc.NullSpace:
+        """Return the rigid motions in the unknowns."""
+
+    def stiffness(self, x: PETSc.Vec) -> float:
+        """Return ``x . K x`` for the last tangent, without cancellation in rigid motions."""
+
+    def is_rigid(self, x: PETSc.Vec) -> bool:
+        """Return whether x moves each body as a rigid one."""
+
+    def one_sided(self) -> bool:
+        """Return whether something may let bodies go and hold them again, as contact does."""
+
+
+def mechanism(system: Resisting, factor: ShiftedFactor, y: PETSc.Vec) -> PETSc.Vec | None:
+    """Return a motion that the proximal term holds in y and nothing else does, if there is one.
+
+    Solving for the forces of that term, again and again, leaves what gives way to them most;
+    the stiffness along it tells a soft body, or a stiff one on a soft one, from a motion
+    without any.
+
+    Args:
+        system: What resists.
+        factor: The factor of its tangent, with the proximal term's diagonal D.
+        y: A step of the unknowns.
+    """
+    assert factor.D is not None
+    mode, force = y.copy(), y.duplicate()
+    before = np.inf
+    for _ in range(INVERSE_ITERATIONS):
+        force.pointwiseMult(mode, factor.D)
+        force.scale(1.0 / norm(force))
+        factor.solve(force, mode)
+        mode.scale(1.0 / norm(mode))
+        force.pointwiseMult(mode, factor.D)
+        if factor.num_negative:
+            force.array_w[:] = np.copysign(force.array_r, mode.array_r)
+            ratio = abs(system.stiffness(mode)) / mode.dot(force)
+        else:
+            ratio = system.stiffness(mode) / mode.dot(force)
+        if ratio <= MECHANISM:
+            return mode
+        if ratio > 0.95 * before:
+            return None
+        before = ratio
+    return None
+
+
+def not_held(system: Resisting, factor: ShiftedFactor, mode: PETSc.Vec, share: float) -> MPMError:
+    """Return the error that says that forces act on a motion without stiffness.
+
+    A rigid motion has none whatever the step, unless something one-sided comes to hold it.
+    Other motions may get it from their own size, or have lost it to plastic flow: a smaller
+    step may do.
+
+    Args:
+        system: What resists.
+        factor: The factor of its tangent.
+        mode: The motion.
+        share: Share of the forces that act on it.
+    """
+    if not (system.is_rigid(mode) or _all_move_rigidly(system, factor)):
+        return _not_resisted(share)
+    return _let_go(share) if system.one_sided() else _unsupported(share)
+
+
+def _all_move_rigidly(system: Resisting, factor: ShiftedFactor) -> bool:
+    """Whether all bodies of a background can move as one rigid body."""
+    assert factor.K is not None and factor.D is not None
+    motions = system.rigid_motions().getVecs()
+    forces = [factor.K * motion for motion in motions]
+    held = [motion * factor.D for motion in motions]
+    K = np.array([[motion.dot(force) for force in forces] for motion in motions])
+    D = np.array([[motion.dot(force) for force in held] for motion in motions])
+    size = np.linalg.inv(np.linalg.cholesky(D / D.trace()))
+    softest = size.T @ np.linalg.eigh(size @ ((K + K.T) / D.trace()) @ size.T)[1][:, 0]
+    softest = motions[0].comm.tompi4py().bcast(softest)
+    motion = motions[0].duplicate()
+    motion.set(0.0)
+    motion.maxpy(softest, motions)
+    resistance = motion.dot(motion * factor.D)
+    return bool(system.stiffness(motion) <= MECHANISM * resistance)
+
+
+def _unsupported(share: float) -> MPMError:
+    return MPMError(
+        f"Forces ({share:.1e} of all) act where nothing holds the bodies; support each of them "
+        "against all rigid motions, with conditions and supports that reach it where it is"
+    )
+
+
+def _let_go(share: float) -> ConvergenceError:
+    return ConvergenceError(
+        f"Forces ({share:.1e} of all) act where nothing holds the bodies once what only pushes has "
+        "let them go; support each of them against all rigid motions, or bring them into contact "
+        "by displacements before"
+    )
+
+
+def _not_resisted(share: float) -> ConvergenceError:
+    return ConvergenceError(
+        f"Forces ({share:.1e} of all) act on motions that are not rigid and that nothing resists: "
+        "hourglass motions of domains with one quadrature point, parts that the background moves "
+        "apart, or parts that nothing holds; use quadrature_degree=2, larger cells of the "
+        "background or smaller domains"
+    )
