@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2
+# Level: 2.8
 
 # # When particles cross cells
 #
@@ -103,7 +103,8 @@ if comm.rank == 0:
     fig, ax = plt.subplots(figsize=(9, 4.5), layout="constrained")
     ax.plot([0.0, 1.0], [0.0, g0 * (length - MARKED[0]) / 1e3], color="0.2", label="exact")
     for name, (path, scatter, end) in results.items():
-        print(f"{name:18s} scatter {100 * scatter:6.2f} %, load {path[-1, 0]:.3f}{end}")
+        carried = f"load {path[-1, 0]:.3f}{end}"
+        print(f"{name:18s} scatter {100 * scatter:6.2f} %, {carried}")
         ax.plot(path[:, 0], path[:, 1] / 1e3, label=f"{name} (scatter {100 * scatter:.1f} %)")
     ax.set(xlabel="load", ylabel="stress of one particle, kPa")
     ax.set_title("Points that cross cells upset the stress; domains do not")

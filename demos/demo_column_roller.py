@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 1
+# Level: 1.3
 
 # # An elasto-plastic column between rollers
 #
@@ -122,7 +122,8 @@ stress = particles.stress
 s_yy, s_xx, _ = exact(particles.initial_centroid[:, 1])
 errors = error(stress[:, 1, 1], s_yy), error(stress[:, 0, 0], s_xx)
 if comm.rank == 0:
-    print(f"{particles.num_global} particles, {problem.history.total_iterations} linear solves")
+    solves = problem.history.total_iterations
+    print(f"{particles.num_global} particles, {solves} linear solves")
     print(f"error of s_yy {errors[0]:.2e}, of s_xx {errors[1]:.2e}")
     print(f"the yield function is at most {max(violation, 0.0):.0e}")
 

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2
+# Level: 2.3
 
 # # Bearing capacity of a strip footing
 #
@@ -76,7 +76,7 @@ def divided(along, parts):
 
 
 def grid(x, y):
-    """A mesh with given grid lines: that of a rectangle with its vertices moved."""
+    """A mesh with given grid lines: a rectangle's with its vertices moved."""
     n = [len(x) - 1, len(y) - 1]
     domain = mesh.create_rectangle(comm, [[0.0, 0.0], n], n, mesh.CellType.quadrilateral)
     for axis, along in enumerate((x, y)):
@@ -150,9 +150,10 @@ before = float(np.interp(0.9 * load[-1], load, pressure))
 drop = float(np.max(np.maximum.accumulate(pressure) - pressure)) / limit
 ratio, plateau = pressure[-1] / limit, pressure[-1] / before - 1.0
 if comm.rank == 0:
-    print(f"{particles.num_global} particles, {problem.history.total_iterations} linear solves")
-    print(f"pressure {pressure[-1]:.0f} kPa, limit {limit:.0f} kPa, ratio {ratio:.3f}")
-    print(f"rise over the last tenth {100 * plateau:.2f} %, largest fall {100 * drop:.2f} %")
+    print(f"{particles.num_global} particles, {problem.history.total_iterations}", "linear solves")
+    print(f"pressure {pressure[-1]:.0f} kPa, limit {limit:.0f} kPa,", f"ratio {ratio:.3f}")
+    rise, fall = f"{100 * plateau:.2f} %", f"{100 * drop:.2f} %"
+    print(f"rise over the last tenth {rise}, largest fall {fall}")
 
 # The picture: where the soil flows, with the displacement magnified, and the pressure.
 

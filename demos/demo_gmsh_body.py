@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2
+# Level: 2.4
 
 # # A body with holes, from gmsh
 #
@@ -61,7 +61,7 @@ PLATE, RINGS, END = 1, 2, 3
 
 
 def meshed(build, size):
-    """Return the mesh that `build` describes to gmsh, with tags of its cells and facets."""
+    """The mesh that `build` describes, with tags of cells and facets."""
     gmsh.initialize(interruptible=False)
     gmsh.option.setNumber("General.Terminal", 0)
     if comm.rank == 0:
@@ -140,7 +140,8 @@ area = comm.allreduce(particles.initial_volume.sum())
 error_area = abs(area / (length * height - len(centres) * np.pi * radius**2) - 1.0)
 
 if comm.rank == 0:
-    print(f"{particles.num_global} triangles, {problem.history.total_iterations} linear solves")
+    solves = problem.history.total_iterations
+    print(f"{particles.num_global} triangles, {solves} linear solves")
     print(f"deflection {deflection:.4f} m, shortening {shortening:.4f} m")
     print(f"error of the reaction {error_reaction:.1e}")
 

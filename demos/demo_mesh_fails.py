@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2
+# Level: 2.1
 
 # # Where the body's own mesh fails, and particles go on
 #
@@ -59,7 +59,7 @@ def energy(d, dx, load):
 
 
 def held(space):
-    """No horizontal displacement at the left, none at the base, of either space."""
+    """None across the left side, none across the base, in either space."""
     domain = space.mesh
     side = mesh.locate_entities_boundary(domain, 1, lambda x: np.isclose(x[0], 0))
     base = mesh.locate_entities_boundary(domain, 1, lambda x: np.isclose(x[1], 0))

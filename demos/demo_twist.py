@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 3
+# Level: 3.1
 
 # # A rubber bar is twisted by three quarters of a turn
 #
@@ -100,7 +100,8 @@ if comm.rank == 0:
     print(problem.history)
     print("angle, degrees   torque, kNm   linear theory")
     for angle, moment in curve[4::4]:
-        print(f"{np.degrees(angle):12.1f}{moment / 1e3:16.2f}{linear * angle / 1e3:14.2f}")
+        row = f"{np.degrees(angle):12.1f}{moment / 1e3:16.2f}"
+        print(row + f"{linear * angle / 1e3:14.2f}")
 
 J = particles.volume / particles.initial_volume
 least = comm.allreduce(J.min(initial=1.0), MPI.MIN)

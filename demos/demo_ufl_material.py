@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2
+# Level: 2.2
 
 # # Your own material in UFL: a rubber block is squeezed and turned
 #
@@ -75,7 +75,7 @@ def run(shortening, steps):
     R = ufl.as_matrix([[ufl.cos(theta), -ufl.sin(theta)], [ufl.sin(theta), ufl.cos(theta)]])
     grips = centre + R * ufl.as_matrix([[1 - s, 0], [0, 1]]) * (X - centre) - X
 
-    # The unknown, the test function's space and the measure are the particles'. That is all.
+    # Unknown, test functions and measure are the particles'. That is all.
 
     d, v = particles.displacement, ufl.TestFunction(particles.W)
     energy = stored(d) * particles.dx + glue / 2 * ufl.inner(d - grips, d - grips) * ds(1)

@@ -4,7 +4,8 @@
 
 What the script printed and drew is in ``images/demos``, kept by ``scripts/run_demos.py``; it comes
 before the exercises. Beside each page are the script and a notebook made of it. The gallery has the
-demos by the level that stands below their licence.
+demos by the level that stands below their licence, as ``# Level: 1.2``: the second of the first
+level.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ from mkdocs.structure.files import File, Files
 log = logging.getLogger("mkdocs.hooks.demos")
 
 HEADER = re.compile(r"\A(?:#!.*\n)?(?:# (?:Copyright|SPDX-|Level:).*\n)+(?:#?\n)*")
-LEVEL = re.compile(r"^# Level: ([123])$", re.MULTILINE)
+LEVEL = re.compile(r"^# Level: ([123])(?:\.(\d+))?$", re.MULTILINE)
 LEVELS = ("First steps", "Standard problems", "Further on")
 EXERCISES = "\n## Exercises\n"
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     root = Path(config.config_file_path).parent
-    levels: list[list[tuple[str, str]]] = [[] for _ in LEVELS]
+    levels: list[list[tuple[int, str, str]]] = [[] for _ in LEVELS]
     for script in sorted((root / "demos").glob("demo_*.py")):
         source = script.read_text("utf-8")
         level = LEVEL.search(source)
@@ -49,20 +50,22 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             cell["id"] = f"cell-{number}"
         text = jupytext.writes(notebook, fmt="ipynb")
         files.append(File.generated(config, f"demos/{script.stem}.ipynb", content=text))
-        levels[int(level[1]) - 1 if level else -1].append((title, name))
+        place = int(level[2] or 99) if level else 99
+        levels[int(level[1]) - 1 if level else -1].append((place, title, name))
     nav: list[object] = ["demos/index.md"]
     parts = ["# Demos", "Each is a script that runs alone, and a notebook of the same text."]
     for heading, entries in zip(LEVELS, levels, strict=True):
         if not entries:
             continue
         parts.append(f"## {heading}")
+        entries.sort()
         cards = [
             f'<a href="demo_{name}.html">{thumbnail(root / "docs", name)}'
             f"<strong>{html.escape(title)}</strong></a>"
-            for title, name in entries
+            for _, title, name in entries
         ]
         parts.append('<div class="gallery">\n' + "\n".join(cards) + "\n</div>")
-        nav.append({heading: [{title: f"demos/demo_{name}.md"} for title, name in entries]})
+        nav.append({heading: [{title: f"demos/demo_{name}.md"} for _, title, name in entries]})
     files.append(File.generated(config, "demos/index.md", content="\n\n".join(parts) + "\n"))
     config.nav.append({"Demos": nav})
     return files

@@ -96,7 +96,8 @@ class Rigid(Contact):
 
     Give it to ``QuasiStaticProblem(..., terms=[contact])``, and move the obstacle along a path::
 
-        pile = mpm.contact.Rigid(soil, mpm.contact.polygon(corners, radius=0.05), friction=0.3)
+        shape = mpm.contact.polygon(corners, radius=0.05)
+        pile = mpm.contact.Rigid(soil, shape, friction=0.3)
         problem = mpm.QuasiStaticProblem(soil, law, terms=[pile])
         problem.solve(40, update=lambda t: pile.move((0.0, -0.5 * t)))
 

@@ -116,7 +116,8 @@ class Material(ABC):
                 H, lame = displacement_gradient, self.parameters["lame"]
                 eye = np.eye(H.shape[1])
                 F = eye + H
-                p = lame * (np.trace(H, axis1=1, axis2=2) + 0.5 * np.sum(H * H, axis=(1, 2)))
+                quadratic = 0.5 * np.sum(H * H, axis=(1, 2))
+                p = lame * (np.trace(H, axis1=1, axis2=2) + quadratic)
                 P = p[:, None, None] * F
                 A = p[:, None, None, None, None] * np.einsum("ik,JL->iJkL", eye, eye)
                 A += lame * np.einsum("niJ,nkL->niJkL", F, F)

@@ -47,7 +47,8 @@ class ReturnMapping(IsotropicElastic):
         class DruckerPrager(ReturnMapping):
             def __init__(self, young, poisson, slope, strength):
                 super().__init__(young, poisson)
-                self.parameters = {**self.parameters, "slope": slope, "strength": strength}
+                own = {"slope": slope, "strength": strength}
+                self.parameters = {**self.parameters, **own}
 
             def yield_function(self, stress, plastic_strain):
                 pressure_part = self.parameters["slope"] * mandel.trace(stress)
