@@ -1,19 +1,17 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Print the tables of docs/high-order.md.
-
-python docs/studies/high_order.py [pairs|fronts|beam|flow]
-"""
+"""The tables of docs/high-order.md."""
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from mpi4py import MPI
 
 import numpy as np
-from case_runs import run, table
+from case_runs import Table, run, scientific
 
 import ufl
 from dolfinx import fem, mesh
@@ -88,74 +86,87 @@ def errors(kind: Any, k: int, m: int, elements: int) -> tuple[float, float]:
     )
 
 
-def pairs() -> None:
+def pair(kind: Any, k: int, m: int) -> list[Any]:
     validation._validate_degrees = lambda *_: None  # to see what is refused, and why
+    found = np.array([errors(kind, k, m, ne) for ne in (8, 16, 32)])
+    order = np.log2(found[1] / found[2])
+    stress = [scientific(e) for e in found[:, 0]]
+    last = [f"{order[0]:.1f}", scientific(found[2, 1]), f"{order[1]:.1f}"]
+    return [*(modes(kind, k, m, n) for n in (1, 2)), *stress, *last]
+
+
+def front(options: Sequence[Any]) -> list[Any]:
+    found = [run("column_roller", "--elements", ne, *options) for ne in (16, 32, 64)]
+    return [*(scientific(r["error_syy"]) for r in found), found[0]["iterations"]]
+
+
+def beam(degree: int, h: float) -> list[Any]:
+    found = [
+        run("cantilever", "--degree", degree, "--cell", h, "--offset", offset)
+        for offset in (0.0, 0.1 * h, 0.37 * h, 1e-9)
+    ]
+    return [*(scientific(r["error"]) for r in found), max(r["iterations"] for r in found)]
+
+
+def flow(weight: int, h: float, domain: str, kind: str) -> list[Any]:
+    options = ["--domain", domain, "--g0", 1e3 * weight, "--cell", h, "--degree", 2]
+    options += ["--quadrature-degree", {"quad": 3, "tri": 2}[domain], "--stabilisation", kind]
+    r = run("column_free", *options)
+    reached = "" if r["completed"] else f" (to {100 * r['load']:.0f} %)"
+    return [r["cutbacks"], r["iterations"], f"{r['toe']:.2f}{reached}", f"{r['y_mean']:.4f}"]
+
+
+FRONTS: dict[str, tuple[Any, ...]] = {
+    "degree 1": ("--degree", 1),
+    "degree 1, 4 x 4 domains in a cell": ("--degree", 1, "--particles-per-cell", 4),
+    "degree 1, domains of degree 2": ("--degree", 1, "--domain-degree", 2),
+    "degree 2": ("--degree", 2),
+    "degree 2, 3 x 3 points": ("--degree", 2, "--quadrature-degree", 5),
+    "degree 2, 4 x 4 points": ("--degree", 2, "--quadrature-degree", 7),
+    "degree 2, 3 x 3 domains in a cell": ("--degree", 2, "--particles-per-cell", 3),
+    "degree 3": ("--degree", 3),
+}
+
+
+def tables() -> dict[str, Table]:
     head = ["background / domains", "modes, 1 per cell", "2 per cell", "stress, ne 8", "16", "32"]
     head += ["order", "position, ne 32", "order"]
-    for name, kind in CELLS.items():
-        rows = []
-        for k, m in PAIRS:
-            found = np.array([errors(kind, k, m, ne) for ne in (8, 16, 32)])
-            order = np.log2(found[1] / found[2])
-            counts = [modes(kind, k, m, n) for n in (1, 2)]
-            stress = [f"{e:.1e}" for e in found[:, 0]]
-            last = [f"{order[0]:.1f}", f"{found[2, 1]:.1e}", f"{order[1]:.1f}"]
-            rows.append([f"{k} / {m}", *counts, *stress, *last])
-        print(f"\n{name}:\n\n{table(head, rows)}", flush=True)
-
-
-def fronts() -> None:
-    variants = {
-        "degree 1": ("--degree", 1),
-        "degree 1, 4 x 4 domains in a cell": ("--degree", 1, "--particles-per-cell", 4),
-        "degree 2": ("--degree", 2),
-        "degree 2, 3 x 3 points": ("--degree", 2, "--quadrature-degree", 5),
-        "degree 2, 4 x 4 points": ("--degree", 2, "--quadrature-degree", 7),
-        "degree 2, 3 x 3 domains in a cell": ("--degree", 2, "--particles-per-cell", 3),
-        "degree 3": ("--degree", 3),
+    beams = [(k, h) for k in (1, 2, 3) for h in (0.5, 0.25)]
+    flows = [(g, h) for g, h in ((20, 1.0), (20, 0.5), (80, 1.0), (80, 0.5), (160, 1.0))]
+    found = {
+        f"high-order/pairs-{name}": Table(
+            "high-order",
+            head,
+            {
+                f"{k} / {m}{' *refused*' if m < k else ''}": partial(pair, kind, k, m)
+                for k, m in PAIRS
+            },
+            quick=["1 / 1", "2 / 2"],
+        )
+        for name, kind in CELLS.items()
     }
-    rows = []
-    for name, options in variants.items():
-        found = [run("column_roller", "--elements", ne, *options) for ne in (16, 32, 64)]
-        rows.append([name, *(f"{r['error_syy']:.1e}" for r in found), found[0]["iterations"]])
-    print(table(["", "ne 16", "32", "64", "solves"], rows), flush=True)
-
-
-def beam() -> None:
-    rows = []
-    for degree, h in ((1, 0.5), (1, 0.25), (2, 0.5), (2, 0.25), (3, 0.5), (3, 0.25)):
-        found = [
-            run("cantilever", "--degree", degree, "--cell", h, "--offset", offset)
-            for offset in (0.0, 0.1 * h, 0.37 * h, 1e-9)
-        ]
-        worst = max(r["iterations"] for r in found)
-        rows.append([f"{degree}, {h:g} m", *(f"{r['error']:.1e}" for r in found), worst])
-    print(table(["degree, cells", "0", "0.1 h", "0.37 h", "1e-9", "solves"], rows), flush=True)
-
-
-def flow() -> None:
-    rows = []
-    for g0, h in ((20e3, 1.0), (20e3, 0.5), (80e3, 1.0), (80e3, 0.5), (160e3, 1.0)):
-        for domain, rule in (("quad", 3), ("tri", 2)):
-            options = ("--domain", domain, "--g0", g0, "--cell", h, "--degree", 2)
-            for kind in ("auto", "aggregate", "none"):
-                r = run(
-                    "column_free", *options, "--quadrature-degree", rule, "--stabilisation", kind
-                )
-                rows.append(
-                    [
-                        f"{g0 / 1e3:g}, {h:g} m, {domain}, {kind}",
-                        f"{100 * r['load']:.4g} %",
-                        r["cutbacks"],
-                        r["iterations"],
-                        f"{r['toe']:.2f}",
-                        f"{r['y_mean']:.4f}",
-                    ]
-                )
-    head = ["kN/m³, cells, domains, stabilisation", "load", "cutbacks", "solves", "toe, m"]
-    print(table([*head, "mean height, m"], rows), flush=True)
-
-
-if __name__ == "__main__":
-    for part in sys.argv[1:] or ("pairs", "fronts", "beam", "flow"):
-        {"pairs": pairs, "fronts": fronts, "beam": beam, "flow": flow}[part]()
+    found["high-order/beam"] = Table(
+        "high-order",
+        ["degree, cells", "0", "0.1 h", "0.37 h", "1e-9", "solves, at most"],
+        {f"{k}, {h:g} m": partial(beam, k, h) for k, h in beams},
+        quick=["1, 0.5 m"],
+        cases=["cantilever"],
+    )
+    found["high-order/front"] = Table(
+        "high-order",
+        ["", "ne 16", "32", "64", "solves, ne 16"],
+        {name: partial(front, options) for name, options in FRONTS.items()},
+        quick=["degree 2"],
+        cases=["column_roller"],
+    )
+    found["high-order/flow"] = Table(
+        "high-order",
+        ["kN/m³, cells, domains", "cutbacks", "solves", "toe, m", "mean height, m"],
+        {
+            f"{g}, {h:g} m, {name}": partial(flow, g, h, domain, "auto")
+            for g, h in flows
+            for domain, name in (("quad", "quadrilaterals"), ("tri", "triangles"))
+        },
+        cases=["column_free"],
+    )
+    return found

@@ -1,28 +1,27 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Print the tables of docs/load-steps.md: python docs/studies/load_steps.py [errors | equal]"""
+"""The table of docs/load-steps.md: errors of steps chosen by a tolerance, and of equal ones."""
 
 from __future__ import annotations
 
-import argparse
 import sys
-from functools import cache
+from functools import cache, partial
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
-from mpi4py import MPI
-
 import numpy as np
-from case_runs import table
+from case_runs import Table, scientific
 
 from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
 
-sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks"))
-
-import scenes
-from scenes import _rollers as rollers
-from scenes import kit
+SCENES = Path(__file__).resolve().parents[2] / "benchmarks" / "scenes.py"
+spec = spec_from_file_location("benchmark_scenes", SCENES)  # the tests have a module of that name
+assert spec is not None and spec.loader is not None
+scenes = sys.modules["benchmark_scenes"] = module_from_spec(spec)
+spec.loader.exec_module(scenes)
+rollers, kit = scenes._rollers, scenes.kit
 
 QUAD = mesh.CellType.quadrilateral
 
@@ -122,42 +121,25 @@ def error(problem: mpm.QuasiStaticProblem, case: str) -> float:
     return float(np.linalg.norm(nodal(problem) - exact) / np.linalg.norm(exact))
 
 
-def errors() -> None:
-    """Print steps, solves and errors by tolerance."""
+def cells(case: str) -> list[str]:
+    """Return steps, rejected ones, solves and errors by tolerance, and those of equal steps."""
+    make, _ = CASES[case]
+    found = []
     for tolerance in (0.02, 0.01):
-        rows = []
-        for case, (make, _) in CASES.items():
-            problem = make()
-            history = problem.solve("auto", tolerance=tolerance)
-            rejected = int(history.statistics["rejected_steps"])
-            row = [len(history.steps), history.total_iterations, rejected, history.cutbacks]
-            rows.append([case, *row, f"{error(problem, case):.1e}"])
-        head = [f"tolerance={tolerance:g}", "steps", "solves", "rejected", "cutbacks", "error"]
-        print(f"\n{table(head, rows)}", flush=True)
+        problem = make()
+        history = problem.solve("auto", tolerance=tolerance)
+        rejected = int(history.statistics["rejected_steps"])
+        found.append(f"{len(history.steps)}, {rejected}, {history.total_iterations}")
+        found.append(scientific(error(problem, case)))
+    for count in (20, 80):
+        problem = make()
+        history = problem.solve(count)
+        found.append(f"{history.total_iterations}, {scientific(error(problem, case))}")
+    return found
 
 
-def equal() -> None:
-    """Print solves and errors of equal steps."""
-    counts = (20, 80)
-    rows = []
-    for case, (make, _) in CASES.items():
-        row = [case]
-        for count in counts:
-            problem = make()
-            history = problem.solve(count)
-            row.append(f"{history.total_iterations}, {error(problem, case):.1e}")
-        rows.append(row)
-    print(f"\n{table(['solves, error', *(f'{n} steps' for n in counts)], rows)}", flush=True)
-
-
-def main() -> None:
-    if MPI.COMM_WORLD.size > 1:
-        raise SystemExit("Run this on one rank.")
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("parts", nargs="*", choices=("errors", "equal"))
-    for part in parser.parse_args().parts or ("errors", "equal"):
-        {"errors": errors, "equal": equal}[part]()
-
-
-if __name__ == "__main__":
-    main()
+def tables() -> dict[str, Table]:
+    head = ["", "0.02: steps, rejected, solves", "error", "0.01: steps, rejected, solves", "error"]
+    head += ["20 equal steps: solves, error", "80"]
+    rows = {case: partial(cells, case) for case in CASES}
+    return {"load-steps/errors": Table("load-steps", head, rows, quick=["elastic cantilever"])}

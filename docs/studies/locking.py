@@ -1,35 +1,122 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Print the table of the cantilever in docs/locking.md: python docs/studies/locking.py"""
+"""The tables of docs/locking.md."""
 
 from __future__ import annotations
 
-from case_runs import run, table
+from functools import partial
+from typing import Any
 
-#: Name and arguments; two sizes of cells each.
-ROWS = {
+from case_runs import Table, run, scientific, share
+
+FOOTING = {
+    "one point": "--f-bar none --quadrature-degree 1",
+    "2 by 2 points": "--f-bar none",
+    '2 by 2 points, `"domain"`': "--f-bar domain",
+    "triangles": "--f-bar none --domain tri",
+    'triangles, `"pair"`': "--f-bar pair --domain tri",
+    'one point, `"patch"`': "--f-bar patch --quadrature-degree 1",
+    '2 by 2 points, `"patch"`': "--f-bar patch",
+    'triangles, `"patch"`': "--f-bar patch --domain tri",
+    "degree 2": "--f-bar none --degree 2",
+    'degree 2, `"domain"`': "--f-bar domain --degree 2",
+    'degree 2, `mixed="pressure"`': "--mixed pressure --degree 2",
+}
+BEAM = {
     'one point, `"patch"`': "--quadrature-degree 1 --f-bar patch",
     '2 by 2 points, `"patch"`': "--quadrature-degree 2 --f-bar patch",
     'triangles, `"patch"`': "--domain tri --f-bar patch",
     "degree 2": "--degree 2",
     'degree 2, `"domain"`': "--degree 2 --f-bar domain",
 }
+MIXED = [(0.5, 0.0), (0.5, 0.1), (0.5, 0.37), (0.5, 2e-9), (0.25, 0.0), (0.25, 0.37)]
+COLUMNS = {
+    'quadrilaterals, `"domain"`': "--f-bar domain",
+    'quadrilaterals, `"patch"`': "--f-bar patch",
+    'triangles, `"pair"`': "--f-bar pair --domain tri",
+    'triangles, `"patch"`': "--f-bar patch --domain tri",
+}
+BLOCK = {
+    "none, 3 by 3": "--particles-per-cell 3",
+    "none, 6 by 6": "--particles-per-cell 6",
+    '`"patch"`, 3 by 3': "--particles-per-cell 3 --f-bar patch",
+    '`"patch"`, 6 by 6': "--particles-per-cell 6 --f-bar patch",
+}
 
 
-def main() -> None:
-    rows = []
-    for name, arguments in ROWS.items():
-        results = [
-            run("cantilever", "--poisson", 0.4999, "--cell", cell, *arguments.split())
-            for cell in (0.5, 0.25)
-        ]
-        errors = [
-            f"{r['error']:.1e}" if r["completed"] else f"stops at {100 * r['load']:.0f} %"
-            for r in results
-        ]
-        rows.append([name, *errors, ", ".join(str(r["iterations"]) for r in results)])
-    print("\nCantilever:\n\n" + table(["", "cells of 0.5 m", "0.25 m", "linear solves"], rows))
+def footing(options: str) -> list[Any]:
+    found = []
+    for cell in (0.25, 0.125):
+        r = run("footing", "--cell", cell, *options.split())
+        found += [share(r, f"{r['ratio']:.3f} ({100 * r['plateau']:.1f} %)"), r["iterations"]]
+    return found
 
 
-if __name__ == "__main__":
-    main()
+def beam(options: str) -> list[Any]:
+    results = [
+        run("cantilever", "--poisson", 0.4999, "--cell", cell, *options.split())
+        for cell in (0.5, 0.25)
+    ]
+    errors = [share(r, scientific(r["error"])) for r in results]
+    return [*errors, ", ".join(str(r["iterations"]) for r in results)]
+
+
+def mixed(cell: float, offset: float) -> list[Any]:
+    options = ["--poisson", 0.4999, "--degree", 2, "--mixed", "pressure"]
+    r = run("cantilever", *options, "--cell", cell, "--offset", offset * cell)
+    return [share(r, scientific(r["error"])), r["iterations"], r["cutbacks"]]
+
+
+def columns(options: str) -> list[str]:
+    """Return errors over those of the same domains without an average."""
+    kind = ["--domain", "tri"] if "tri" in options else []
+    asked = ["--elements", 16, *options.split()]
+    r, plain = run("column_roller", *asked), run("column_roller", "--elements", 16, *kind)
+    return [f"{r[key] / plain[key]:.2f}" for key in ("error_syy", "error_sxx")]
+
+
+def block(options: str) -> list[Any]:
+    found = []
+    for cell in (1.0, 2.0):
+        r = run("collapse", "--cell", cell, *options.split())
+        found += [share(r, f"{-r['u_top']:.3f}, {r['u_toe']:.3f}"), r["iterations"]]
+    return found
+
+
+def tables() -> dict[str, Table]:
+    beside = ["cells of 0.25 m", "solves", "0.125 m", "solves"]
+    return {
+        "locking/footing": Table(
+            "locking",
+            ["", *beside],
+            {name: partial(footing, options) for name, options in FOOTING.items()},
+            cases=["footing"],
+        ),
+        "locking/cantilever": Table(
+            "locking",
+            ["", "cells of 0.5 m", "0.25 m", "linear solves"],
+            {name: partial(beam, options) for name, options in BEAM.items()},
+            cases=["cantilever"],
+        ),
+        "locking/mixed": Table(
+            "locking",
+            ["cells; the beam is lower by", "larger error", "linear solves", "cutbacks"],
+            {f"{h:g} m; {o:g} cells": partial(mixed, h, o) for h, o in MIXED},
+            quick=["0.5 m; 0 cells"],
+            cases=["cantilever"],
+        ),
+        "locking/columns": Table(
+            "locking",
+            ["", "stress along", "across"],
+            {name: partial(columns, options) for name, options in COLUMNS.items()},
+            quick=list(COLUMNS)[:1],
+            cases=["column_roller"],
+        ),
+        "locking/collapse": Table(
+            "locking",
+            ["average, domains in a cell", "cells of 1 m: top, toe", "solves", "2 m", "solves"],
+            {name: partial(block, options) for name, options in BLOCK.items()},
+            quick=list(BLOCK)[:1],
+            cases=["collapse"],
+        ),
+    }

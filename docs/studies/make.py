@@ -1,120 +1,228 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Make the tables of the documentation again, and say which pages no longer follow.
+"""Make the tables of the documentation again, and say which no longer follow.
 
-    python docs/studies/make.py [NAME ...] [--check] [--times]
+    python docs/studies/make.py NAME ...      run these tables, write them into their pages
+    python docs/studies/make.py               all but those of run times
+    python docs/studies/make.py --check       what does not follow: runs the quick rows
+    python docs/studies/make.py --still       the same without any run
+    python docs/studies/make.py --stamp PAGE  tables of other commands were measured just now
 
-What a study prints is kept in docs/studies/results. Each row of a table there must stand in the
-study's page, else the page no longer follows: the status is 1. ``--check`` runs nothing but the
-quick studies, changes no file, and compares what they print with the results too. Rows that hold
-times are not compared; ``--times`` makes them with the others.
+NAME is a table, as ``locking/cantilever``, or the beginning of several, as ``locking``. A comment
+above each table of measured numbers tells where it comes from:
+
+    <!-- table locking/cantilever: 0123abcd 4567ef89 -->     made by this program
+    <!-- table by benchmarks/skip.py: 0123abcd 4567ef89 -->  by another one, copied by hand
+    <!-- table once: abcdef0, REASON -->                     not made again; the commit it is of
+
+The first number is a hash of the scripts that made the table, the second one of its rows. A table
+does not follow where the scripts have changed since, where it was edited by hand, or where its
+quick rows come out otherwise.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
-import subprocess
-import sys
+import re
+import shlex
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-HERE = Path(__file__).resolve().parent
-ROOT = HERE.parents[1]
-RESULTS = HERE / "results"
+import high_order
+import load_steps
+import locking
+import methods
+import soils
+import solver
+import splitting
+import step_size
+from case_runs import ROOT, Table, head, row
 
-
-class Study(NamedTuple):
-    """A script with the parts it prints, the page that holds its tables, and what it runs."""
-
-    script: str
-    page: str
-    parts: tuple[str, ...] = ()
-    quick: bool = False
-    cases: tuple[str, ...] = ()
-
-
-STUDIES = {
-    "load-steps": Study("load_steps", "load-steps"),
-    "step-size": Study("step_size", "step-size", cases=("column_roller", "column_free")),
-    "locking": Study("locking", "locking", cases=("cantilever",)),
-    "methods": Study("methods", "methods", ("crossing", "compaction"), cases=("compaction",)),
-    "distortion": Study("methods", "methods", ("distortion",), True, ("domain_distortion",)),
-    "patches": Study("methods", "methods", ("patches",), True),
-    "cycle": Study("methods", "methods", ("cycle",), True),
-    "times": Study("methods", "methods", ("times",)),
-    "high-order": Study("high_order", "high-order"),
-    "solver": Study("solver", "solver"),
-    "kernel": Study("kernel", "solver"),
+DOCS = ROOT / "docs"
+SCRIPTS = (step_size, load_steps, locking, splitting, soils, methods, high_order, solver)
+TABLES: dict[str, tuple[Table, Path]] = {
+    name: (table, Path(str(script.__file__)))
+    for script in SCRIPTS
+    for name, table in script.tables().items()
 }
-TIMES = {"times", "solver", "high-order"}
+MARK = re.compile(r"<!-- table (?P<source>[^:>]*)(?::\s*(?P<rest>[^>]*?))?\s*-->")
+NUMBER = re.compile(r"^[*<≤≥+\-−\s$]*\d")
 
 
-def inputs(study: Study) -> str:
-    """Return a hash of the scripts that a study is made of."""
-    scripts = [
-        HERE / f"{study.script}.py",
-        *(ROOT / f"benchmarks/cases/{c}.py" for c in study.cases),
-    ]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in scripts)).hexdigest()[:16]
+class Found(NamedTuple):
+    """A table in a page: its lines from ``start`` to ``stop``, and the comment above it."""
+
+    page: str
+    start: int
+    stop: int
+    rows: list[str]
+    mark: re.Match[str] | None
+    at: int
+
+    @property
+    def source(self) -> str:
+        return self.mark["source"] if self.mark else ""
+
+    @property
+    def name(self) -> str:
+        """What a complaint calls it."""
+        return f"docs/{self.page}.md, line {self.start + 1}"
 
 
-def rows(text: str) -> list[str]:
-    """Return the rows of all tables of a text."""
-    return [line.strip() for line in text.splitlines() if line.startswith("| ")]
+def digest(*parts: bytes) -> str:
+    return hashlib.sha256(b"\0".join(parts)).hexdigest()[:8]
 
 
-def printed(study: Study) -> str:
-    """Run a study and return what it prints."""
-    done = subprocess.run(
-        [sys.executable, str(HERE / f"{study.script}.py"), *study.parts],
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-    )
-    return done.stdout.strip() + "\n"
+def scripts_of(source: str) -> list[Path]:
+    """Return the scripts that a table comes from."""
+    if source.startswith("by "):
+        words = [ROOT / word for word in shlex.split(source[3:])]
+        return [path for path in words if path.suffix == ".py"]
+    table, script = TABLES[source]
+    return [script, *(ROOT / f"benchmarks/cases/{case}.py" for case in table.cases)]
 
 
-def complaints(name: str, check: bool) -> list[str]:
-    """Return what does not follow of a study, which is made again unless ``check``."""
-    study, kept = STUDIES[name], RESULTS / f"{name}.md"
-    head = f"<!-- inputs {inputs(study)} -->\n"
-    if not check:
-        RESULTS.mkdir(exist_ok=True)
-        kept.write_text(head + printed(study), "utf-8")
-    if not kept.exists():
-        return []
-    text, found = kept.read_text("utf-8"), []
-    if not text.startswith(head):
-        found.append(f"{name}: the scripts have changed since its results were made.")
-    page = set(rows((ROOT / f"docs/{study.page}.md").read_text("utf-8")))
-    lost = [] if name in TIMES else [row for row in rows(text) if row not in page]
-    found += [f"{name}: docs/{study.page}.md has no row {row}" for row in lost]
-    if check and study.quick and rows(printed(study)) != rows(text):
-        found.append(f"{name}: a run prints other numbers than its results.")
-    return found
+def inputs(source: str) -> str:
+    """Return a hash of the scripts that a table is made of."""
+    return digest(*(path.read_bytes() for path in scripts_of(source)))
+
+
+def rows_hash(rows: list[str]) -> str:
+    return digest("\n".join(rows).encode())
+
+
+def found_in(page: str) -> Iterator[Found]:
+    """Yield the tables of a page."""
+    lines = (DOCS / f"{page}.md").read_text("utf-8").splitlines()
+    start, fenced = None, False
+    for i, text in enumerate([*lines, ""]):
+        fenced ^= text.startswith("```")
+        if text.startswith("|") and not fenced:
+            start = i if start is None else start
+        elif start is not None:
+            at = start - 1
+            while at >= 0 and not lines[at].strip():
+                at -= 1
+            yield Found(page, start, i, lines[start:i], MARK.fullmatch(lines[at].strip()), at)
+            start = None
+
+
+def measured(rows: list[str]) -> bool:
+    """Return whether a table holds measured numbers: a quarter of its cells begin with a digit."""
+    cells = [c.strip() for text in rows[2:] for c in text.strip().strip("|").split("|")[1:]]
+    filled = [c for c in cells if c]
+    numbers = [c for c in filled if NUMBER.match(c) and "\\sin" not in c]
+    return len(numbers) >= max(1.0, 0.25 * len(filled))
+
+
+def all_found() -> list[Found]:
+    return [f for path in sorted(DOCS.glob("*.md")) for f in found_in(path.stem)]
+
+
+def marked(source: str, rows: list[str]) -> str:
+    return f"<!-- table {source}: {inputs(source)} {rows_hash(rows)} -->"
+
+
+def put(found: Found, rows: list[str]) -> None:
+    """Write rows and their comment in place of a table."""
+    path = DOCS / f"{found.page}.md"
+    lines = path.read_text("utf-8").splitlines()
+    lines[found.start : found.stop] = rows
+    lines[found.at] = marked(found.source, rows)
+    path.write_text("\n".join(lines) + "\n", "utf-8")
+
+
+def make(name: str) -> bool:
+    """Run a table and write it into its page. Return whether that changed it."""
+    table, _ = TABLES[name]
+    rows = head(table)
+    for label in table.rows:
+        rows.append(row(table, label))
+        print(rows[-1], flush=True)
+    here = [f for f in found_in(table.page) if f.source == name]
+    if not here:
+        raise SystemExit(
+            f"docs/{table.page}.md has no comment <!-- table {name}: --> above a table"
+        )
+    put(here[0], rows)
+    return rows != here[0].rows
+
+
+def complaints(found: Found, still: bool) -> list[str]:
+    """Return what does not follow of a table."""
+    if found.mark is None:
+        return ["no comment says where its numbers come from"] if measured(found.rows) else []
+    source, rest = found.source, (found.mark["rest"] or "")
+    if source == "once":
+        return [] if rest else ["no reason is given"]
+    if not source.startswith("by ") and source not in TABLES:
+        return [f"there is no table {source!r}"]
+    missing = [str(p.relative_to(ROOT)) for p in scripts_of(source) if not p.exists()]
+    if missing or not scripts_of(source):
+        return [f"{source!r} names no script that exists"]
+    kept = rest.split()
+    if len(kept) != 2:
+        return ["it has not been made yet"]
+    new = []
+    if kept[0] != inputs(source):
+        new.append(f"the scripts of {source!r} have changed since it was made")
+    if kept[1] != rows_hash(found.rows):
+        new.append("its rows were changed by hand")
+    if source in TABLES and not still and not TABLES[source][0].times:
+        table, _ = TABLES[source]
+        anew = [row(table, label) for label in table.quick]
+        new += [f"{source} is now {text}" for text in anew if text not in found.rows]
+    return new
+
+
+def check(still: bool, chosen: list[str]) -> int:
+    """Print what does not follow, and return how many complaints there are."""
+    total = 0
+    every = all_found()
+    for found in every:
+        if chosen and not found.source.startswith(tuple(chosen)):
+            continue
+        new = complaints(found, still)
+        total += len(new)
+        for text in new:
+            print(f"{found.name}: {text}", flush=True)
+    for name in TABLES.keys() - {found.source for found in every}:
+        total += 1
+        print(f"{name} stands in no page", flush=True)
+    print(f"{len(every)} tables, {total} complaints")
+    return total
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(STUDIES))
-    parser.add_argument("--check", action="store_true", help="change nothing")
-    parser.add_argument("--times", action="store_true", help="also studies of run times")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help="a table, or its beginning")
+    parser.add_argument("--check", action="store_true", help="change nothing, run the quick rows")
+    parser.add_argument("--still", action="store_true", help="change nothing, run nothing")
+    parser.add_argument("--stamp", metavar="PAGE", help="tables by other commands are new")
+    parser.add_argument("--times", action="store_true", help="also tables of run times")
     args = parser.parse_args()
-    unknown = set(args.names) - STUDIES.keys()
+    if args.stamp:
+        for found in list(found_in(args.stamp)):
+            if found.source.startswith("by "):
+                put(found, found.rows)
+        return
+    unknown = [n for n in args.names if not any(t.startswith(n) for t in TABLES)]
     if unknown:
-        parser.error(f"no such study: {', '.join(sorted(unknown))}")
-    found = []
-    for name in args.names or STUDIES:
-        if name in TIMES and not (args.times or name in args.names):
-            continue
-        if args.check and not (RESULTS / f"{name}.md").exists():
-            print(f"{name}: no results are kept", flush=True)
-            continue
-        new = complaints(name, args.check)
-        print("\n".join(new) or f"{name}: follows", flush=True)
-        found += new
-    raise SystemExit(1 if found else 0)
+        parser.error(f"no such table: {', '.join(unknown)}; there are {', '.join(TABLES)}")
+    if args.check or args.still:
+        raise SystemExit(1 if check(args.still, args.names) else 0)
+    changed = []
+    for name, (table, _) in TABLES.items():
+        named = any(name.startswith(n) for n in args.names)
+        if named or not (args.names or (table.times and not args.times)):
+            print(f"\n{name}", flush=True)
+            changed += [name] if make(name) else []
+    for name in changed:
+        print(f"{name} has changed: read what docs/{TABLES[name][0].page}.md says about it")
 
 
 if __name__ == "__main__":

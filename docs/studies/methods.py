@@ -1,22 +1,21 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Print the tables of docs/methods.md and draw its figures.
-
-python docs/studies/methods.py [PART ...]
-"""
+"""The tables of docs/methods.md; run by itself it draws the page's figures."""
 
 from __future__ import annotations
 
 import sys
+from functools import cache, partial
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 from mpi4py import MPI
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-from case_runs import run, table
+from case_runs import Table, run, scientific
 from matplotlib.collections import PolyCollection
 from PIL import Image
 
@@ -39,50 +38,31 @@ def percent(value: float) -> str:
     return "0" if value < 1e-9 else f"{100 * value:.1f} %"
 
 
-def compaction() -> None:
-    rows = []
-    for method, name in METHODS.items():
-        row = [name]
-        for ne in (16, 64, 256):
-            r = run("compaction", "--method", method, "--elements", ne)
-            done = "" if r["completed"] else f", to {100 * r['load']:.0f} %"
-            row.append(f"{r['error']:.2e} ({r['iterations']}{done})")
-        rows.append(row)
-    print("\nCompaction:\n\n" + table(["method", "16", "64", "256"], rows), flush=True)
+def compaction(method: str) -> list[str]:
+    row = []
+    for ne in (16, 64, 256):
+        r = run("compaction", "--method", method, "--elements", ne)
+        done = "" if r["completed"] else f", to {100 * r['load']:.0f} %"
+        row.append(f"{scientific(r['error'], 2)} ({r['iterations']}{done})")
+    return row
 
 
-def distortion() -> None:
-    r = run("domain_distortion")
-    rows = []
-    for method, name in METHODS.items():
-        row = [name]
-        for motion in ("shear", "rotation", "swirl"):
-            values = r["motions"][motion]
-            row.append(" / ".join(percent(values[f"{k}_{method}"]) for k in ("gap", "overlap")))
-        row.append(percent(r["motions"]["swirl"][f"error_F_{method}"]))
-        rows.append(row)
-    head = ["gap / overlap", "simple shear", "rotation", "swirl", "error of F, swirl"]
-    print("\nDistortion:\n\n" + table(head, rows))
-    print(f"\nFigure 2, fixed boxes: gap {percent(r['gap_figure_2'])}", flush=True)
+@cache
+def motions() -> dict[str, Any]:
+    return run("domain_distortion")["motions"]
 
 
-def crossing() -> None:
-    r = run("cell_crossing")
-    names = {"cpdi2": "CPDI2", "cpdi": "CPDI", "gimp": "GIMP, stretched"}
-    names |= {"gimp_fixed": "GIMP, fixed", "mpm": "MPM"}
-    rows = [[name, percent(r[f"scatter_{m}"])] for m, name in names.items()]
-    print("\nCell crossing:\n\n" + table(["method", "scatter of stress"], rows), flush=True)
+def distortion(method: str) -> list[str]:
+    row = []
+    for motion in ("shear", "rotation", "swirl"):
+        values = motions()[motion]
+        row.append(" / ".join(percent(values[f"{k}_{method}"]) for k in ("gap", "overlap")))
+    return [*row, percent(motions()["swirl"][f"error_F_{method}"])]
 
 
-def patches() -> None:
-    rows = [[name, f"{make():.2e}"] for name, (make, _) in test_patch.FAILING.items()]
-    print("\nPatch tests not passed:\n\n" + table(["", "error of stress"], rows))
-    rows = [
-        [f"{a:.0%}", *(f"{100 * d:.2g} %" for d in test_patch.hexahedra_difference(a))]
-        for a in (0.05, 0.1, 0.2)
-    ]
-    head = ["corners moved by", "gradients", "volumes"]
-    print("\nHexahedra:\n\n" + table(head, rows), flush=True)
+@cache
+def crossing() -> dict[str, Any]:
+    return run("cell_crossing")
 
 
 def block(method: str, n: int = 32, weight: float = 50.0) -> mpm.QuasiStaticProblem:
@@ -106,9 +86,10 @@ def block(method: str, n: int = 32, weight: float = 50.0) -> mpm.QuasiStaticProb
     return mpm.QuasiStaticProblem(particles, material, body_force=(0.0, -weight), bcs=bcs)
 
 
-def times(steps: int = 4, repeats: int = 3) -> None:
-    """Print the time of a step and its solves, the methods in turn, the least of the repeats."""
-    seconds = {method: np.inf for method in METHODS}
+@cache
+def times(steps: int = 4, repeats: int = 3) -> dict[str, tuple[float, float]]:
+    """Return solves and time of a step, the methods in turn, the least of the repeats."""
+    seconds = dict.fromkeys(METHODS, np.inf)
     solves = {}
     for _ in range(repeats):
         for method in METHODS:
@@ -116,33 +97,80 @@ def times(steps: int = 4, repeats: int = 3) -> None:
             start = perf_counter()
             problem.solve(steps=steps)
             seconds[method] = min(seconds[method], (perf_counter() - start) / steps)
-            solves[method] = problem.history.total_iterations
-    rows = [
-        [name, solves[m] / steps, f"{seconds[m] / seconds['cpdi2']:.2f}"]
-        for m, name in METHODS.items()
-    ]
-    print(
-        "\nOne step:\n\n" + table(["method", "solves", "time over that of CPDI2"], rows), flush=True
-    )
+            solves[method] = problem.history.total_iterations / steps
+    return {method: (solves[method], seconds[method]) for method in METHODS}
 
 
-def cycle() -> None:
-    """Print what is left of the displacement of an elastic block, loaded and unloaded."""
-    rows = []
-    for method in ("cpdi2", "gimp"):
-        row = [METHODS[method]]
-        for steps in (10, 20, 40):
-            problem = block(method, 8, 10.0)
-            d = problem.particles.displacement.x
-            problem.solve(steps=steps)
-            most = np.abs(d.array).max()
-            for step in range(steps - 1, -1, -1):
-                problem.particles.load.value = step / steps
-                problem.step()
-            row.append(f"{np.abs(d.array).max() / most:.1e}")
-        rows.append(row)
-    head = ["steps each way", "10", "20", "40"]
-    print("\nClosed cycle:\n\n" + table(head, rows), flush=True)
+def cycle(method: str) -> list[str]:
+    """Return what is left of the displacement of an elastic block, loaded and unloaded."""
+    row = []
+    for steps in (10, 20, 40):
+        problem = block(method, 8, 10.0)
+        d = problem.particles.displacement.x
+        problem.solve(steps=steps)
+        most = np.abs(d.array).max()
+        for step in range(steps - 1, -1, -1):
+            problem.particles.load.value = step / steps
+            problem.step()
+        row.append(scientific(np.abs(d.array).max() / most))
+    return row
+
+
+def hexahedra(amplitude: float) -> list[str]:
+    return [f"{100 * d:.2g} %" for d in test_patch.hexahedra_difference(amplitude)]
+
+
+def tables() -> dict[str, Table]:
+    crossed = {"cpdi2": "CPDI2", "cpdi": "CPDI", "gimp": "GIMP, stretched"}
+    crossed |= {"gimp_fixed": "GIMP, fixed", "mpm": "MPM"}
+    failing = test_patch.FAILING
+    moved = {f"{a:.0%}": partial(hexahedra, a) for a in (0.05, 0.1, 0.2)}
+    cost = {n: (lambda m=m: cost_of(m)) for m, n in METHODS.items()}
+    return {
+        "methods/distortion": Table(
+            "methods",
+            ["gap / overlap", "simple shear", "rotation", "swirl", "error of F, swirl"],
+            {name: partial(distortion, m) for m, name in METHODS.items()},
+            quick=list(METHODS.values()),
+            cases=["domain_distortion"],
+        ),
+        "methods/crossing": Table(
+            "methods",
+            ["method", "scatter of stress"],
+            {n: (lambda m=m: [percent(crossing()[f"scatter_{m}"])]) for m, n in crossed.items()},
+            cases=["cell_crossing"],
+        ),
+        "methods/compaction": Table(
+            "methods",
+            ["method", "16", "64", "256"],
+            {name: partial(compaction, m) for m, name in METHODS.items()},
+            quick=["CPDI2"],
+            cases=["compaction"],
+        ),
+        "methods/patches": Table(
+            "methods",
+            ["", "error of stress"],
+            {name: (lambda f=f: [scientific(f[0](), 2)]) for name, f in failing.items()},
+            quick=list(failing),
+        ),
+        "methods/cycle": Table(
+            "methods",
+            ["steps each way", "10", "20", "40"],
+            {METHODS[m]: partial(cycle, m) for m in ("cpdi2", "gimp")},
+            quick=["CPDI2"],
+        ),
+        "methods/hexahedra": Table(
+            "methods", ["corners moved by", "gradients", "volumes"], moved, quick=list(moved)
+        ),
+        "methods/cost": Table(
+            "methods", ["method", "solves", "time over that of CPDI2"], cost, times=True
+        ),
+    }
+
+
+def cost_of(method: str) -> list[str]:
+    solves, seconds = times()[method]
+    return [f"{solves:g}", f"{seconds / times()['cpdi2'][1]:.2f}"]
 
 
 def picture() -> None:
@@ -213,11 +241,8 @@ def demo_pictures() -> None:
 
 def main() -> None:
     mpl.use("agg")
-    parts = (picture, demo_pictures, patches, cycle, times, crossing, distortion, compaction)
-    chosen = sys.argv[1:] or [part.__name__ for part in parts]
-    for part in parts:
-        if part.__name__ in chosen:
-            part()
+    picture()
+    demo_pictures()
 
 
 if __name__ == "__main__":

@@ -1,13 +1,15 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Print the tables of docs/solver.md: python docs/studies/solver.py"""
+"""The tables of docs/solver.md."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
-from case_runs import run, table
-from kernel import STEPS, column
+import numpy as np
+from case_runs import Table, run, scientific
+from kernel import SCENES, STEPS, column, kernel
 
 import mpm_dolfinx as mpm
 
@@ -30,38 +32,94 @@ def outcome(r: dict[str, Any]) -> str:
     return f"**{100 * r['load']:.1f} %** {error}, {r['cutbacks']}"
 
 
-def alone() -> None:
-    """Print what shift and line search do, each by itself."""
-    for domain, name in DOMAINS.items():
-        rows = []
-        for shift in (0.0, 1e-13):
-            for search in (False, True):
-                row = []
-                for g0, width in ((20e3, 20.0), (80e3, 80.0), (160e3, 128.0)):
-                    _, problem, _ = column(domain, g0, width, shift=shift, line_search=search)
-                    try:
-                        history = problem.solve(STEPS)
-                        row.append(f"whole ({history.cutbacks})")
-                    except mpm.MPMError as error:
-                        row.append(f"{100 * error.load:.2f} % ({problem.history.cutbacks})")
-                rows.append([f"shift {shift:g}, line search {search}", *row])
-        print(f"\n{table([name, '20', '80', '160'], rows)}", flush=True)
+def alone(domain: str, shift: float, search: bool) -> list[str]:
+    """Return what shift and line search do, each by itself."""
+    row = []
+    for g0, width in ((20e3, 20.0), (80e3, 80.0), (160e3, 128.0)):
+        _, problem, _ = column(domain, g0, width, shift=shift, line_search=search)
+        try:
+            history = problem.solve(STEPS)
+            row.append(f"whole ({history.cutbacks})")
+        except mpm.MPMError as error:
+            row.append(f"stops at {100 * error.load:.1f} % ({problem.history.cutbacks})")
+    return row
 
 
-def main() -> None:
-    alone()
-    for plain in (False, True):
-        rows = []
-        for domain, name in DOMAINS.items():
-            for factor, petsc in FACTORS:
-                options = ["--domain", domain, *["--plain-solver"] * plain]
-                runs = [run("column_free", *options, "--g0", g0, petsc=petsc) for g0 in LOADS]
-                rows.append([f"{name}, {factor}", *map(outcome, runs)])
-                print(rows[-1], [r["worst_domain"] for r in runs], flush=True)
-        solver = "No shift, no line search" if plain else "Default"
-        head = [solver, *(f"{g0 / 1e3:g} kN/m³" for g0 in LOADS)]
-        print(f"\n{table(head, rows)}\n", flush=True)
+def factors(domain: str, petsc: str, plain: bool) -> list[str]:
+    options = ["--domain", domain, *["--plain-solver"] * plain]
+    return [outcome(run("column_free", *options, "--g0", g0, petsc=petsc)) for g0 in LOADS]
 
 
-if __name__ == "__main__":
-    main()
+def predicted(domain: str, g0: float, width: float) -> list[str]:
+    """Return solves and cutbacks from zero and predicted, and how many steps were."""
+    found = []
+    for predictor in (False, True):
+        _, problem, _ = column(domain, g0, width, predictor=predictor)
+        history = problem.solve(STEPS)
+        found.append(f"{history.total_iterations}, {history.cutbacks}")
+    kept = int(history.statistics["predictions"])
+    return [*found, f"{kept} of {len(history.steps)}"]
+
+
+def kernels(domain: str, g0: float, width: float) -> list[Any]:
+    """Return what is known of the kernel of T in the run of a column."""
+    particles, problem, fixed = column(domain, g0, width)
+    dimensions, smallest, free = [], np.inf, np.zeros(0)
+    for _ in problem.steps(STEPS):
+        free, sizes, null = kernel(particles, fixed)
+        dimensions.append(len(null))
+        smallest = min(smallest, sizes[len(sizes) - len(null) - 1])
+    with_one = f"{np.count_nonzero(dimensions)} of {len(dimensions)}"
+    return [with_one, max(dimensions), scientific(smallest), len(free)]
+
+
+def tables() -> dict[str, Table]:
+    loads = [f"{g0 / 1e3:g} kN/m³" for g0 in LOADS]
+    found = {}
+    for name, title, plain in (
+        ("plain", "No shift, no line search", True),
+        ("default", "Default", False),
+    ):
+        found[f"solver/{name}"] = Table(
+            "solver",
+            [title, *loads],
+            {
+                f"{kind}, {factor}": partial(factors, domain, petsc, plain)
+                for domain, kind in DOMAINS.items()
+                for factor, petsc in FACTORS
+            },
+            cases=["column_free"],
+        )
+    for domain in DOMAINS:
+        found[f"solver/alone-{domain}"] = Table(
+            "solver",
+            ["", "20 kN/m³", "80 kN/m³", "160 kN/m³"],
+            {
+                label: partial(alone, domain, shift, search)
+                for label, shift, search in (
+                    ("neither", 0.0, False),
+                    ("line search alone", 0.0, True),
+                    ("shift alone", 1e-13, False),
+                    ("both", 1e-13, True),
+                )
+            },
+        )
+    scenes = {f"{DOMAINS[s[0]]}, {s[1] / 1e3:g} kN/m³": s for s in SCENES}
+    found["solver/predictor"] = Table(
+        "solver",
+        ["free column: solves, cutbacks", "from zero", "predicted", "steps from a prediction"],
+        {label: partial(predicted, *scene) for label, scene in scenes.items()},
+        quick=list(scenes)[-2:-1],
+    )
+    found["solver/kernel"] = Table(
+        "solver",
+        [
+            "",
+            "states with a kernel",
+            "largest dimension",
+            "smallest other singular value",
+            "free dofs at the end",
+        ],
+        {label: partial(kernels, *scene) for label, scene in scenes.items()},
+    )
+    return found
