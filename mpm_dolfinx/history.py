@@ -202,7 +202,8 @@ class Energy:
             particles took away, and what the scheme makes of elastic bodies, which is nothing with
             ``scheme="conserving"`` and positive or negative with others; not a number where
             :attr:`strain` is none.
-        damping: Work done against Rayleigh damping and dashpots.
+        damping: Work done against Rayleigh damping, dashpots and, in steps whose force is a mean,
+            friction of contacts.
         stabilisation: Work done against a ghost penalty.
         prescribed: Work of Dirichlet values that move.
         residual: Work done against what Newton's method left: its tolerance, and the proximal term

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +61,7 @@ class Contact(Term):
         self.axisymmetric = axisymmetric
         self._materials: Sequence[PointMaterial | None] = [None] * len(self.bodies)
         self._number = 0
+        self._share = 1.0
         self._places: list[int] = []
 
     def take_part(
@@ -69,7 +71,7 @@ class Contact(Term):
         materials: Sequence[PointMaterial | None],
     ) -> None:
         """See :meth:`Term.take_part`."""
-        self._number = number
+        self._number, self._share = number, 1.0
         self._places = [
             next(i for i, body in enumerate(bodies) if body is mine) for mine in self.bodies
         ]
@@ -78,24 +80,38 @@ class Contact(Term):
     @property
     def symmetric(self) -> bool:
         """See :attr:`Term.symmetric`."""
-        return self.friction.smooth
+        return self.friction.smooth and not self._of_step
 
     @property
     def one_sided(self) -> bool:
         """See :attr:`Term.one_sided`: bodies may lift off."""
         return True
 
-    def pace(self, dt: float, share: float) -> None:
-        """See :meth:`Term.pace`.
+    # -- In a motion ----------------------------------------------------------------------------
 
-        Raises:
-            MPMError: The scheme takes the mean of forces, to which contact would add energy.
-        """
-        if share != 1.0:
-            raise MPMError(
-                f"A {type(self).__name__} takes its forces at the end of a step, which would add "
-                "energy to a mean of forces; use scheme='euler'."
-            )
+    @property
+    def _of_step(self) -> bool:
+        """Whether forces are those of whole steps of a motion."""
+        return self._share < 1.0
+
+    def pace(self, dt: float, share: float) -> None:
+        """See :meth:`Term.pace`: where others take means of forces, contact has one of the step."""
+        self._share = share
+
+    def end_forces(self) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.end_forces`."""
+        return () if self._of_step else self.residuals()
+
+    def step_work(self) -> tuple[float, float]:
+        """See :meth:`Term.step_work`: that of friction counts as damping."""
+        if not self._of_step:
+            return 0.0, 0.0
+        normal, shear = self._comm.allreduce(np.array(self._works()))
+        return float(normal), float(shear)
+
+    def _works(self) -> tuple[float, float]:
+        """Return this rank's work against pressure and against friction in the last step."""
+        raise NotImplementedError
 
     @property
     def _comm(self) -> MPI.Comm:

@@ -19,7 +19,15 @@ from numpy.typing import NDArray
 
 from ..errors import MPMError
 
-__all__ = ["Coulomb", "Points", "Traction", "as_friction", "derivative", "traction"]
+__all__ = [
+    "Coulomb",
+    "Points",
+    "Traction",
+    "as_friction",
+    "derivative",
+    "shear_derivative",
+    "traction",
+]
 
 
 @dataclass(frozen=True)
@@ -136,6 +144,7 @@ def traction(
     gap: NDArray[Any],
     n: NDArray[Any],
     touch: float,
+    pressure: NDArray[Any] | None = None,
 ) -> Traction:
     """Return what acts on points.
 
@@ -146,9 +155,14 @@ def traction(
         gap: Shape ``(n,)``.
         n: Normals, towards the points, shape ``(n, gdim)``.
         touch: Gap at which points touch: round-off of positions.
+        pressure: That of a whole step, which may act where there is a gap at its end; ``None`` is
+            that of the gap.
     """
     inside = gap.real <= touch
-    p = np.where(inside, -points.stiffness * gap, 0.0)
+    if pressure is None:
+        p = np.where(inside, -points.stiffness * gap, 0.0)
+    else:
+        p, inside = pressure, inside | (pressure.real != 0.0)
     none = np.zeros(len(p), dtype=bool)
     if law.smooth:
         return Traction(p, np.zeros_like(n), inside, none)
@@ -188,6 +202,38 @@ def derivative(
     D = n[:, :, None] * dp[:, None, :] + acts.pressure[:, None, None] * H
     if law.smooth:
         return D
+    return D + shear_derivative(law, points, delta, gap, n, H, touch, acts, dp, n)
+
+
+def shear_derivative(
+    law: Coulomb,
+    points: Points,
+    delta: NDArray[np.float64],
+    gap: NDArray[np.float64],
+    n: NDArray[np.float64],
+    H: NDArray[np.float64],
+    touch: float,
+    acts: Traction,
+    dp: NDArray[np.float64],
+    dgap: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the derivative of the shear traction by positions of points that are in contact.
+
+    Args:
+        law: As for :func:`derivative`, as all that is not said here.
+        points: As there.
+        delta: As there.
+        gap: As there.
+        n: As there.
+        H: As there.
+        touch: As there.
+        acts: What :func:`traction` returned.
+        dp: Derivative of the pressure, shape ``(n, gdim)``.
+        dgap: Derivative of the gap, shape ``(n, gdim)``.
+
+    Returns:
+        Shape ``(n, gdim, gdim)``.
+    """
     share, slope = _since_touch(points, gap, touch)
     depth = (n * delta).sum(axis=1)
     along = delta - n * depth[:, None]
@@ -195,7 +241,7 @@ def derivative(
     eye = np.eye(n.shape[1])
     moved = eye - n[:, :, None] * n[:, None, :]
     moved = moved - depth[:, None, None] * H - n[:, :, None] * bent[:, None, :]
-    dt = share[:, None, None] * moved + along[:, :, None] * (slope[:, None] * n)[:, None, :]
+    dt = share[:, None, None] * moved + along[:, :, None] * (slope[:, None] * dgap)[:, None, :]
     dt *= -points.tangential[:, None, None]
     if acts.slips.any():
         s = acts.slips
@@ -205,4 +251,4 @@ def derivative(
         bound, grows = law.bound(acts.pressure[s])
         turned = (bound / size)[:, None, None] * (eye - tau[:, :, None] * tau[:, None, :])
         dt[s] = turned @ dt[s] + tau[:, :, None] * (np.asarray(grows)[:, None] * dp[s])[:, None, :]
-    return np.asarray(D + dt)
+    return np.asarray(dt)

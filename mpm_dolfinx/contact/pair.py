@@ -31,8 +31,9 @@ from ..particles.particles import Particles
 from ..system.term import PointMaterial
 from .contact import Contact, Outcome, as_positive, stiffness
 from .facets import Closest, NearFacets
-from .law import Coulomb, Points, as_friction, traction
+from .law import Coulomb, Points, Traction, as_friction, traction
 from .surface import Blocks, PointMatrix, Surface, global_dofs, normals
+from .whole_step import corrected, deformation, mean_pressure
 
 __all__ = ["Pair"]
 
@@ -58,7 +59,11 @@ class _Memory(NamedTuple):
         facet: Number of the facet of their anchors, or of the closest where they touched nothing,
             -1 where none was near, shape ``(n,)``.
         place: Place on it, shape ``(n, gdim - 1)``.
+        closest: Number of the closest facet, shape ``(n,)``.
         gap: Shape ``(n,)``.
+        within: Which points were behind their facets, shape ``(n,)``.
+        offset: Gap at which each begins to be pressed in a motion, shape ``(n,)``: negative for
+            points that came there from the side and not through a facet, or they would win energy.
         points: Where they were, shape ``(n, gdim)``.
         anchors: Where their anchors were, shape ``(n, gdim)``.
     """
@@ -66,9 +71,28 @@ class _Memory(NamedTuple):
     touched: NDArray[np.bool_]
     facet: NDArray[np.int64]
     place: NDArray[np.float64]
+    closest: NDArray[np.int64]
     gap: NDArray[np.float64]
+    within: NDArray[np.bool_]
+    offset: NDArray[np.float64]
     points: NDArray[np.float64]
     anchors: NDArray[np.float64]
+
+
+class _Start(NamedTuple):
+    """Where a step of a motion begins, at some points.
+
+    Attributes:
+        x: Positions of points and nodes of their facets, shape ``(n, 1 + k, gdim)``.
+        place: Their projections on facets in the middle of the step, shape ``(n, e)``.
+        gap: The gap, infinite where nothing was near, shape ``(n,)``.
+        offset: As that of :class:`_Memory`.
+    """
+
+    x: NDArray[np.float64]
+    place: NDArray[np.float64]
+    gap: NDArray[np.float64]
+    offset: NDArray[np.float64]
 
 
 class _Stencil(NamedTuple):
@@ -81,6 +105,7 @@ class _Stencil(NamedTuple):
         x: Positions of points, nodes of their facets and of those of their anchors, ``(n, k, i)``.
         points: Stiffness and memory.
         outward: As that of :class:`Surface`.
+        start: Where the step begins, if it is one of a motion.
     """
 
     which: NDArray[np.int64]
@@ -89,6 +114,39 @@ class _Stencil(NamedTuple):
     x: NDArray[Any]
     points: Points
     outward: NDArray[np.float64]
+    start: _Start | None
+
+
+class _Foot(NamedTuple):
+    """Projections of points on facets, which may have a small imaginary part.
+
+    Attributes:
+        N: Shape functions there, shape ``(n, k)``.
+        dN: Their derivatives, shape ``(n, e, k)``.
+        along: Tangents, shape ``(n, e, gdim)``.
+        n: Normals, shape ``(n, gdim)``.
+        gap: Shape ``(n,)``.
+    """
+
+    N: NDArray[Any]
+    dN: NDArray[Any]
+    along: NDArray[Any]
+    n: NDArray[Any]
+    gap: NDArray[Any]
+
+
+class _Acting(NamedTuple):
+    """What acts on points and on nodes of their facets.
+
+    Attributes:
+        pushes: Tractions by pressure on points and nodes, shape ``(n, 1 + k, gdim)``.
+        rubs: The same by friction.
+        acts: Pressure and shear.
+    """
+
+    pushes: NDArray[Any]
+    rubs: NDArray[Any]
+    acts: Traction
 
 
 class _Pass:
@@ -100,6 +158,10 @@ class _Pass:
         law: Friction.
         penalties: In the normal direction and along the surface.
         share: Share of the stiffness.
+
+    Attributes:
+        of_step: Whether forces are those of whole steps of a motion.
+        works: This rank's work against pressure and against friction in such a step.
     """
 
     def __init__(
@@ -115,6 +177,8 @@ class _Pass:
         self._comm: MPI.Comm = source.particles.mesh.comm
         self.memory: _Memory | None = None
         self.stencil: _Stencil | None = None
+        self.of_step = False
+        self.works = (0.0, 0.0)
         self._near: NearFacets | None = None
 
     def settle(self, source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
@@ -150,6 +214,7 @@ class _Pass:
         x = self._flat(self.source.positions(converged))
         nodes = self.target.node_positions(converged)
         self._near = NearFacets(self.target, self._number, x, 3.0 * self.reach, nodes)
+        self._before = self._near.positions(self.target.node_positions(converged=True))
         self._start = x, nodes
         self._paired: Closest | None = None
         self.stencil = None
@@ -166,6 +231,7 @@ class _Pass:
         paired, near = self._paired, self._near
         assert near is not None
         self._near = NearFacets(self.target, self._number, x, 3.0 * self.reach, nodes)
+        self._before = self._near.positions(self.target.node_positions(converged=True))
         self._start = x, nodes
         if paired is not None:
             place = np.where(paired.facet >= 0, self._near.find(_numbers(near, paired.facet)), -1)
@@ -182,7 +248,10 @@ class _Pass:
             np.zeros(len(x), dtype=bool),
             _numbers(self._near, found.facet),
             found.place,
+            _numbers(self._near, found.facet),
             found.gap,
+            found.near & (found.gap <= self.touch),
+            np.zeros(len(x)),
             x,
             x,
         )
@@ -231,16 +300,28 @@ class _Pass:
             found = self._frozen(found, x, nodes)
         self._paired = found
         gap = np.where(found.near, found.gap, np.inf)
-        inside = found.near & (gap <= self.touch) & (self.source.weights.ravel() > 0.0)
-        which = np.flatnonzero(inside)
+        borne = self.source.weights.ravel() > 0.0
+        within = found.near & (gap <= self.touch) & borne
+        inside = acting = within
+        self._within, self._offset = within, np.zeros(len(x))
+        if self.of_step:
+            found, inside, acting = self._over_step(found, within, x, nodes)
+            acting &= borne
+        which = np.flatnonzero(acting)
         self.stencil = self._stencil(which, found, x, nodes)
         shape = (len(self.source.cells), self.source.nq)
         force = np.zeros_like(x)
         pressure, slips = np.zeros(len(x)), np.zeros(len(x), dtype=bool)
-        T, reaction, acts = self._act(self.stencil, self.stencil.x)
-        force[which], pressure[which], slips[which] = T, acts.pressure, acts.slips
-        self.reaction = reaction
+        pushes, rubs, acts = self._act(self.stencil, self.stencil.x)
+        both = pushes + rubs
+        force[which], pressure[which], slips[which] = both[:, 0], acts.pressure, acts.slips
+        self.reaction = both[:, 1:]
         self.shear = acts.shear
+        if self.stencil.start is not None:
+            change = self.stencil.x[:, : both.shape[1]] - self.stencil.start.x
+            w = self.source.weights.ravel()[which]
+            done = [-float(w @ (part * change).sum(axis=(1, 2))) for part in (pushes, rubs)]
+            self.works = done[0], done[1]
         self.outcome = Outcome(
             x.reshape(*shape, -1),
             gap.reshape(shape),
@@ -249,6 +330,35 @@ class _Pass:
             inside.reshape(shape),
             slips.reshape(shape),
         )
+
+    def _over_step(
+        self,
+        found: Closest,
+        within: NDArray[np.bool_],
+        x: NDArray[np.float64],
+        nodes: NDArray[np.float64],
+    ) -> tuple[Closest, NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return facets, and which points touch at the end of a step and in the whole of it.
+
+        Points that leave through their facets give back their energy.
+        """
+        near, memory = self._near, self.memory
+        assert near is not None and memory is not None
+        lost = np.flatnonzero(memory.within & (found.facet < 0))
+        at = near.find(memory.closest[lost])
+        lost, at = lost[at >= 0], at[at >= 0]
+        if len(lost):
+            facet, place, gap = found.facet.copy(), found.place.copy(), found.gap.copy()
+            place[lost] = self._near_place(x[lost], nodes[at])
+            foot = self._foot(place[lost], x[lost], nodes[at], near.outward[at])
+            facet[lost], gap[lost] = at, foot.gap
+            found = found._replace(facet=facet, place=place, gap=gap)
+        sideways = within & ~memory.within & (memory.gap < -self.touch)
+        offset = np.where(memory.within, np.clip(found.gap, memory.offset, 0.0), 0.0)
+        self._offset = np.where(within, np.where(sideways, found.gap, offset), 0.0)
+        inside = within & ~sideways & (found.gap - memory.offset <= self.touch)
+        out = (found.facet >= 0) & (found.near | (found.gap > self.touch))
+        return found, inside, inside | (memory.within & out)
 
     def _frozen(
         self, found: Closest, x: NDArray[np.float64], nodes: NDArray[np.float64]
@@ -296,6 +406,12 @@ class _Pass:
             np.where(lost, 0.0, memory.gap[which]),
         )
         self._facet, self._anchor = facet, anchor
+        start = None
+        if self.of_step:
+            before = np.concatenate([memory.points[which][:, None], self._before[facet]], axis=1)
+            middle = 0.5 * (before + np.concatenate(parts[:2], axis=1))
+            place = near.project(middle[:, 0], middle[:, 1:], found.place[which])
+            start = _Start(before, place, memory.gap[which], memory.offset[which])
         return _Stencil(
             which,
             found.place[which],
@@ -303,47 +419,78 @@ class _Pass:
             np.concatenate(parts, axis=1),
             points,
             near.outward[facet],
+            start,
         )
 
-    def _act(self, stencil: _Stencil, z: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], Any]:
-        """Return tractions ``(n, i)`` on the points, and what they do to nodes of facets.
+    def _foot(
+        self,
+        place: NDArray[np.float64],
+        x: NDArray[Any],
+        X: NDArray[Any],
+        outward: NDArray[np.float64],
+    ) -> _Foot:
+        """Return projections of points ``(n, i)`` on facets with nodes ``(n, k, i)``.
 
         Args:
-            stencil: The points.
-            z: Their stencils' positions, real or with a small imaginary part.
-
-        Returns:
-            Tractions, forces on the facet's nodes per area ``(n, k, i)``, and what acts.
+            place: Where they are, shape ``(n, e)``.
+            x: The points, real or with a small imaginary part.
+            X: The nodes.
+            outward: As that of :class:`Surface`.
         """
-        near = self._near
-        assert near is not None
-        k = near.element.dim
-        x, X = z[:, 0], z[:, 1 : 1 + k]
-        N, dN, ddN = near.tabulate(stencil.place)
+        assert self._near is not None
+        N, dN, ddN = self._near.tabulate(place)
         # One step of Newton's method has the derivative of the projection exactly.
         r = x - np.einsum("nk,nki->ni", N, X)
         A = np.einsum("nek,nki->nei", dN, X)
         B = np.einsum("nefk,nki->nefi", ddN, X)
         G = (A @ A.swapaxes(1, 2) - np.einsum("nefi,ni->nef", B, r)).real
-        ds = np.linalg.solve(G.astype(z.dtype), np.einsum("nei,ni->ne", A, r)[:, :, None])[:, :, 0]
+        ds = np.linalg.solve(G.astype(x.dtype), np.einsum("nei,ni->ne", A, r)[:, :, None])[:, :, 0]
         N = N + np.einsum("nek,ne->nk", dN, ds)
         dN = dN + np.einsum("nefk,nf->nek", ddN, ds)
         r = x - np.einsum("nk,nki->ni", N, X)
         A = np.einsum("nek,nki->nei", dN, X)
-        n = stencil.outward[:, None] * normals(A.swapaxes(1, 2))
+        n = outward[:, None] * normals(A.swapaxes(1, 2))
         n = n / np.sqrt((n * n).sum(axis=1))[:, None]
-        g = (r * n).sum(axis=1)
+        return _Foot(N, dN, A, n, (r * n).sum(axis=1))
+
+    def _act(self, stencil: _Stencil, z: NDArray[Any]) -> _Acting:
+        """Return what acts on the points and on nodes of their facets.
+
+        Args:
+            stencil: The points.
+            z: Their stencils' positions, real or with a small imaginary part.
+        """
+        near, start = self._near, stencil.start
+        assert near is not None
+        both = z[:, : 1 + near.element.dim]
+        x, X = both[:, 0], both[:, 1:]
+        foot = self._foot(stencil.place, x, X, stencil.outward)
         delta = np.zeros_like(x)
         if not self.law.smooth:
             at, _, _ = near.tabulate(stencil.anchored)
-            delta = x - np.einsum("nk,nki->ni", at, z[:, 1 + k :])
-        acts = traction(self.law, stencil.points, delta, g, n, self.touch)
-        T = acts.pressure[:, None] * n + acts.shear
+            delta = x - np.einsum("nk,nki->ni", at, z[:, 1 + near.element.dim :])
+        if start is None:
+            acts = traction(self.law, stencil.points, delta, foot.gap, foot.n, self.touch)
+            gradient = _gradient(foot)
+        else:
+            gap, middle, change = foot.gap, 0.5 * (start.x + both), both - start.x
+            foot = self._foot(start.place, middle[:, 0], middle[:, 1:], stencil.outward)
+            gradient = _gradient(foot)
+            linear = gap - (gradient * change).sum(axis=(1, 2))
+            linear = np.where(linear.real > 0.0, linear, 0.0)
+            before = np.where(np.isfinite(start.gap), start.gap, linear)
+            v = deformation(middle, change)
+            gradient, _ = corrected(gradient, change, v, gap - before, self.target.extent)
+            gap, before = gap - start.offset, before - start.offset
+            p = mean_pressure(stencil.points.stiffness, before, gap, self.touch)
+            acts = traction(self.law, stencil.points, delta, gap, foot.n, self.touch, p)
+        pushes = acts.pressure[:, None, None] * gradient
         # the arm g n turns with the facet
+        A = foot.along
         along = np.linalg.solve(A @ A.swapaxes(1, 2), (A @ acts.shear[:, :, None]))[:, :, 0]
-        turn = -g[:, None] * np.einsum("nek,ne->nk", dN, along)
-        reaction = -(N[:, :, None] * T[:, None, :] + turn[:, :, None] * n[:, None, :])
-        return T, reaction, acts
+        turn = -foot.gap[:, None] * np.einsum("nek,ne->nk", foot.dN, along)
+        rubs = -(foot.N[:, :, None] * acts.shear[:, None, :] + turn[:, :, None] * foot.n[:, None])
+        return _Acting(pushes, np.concatenate([acts.shear[:, None], rubs], axis=1), acts)
 
     def forces(self) -> tuple[PETSc.Vec, PETSc.Vec]:
         """Return the forces on the nodes of both bodies (collective)."""
@@ -365,24 +512,30 @@ class _Pass:
         n, count, gdim = z.shape
         assert self._near is not None
         D = np.zeros((n, 1 + self._near.element.dim, gdim, count, gdim))
+        if n == 0:
+            return D
         for node in range(count):
             for j in range(gdim):
                 kept = z[:, node, j].copy()
                 z[:, node, j] += 1j * STEP
-                T, reaction, _ = self._act(self.stencil, z)
+                pushes, rubs, _ = self._act(self.stencil, z)
                 z[:, node, j] = kept
-                D[:, 0, :, node, j] = T.imag / STEP
-                D[:, 1:, :, node, j] = reaction.imag / STEP
+                D[:, :, :, node, j] = (pushes + rubs).imag / STEP
         return D
 
-    def blocks(self) -> dict[tuple[int, int], list[Blocks]]:
-        """Return what the forces' derivatives add to matrices, by (source 0, target 1)."""
+    def blocks(self, factor: float) -> dict[tuple[int, int], list[Blocks]]:
+        """Return what the forces' derivatives add to matrices, by (source 0, target 1).
+
+        Args:
+            factor: What they are multiplied by.
+        """
         near, source = self._near, self.source
         assert near is not None and self.stencil is not None
         k = near.element.dim
         which = self.stencil.which
         facet_of, point = which // source.nq, which % source.nq
-        D = self.derivatives() * -source.weights.ravel()[which][:, None, None, None, None]
+        w = -factor * source.weights.ravel()[which]
+        D = self.derivatives() * w[:, None, None, None, None]
         N = source.shapes[point]
         own = global_dofs(source.particles.W, source.nodes[facet_of])
         columns: list[tuple[int, NDArray[np.int64], NDArray[np.int64], slice]] = [
@@ -426,7 +579,7 @@ class _Pass:
             k = self.stencil.points.tangential
             stays = inside & ~slips & self.stencil.points.touched
             stays &= near.find(memory.facet[which]) >= 0
-            moves = ~stays
+            moves = inside & ~stays
             # anchors that moved are beside the foot, and belong to the facet that is there
             X = self._nodes[self._facet[moves]]
             N, _, _ = near.tabulate(self.stencil.place[moves])
@@ -442,7 +595,18 @@ class _Pass:
         N, _, _ = near.tabulate(place[at >= 0])
         anchors[at >= 0] = np.einsum("nk,nki->ni", N, self._nodes[at[at >= 0]])
         inside = self.outcome.inside.ravel().copy()
-        return _Memory(inside, numbers, place, found.gap, x, anchors)
+        closest = _numbers(near, found.facet)
+        return _Memory(
+            inside,
+            numbers,
+            place,
+            closest,
+            found.gap,
+            self._within,
+            self._offset,
+            x,
+            anchors,
+        )
 
     def located(
         self,
@@ -484,7 +648,12 @@ class _Pass:
         middle = basix.geometry(self._near.element.cell_type).mean(axis=0)
         return self._near.project(x, X, np.tile(middle, (len(x), 1)))
 
-    def restore(self, touched: NDArray[np.bool_], anchors: NDArray[np.float64]) -> None:
+    def restore(
+        self,
+        touched: NDArray[np.bool_],
+        anchors: NDArray[np.float64],
+        offset: NDArray[np.float64],
+    ) -> None:
         """Take what was remembered, on the meshes of now (collective)."""
         self.begin_anew()
         near, memory = self._near, self.memory
@@ -496,8 +665,13 @@ class _Pass:
         there = found.facet >= 0
         numbers[which[there]] = near.number[found.facet[there]]
         place[which[there]] = found.place[there]
-        self.memory = _Memory(
-            touched.ravel(), numbers, place, memory.gap, memory.points, self._flat(anchors)
+        self.memory = memory._replace(
+            touched=touched.ravel(),
+            facet=numbers,
+            place=place,
+            within=touched.ravel() | memory.within,
+            offset=offset.ravel(),
+            anchors=self._flat(anchors),
         )
 
 
@@ -506,6 +680,12 @@ def _numbers(near: NearFacets, facet: NDArray[np.int64]) -> NDArray[np.int64]:
     numbers = np.full(len(facet), -1, dtype=np.int64)
     numbers[facet >= 0] = near.number[facet[facet >= 0]]
     return numbers
+
+
+def _gradient(foot: _Foot) -> NDArray[Any]:
+    """Return the gradient of the gap by the point and the nodes of its facet, ``(n, 1 + k, i)``."""
+    n = foot.n[:, None, :]
+    return np.concatenate([n, -foot.N[:, :, None] * n], axis=1)
 
 
 class Pair(Contact):
@@ -595,7 +775,7 @@ class Pair(Contact):
             _Pass(self._surfaces[i], self._surfaces[1 - i], law, penalties, 1.0 / passes)
             for i in range(passes)
         ]
-        self._made = False
+        self._made, self._begins = False, True
         self._last: list[Outcome] | None = None
 
     # -- The term -------------------------------------------------------------------------------
@@ -646,19 +826,30 @@ class Pair(Contact):
                     )
 
     def begin(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.begin`."""
+        """See :meth:`Term.begin`.
+
+        What was evaluated last stays until the next evaluation: it may still be committed.
+        """
         self._settle()
         for surface in self._surfaces:
             surface.look_at_deleted()
-        for each in self._passes:
-            each.begin()
-        self._new_pattern()
+        self._begins = True
         return ()
+
+    def _look(self) -> None:
+        """Learn where facets are now (collective)."""
+        if self._begins:
+            self._begins = False
+            for each in self._passes:
+                each.of_step = self._of_step
+                each.begin()
+            self._new_pattern()
+        for each in self._passes:
+            each.look()
 
     def update(self) -> MPMError | None:
         """See :meth:`Term.update`."""
-        for each in self._passes:
-            each.look()
+        self._look()
         try:
             for each in self._passes:
                 each.evaluate()
@@ -675,9 +866,9 @@ class Pair(Contact):
 
     def residuals(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.residuals`."""
-        for each in self._passes:
-            if each.stencil is None:
-                each.look()
+        if self._begins or any(each.stencil is None for each in self._passes):
+            self._look()
+            for each in self._passes:
                 each.evaluate()
         first, second = self._passes[0].forces()
         for each in self._passes[1:]:
@@ -685,14 +876,19 @@ class Pair(Contact):
             first.axpy(1.0, on_a)
             second.axpy(1.0, on_b)
         for force in (first, second):
-            force.scale(-1.0)
+            force.scale(-1.0 / self._share)
         return [first, second]
+
+    def _works(self) -> tuple[float, float]:
+        """See :meth:`Contact._works`."""
+        normal, shear = np.sum([each.works for each in self._passes], axis=0)
+        return float(normal), float(shear)
 
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
         """See :meth:`Term.tangents`."""
         parts: dict[tuple[int, int], list[Blocks]] = {pair: [] for pair in self._matrices}
         for number, each in enumerate(self._passes):
-            for (i, j), blocks in each.blocks().items():
+            for (i, j), blocks in each.blocks(1.0 / self._share).items():
                 parts[abs(i - number), abs(j - number)] += blocks
         found = {pair: self._matrices[pair].of(blocks) for pair, blocks in parts.items()}
         return {pair: K for pair, K in found.items() if K is not None}
@@ -780,6 +976,7 @@ class Pair(Contact):
             shape = outcome.inside.shape
             columns["anchor"] = surface.column(memory.anchors.reshape(*shape, surface.gdim))
             columns["touches"] = surface.column(memory.touched.reshape(shape))
+            columns["offset"] = surface.column(memory.offset.reshape(shape))
             columns["slips"] = surface.column(outcome.slips)
             columns["pressure"] = surface.column(outcome.pressure)
             columns["traction"] = surface.column(outcome.traction)
@@ -794,7 +991,11 @@ class Pair(Contact):
         self._settle(again=True)
         for each, surface, columns in zip(self._passes, self._surfaces, every, strict=False):
             touched = surface.of_column(columns["touches"])
-            each.restore(touched, surface.of_column(columns["anchor"]))
+            each.restore(
+                touched,
+                surface.of_column(columns["anchor"]),
+                surface.of_column(columns["offset"]),
+            )
         self.update()
         self._last = [
             replace(

@@ -22,9 +22,10 @@ from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..system.term import PointMaterial
 from .contact import Contact, Outcome, as_positive, stiffness
-from .law import Coulomb, Points, as_friction, derivative, traction
+from .law import Coulomb, Points, as_friction, derivative, shear_derivative, traction
 from .shapes import Shape
 from .surface import Blocks, PointMatrix, Surface, global_dofs
+from .whole_step import corrected, mean_pressure, pressure_slope
 
 __all__ = ["Rigid"]
 
@@ -47,6 +48,10 @@ class _Pose(NamedTuple):
 
     offset: NDArray[np.float64]
     angle: NDArray[np.float64]
+
+    def middle(self, other: _Pose) -> _Pose:
+        """Return the pose halfway to another."""
+        return _Pose(0.5 * (self.offset + other.offset), 0.5 * (self.angle + other.angle))
 
     @property
     def Q(self) -> NDArray[np.float64]:
@@ -73,6 +78,7 @@ class _Memory:
         gap: Shape ``(m, nq)``.
         normal: Normals, in the frame of the shape.
         outcome: What acted.
+        works: What was done against pressure and against friction in the step, if there is motion.
     """
 
     pose: _Pose
@@ -81,6 +87,29 @@ class _Memory:
     gap: NDArray[np.float64]
     normal: NDArray[np.float64]
     outcome: Outcome
+    works: tuple[float, float] = (0.0, 0.0)
+
+
+class _Step(NamedTuple):
+    """A step of a motion, at some points, in the frame of the shape.
+
+    Attributes:
+        change: Of positions, shape ``(n, gdim)``.
+        middle: Positions in the middle.
+        normal: Normals there.
+        gradient: That by which the change of the gap is the one of positions.
+        factor: What of the change is in it.
+        before: Gap at the beginning, shape ``(n,)``.
+        pressure: Mean pressure.
+    """
+
+    change: NDArray[np.float64]
+    middle: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    factor: NDArray[np.float64]
+    before: NDArray[np.float64]
+    pressure: NDArray[np.float64]
 
 
 class Rigid(Contact):
@@ -342,15 +371,34 @@ class Rigid(Contact):
         except Exception as error:
             raise as_ours(error, "The shape of a Rigid") from error
         points = self._points(memory)
-        acts = traction(self.friction, points, y - points.anchor, phi, n, self._surface.touch)
-        force = (acts.pressure[:, None] * n + acts.shear) @ pose.Q.T
+        pushes, step, Q = n, None, pose.Q
+        if self._of_step:
+            step = self._step(points, memory, y, phi)
+            pushes, Q = step.gradient, memory.pose.middle(pose).Q
+        acts = traction(
+            self.friction,
+            points,
+            y - points.anchor,
+            phi,
+            n if step is None else step.normal,
+            self._surface.touch,
+            None if step is None else step.pressure,
+        )
         shape = (m, nq)
+        normal, shear = (
+            (part @ Q.T).reshape(x.shape) for part in (acts.pressure[:, None] * pushes, acts.shear)
+        )
+        force = normal + shear
+        works = (0.0, 0.0)
+        if step is not None:
+            moves = self._surface.weights[:, :, None] * (x - memory.outcome.positions)
+            works = -float((normal * moves).sum()), -float((shear * moves).sum())
         outcome = Outcome(
             x,
             phi.reshape(shape),
             acts.pressure.reshape(shape),
-            force.reshape(x.shape),
-            acts.inside.reshape(shape),
+            force,
+            (phi <= self._surface.touch).reshape(shape),
             acts.slips.reshape(shape),
         )
         return _Memory(
@@ -360,7 +408,31 @@ class Rigid(Contact):
             outcome.gap,
             n.reshape(x.shape),
             outcome,
+            works,
         )
+
+    def _step(
+        self,
+        points: Points,
+        memory: _Memory,
+        y: NDArray[np.float64],
+        gap: NDArray[np.float64],
+    ) -> _Step:
+        """Return what there is of a step to positions and gaps at all points."""
+        before = memory.gap.ravel()
+        x = memory.outcome.positions
+        change = y - self._framed(x, memory.pose).reshape(y.shape)
+        middle = y - 0.5 * change
+        _, n = self.shape.distance(middle)
+        surface = self._surface
+        gradient, factor = corrected(n, change, change, gap - before, surface.extent)
+        pressure = mean_pressure(points.stiffness, before, gap, surface.touch)
+        return _Step(change, middle, n, gradient, factor, before, pressure)
+
+    def _works(self) -> tuple[float, float]:
+        """See :meth:`Contact._works`."""
+        assert self._trial is not None
+        return self._trial.works
 
     def _anchors(
         self,
@@ -386,42 +458,61 @@ class Rigid(Contact):
     def residuals(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.residuals`."""
         assert self._trial is not None
-        return [self._surface.force(self._trial.outcome.traction, -1.0)]
+        return [self._surface.force(self._trial.outcome.traction, -1.0 / self._share)]
 
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
         """See :meth:`Term.tangents`."""
         assert self._trial is not None and self._memory is not None
         trial, memory, surface = self._trial, self._memory, self._surface
+        acting = trial.touched
+        if self._of_step:
+            acting = acting | (memory.gap <= surface.touch)
         which = np.flatnonzero(
-            trial.touched.any(axis=1) & (surface.weights.max(axis=1, initial=0.0) > 0.0)
+            acting.any(axis=1) & (surface.weights.max(axis=1, initial=0.0) > 0.0)
         )
         D = np.zeros((len(which), surface.nq, surface.gdim, surface.gdim))
-        inside = trial.touched[which]
+        inside = acting[which]
         flat = (which[:, None] * surface.nq + np.arange(surface.nq))[inside]
         if len(flat):
-            gdim, Q = surface.gdim, trial.pose.Q
-            y = self._framed(trial.outcome.positions, trial.pose).reshape(-1, gdim)[flat]
-            n = trial.normal.reshape(-1, gdim)[flat]
-            points = self._points(memory).of(flat)
-            D[inside] = (
-                Q
-                @ derivative(
-                    self.friction,
-                    points,
-                    y - points.anchor,
-                    trial.gap.ravel()[flat],
-                    n,
-                    self.shape.curvature(y),
-                    surface.touch,
-                )
-                @ Q.T
-            )
+            D[inside] = self._derivative(trial, memory, flat) / self._share
         N, w = surface.shapes, surface.weights[which]
         k = N.shape[1] * surface.gdim
         blocks = np.einsum("mq,qa,qb,mqij->maibj", -w, N, N, D, optimize=True)
         dofs = global_dofs(self.bodies[0].W, surface.nodes[which])
         K = self._matrix.of([Blocks(which[:, None], dofs, dofs, blocks.reshape(-1, k, k))])
         return {} if K is None else {(0, 0): K}
+
+    def _derivative(
+        self, trial: _Memory, memory: _Memory, flat: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return the derivative of the traction by positions at some points that touch."""
+        surface, gdim, Q = self._surface, self._surface.gdim, trial.pose.Q
+        y = self._framed(trial.outcome.positions, trial.pose).reshape(-1, gdim)
+        n, gap = trial.normal.reshape(-1, gdim)[flat], trial.gap.ravel()[flat]
+        every = self._points(memory)
+        points = every.of(flat)
+        delta = y[flat] - points.anchor
+        touch, law = surface.touch, self.friction
+        if not self._of_step:
+            H = self.shape.curvature(y[flat])
+            return np.asarray(Q @ derivative(law, points, delta, gap, n, H, touch) @ Q.T)
+        step = _Step(*(part[flat] for part in self._step(every, memory, y, trial.gap.ravel())))
+        H = 0.5 * self.shape.curvature(step.middle)
+        slope = pressure_slope(points.stiffness, step.before, gap, touch)
+        size = (step.change**2).sum(axis=1)
+        moved = step.factor != 0.0
+        dfactor = n - step.normal - np.einsum("nij,nj->ni", H, step.change)
+        dfactor -= 2.0 * step.factor[:, None] * step.change
+        dfactor = np.where(moved[:, None], dfactor / np.where(moved, size, 1.0)[:, None], 0.0)
+        turn = H + step.factor[:, None, None] * np.eye(gdim)
+        turn = turn + step.change[:, :, None] * dfactor[:, None, :]
+        D = step.gradient[:, :, None] * (slope[:, None] * n)[:, None, :]
+        D = D + step.pressure[:, None, None] * turn
+        if not law.smooth:
+            acts = traction(law, points, delta, gap, step.normal, touch, step.pressure)
+            dp = slope[:, None] * n
+            D = D + shear_derivative(law, points, delta, gap, step.normal, H, touch, acts, dp, n)
+        return np.asarray(memory.pose.middle(trial.pose).Q @ D @ Q.T)
 
     # -- What it remembers ------------------------------------------------------------------------
 

@@ -30,6 +30,7 @@ from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..stepping.progress import with_bar
 from ..system.inertia import Followed, Inertia
+from ..system.term import PointMaterial
 from .arguments import as_bodies
 from .particle_problem import ParticleProblem
 
@@ -66,6 +67,13 @@ class MovingProblem(ParticleProblem):
             weakly(self._driven),
         )
         self.inertia.follow(followed)
+
+    def _let_take_part(self, materials: Sequence[PointMaterial | None]) -> None:
+        """See :meth:`ParticleProblem._let_take_part`; terms learn that there is motion."""
+        super()._let_take_part(materials)
+        for term in self.terms:
+            if term is not self.inertia:
+                term.pace(self.inertia.dt, self.inertia.share)
 
     def _works(self) -> NDArray[np.float64]:
         """Return the works of the last increment on the backgrounds (collective)."""
@@ -298,8 +306,8 @@ class MovingProblem(ParticleProblem):
     def reaction(self, bc: fem.DirichletBC | Support | Contact) -> NDArray[np.float64]:
         """Return the force of a support on the body: of a Dirichlet condition in the last step.
 
-        That is the mean over the step, but with ``scheme="euler"``; supports of
-        :mod:`mpm_dolfinx.boundary` and contacts have that at its end. See
+        That is the mean over the step, but with ``scheme="euler"``, as is that of a contact;
+        supports of :mod:`mpm_dolfinx.boundary` have that at its end. See
         :meth:`ParticleProblem.reaction`.
         """
         force = super().reaction(bc)

@@ -49,7 +49,7 @@ from ..system.field import Field, ValueField
 from ..system.predictor import Predictor
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
-from ..system.term import Term, UserTerm
+from ..system.term import PointMaterial, Term, UserTerm
 from ..system.values import FieldTerm, FormsTerm
 from . import kept
 from .arguments import (
@@ -326,6 +326,11 @@ class ParticleProblem:
             raise
         self._govern()
 
+    def _let_take_part(self, materials: Sequence[PointMaterial | None]) -> None:
+        """Tell terms of bodies and materials (collective)."""
+        for number, term in enumerate(self.terms):
+            term.take_part(number, self.bodies, materials)
+
     def _build_system(self, groups: list[list[Particles]], clean_up: Cleaner) -> None:
         """Make the system and its solver (collective).
 
@@ -366,8 +371,7 @@ class ParticleProblem:
             body for body, c in zip(self.bodies, contributions, strict=True) if self._moves(c)
         ]
         groups = by_space(moving)
-        for number, term in enumerate(self.terms):
-            term.take_part(number, self.bodies, [given.material for given in contributions])
+        self._let_take_part([given.material for given in contributions])
         on_backgrounds = _on_backgrounds(self._background, groups, **options)
         remove = numerics.dependent_dofs == "remove"
         fields = [

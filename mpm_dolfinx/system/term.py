@@ -123,6 +123,8 @@ class Term:
     def pace(self, dt: float, share: float) -> None:
         """Take notice that a step of a motion begins, before its first residuals.
 
+        It is also called when a problem of motion has been built, after :meth:`take_part`.
+
         The scheme of a DynamicProblem takes the mean of a step's end forces: its residual is the
         sum of :meth:`end_forces` at the beginning (if ``share`` is 0.5) and :meth:`residuals`, and
         ``share`` of that is force. A term whose force is one of the whole step, such as that of a
