@@ -3,6 +3,7 @@
 """A von Mises column that slumps in time under its own weight."""
 
 from math import ceil
+from time import process_time
 
 from mpi4py import MPI
 
@@ -51,6 +52,7 @@ else:
     run = problem.steps(args.time, args.time / steps)
 X = particles.W.tabulate_dof_coordinates()
 path = [(0.0, 4.0, 8.0)]
+began = process_time()
 try:
     for step in kit.progress(run, steps, args):
         x = X[:, :2] + particles.displacement.x.array.reshape(-1, 2)
@@ -59,12 +61,14 @@ except mpm.MPMError as error:
     failure = error
 
 history = problem.history
+seconds = kit.largest([process_time() - began])
 _, toe, top = path[-1]
 numbers = {
     **kit.outcome(history, failure),
     "toe": toe,
     "top": top,
     "iterations_per_step": float(np.mean(history.iterations)),
+    "cpu_per_step": seconds / max(1, len(history.steps)),
     "plastic_strain": kit.largest(particles.plastic_strain),
     "particles": particles.num_global,
 }
@@ -80,6 +84,7 @@ rows = [
     ("toe", f"{toe:.3f} m"),
     ("top", f"{top:.3f} m"),
     ("linear solves in a step", f"{numbers['iterations_per_step']:.2f}"),
+    ("CPU in a step", f"{1e3 * numbers['cpu_per_step']:.1f} ms"),
 ]
 
 if args.plot:

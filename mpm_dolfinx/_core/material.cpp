@@ -10,6 +10,7 @@
 
 #include "material.h"
 #include "hot_loop.h"
+#include "matrix.h"
 
 #include <algorithm>
 #include <array>
@@ -21,12 +22,12 @@
 
 namespace
 {
+using core::inverse;
+using core::Matrix;
+
 constexpr double root_two = 1.41421356237309504880;
 constexpr double root_half = 0.70710678118654752440;
 constexpr double root_two_thirds = 0.81649658092772603273;
-
-template <int dim>
-using Matrix = std::array<std::array<double, dim>, dim>;
 
 // Components of a Mandel vector: xx, yy, zz, xy, yz, xz.
 constexpr int mandel_position[3][3] = {{0, 3, 5}, {3, 1, 4}, {5, 4, 2}};
@@ -50,36 +51,6 @@ void pack(const Matrix<dim>& tensor, double* vector)
     for (int j = i + 1; j < dim; ++j)
       vector[mandel_position[i][j]] = (tensor[i][j] + tensor[j][i]) * root_half;
   }
-}
-
-// The inverse of I + H; returns its determinant.
-template <int dim>
-double inverse(const Matrix<dim>& H, Matrix<dim>& result)
-{
-  Matrix<dim> F = H;
-  for (int i = 0; i < dim; ++i)
-    F[i][i] += 1.0;
-  double det;
-  if constexpr (dim == 2)
-  {
-    det = F[0][0] * F[1][1] - F[0][1] * F[1][0];
-    result = {{{F[1][1] / det, -F[0][1] / det}, {-F[1][0] / det, F[0][0] / det}}};
-  }
-  else
-  {
-    for (int k = 0; k < 3; ++k)
-    {
-      const auto &a = F[(k + 1) % 3], &b = F[(k + 2) % 3];
-      result[0][k] = a[1] * b[2] - a[2] * b[1];
-      result[1][k] = a[2] * b[0] - a[0] * b[2];
-      result[2][k] = a[0] * b[1] - a[1] * b[0];
-    }
-    det = F[0][0] * result[0][0] + F[0][1] * result[1][0] + F[0][2] * result[2][0];
-    for (auto& row : result)
-      for (double& entry : row)
-        entry /= det;
-  }
-  return det;
 }
 
 // Zero the entry (p, q) of a symmetric matrix by a rotation (Golub & Van Loan 2013, section

@@ -17,6 +17,7 @@
 #include "domains.h"
 #include "material.h"
 #include "sparsity.h"
+#include "step_stress.h"
 
 namespace
 {
@@ -339,4 +340,41 @@ NB_MODULE(_loops, m)
         "tolerance"_a, "P"_a.noconvert(), "A"_a.noconvert(), "stress"_a.noconvert(),
         "c"_a.noconvert(), "variables"_a.noconvert(),
         "Update a law with a history; return the points whose domains are inverted.");
+
+  m.def("step_stress",
+        [](Reals gradient, Reals old_gradient, Reals P, Reals old_P, Reals A, Reals energy,
+           Reals old_energy, Array<const std::uint8_t> kind, double small, double factor,
+           RealsOut stress, RealsOut tangent) {
+    require(gradient.ndim() == 3 && old_gradient.size() == gradient.size()
+                && P.size() == gradient.size() && old_P.size() == gradient.size()
+                && stress.size() == gradient.size(),
+            "gradients and stresses (n, dim, dim)");
+    const auto dim = static_cast<int>(gradient.shape(2));
+    require(dim == 2 || dim == 3, "two or three dimensions");
+    const std::size_t count = gradient.shape(0), square = static_cast<std::size_t>(dim * dim);
+    require(A.size() == count * square * square && tangent.size() == A.size(),
+            "tangents (n, dim, dim, dim, dim)");
+    require(kind.size() == count || kind.size() == 1, "one kind, or one for each point");
+    const bool known = energy.size() == count && old_energy.size() == count;
+    for (std::size_t p = 0; p < kind.size(); ++p)
+      require(kind.data()[p] <= static_cast<std::uint8_t>(Step::gonzalez)
+                  && (known || kind.data()[p] != static_cast<std::uint8_t>(Step::gonzalez)),
+              "kinds, and energies (n,) where they are asked for");
+    const StepEnds ends{count,
+                        gradient.data(),
+                        old_gradient.data(),
+                        P.data(),
+                        old_P.data(),
+                        A.data(),
+                        known ? energy.data() : nullptr,
+                        known ? old_energy.data() : nullptr,
+                        kind.data(),
+                        kind.size() == 1 ? std::size_t{0} : std::size_t{1},
+                        small,
+                        factor};
+    return to_numpy(step_stress(ends, dim, stress.data(), tangent.data()));
+  },
+        "gradient"_a, "old_gradient"_a, "P"_a, "old_P"_a, "A"_a, "energy"_a, "old_energy"_a,
+        "kind"_a, "small"_a, "factor"_a, "stress"_a.noconvert(), "tangent"_a.noconvert(),
+        "Set stress and tangent of a whole step; return the points whose F is singular.");
 }

@@ -86,6 +86,7 @@ class MaterialPoints:
     Attributes:
         dim: Dimension of stress and strain, 2 in plane strain.
         strain: As given.
+        compiled: As given.
         mean_stress: The pressure in place of the mean stress, or ``None``.
         averaging: F-bar, or ``None``; the material then sees Fbar, and what follows is what
             does work on F.
@@ -109,7 +110,7 @@ class MaterialPoints:
         pressure: fem.Function | None = None,
     ) -> None:
         self._particles = particles = strain.particles
-        self._compiled = compiled
+        self.compiled = compiled
         self.strain = strain
         self.dim = strain.dim
         self._points = particles.num_local * particles.num_points
@@ -383,7 +384,7 @@ class MaterialPoints:
             material = material.with_parameters(**replaced).at(points)
         if self._weakening != 1.0:
             material = material.weakened(self._weakening)
-        if not self._compiled and isinstance(material, CompiledMaterial):
+        if not self.compiled and isinstance(material, CompiledMaterial):
             material = material.with_parameters()
             material.compiled = False
         return material

@@ -24,6 +24,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from .._core import loops
 from ..errors import ConvergenceError
 from .points import MaterialPoints
 
@@ -62,10 +63,11 @@ class StepStress:
         self._undeformed: Array | None = None
         self._small = points.has_small_strain
         self._exact = points.is_hyperelastic & ~self._small
+        self._kind = np.where(self._small, 0, np.where(self._exact, 2, 1)).astype(np.uint8)
         plain = not conserving and viscosity == 0.0
         self.symmetric: bool = points.symmetric and (plain or bool(self._small.all()))
         self.settle()
-        self._tried: Array = self._F
+        self._tried: Array = self._H
         self._stress = points.first_piola
         self._viscous: Array | None = None
         self.tangent = points.tangent
@@ -101,17 +103,16 @@ class StepStress:
     def settle(self) -> None:
         """Take the last converged step for the beginning of the next."""
         points = self._points
-        self._F = self._gradient()
+        self._H = self._gradient()
         self._P = points.first_piola.copy()
         self._energy = points.strain_energy()
         if self._viscosity > 0.0:
             self._undeformed = points.undeformed_tangent()
 
     def _gradient(self) -> Array:
-        """Return F at the points at the present displacement."""
+        """Return F - I at the points at the present displacement."""
         dim = self._points.dim
-        gradient: Array = np.eye(dim) + self._points.strain.gradient().reshape(-1, dim, dim)
-        return gradient
+        return self._points.strain.gradient().reshape(-1, dim, dim)
 
     def update(self) -> None:
         """Update stress and tangent for the present displacement.
@@ -126,25 +127,50 @@ class StepStress:
             return
         self._tried = self._gradient()
         if self._conserving:
-            try:
-                stress, tangent = self._mean()
-            except np.linalg.LinAlgError as error:
-                raise ConvergenceError(f"A deformation gradient is singular ({error})") from error
-            self._stress, self.tangent = stress / self._share, tangent / self._share
+            compiled = points.compiled and loops is not None
+            self._stress, self.tangent = self._compiled_mean() if compiled else self._mean()
         if self._viscosity > 0.0:
             viscous, tangent = self._resisting()
             self._viscous = viscous
             self._stress = self._stress + viscous / self._share
             self.tangent = self.tangent + tangent / self._share
 
+    def _compiled_mean(self) -> tuple[Array, Array]:
+        """Return what :meth:`_mean` does, by the compiled loops."""
+        points = self._points
+        stress, tangent = np.empty_like(self._P), np.empty(points.tangent.shape)
+        none = np.zeros(0)
+        energies = (points.strain_energy(trial=True), self._energy) if self._exact.any() else None
+        singular = loops.step_stress(
+            np.ascontiguousarray(self._tried),
+            np.ascontiguousarray(self._H),
+            np.ascontiguousarray(points.first_piola),
+            self._P,
+            np.ascontiguousarray(points.tangent),
+            *(energies or (none, none)),
+            self._kind,
+            SMALL,
+            1.0 / self._share,
+            stress,
+            tangent,
+        )
+        if len(singular):
+            raise ConvergenceError("A deformation gradient is singular")
+        return stress, tangent
+
     def _mean(self) -> tuple[Array, Array]:
-        """Return P* and its derivative by F at the step's end."""
+        """Return P* and its derivative by F at the step's end, over the share."""
         points, small = self._points, self._small
         if small.all():
-            return 0.5 * (self._P + points.first_piola), 0.5 * points.tangent
-        F, F_n = self._tried, self._F
-        inverse = np.linalg.inv(F)
-        S, S_n = inverse @ points.first_piola, np.linalg.solve(F_n, self._P)
+            both = 0.5 * (self._P + points.first_piola), 0.5 * points.tangent
+            return both[0] / self._share, both[1] / self._share
+        unit = np.eye(points.dim)
+        F, F_n = unit + self._tried, unit + self._H
+        try:
+            inverse = np.linalg.inv(F)
+            S, S_n = inverse @ points.first_piola, np.linalg.solve(F_n, self._P)
+        except np.linalg.LinAlgError:
+            raise ConvergenceError("A deformation gradient is singular") from None
         dS = _times(inverse, points.tangent)
         dS -= np.einsum("nIk,nLJ->nIJkL", inverse, S)
         S_mean, dS_mean = 0.5 * (S + S_n), 0.5 * dS
@@ -158,13 +184,13 @@ class StepStress:
         if small.any():
             stress[small] = 0.5 * (self._P[small] + points.first_piola[small])
             tangent[small] = 0.5 * points.tangent[small]
-        return stress, tangent
+        return stress / self._share, tangent / self._share
 
     def _correct(self, S: Array, S_mean: Array, dS_mean: Array) -> None:
         """Add Gonzalez' correction to S* and its derivative, in place."""
         where = self._exact
-        F, S, mean = self._tried[where], S[where], S_mean[where]
-        change, slope = self._strain(F, self._F[where])
+        S, mean = S[where], S_mean[where]
+        change, slope = _strain(self._tried[where], self._H[where])
         size = np.einsum("nIJ,nIJ->n", change, change) + SMALL**2
         energy = self._points.strain_energy(trial=True)[where] - self._energy[where]
         c = (energy - np.einsum("nIJ,nIJ->n", mean, change)) / size
@@ -175,32 +201,18 @@ class StepStress:
         dS_mean[where] += c[:, None, None, None, None] * slope
         dS_mean[where] += change[:, :, :, None, None] * dc[:, None, None]
 
-    @staticmethod
-    def _strain(F: Array, F_n: Array) -> tuple[Array, Array]:
-        """Return the change of Green's strain, and its derivative by F."""
-        H = F - F_n
-        mean = 0.5 * (F + F_n)
-        half = mean.swapaxes(1, 2) @ H
-        dim = F.shape[-1]
-        slope = np.zeros((len(F), dim, dim, dim, dim))
-        for J in range(dim):
-            slope[:, :, J, :, J] += 0.5 * F.swapaxes(1, 2)
-            slope[:, J, :, :, J] += 0.5 * F.swapaxes(1, 2)
-        return 0.5 * (half + half.swapaxes(1, 2)), slope
-
     def _resisting(self) -> tuple[Array, Array]:
         """Return the viscous stress P_v and its derivative by F at the step's end."""
         assert self._undeformed is not None
-        F, F_n, small = self._tried, self._F, self._small
+        H, small = self._tried - self._H, self._small
         factor = self._viscosity / self._dt
         C = factor * self._undeformed
-        change, slope = self._strain(F, F_n)
-        H = F - F_n
+        change, slope = _strain(self._tried, self._H)
         change[small] = 0.5 * (H + H.swapaxes(1, 2))[small]
         S = np.einsum("nIJKL,nKL->nIJ", C, change)
-        mean = 0.5 * (F + F_n)
-        mean[small] = np.eye(self._points.dim)
-        n, dim = len(F), self._points.dim
+        n, dim = len(H), self._points.dim
+        mean = np.eye(dim) + 0.5 * (self._tried + self._H)
+        mean[small] = np.eye(dim)
         flat = (n, dim * dim, dim * dim)
         dS = (C.reshape(flat) @ slope.reshape(flat)).reshape(C.shape)
         dS[small] = C[small]
@@ -229,8 +241,8 @@ class StepStress:
             A function that takes it back.
         """
         points = self._points
-        before = self._F, self._P, self._energy, self._work
-        H = self._gradient() - self._F
+        before = self._H, self._P, self._energy, self._work
+        H = self._gradient() - self._H
         viscous = 0.0 if self._viscous is None else self._viscous
         if self._conserving:
             stress = self._share * self._stress - viscous
@@ -247,7 +259,7 @@ class StepStress:
 
         def undo() -> None:
             taken()
-            self._F, self._P, self._energy, self._work = before
+            self._H, self._P, self._energy, self._work = before
 
         return undo
 
@@ -279,6 +291,19 @@ class StepStress:
         weights = self._points.weights.ravel()
         present = weights > 0.0
         return float(weights[present] @ self._energy[present])
+
+
+def _strain(H: Array, H_n: Array) -> tuple[Array, Array]:
+    """Return the change of Green's strain between gradients F - I, and its derivative by F."""
+    dim = H.shape[-1]
+    F = np.eye(dim) + H
+    mean = np.eye(dim) + 0.5 * (H + H_n)
+    half = mean.swapaxes(1, 2) @ (H - H_n)
+    slope = np.zeros((len(H), dim, dim, dim, dim))
+    for J in range(dim):
+        slope[:, :, J, :, J] += 0.5 * F.swapaxes(1, 2)
+        slope[:, J, :, :, J] += 0.5 * F.swapaxes(1, 2)
+    return 0.5 * (half + half.swapaxes(1, 2)), slope
 
 
 def _times(factor: Array, tangent: Array) -> Array:

@@ -21,6 +21,7 @@ from dolfinx.fem import petsc as fem_petsc
 
 from .. import _compat
 from ..assembly.inputs import as_expression
+from ..assembly.petsc import of_same_components
 from ..boundary.supports import Support
 from ..contact.contact import Contact
 from ..errors import MPMError, agree, as_ours, on_all_ranks
@@ -111,7 +112,7 @@ class MovingProblem(ParticleProblem):
         matrix = fem_petsc.create_matrix(compiled)
         fem_petsc.assemble_matrix(matrix, compiled)
         matrix.assemble()
-        return matrix
+        return of_same_components(matrix, body.W.dofmap.index_map_bs)
 
     # -- Velocities ---------------------------------------------------------------------------
 

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, box, vectors
 
+from dolfinx import mesh
+
 import mpm_dolfinx as mpm
 from mpm_dolfinx.constitutive.points import MaterialPoints
 from mpm_dolfinx.constitutive.step_stress import StepStress
 from mpm_dolfinx.constitutive.strain import strain_of
+from mpm_dolfinx.errors import ConvergenceError
 from mpm_dolfinx.materials import Hencky, LinearElastic, ModifiedCamClay, VonMises
 
 LAWS = {
@@ -34,10 +37,15 @@ def body_of(cell):
     return mpm.Particles(box([0.0] * dim, [1.0] * dim, [2] * dim, cell), V)
 
 
-def stepped(cell, law, conserving=True, viscosity=0.0, axisymmetric=False):
+def stepped(cell, law, conserving=True, viscosity=0.0, axisymmetric=False, compiled=True):
     """Return the stress over a step between two displacements, and how to set the second."""
     body = body_of(cell)
-    points = MaterialPoints(strain_of(body, axisymmetric), law, None)
+    tags = None
+    if isinstance(law, dict):  # one half of the cells each
+        cells = np.arange(body.num_local, dtype=np.int32)
+        values = np.where(2 * cells < len(cells), 1, 2).astype(np.int32)
+        tags = mesh.meshtags(body.mesh, body.mesh.topology.dim, cells, values)
+    points = MaterialPoints(strain_of(body, axisymmetric), law, tags, compiled=compiled)
     stress = StepStress(points, conserving, viscosity)
     stress.pace(0.25, 0.5)
     dim = body.mesh.geometry.dim
@@ -84,6 +92,40 @@ def test_the_tangent_is_the_derivative(cell, law, conserving, viscosity, axisymm
     change = np.einsum("niJkL,nkL->niJ", stress.tangent, gradients[1] - gradients[0])
     found = values[1] - values[0]
     np.testing.assert_allclose(change, found, atol=2e-6 * np.abs(found).max(initial=1e-30))
+
+
+@pytest.mark.parametrize(
+    ("cell", "law", "axisymmetric"),
+    [
+        (TRIANGLE, LAWS["Hencky"], False),
+        (QUADRILATERAL, LAWS["von Mises"], True),
+        (HEXAHEDRON, LAWS["Hencky"], False),
+        (HEXAHEDRON, {1: LAWS["linear"], 2: LAWS["von Mises"]}, False),
+        (TRIANGLE, {1: LAWS["Hencky"], 2: LAWS["linear"]}, False),
+    ],
+)
+def test_the_compiled_loop_gives_what_numpy_gives(cell, law, axisymmetric):
+    found = []
+    for compiled in (True, False):
+        _, _, stress, put = stepped(cell, law, axisymmetric=axisymmetric, compiled=compiled)
+        put(0.4, 2.5)
+        stress.update()
+        found.append((stress.first_piola, stress.tangent))
+    for one, other in zip(*found, strict=True):
+        size = np.abs(other).max(initial=1e-300)
+        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12 * size)
+
+
+def test_a_singular_gradient_is_an_error_of_the_step():
+    for compiled in (True, False):
+        body, points, stress, _ = stepped(TRIANGLE, LAWS["von Mises"], compiled=compiled)
+        x = body.W.tabulate_dof_coordinates()[:, :2]
+        update, points.update = points.update, lambda: None  # the law would say so itself
+        body.displacement.x.array[:] = (-x * [1.0, 0.0]).ravel()
+        if body.num_local:
+            with pytest.raises(ConvergenceError, match="singular"):
+                stress.update()
+        points.update = update
 
 
 @pytest.mark.parametrize("cell", [TRIANGLE, QUADRILATERAL, HEXAHEDRON])
