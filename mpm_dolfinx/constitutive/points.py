@@ -21,8 +21,9 @@ from ..materials.base import Material, Refused, State, Update, check_parameter
 from ..materials.compiled import CompiledMaterial
 from ..materials.mandel import num_components
 from ..meshes.remesh import Column
+from ..particles.field import ParticleField
 from .averaging import VolumeAveraging
-from .pressure import MeanStress, require_split, without_bulk
+from .pressure import MeanStress, VolumeStrain, require_split, without_bulk
 from .strain import Strain
 
 __all__ = ["MaterialPoints"]
@@ -107,7 +108,7 @@ class MaterialPoints:
         cell_tags: mesh.MeshTags | None,
         f_bar: str = "none",
         compiled: bool = True,
-        pressure: fem.Function | None = None,
+        pressure: ParticleField | None = None,
     ) -> None:
         self._particles = particles = strain.particles
         self.compiled = compiled
@@ -129,6 +130,7 @@ class MaterialPoints:
         self._trial: list[State] = self._states
         self._trial_gradient = self._gradient
         self._stress = self.first_piola.copy()
+        self._volume = np.zeros(self._points)
         self.recovery: NDArray[np.float64] | float = 0.0
         self.averaging: VolumeAveraging | None = None
         if f_bar != "none":
@@ -205,6 +207,8 @@ class MaterialPoints:
             MPMError: A material cannot bear it; ``particles`` are global indices.
         """
         stress = cauchy_stress.reshape(self._points, 3, 3)
+        if self.mean_stress is not None:
+            self.mean_stress.begin_with(np.trace(stress, axis1=1, axis2=2) / 3.0)
         with agree(self._particles.mesh.comm):
             states = [self._stressed(g, np.arange(len(g.points)), stress) for g in self._groups]
         self._settle(states)
@@ -295,6 +299,7 @@ class MaterialPoints:
             self.update()
         self._trial, self._gradient = self._states, self._trial_gradient
         self._stress = self.first_piola.copy()
+        self._keep_volume()
         self._recover()
 
     def _recover(self) -> None:
@@ -317,6 +322,25 @@ class MaterialPoints:
     def hoop(self) -> NDArray[np.float64] | None:
         """Hoop strains of a body of revolution's nodes, shape ``(n, nq, k)``, or ``None``."""
         return self.strain.hoop
+
+    @property
+    def volume_strain(self) -> VolumeStrain:
+        """What a pressure of its own is the multiplier of, in the last update."""
+        assert self.mean_stress is not None
+        return self.mean_stress.strain
+
+    @property
+    def converged_pressure(self) -> NDArray[np.float64]:
+        """Mean of the laws' own stress at the last converged step, shape ``(n nq,)``."""
+        result = np.zeros(self._points)
+        for group, state in zip(self._groups, self._states, strict=True):
+            result[group.points] = state["stress"][:, :3].sum(axis=1) / 3.0
+        return result
+
+    @property
+    def by_pressure(self) -> NDArray[np.float64]:
+        """Derivative of the stress by a pressure of its own, ``(n nq, dim, dim)``."""
+        return self.volume_strain.slope
 
     def _group(self, assignment: Assignment, cell_tags: mesh.MeshTags | None) -> list[_Group]:
         if isinstance(assignment, Material):
@@ -450,7 +474,10 @@ class MaterialPoints:
 
     @property
     def is_hyperelastic(self) -> NDArray[np.bool_]:
-        """Which points have a stress that derives from the energy of F alone, ``(n nq,)``."""
+        """Which points have a stress that derives from the energy of F alone, ``(n nq,)``.
+
+        With a pressure of its own that is the stress without it.
+        """
         if self.averaging is not None:
             return np.zeros(self._points, dtype=bool)
         elastic = self._where(lambda law: not getattr(law, "inelastic", True))
@@ -655,11 +682,11 @@ class MaterialPoints:
         Returns:
             A function that makes the history of before that again.
         """
-        before = self._states, self._gradient, self._stress, self.recovery
+        before = self._states, self._gradient, self._stress, self.recovery, self._volume
         tried = self._trial, self._trial_gradient, self.first_piola
 
         def undo() -> None:
-            self._states, self._gradient, self._stress, self.recovery = before
+            self._states, self._gradient, self._stress, self.recovery, self._volume = before
             self._trial, self._trial_gradient, self.first_piola = tried
 
         self._states = [
@@ -669,13 +696,20 @@ class MaterialPoints:
         self._trial, self._gradient = self._states, self._trial_gradient
         alone = len(self._groups) == 1 and _is_own(self._groups[0].material)
         self._stress = self.first_piola if alone else self.first_piola.copy()
+        self._keep_volume()
         self._recover()
         return undo
+
+    def _keep_volume(self) -> None:
+        if self.mean_stress is not None:
+            self._volume = self.mean_stress.strain.volume
 
     def roll_back(self) -> None:
         """Forget the last update."""
         self._trial, self._trial_gradient = self._states, self._gradient
         self.first_piola = self._stress.copy()
+        if self.mean_stress is not None:
+            self.mean_stress.return_to(self._volume, self._gradient)
 
     def converged_state(self) -> dict[str, Column]:
         """Return the history of the last converged step.
@@ -684,7 +718,10 @@ class MaterialPoints:
             Columns ``(n, nq, ...)`` by name (``recovery``: ``(n, 3, 3)``); a variable of the
             materials has the numbers of those that have it in its name.
         """
-        whole = {"gradient": self._gradient, "first_piola": self._stress}
+        whole: dict[str, NDArray[Any]] = {"gradient": self._gradient}
+        whole["first_piola"] = self._stress
+        if self.mean_stress is not None:
+            whole["volume_strain"] = self._volume
         owners: dict[tuple[str, tuple[int, ...], np.dtype[Any]], list[int]] = {}
         for number, state in enumerate(self._states):
             for name, values in state.items():
@@ -711,6 +748,7 @@ class MaterialPoints:
         }
         self.recovery = arrays.get("recovery", 0.0)
         self._gradient, self._stress = flat.pop("gradient"), flat.pop("first_piola")
+        self._volume = flat.pop("volume_strain", self._volume)
         self._states = [{} for _ in self._groups]
         for key, values in flat.items():
             name, numbers = key.rsplit("@", 1)

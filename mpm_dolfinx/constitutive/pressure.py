@@ -16,17 +16,30 @@ with K, which may be as large as one likes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dolfinx import fem
-
 from ..errors import MPMError
 from ..materials.base import Material, StrainMaterial
+from ..particles.field import ParticleField
 
-__all__ = ["MeanStress", "require_split", "without_bulk"]
+__all__ = ["MeanStress", "VolumeStrain", "require_split", "without_bulk"]
+
+
+class VolumeStrain(NamedTuple):
+    """What a pressure is the multiplier of: ``volume - compliance p = 0``.
+
+    Attributes:
+        volume: Elastic volumetric strain theta, shape ``(n,)``.
+        slope: Its derivative by F, shape ``(n, dim, dim)``.
+        compliance: 1/K, shape ``(n,)``.
+    """
+
+    volume: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    compliance: NDArray[np.float64]
 
 
 def require_split(material: Any) -> None:
@@ -63,23 +76,45 @@ class MeanStress:
     """The pressure at a body's points, which replaces the mean stress of its laws.
 
     Args:
-        pressure: A Function at the points.
+        pressure: A field at the points.
         shape: Number of points, and the dimension of the deformation gradient.
 
     Attributes:
-        volume: Elastic volumetric strain theta of the last update, shape ``(n,)``.
-        slope: Its derivative by F, shape ``(n, dim, dim)``.
-        compliance: 1/K, shape ``(n,)``.
+        strain: Volume strain of the last update, and the compliance.
     """
 
-    def __init__(self, pressure: fem.Function, shape: tuple[int, int]) -> None:
+    def __init__(self, pressure: ParticleField, shape: tuple[int, int]) -> None:
         self._pressure = pressure
         count, dim = shape
-        self.volume = np.zeros(count)
-        self.slope: NDArray[np.float64] = np.zeros((count, dim, dim))
-        self.compliance = np.zeros(count)
+        self.strain = VolumeStrain(np.zeros(count), np.zeros((count, dim, dim)), np.zeros(count))
         self._soft = np.zeros(count)
         self._small = np.zeros(count, dtype=bool)
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """The pressure at the points, shape ``(n,)``."""
+        return np.asarray(self._pressure.x.array[: len(self._soft)])
+
+    def begin_with(self, values: NDArray[np.float64]) -> None:
+        """Let a body that has not moved have a pressure, shape ``(n,)`` (collective)."""
+        whole = np.zeros(len(self._pressure.x.array))
+        whole[: len(values)] = values
+        self._pressure.set(whole)
+
+    def return_to(self, volume: NDArray[np.float64], gradient: NDArray[np.float64]) -> None:
+        """Return to what was seen before.
+
+        Args:
+            volume: Volume strain, shape ``(n,)``.
+            gradient: ``F - I``, shape ``(n, dim, dim)``.
+        """
+        self.strain = self.strain._replace(volume=volume, slope=self._slope(gradient))
+
+    def _slope(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+        eye = np.eye(gradient.shape[-1])
+        slope = np.linalg.inv(gradient + eye).swapaxes(1, 2)
+        slope[self._small] = eye
+        return slope
 
     def follow(self, points: NDArray[np.int64], material: Material, bulk: Any, soft: Any) -> None:
         """Take over a law's moduli at some points.
@@ -90,7 +125,7 @@ class MeanStress:
             bulk: Its bulk modulus, a number or ``(n,)``.
             soft: That of the law in use.
         """
-        self.compliance[points], self._soft[points] = 1.0 / np.asarray(bulk), soft
+        self.strain.compliance[points], self._soft[points] = 1.0 / np.asarray(bulk), soft
         self._small[points] = getattr(material, "kinematics", "") == "small"
 
     def replace(
@@ -111,16 +146,12 @@ class MeanStress:
         Returns:
             First Piola stress and derivative at constant pressure, and the laws' own stresses.
         """
-        count = len(self.volume)
-        mean = np.zeros(count)
+        mean = np.zeros(len(self._soft))
         for points, stress in stresses:
             mean[points] = stress[:, :3].sum(axis=1) / 3.0
-        change = self._pressure.x.array[:count] - mean
-        self.volume = mean / self._soft
-        eye = np.eye(gradient.shape[-1])
-        slope = np.linalg.inv(gradient + eye).swapaxes(1, 2)
-        slope[self._small] = eye
-        self.slope = slope
+        change = self.values - mean
+        slope = self._slope(gradient)
+        self.strain = self.strain._replace(volume=mean / self._soft, slope=slope)
         stress = first_piola + change[:, None, None] * slope
         turning = np.where(self._small, 0.0, change)
         whole = tangent - np.einsum("n,niL,nkJ->niJkL", turning, slope, slope, optimize=True)

@@ -20,6 +20,7 @@ merits as far as they go there. Damping in proportion to the stiffness C of the 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 from .._core import loops
 from ..errors import ConvergenceError
 from .points import MaterialPoints
+from .pressure import VolumeStrain
 
 __all__ = ["StepStress"]
 
@@ -34,6 +36,24 @@ __all__ = ["StepStress"]
 SMALL = 1e-6
 
 type Array = NDArray[np.float64]
+
+
+class _Ends(NamedTuple):
+    """Derivatives of a potential by F at a step's ends.
+
+    Attributes:
+        stress: At its end, shape ``(n, dim, dim)``.
+        before: At its beginning.
+        tangent: Derivative of that at its end.
+        potentials: At its end and at its beginning, or ``None``.
+        kind: 0: of small strains; 2: the work is to be the change of the potential; else 1.
+    """
+
+    stress: Array
+    before: Array
+    tangent: Array
+    potentials: tuple[Array, Array] | None
+    kind: NDArray[np.uint8]
 
 
 class StepStress:
@@ -47,6 +67,7 @@ class StepStress:
         points: The material with its history.
         conserving: Whether the stress is that of the whole step; otherwise it is that of its end.
         viscosity: beta, of damping in proportion to stiffness; a time.
+        share: As :meth:`pace` gives it.
 
     Attributes:
         first_piola: Shape ``(n nq, dim, dim)``.
@@ -54,17 +75,20 @@ class StepStress:
         symmetric: Whether that is symmetric.
     """
 
-    def __init__(self, points: MaterialPoints, conserving: bool, viscosity: float) -> None:
+    def __init__(
+        self, points: MaterialPoints, conserving: bool, viscosity: float, share: float
+    ) -> None:
         self._points = points
         self._conserving, self._viscosity = conserving, viscosity
-        self._dt, self._share = 1.0, 1.0
+        self._dt, self._share = 1.0, share
         self._muted = False
-        self._work = (0.0, 0.0)
+        self._work = (0.0, 0.0, 0.0)
+        self._splits = points.mean_stress is not None and share < 1.0
         self._undeformed: Array | None = None
         self._small = points.has_small_strain
         self._exact = points.is_hyperelastic & ~self._small
         self._kind = np.where(self._small, 0, np.where(self._exact, 2, 1)).astype(np.uint8)
-        plain = not conserving and viscosity == 0.0
+        plain = not conserving and viscosity == 0.0 and not self._splits
         self.symmetric: bool = points.symmetric and (plain or bool(self._small.all()))
         self.settle()
         self._tried: Array = self._H
@@ -83,11 +107,27 @@ class StepStress:
         return self._points.hoop
 
     @property
+    def volume_strain(self) -> VolumeStrain:
+        """What a pressure of its own is the multiplier of: that at the step's end.
+
+        It counts ``1 / share`` times, as its pressure does: the tangent of small strains is
+        symmetric then.
+        """
+        found = self._points.volume_strain
+        return VolumeStrain(*(part / self._share for part in found))
+
+    @property
+    def by_pressure(self) -> Array:
+        """Derivative of the stress by a pressure of its own, shape ``(n nq, dim, dim)``."""
+        return self._of_pressure if self._splits else self._points.by_pressure
+
+    @property
     def first_piola(self) -> Array:
         """First Piola stress."""
         if self._muted:
-            points = self._points.first_piola
-            return np.zeros_like(points) if self._conserving else points
+            if self._conserving:
+                return np.zeros_like(self._stress)
+            return self._own if self._splits else self._points.first_piola
         return self._stress
 
     # -- The course of a step -------------------------------------------------------------
@@ -105,7 +145,14 @@ class StepStress:
         points = self._points
         self._H = self._gradient()
         self._P = points.first_piola.copy()
-        self._energy = points.strain_energy()
+        self._energy = self._elastic = points.strain_energy()
+        if self._splits:
+            found, p = points.volume_strain, points.converged_pressure
+            self._volume, self._slope = found.volume, found.slope
+            self._of_pressure = found.slope / self._share
+            self._elastic = self._energy - 0.5 * found.compliance * p**2
+            self._P -= p[:, None, None] * found.slope
+            self._own = self._P
         if self._viscosity > 0.0:
             self._undeformed = points.undeformed_tangent()
 
@@ -123,32 +170,110 @@ class StepStress:
         points = self._points
         points.update()
         self._stress, self.tangent = points.first_piola, points.tangent
-        if not self._conserving and self._viscosity == 0.0:
+        if not self._conserving and not self._splits and self._viscosity == 0.0:
             return
         self._tried = self._gradient()
+        if self._splits:
+            self._take_pressure_out()
         if self._conserving:
-            compiled = points.compiled and loops is not None
-            self._stress, self.tangent = self._compiled_mean() if compiled else self._mean()
+            self._stress, self.tangent = self._whole_step()
+        elif self._splits:
+            stress, tangent = self._of_volume()
+            self._stress, self.tangent = self._own + stress, self.tangent + tangent
         if self._viscosity > 0.0:
             viscous, tangent = self._resisting()
             self._viscous = viscous
             self._stress = self._stress + viscous / self._share
             self.tangent = self.tangent + tangent / self._share
 
-    def _compiled_mean(self) -> tuple[Array, Array]:
+    def _take_pressure_out(self) -> None:
+        """Leave in stress and tangent what is not of the pressure."""
+        p, slope = self._present_pressure()
+        self._stress = self._own = self._stress - p[:, None, None] * slope
+        self.tangent = self.tangent - p[:, None, None, None, None] * self._turning(slope)
+
+    def _present_pressure(self) -> tuple[Array, Array]:
+        """Return the pressure, and the slope of the volume strain, in the last update."""
+        pressure = self._points.mean_stress
+        assert pressure is not None
+        return pressure.values, pressure.strain.slope
+
+    def _turning(self, slope: Array) -> Array:
+        """Return the derivative of the volume strain's slope by F."""
+        factor = np.where(self._small, 0.0, -1.0)
+        return np.asarray(np.einsum("n,niL,nkJ->niJkL", factor, slope, slope, optimize=True))
+
+    def _whole_step(self) -> tuple[Array, Array]:
+        """Return P* and its derivative by F at the step's end, over the share."""
+        energies = None
+        if self._exact.any():
+            energy = self._points.strain_energy(trial=True)
+            if self._splits:
+                p, found = self._present_pressure()[0], self._points.volume_strain
+                energy = energy - 0.5 * found.compliance * p**2
+            energies = energy, self._elastic
+        ends = _Ends(self._stress, self._P, self.tangent, energies, self._kind)
+        stress, tangent = self._mean(ends)
+        if self._splits:
+            more, its = self._of_volume()
+            stress, tangent = stress + more, tangent + its
+        return stress, tangent
+
+    def _of_volume(self) -> tuple[Array, Array]:
+        """Return the stress of the pressure of the whole step, and its derivative, as above."""
+        p, slope = self._present_pressure()
+        turning, before = self._turning(slope), self._slope
+        if self._conserving:
+            volumes = self._points.volume_strain.volume, self._volume
+            kind = np.where(self._small, 0, 2).astype(np.uint8)
+            mean, tangent = self._mean(_Ends(slope, before, turning, volumes, kind))
+        else:
+            mean, tangent = 0.5 * (slope + before) / self._share, 0.5 * turning / self._share
+        self._of_pressure = mean
+        return p[:, None, None] * mean, p[:, None, None, None, None] * tangent
+
+    def _mean(self, ends: _Ends) -> tuple[Array, Array]:
+        """Return what acts over a step, and its derivative by F at the end, over the share."""
+        if self._points.compiled and loops is not None:
+            return self._compiled_mean(ends)
+        small, factor = ends.kind == 0, 1.0 / self._share
+        P, P_n, A = ends.stress, ends.before, ends.tangent
+        if small.all():
+            return factor * 0.5 * (P_n + P), factor * 0.5 * A
+        unit = np.eye(self._points.dim)
+        F, F_n = unit + self._tried, unit + self._H
+        try:
+            inverse = np.linalg.inv(F)
+            S, S_n = inverse @ P, np.linalg.solve(F_n, P_n)
+        except np.linalg.LinAlgError:
+            raise ConvergenceError("A deformation gradient is singular") from None
+        dS = _times(inverse, A)
+        dS -= np.einsum("nIk,nLJ->nIJkL", inverse, S)
+        S_mean, dS_mean = 0.5 * (S + S_n), 0.5 * dS
+        if ends.potentials is not None:
+            self._correct(S, S_mean, dS_mean, ends)
+        F_mean = 0.5 * (F + F_n)
+        stress = F_mean @ S_mean
+        tangent = _times(F_mean, dS_mean)
+        for i in range(self._points.dim):
+            tangent[:, i, :, i, :] += 0.5 * S_mean.swapaxes(1, 2)
+        if small.any():
+            stress[small] = 0.5 * (P_n[small] + P[small])
+            tangent[small] = 0.5 * A[small]
+        return factor * stress, factor * tangent
+
+    def _compiled_mean(self, ends: _Ends) -> tuple[Array, Array]:
         """Return what :meth:`_mean` does, by the compiled loops."""
-        points = self._points
-        stress, tangent = np.empty_like(self._P), np.empty(points.tangent.shape)
+        stress, tangent = np.empty(ends.stress.shape), np.empty(ends.tangent.shape)
         none = np.zeros(0)
-        energies = (points.strain_energy(trial=True), self._energy) if self._exact.any() else None
         singular = loops.step_stress(
             np.ascontiguousarray(self._tried),
             np.ascontiguousarray(self._H),
-            np.ascontiguousarray(points.first_piola),
-            self._P,
-            np.ascontiguousarray(points.tangent),
-            *(energies or (none, none)),
-            self._kind,
+            np.ascontiguousarray(ends.stress),
+            np.ascontiguousarray(ends.before),
+            np.ascontiguousarray(ends.tangent),
+            *(ends.potentials or (none, none)),
+            ends.kind,
             SMALL,
             1.0 / self._share,
             stress,
@@ -158,42 +283,15 @@ class StepStress:
             raise ConvergenceError("A deformation gradient is singular")
         return stress, tangent
 
-    def _mean(self) -> tuple[Array, Array]:
-        """Return P* and its derivative by F at the step's end, over the share."""
-        points, small = self._points, self._small
-        if small.all():
-            both = 0.5 * (self._P + points.first_piola), 0.5 * points.tangent
-            return both[0] / self._share, both[1] / self._share
-        unit = np.eye(points.dim)
-        F, F_n = unit + self._tried, unit + self._H
-        try:
-            inverse = np.linalg.inv(F)
-            S, S_n = inverse @ points.first_piola, np.linalg.solve(F_n, self._P)
-        except np.linalg.LinAlgError:
-            raise ConvergenceError("A deformation gradient is singular") from None
-        dS = _times(inverse, points.tangent)
-        dS -= np.einsum("nIk,nLJ->nIJkL", inverse, S)
-        S_mean, dS_mean = 0.5 * (S + S_n), 0.5 * dS
-        if self._exact.any():
-            self._correct(S, S_mean, dS_mean)
-        F_mean = 0.5 * (F + F_n)
-        stress = F_mean @ S_mean
-        tangent = _times(F_mean, dS_mean)
-        for i in range(points.dim):
-            tangent[:, i, :, i, :] += 0.5 * S_mean.swapaxes(1, 2)
-        if small.any():
-            stress[small] = 0.5 * (self._P[small] + points.first_piola[small])
-            tangent[small] = 0.5 * points.tangent[small]
-        return stress / self._share, tangent / self._share
-
-    def _correct(self, S: Array, S_mean: Array, dS_mean: Array) -> None:
+    def _correct(self, S: Array, S_mean: Array, dS_mean: Array, ends: _Ends) -> None:
         """Add Gonzalez' correction to S* and its derivative, in place."""
-        where = self._exact
+        assert ends.potentials is not None
+        where = ends.kind == 2
         S, mean = S[where], S_mean[where]
         change, slope = _strain(self._tried[where], self._H[where])
         size = np.einsum("nIJ,nIJ->n", change, change) + SMALL**2
-        energy = self._points.strain_energy(trial=True)[where] - self._energy[where]
-        c = (energy - np.einsum("nIJ,nIJ->n", mean, change)) / size
+        work = ends.potentials[0][where] - ends.potentials[1][where]
+        c = (work - np.einsum("nIJ,nIJ->n", mean, change)) / size
         dc = np.einsum("nIJ,nIJkL->nkL", S - mean - 2.0 * c[:, None, None] * change, slope)
         dc -= np.einsum("nIJ,nIJkL->nkL", change, dS_mean[where])
         dc /= size[:, None, None]
@@ -244,16 +342,23 @@ class StepStress:
         before = self._H, self._P, self._energy, self._work
         H = self._gradient() - self._H
         viscous = 0.0 if self._viscous is None else self._viscous
+        whole: Array | float = 0.0
         if self._conserving:
-            stress = self._share * self._stress - viscous
+            stress = whole = self._share * self._stress - viscous
+        elif self._splits:
+            p, _ = self._present_pressure()
+            whole = self._share * p[:, None, None] * self._of_pressure
+            stress = 0.5 * (self._P + self._own) + whole
         elif self._share < 1.0:
             stress = 0.5 * (self._P + points.first_piola)
         else:
             stress = points.first_piola
         weights = points.weights.ravel()
-        power = np.einsum("niJ,niJ->n", stress, H)
-        damped = np.einsum("niJ,niJ->n", np.broadcast_to(viscous, H.shape), H)
-        self._work = float(weights @ power), float(weights @ damped)
+        done, in_step, damped = (
+            float(weights @ np.einsum("niJ,niJ->n", np.broadcast_to(one, H.shape), H))
+            for one in (stress, whole, viscous)
+        )
+        self._work = done, in_step, damped
         taken = points.commit()
         self.settle()
 
@@ -270,6 +375,8 @@ class StepStress:
         self._stress, self.tangent = self._points.first_piola, self._points.tangent
         if self._conserving:
             self._stress = self._stress / self._share
+        elif self._splits:
+            self._stress = self._own + (self._stress - self._own) / self._share
 
     # -- Energies -------------------------------------------------------------------------
 
@@ -279,7 +386,7 @@ class StepStress:
         Returns:
             That against stress, and that against damping.
         """
-        return self._work[0] if self._conserving else 0.0, self._work[1]
+        return self._work[1], self._work[2]
 
     @property
     def stress_work(self) -> float:

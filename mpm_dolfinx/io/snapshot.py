@@ -208,6 +208,7 @@ def merged(
     before: Snapshot,
     now: Snapshot,
     bodies: tuple[int, int],
+    backgrounds: Sequence[int | None],
     renewed: Callable[[int | None, str], bool],
 ) -> Snapshot:
     """Return a state of before, with what is new or renewed from one of now, on the same meshes.
@@ -216,6 +217,7 @@ def merged(
         before: The state of before.
         now: The state of now, which may have more bodies and backgrounds.
         bodies: Number of the bodies before and now.
+        backgrounds: For each background now its number before, ``None`` where it is new.
         renewed: Returns whether something that was there before is new too, by the number of its
             body (``None``: a number) and its name.
     """
@@ -225,8 +227,10 @@ def merged(
     for number, (earlier, present) in enumerate(zip(before.tables[:old], now.tables, strict=False)):
         columns = {n: v for n, v in earlier.columns.items() if not renewed(number, n)}
         tables.append(Table(present.rows, present.columns | columns))
-    tables += [*now.tables[old:new], *before.tables[old:]]
-    return Snapshot(numbers, tables + now.tables[len(tables) :])
+    tables += now.tables[old:new]
+    for number, known in enumerate(backgrounds):
+        tables.append(now.tables[new + number] if known is None else before.tables[old + known])
+    return Snapshot(numbers, tables)
 
 
 def require_key(key: str, things: Sequence[Kept], bodies: int) -> None:

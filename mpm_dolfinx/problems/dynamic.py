@@ -94,8 +94,6 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         self._energies = []
         self.inertia = Inertia(bodies, start, scheme, out_of_range, alpha, self._energies)
         given = as_terms(terms, bodies)
-        if options.get("mixed") is not None:
-            raise MPMError("mixed= is for mpm.QuasiStaticProblem; use f_bar= in dynamics.")
         super().__init__(
             particles,
             material,
@@ -132,7 +130,8 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         self, history: MaterialPoints, supports: Sequence[Support]
     ) -> tuple[StepStress, Sequence[StepForce]]:
         """See :meth:`QuasiStaticProblem._in_time`."""
-        stress = StepStress(history, self.inertia.scheme == "conserving", self._viscosity)
+        conserving, share = self.inertia.scheme == "conserving", self.inertia.share
+        stress = StepStress(history, conserving, self._viscosity, share)
         self._step_stresses.append(stress)
         return stress, (stress, *supports)
 

@@ -125,6 +125,28 @@ class Change(Protocol):
         """Take back what was changed."""
 
 
+class _Standing(NamedTuple):
+    """Forces before a stage: of what, and where.
+
+    Attributes:
+        moved: What each force acts on.
+        forces: On own dofs of its W.
+        spaces: The backgrounds.
+        gathered: Forces on their own dofs, of bodies whose nodes go with their cells.
+        left: What is held back there.
+        reactions: Reactions there, if any are known.
+        fixed: Dofs with a condition.
+    """
+
+    moved: list[tuple[int, str]]
+    forces: list[NDArray[np.float64]]
+    spaces: list[fem.FunctionSpace]
+    gathered: list[NDArray[np.float64]]
+    left: list[NDArray[np.float64]]
+    reactions: list[NDArray[np.float64]] | None
+    fixed: list[NDArray[np.bool_]]
+
+
 type Law = tuple[str, dict[str, Any]]
 """Name of a material, and its parameters: numbers, or indices and values of points."""
 
@@ -390,7 +412,7 @@ class ParticleProblem:
                 "other fields, such as a pressure."
             )
         statistics = self.history.statistics
-        self._held.follow(self.bodies, spaces_of(self.bodies))
+        self._held.follow([*self.bodies, *carried], [field.V for field in fields])
         reduced = ReducedSystem(
             [*moving, *carried],
             fields,
@@ -540,26 +562,17 @@ class ParticleProblem:
             sudden: Whether nothing is held back.
 
         Raises:
-            MPMError: What is to be changed does not go together, or there are fields.
+            MPMError: What is to be changed does not go together.
         """
         self._require_governing()
-        if self.carried:
-            raise MPMError(
-                "Stages do not go together with fields=, nor with mixed='pressure'; use steps with "
-                "a path (update=...), or f_bar= in place of mixed=."
-            )
         if sudden and self._held.remaining > 0.0:
             raise MPMError(
                 f"{100 * self._held.remaining:.3g} % of what the last stage changes is held back "
                 "yet; finish it with solve() before a sudden one."
             )
         first = self._first_identity if self._stages else identity.identity(self)
-        forces = None if sudden else self.reduced.nodal_forces()
-        apart = [] if forces is None else self._gathered(forces)
-        left = self._held.left()
-        reactions = self._stepper.converged.reactions
-        fixed = [fixed_dofs(field.conditions, field.V) for field in self.reduced.fields]
-        snapshot = self._snapshot()
+        before = None if sudden else self._standing_forces()
+        spaces, snapshot = self._spaces(), self._snapshot()
         seconds, kept = self.history.statistics.seconds, list(self._kept)
         count = len(self.bodies)
         self._release()
@@ -569,7 +582,8 @@ class ParticleProblem:
             self._keep_terms()
             change.settle()
             numbers = (count, len(self.bodies))
-            state = merged(snapshot, self._snapshot(), numbers, change.renews)
+            backgrounds = [_number_of(V, spaces) for V in self._spaces()]
+            state = merged(snapshot, self._snapshot(), numbers, backgrounds, change.renews)
             state.numbers.update({"past": [], "release remaining": 0.0})
             self._adopt(state, (), "The state before")
         except BaseException:
@@ -584,22 +598,44 @@ class ParticleProblem:
         self._first_identity = first
         self._stages.append(f"{change.kind} {name!r}")
         self.history.stages.append(Stage(name, self.history.stage))
-        if forces is None:
-            return
+        if before is not None:
+            self._hold_difference(before)
+
+    def _moved(self) -> list[Particles | CarriedField]:
+        """Return all that has unknowns, in the order of :meth:`ReducedSystem.nodal_forces`."""
+        return [*self.bodies, *self.carried]
+
+    def _standing_forces(self) -> _Standing:
+        """Return the forces of the last converged state (collective)."""
+        reduced = self.reduced
+        forces = reduced.nodal_forces()
+        return _Standing(
+            [_identity(one) for one in self._moved()],
+            forces,
+            self._spaces(),
+            self._gathered(forces),
+            self._held.left(),
+            self._stepper.converged.reactions,
+            [fixed_dofs(field.conditions, field.V) for field in reduced.fields],
+        )
+
+    def _hold_difference(self, before: _Standing) -> None:
+        """Hold back what the forces are other now than before a stage (collective)."""
         after = self.reduced.nodal_forces()
         freed = self._gathered(after)
-        for new, old in zip(freed, apart, strict=False):
-            new -= old
-        for new, old in zip(after, forces, strict=False):
-            new -= old
-        for body, new in zip(self.bodies, after, strict=True):
-            new *= body.shares_nodes
-        for number, (before, rest) in enumerate(zip(fixed, left, strict=True)):
-            field = self.reduced.fields[number]
-            dofs = before & ~fixed_dofs(field.conditions, field.V)
-            freed[number] += rest
-            if reactions is not None:
-                freed[number][dofs] += reactions[number][dofs]
+        for one, new in zip(self._moved(), after, strict=True):
+            if (known := _identity(one)) in before.moved:
+                new -= before.forces[before.moved.index(known)]
+            new *= one.shares_nodes
+        for field, new in zip(self.reduced.fields, freed, strict=True):
+            number = _number_of(field.V, before.spaces)
+            if number is None:
+                continue
+            new -= before.gathered[number]
+            new += before.left[number]
+            if before.reactions is not None:
+                dofs = before.fixed[number] & ~fixed_dofs(field.conditions, field.V)
+                new[dofs] += before.reactions[number][dofs]
         self._held.hold(after, freed)
 
     @property
@@ -613,12 +649,12 @@ class ParticleProblem:
         Where a cell is taken away its own nodes are of no use to hold its force.
 
         Args:
-            forces: On this rank's own dofs of W of each body.
+            forces: On this rank's own dofs of W of each body, and of each of its fields.
         """
         totals = []
         for field in self.reduced.fields:
             total = np.zeros(field.V.dofmap.index_map.size_local * field.V.dofmap.index_map_bs)
-            for body, force in zip(self.bodies, forces, strict=True):
+            for body, force in zip(self._moved(), forces, strict=True):
                 if body.V is field.V and not body.shares_nodes:
                     vector, part = body.T.createVecLeft(), body.T.createVecRight()
                     vector.array_w[:] = force
@@ -1164,6 +1200,18 @@ class ParticleProblem:
         """Return Functions at quadrature points that the forms hold and no history keeps."""
         keeps = type(self).converged_state is not ParticleProblem.converged_state
         return set() if keeps else self._data
+
+
+def _identity(one: Particles | CarriedField) -> tuple[int, str]:
+    """Return what a body, or a field on it, is known by through stages."""
+    if isinstance(one, CarriedField):
+        return id(one.field.particles), one.field.name
+    return id(one), ""
+
+
+def _number_of(V: fem.FunctionSpace, spaces: Sequence[fem.FunctionSpace]) -> int | None:
+    """Return the number of a background among others, if it is one of them."""
+    return next((number for number, known in enumerate(spaces) if known is V), None)
 
 
 def _as_list(background: Any) -> list[Any]:

@@ -186,8 +186,6 @@ class QuasiStaticProblem(ParticleProblem):
             strict=True,
         )
         stresses = _for_each(initial_stress, count)
-        if mixed is not None and any(stress is not None for stress in stresses):
-            raise MPMError("initial_stress= does not go with mixed='pressure'; use f_bar=.")
         setup = Setup(
             tuple(BodySetup(*values) for values in given),
             axisymmetric,
@@ -199,11 +197,7 @@ class QuasiStaticProblem(ParticleProblem):
             setup.require_divisible()
         self.setup = setup
         self._parameters = self._functions()
-        self._spaces_of_pressure = [
-            fem.functionspace(body.V.mesh, ("Lagrange", body.V.ufl_element().degree - 1))
-            for body in bodies
-            if mixed is not None
-        ]
+        self._spaces_of_pressure: list[tuple[Particles, fem.FunctionSpace]] = []
         self.pressure: list[ParticleField] = []
         self._left: dict[int, tuple[fem.Function, NDArray[np.float64]]] = {}
         self._remeshing = Remeshing(self)
@@ -479,12 +473,22 @@ class QuasiStaticProblem(ParticleProblem):
     def _contributions(self) -> list[Contribution]:
         """See :meth:`ParticleProblem._contributions`."""
         self._stresses: list[MaterialPoints] = []
+        self._acting: list[MaterialPoints | StepStress] = []
         self._density: list[tuple[VirtualWork, Density]] = []
-        self.pressure = [
-            given.particles.field(V, at="points", name="pressure")
-            for given, V in zip(self.setup.bodies, self._spaces_of_pressure, strict=False)
-        ]
+        bodies = [given.particles for given in self.setup.bodies]
+        self.pressure = [self._pressure_of(body) for body in bodies if self.setup.mixed]
         return [self._contribution(given) for given in self.setup.bodies]
+
+    def _pressure_of(self, body: Particles) -> ParticleField:
+        """Return the pressure of a body, a new one where its mesh is (collective)."""
+        for known in self.pressure:
+            if known.particles is body and known.W.mesh is body.mesh:
+                return known
+        V = next((V for its, V in self._spaces_of_pressure if its is body), None)
+        if V is None:
+            V = fem.functionspace(body.V.mesh, ("Lagrange", body.V.ufl_element().degree - 1))
+            self._spaces_of_pressure.append((body, V))
+        return body.field(V, at="points", name="pressure")
 
     def _contribution(self, given: BodySetup) -> Contribution:
         """Return what one body adds to the system (collective)."""
@@ -507,6 +511,7 @@ class QuasiStaticProblem(ParticleProblem):
         if body.mass_share is not None:
             mass = mass * body.mass_share
         acting, of_step = self._in_time(history, given.supports)
+        self._acting.append(acting)
         symmetric = acting.symmetric and not given.pressures
         loads: list[ufl.Form] = []
         if given.body_force is not None:
@@ -557,8 +562,8 @@ class QuasiStaticProblem(ParticleProblem):
         if self.setup.mixed is None:
             return []
         return [
-            PressureTerm(body, CarriedField(field), history)
-            for body, field, history in zip(self.bodies, self.pressure, self._stresses, strict=True)
+            PressureTerm(body, CarriedField(field), acting)
+            for body, field, acting in zip(self.bodies, self.pressure, self._acting, strict=True)
         ]
 
     def begin_step(self) -> None:

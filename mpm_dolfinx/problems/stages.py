@@ -196,7 +196,7 @@ class Addition(_Change):
 
     def renews(self, body: int | None, name: str) -> bool:
         """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
-        return body is None and name in ("moduli", "cuts")
+        return body is None and name in ("moduli", "cuts", "fields units")
 
 
 def chosen_cells(particles: Particles, which: Any, tags: Any, cell_tags: Any) -> NDArray[np.int64]:

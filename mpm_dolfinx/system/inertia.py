@@ -350,12 +350,7 @@ class Inertia(Term):
         From zero the solver's proximal term takes energy, if any; from elsewhere it may give some.
         Where nothing is projected, and nothing lost, steps therefore start from zero.
         """
-        Ts = [transfer(body) for body in self.bodies]
-        if not all(T is known for T, known in zip(Ts, self._transferred, strict=False)) or not (
-            self._transferred
-        ):
-            self._transferred = Ts
-            self._reduce(Ts)
+        Ts = self._follow(transfer)
         if self.scheme == "euler" or self.out_of_range != "project":
             return None
         driven = self._driven()
@@ -389,6 +384,16 @@ class Inertia(Term):
         if not comm.allreduce(any(bool(np.any(rate)) for rate in rates), MPI.LOR):
             return None
         return [self._followed.driven(body, rates) for body in self.bodies]
+
+    def _follow(self, transfer: Transfer) -> list[PETSc.Mat]:
+        """Return T of all bodies, by which the mass is reduced, anew where they are others."""
+        Ts = [transfer(body) for body in self.bodies]
+        if not all(T is known for T, known in zip(Ts, self._transferred, strict=False)) or not (
+            self._transferred
+        ):
+            self._transferred = Ts
+            self._reduce(Ts)
+        return Ts
 
     def _reduce(self, Ts: Sequence[PETSc.Mat]) -> None:
         """Reduce the mass by T, and prepare to solve with it."""
@@ -510,6 +515,7 @@ class Inertia(Term):
 
     def reduced_tangents(self, transfer: Transfer) -> Sequence[PETSc.Mat]:
         """See :meth:`Term.reduced_tangents`."""
+        self._follow(transfer)
         self._A.copy(self._scaled, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         self._scaled.scale(self._factors[0])
         return [self._scaled]
@@ -635,8 +641,10 @@ class Inertia(Term):
 
     def rates(self, number: int) -> dict[str, Column]:
         """Return the rates of Dirichlet values on a background in the last step."""
-        V = spaces_of(self.bodies)[number]
-        function = fem.Function(V)
+        spaces = spaces_of(self.bodies)
+        if number >= len(spaces):  # that of a pressure, which has no rates
+            return {}
+        function = fem.Function(spaces[number])
         if self._rates_dt > 0.0 and number < len(self._rates):
             function.x.array[: len(self._rates[number])] = self._rates[number]
             function.x.scatter_forward()
@@ -659,7 +667,7 @@ class Inertia(Term):
         self._totals = np.array(taken.numbers["totals"], dtype=np.float64)
         self._kinetic, self._stress_work, self._strain = taken.numbers["stress"]
         self._rates_dt, self._rates = taken.numbers["rates"], []
-        for V, columns in zip(spaces_of(self.bodies), taken.backgrounds, strict=True):
+        for V, columns in zip(spaces_of(self.bodies), taken.backgrounds, strict=False):
             function = fem.Function(V)
             fill(function, columns["rates"])
             owned = V.dofmap.index_map.size_local * V.dofmap.index_map_bs

@@ -12,19 +12,12 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
+from ..constitutive.pressure import VolumeStrain
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from .values import FieldTerm
 
-__all__ = ["PressureTerm", "VolumeStrain"]
-
-
-class VolumeStrain(Protocol):
-    """The volume strain at a body's points, as its material saw it last."""
-
-    volume: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    compliance: NDArray[np.float64]
+__all__ = ["PressureTerm"]
 
 
 class PressurePoints(Protocol):
@@ -39,8 +32,12 @@ class PressurePoints(Protocol):
         """Hoop strains of a body of revolution's nodes, shape ``(n, nq, k)``, or ``None``."""
 
     @property
-    def mean_stress(self) -> VolumeStrain | None:
-        """Volume strain, its derivative and the compliance."""
+    def volume_strain(self) -> VolumeStrain:
+        """Volume strain, its derivative and the compliance, as they were seen last."""
+
+    @property
+    def by_pressure(self) -> NDArray[np.float64]:
+        """Derivative of the acting first Piola stress by the pressure, ``(n nq, dim, dim)``."""
 
     @property
     def symmetric(self) -> bool:
@@ -77,9 +74,7 @@ class PressureTerm(FieldTerm):
         none, force = particles.T.createVecLeft(), pressure.T.createVecLeft()
         none.set(0.0)
         self._none, self._force = none, force
-        assert material.mean_stress is not None
-        self._strain: VolumeStrain = material.mean_stress
-        self._mats: tuple[PETSc.Mat, PETSc.Mat, PETSc.Mat] | None = None
+        self._mats: tuple[PETSc.Mat, PETSc.Mat, PETSc.Mat, PETSc.Mat] | None = None
 
     @property
     def symmetric(self) -> bool:
@@ -88,7 +83,7 @@ class PressureTerm(FieldTerm):
 
     def residuals(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.residuals`."""
-        found = self._strain
+        found = self._material.volume_strain
         p = self._pressure.displacement.x.array[: len(found.volume)]
         weights = self._material.weights.ravel()
         gap = np.where(weights > 0.0, found.volume - found.compliance * p, 0.0)
@@ -101,14 +96,13 @@ class PressureTerm(FieldTerm):
         size.abs()
         return [self._none, size]
 
-    def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        """See :meth:`Term.tangents`."""
+    def _rows(self, slope: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return volumes times strains of the nodes by a slope, row by row of the points."""
         weights = self._material.weights
-        found = self._strain
         n, nq = weights.shape
         gradients = self._particles.quadrature.gradients
         gdim = gradients.shape[-1]
-        slope = found.slope.reshape(n, nq, *found.slope.shape[1:])
+        slope = slope.reshape(n, nq, *slope.shape[1:])
         strains = np.einsum("nqkJ,nqiJ->nqki", gradients, slope[:, :, :gdim, :gdim])
         hoop = self._material.hoop
         if hoop is not None:
@@ -116,24 +110,37 @@ class PressureTerm(FieldTerm):
         strains *= np.where(weights > 0.0, weights, 0.0)[:, :, None, None]
         if self._particles.deletion is not None:
             strains[weights == 0.0] = 0.0
-        rows = np.take_along_axis(strains, self._order[:, None, :, None], axis=2).ravel()
+        return np.take_along_axis(strains, self._order[:, None, :, None], axis=2).ravel()
+
+    def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
+        """See :meth:`Term.tangents`."""
+        found = self._material.volume_strain
         diagonal = self._force.duplicate()
-        diagonal.array_w[:] = -weights.ravel() * found.compliance
+        diagonal.array_w[:] = -self._material.weights.ravel() * found.compliance
         if self._mats is None:
-            points, nodes = self._force.getSizes(), self._none.getSizes()
-            comm = self._particles.mesh.comm
-            csr = self._offsets, self._columns, rows
-            by_nodes = PETSc.Mat().createAIJ((points, nodes), csr=csr, comm=comm)
-            first = by_nodes.getOwnershipRange()[0]
-            own = np.arange(first, first + points[0], dtype=PETSc.IntType)
-            ones = np.arange(points[0] + 1, dtype=PETSc.IntType), own, np.zeros(points[0])
-            alone = PETSc.Mat().createAIJ((points, points), csr=ones, comm=comm)
-            self._mats = by_nodes, by_nodes.transpose(PETSc.Mat()), alone
-        else:
-            by_nodes, by_points, _ = self._mats
-            by_nodes.setValuesCSR(self._offsets, self._columns, rows)
-            by_nodes.assemble()
-            by_nodes.transpose(by_points)
-        by_nodes, by_points, alone = self._mats
+            self._mats = self._matrices()
+        of_strain, of_stress, by_points, alone = self._mats
+        of_strain.setValuesCSR(self._offsets, self._columns, self._rows(found.slope))
+        of_strain.assemble()
+        if of_stress is not of_strain:
+            values = self._rows(self._material.by_pressure)
+            of_stress.setValuesCSR(self._offsets, self._columns, values)
+            of_stress.assemble()
+        of_stress.transpose(by_points)
         alone.setDiagonal(diagonal)
-        return {(0, 1): by_points, (1, 0): by_nodes, (1, 1): alone}
+        return {(0, 1): by_points, (1, 0): of_strain, (1, 1): alone}
+
+    def _matrices(self) -> tuple[PETSc.Mat, PETSc.Mat, PETSc.Mat, PETSc.Mat]:
+        """Return matrices of strain and of stress, points by nodes, and the other two blocks."""
+        points, nodes = self._force.getSizes(), self._none.getSizes()
+        comm = self._particles.mesh.comm
+        csr = self._offsets, self._columns, np.zeros(len(self._columns))
+        of_strain = of_stress = PETSc.Mat().createAIJ((points, nodes), csr=csr, comm=comm)
+        if not self._material.symmetric:
+            of_stress = of_strain.duplicate()
+            of_stress.assemble()
+        first = of_strain.getOwnershipRange()[0]
+        own = np.arange(first, first + points[0], dtype=PETSc.IntType)
+        ones = np.arange(points[0] + 1, dtype=PETSc.IntType), own, np.zeros(points[0])
+        alone = PETSc.Mat().createAIJ((points, points), csr=ones, comm=comm)
+        return of_strain, of_stress, of_stress.transpose(PETSc.Mat()), alone

@@ -687,8 +687,12 @@ class ReducedSystem:
         return motion.of(field.driven(values[self.fields.index(field)])).copy()
 
     def works(self) -> NDArray[np.float64]:
-        """Return :meth:`Field.works` of all fields."""
-        found = [field.works(partial(self._stiffness, field)) for field in self.fields]
+        """Return :meth:`Field.works` of all displacements."""
+        found = [
+            field.works(partial(self._stiffness, field))
+            for field in self.fields
+            if not isinstance(field, ValueField)
+        ]
         return np.asarray(np.sum(found, axis=0))
 
     def resultant(self) -> float:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal, cast
 
 from petsc4py import PETSc
 
@@ -16,6 +16,7 @@ from dolfinx import fem
 
 from ..io.snapshot import Kept, Taken, fill, of_cells
 from ..meshes.remesh import Column
+from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from .term import Term
 
@@ -53,14 +54,18 @@ class Release(Term):
         """Whether it may let its bodies go: see :attr:`Term.one_sided`."""
         return False
 
-    def follow(self, bodies: Sequence[Particles], spaces: Sequence[fem.FunctionSpace]) -> None:
+    def follow(
+        self,
+        bodies: Sequence[Particles | CarriedField],
+        spaces: Sequence[fem.FunctionSpace],
+    ) -> None:
         """Take bodies on their present meshes, without any force on them (collective).
 
         Args:
-            bodies: The bodies.
+            bodies: The bodies, then their other fields.
             spaces: Their backgrounds.
         """
-        self.bodies, self._spaces = tuple(bodies), list(spaces)
+        self.bodies, self._spaces = cast("tuple[Particles, ...]", tuple(bodies)), list(spaces)
         self._let_go()
 
     def left(self) -> list[Array]:
@@ -80,7 +85,7 @@ class Release(Term):
         """Hold forces back, in place of those that were held before (collective).
 
         Args:
-            nodal: q on this rank's own dofs of W of each body.
+            nodal: q on this rank's own dofs of W of each body, and of each of its fields.
             reactions: q on this rank's own dofs of each background.
         """
         self._nodal = [_function(b.W, f) for b, f in zip(self.bodies, nodal, strict=True)]
@@ -147,8 +152,21 @@ class Release(Term):
         return [_Held(self)]
 
     def columns(self, body: int) -> dict[str, Column]:
-        """Return what is held back at the nodes of a body."""
-        return {"force": Column(of_cells(self._nodal[body]), "nodes")} if self._nodal else {}
+        """Return what is held back at the nodes of a body, and for its fields."""
+        if not self._nodal:
+            return {}
+        return {
+            name: Column(of_cells(self._nodal[number]), place)
+            for number, name, place in self._of_body(body)
+        }
+
+    def _of_body(self, body: int) -> list[tuple[int, str, Literal["points", "nodes"]]]:
+        """Return the numbers of a body and of its fields, what they are called, and where."""
+        found: list[tuple[int, str, Literal["points", "nodes"]]] = [(body, "force", "nodes")]
+        for number, one in enumerate(self.bodies):
+            if isinstance(one, CarriedField) and one.field.particles is self.bodies[body]:
+                found.append((number, f"force {one.field.name}", one.place))
+        return found
 
     def on_cells(self, number: int) -> dict[str, Column]:
         """Return what is held back on a background."""
@@ -162,9 +180,10 @@ class Release(Term):
         remaining = float(taken.numbers.get("remaining", 0.0))
         if remaining == 0.0:
             return
-        for body, columns in zip(self.bodies, taken.columns, strict=False):
-            self._nodal.append(fem.Function(body.W))
-            fill(self._nodal[-1], columns["force"])
+        self._nodal = [fem.Function(one.W) for one in self.bodies]
+        for body, columns in enumerate(taken.columns[:-1]):
+            for number, name, _ in self._of_body(body):
+                fill(self._nodal[number], columns[name])
         for V, columns in zip(self._spaces, taken.backgrounds, strict=True):
             self._reactions.append(fem.Function(V))
             fill(self._reactions[-1], columns["reaction"])

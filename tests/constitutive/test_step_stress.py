@@ -46,7 +46,7 @@ def stepped(cell, law, conserving=True, viscosity=0.0, axisymmetric=False, compi
         values = np.where(2 * cells < len(cells), 1, 2).astype(np.int32)
         tags = mesh.meshtags(body.mesh, body.mesh.topology.dim, cells, values)
     points = MaterialPoints(strain_of(body, axisymmetric), law, tags, compiled=compiled)
-    stress = StepStress(points, conserving, viscosity)
+    stress = StepStress(points, conserving, viscosity, 0.5)
     stress.pace(0.25, 0.5)
     dim = body.mesh.geometry.dim
     x = body.W.tabulate_dof_coordinates()[:, :dim]

@@ -510,7 +510,6 @@ def test_a_feature_in_motion(feature, mpi_tmp_path, monkeypatch):
 #: What does not go together with a stage that takes cells away, and why.
 NO_STAGES = {
     "rebase": "are concave or deleted, so the body cannot be rebased",
-    "mixed pressure": "Stages do not go together with fields=, nor with mixed='pressure'",
 }
 
 

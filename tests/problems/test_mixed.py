@@ -9,6 +9,7 @@ import pytest
 import scenes
 from compare import EXACT, error_of_blocks, outcome, raises, same_run
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
+from stock import held, mixed_space, newton, same_values
 
 import ufl
 from dolfinx import fem
@@ -198,16 +199,200 @@ def test_a_failed_step_leaves_the_pressure_as_it_was():
 def test_what_does_not_go_together_is_refused():
     raises(lambda: beam(mixed="volume"), mpm.MPMError, "Unknown mixed='volume'")
     raises(lambda: beam(degree=1), mpm.MPMError, "needs a background and particles of degree 2")
-    stress = np.zeros((3, 3))
-    raises(lambda: beam(initial_stress=stress), mpm.MPMError, "does not go with mixed=")
-    raises(lambda: beam().stage("cut"), mpm.MPMError, "Stages do not go together with fields=")
     raises(lambda: beam(f_bar="domain"), mpm.MPMError, "takes the place of f_bar")
     soil = DruckerPrager(30.0, 0.3, cohesion=1.0, friction_angle=20.0)
     raises(lambda: beam(soil), mpm.MPMError, "not DruckerPrager; use f_bar='patch'")
     raises(lambda: beam().rebase(), mpm.MPMError, "With f_bar, mixed or")
-    background = scenes.vectors(scenes.unit(3, QUADRILATERAL), 2)
+
+
+# -- Stages ------------------------------------------------------------------------------
+
+
+def ground(V, low, high, law, **options):
+    """Return what carries its weight between rollers, as a problem or as a lift."""
+    shape = scenes.box([0.0, low], [2.0, high], (4, round(2 * (high - low))), QUADRILATERAL)
+    return mpm.Particles(shape, V, degree=2), law, {"density": 2.0, "body_force": (0.0, -10.0)}
+
+
+def test_a_lift_and_another_material():
+    """Two lifts, of which the lower one is replaced: stress stays, and the end is exact."""
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 3.0], (2, 3), QUADRILATERAL), 2)
+    law = Hencky(1e7, 0.49)
+    bcs = [
+        scenes.fix(V, scenes.at(0, 0, 2), component=0),
+        scenes.fix(V, scenes.at(1, 0), component=1),
+    ]
+    body, law, loads = ground(V, 0.0, 1.0, law)
+    problem = mpm.QuasiStaticProblem(body, law, bcs=bcs, mixed="pressure", **loads)
+    problem.solve(2)
+    lift, _, loads = ground(V, 1.0, 2.0, law)
+    problem.add(lift, law, **loads)
+    assert len(problem.pressure) == 2
+    for step in problem.steps(2):
+        weight = 2.0 * 20.0 * (1.0 + step.load)
+        assert problem.reaction(bcs[1])[1] == pytest.approx(weight, rel=1e-8)
+    # sigma_zz = -20 (2 - z), and the pressure is (1 + nu) / (3 (1 - nu)) of it
+    share = 1.49 / 3.0 / 0.51
+    for part in (body, lift):
+        z = part.centroid[:, 1]
+        mean = np.trace(part.stress, axis1=1, axis2=2) / 3.0
+        np.testing.assert_allclose(mean, -20.0 * share * (2.0 - z), atol=1e-3)
+    before, moved = [b.stress for b in (body, lift)], scenes.in_order(body, body.centroid)
+    stiffer = Hencky(2e7, 0.4999)
+    problem.stage("another below", material=[stiffer, law])
+    for part, stress in zip((body, lift), before, strict=True):
+        np.testing.assert_allclose(part.stress, stress, rtol=1e-7, atol=1e-7)
+    problem.solve(1)
+    np.testing.assert_allclose(scenes.in_order(body, body.centroid), moved, atol=1e-9)
+    problem.stage("more weight", body_force=(0.0, -12.0))
+    problem.solve(1)
+    change = scenes.in_order(body, body.centroid)[:, 1] - moved[:, 1]
+    E, nu = 2e7, 0.4999
+    confined = E * (1 - nu) / (1 + nu) / (1 - 2 * nu)
+    z = moved[:, 1]
+    np.testing.assert_allclose(change, -4.0 * (2.0 * z - z**2 / 2.0) / confined, atol=1e-11)
+
+
+def test_an_initial_stress():
+    """A geostatic stress of any K0 is carried without a motion."""
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 3.0], (2, 3), QUADRILATERAL), 2)
+    bcs = [
+        scenes.fix(V, scenes.at(0, 0, 2), component=0),
+        scenes.fix(V, scenes.at(1, 0), component=1),
+    ]
+    for law in (Hencky(1e3, 0.4999), SmallStrainVonMises(1e3, 0.4999, yield_stress=50.0)):
+        body, law, loads = ground(V, 0.0, 2.0, law)
+        stress = mpm.geostatic(2.0, 2.0, 0.8, (0.0, -10.0))
+        problem = mpm.QuasiStaticProblem(
+            body, law, bcs=bcs, mixed="pressure", initial_stress=stress, **loads
+        )
+        problem.solve(1)
+        assert scenes.largest(body.displacement.x.array) < 1e-12
+        mean = np.trace(body.stress, axis1=1, axis2=2) / 3.0
+        np.testing.assert_allclose(mean, -20.0 * 2.6 / 3.0 * (2.0 - body.centroid[:, 1]))
+
+
+def test_a_stage_is_taken_back_where_it_cannot_be():
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 3.0], (2, 3), QUADRILATERAL), 2)
+    body, law, loads = ground(V, 0.0, 1.0, Hencky(1e4, 0.49))
+    bcs = [
+        scenes.fix(V, scenes.at(0, 0, 2), component=0),
+        scenes.fix(V, scenes.at(1, 0), component=1),
+    ]
+    problem = mpm.QuasiStaticProblem(body, law, bcs=bcs, mixed="pressure", **loads)
+    problem.solve(1)
+    pressure = problem.pressure[0].previous.x.array.copy()
+    soil = DruckerPrager(30.0, 0.3, cohesion=1.0, friction_angle=20.0)
+    raises(lambda: problem.stage(material=soil), mpm.MPMError, "not DruckerPrager")
+    flat = scenes.box([0.0, 1.0], [2.0, 2.0], (4, 2), QUADRILATERAL)
+    lift = mpm.Particles(flat, scenes.vectors(V.mesh), degree=1)
+    raises(lambda: problem.add(lift, law), mpm.MPMError, "of degree 2 or 3")
+    assert np.array_equal(problem.pressure[0].previous.x.array, pressure)
+    problem.stage(body_force=(0.0, -11.0))
+    problem.solve(1)
+    assert problem.reaction(bcs[1])[1] == pytest.approx(44.0, rel=1e-8)
+
+
+# -- In motion ---------------------------------------------------------------------------
+
+
+def test_a_small_motion_as_in_stock_finite_elements():
+    """Steps of linear elasticity with Taylor & Hood's pair, particles being the cells."""
+    law, density, dt, size = LinearElastic(10.0, 0.4999), 2.0, 0.1, 1e-9
+    background = scenes.box([0.0, -0.5], [1.5, 1.5], (3, 4), QUADRILATERAL)
     body = mpm.Particles(
-        scenes.box([0.1] * 2, [0.6] * 2, (3, 3), QUADRILATERAL), background, degree=2
+        scenes.unit(2, QUADRILATERAL), scenes.vectors(background, 2), degree=2, quadrature_degree=4
     )
-    make = lambda: mpm.DynamicProblem(body, STIFF, 1.0, mixed="pressure")  # noqa: E731
-    raises(make, mpm.MPMError, "mixed= is for mpm.QuasiStaticProblem")
+
+    def start(x):
+        return size * np.array([0.0 * x[0], x[0] * (0.3 + x[1])])
+
+    problem = mpm.DynamicProblem(
+        body,
+        law,
+        density,
+        velocity=start,
+        bcs=[scenes.fix(body.V, scenes.at(0, 0.0))],
+        body_force=(0.0, -size),
+        mixed="pressure",
+        stabilisation=None,
+        petsc_options={"snes_rtol": 1e-12},
+    )
+    for _ in range(3):
+        problem.step(dt)
+
+    domain = scenes.unit(2, QUADRILATERAL)
+    W = mixed_space(domain, 2, 1)
+    z, (v, q) = fem.Function(W), ufl.TestFunctions(W)
+    w, p = ufl.split(z)
+    d_n, v_n = fem.Function(W.sub(0).collapse()[0]), fem.Function(W.sub(0).collapse()[0])
+    v_n.interpolate(start)
+    strain = ufl.sym(ufl.grad(d_n + w / 2.0))
+    deviator = strain - ufl.tr(strain) / 3.0 * ufl.Identity(2)
+    F = density * ufl.inner(2.0 / dt * (w / dt - v_n), v) + density * size * v[1]
+    F += 2.0 * law.shear * ufl.inner(deviator, ufl.grad(v)) + p * ufl.div(v)
+    F += q * (ufl.div(d_n + w) - p / law.bulk)
+    for _ in range(3):
+        z.x.array[:] = 0.0
+        newton(F * ufl.dx, z, [held(W, 0, scenes.at(0, 0.0))])
+        increment = z.sub(0).collapse().x.array
+        d_n.x.array[:] += increment
+        v_n.x.array[:] = 2.0 * increment / dt - v_n.x.array
+    same_values(body.displacement, d_n, 1e-7)
+    same_values(problem.velocity, v_n, 1e-7)
+
+
+def turning(scheme, law=STIFF, **options):
+    """Return a problem of a block that turns, and shakes, through cells of the background."""
+    background = scenes.box([-2.0] * 2, [2.0] * 2, (8, 8), QUADRILATERAL)
+    shape = scenes.box([-0.8, -0.3], [0.8, 0.3], (6, 3), QUADRILATERAL)
+    body = mpm.Particles(shape, scenes.vectors(background, 2), degree=2)
+    return mpm.DynamicProblem(
+        body,
+        law,
+        1.0,
+        velocity=lambda x: np.array([-2.0 * x[1], 2.0 * x[0] + 0.5 * x[0] ** 2]),
+        scheme=scheme,
+        mixed="pressure",
+        **options,
+    )
+
+
+@pytest.mark.parametrize("scheme", ["midpoint", "conserving"])
+def test_a_body_that_turns(scheme):
+    """The volume stays, so does energy, and angular momentum by the conserving scheme."""
+    problem = turning(scheme)
+    begin = problem.angular_momentum
+    history = problem.solve(0.4, 0.02)
+    assert history.cutbacks == 0 and np.mean(history.iterations) <= 3.0
+    lost = problem.angular_momentum / begin - 1.0
+    assert scenes.largest(lost) < (1e-10 if scheme == "conserving" else 1e-4)
+    total = [e.kinetic + e.strain for e in history.energies]
+    assert abs(total[-1] / total[0] - 1.0) < 3e-3
+    balance = np.ptp([e.balance for e in history.energies])
+    assert balance < 1e-11 * total[0]
+    body = problem.particles
+    volume = scenes.total(body, body.point_volumes().sum())
+    assert abs(volume / 0.96 - 1.0) < 1e-6
+
+
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: type(law).__name__)
+@pytest.mark.parametrize("scheme", ["midpoint", "conserving", "euler"])
+def test_the_tangent_in_motion(scheme, law):
+    problem = turning(scheme, law, rayleigh=(0.5, 1e-3))
+    problem.solve(0.06, 0.03)
+    assert error_of_blocks(problem, step=1e-6, size=1e-4) <= 1e-6
+
+
+def test_a_motion_from_a_file_and_on_other_ranks(mpi_tmp_path):
+    ends = []
+    for how in ("straight", "restored", "moved"):
+        problem = turning("midpoint", YIELDING)
+        if how == "restored":
+            problem.restore(mpi_tmp_path / "motion")
+        for _ in problem.steps(0.1, 0.025, repartition=0.0 if how == "moved" else None):
+            if how == "straight" and problem.history.time == 0.05:
+                problem.save(mpi_tmp_path / "motion")
+        ends.append(outcome(problem))
+    same_run(ends[1], ends[0], EXACT)
+    same_run(ends[2], ends[0], 1e-9)

@@ -75,6 +75,8 @@ def heave(problem, depth=3.0):
         {"cell": TETRAHEDRON, "dim": 3},
         {"outside": "delete"},
         {"assembly": "reference"},
+        {"degree": 2, "space": 2, "mixed": "pressure"},
+        {"degree": 2, "space": 2, "mixed": "pressure", "assembly": "reference"},
     ],
     ids=lambda options: ",".join(f"{v}" for v in options.values()) or "plain",
 )
