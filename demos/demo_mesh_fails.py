@@ -59,7 +59,7 @@ def energy(d, dx, load):
 
 
 def held(space):
-    """None across the left side, none across the base, in either space."""
+    """A roller on the left, a base that holds, in either space."""
     domain = space.mesh
     side = mesh.locate_entities_boundary(domain, 1, lambda x: np.isclose(x[0], 0))
     base = mesh.locate_entities_boundary(domain, 1, lambda x: np.isclose(x[1], 0))

@@ -101,7 +101,12 @@ def tables() -> dict[str, Table]:
         "locking/mixed": Table(
             "locking",
             ["cells; the beam is lower by", "larger error", "linear solves", "cutbacks"],
-            {f"{h:g} m; {o:g} cells": partial(mixed, h, o) for h, o in MIXED},
+            {
+                f"{h:g} m; {scientific(o, 0) if 0.0 < o < 1e-3 else format(o, 'g')} cells": partial(
+                    mixed, h, o
+                )
+                for h, o in MIXED
+            },
             quick=["0.5 m; 0 cells"],
             cases=["cantilever"],
         ),

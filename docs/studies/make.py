@@ -215,6 +215,10 @@ def main() -> None:
         parser.error(f"no such table: {', '.join(unknown)}; there are {', '.join(TABLES)}")
     if args.check or args.still:
         raise SystemExit(1 if check(args.still, args.names) else 0)
+    places = {found.source for found in all_found()}
+    homeless = [name for name in TABLES if name not in places]
+    if homeless:
+        raise SystemExit(f"No page has a comment <!-- table {homeless[0]}: --> above a table.")
     changed = []
     for name, (table, _) in TABLES.items():
         named = any(name.startswith(n) for n in args.names)
