@@ -20,6 +20,7 @@ from .shapes import (
     signed_distance,
     sphere,
 )
+from .triangulation import polyline, read_surface, terrain, triangulated
 
 __all__ = [
     "Coulomb",
@@ -32,6 +33,10 @@ __all__ = [
     "disc",
     "plane",
     "polygon",
+    "polyline",
+    "read_surface",
     "signed_distance",
     "sphere",
+    "terrain",
+    "triangulated",
 ]

@@ -22,7 +22,7 @@ from ..system.term import PointMaterial, Term
 from .law import Coulomb
 from .surface import Surface
 
-__all__ = ["Contact", "Outcome", "as_positive", "stiffness"]
+__all__ = ["Contact", "Outcome", "stiffness"]
 
 
 @dataclass(frozen=True)
@@ -247,18 +247,6 @@ def cross(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
     if a.shape[-1] == 3:
         return np.cross(a, b)
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
-
-
-def as_positive(value: Any, name: str) -> float:
-    """Return a positive number.
-
-    Raises:
-        MPMError: It is something else.
-    """
-    known = isinstance(value, float | int | np.number) and not isinstance(value, bool)
-    if not known or not 0.0 < value < np.inf:
-        raise MPMError(f"{name} must be a positive number, not {value!r}.")
-    return float(value)
 
 
 def stiffness(

@@ -29,9 +29,10 @@ from ..meshes.remesh import Column
 from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..system.term import PointMaterial
-from .contact import Contact, Outcome, as_positive, stiffness
+from .contact import Contact, Outcome, stiffness
 from .facets import Closest, NearFacets
 from .law import Coulomb, Points, Traction, as_friction, traction
+from .shapes import as_positive
 from .surface import Blocks, PointMatrix, Surface, global_dofs, normals
 from .whole_step import corrected, deformation, mean_pressure
 

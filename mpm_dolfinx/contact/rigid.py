@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from petsc4py import PETSc
@@ -21,9 +21,9 @@ from ..meshes.remesh import Column
 from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..system.term import PointMaterial
-from .contact import Contact, Outcome, as_positive, stiffness
+from .contact import Contact, Outcome, stiffness
 from .law import Coulomb, Points, as_friction, derivative, shear_derivative, traction
-from .shapes import Shape
+from .shapes import Shape, as_positive
 from .surface import Blocks, PointMatrix, Surface, global_dofs
 from .whole_step import corrected, mean_pressure, pressure_slope
 
@@ -237,6 +237,31 @@ class Rigid(Contact):
         """Angle of the obstacle now, shape ``(1,)``, or its vector of rotation, ``(3,)``."""
         return self._pose.angle.copy()
 
+    @property
+    def bounds(self) -> NDArray[np.float64] | None:
+        """Corners of a box around the obstacle now, ``(2, gdim)``; ``None`` where it has none."""
+        box = self.shape.bounds
+        if box is None:
+            return None
+        corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, box.shape[1])
+        pivot = self.shape.pivot
+        placed = (corners - pivot) @ self._pose.Q.T + pivot + self._pose.offset
+        return np.array([placed.min(axis=0), placed.max(axis=0)])
+
+    def distance(self, x: Any) -> NDArray[np.float64]:
+        """Return the distance of points to the obstacle now, negative inside, shape ``(n,)``.
+
+        Args:
+            x: Points, shape ``(n, gdim)``.
+
+        Raises:
+            MPMError: No points of this dimension.
+        """
+        points = np.asarray(x, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != self.shape.dim:
+            raise MPMError(f"Points have the shape (n, {self.shape.dim}), not {points.shape}.")
+        return np.asarray(self.shape.distance(self._framed(points, self._pose))[0])
+
     def _framed(self, x: NDArray[Any], pose: _Pose) -> NDArray[Any]:
         """Return positions in the frame of the shape."""
         return (x - self.shape.pivot - pose.offset) @ pose.Q + self.shape.pivot
@@ -364,12 +389,7 @@ class Rigid(Contact):
         x = self._surface.positions()
         m, nq, gdim = x.shape
         y = self._framed(x, pose).reshape(-1, gdim)
-        try:
-            phi, n = self.shape.distance(y)
-        except MPMError:
-            raise
-        except Exception as error:
-            raise as_ours(error, "The shape of a Rigid") from error
+        phi, n = self._distance(y, memory)
         points = self._points(memory)
         pushes, step, Q = n, None, pose.Q
         if self._of_step:
@@ -411,6 +431,24 @@ class Rigid(Contact):
             works,
         )
 
+    def _distance(
+        self, y: NDArray[np.float64], memory: _Memory
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return gaps and normals of points; of a costly shape what they are at least if far."""
+        phi, n = np.zeros(len(y)), memory.normal.reshape(y.shape).copy()
+        near = np.ones(len(y), dtype=bool)
+        if self.shape.costly:
+            before = self._framed(memory.outcome.positions, memory.pose).reshape(y.shape)
+            phi = memory.gap.ravel() - np.linalg.norm(y - before, axis=1)
+            near = ~(phi > self._surface.touch)
+        try:
+            phi[near], n[near] = self.shape.distance(y[near])
+        except MPMError:
+            raise
+        except Exception as error:
+            raise as_ours(error, "The shape of a Rigid") from error
+        return phi, n
+
     def _step(
         self,
         points: Points,
@@ -423,8 +461,10 @@ class Rigid(Contact):
         x = memory.outcome.positions
         change = y - self._framed(x, memory.pose).reshape(y.shape)
         middle = y - 0.5 * change
-        _, n = self.shape.distance(middle)
         surface = self._surface
+        n = memory.normal.reshape(y.shape).copy()
+        acts = (before <= surface.touch) | (gap <= surface.touch)
+        n[acts] = self.shape.distance(middle[acts])[1]
         gradient, factor = corrected(n, change, change, gap - before, surface.extent)
         pressure = mean_pressure(points.stiffness, before, gap, surface.touch)
         return _Step(change, middle, n, gradient, factor, before, pressure)
@@ -525,6 +565,8 @@ class Rigid(Contact):
         before, trial = self._memory, self._trial
         assert before is not None and trial is not None
         failure: MPMError | None = None
+        if self.shape.costly:
+            trial = self._in_full(trial)
         turned = (before.normal * trial.normal).sum(axis=2) < -0.5
         flipped = before.touched & trial.touched & turned
         if flipped.any() or self._passes(before, trial.outcome.positions, trial.pose):
@@ -539,6 +581,14 @@ class Rigid(Contact):
             self._memory = before
 
         return undo
+
+    def _in_full(self, trial: _Memory) -> _Memory:
+        """Return what there is with the gaps of all points."""
+        x = trial.outcome.positions
+        phi, n = self.shape.distance(self._framed(x, trial.pose).reshape(-1, x.shape[2]))
+        gap = phi.reshape(trial.gap.shape)
+        outcome = replace(trial.outcome, gap=gap)
+        return replace(trial, gap=gap, normal=n.reshape(x.shape), outcome=outcome)
 
     def roll_back(self) -> None:
         """See :meth:`Term.roll_back`."""

@@ -14,6 +14,10 @@ from ..errors import MPMError, as_ours
 
 __all__ = [
     "Shape",
+    "as_direction",
+    "as_point",
+    "as_positive",
+    "as_radius",
     "box",
     "cavity",
     "cylinder",
@@ -42,11 +46,21 @@ class Shape:
     Attributes:
         dim: As given.
         pivot: As given.
+        costly: Whether looking for the distance takes long, so that it is not done in each
+            iteration for points that cannot have come near; it must not change faster than its
+            points move then.
     """
+
+    costly = False
 
     def __init__(self, dim: int, pivot: Any) -> None:
         self.dim = dim
         self.pivot: NDArray[np.float64] = np.asarray(pivot, dtype=np.float64)
+
+    @property
+    def bounds(self) -> NDArray[np.float64] | None:
+        """Corners of a box around it along the axes, ``(2, dim)``; ``None`` where it has none."""
+        return None
 
     def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the signed distance of points and its gradient, ``(n,)`` and ``(n, dim)``.
@@ -89,6 +103,12 @@ class _Round(Shape):
         if axis is not None:
             self._across -= np.outer(axis, axis)
 
+    @property
+    def bounds(self) -> NDArray[np.float64] | None:
+        if np.linalg.matrix_rank(self._across) < self.dim:
+            return None
+        return np.array([self.pivot - self._radius, self.pivot + self._radius])
+
     def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         arm = (y - self.pivot) @ self._across
         length = np.sqrt((arm * arm).sum(axis=1) + TINY)
@@ -109,6 +129,11 @@ class _Box(Shape):
         super().__init__(len(lower), (lower + upper) / 2)
         self._half = (upper - lower) / 2 - radius
         self._radius = radius
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        half = self._half + self._radius
+        return np.array([self.pivot - half, self.pivot + half])
 
     def _beyond(
         self, y: NDArray[Any]
@@ -150,6 +175,11 @@ class _Polygon(Shape):
         self._squares = (self._edges**2).sum(axis=1)
         lengths = np.sqrt(self._squares)[:, None]
         self._normals = np.column_stack([self._edges[:, 1], -self._edges[:, 0]]) / lengths
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        low, high = self._corners.min(axis=0), self._corners.max(axis=0)
+        return np.array([low - self._radius, high + self._radius])
 
     def _nearest(
         self, y: NDArray[Any]
@@ -196,6 +226,7 @@ class _Cavity(Shape):
     def __init__(self, shape: Shape) -> None:
         super().__init__(shape.dim, shape.pivot)
         self._shape = shape
+        self.costly = shape.costly
 
     def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         phi, n = self._shape.distance(y)
@@ -266,8 +297,8 @@ def plane(point: Any, normal: Any) -> Shape:
     Raises:
         MPMError: No point and direction.
     """
-    at = _vector(point, "point")
-    return _Plane(at, _direction(normal, "normal", len(at)))
+    at = as_point(point, "point")
+    return _Plane(at, as_direction(normal, "normal", len(at)))
 
 
 def disc(centre: Any, radius: float) -> Shape:
@@ -280,12 +311,12 @@ def disc(centre: Any, radius: float) -> Shape:
     Raises:
         MPMError: No centre in the plane, or no radius.
     """
-    return _Round(_vector(centre, "centre", 2), _positive(radius, "radius"))
+    return _Round(as_point(centre, "centre", 2), as_positive(radius, "radius"))
 
 
 def sphere(centre: Any, radius: float) -> Shape:
     """Return a ball in space; see :func:`disc`, with a centre of shape ``(3,)``."""
-    return _Round(_vector(centre, "centre", 3), _positive(radius, "radius"))
+    return _Round(as_point(centre, "centre", 3), as_positive(radius, "radius"))
 
 
 def cylinder(point: Any, axis: Any, radius: float) -> Shape:
@@ -299,8 +330,8 @@ def cylinder(point: Any, axis: Any, radius: float) -> Shape:
     Raises:
         MPMError: No axis in space, or no radius.
     """
-    at = _vector(point, "point", 3)
-    return _Round(at, _positive(radius, "radius"), _direction(axis, "axis", 3))
+    at = as_point(point, "point", 3)
+    return _Round(at, as_positive(radius, "radius"), as_direction(axis, "axis", 3))
 
 
 def box(lower: Any, upper: Any, radius: float = 0.0) -> Shape:
@@ -315,11 +346,11 @@ def box(lower: Any, upper: Any, radius: float = 0.0) -> Shape:
     Raises:
         MPMError: No box, or a radius above half its smallest side.
     """
-    low = _vector(lower, "lower")
-    high = _vector(upper, "upper", len(low))
+    low = as_point(lower, "lower")
+    high = as_point(upper, "upper", len(low))
     if not np.all(high > low):
         raise MPMError(f"A box needs lower below upper, not {lower!r} and {upper!r}.")
-    r = _radius(radius)
+    r = as_radius(radius)
     if 2.0 * r >= (high - low).min():
         raise MPMError(f"The radius {r:g} of a box must be below half of its smallest side.")
     return _Box(low, high, r)
@@ -350,7 +381,7 @@ def polygon(corners: Any, radius: float = 0.0) -> Shape:
         raise MPMError("The corners of a polygon must enclose an area and differ from each other.")
     if area < 0.0:
         return polygon(given[::-1], radius)
-    r = _radius(radius)
+    r = as_radius(radius)
     if r == 0.0:
         return _Polygon(given, 0.0)
     inward = np.column_stack([-edges[:, 1], edges[:, 0]]) / lengths[:, None]
@@ -395,11 +426,16 @@ def signed_distance(function: Callable[..., Any], pivot: Any) -> Shape:
     """
     if not callable(function):
         raise MPMError(f"signed_distance needs a function of points, not {function!r}.")
-    at = _vector(pivot, "pivot")
+    at = as_point(pivot, "pivot")
     return _Given(function, len(at), at)
 
 
-def _vector(value: Any, name: str, dim: int | None = None) -> NDArray[np.float64]:
+def as_point(value: Any, name: str, dim: int | None = None) -> NDArray[np.float64]:
+    """Return coordinates of a point or a vector.
+
+    Raises:
+        MPMError: They are none.
+    """
     try:
         vector = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -412,8 +448,13 @@ def _vector(value: Any, name: str, dim: int | None = None) -> NDArray[np.float64
     return vector
 
 
-def _direction(value: Any, name: str, dim: int) -> NDArray[np.float64]:
-    vector = _vector(value, name, dim)
+def as_direction(value: Any, name: str, dim: int) -> NDArray[np.float64]:
+    """Return the unit vector of a direction.
+
+    Raises:
+        MPMError: It is none.
+    """
+    vector = as_point(value, name, dim)
     length = float(np.linalg.norm(vector))
     if length == 0.0:
         raise MPMError(f"{name} must not be zero.")
@@ -424,13 +465,23 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, float | int | np.number) and not isinstance(value, bool)
 
 
-def _positive(value: Any, name: str) -> float:
+def as_positive(value: Any, name: str) -> float:
+    """Return a positive number.
+
+    Raises:
+        MPMError: It is something else.
+    """
     if not _is_number(value) or not 0.0 < value < np.inf:
         raise MPMError(f"{name} must be a positive number, not {value!r}.")
     return float(value)
 
 
-def _radius(value: Any) -> float:
+def as_radius(value: Any) -> float:
+    """Return a radius, which may be 0.
+
+    Raises:
+        MPMError: It is none.
+    """
     if not _is_number(value) or not 0.0 <= value < np.inf:
         raise MPMError(f"radius must be a number from 0 on, not {value!r}.")
     return float(value)

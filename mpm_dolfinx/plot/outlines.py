@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from importlib import import_module
+from inspect import signature
 from typing import Any
 
 from mpi4py import MPI
@@ -19,7 +20,7 @@ from .. import _compat
 from ..errors import MPMError, agree
 from ..particles.particles import Particles
 
-__all__ = ["background", "domains", "edges", "grid", "imported", "outlines"]
+__all__ = ["background", "domains", "edges", "grid", "imported", "outlines", "surface_algorithm"]
 
 
 #: Straight pieces that an edge is drawn with where it is curved.
@@ -227,6 +228,12 @@ def imported(module: str, comm: MPI.Comm) -> Any:
                 f"Pictures need {name}; install it with pip install 'mpm-dolfinx[plot]'."
             ) from None
     return found
+
+
+def surface_algorithm(pyvista: Any) -> dict[str, Any]:
+    """Return how surfaces are found: pyvista warns of its new default unless it is named."""
+    known = signature(pyvista.UnstructuredGrid.extract_surface).parameters
+    return {"algorithm": "dataset_surface"} if "algorithm" in known else {}
 
 
 def _added(artist: Any, ax: Any) -> Any:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..errors import MPMError, agree
 from ..particles.particles import Particles
 from .fields import LABELS, Field, bodies_of, values_of
-from .outlines import edges, grid, imported, outlines
+from .outlines import edges, grid, imported, outlines, surface_algorithm
 
 __all__ = ["Look", "Shot", "draw", "scene", "take"]
 
@@ -324,7 +324,7 @@ def _rendered(shot: Shot, look: Look, limits: tuple[float, float]) -> NDArray[np
             linear = int(body.celltypes.max(initial=0)) < LAGRANGE
             surface = body.clean(tolerance=1e-9) if linear else body
             surface = surface.extract_surface(
-                nonlinear_subdivision=0 if linear else 3, **_algorithm(pyvista)
+                nonlinear_subdivision=0 if linear else 3, **surface_algorithm(pyvista)
             )
             plotter.add_mesh(
                 surface,
@@ -371,14 +371,6 @@ def _rendered(shot: Shot, look: Look, limits: tuple[float, float]) -> NDArray[np
 
 #: The first of VTK's cell types of any degree.
 LAGRANGE = 68
-
-
-def _algorithm(pyvista: Any) -> dict[str, Any]:
-    """Return how surfaces are found: pyvista warns of its new default unless it is named."""
-    import inspect
-
-    known = inspect.signature(pyvista.UnstructuredGrid.extract_surface).parameters
-    return {"algorithm": "dataset_surface"} if "algorithm" in known else {}
 
 
 @contextmanager

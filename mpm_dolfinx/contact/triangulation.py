@@ -1,0 +1,511 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Rigid shapes by segments in the plane and by triangles in space: polylines, terrain, files.
+
+The distance is that of the nearest place, which lies within a facet, on an edge or at a corner.
+Its sign is that of the normal of a facet, of the sum of both at an edge, and of the sum of all at a
+corner, weighted by their angles (J. A. Baerentzen and H. Aanaes, "Signed distance computation using
+the angle weighted pseudonormal", IEEE Trans. Vis. Comput. Graph. 11, 2005).
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import MPMError, agree, as_ours
+from ..plot.outlines import surface_algorithm
+from .nearest import FacetTree
+from .shapes import Shape, as_direction, as_point, as_positive, as_radius
+
+__all__ = ["polyline", "read_surface", "terrain", "triangulated"]
+
+#: Distance, relative to the extent, below which two corners are one.
+SAME = 1e-9
+#: Difference of unit normals below which facets are one plane.
+FLAT = 1e-9
+#: Distance, relative to the extent, below which a place is on an edge or a corner.
+ON = 1e-13
+#: Least product of the normals of a facet before and after its corners were moved inwards.
+KEPT = 0.5
+
+
+class _Place(NamedTuple):
+    """What the distance of points to a surface is made of.
+
+    Attributes:
+        arm: From the nearest corner or edge to the point; from some place of the plane, where that
+            of a facet is nearest, shape ``(n, dim)``.
+        size: Length of the arm, 1 where it is that of a plane, shape ``(n,)``.
+        sign: -1 for a point inside, shape ``(n,)``.
+        normal: That of the plane, shape ``(n, dim)``.
+        along: Direction of the nearest edge, 0 where a corner is nearest, shape ``(n, dim)``.
+        off: Whether an edge or a corner is nearest, and the point not on it, shape ``(n,)``.
+    """
+
+    arm: NDArray[Any]
+    size: NDArray[Any]
+    sign: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    along: NDArray[np.float64]
+    off: NDArray[np.bool_]
+
+
+class _Faceted(Shape):
+    """What lies behind segments or triangles, which are oriented outwards, with rounded edges.
+
+    Args:
+        points: Corners, shape ``(n, dim)``.
+        facets: Corners of each facet, shape ``(m, dim)``.
+        radius: Of its edges: how far the facets given lie within the surface.
+        pivot: The point about which it turns.
+        extent: Corners of a box around the surface, shape ``(2, dim)``.
+    """
+
+    costly = True
+
+    def __init__(
+        self,
+        points: NDArray[np.float64],
+        facets: NDArray[np.int64],
+        radius: float,
+        pivot: NDArray[np.float64],
+        extent: NDArray[np.float64],
+    ) -> None:
+        super().__init__(points.shape[1], pivot)
+        self.points, self.facets = points, facets
+        self._radius, self._extent = radius, extent
+        self._on = ON * float(np.abs(points).max(initial=0.0))
+        corners = points[facets]
+        self._normals = facet_normals(corners)
+        self._tree = FacetTree(corners)
+        self._at_corner, self._flat_corner = _corner_normals(points, facets, self._normals)
+        self._end_corner = np.zeros(len(points), dtype=bool)
+        if self.dim == 2:
+            self._end_corner = np.bincount(facets.ravel(), minlength=len(points)) < 2
+            return
+        keys, self._of_facet, count = edges_of(facets)
+        self._at_edge = np.zeros((len(keys), 3))
+        for k in range(3):
+            np.add.at(self._at_edge, self._of_facet[:, k], self._normals)
+        # both normals of a flat edge are the same, and their sum is twice as long
+        length = np.linalg.norm(self._at_edge, axis=1)
+        self._flat_edge = (count == 2) & (length > 2.0 - FLAT**2)
+        self._end_edge = count < 2
+        self._end_corner[keys[self._end_edge].ravel()] = True
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """See :attr:`Shape.bounds`."""
+        return self._extent.copy()
+
+    def _resolved(self, y: NDArray[Any]) -> _Place:
+        """Return what the distance of points is made of."""
+        facet, corner, edge = self._tree(y.real)
+        vertex = self.facets[facet, np.maximum(corner, 0)]
+        arm = y - self.points[vertex]
+        n, along = self._normals[facet], np.zeros(y.shape)
+        off = (corner >= 0) & ~self._flat_corner[vertex]
+        side, end = self._at_corner[vertex], self._end_corner[vertex] & off
+        if self.dim == 3:
+            on = edge >= 0
+            which = self._of_facet[facet, np.maximum(edge, 0)]
+            begin = self.points[self.facets[facet, np.maximum(edge, 0)]]
+            way = self.points[self.facets[facet, (edge + 1) % 3]] - begin
+            way /= np.maximum(np.linalg.norm(way, axis=1), 1e-300)[:, None]
+            bent = on & ~self._flat_edge[which]
+            off = off | bent
+            along = np.where(bent[:, None], way, 0.0)
+            beside = y - begin
+            beside = beside - along * (beside * along).sum(axis=1)[:, None]
+            arm = np.where(on[:, None], beside, arm)
+            side = np.where(on[:, None], self._at_edge[which], side)
+            end = np.where(on, self._end_edge[which], end)
+        sign = np.where(((side * arm.real).sum(axis=1) < 0.0) & ~end, -1.0, 1.0)
+        # what is on an edge has the normal that decides about the sign
+        close = off & (np.linalg.norm(arm.real, axis=1) <= self._on)
+        length = np.maximum(np.linalg.norm(side, axis=1), 1e-300)[:, None]
+        n = np.where(close[:, None], side / length, n)
+        off = off & ~close
+        size = np.sqrt(np.where(off, (arm * arm).sum(axis=1), 1.0))
+        return _Place(arm, size, sign, n, along, off)
+
+    def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """See :meth:`Shape.distance`."""
+        at = self._resolved(y)
+        phi = np.where(at.off, at.sign * at.size, (at.arm * at.normal).sum(axis=1))
+        n = np.where(at.off[:, None], at.arm * (at.sign / at.size)[:, None], at.normal)
+        return phi - self._radius, n
+
+    def curvature(self, y: NDArray[Any]) -> NDArray[Any]:
+        """See :meth:`Shape.curvature`."""
+        at = self._resolved(y)
+        n, t = at.arm / at.size[:, None], at.along
+        across = np.eye(self.dim) - n[:, :, None] * n[:, None, :] - t[:, :, None] * t[:, None, :]
+        return np.where(at.off[:, None, None], across * (at.sign / at.size)[:, None, None], 0.0)
+
+
+def facet_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return unit normals of segments, to the right of their way, or of triangles, ``(m, dim)``.
+
+    Those without a size have zero.
+    """
+    if corners.shape[-1] == 2:
+        way = corners[:, 1] - corners[:, 0]
+        n = np.column_stack([way[:, 1], -way[:, 0]])
+    else:
+        n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(n, axis=1)[:, None]
+    return np.asarray(n / np.where(size > 0.0, size, 1.0))
+
+
+def edges_of(
+    facets: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return the edges of triangles: their corners, numbers for each triangle, and how many share.
+
+    Args:
+        facets: Shape ``(m, 3)``.
+
+    Returns:
+        Corners, the lower first ``(e, 2)``, numbers of the edge from each corner to the next
+        ``(m, 3)``, and how many triangles have it, ``(e,)``.
+    """
+    pairs = np.stack([facets, np.roll(facets, -1, axis=1)], axis=2).reshape(-1, 2)
+    size = int(facets.max(initial=0)) + 1
+    keys, number, count = np.unique(
+        pairs.min(axis=1) * size + pairs.max(axis=1), return_inverse=True, return_counts=True
+    )
+    return np.column_stack(np.divmod(keys, size)), number.reshape(-1, 3), count
+
+
+def _corner_normals(
+    points: NDArray[np.float64], facets: NDArray[np.int64], normals: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the weighted sum of normals at each corner, and whether all of them are equal."""
+    m, dim = facets.shape
+    corners = points[facets]
+    weights = np.ones((m, dim))
+    if dim == 3:
+        one = np.roll(corners, -1, axis=1) - corners
+        two = np.roll(corners, 1, axis=1) - corners
+        across = np.linalg.norm(np.cross(one, two), axis=2)
+        weights = np.arctan2(across, (one * two).sum(axis=2))
+    total = np.zeros_like(points)
+    for k in range(dim):
+        np.add.at(total, facets[:, k], weights[:, k, None] * normals)
+    unit = total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None]
+    flat = np.ones(len(points), dtype=bool)
+    for k in range(dim):
+        bent = np.linalg.norm(unit[facets[:, k]] - normals, axis=1) > FLAT
+        flat[facets[bent, k]] = False
+    if dim == 2:
+        flat &= np.bincount(facets.ravel(), minlength=len(points)) == 2
+    else:
+        keys, _, count = edges_of(facets)
+        flat[keys[count == 1].ravel()] = False
+    return total, flat
+
+
+def triangulated(
+    points: Any, triangles: Any, *, outside: Any = None, radius: float = 0.0, pivot: Any = None
+) -> Shape:
+    """Return what lies behind triangles in space: a closed surface, or an open one.
+
+    Triangles may be given in either sense of rotation, but all in the same; corners at one place
+    are one. Beyond the border of an open surface there is no obstacle. Parts that go through each
+    other are not looked for, and have wrong distances there.
+
+    Args:
+        points: Corners, shape ``(n, 3)``.
+        triangles: Three corners each, shape ``(m, 3)``.
+        outside: For an open surface, a direction that points to its free side, such as
+            ``(0, 0, 1)`` for a terrain.
+        radius: Of edges and corners, within the outline; see :func:`box`. The nodes are moved
+            inwards by as much, which keeps planes where they are exactly where at most three meet
+            in a node. A point that is pressed in by less than this slides over edges smoothly.
+        pivot: The point about which it turns; the middle of the box around it by default.
+
+    Raises:
+        MPMError: What makes no surface: wrong shapes, edges of more than two triangles, triangles
+            turned against each other, an open surface without ``outside``, or a radius that is
+            too large.
+    """
+    x, facets = _as_arrays(points, triangles, 3, "triangulated")
+    return _surface(x, facets, outside, radius, pivot)
+
+
+def polyline(points: Any, *, outside: Any = None, radius: float = 0.0, pivot: Any = None) -> Shape:
+    """Return what lies behind a line of segments in the plane, such as the profile of a terrain.
+
+    Beyond its ends there is no obstacle. It is closed where the last point is the first.
+
+    Args:
+        points: One after the other, shape ``(n, 2)``.
+        outside: For an open line, a direction that points to its free side, such as ``(0, 1)``.
+        radius: Of its corners, within the outline; see :func:`triangulated`.
+        pivot: The point about which it turns; the middle of the box around it by default.
+
+    Raises:
+        MPMError: What makes no line; see :func:`triangulated`.
+    """
+    count = np.arange(len(points) if hasattr(points, "__len__") else 0)
+    x, facets = _as_arrays(points, np.column_stack([count[:-1], count[1:]]), 2, "polyline")
+    return _surface(x, facets, outside, radius, pivot)
+
+
+def terrain(x: Any, y: Any, heights: Any, *, radius: float = 0.0, pivot: Any = None) -> Shape:
+    """Return what lies below a height that is given on a grid, two triangles to each cell.
+
+    Beyond the border there is no obstacle; let it reach farther than the body goes.
+
+    Args:
+        x: Places along the first axis, growing, shape ``(n,)``.
+        y: Places along the second axis, growing, shape ``(m,)``.
+        heights: Shape ``(n, m)``.
+        radius: Of edges; see :func:`triangulated`.
+        pivot: As there.
+
+    Raises:
+        MPMError: No grid of heights, or a radius that is too large.
+    """
+    try:
+        first, second, z = (np.asarray(v, dtype=np.float64) for v in (x, y, heights))
+    except (TypeError, ValueError):
+        first = second = z = np.zeros(0)
+    good = first.ndim == second.ndim == 1 and min(len(first), len(second)) > 1
+    good = good and z.shape == (len(first), len(second))
+    if (
+        not good
+        or not np.isfinite(z).all()
+        or not all(np.all(np.diff(v) > 0) for v in (first, second))
+    ):
+        raise MPMError(
+            "A terrain needs two arrays of places that grow, (n,) and (m,), and finite heights "
+            f"(n, m), not {np.shape(x)}, {np.shape(y)} and {np.shape(heights)}."
+        )
+    points = np.column_stack(
+        [*(v.ravel() for v in np.meshgrid(first, second, indexing="ij")), z.ravel()]
+    )
+    number = np.arange(z.size).reshape(z.shape)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    cells = [np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))]
+    return _surface(points, np.concatenate(cells), (0.0, 0.0, 1.0), radius, pivot)
+
+
+def read_surface(
+    path: str | Path,
+    *,
+    outside: Any = None,
+    radius: float = 0.0,
+    scale: float = 1.0,
+    pivot: Any = None,
+    comm: MPI.Comm = MPI.COMM_WORLD,
+) -> Shape:
+    """Return what lies behind a triangulated surface of a file (collective).
+
+    Rank 0 reads it by pyvista: STL, PLY, OBJ, VTK, VTP and more; of volumes the boundary is taken,
+    and other polygons are divided.
+
+    Args:
+        path: The file.
+        outside: For an open surface, a direction that points to its free side; see
+            :func:`triangulated`.
+        radius: Of edges and corners, after scaling; see there.
+        scale: Factor on coordinates, such as 1e-3 for millimetres.
+        pivot: The point about which it turns; the middle of the box around it by default.
+        comm: The ranks that call it, those of the body.
+
+    Raises:
+        MPMError: No such file, no triangles in it, pyvista is missing, or see
+            :func:`triangulated`.
+    """
+    factor = as_positive(scale, "scale")
+    found: tuple[NDArray[np.float64], NDArray[np.int64]] | None = None
+    with agree(comm):
+        if comm.rank == 0:
+            found = _read(Path(path))
+    found = comm.bcast(found)
+    assert found is not None
+    return _surface(factor * found[0], found[1], outside, radius, pivot, str(path))
+
+
+def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return points and triangles of a file."""
+    try:
+        pyvista = import_module("pyvista")
+    except ImportError:
+        raise MPMError(
+            "A surface from a file needs pyvista; install it with pip install 'mpm-dolfinx[plot]'."
+        ) from None
+    if not path.is_file():
+        raise MPMError(f"There is no file {path}.")
+    try:
+        data = pyvista.read(path)
+        if isinstance(data, pyvista.MultiBlock):
+            data = data.combine()
+        if not isinstance(data, pyvista.PolyData):
+            data = data.extract_surface(**surface_algorithm(pyvista))
+        surface = data.triangulate()
+        points = np.asarray(surface.points, dtype=np.float64)
+        triangles = np.asarray(surface.regular_faces, dtype=np.int64).reshape(-1, 3)
+    except Exception as error:
+        raise as_ours(error, f"Reading {path}") from error
+    if len(triangles) == 0:
+        raise MPMError(f"There are no triangles in {path}.")
+    if triangles.min() < 0 or triangles.max() >= len(points):
+        raise MPMError(f"Triangles of {path} have points that are not there.")
+    return points, triangles
+
+
+def _as_arrays(
+    points: Any, facets: Any, dim: int, what: str
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    try:
+        x, corners = np.array(points, dtype=np.float64), np.array(facets)
+    except (TypeError, ValueError):
+        x, corners = np.zeros(0), np.zeros(0)
+    if x.ndim != 2 or x.shape[1] != dim or not np.isfinite(x).all():
+        raise MPMError(f"{what} needs finite points of the shape (n, {dim}), not {_told(points)}.")
+    if corners.ndim != 2 or corners.shape[1] != dim or not len(corners):
+        names = "two points or more" if dim == 2 else "triangles of the shape (m, 3)"
+        raise MPMError(f"{what} needs {names}, not {_told(points if dim == 2 else facets)}.")
+    if not np.issubdtype(corners.dtype, np.integer) or corners.min() < 0 or corners.max() >= len(x):
+        raise MPMError(f"triangles must be numbers of points from 0 to {len(x) - 1}.")
+    return x, corners.astype(np.int64)
+
+
+def _told(value: Any) -> str:
+    shape = getattr(value, "shape", None)
+    return f"{value!r:.80}" if shape is None else f"an array of the shape {shape}"
+
+
+def _surface(
+    x: NDArray[np.float64],
+    facets: NDArray[np.int64],
+    outside: Any,
+    radius: float,
+    pivot: Any,
+    name: str | None = None,
+) -> Shape:
+    """Return the shape of facets that are looked at."""
+    what = "The surface" if name is None else f"The surface of {name}"
+    if len(x) and not np.isfinite(x).all():
+        raise MPMError(f"{what} has points that are not finite.")
+    dim = x.shape[1]
+    r = as_radius(radius)
+    x, facets = _merged(x, facets)
+    if len(facets) == 0:
+        raise MPMError(f"{what} has no extent: all of its corners are at one place.")
+    extent = np.array([x.min(axis=0), x.max(axis=0)])
+    facets = _oriented(x, facets, outside, what)
+    centre = extent.mean(axis=0) if pivot is None else as_point(pivot, "pivot", dim)
+    if r > 0.0:
+        x = _inner(x, facets, r, what)
+    return _Faceted(x, facets, r, centre, extent)
+
+
+def _merged(
+    x: NDArray[np.float64], facets: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return corners with one number for each place, and facets that have different ones."""
+    used = np.unique(facets)
+    step = SAME * max(float(np.ptp(x[used], axis=0).max()), 1e-300)
+    number = np.full(len(x), -1)
+    keys = np.round((x[used] - x[used].min(axis=0)) / step).astype(np.int64)
+    order = np.lexsort(keys.T)
+    first = np.ones(len(used), dtype=bool)
+    first[1:] = (np.abs(np.diff(keys[order], axis=0)) > 1).any(axis=1)
+    group = np.cumsum(first) - 1
+    number[used[order]] = group
+    merged = x[used[order[first]]]
+    facets = number[facets]
+    good = (facets != np.roll(facets, -1, axis=1)).all(axis=1)
+    return merged, facets[good]
+
+
+def _oriented(
+    x: NDArray[np.float64], facets: NDArray[np.int64], outside: Any, what: str
+) -> NDArray[np.int64]:
+    """Return facets whose normals point outwards."""
+    dim = facets.shape[1]
+    if dim == 2:
+        ends = np.bincount(facets.ravel(), minlength=len(x))
+        most, borders = int(ends.max()), int(np.count_nonzero(ends == 1))
+        turned = 0
+    else:
+        keys, number, count = edges_of(facets)
+        most, borders = int(count.max()), int(np.count_nonzero(count == 1))
+        ahead = np.where(facets == keys[number][:, :, 0], 1, -1)
+        sense = np.bincount(number.ravel(), weights=ahead.ravel())
+        turned = int(np.count_nonzero((count == 2) & (sense != 0.0)))
+    if most > 2:
+        raise MPMError(
+            f"{what} is none: {'a point' if dim == 2 else 'an edge'} of it belongs to {most} "
+            f"{'segments' if dim == 2 else 'triangles'}; a surface has two on each."
+        )
+    if turned:
+        raise MPMError(
+            f"{what} has triangles that are turned against each other at {turned} edges; make "
+            "their normals consistent, e.g. by pyvista's compute_normals(consistent_normals=True)."
+        )
+    corners = x[facets]
+    if borders:
+        if outside is None:
+            raise MPMError(
+                f"{what} is open: {borders} {'ends' if dim == 2 else 'edges'} belong to one "
+                f"{'segment' if dim == 2 else 'triangle'} only; say on which side it is free by "
+                "outside=, or close it."
+            )
+        way = as_direction(outside, "outside", dim)
+        whole = _area_vectors(corners) @ way
+        if abs(whole.sum()) <= SAME * np.abs(whole).sum():
+            raise MPMError(f"outside={outside!r} does not tell the sides of the surface apart.")
+        return facets if whole.sum() > 0.0 else facets[:, ::-1].copy()
+    if outside is not None:
+        raise MPMError(
+            f"{what} is closed, and has its outside; leave outside= away (contact.cavity turns it "
+            "inside out)."
+        )
+    middle = x.mean(axis=0)
+    volume = (_area_vectors(corners) * (corners[:, 0] - middle)).sum()
+    if abs(volume) <= SAME * np.ptp(x, axis=0).max() ** dim:
+        raise MPMError(f"{what} encloses nothing.")
+    return facets if volume > 0.0 else facets[:, ::-1].copy()
+
+
+def _area_vectors(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return normals with the size of each facet."""
+    if corners.shape[-1] == 2:
+        way = corners[:, 1] - corners[:, 0]
+        return np.column_stack([way[:, 1], -way[:, 0]])
+    return np.asarray(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0)
+
+
+def _inner(
+    x: NDArray[np.float64], facets: NDArray[np.int64], radius: float, what: str
+) -> NDArray[np.float64]:
+    """Return corners moved inwards so that planes of facets move by a radius, as far as they can.
+
+    The motion m of a corner is the shortest that comes nearest to ``n m = 1`` for the normals n of
+    its facets.
+    """
+    dim = x.shape[1]
+    n = facet_normals(x[facets])
+    A, b = np.zeros((len(x), dim, dim)), np.zeros((len(x), dim))
+    for k in range(dim):
+        np.add.at(A, facets[:, k], n[:, :, None] * n[:, None, :])
+        np.add.at(b, facets[:, k], n)
+    move = np.einsum("nij,nj->ni", np.linalg.pinv(A, rcond=1e-6, hermitian=True), b)
+    inner = x - radius * move
+    after = facet_normals(inner[facets])
+    there = np.linalg.norm(n, axis=1) > 0.5
+    if ((after * n).sum(axis=1)[there] < KEPT).any():
+        raise MPMError(f"{what} has facets that are too small for the radius {radius:g}.")
+    return np.asarray(inner)
