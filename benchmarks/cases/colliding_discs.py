@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Two elastic discs collide on one background (Sulsky, Chen & Schreyer 1994)."""
+"""Two elastic discs collide, on one background or by contact (Sulsky, Chen & Schreyer 1994)."""
 
 from mpi4py import MPI
 
@@ -12,12 +12,17 @@ from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
 
-parser = kit.Parser("Two elastic discs collide on one background, which is their contact.")
+parser = kit.Parser("Two elastic discs collide on one background, or on two by contact.")
 parser.add_argument("--cell", type=kit.positive, default=1 / 20, help="background cell size")
 parser.add_argument("--dt", type=kit.positive, default=0.02, help="time step")
 parser.add_argument("--steps", type=kit.whole, help="time steps; up to 3.5 by dt")
 parser.add_argument("--scheme", choices=("midpoint", "conserving", "euler"), default="conserving")
 parser.add_argument("--out-of-range", choices=("project", "reflect"), default="reflect")
+parser.add_argument(
+    "--contact", action="store_true", help="a background for each, and contact of their facets"
+)
+parser.add_argument("--friction", type=float, default=0.0, help="of the contact")
+parser.add_argument("--beside", type=float, default=0.0, help="how far the paths lie apart")
 args = parser.parse()
 
 comm = MPI.COMM_WORLD
@@ -28,6 +33,7 @@ background = mesh.create_rectangle(
     comm, [[-0.2, -0.2], [1.2, 1.2]], [cells, cells], mesh.CellType.quadrilateral
 )
 V = fem.functionspace(background, ("Lagrange", 1, (2,)))
+spaces = [V, fem.functionspace(background, ("Lagrange", 1, (2,))) if args.contact else V]
 
 
 def disc(centre, n):
@@ -45,7 +51,14 @@ def disc(centre, n):
 
 
 n = max(2, round(0.72 / h))
-bodies = [mpm.Particles(disc(c, n), V, quadrature_degree=3) for c in ((0.2, 0.2), (0.8, 0.8))]
+side = np.sqrt(0.5) * args.beside / 2.0
+centres = (0.2 - side, 0.2 + side), (0.8 + side, 0.8 - side)
+bodies = [
+    # (by contact, meshes do not mirror each other)
+    mpm.Particles(disc(c, n + number * args.contact), V, quadrature_degree=3)
+    for number, (c, V) in enumerate(zip(centres, spaces, strict=True))
+]
+touch = mpm.contact.Pair(*bodies, friction=args.friction) if args.contact else None
 problem = mpm.DynamicProblem(
     bodies,
     mpm.materials.Hencky(1000.0, 0.3),
@@ -53,6 +66,7 @@ problem = mpm.DynamicProblem(
     velocity=[(speed, speed), (-speed, -speed)],
     scheme=args.scheme,
     out_of_range=args.out_of_range,
+    terms=[touch] if touch else [],
     petsc_options={"snes_rtol": 1e-12},
 )
 
@@ -65,11 +79,22 @@ def mean_speed(number: int) -> float:
     return kit.mean(v.ravel(), mass.ravel())
 
 
-failure, drift = None, 0.0
+def smallest_gap() -> float:
+    """Smallest gap of the contact."""
+    return comm.allreduce(touch.gap.min(initial=np.inf), MPI.MIN) if touch else np.inf
+
+
+failure, drift, turned = None, 0.0, 0.0
 scale = 1000.0 * np.pi * 0.04 * speed
+momentum, turning = problem.momentum, problem.angular_momentum
+gap, first_gap = smallest_gap(), -np.inf
 try:
     for _ in kit.progress(problem.steps(steps * args.dt, args.dt), steps, args):
-        drift = max(drift, float(np.abs(problem.momentum).max()) / scale)
+        drift = max(drift, float(np.abs(problem.momentum - momentum).max()) / scale)
+        turned = max(turned, float(np.abs(problem.angular_momentum - turning).max()) / scale / 0.2)
+        before, gap = gap, smallest_gap()
+        if touch and np.abs(problem.reaction(touch)).max() > 0.0:
+            first_gap = max(first_gap, min(before, gap) / h)
 except mpm.MPMError as error:
     failure = error
 history = problem.history
@@ -83,6 +108,9 @@ numbers = {
     "kinetic_least": kinetic.min() / kinetic[0],
     "rebound": mean_speed(0) / speed,
     "momentum_error": drift,
+    "angular_momentum_error": turned,
+    "force_at_gap": first_gap if touch else None,
+    "friction_loss": history.energies[-1].damping / whole[0],
     "balance_error": float(np.abs(balances - balances[0]).max() / whole[0]),
     "iterations_per_step": float(np.mean(history.iterations)),
     "particles": sum(body.num_global for body in bodies),
@@ -93,7 +121,10 @@ rows = [
     ("change of energy", f"{numbers['energy_change']:+.2e}"),
     ("speed after, over that before", f"{numbers['rebound']:.3f}"),
     ("momentum, over a disc's", f"{drift:.1e}"),
+    ("angular momentum", f"{turned:.1e}"),
 ]
+if touch:
+    rows += [("largest gap with a force, in cells", f"{first_gap:.3f}")]
 
 if args.plot:
     fig, axes = kit.figure(12.0, 5.0, [["bodies", "energy"]])

@@ -19,7 +19,7 @@ CASES = Path(__file__).parents[2] / "benchmarks" / "cases"
 #: Programs that ``make test`` runs, and numbers that it leaves to ``make test-all``.
 SHORT = ("compaction", "column_free", "snap_through")
 LONG = {
-    *("vortex", "discs", "column"),
+    *("vortex", "discs", "discs-contact", "column"),
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
     *("slope", "vertical-cut", "footing-friction"),
     *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
@@ -151,6 +151,16 @@ RUNS = {
         "colliding_discs",
         "--steps 10",
         {"energy_largest": 1e-11, "momentum_error": 1e-12, "balance_error": 1e-12},
+    ),
+    "discs-contact": (
+        "colliding_discs",
+        "--contact --cell 0.1 --dt 0.05",
+        {
+            "energy_largest": 1e-6,
+            "momentum_error": 1e-11,
+            "angular_momentum_error": 1e-11,
+            "force_at_gap": 0.02,
+        },
     ),
     "vortex": ("vortex", "", {"displacement_error": 4.6e-2, "velocity_error": 1.26e-1}),
     "column": ("column_dynamic", "--time 0.4", {"cutbacks": 0, "balance_error": 1e-12}),

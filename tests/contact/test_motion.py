@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Contact in motion: what bounces and collides keeps energy and momentum, and friction takes some."""
+"""Contact in motion: what bounces and collides keeps energy and momentum; friction takes some."""
 
 import numpy as np
 import pytest
@@ -228,7 +228,7 @@ def test_a_checkpoint_in_the_middle_of_an_impact_goes_on_as_the_run_does(what, m
             problem.save(mpi_tmp_path / "half.ckpt")
             force = problem.reaction(touch)
     assert np.abs(force).max() > 0.0
-    other, again = made()
+    other, _ = made()
     other.restore(mpi_tmp_path / "half.ckpt")
     other.solve(2 * half, dt, output_at=[half])
     end = problem.momentum
