@@ -27,7 +27,7 @@ from .shapes import Shape, as_positive
 from .surface import Blocks, PointMatrix, Surface, global_dofs
 from .whole_step import corrected, mean_pressure, pressure_slope
 
-__all__ = ["Rigid"]
+__all__ = ["Placed", "Rigid"]
 
 #: Penetration, over the thickness of the domain behind, from which a body is in an obstacle
 #: rather than on it.
@@ -88,6 +88,20 @@ class _Memory:
     normal: NDArray[np.float64]
     outcome: Outcome
     works: tuple[float, float] = (0.0, 0.0)
+
+
+class Placed(NamedTuple):
+    """An obstacle in one place.
+
+    Attributes:
+        distance: Its signed distance, a function of points ``(n, gdim)``.
+        bounds: Corners of a box around it, shape ``(2, gdim)``; ``None`` where it has none.
+        facets: Points and facets of its surface, ``None`` where it has no facets.
+    """
+
+    distance: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    bounds: NDArray[np.float64] | None
+    facets: tuple[NDArray[np.float64], NDArray[np.int64]] | None
 
 
 class _Step(NamedTuple):
@@ -237,16 +251,23 @@ class Rigid(Contact):
         """Angle of the obstacle now, shape ``(1,)``, or its vector of rotation, ``(3,)``."""
         return self._pose.angle.copy()
 
-    @property
-    def bounds(self) -> NDArray[np.float64] | None:
-        """Corners of a box around the obstacle now, ``(2, gdim)``; ``None`` where it has none."""
-        box = self.shape.bounds
-        if box is None:
-            return None
-        corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, box.shape[1])
-        pivot = self.shape.pivot
-        placed = (corners - pivot) @ self._pose.Q.T + pivot + self._pose.offset
-        return np.array([placed.min(axis=0), placed.max(axis=0)])
+    def placed(self) -> Placed:
+        """Return the obstacle as it is now; it does not follow when this one moves."""
+        pose, shape = self._pose, self.shape
+
+        def out(y: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.asarray((y - shape.pivot) @ pose.Q.T + shape.pivot + pose.offset)
+
+        bounds = None
+        if shape.bounds is not None:
+            corners = np.stack(np.meshgrid(*shape.bounds.T), axis=-1).reshape(-1, shape.dim)
+            bounds = np.array([f(out(corners), axis=0) for f in (np.min, np.max)])
+        facets = None if shape.outline is None else (out(shape.outline[0]), shape.outline[1])
+
+        def distance(x: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.asarray(shape.distance(self._framed(x, pose))[0])
+
+        return Placed(distance, bounds, facets)
 
     def distance(self, x: Any) -> NDArray[np.float64]:
         """Return the distance of points to the obstacle now, negative inside, shape ``(n,)``.
@@ -260,7 +281,7 @@ class Rigid(Contact):
         points = np.asarray(x, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != self.shape.dim:
             raise MPMError(f"Points have the shape (n, {self.shape.dim}), not {points.shape}.")
-        return np.asarray(self.shape.distance(self._framed(points, self._pose))[0])
+        return self.placed().distance(points)
 
     def _framed(self, x: NDArray[Any], pose: _Pose) -> NDArray[Any]:
         """Return positions in the frame of the shape."""

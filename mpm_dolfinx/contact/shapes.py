@@ -62,6 +62,11 @@ class Shape:
         """Corners of a box around it along the axes, ``(2, dim)``; ``None`` where it has none."""
         return None
 
+    @property
+    def outline(self) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
+        """Points ``(n, dim)`` and facets ``(m, dim)`` of its surface, where it is made of such."""
+        return None
+
     def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the signed distance of points and its gradient, ``(n,)`` and ``(n, dim)``.
 
@@ -227,6 +232,10 @@ class _Cavity(Shape):
         super().__init__(shape.dim, shape.pivot)
         self._shape = shape
         self.costly = shape.costly
+
+    @property
+    def outline(self) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
+        return self._shape.outline
 
     def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         phi, n = self._shape.distance(y)

@@ -65,7 +65,7 @@ class _Faceted(Shape):
         facets: Corners of each facet, shape ``(m, dim)``.
         radius: Of its edges: how far the facets given lie within the surface.
         pivot: The point about which it turns.
-        extent: Corners of a box around the surface, shape ``(2, dim)``.
+        outline: Corners of the surface before they were moved inwards by the radius.
     """
 
     costly = True
@@ -76,11 +76,11 @@ class _Faceted(Shape):
         facets: NDArray[np.int64],
         radius: float,
         pivot: NDArray[np.float64],
-        extent: NDArray[np.float64],
+        outline: NDArray[np.float64],
     ) -> None:
         super().__init__(points.shape[1], pivot)
         self.points, self.facets = points, facets
-        self._radius, self._extent = radius, extent
+        self._radius, self._outline = radius, outline
         self._on = ON * float(np.abs(points).max(initial=0.0))
         corners = points[facets]
         self._normals = facet_normals(corners)
@@ -103,7 +103,12 @@ class _Faceted(Shape):
     @property
     def bounds(self) -> NDArray[np.float64]:
         """See :attr:`Shape.bounds`."""
-        return self._extent.copy()
+        return np.array([self._outline.min(axis=0), self._outline.max(axis=0)])
+
+    @property
+    def outline(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """See :attr:`Shape.outline`."""
+        return self._outline, self.facets
 
     def _resolved(self, y: NDArray[Any]) -> _Place:
         """Return what the distance of points is made of."""
@@ -406,9 +411,8 @@ def _surface(
     extent = np.array([x.min(axis=0), x.max(axis=0)])
     facets = _oriented(x, facets, outside, what)
     centre = extent.mean(axis=0) if pivot is None else as_point(pivot, "pivot", dim)
-    if r > 0.0:
-        x = _inner(x, facets, r, what)
-    return _Faceted(x, facets, r, centre, extent)
+    inner = _inner(x, facets, r, what) if r > 0.0 else x
+    return _Faceted(inner, facets, r, centre, x)
 
 
 def _merged(

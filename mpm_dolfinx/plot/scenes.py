@@ -29,6 +29,10 @@ MARGIN, PIXELS = 0.04, (1500, 1200)
 FLAT = 0.4
 #: Radius of the marks of contact points in points.
 MARK = 3.0
+#: Colour of obstacles; in the plane and in space, how far they are shown around the bodies, over
+#: the extent of these, and samples of their distance along the longest side.
+OBSTACLE = "#b9b2a6"
+NEAR, SAMPLES = {2: 0.3, 3: 1.0}, {2: 300, 3: 60}
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,7 @@ class Shot:
         marks: Points of contact ``(m, gdim)`` and their pressures ``(m,)``.
         extent: Corners of the box around all domains, shape ``(2, gdim)``.
         around: That around the backgrounds.
+        obstacles: What rigid obstacles tell of where they are: signed distance, bounds and facets.
     """
 
     bodies: list[Any]
@@ -68,6 +73,7 @@ class Shot:
     marks: tuple[NDArray[np.float64], NDArray[np.float64]] | None
     extent: NDArray[np.float64]
     around: NDArray[np.float64]
+    obstacles: list[Any]
 
     @property
     def range(self) -> tuple[float, float]:
@@ -93,6 +99,8 @@ def scene(
     title: str | None = None,
 ) -> Any:
     """Draw all bodies of a problem as they are now, coloured by a field (collective).
+
+    Rigid obstacles are drawn in grey, as far as they are near the bodies.
 
     In the plane the picture is matplotlib's, in space it is rendered by pyvista, off the screen;
     the colour bar stands beside it.
@@ -185,14 +193,30 @@ def take(
     around = np.array(
         [np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)]
     )
+    terms = getattr(problem, "terms", ())
+    obstacles = [t.placed() for t in terms if hasattr(type(t), "placed")]
+    extent = _with_obstacles(np.array([low, high]), obstacles)
     return Shot(
         shapes,
         None if values is None else shown,
         [cell for cell in cells if cell is not None],
         marks,
-        np.array([low, high]),
-        around if background else np.array([low, high]),
+        extent,
+        around if background else extent,
+        obstacles,
     )
+
+
+def _with_obstacles(extent: NDArray[np.float64], obstacles: Sequence[Any]) -> NDArray[np.float64]:
+    """Return the box around the bodies, and around obstacles as far as they are near."""
+    room = NEAR[extent.shape[1]] * float((extent[1] - extent[0]).max())
+    low, high = extent[0] - room, extent[1] + room
+    for obstacle in obstacles:
+        if obstacle.bounds is not None:
+            first, last = np.clip(obstacle.bounds, low, high)
+            if (first < last).all():
+                extent = np.array([np.minimum(extent[0], first), np.maximum(extent[1], last)])
+    return extent
 
 
 def _kept(whole: Any, there: NDArray[np.bool_], warp: float) -> Any:
@@ -293,9 +317,42 @@ def _draw_plane(shot: Shot, look: Look, limits: tuple[float, float], ax: Any) ->
         ax.scatter(*points.T, s=MARK**2, c=colours.to_rgba(pressures), zorder=3)
     low, high = shot.extent if look.box is None else look.box
     room = MARGIN * max(high - low)
-    ax.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
+    low, high = low - room, high + room
+    for obstacle in shot.obstacles:
+        (x, y), phi = _sampled(obstacle, low, high)
+        if phi.min() < 0.0 < phi.max():
+            ax.contourf(x, y, phi.T, [phi.min(), 0.0], colors=[OBSTACLE], zorder=0.8)
+            ax.contour(x, y, phi.T, [0.0], colors="0.25", linewidths=0.8, zorder=0.8)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set_aspect("equal")
     return colours
+
+
+def _sampled(
+    obstacle: Any, low: NDArray[np.float64], high: NDArray[np.float64]
+) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
+    """Return places along each axis and the distances at all, shape ``(n, m)`` or ``(n, m, k)``."""
+    step = float((high - low).max()) / SAMPLES[len(low)]
+    counts = np.ceil((high - low) / step).astype(int) + 1
+    axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    return axes, obstacle.distance(points.reshape(-1, len(low))).reshape(counts)
+
+
+def _solid(pyvista: Any, obstacle: Any, box: NDArray[np.float64]) -> Any:
+    """Return the surface of an obstacle in space within a box, or nothing."""
+    if obstacle.facets is not None:
+        points, facets = obstacle.facets
+        surface = pyvista.PolyData(points, np.column_stack([np.full(len(facets), 3), facets]))
+        return surface.clip_box(box.T.ravel(), invert=False).extract_surface(
+            **surface_algorithm(pyvista)
+        )
+    axes, phi = _sampled(obstacle, box[0], box[1])
+    if not phi.min() < 0.0 < phi.max():
+        return None
+    grid = pyvista.RectilinearGrid(*axes)
+    grid["distance"] = phi.ravel(order="F")
+    return grid.contour([0.0], scalars="distance")
 
 
 def _draw_space(shot: Shot, look: Look, limits: tuple[float, float], ax: Any) -> Any:
@@ -349,6 +406,11 @@ def _rendered(shot: Shot, look: Look, limits: tuple[float, float]) -> NDArray[np
                 render_points_as_spheres=True,
                 show_scalar_bar=False,
             )
+        for obstacle in shot.obstacles:
+            solid = _solid(pyvista, obstacle, _with_obstacles(shot.around, shot.obstacles))
+            if solid is not None and solid.n_cells:
+                look_of = {"smooth_shading": True, "split_sharp_edges": True}
+                plotter.add_mesh(solid, color=OBSTACLE, ambient=0.35, diffuse=0.65, **look_of)
         low, high = shot.around
         box = pyvista.Box(np.column_stack([low, high]).ravel())
         plotter.add_mesh(box, style="wireframe", color="#999999", line_width=1.0)

@@ -152,3 +152,50 @@ def test_history_of_a_motion_shows_energies():
         labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
         assert labels[0] == "kinetic" and labels[-1] == "balance"
         np.testing.assert_allclose(speed.axes[1].get_ylim(), (-0.1, -0.1), atol=1e-2)
+
+
+def pressed(shape, dim):
+    """Return a cube that a shape touches."""
+    kind = TRIANGLE if dim == 2 else HEXAHEDRON
+    V = vectors(box([-0.2] * dim, [1.2] * dim, [4] * dim, kind))
+    particles = mpm.Particles(scenes.unit(2, kind), V)
+    die = mpm.contact.Rigid(particles, shape)
+    law = mpm.materials.Hencky(1e3, 0.3)
+    return mpm.QuasiStaticProblem(particles, law, terms=[die]), die
+
+
+def test_an_obstacle_is_drawn_where_it_is():
+    problem, die = pressed(mpm.contact.disc((0.5, 1.3), 0.3), 2)
+    die.move((0.1, 0.05), 0.7)
+    figure = mpm.plot.scene(problem, None)
+    if WORLD.rank > 0:
+        return
+    ax = figure.axes[0]
+    lines = [
+        path.vertices
+        for artist in ax.collections
+        for path in artist.get_paths()
+        if artist.get_zorder() == 0.8 and len(path.vertices)
+    ]
+    x = np.concatenate(lines)
+    x = x[x[:, 1] < ax.get_ylim()[1] - 1e-6]
+    assert len(x) > 50
+    radius = np.linalg.norm(x - [0.6, 1.35], axis=1)
+    assert np.abs(radius - 0.3).max() < 1e-3
+    assert ax.get_ylim()[1] > 1.3  # as far as it is near the body
+
+
+@pytest.mark.parametrize("kind", ["sphere", "hills", "nowhere"])
+def test_obstacles_in_space_are_rendered(kind):
+    pytest.importorskip("pyvista")
+    shape = {
+        "sphere": mpm.contact.sphere((0.5, 0.5, 1.3), 0.3),
+        "hills": mpm.contact.terrain([0.0, 1.0, 2.0], [-1.0, 2.0], -0.1 - 0.1 * np.eye(3)[:, :2]),
+        "nowhere": mpm.contact.sphere((50.0, 50.0, 50.0), 0.3),
+    }[kind]
+    problem, _ = pressed(shape, 3)
+    figure = mpm.plot.scene(problem, None)
+    if WORLD.rank == 0:
+        pixels = np.asarray(figure.axes[0].images[0].get_array())[..., :3].astype(float)
+        brownish = (pixels[..., 0] - pixels[..., 2] > 10).mean()
+        assert brownish < 1e-3 if kind == "nowhere" else brownish > 0.03
