@@ -136,7 +136,13 @@ class BodyForms:
             if any(constant is load for constant in part.constants())
         ]
         self.follows_load = any(any(c is load for c in part.constants()) for part in live)
-        together = [fast and not couples_cells(form) for form in tangents]
+        # (loops pack what a form holds by the cells of its own mesh)
+        together = [
+            fast
+            and not couples_cells(form)
+            and all(c.function_space.mesh is particles.mesh for c in form.coefficients())
+            for form in tangents
+        ]
         compiled = self._compile(tangents)
         self.fused = [form for form, fuse in zip(compiled, together, strict=True) if fuse]
         self.stock = [form for form, fuse in zip(compiled, together, strict=True) if not fuse]

@@ -139,6 +139,7 @@ def require_own_fields(
     bodies: Sequence[Particles],
     what: str,
     fields: Sequence[ParticleField] = (),
+    mapped: bool = False,
 ) -> None:
     """Raise an error where a form of a body holds what its tangent or its steps do not see.
 
@@ -148,6 +149,7 @@ def require_own_fields(
         bodies: The bodies of the problem.
         what: What it is called in a sentence.
         fields: The unknowns of the problem besides displacements.
+        mapped: Whether there are maps to other meshes; Functions on them are left to DOLFINx.
 
     Raises:
         MPMError: A field that is no unknown, a displacement or load factor of another body, or
@@ -172,7 +174,7 @@ def require_own_fields(
                 "problem; give it in fields=, or use its .previous."
             )
     _require_own_load(form, body, name)
-    _require_mesh(form, body.mesh, name, "particles.mesh")
+    _require_mesh(form, body.mesh, name, "particles.mesh", mapped)
 
 
 def require_background_fields(form: Any, bodies: Sequence[Particles]) -> None:
@@ -206,7 +208,9 @@ def _require_own_load(form: ufl.Form, body: Particles, name: str) -> None:
         )
 
 
-def _require_mesh(form: ufl.Form, domain: mesh.Mesh, name: str, where: str) -> None:
+def _require_mesh(
+    form: ufl.Form, domain: mesh.Mesh, name: str, where: str, mapped: bool = False
+) -> None:
     """Raise an error where a form holds Functions or geometry of another mesh."""
     own = domain.ufl_domain()
     for integral in form.integrals():
@@ -217,6 +221,8 @@ def _require_mesh(form: ufl.Form, domain: mesh.Mesh, name: str, where: str) -> N
             if isinstance(terminal, kinds) and extract_unique_domain(terminal) != own:
                 called = type(terminal).__name__
                 if isinstance(terminal, fem.Function):
+                    if mapped:
+                        continue
                     called = f"'{terminal.name}'"
                 raise MPMError(
                     f"The {name} holds {called} of another mesh, but must be written on {where}; "

@@ -145,6 +145,17 @@ class Functions(Kept):
                     f"{', '.join(names)}."
                 )
         missing = needed.difference(functions)
+        elsewhere = sorted(
+            f.name
+            for f in missing
+            if all(f.function_space.mesh is not body.mesh for body in bodies)
+        )
+        if elsewhere:
+            raise MPMError(
+                "The residual holds data on another mesh than the body's "
+                f"({', '.join(elsewhere)}), which a checkpoint does not know; return them from converged_state() of an heir "
+                "of the problem, and take them in set_converged_state()."
+            )
         if missing:
             names = sorted(f.name for f in missing)
             raise MPMError(

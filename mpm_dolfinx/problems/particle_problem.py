@@ -205,6 +205,8 @@ class ParticleProblem:
         terms: What else acts on the bodies: a list of :class:`mpm_dolfinx.Term`.
         fields: Unknowns besides displacements, made by :meth:`Particles.field`. Those on the same
             background space are one there, where bodies touch.
+        entity_maps: Passed on to ``dolfinx.fem.form``: how the body mesh is related to others that
+            R and J have Functions on, such as a submesh of facets.
 
     Attributes:
         particles: The body or bodies, as given.
@@ -242,6 +244,7 @@ class ParticleProblem:
         linear_solver: str = "auto",
         terms: Sequence[Term] = (),
         fields: Sequence[ParticleField] = (),
+        entity_maps: Any = None,
     ) -> None:
         bodies = as_bodies(particles)
         fields = as_fields(fields, bodies)
@@ -266,6 +269,7 @@ class ParticleProblem:
             linear_solver=linear_solver,
             terms=terms,
             fields=[field.name for field in fields],
+            entity_maps=entity_maps is None,
         )
         numerics = Numerics(
             petsc_options_prefix,
@@ -279,6 +283,7 @@ class ParticleProblem:
             predictor,
             stabilisation,
             linear_solver,
+            entity_maps,
         )
         residuals, self._of_fields = residuals_of(R, bodies, fields)
         if fields and J is not None:
@@ -362,9 +367,10 @@ class ParticleProblem:
         """
         numerics = self._numerics
         contributions = self._contributions()
+        mapped = numerics.entity_maps is not None
         for number, given in enumerate(contributions):
-            require_own_fields(given.residual, number, self.bodies, "residual R", self.fields)
-            require_own_fields(given.tangent, number, self.bodies, "tangent J", self.fields)
+            for form, what in ((given.residual, "residual R"), (given.tangent, "tangent J")):
+                require_own_fields(form, number, self.bodies, what, self.fields, mapped)
         fast, options = is_fast(numerics.assembly), numerics.of_forms
         self.body_terms = [
             BodyTerm(
@@ -992,11 +998,14 @@ class ParticleProblem:
         """Return to a state of this problem on the present meshes (collective)."""
         self._adopt(snapshot, (), "The state before")
 
-    def _all_kept(self, functions: Sequence[fem.Function]) -> tuple[list[Kept], kept.Standing]:
+    def _all_kept(
+        self, functions: Sequence[fem.Function], whole: bool = True
+    ) -> tuple[list[Kept], kept.Standing]:
         """Return all that goes with the problem, and what knows how far it is.
 
         Args:
             functions: As in :meth:`save`.
+            whole: Whether data at points must be among them.
 
         Raises:
             MPMError: Functions that cannot be kept, or that are missing.
@@ -1008,7 +1017,7 @@ class ParticleProblem:
         things = [
             kept.Bodies(self.bodies),
             kept.Material(self.converged_state, self.set_converged_state, self._history_at),
-            kept.Functions(functions, self.bodies, self.data_at_points()),
+            kept.Functions(functions, self.bodies, self.data_at_points() if whole else set()),
             kept.Values(carried, self.reduced),
             kept.Increments(self.reduced, self.bodies, carried),
             kept.Past(self.history, self.reduced, self._comm),
@@ -1052,7 +1061,7 @@ class ParticleProblem:
 
     def _keep(self, thing: Kept, owner: Term | None) -> None:
         """Let something go with the problem, as long as a term that owns it is one of its own."""
-        things, _ = self._all_kept(tuple(self.data_at_points()))
+        things, _ = self._all_kept((), whole=False)
         require_key(thing.key, things, len(self.bodies))
         self._kept.append((owner, thing))
 

@@ -48,6 +48,7 @@ class Numerics:
     predictor: bool
     stabilisation: str | None
     linear_solver: str
+    entity_maps: Any = None
 
     def __post_init__(self) -> None:
         """Say so where something is unknown."""
@@ -82,10 +83,11 @@ class Numerics:
     @property
     def of_forms(self) -> dict[str, Any]:
         """Options with which forms are compiled."""
-        return {
+        options = {
             "form_compiler_options": self.form_compiler_options,
             "jit_options": self.jit_options,
         }
+        return options if self.entity_maps is None else {**options, "entity_maps": self.entity_maps}
 
 
 @dataclass(frozen=True)
