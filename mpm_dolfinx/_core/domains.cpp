@@ -316,7 +316,8 @@ HOT_LOOP void core::assemble_points(const Domains& domains, const double* suppor
 }
 
 HOT_LOOP void core::assemble_domains(const Domains& domains, const double* transfers,
-                                     const double* A, const double* vectors, const Target& target)
+                                     const double* A, const double* vectors, int pairs,
+                                     const Target& target)
 {
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
@@ -351,13 +352,13 @@ HOT_LOOP void core::assemble_domains(const Domains& domains, const double* trans
                     domains.nodes, K.data());
         }
       }
-      if (vectors != nullptr)
+      for (int m = 0; m < pairs; ++m)
       {
-        const double* a = vectors + p * 3 * width;
-        const double *b = a + width, *g = b + width;
+        const double* left = vectors + (p * pairs + m) * 2 * width;
+        const double* right = left + width;
         for (int r = 0; r < width; ++r)
           for (int s = 0; s < width; ++s)
-            K[r * width + s] += a[r] * g[s] + g[r] * b[s];
+            K[r * width + s] += left[r] * right[s];
       }
       add_element<dim>(K.data(), domains.nodes, transfers + target.offsets[p] * domains.nodes, size,
                        positions, target.values, work);

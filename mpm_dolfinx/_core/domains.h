@@ -67,10 +67,10 @@ struct Target
 void assemble_points(const Domains& domains, const double* support_gradients, const double* A,
                      bool symmetric, const Target& target);
 
-// Add T^T (sum_q w_q G^T A G + a g^T + g b^T) T with the vectors a, b and g of each domain in
-// vectors, (count, 3, nodes, dim), or without where that is null.
+// Add T^T (sum_q w_q G^T A G + sum_m a_m b_m^T) T with the vectors a_1, b_1, a_2, ... of each domain
+// in vectors, (count, 2 pairs, nodes, dim).
 void assemble_domains(const Domains& domains, const double* transfers, const double* A,
-                      const double* vectors, const Target& target);
+                      const double* vectors, int pairs, const Target& target);
 
 using Kernel = void (*)(double*, const double*, const double*, const double*, const int*,
                         const std::uint8_t*, void*);

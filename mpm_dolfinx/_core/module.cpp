@@ -275,11 +275,11 @@ NB_MODULE(_loops, m)
     revolve(domains, hoop);
     const int square = domains.strain() * domains.strain();
     require(A.size() == num_points(domains) * square * square, "A (n, nq, dim, dim, dim, dim)");
-    require(vectors.size() == 0
-                || vectors.size() == domains.count * 3 * domains.nodes * domains.dim,
-            "vectors (n, 3, k, dim), or none");
-    assemble_domains(domains, transfers.data(), A.data(),
-                     vectors.size() > 0 ? vectors.data() : nullptr,
+    require(vectors.size() == 0 || vectors.ndim() == 4, "vectors (n, 2 m, k, dim), or none");
+    const std::size_t pairs = vectors.size() == 0 ? 0 : vectors.shape(1) / 2;
+    require(vectors.size() == domains.count * 2 * pairs * domains.nodes * domains.dim,
+            "vectors (n, 2 m, k, dim), or none");
+    assemble_domains(domains, transfers.data(), A.data(), vectors.data(), static_cast<int>(pairs),
                      target_of(domains, offsets, positions, values));
   },
         "dofmap"_a, "gradients"_a, "weights"_a, "hoop"_a, "transfers"_a, "A"_a, "vectors"_a,

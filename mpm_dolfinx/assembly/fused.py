@@ -85,10 +85,11 @@ class _Loops:
 
     @staticmethod
     def _vectors(term: LowRankTerm | None) -> NDArray[np.float64]:
-        """Return left, right and g of each domain, ``(n, 3, k, gdim)``; or none."""
+        """Return left and right vectors of each domain in turn, ``(n, 2 m, k, gdim)``; or none."""
         if term is None:
             return no_values
-        return np.stack([term.left, term.right, term.g], axis=1)
+        pairs = zip(term.left, term.right, strict=True)
+        return np.stack([vector for pair in pairs for vector in pair], axis=1)
 
     def add(self, values: NDArray[np.float64]) -> None:
         """Add the body's reduced tangent to the values of the pattern's blocks."""

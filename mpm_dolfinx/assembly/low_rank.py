@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from petsc4py import PETSc
 
 import numpy as np
@@ -21,8 +19,8 @@ __all__ = ["LowRankTangent", "ReducedLowRank"]
 class LowRankTangent:
     """The low-rank part of a body's tangent by PETSc's sparse products.
 
-    With the vectors g, left and right of all groups as rows of sparse matrices G, L and R, the
-    part is ``G^T R + L^T G``.
+    With the k-th left and right vectors of all groups as rows of sparse matrices L_k and R_k, the
+    part is the sum of ``L_k^T R_k``.
 
     Args:
         particles: The body.
@@ -34,6 +32,7 @@ class LowRankTangent:
         self._W = particles.W
         self._nodes = particles.domain_nodes
         self._factors: list[PETSc.Mat] = []
+        self._pairs: list[tuple[int, int]] = []
         self._total = MatrixSum()
         self._products = _Products()
 
@@ -43,7 +42,8 @@ class LowRankTangent:
 
     def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
         """Return K on W plus the low-rank part, always the same object (collective)."""
-        parts = [K, *self._products.of(*self._filled())]
+        factors = self._filled()
+        parts = [K, *self._products.of(factors, self._pairs)]
         return self._total.of(parts)
 
     def reduced(self, T: PETSc.Mat, last: ReducedLowRank | None) -> ReducedLowRank:
@@ -54,17 +54,27 @@ class LowRankTangent:
             last: What this returned before for the same T, if anything.
         """
         last = ReducedLowRank() if last is None else last
-        for number, factor in enumerate(self._filled()):
-            last.factors[number] = factor.matMult(T, result=last.factors[number])
-        last.parts = last.products.of(*last.factors)
+        factors = self._filled()
+        known = last.factors or [None] * len(factors)
+        last.factors = [
+            factor.matMult(T, result=result) for factor, result in zip(factors, known, strict=True)
+        ]
+        last.parts = last.products.of(last.factors, self._pairs)
         return last
 
     def _filled(self) -> list[PETSc.Mat]:
-        """Return G, L and R with their present values, always the same objects."""
+        """Return the factors with their present values, always the same objects.
+
+        Vectors that are the same array are one factor.
+        """
         term = self._source.linearise()
+        parts: list[Array] = []
+        numbers = [_number(parts, part) for part in (*term.left, *term.right)]
+        count = len(term.left)
+        self._pairs = list(zip(numbers[:count], numbers[count:], strict=True))
         if not self._factors:
-            self._factors = [self._empty() for _ in range(3)]
-        for matrix, part in zip(self._factors, (term.g, term.left, term.right), strict=True):
+            self._factors = [self._empty() for _ in parts]
+        for matrix, part in zip(self._factors, parts, strict=True):
             _compat.set_entries(matrix, np.ascontiguousarray(part).ravel())
         return self._factors
 
@@ -84,29 +94,40 @@ class LowRankTangent:
         return matrix
 
 
+def _number(parts: list[Array], part: Array) -> int:
+    """Return the number of an array in a list, to which it is added if it is not there."""
+    for number, known in enumerate(parts):
+        if known is part:
+            return number
+    parts.append(part)
+    return len(parts) - 1
+
+
 class _Products:
-    """``G^T R`` and ``L^T G`` of matrices whose sparsity does not change."""
+    """``L^T R`` of pairs of matrices whose sparsity does not change."""
 
     def __init__(self) -> None:
-        self._results: list[PETSc.Mat | None] = [None, None]
+        self._results: list[PETSc.Mat] = []
 
-    def of(self, G: PETSc.Mat, L: PETSc.Mat, R: PETSc.Mat) -> list[PETSc.Mat]:
-        """Return both products for new values, always the same objects."""
-        first, second = self._results
-        products = [G.transposeMatMult(R, result=first), L.transposeMatMult(G, result=second)]
-        self._results = [*products]
-        return products
+    def of(self, factors: list[PETSc.Mat], pairs: list[tuple[int, int]]) -> list[PETSc.Mat]:
+        """Return the products for new values, always the same objects."""
+        known = self._results or [None] * len(pairs)
+        self._results = [
+            factors[left].transposeMatMult(factors[right], result=result)
+            for (left, right), result in zip(pairs, known, strict=True)
+        ]
+        return list(self._results)
 
 
 class ReducedLowRank:
     """Factors and products of one T.
 
     Attributes:
-        factors: G T, L T and R T.
+        factors: Those of the tangent times T.
         parts: The matrices whose sum is the reduced part.
     """
 
     def __init__(self) -> None:
-        self.factors: list[Any] = [None, None, None]
+        self.factors: list[PETSc.Mat] = []
         self.products = _Products()
         self.parts: list[PETSc.Mat] = []

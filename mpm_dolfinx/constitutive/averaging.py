@@ -23,7 +23,16 @@ from ..errors import MPMError
 from .groups import Groups, pairs, patches, singles
 from .strain import Strain
 
-__all__ = ["F_BARS", "Array", "Linearised", "LowRankTerm", "VolumeAveraging", "deviation"]
+__all__ = [
+    "F_BARS",
+    "Array",
+    "GroupedTangent",
+    "Linearised",
+    "LowRankTerm",
+    "VolumeAveraging",
+    "deviation",
+    "deviation_energy",
+]
 
 F_BARS = ("none", "domain", "pair", "patch")
 #: Deviation of ln J from its average that costs nothing, and that from which all is resisted.
@@ -47,22 +56,28 @@ def deviation(d: Array, free: float, whole: float) -> tuple[Array, Array]:
     return np.sign(d) * force, np.minimum(excess / width, 1.0)
 
 
+def deviation_energy(d: Array, free: float, whole: float) -> Array:
+    """Return Phi, of which :func:`deviation` has the derivatives; 0 at 0."""
+    width = whole - free
+    excess = np.maximum(np.abs(d) - free, 0.0)
+    beyond = 0.5 * excess * (excess - width) + width**2 / 6.0
+    return np.asarray(np.where(excess < width, excess**3 / (6.0 * width), beyond))
+
+
 class LowRankTerm(NamedTuple):
-    """``sum_m left_m g_m^T + g_m right_m^T`` on the dofs of W, m a group.
+    """``sum_m sum_k left_mk right_mk^T`` on the dofs of W, m a group.
 
     The vectors of a group are the sums of what its domains contribute to their nodes.
 
     Attributes:
         groups: The groups; ``groups.number`` are those of the owned domains, shape ``(n,)``.
-        g: Contributions to g, shape ``(n, k, gdim)``.
-        left: Contributions to the left vectors, shape ``(n, k, gdim)``.
-        right: The same array where the term is symmetric.
+        left: Contributions to the left vectors, each of shape ``(n, k, gdim)``.
+        right: Contributions to the right vectors, as many; the same arrays where vectors are.
     """
 
     groups: Groups
-    g: Array
-    left: Array
-    right: Array
+    left: tuple[Array, ...]
+    right: tuple[Array, ...]
 
     @classmethod
     def of(cls, groups: Groups, h: Array, g: Array, left: Array, right: Array) -> LowRankTerm:
@@ -77,7 +92,7 @@ class LowRankTerm(NamedTuple):
         """
         half = 0.5 * h[:, None, None] * g
         first = half + left
-        return cls(groups, g, first, first if right is left else half + right)
+        return cls(groups, (first, g), (g, first if right is left else half + right))
 
     def times(self, nodal: Array) -> Array:
         """Return what the owned domains contribute to the term times a vector (collective).
@@ -85,19 +100,36 @@ class LowRankTerm(NamedTuple):
         Args:
             nodal: The vector at the domains' nodes, shape ``(n, k, gdim)``.
         """
-        parts = [np.einsum("nki,nki->n", vector, nodal) for vector in (self.g, self.right)]
+        parts = [np.einsum("nki,nki->n", vector, nodal) for vector in self.right]
         sums = self.groups.sum(np.stack(parts, axis=1))[:, :, None, None]
-        return np.asarray(sums[:, 0] * self.left + sums[:, 1] * self.g)
+        return np.asarray(sum(sums[:, k] * left for k, left in enumerate(self.left)))
+
+
+class GroupedTangent(NamedTuple):
+    """What an effective stress at the points of a group has from the group's other points.
+
+    That is ``(h gamma + left) (gamma : dF) + gamma (right : dF)``, where ``a : dF`` is the integral
+    over the group.
+
+    Attributes:
+        h: Factor of each owned domain's group, shape ``(n,)``.
+        gamma: ``d ln Jbar / dF`` per volume, shape ``(n, nq, dim, dim)``, as are the others.
+        left: See above.
+        right: The same array where the material's tangent is symmetric.
+    """
+
+    h: Array
+    gamma: Array
+    left: Array
+    right: Array
 
 
 class Linearised(Protocol):
-    """What knows the low-rank part of a body's tangent.
+    """What knows the low-rank part of a body's tangent."""
 
-    Attributes:
-        groups: The groups of domains.
-    """
-
-    groups: Groups
+    @property
+    def groups(self) -> Groups:
+        """The groups of domains."""
 
     def linearise(self) -> LowRankTerm:
         """Return it at the last evaluation (collective)."""
@@ -141,6 +173,7 @@ class VolumeAveraging:
         self.modulus = modulus
         self.groups = self._grouped(kind, material)
         self.kind = kind
+        self._grouped_tangent: GroupedTangent | None = None
         self._low_rank: LowRankTerm | None = None
 
     def _grouped(self, kind: str, material: NDArray[np.int64]) -> Groups:
@@ -194,7 +227,7 @@ class VolumeAveraging:
     def effective(self, P: Array, A: Array) -> tuple[Array, Array]:
         """Return the first Piola stress that does work on F, and its pointwise tangent.
 
-        The rest of the tangent is :meth:`linearise` (collective).
+        The rest of the tangent is :meth:`linearise`. Collective.
 
         Args:
             P: The material's first Piola stress at Fbar, shape ``(n, nq, dim, dim)``.
@@ -234,17 +267,32 @@ class VolumeAveraging:
         tangent += _dyad((a**2 * stiffness + beta + stiffening)[:, :, None, None] * Z, Z)
         tangent -= np.einsum("nqiL,nqkJ->nqiJkL", factor * Z, Z)
 
-        g = self._nodal((J / self._group_size[:, None])[:, :, None, None] * Z)
         projected = (a**2 * stiffness + stiffening)[:, :, None, None] * Z
-        left = self._nodal(a * s2 * left - projected)
-        right = left if self._symmetric else self._nodal(a * s2 * right - projected)
-        self._low_rank = LowRankTerm.of(self.groups, sums[:, 1] - B, g, left, right)
+        left = a * s2 * left - projected
+        right = left if self._symmetric else a * s2 * right - projected
+        gamma = (J / self._group_size[:, None])[:, :, None, None] * Z
+        self._grouped_tangent = GroupedTangent(sums[:, 1] - B, gamma, left, right)
+        self._low_rank = None
         return stress, tangent
 
+    def grouped_tangent(self) -> GroupedTangent:
+        """Return what the pointwise tangent of the last evaluation lacks, at the points."""
+        assert self._grouped_tangent is not None
+        return self._grouped_tangent
+
     def linearise(self) -> LowRankTerm:
-        """Return what the pointwise tangent of the last evaluation lacks."""
-        assert self._low_rank is not None
+        """Return what the pointwise tangent of the last evaluation lacks, on the nodes."""
+        if self._low_rank is None:
+            h, gamma, left, right = self.grouped_tangent()
+            before = self.nodal(left)
+            after = before if right is left else self.nodal(right)
+            self._low_rank = LowRankTerm.of(self.groups, h, self.nodal(gamma), before, after)
         return self._low_rank
+
+    def energy(self) -> Array:
+        """Return the energy per volume of deviations in the last evaluation, shape ``(n, nq)``."""
+        cost = deviation_energy(self._deviation, *FREE[self.kind])
+        return np.asarray(self.modulus[:, None] * cost)
 
     def _resistance(self) -> tuple[Array, Array]:
         """Return force and stiffness, per volume, against deviations at the points."""
@@ -252,7 +300,11 @@ class VolumeAveraging:
         force, stiffness = deviation(self._deviation, *FREE[self.kind])
         return modulus * force, modulus * stiffness
 
-    def _nodal(self, stress: Array) -> Array:
+    def counted(self) -> Array:
+        """Return the volume of each point that counts in its group, shape ``(n, nq)``."""
+        return self._counted
+
+    def nodal(self, stress: Array) -> Array:
         """Return the integrals of ``stress : grad N`` over each domain, ``(n, k, gdim)``."""
         return self._strain.nodal(stress, self._counted)
 

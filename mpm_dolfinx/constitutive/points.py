@@ -132,6 +132,7 @@ class MaterialPoints:
         self._stress = self.first_piola.copy()
         self._volume = np.zeros(self._points)
         self.recovery: NDArray[np.float64] | float = 0.0
+        self._resisted = np.zeros(self._points)
         self.averaging: VolumeAveraging | None = None
         if f_bar != "none":
             material = np.zeros(particles.num_local, dtype=np.int64)
@@ -307,6 +308,12 @@ class MaterialPoints:
             with agree(self._particles.mesh.comm):
                 stress = self.strain.average(self.cauchy_stress())
             self.recovery = self.averaging.recover(stress) - stress
+            self._resisted = self.averaging.energy().ravel()
+
+    @property
+    def grouped(self) -> VolumeAveraging | None:
+        """What knows what the tangent has from other points of a group; ``None`` without F-bar."""
+        return self.averaging
 
     @property
     def symmetric(self) -> bool:
@@ -457,7 +464,8 @@ class MaterialPoints:
             trial: Whether it is that of the last update, not of the last converged step.
 
         Returns:
-            Not a number where a material does not know it.
+            That of the material, and of what F-bar resists; not a number where a material does not
+            know it.
         """
         result = np.full(self._points, np.nan)
         for group, state in zip(self._groups, self._trial if trial else self._states, strict=True):
@@ -465,6 +473,8 @@ class MaterialPoints:
             if energy is not None:
                 self._require(group, "strain energy", energy, (len(group.points),))
                 result[group.points] = energy
+        if self.averaging is not None:
+            result += self.averaging.energy().ravel() if trial else self._resisted
         return result
 
     @property
@@ -474,12 +484,11 @@ class MaterialPoints:
 
     @property
     def is_hyperelastic(self) -> NDArray[np.bool_]:
-        """Which points have a stress that derives from the energy of F alone, ``(n nq,)``.
+        """Which points have a stress that derives from an energy, ``(n nq,)``.
 
+        That is one of F there; with F-bar, of F at the points of a group, which has one material.
         With a pressure of its own that is the stress without it.
         """
-        if self.averaging is not None:
-            return np.zeros(self._points, dtype=bool)
         elastic = self._where(lambda law: not getattr(law, "inelastic", True))
         return elastic & np.isfinite(self.strain_energy())
 
@@ -682,11 +691,25 @@ class MaterialPoints:
         Returns:
             A function that makes the history of before that again.
         """
-        before = self._states, self._gradient, self._stress, self.recovery, self._volume
+        before = (
+            self._states,
+            self._gradient,
+            self._stress,
+            self.recovery,
+            self._resisted,
+            self._volume,
+        )
         tried = self._trial, self._trial_gradient, self.first_piola
 
         def undo() -> None:
-            self._states, self._gradient, self._stress, self.recovery, self._volume = before
+            (
+                self._states,
+                self._gradient,
+                self._stress,
+                self.recovery,
+                self._resisted,
+                self._volume,
+            ) = before
             self._trial, self._trial_gradient, self.first_piola = tried
 
         self._states = [
@@ -737,6 +760,7 @@ class MaterialPoints:
         }
         if self.averaging is not None:
             columns["recovery"] = Column(np.broadcast_to(self.recovery, (n, 3, 3)), "cells")
+            columns["resisted"] = Column(self._resisted.reshape(n, nq), "points")
         return columns
 
     def set_converged_state(self, arrays: dict[str, NDArray[Any]]) -> None:
@@ -744,9 +768,10 @@ class MaterialPoints:
         flat = {
             name: v.reshape(self._points, *v.shape[2:])
             for name, v in arrays.items()
-            if name != "recovery"
+            if name not in ("recovery", "resisted")
         }
         self.recovery = arrays.get("recovery", 0.0)
+        self._resisted = arrays.get("resisted", self._resisted).reshape(self._points)
         self._gradient, self._stress = flat.pop("gradient"), flat.pop("first_piola")
         self._volume = flat.pop("volume_strain", self._volume)
         self._states = [{} for _ in self._groups]

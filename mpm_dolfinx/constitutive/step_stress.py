@@ -12,9 +12,12 @@ c = 0 (Simo & Tarnow 1992), or, where the stress derives from an energy W of the
     c = (W_1 - W_n - (S_n + S_1)/2 : (E_1 - E_n)) / |E_1 - E_n|^2
 
 (Gonzalez 2000), so that the work P* : (F_1 - F_n) is W_1 - W_n. As S* is symmetric, angular
-momentum is kept. A law of small strains takes the mean of its stresses, which has the same two
-merits as far as they go there. Damping in proportion to the stiffness C of the undeformed body is
-``P_v = F_m (beta C : (E_1 - E_n) / dt)``: it resists no rotation and never gives energy.
+momentum is kept. With F-bar, W is the energy of a group of domains and depends on F at all of its
+points, with the effective stress P as its derivative; numerator and denominator of c are integrals
+over the group then, and so is W_1 - W_n what is exact. A law of small strains takes the mean of its
+stresses, which has the same two merits as far as they go there. Damping in proportion to the
+stiffness C of the undeformed body is ``P_v = F_m (beta C : (E_1 - E_n) / dt)``: it resists no
+rotation and never gives energy.
 """
 
 from __future__ import annotations
@@ -27,6 +30,8 @@ from numpy.typing import NDArray
 
 from .._core import loops
 from ..errors import ConvergenceError
+from .averaging import Linearised, LowRankTerm, VolumeAveraging
+from .groups import Groups
 from .points import MaterialPoints
 from .pressure import VolumeStrain
 
@@ -34,6 +39,8 @@ __all__ = ["StepStress"]
 
 #: Change of strain below which Gonzalez' correction, a quotient of small numbers, is faded out.
 SMALL = 1e-6
+#: How many numbers of each domain are summed over its group in an evaluation.
+SUMS = 4
 
 type Array = NDArray[np.float64]
 
@@ -94,6 +101,7 @@ class StepStress:
         self._tried: Array = self._H
         self._stress = points.first_piola
         self._viscous: Array | None = None
+        self._low_rank: LowRankTerm | None = None
         self.tangent = points.tangent
 
     @property
@@ -162,13 +170,17 @@ class StepStress:
         return self._points.strain.gradient().reshape(-1, dim, dim)
 
     def update(self) -> None:
-        """Update stress and tangent for the present displacement.
+        """Update stress and tangent for the present displacement (collective with F-bar).
 
         Raises:
             MPMError: The material's update fails, or F is singular.
         """
         points = self._points
-        points.update()
+        try:
+            points.update()
+        except BaseException:
+            self._abandon()
+            raise
         self._stress, self.tangent = points.first_piola, points.tangent
         if not self._conserving and not self._splits and self._viscosity == 0.0:
             return
@@ -185,6 +197,12 @@ class StepStress:
             self._viscous = viscous
             self._stress = self._stress + viscous / self._share
             self.tangent = self.tangent + tangent / self._share
+
+    def _abandon(self) -> None:
+        """Take part in the sums of an evaluation that failed on this rank (collective)."""
+        averaging = self._points.averaging
+        if self._conserving and averaging is not None:
+            averaging.groups.sum(np.zeros((self._points.weights.shape[0], SUMS)))
 
     def _take_pressure_out(self) -> None:
         """Leave in stress and tangent what is not of the pressure."""
@@ -234,11 +252,12 @@ class StepStress:
 
     def _mean(self, ends: _Ends) -> tuple[Array, Array]:
         """Return what acts over a step, and its derivative by F at the end, over the share."""
-        if self._points.compiled and loops is not None:
+        averaging = self._points.averaging
+        if self._points.compiled and loops is not None and averaging is None:
             return self._compiled_mean(ends)
         small, factor = ends.kind == 0, 1.0 / self._share
         P, P_n, A = ends.stress, ends.before, ends.tangent
-        if small.all():
+        if small.all() and averaging is None:
             return factor * 0.5 * (P_n + P), factor * 0.5 * A
         unit = np.eye(self._points.dim)
         F, F_n = unit + self._tried, unit + self._H
@@ -246,13 +265,16 @@ class StepStress:
             inverse = np.linalg.inv(F)
             S, S_n = inverse @ P, np.linalg.solve(F_n, P_n)
         except np.linalg.LinAlgError:
+            self._abandon()
             raise ConvergenceError("A deformation gradient is singular") from None
         dS = _times(inverse, A)
         dS -= np.einsum("nIk,nLJ->nIJkL", inverse, S)
         S_mean, dS_mean = 0.5 * (S + S_n), 0.5 * dS
-        if ends.potentials is not None:
-            self._correct(S, S_mean, dS_mean, ends)
         F_mean = 0.5 * (F + F_n)
+        if averaging is not None:
+            self._correct_groups(averaging, ends, F_mean, inverse, (S, S_mean, dS_mean))
+        elif ends.potentials is not None:
+            self._correct(S, S_mean, dS_mean, ends)
         stress = F_mean @ S_mean
         tangent = _times(F_mean, dS_mean)
         for i in range(self._points.dim):
@@ -298,6 +320,81 @@ class StepStress:
         S_mean[where] += c[:, None, None] * change
         dS_mean[where] += c[:, None, None, None, None] * slope
         dS_mean[where] += change[:, :, :, None, None] * dc[:, None, None]
+
+    def _correct_groups(
+        self,
+        averaging: VolumeAveraging,
+        ends: _Ends,
+        F_mean: Array,
+        inverse: Array,
+        stresses: tuple[Array, Array, Array],
+    ) -> None:
+        """Add the correction of groups to S* and its pointwise derivative, in place (collective).
+
+        The other points of a group change the stress by Jbar and by c: that is kept for
+        :meth:`linearise`.
+
+        Args:
+            averaging: F-bar.
+            ends: The step's ends.
+            F_mean: Mean of F.
+            inverse: Inverse of F at the end.
+            stresses: Second Piola stress at the end, S* and its derivative.
+        """
+        S, S_mean, dS_mean = stresses
+        h, gamma, left, right = averaging.grouped_tangent()
+        shape = gamma.shape
+        volumes = averaging.counted()
+        change, slope = _strain(self._tried, self._H)
+        turned = np.einsum("nIi,nIJ->niJ", inverse, change).reshape(shape)
+        whole = h[:, None, None, None] * gamma + left
+        energy = np.zeros(len(S))
+        if ends.potentials is not None:
+            energy = np.where(self._exact, ends.potentials[0] - ends.potentials[1], 0.0)
+        square = np.einsum("nIJ,nIJ->n", change, change) + SMALL**2
+        own = [
+            (energy - np.einsum("nIJ,nIJ->n", S_mean, change)).reshape(volumes.shape),
+            square.reshape(volumes.shape),
+            np.einsum("nqiJ,nqiJ->nq", turned, whole),
+            np.einsum("nqiJ,nqiJ->nq", turned, gamma),
+        ]
+        sums = averaging.groups.sum(np.stack([(volumes * part).sum(axis=1) for part in own], 1))
+        size = np.where(sums[:, 1] > 0.0, sums[:, 1], 1.0)
+        exact = self._exact.reshape(volumes.shape)[:, 0]
+        c = np.where(exact, sums[:, 0] / size, 0.0)
+        each = np.repeat(c, volumes.shape[1])[:, None, None]
+        X = np.einsum("nIJ,nIJkL->nkL", S - S_mean - 2.0 * each * change, slope)
+        X -= np.einsum("nIJ,nIJkL->nkL", change, dS_mean)
+        S_mean += each * change
+        dS_mean += each[:, :, :, None, None] * slope
+
+        over = np.where(exact, 1.0 / size, 0.0)[:, None, None]
+        half = 0.5 / self._share * _or_unit(F_mean @ inverse, self._small)
+        first = averaging.nodal((half @ whole.reshape(S.shape)).reshape(shape))
+        second = averaging.nodal((half @ gamma.reshape(S.shape)).reshape(shape))
+        along = averaging.nodal((F_mean @ change / self._share).reshape(shape)) * over
+        first -= 0.5 * sums[:, 2, None, None] * along
+        second -= 0.5 * sums[:, 3, None, None] * along
+        after = (averaging.nodal(gamma), averaging.nodal(right), averaging.nodal(X.reshape(shape)))
+        self._low_rank = LowRankTerm(averaging.groups, (first, second, along), after)
+
+    @property
+    def grouped(self) -> Linearised | None:
+        """What knows what the tangent has from other points of a group; ``None`` without F-bar."""
+        averaging = self._points.averaging
+        return averaging if averaging is None or not self._conserving else self
+
+    @property
+    def groups(self) -> Groups:
+        """The groups of domains."""
+        averaging = self._points.averaging
+        assert averaging is not None
+        return averaging.groups
+
+    def linearise(self) -> LowRankTerm:
+        """See :class:`Linearised`."""
+        assert self._low_rank is not None
+        return self._low_rank
 
     def _resisting(self) -> tuple[Array, Array]:
         """Return the viscous stress P_v and its derivative by F at the step's end."""
@@ -411,6 +508,12 @@ def _strain(H: Array, H_n: Array) -> tuple[Array, Array]:
         slope[:, :, J, :, J] += 0.5 * F.swapaxes(1, 2)
         slope[:, J, :, :, J] += 0.5 * F.swapaxes(1, 2)
     return 0.5 * (half + half.swapaxes(1, 2)), slope
+
+
+def _or_unit(values: Array, where: NDArray[np.bool_]) -> Array:
+    """Return matrices, with the unit matrix in some places."""
+    values[where] = np.eye(values.shape[-1])
+    return values
 
 
 def _times(factor: Array, tangent: Array) -> Array:

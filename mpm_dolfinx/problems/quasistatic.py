@@ -538,7 +538,7 @@ class QuasiStaticProblem(ParticleProblem):
             sum(loads[1:], loads[0]) if loads else None,
             sum(slopes[1:], slopes[0]) if slopes else None,
             acting if self._compiled else None,
-            history.averaging,
+            acting.grouped,
             symmetric,
             acting,
             injected,

@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Stress of a whole step: its tangent against differences, its work against the energy."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
-from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, box, vectors
+from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD, box, vectors
 
 from dolfinx import mesh
 
@@ -31,21 +33,25 @@ def moving(x, amount, wave):
     return x @ (turn - np.eye(dim)).T + 0.1 * amount * np.sin(wave * x[:, ::-1])
 
 
-def body_of(cell):
+def body_of(cell, points=1):
     dim = 3 if cell == HEXAHEDRON else 2
     V = vectors(box([-1.0] * dim, [2.0] * dim, [3] * dim, cell))
-    return mpm.Particles(box([0.0] * dim, [1.0] * dim, [2] * dim, cell), V)
+    return mpm.Particles(
+        box([0.0] * dim, [1.0] * dim, [2] * dim, cell), V, quadrature_degree=points
+    )
 
 
-def stepped(cell, law, conserving=True, viscosity=0.0, axisymmetric=False, compiled=True):
+def stepped(
+    cell, law, conserving=True, viscosity=0.0, axisymmetric=False, compiled=True, f_bar="none"
+):
     """Return the stress over a step between two displacements, and how to set the second."""
-    body = body_of(cell)
+    body = body_of(cell, 2 if f_bar == "domain" else 1)
     tags = None
     if isinstance(law, dict):  # one half of the cells each
         cells = np.arange(body.num_local, dtype=np.int32)
         values = np.where(2 * cells < len(cells), 1, 2).astype(np.int32)
         tags = mesh.meshtags(body.mesh, body.mesh.topology.dim, cells, values)
-    points = MaterialPoints(strain_of(body, axisymmetric), law, tags, compiled=compiled)
+    points = MaterialPoints(strain_of(body, axisymmetric), law, tags, f_bar, compiled)
     stress = StepStress(points, conserving, viscosity, 0.5)
     stress.pace(0.25, 0.5)
     dim = body.mesh.geometry.dim
@@ -139,6 +145,66 @@ def test_the_work_of_an_elastic_body_is_its_energy(cell, law):
     stress.commit()
     assert stress.stress_work == pytest.approx(stress.strain_energy() - before, rel=1e-9)
     assert symmetric.shape == stress.first_piola.shape
+
+
+GROUPED = [
+    (QUADRILATERAL, "Hencky", "domain", False),
+    (QUADRILATERAL, "Hencky", "domain", True),
+    (TRIANGLE, "Hencky", "pair", False),
+    (TRIANGLE, "Hencky", "patch", False),
+    (HEXAHEDRON, "Hencky", "domain", False),
+    (QUADRILATERAL, "von Mises", "domain", False),
+    (TRIANGLE, "linear", "pair", False),
+]
+
+
+@pytest.mark.parametrize(("cell", "law", "f_bar", "axisymmetric"), GROUPED)
+def test_with_f_bar_the_tangent_is_the_derivative(cell, law, f_bar, axisymmetric):
+    body, points, stress, put = stepped(
+        cell, LAWS[law], f_bar=f_bar, axisymmetric=axisymmetric, viscosity=0.1
+    )
+    dim = body.mesh.geometry.dim
+    x = body.W.tabulate_dof_coordinates()[:, :dim]
+    direction = np.sin(7.0 * x @ np.arange(1.0, dim + 1.0)[:, None] + np.arange(dim))
+    if axisymmetric:
+        direction[:, 0] *= x[:, 0]
+    nodes, volumes = body.domain_nodes, points.averaging.counted()
+    shape = (*volumes.shape, points.dim, points.dim)
+
+    def forces():
+        return points.strain.nodal(stress.first_piola.reshape(shape), volumes)
+
+    size, values, gradients = 1e-6, [], []
+    for sign in (-1.0, 1.0):
+        put(0.25, 2.5, sign * size * direction)
+        stress.update()
+        values.append(forces())
+        gradients.append(points.strain.gradient().reshape(-1, points.dim, points.dim))
+    put(0.25, 2.5)
+    stress.update()
+    pointwise = np.einsum("niJkL,nkL->niJ", stress.tangent, gradients[1] - gradients[0])
+    change = points.strain.nodal(pointwise.reshape(shape), volumes)
+    change += 2.0 * size * stress.linearise().times(direction[nodes])
+    found = values[1] - values[0]
+    scale = WORLD.allreduce(np.abs(found).max(initial=1e-30), MPI.MAX)
+    np.testing.assert_allclose(change, found, atol=4e-6 * scale)
+
+
+@pytest.mark.parametrize(("cell", "f_bar"), [(c, f) for c, law, f, a in GROUPED[:5] if not a])
+def test_with_f_bar_the_work_of_an_elastic_body_is_its_energy(cell, f_bar):
+    body, points, stress, put = stepped(cell, LAWS["Hencky"], f_bar=f_bar)
+    dim = body.mesh.geometry.dim
+    x = body.W.tabulate_dof_coordinates()[:, :dim]
+    resisted = []
+    for amount in (0.0, 0.12, 0.05):  # what is rough is resisted where it is far from its average
+        before = WORLD.allreduce(stress.strain_energy())
+        put(0.2 + amount, 2.0, amount * np.cos(2 * np.pi * x).prod(axis=1)[:, None])
+        stress.update()
+        stress.commit()
+        change = WORLD.allreduce(stress.strain_energy()) - before
+        assert WORLD.allreduce(stress.stress_work) == pytest.approx(change, rel=1e-9)
+        resisted.append(WORLD.allreduce(float(points.averaging.energy().sum())))
+    assert resisted[0] == 0.0 and resisted[1] > 1e-6
 
 
 def test_a_commit_is_taken_back_and_a_trial_forgotten():

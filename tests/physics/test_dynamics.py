@@ -172,6 +172,31 @@ def test_a_spinning_body_keeps_momentum_and_its_account(scheme, out):
         assert abs(end.dissipated) < 1e-12 * end.kinetic
 
 
+@pytest.mark.parametrize(
+    ("cell", "f_bar"), [(QUADRILATERAL, "domain"), (TRIANGLE, "pair"), (TRIANGLE, "patch")]
+)
+@pytest.mark.parametrize("assembly", ["fast", "reference"])
+def test_with_f_bar_an_elastic_body_keeps_its_energy(cell, f_bar, assembly):
+    particles = square(cell, quadrature_degree=2 if f_bar == "domain" else None)
+    problem = spinning(
+        particles,
+        Hencky(100.0, 0.49),
+        lambda x: spin(x) + 0.3 * np.sin(4.0 * x[:2]),
+        scheme="conserving",
+        out_of_range="reflect",
+        f_bar=f_bar,
+        assembly=assembly,
+    )
+    turning = problem.angular_momentum
+    history = problem.solve(0.4, 0.04)
+    np.testing.assert_allclose(problem.angular_momentum, turning, rtol=1e-11)
+    whole = np.array([e.kinetic + e.strain for e in history.energies])
+    assert np.abs(whole / whole[0] - 1.0).max() < 1e-10
+    assert history.energies[-1].strain > 0.01 * whole[0]
+    assert change_of_balance(history) < 1e-12
+    assert np.mean(history.iterations) <= 5.0 and history.cutbacks == 0
+
+
 @pytest.mark.parametrize("cell", [TRIANGLE, QUADRILATERAL])
 def test_a_body_that_yields_keeps_its_angular_momentum(cell):
     # Bounds of the prototype: 1e-10, at most 5 solves in a step and no cutback.
