@@ -229,9 +229,10 @@ struct VonMises
 struct MohrCoulomb
 {
   double bulk, shear, friction, dilation, strength, tension, lame;
+  bool corrects;
   explicit MohrCoulomb(const double* p)
       : bulk(p[0]), shear(p[1]), friction(p[2]), dilation(p[3]), strength(p[4]), tension(p[5]),
-        lame(p[0] - 2.0 / 3.0 * p[1])
+        lame(p[0] - 2.0 / 3.0 * p[1]), corrects(p[6] != 0.0)
   {
   }
 
@@ -327,6 +328,16 @@ struct MohrCoulomb
     return result;
   }
 
+  // With the volume correction what opens at a point of the hydrostatic axis stays in the elastic
+  // strain, to close again before there is pressure.
+  void keep_volume(const Vector& strain, Answer& answer) const
+  {
+    if (!corrects)
+      return;
+    const double third = (strain[0] + strain[1] + strain[2]) / 3.0;
+    answer.elastic = {third, third, third};
+  }
+
   // Return to the cut-off, its edges and corners: what fits best, or fits.
   Answer tensile(const Vector& strain) const
   {
@@ -367,6 +378,8 @@ struct MohrCoulomb
       {
         best = misfit;
         answer = candidate;
+        if (number == 2)
+          keep_volume(strain, answer);
       }
     };
     compare({true, false, false}, {t, t, t}, 0);
@@ -399,6 +412,7 @@ struct MohrCoulomb
         }
       }
     answer = at_stress(strain, {true, true, true}, {apex, apex, apex});
+    keep_volume(strain, answer);
   }
 
   void operator()(const Vector& unsorted, double tolerance, Response& r) const
@@ -460,8 +474,10 @@ struct MohrCoulomb
 struct DruckerPrager
 {
   double bulk, shear, eta, flow, strength, top;
+  bool corrects;
   explicit DruckerPrager(const double* p)
-      : bulk(p[0]), shear(p[1]), eta(p[2]), flow(p[3]), strength(p[4]), top(p[5])
+      : bulk(p[0]), shear(p[1]), eta(p[2]), flow(p[3]), strength(p[4]), top(p[5]),
+        corrects(p[6] != 0.0)
   {
   }
 
@@ -489,6 +505,7 @@ struct DruckerPrager
     double p = mean - bulk * flow * multiplier, q = root - shear * multiplier;
     // Derivatives of p and q by the trace and the size of the deviator.
     double p_trace = 0.0, q_size = 0.0, p_size = 0.0, q_trace = 0.0;
+    const bool keeps_volume = corrects && p > top;
     if (p > top)
     {
       const double limit = std::max(strength - eta * top, 0.0);
@@ -511,7 +528,7 @@ struct DruckerPrager
     {
       direction[a] = size > 0.0 ? deviator[a] / size : 0.0;
       r.stress[a] = p + secant * deviator[a];
-      r.elastic_strain[a] = ratio * deviator[a] + p / (3.0 * bulk);
+      r.elastic_strain[a] = ratio * deviator[a] + (keeps_volume ? trace : p / bulk) / 3.0;
     }
     r.variables[0] += root_two_thirds * norm_of_difference(strain, r.elastic_strain);
     for (int a = 0; a < 3; ++a)

@@ -21,12 +21,12 @@ enum class Law
 {
   hencky,       // bulk, shear
   von_mises,    // bulk, shear, rho_y, hardening
-  mohr_coulomb, // bulk, shear, sin(phi), sin(psi), 2 c cos(phi), cut-off
-  drucker_prager, // bulk, shear, eta, eta_psi, xi c, largest mean stress
+  mohr_coulomb, // bulk, shear, sin(phi), sin(psi), 2 c cos(phi), cut-off, volume correction
+  drucker_prager, // bulk, shear, eta, eta_psi, xi c, largest mean stress, volume correction
   cam_clay // compression, swelling, M, shear, reference pressure
 };
 
-constexpr std::size_t max_parameters = 6;
+constexpr std::size_t max_parameters = 7;
 constexpr std::size_t max_variables = 2;
 
 // How many parameters and internal variables a law has.
@@ -41,7 +41,7 @@ constexpr std::size_t num_parameters(Law law)
   case Law::cam_clay:
     return 5;
   default:
-    return 6;
+    return 7;
   }
 }
 constexpr std::size_t num_variables(Law law)

@@ -53,6 +53,11 @@ class DruckerPrager(FrictionalMaterial):
         dilation_angle: ArrayLike | Field = 0.0,
         tension_cutoff: ArrayLike | Field | None = None,
         match: Match = "outer",
+        *,
+        cohesion_residual: ArrayLike | Field | None = None,
+        friction_residual: ArrayLike | Field | None = None,
+        decay: ArrayLike | Field | None = None,
+        volume_correction: bool = False,
     ) -> None:
         """Set the parameters.
 
@@ -66,17 +71,34 @@ class DruckerPrager(FrictionalMaterial):
                 tangent symmetric.
             tension_cutoff: Largest mean stress that is borne; ``None``: as far as the cone goes.
             match: ``"outer"``, ``"inner"`` or ``"plane_strain"``.
+            cohesion_residual: Cohesion after much plastic strain; ``None``: as before.
+            friction_residual: Angle of friction after much plastic strain; ``None``: as before.
+                The angle of dilation falls with it where it is larger.
+            decay: How fast strength falls: by 1/e in a plastic strain of 1/decay.
+            volume_correction: Whether volume that opens at the apex or the cap closes again
+                before there is pressure; without it, it is plastic and stays.
 
         Raises:
-            MPMError: A value is out of range.
+            MPMError: A value is out of range; see :class:`FrictionalMaterial`.
         """
-        super().__init__(young, poisson, cohesion, friction_angle, dilation_angle, tension_cutoff)
+        super().__init__(
+            young,
+            poisson,
+            cohesion,
+            friction_angle,
+            dilation_angle,
+            tension_cutoff,
+            cohesion_residual=cohesion_residual,
+            friction_residual=friction_residual,
+            decay=decay,
+            volume_correction=volume_correction,
+        )
         if match not in get_args(Match):
             raise MPMError(f"match is {match!r} but must be one of {', '.join(get_args(Match))}")
         self.match = match
 
     def _constants(self) -> tuple[Parameter, ...]:
-        """Return the moduli, eta, eta_psi, the strength xi c, and the largest mean stress."""
+        """Return moduli, eta, eta_psi, strength xi c, largest mean stress, and the correction."""
         friction, dilation, cosine = self._sines()
         if self.match == "plane_strain":
             flow = dilation / np.sqrt(1.0 + dilation**2 / 3.0)
@@ -92,25 +114,31 @@ class DruckerPrager(FrictionalMaterial):
             apex = np.where(np.equal(eta, 0.0), np.inf, np.divide(strength, eta))
         top = np.minimum(apex, self._tension())
         largest = top if np.ndim(top) else float(top)
-        return self.bulk, self.shear, eta, flow, strength, largest
+        corrects = float(self.volume_correction)
+        return self.bulk, self.shear, eta, flow, strength, largest, corrects
 
     def yield_function(self, stress: Array, plastic_strain: Array) -> Array:
         """Return f, shape ``(n,)``, in units of stress, of stresses ``(n, m)``.
 
         The larger one of sqrt(J2) + eta p - xi c and p less the cut-off.
         """
-        _, _, eta, _, strength, _ = self._constants()
+        if "decay" in self.parameters:
+            return self.softened(plastic_strain).yield_function(stress, plastic_strain)
+        _, _, eta, _, strength, *_ = self._constants()
         mean = trace(stress) / 3.0
         cone = np.sqrt(0.5) * norm(deviator(stress)) + eta * mean - strength
         return np.asarray(np.maximum(cone, mean - self._tension()))
 
     def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
         """See :meth:`StrainMaterial.integrate`."""
+        if "decay" in self.parameters:
+            law = self.softened(variables["plastic_strain"])
+            return law.integrate(trial_strain, variables, tangent)
         n, m = trial_strain.shape
         stress = self.elastic_stress(trial_strain)
         D = self.elastic_tangent(n, m) if tangent else None
         constants = _Constants(*(np.broadcast_to(c, n) for c in self._constants()))
-        bulk, shear, eta, _, strength, top = constants
+        bulk, shear, eta, _, strength, top, _ = constants
         mean = bulk * trace(trial_strain)
         root = np.sqrt(2.0) * shear * norm(deviator(trial_strain))
         room = self.yield_tolerance * (root + np.abs(mean) + strength)
@@ -138,6 +166,7 @@ class _Constants(NamedTuple):
     flow: Array
     strength: Array
     top: Array
+    corrects: Array
 
 
 def _give_back(
@@ -145,7 +174,7 @@ def _give_back(
 ) -> tuple[Array, Array, Array | None]:
     """Return stress, elastic strain and tangent of trial strains ``(n, m)`` that yield."""
     n, m = strain.shape
-    bulk, shear, eta, flow, strength, top = constants
+    bulk, shear, eta, flow, strength, top, corrects = constants
     mean, dev = bulk * trace(strain), deviator(strain)
     size = norm(dev)
     root = np.sqrt(2.0) * shear * size
@@ -162,7 +191,8 @@ def _give_back(
     ratio = np.divide(q, root, out=np.ones(n), where=root > 0.0)
     ratio = np.where(cap & ~held & (root == 0.0), 0.0, ratio)
     elastic = ratio[:, None] * dev
-    elastic[:, :3] += (p / (3.0 * bulk))[:, None]
+    volume = np.where(cap & (corrects != 0.0), trace(strain), p / bulk)
+    elastic[:, :3] += (volume / 3.0)[:, None]
     stress = (2.0 * shear * ratio)[:, None] * dev
     stress[:, :3] += p[:, None]
     if not tangent:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple, Self
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
-from .base import Field, Integration, Parameter, State, check_parameter
+from .base import Field, Integration, Parameter, State, Update, check_parameter
 from .elastic import IsotropicElastic
 from .mandel import to_tensor
 from .principal import axes_in_order, from_axes, shear_quotients, tangent_from_axes
@@ -25,10 +26,14 @@ Array = NDArray[np.float64]
 class FrictionalMaterial(IsotropicElastic):
     """What laws with cohesion and angles of friction and dilation have in common.
 
-    Hencky elasticity at finite strain, perfect plasticity; the state holds the accumulated
-    plastic strain, the sum of sqrt(2/3) |d eps_p|, as ``"plastic_strain"``, shape ``(n,)``.
+    Hencky elasticity at finite strain; the state holds the accumulated plastic strain kappa, the
+    sum of sqrt(2/3) |d eps_p|, as ``"plastic_strain"``, shape ``(n,)``. Plasticity is perfect, or
+    softens: cohesion and angle of friction fall as c_r + (c - c_r) exp(-decay kappa). A step has
+    the strength of its beginning, so returns stay closed forms and tangents exact.
 
     Attributes:
+        volume_correction: Whether volume that opens at the apex closes again before there is
+            pressure.
         symmetric: Whether flow is associated: both angles are the same number or object.
         yield_tolerance: Excess of the yield function over the strength that counts as round-off.
     """
@@ -45,6 +50,9 @@ class FrictionalMaterial(IsotropicElastic):
             "friction_angle": {"least": 0.0, "below": 90.0},
             "dilation_angle": {"least": 0.0, "below": 90.0},
             "tension_cutoff": {"least": 0.0},
+            "cohesion_residual": {"least": 0.0},
+            "friction_residual": {"least": 0.0, "below": 90.0},
+            "decay": {"least": 0.0},
         }
     )
     yield_tolerance: ClassVar[float] = 1e-13
@@ -57,6 +65,11 @@ class FrictionalMaterial(IsotropicElastic):
         friction_angle: ArrayLike | Field,
         dilation_angle: ArrayLike | Field = 0.0,
         tension_cutoff: ArrayLike | Field | None = None,
+        *,
+        cohesion_residual: ArrayLike | Field | None = None,
+        friction_residual: ArrayLike | Field | None = None,
+        decay: ArrayLike | Field | None = None,
+        volume_correction: bool = False,
     ) -> None:
         """Set the parameters.
 
@@ -70,9 +83,18 @@ class FrictionalMaterial(IsotropicElastic):
                 tangent symmetric.
             tension_cutoff: Largest tension that is borne, in units of stress; ``None``: as far as
                 cohesion and friction go.
+            cohesion_residual: Cohesion after much plastic strain; ``None``: as before.
+            friction_residual: Angle of friction after much plastic strain; ``None``: as before.
+                The angle of dilation falls with it where it is larger.
+            decay: How fast strength falls: by 1/e in a plastic strain of 1/decay.
+            volume_correction: Whether volume that opens at the apex (or at the corner of the
+                cut-off on the hydrostatic axis) is kept in mind, and closes again at the stress
+                of the apex, before there is pressure: for soils that part and come together
+                again. Without it, it is plastic and stays.
 
         Raises:
-            MPMError: A value is out of range.
+            MPMError: A value is out of range; a residual strength without decay, decay without a
+                residual strength, or one that is larger than the strength at first.
         """
         super().__init__(young, poisson)
         given: dict[str, Any] = {
@@ -80,14 +102,48 @@ class FrictionalMaterial(IsotropicElastic):
             "friction_angle": friction_angle,
             "dilation_angle": dilation_angle,
         }
-        if tension_cutoff is not None:
-            given["tension_cutoff"] = tension_cutoff
+        optional = {
+            "tension_cutoff": tension_cutoff,
+            "cohesion_residual": cohesion_residual,
+            "friction_residual": friction_residual,
+            "decay": decay,
+        }
+        given |= {name: value for name, value in optional.items() if value is not None}
         checked = {name: check_parameter(name, v, **self.limits[name]) for name, v in given.items()}
         self.parameters = {**self.parameters, **checked}
         friction, dilation = (checked[angle] for angle in _ANGLES)
         numbers = isinstance(friction, float) and isinstance(dilation, float)
         self.symmetric = friction == dilation if numbers else friction_angle is dilation_angle
         _require_less_dilation(checked["friction_angle"], checked["dilation_angle"])
+        _require_softening(checked)
+        self.volume_correction = bool(volume_correction)
+
+    def softened(self, plastic_strain: Array) -> Self:
+        """Return the law with the strength after accumulated plastic strains, shape ``(n,)``.
+
+        It does not soften any more; a law that does not soften is returned as it is.
+        """
+        if "decay" not in self.parameters:
+            return self
+        left = np.exp(-self.parameters["decay"] * plastic_strain)
+        values = dict(self.parameters)
+        del values["decay"]
+        for name, residual in _RESIDUALS.items():
+            if residual in values:
+                last = values.pop(residual)
+                values[name] = last + (values[name] - last) * left
+        friction, dilation = (values[angle] for angle in _ANGLES)
+        values["dilation_angle"] = np.minimum(dilation, friction)
+        other = copy.copy(self)
+        other.parameters = values
+        return other
+
+    def update(self, displacement_gradient: Array, state: State, tangent: bool = True) -> Update:
+        """See :meth:`Material.update`."""
+        if "decay" in self.parameters:
+            law = self.softened(state["plastic_strain"])
+            return law.update(displacement_gradient, state, tangent)
+        return super().update(displacement_gradient, state, tangent)
 
     def with_parameters(self, **parameters: Parameter) -> Self:
         """See :meth:`Material.with_parameters`."""
@@ -103,17 +159,20 @@ class FrictionalMaterial(IsotropicElastic):
     def weakened(self, factor: float) -> Self:
         """See :meth:`Material.weakened`.
 
-        c, tan(phi) and a cut-off are divided; psi stays what it is, up to phi.
+        c, tan(phi), their residual values and a cut-off are divided; psi stays what it is, up to
+        phi.
         """
-        friction, dilation = (self.parameters[angle] for angle in _ANGLES)
-        reduced = np.degrees(np.arctan(np.tan(np.radians(friction)) / factor))
-        values: dict[str, Any] = {
-            "cohesion": self.parameters["cohesion"] / factor,
-            "friction_angle": reduced,
-            "dilation_angle": np.minimum(dilation, reduced),
-        }
-        if "tension_cutoff" in self.parameters:
-            values["tension_cutoff"] = self.parameters["tension_cutoff"] / factor
+        values: dict[str, Any] = {}
+        for name in ("cohesion", "cohesion_residual", "tension_cutoff"):
+            if name in self.parameters:
+                values[name] = self.parameters[name] / factor
+        for name in ("friction_angle", "friction_residual"):
+            if name in self.parameters:
+                slope = np.tan(np.radians(self.parameters[name])) / factor
+                values[name] = np.degrees(np.arctan(slope))
+        values["dilation_angle"] = np.minimum(
+            self.parameters["dilation_angle"], values["friction_angle"]
+        )
         known = {n: v if isinstance(v, np.ndarray) else float(v) for n, v in values.items()}
         return self.with_parameters(**known)
 
@@ -133,6 +192,25 @@ class FrictionalMaterial(IsotropicElastic):
 
 
 _ANGLES = ("friction_angle", "dilation_angle")
+_RESIDUALS = {"cohesion": "cohesion_residual", "friction_angle": "friction_residual"}
+
+
+def _require_softening(parameters: Mapping[str, Parameter]) -> None:
+    """Raise an error where what is said of softening is not whole, or is hardening."""
+    residuals = [name for name in _RESIDUALS.values() if name in parameters]
+    if ("decay" in parameters) != bool(residuals):
+        raise MPMError(
+            "Softening needs decay and a residual strength, cohesion_residual or "
+            f"friction_residual; given: {', '.join(residuals) or 'decay'}."
+        )
+    for name, residual in _RESIDUALS.items():
+        first, last = parameters[name], parameters.get(residual, 0.0)
+        if not all(isinstance(value, float | np.ndarray) for value in (first, last)):
+            continue
+        if np.shape(first) and np.shape(last) and np.shape(first) != np.shape(last):
+            continue  # said where they are used
+        if np.any(np.asarray(last) > np.asarray(first)):
+            raise MPMError(f"{residual} is larger than {name}; give at most that.")
 
 
 def _require_less_dilation(friction: Any, dilation: Any) -> None:
@@ -170,21 +248,26 @@ class MohrCoulomb(FrictionalMaterial):
         The larger one of (s1 - s3)/2 + (s1 + s3)/2 sin(phi) - c cos(phi) and s1 less the
         cut-off.
         """
+        if "decay" in self.parameters:
+            return self.softened(plastic_strain).yield_function(stress, plastic_strain)
         largest, smallest = np.linalg.eigvalsh(to_tensor(stress))[:, [2, 0]].T
         sine, _, cosine = self._sines()
         shear = 0.5 * (largest - smallest) + 0.5 * (largest + smallest) * sine
-        return np.asarray(
-            np.maximum(shear - self.parameters["cohesion"] * cosine, largest - self._tension())
-        )
+        strength = self.parameters["cohesion"] * cosine
+        return np.asarray(np.maximum(shear - strength, largest - self._tension()))
 
     def _constants(self) -> tuple[Parameter, ...]:
-        """Return the moduli, sin(phi), sin(psi), 2 c cos(phi), and the cut-off."""
+        """Return the moduli, sin(phi), sin(psi), 2 c cos(phi), the cut-off, and the correction."""
         friction, dilation, cosine = self._sines()
         strength = 2.0 * self.parameters["cohesion"] * cosine
-        return self.bulk, self.shear, friction, dilation, strength, self._tension()
+        corrects = float(self.volume_correction)
+        return self.bulk, self.shear, friction, dilation, strength, self._tension(), corrects
 
     def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
         """See :meth:`StrainMaterial.integrate`."""
+        if "decay" in self.parameters:
+            softer = self.softened(variables["plastic_strain"])
+            return softer.integrate(trial_strain, variables, tangent)
         n, m = trial_strain.shape
         stress = self.elastic_stress(trial_strain)
         D = self.elastic_tangent(n, m) if tangent else None
@@ -220,6 +303,9 @@ class Tresca(MohrCoulomb):
         poisson: ArrayLike | Field,
         cohesion: ArrayLike | Field,
         tension_cutoff: ArrayLike | Field | None = None,
+        *,
+        cohesion_residual: ArrayLike | Field | None = None,
+        decay: ArrayLike | Field | None = None,
     ) -> None:
         """Set the parameters.
 
@@ -228,11 +314,22 @@ class Tresca(MohrCoulomb):
             poisson: Poisson's ratio.
             cohesion: Shear strength, half the uniaxial one, in units of stress.
             tension_cutoff: Largest tension that is borne, in units of stress; ``None``: any.
+            cohesion_residual: Cohesion after much plastic strain; ``None``: as before.
+            decay: How fast it falls: by 1/e in a plastic strain of 1/decay.
 
         Raises:
-            MPMError: A value is out of range.
+            MPMError: A value is out of range; see :class:`FrictionalMaterial`.
         """
-        super().__init__(young, poisson, cohesion, 0.0, 0.0, tension_cutoff)
+        super().__init__(
+            young,
+            poisson,
+            cohesion,
+            0.0,
+            0.0,
+            tension_cutoff,
+            cohesion_residual=cohesion_residual,
+            decay=decay,
+        )
 
 
 class _Answer(NamedTuple):
@@ -268,6 +365,7 @@ class _Law(NamedTuple):
     dilation: Array
     strength: Array
     tension: Array
+    corrects: Array
 
     @classmethod
     def of(cls, constants: tuple[Parameter, ...], n: int) -> Self:
@@ -335,6 +433,7 @@ class _Law(NamedTuple):
         if neither.any():
             law, corner = self.at(neither), np.broadcast_to(apex[neither], (3, neither.sum()))
             part = law.at_stress(strain[:, neither], (0, 1, 2), corner)
+            part = law.with_volume(strain[:, neither], part)
             for mine, theirs in zip(answer, part, strict=True):
                 mine[..., neither] = theirs
         return answer
@@ -374,6 +473,14 @@ class _Law(NamedTuple):
         normal = free * (lame * slope + shear * np.eye(3)[:, :, None])
         return _Answer(stress, elastic, normal)
 
+    def with_volume(self, strain: Array, answer: _Answer) -> _Answer:
+        """Return the answer at a point of the hydrostatic axis, with the volume correction.
+
+        What opens there stays in the elastic strain, to close again before there is pressure.
+        """
+        third = np.broadcast_to(strain.sum(axis=0) / 3.0, strain.shape)
+        return answer._replace(elastic=np.where(self.corrects != 0.0, third, answer.elastic))
+
     def to_cutoff(self, strain: Array) -> _Answer:
         """Return strains to the cut-off, its edges and corners: what fits best, or fits."""
         t = self.tension
@@ -403,6 +510,8 @@ class _Law(NamedTuple):
                 4: (p[2], -p[0], -p[1], -ratio * p[2] - p[0] - p[1]),
                 5: (p[1], p[2], -ratio * (p[1] + p[2]) - p[0]),
             }[number]
+            if number == 2:
+                candidate = self.with_volume(strain, candidate)
             misfit = np.max(misfits, axis=0)
             better = misfit < best
             best = np.where(better, misfit, best)

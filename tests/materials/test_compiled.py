@@ -37,6 +37,19 @@ LAWS = {
     ),
     "cam clay": ModifiedCamClay(0.2, 0.04, 1.2, 300.0, 20.0, 5.0),
     "cam clay by point": ModifiedCamClay(0.2, 0.04, SPREAD, 300.0, 20.0 * SPREAD, 10.0 * SPREAD),
+    "mohr-coulomb, corrected and softening by point": MohrCoulomb(
+        *(1e3, 0.3, 2.0 * SPREAD, 20.0 * SPREAD, 5.0 * SPREAD, 0.5 * SPREAD),
+        cohesion_residual=SPREAD,
+        friction_residual=2.0,
+        decay=10.0 * SPREAD,
+        volume_correction=True,
+    ),
+    "drucker-prager, corrected and softening": DruckerPrager(
+        *(1e3, 0.3, 2.0, 30.0, 10.0),
+        cohesion_residual=0.5,
+        decay=20.0,
+        volume_correction=True,
+    ),
     "drucker-prager": DruckerPrager(1e3, 0.3, 2.0, 30.0, 10.0, match="plane_strain"),
     "drucker-prager without cohesion": DruckerPrager(1e3, 0.3, 0.0, 30.0),
     "drucker-prager by point, cut off": DruckerPrager(

@@ -9,7 +9,7 @@ import pytest
 from marks import slow, thinned
 from materials.reference import moduli, rotation
 from materials.test_von_mises import random_path
-from scenes import QUADRILATERAL, at, box, fix, vectors
+from scenes import QUADRILATERAL, at, box, everywhere, fix, vectors
 from scipy.linalg import logm
 from scipy.optimize import brentq
 
@@ -38,6 +38,18 @@ LAWS = {
     "cone, cut": DruckerPrager(*ELASTIC, COHESION, 30.0, 10.0, tension_cutoff=3.0),
     "cone, no cohesion": DruckerPrager(*ELASTIC, 0.0, 30.0, 10.0),
     "cone, no friction": DruckerPrager(*ELASTIC, COHESION, 0.0),
+    "no cohesion, corrected": MohrCoulomb(*ELASTIC, 0.0, 35.0, volume_correction=True),
+    "cut, corrected": MohrCoulomb(
+        *ELASTIC, COHESION, 30.0, 10.0, tension_cutoff=3.0, volume_correction=True
+    ),
+    "cone, corrected": DruckerPrager(*ELASTIC, COHESION, 30.0, volume_correction=True),
+}
+SOFTENING = {
+    "pyramid": MohrCoulomb(
+        *ELASTIC, COHESION, 30.0, 10.0, cohesion_residual=2.0, friction_residual=20.0, decay=50.0
+    ),
+    "tresca": Tresca(*ELASTIC, COHESION, cohesion_residual=2.0, decay=50.0),
+    "cone": DruckerPrager(*ELASTIC, COHESION, 30.0, friction_residual=5.0, decay=20.0),
 }
 PYRAMIDS = [name for name, law in LAWS.items() if isinstance(law, MohrCoulomb)]
 
@@ -117,7 +129,7 @@ def test_principal_return_against_all_active_sets(law):
         seen.add(active)
     friction = material.parameters["friction_angle"] or "tension_cutoff" in material.parameters
     assert seen >= ({0, 1, 2, 3} if friction else {0, 1, 2})
-    if law == "no cohesion":
+    if law.startswith("no cohesion"):
         assert (np.abs(answer.stress).max(axis=1) < 1e-9).sum() > 50
 
 
@@ -146,7 +158,7 @@ def test_tangents_at_plane_edges_and_apex(law, region, m):
     Q = rotation(0.7, (1.0, 2.0, 3.0) if m == 6 else (0.0, 0.0, 1.0))
     for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0]) if m == 4 else ([0, 1, 2],):
         values = np.array(REGIONS[region])[order]
-        if law == "no cohesion" or law == "cone, no cohesion":
+        if material.parameters["cohesion"] == 0.0:
             values = values - (0.0 if "apex" in region else 4e-4)
         strain = mandel.to_vector((Q * values @ Q.T)[None], 2 if m == 4 else 3)
         answer = integrated(material, strain, tangent=True)
@@ -364,6 +376,106 @@ def test_symmetry_is_that_of_associated_flow():
 def test_bad_parameters(law, arguments, message):
     with pytest.raises(MPMError, match=message):
         law(*ELASTIC, *arguments)
+
+
+@pytest.mark.parametrize(("dim", "cut"), [(2, None), (3, None), (3, 3.0)])
+@pytest.mark.parametrize("law", [MohrCoulomb, DruckerPrager])
+def test_volume_that_opens_closes_again(law, dim, cut):
+    """What opens at the apex, and is sheared there, has the pressure of its volume afterwards."""
+    tear, shear = 0.06 * np.eye(3), np.zeros((3, 3))
+    if cut is None:  # a cut-off bears shear
+        tear[0, 0], tear[2, 2], shear[0, 1] = 0.1, 0.0, 0.05
+    tear, shear = tear[:dim, :dim], (tear + shear)[:dim, :dim]
+    close = -0.004 * np.eye(dim)
+    for corrects in (True, False):
+        material = law(*ELASTIC, COHESION, 30.0, 0.0, cut, volume_correction=corrects)
+        state = material.initial_state(1, dim)
+        top = COHESION / np.tan(PHI) if cut is None else cut
+        for H in (tear, shear):
+            state = material.update(H[None], state).state
+            np.testing.assert_allclose(state["stress"][0, :3], top, rtol=1e-12)
+        stress = material.update(close[None], state).state["stress"][0]
+        pressure = -stress[:3].sum() / 3.0
+        volume = np.log(np.linalg.det(np.eye(dim) + close))
+        opened = np.log(np.linalg.det(np.eye(dim) + shear))
+        left = volume if corrects else volume - opened + top / K
+        assert abs(pressure / (-K * left) - 1.0) < 1e-10
+
+
+@pytest.mark.parametrize("name", SOFTENING)
+def test_softening_ends_at_the_residual_strength_with_an_error_of_first_order(name):
+    """A step has the strength of its beginning; the tangent is exact, and f falls with the step."""
+    material = SOFTENING[name]
+    assert check_tangent(material, 2, strain=2e-2, points=200, steps=3) < 1e-6
+    excess = []
+    for steps in (20, 40, 80):
+        state, worst = material.initial_state(1, 2), 0.0
+        for t in np.linspace(0.0, 1.0, steps + 1)[1:]:
+            H = np.diag([0.012 * t, -0.012 * t])[None]
+            before = material.softened(state["plastic_strain"])
+            state = material.update(H, state).state
+            kappa = state["plastic_strain"]
+            assert abs(before.yield_function(state["stress"], kappa)[0]) < 1e-9 or t < 0.3
+            worst = max(worst, material.yield_function(state["stress"], kappa)[0])
+        excess.append(worst)
+    assert 1.6 < excess[0] / excess[1] < 2.4 and 1.8 < excess[1] / excess[2] < 2.2
+    H = np.diag([1.5, -0.6])[None]
+    for _ in range(3):
+        state = material.update(H, state).state
+    last = {n.replace("_residual", ""): v for n, v in material.parameters.items() if "resid" in n}
+    angle = last.get("friction", material.parameters["friction_angle"])
+    residual = material.with_parameters(
+        cohesion=last.get("cohesion", COHESION),
+        friction_angle=angle,
+        dilation_angle=min(angle, material.parameters["dilation_angle"]),
+        decay=0.0,
+    )
+    assert abs(residual.yield_function(state["stress"], np.zeros(1))[0]) < 1e-6
+
+
+def test_softening_of_a_body_follows_functions_and_is_weakened():
+    """A block in pure shear: the stress of its points is that of an element test."""
+    V = vectors(box([0.0, 0.0], [1.5, 1.5], [3, 3], QUADRILATERAL))
+    body = box([0.0, 0.0], [1.0, 1.0], [4, 4], QUADRILATERAL)
+    residual = fem.Constant(body, 2.0)
+    law = Tresca(*ELASTIC, COHESION, cohesion_residual=residual, decay=100.0)
+    every, moved = everywhere(V)
+    particles = mpm.Particles(body, V)
+    problem = mpm.QuasiStaticProblem(particles, law, bcs=[every])
+
+    def squeeze(t):
+        moved.interpolate(lambda x: (0.02 * t * x[0], -0.02 * t * x[1]))
+
+    problem.solve(10, update=squeeze)
+    element = Tresca(*ELASTIC, COHESION, cohesion_residual=2.0, decay=100.0)
+    state = element.initial_state(1, 2)
+    for step in range(1, 11):  # each moves where the last one has led to
+        H = np.diag([1.002**step - 1.0, 0.998**step - 1.0])[None]
+        state = element.update(H, state).state
+    cauchy = element.cauchy_stress(H, state)[0]
+    np.testing.assert_allclose(
+        particles.stress, np.tile(cauchy, (len(particles.stress), 1, 1)), atol=1e-9
+    )
+    assert np.allclose(particles.plastic_strain, state["plastic_strain"])
+
+    weak = element.weakened(2.0).parameters
+    assert weak["cohesion"] == 5.0 and weak["cohesion_residual"] == 1.0
+    weak = SOFTENING["pyramid"].weakened(2.0).parameters
+    assert abs(np.tan(np.radians(weak["friction_residual"])) - np.tan(np.pi / 9) / 2.0) < 1e-15
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"decay": 1.0}, "Softening needs decay and a residual strength"),
+        ({"friction_residual": 20.0}, "given: friction_residual"),
+        ({"cohesion_residual": 2.0, "decay": 1.0}, "cohesion_residual is larger than cohesion"),
+        ({"friction_residual": 20.0, "decay": -1.0}, "decay is -1"),
+    ],
+)
+def test_bad_softening(options, message):
+    with pytest.raises(MPMError, match=message):
+        MohrCoulomb(*ELASTIC, 1.0, 30.0, **options)
 
 
 @pytest.mark.parametrize("axisymmetric", [False, True])
