@@ -247,12 +247,21 @@ class Stepper:
                 last = now
                 if step is not None:
                     yield step
+                    self._require_governing(run)
             self.run = None
             self._warn_of_outside()
             if interrupted(comm, last.left):
                 self._leave()
         if hold.left:
             raise KeyboardInterrupt
+
+    def _require_governing(self, run: Run) -> None:
+        """Raise an error where something else was begun between two steps of a run."""
+        if self.run is not run:
+            raise MPMError(
+                "This run cannot go on: a step, a stage or another run was begun, or a checkpoint "
+                "restored, between two of its steps; leave its loop before."
+            )
 
     def _try(
         self, run: Run, update: Path | None, control: DisplacementControl | None
@@ -352,23 +361,23 @@ class Stepper:
         """Make one increment to the present values: see :meth:`ParticleProblem.step`."""
         owner = self.owner
         with held() as hold:
-            self.run = None
-            self.converged.parameter = self.converged.load
+            before = self.run, self.converged.parameter
+            self.run, self.converged.parameter = None, self.converged.load
             try:
                 load = float(owner.bodies[0].load.value)
                 self._set_load(load, self.converged.proportional)
                 step = self._advance(load, self._totals())
                 assert step is not None
-            except Interrupted:
+            except BaseException as error:
                 self.go_back()
-                self._leave()
-            except MPMError as error:
-                self.go_back()
+                reached = self.converged.parameter
+                self.run, self.converged.parameter = before
+                if isinstance(error, Interrupted):
+                    self._leave()
+                if not isinstance(error, MPMError):
+                    raise
                 owner.history.failed_iterations += self.newton.iterations
-                raise placed(error, self._reduced, self.converged.parameter) from error.__cause__
-            except BaseException:
-                self.go_back()
-                raise
+                raise placed(error, self._reduced, reached) from error.__cause__
             self._end_step(owner)
             if interrupted(self._comm):
                 self._leave()

@@ -469,3 +469,28 @@ def test_nodes_that_would_cross_the_axis(cell):
     for problem in (disc(True, 300.0), disc(False, -30.0)):
         problem.solve(steps=2)
         assert problem.particles.node_positions[:, 0].min(initial=0.0) > -1e-12
+
+
+@pytest.mark.parametrize("begun", ["solve", "step", "steps", "stage", "remove", "restore"])
+def test_run_in_whose_loop_something_else_is_begun(begun, mpi_tmp_path):
+    """Before, the load went 0.5, 1.0, 0.75, and what was removed was let go at once."""
+    problem = scenes.block()
+    problem.save(mpi_tmp_path / "first.npz")
+    run = problem.steps(4)
+    next(run), next(run)
+    if begun == "remove":
+        problem.remove([0])
+    elif begun == "restore":
+        problem.restore(mpi_tmp_path / "first.npz")
+    elif begun == "solve":
+        problem.solve(2)
+    elif begun == "steps":
+        next(problem.steps(2))
+    else:
+        getattr(problem, begun)()
+    before = problem.particles.displacement.x.array.copy()
+    raises(lambda: next(run), mpm.MPMError, r"cannot go on: a step, a stage or another run")
+    np.testing.assert_array_equal(problem.particles.displacement.x.array, before)
+    if begun not in ("solve", "restore"):
+        problem.solve(2)
+        assert problem.history.load[-1] == 1.0
