@@ -15,6 +15,7 @@ import basix.ufl
 from dolfinx import fem
 
 from .. import _compat
+from .cells import cell_volumes
 
 __all__ = ["CellPairs"]
 
@@ -35,6 +36,7 @@ class CellPairs:
         index: Input index of each cell, those of other ranks last, shape ``(c,)``.
         nodes: Global nodes of V of each cell, shape ``(c, k)``.
         vertices: Geometry nodes of each cell, shape ``(c, m, gdim)``.
+        volumes: Volumes of the cells that this rank owns, areas in the plane.
     """
 
     def __init__(self, V: fem.FunctionSpace) -> None:
@@ -67,6 +69,7 @@ class CellPairs:
         self.index = self.with_others(_compat.input_cell_index(background))
         self.nodes = self.with_others(nodes)
         self.vertices = self.with_others(background.geometry.x[geometry, : background.geometry.dim])
+        self.volumes = cell_volumes(background)
 
     def _across(self, keys: NDArray[np.int64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return pairs with another rank's cell: own cell, that rank, its cell; shape ``(n, 3)``.

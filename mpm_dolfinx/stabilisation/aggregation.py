@@ -56,7 +56,7 @@ class Aggregation(Cure):
     def unknowns(self, touched: TouchedNodes, held: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """See :meth:`Cure.unknowns`: not those that follow a well filled cell."""
         cells, V = self._cells, self._V
-        support = CellFill.of(self._bodies, cells.num_own)
+        support = CellFill.of(self._bodies, cells)
         good = support.active & (support.fill.sum(axis=1) >= FILL)
         self._good = marked(V, cells.nodes[: cells.num_own][good])
         root = self._roots(good, support.active)

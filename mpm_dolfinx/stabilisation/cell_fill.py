@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dolfinx import la
 
 from ..background.basis import PointBasis
-from ..background.cells import cell_volumes
+from ..background.pairs import CellPairs
 from ..particles.particles import Particles
 
 __all__ = ["CellFill"]
@@ -33,7 +33,7 @@ class CellFill(NamedTuple):
     active: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, bodies: Sequence[Particles], count: int) -> CellFill:
+    def of(cls, bodies: Sequence[Particles], pairs: CellPairs) -> CellFill:
         """Look at bodies at their last converged positions (collective).
 
         The volume is that of the history's quadrature points in the cell. A body may also
@@ -42,9 +42,9 @@ class CellFill(NamedTuple):
 
         Args:
             bodies: The bodies.
-            count: Number of background cells that this rank owns.
+            pairs: The cells of the background.
         """
-        V = bodies[0].V
+        V, count = bodies[0].V, pairs.num_own
         comm: MPI.Comm = V.mesh.comm
         volume = np.zeros((count, len(bodies)))
         used = np.zeros(count, dtype=np.uint64)
@@ -66,7 +66,7 @@ class CellFill(NamedTuple):
         known.scatter_forward()
         alone = ((known.array[own] == 0.0) * bit).sum(axis=1, dtype=np.uint64)
         active = filled | ((used & alone) != 0)
-        return cls(volume / cell_volumes(V.mesh)[:, None], active)
+        return cls(volume / pairs.volumes[:, None], active)
 
 
 def _sent(

@@ -25,6 +25,8 @@ __all__ = ["GhostPenalty"]
 
 #: Ghost penalty over shear modulus / cell size^2.
 PENALTY = 1e-4
+#: Shapes of pairs whose matrices are kept; an unstructured background has as many as pairs.
+MOST_SHAPES = 1000
 
 
 class GhostPenalty(Cure):
@@ -48,6 +50,7 @@ class GhostPenalty(Cure):
         self._V = bodies[0].V
         self._least = least * sum(_num_nodes(body) for body in bodies)
         self._acts = False
+        self._known: dict[bytes, NDArray[np.float64]] = {}
 
     @cached_property
     def _cells(self) -> CellPairs:
@@ -75,7 +78,7 @@ class GhostPenalty(Cure):
     def _choose(self) -> None:
         """Find the pairs of cells that are tied together."""
         cells = self._cells
-        support = CellFill.of(self._bodies, cells.num_own)
+        support = CellFill.of(self._bodies, cells)
         fill, active = cells.with_others(support.fill), cells.with_others(support.active)
         a, b = cells.pairs.T
         least = np.minimum(fill[a].sum(axis=1), fill[b].sum(axis=1))
@@ -101,7 +104,7 @@ class GhostPenalty(Cure):
         return blocked(self._V, rows.ravel(), columns.ravel(), values.ravel(), bs)
 
     def _penalties(self, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the matrices of pairs of cells, each shape of a pair once computed.
+        """Return the matrices of pairs of cells, each shape of a pair computed once for all.
 
         Args:
             vertices: Geometry nodes of both cells, shape ``(n, 2, m, gdim)``.
@@ -111,7 +114,17 @@ class GhostPenalty(Cure):
         shape = (vertices - vertices[:, :1, :1]) / size[:, None, None, None]
         keys = np.round(shape.reshape(n, vertices[:1].size), 9)
         _, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        each = self._unit_penalties(shape[first])[which.reshape(-1)]
+        names = [key.tobytes() for key in keys[first]]
+        new = [i for i, name in enumerate(names) if name not in self._known]
+        if len(new) > 0:
+            if len(self._known) + len(new) > MOST_SHAPES:
+                self._known, new = {}, list(range(len(names)))
+            matrices = self._unit_penalties(shape[first[new]])
+            self._known.update(zip([names[i] for i in new], matrices, strict=True))
+        if n == 0:
+            k = 2 * self._cells.nodes.shape[1]
+            return np.zeros((0, k, k))
+        each = np.stack([self._known[name] for name in names])[which.reshape(-1)]
         return np.asarray(each * (size ** (gdim - 2))[:, None, None])
 
     def _unit_penalties(self, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
