@@ -55,6 +55,10 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         out_of_range: ``"project"`` or ``"reflect"``; no matter with ``scheme="euler"``.
         rayleigh: Damping ``(alpha, beta)`` in proportion to mass (one over a time) and to the
             stiffness of the undeformed bodies (a time); not negative.
+        after: A quasi-static problem of the same particles, from the state of which the motion
+            begins: equilibrium under loads and supports that should be given here too. Points
+            whose material is the same object go on with its history, others carry their stress.
+            That problem cannot go on then.
         terms: As in :class:`QuasiStaticProblem`.
         **options: All else that :class:`QuasiStaticProblem` has but ``background`` and
             ``predictor``: ``body_force``, ``bcs``, ``tractions``, ``supports``, ``f_bar``, ...
@@ -76,10 +80,13 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         scheme: str = "midpoint",
         out_of_range: str = "project",
         rayleigh: tuple[float, float] = (0.0, 0.0),
+        after: QuasiStaticProblem | None = None,
         terms: Sequence[Term] = (),
         **options: Any,
     ) -> None:
         bodies = as_bodies(particles)
+        if after is not None:
+            self._require_before(after, bodies, options)
         require_same(
             bodies[0].V.mesh.comm,
             velocity=velocity,
@@ -104,8 +111,35 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         )
         self.history.energies = self._energies
         self.inertia.settle()
+        if after is not None:
+            for points, before in zip(self.points, after.points, strict=True):
+                points.take_over(before)
 
     _gradual = False
+
+    @staticmethod
+    def _require_before(
+        after: QuasiStaticProblem, bodies: Sequence[Particles], options: dict[str, Any]
+    ) -> None:
+        """Raise an error unless a motion of these bodies can begin with the state of a problem."""
+        if not isinstance(after, QuasiStaticProblem) or isinstance(after, MovingProblem):
+            raise MPMError(
+                f"after= needs a QuasiStaticProblem of these particles, not a "
+                f"{type(after).__name__}."
+            )
+        same = len(after.bodies) == len(bodies) and all(
+            one is other for one, other in zip(after.bodies, bodies, strict=True)
+        )
+        if not same:
+            raise MPMError("after= needs a problem of the same particles, in the same order.")
+        if options.get("mixed") is not None or after.setup.mixed is not None:
+            raise MPMError("after= does not go with mixed='pressure'; use f_bar=.")
+        if options.get("initial_stress") is not None:
+            raise MPMError("after= brings its stress with it; leave initial_stress= out.")
+        for name, default in (("axisymmetric", False), ("f_bar", "none")):
+            its = getattr(after.setup, name)
+            if options.get(name, default) != its:
+                raise MPMError(f"after= is a problem with {name}={its!r}; give the same here.")
 
     def add(self, particles: Particles, *args: Any, velocity: Any = None, **options: Any) -> None:
         """Add a body: see :meth:`QuasiStaticProblem.add`; what changes does so at once.

@@ -734,6 +734,89 @@ def test_two_fields_fly_apart_as_if_each_were_alone():
             )
 
 
+def resting(law, **options):
+    """Return a body that stands on a floor in equilibrium, its problem, and what it is made with.
+
+    The weight makes a von Mises body yield at its foot.
+    """
+    V = vectors(box([0.0, 0.0], [3.0, 1.5], [12, 6], QUADRILATERAL))
+    bcs = [fix(V, at(1, 0.0), component=1), fix(V, at(0, 0.0), component=0)]
+    body = box([0.0, 0.0], [1.0, 1.0], [8, 8], options.pop("cell", TRIANGLE))
+    particles = mpm.Particles(body, V, quadrature_degree=options.pop("quadrature_degree", None))
+    given = {"body_force": (0.0, -1.0), "bcs": bcs, "petsc_options": {"snes_rtol": 1e-12}}
+    more = options.pop("more", 0)
+    static = mpm.QuasiStaticProblem(particles, law, 2.0, **given, **options)
+    static.solve(4)
+    for _ in range(more):
+        static.step()  # what is in equilibrium in one step's cells is so in the next one's
+    return particles, static, {**given, **options}
+
+
+@pytest.mark.parametrize(("scheme", "out"), SCHEMES)
+@pytest.mark.parametrize("f_bar", ["none", "domain"])
+def test_a_body_in_equilibrium_stays_at_rest(scheme, out, f_bar):
+    law = VonMises(40.0, 0.3, rho_y=1.0)
+    options = {} if f_bar == "none" else {"f_bar": f_bar, "quadrature_degree": 2}
+    particles, static, given = resting(law, **options, cell=QUADRILATERAL, more=8)
+    settled = nodal(particles.displacement).copy()
+    yielded = particles.plastic_strain.copy()
+    weight = static.reaction(given["bcs"][0])
+    problem = mpm.DynamicProblem(
+        particles, law, 2.0, scheme=scheme, out_of_range=out, after=static, **given
+    )
+    np.testing.assert_array_equal(particles.plastic_strain, yielded)
+    history = problem.solve(0.5, 0.1)
+    assert WORLD.allreduce(float(yielded.sum())) > 1e-3
+    assert largest(nodal(particles.displacement) - settled) < 1e-9
+    assert problem.kinetic_energy < 1e-16
+    np.testing.assert_allclose(problem.reaction(given["bcs"][0]), weight, rtol=1e-8)
+    assert history.energies[0].strain > 0.0
+    assert history.energies[0].time == 0.0
+    raises(static.step, mpm.MPMError, "Another problem was made of these particles")
+
+
+def test_a_body_let_go_from_equilibrium_moves_as_its_energy_says():
+    # Without weight the body springs up: what it stored is in motion and strain.
+    law = Hencky(40.0, 0.3)
+    particles, static, given = resting(law)
+    given["body_force"] = None
+    problem = mpm.DynamicProblem(
+        particles, law, 2.0, scheme="conserving", out_of_range="reflect", after=static, **given
+    )
+    history = problem.solve(0.3, 0.02)
+    first, last = history.energies[0], history.energies[-1]
+    assert first.kinetic == 0.0 and first.strain > 1e-3
+    assert last.kinetic > 0.3 * first.strain
+    assert last.kinetic + last.strain == pytest.approx(first.strain, rel=1e-9)
+
+
+def test_what_a_motion_cannot_begin_with_is_refused():
+    law = Hencky(40.0, 0.3)
+    particles, static, given = resting(law)
+    other, _, _ = resting(law)
+    for sentence, body, options in (
+        ("needs a QuasiStaticProblem", particles, {"after": particles}),
+        ("of the same particles", other, {}),
+        ("with f_bar='none'", particles, {"f_bar": "patch"}),
+        ("with axisymmetric=False", particles, {"axisymmetric": True}),
+        ("leave initial_stress= out", particles, {"initial_stress": lambda x: x}),
+        ("does not go with mixed=", particles, {"mixed": "pressure"}),
+    ):
+        every = {"after": static, **given, **options}
+        raises(
+            lambda body=body, every=every: mpm.DynamicProblem(body, law, 2.0, **every),
+            mpm.MPMError,
+            sentence,
+        )
+    static.step()  # nothing has changed
+    moving = mpm.DynamicProblem(particles, law, 2.0, after=static, **given)
+    raises(
+        lambda: mpm.DynamicProblem(particles, law, 2.0, after=moving, **given),
+        mpm.MPMError,
+        "needs a QuasiStaticProblem",
+    )
+
+
 def test_times_asked_for_are_hit_and_written(tmp_path):
     path = WORLD.bcast(tmp_path) / "run.pvd"
     problem = thrown()
