@@ -772,8 +772,10 @@ class Pair(Contact):
             Surface(body, some, tag, degree, axisymmetric, "A Pair")
             for body, some, tag in zip((a, b), facet_tags, tags, strict=True)
         ]
+        # (each pass bears its share: pressure has it by stiffness)
+        own = replace(law, cohesion=law.cohesion / passes, limit=law.limit / passes)
         self._passes = [
-            _Pass(self._surfaces[i], self._surfaces[1 - i], law, penalties, 1.0 / passes)
+            _Pass(self._surfaces[i], self._surfaces[1 - i], own, penalties, 1.0 / passes)
             for i in range(passes)
         ]
         self._made, self._begins = False, True

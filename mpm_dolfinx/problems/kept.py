@@ -153,8 +153,9 @@ class Functions(Kept):
         if elsewhere:
             raise MPMError(
                 "The residual holds data on another mesh than the body's "
-                f"({', '.join(elsewhere)}), which a checkpoint does not know; return them from converged_state() of an heir "
-                "of the problem, and take them in set_converged_state()."
+                f"({', '.join(elsewhere)}), which a checkpoint does not know; return them from "
+                "converged_state() of an heir of the problem, and take them in "
+                "set_converged_state()."
             )
         if missing:
             names = sorted(f.name for f in missing)

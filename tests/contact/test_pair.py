@@ -134,6 +134,17 @@ def test_forces_and_moments_of_friction_balance():
     assert not touch.sticks.all() and touch.touches.any()
 
 
+def test_cohesion_is_borne_once_by_two_passes():
+    dragged = []
+    for passes in (1, 2):
+        problem, touch, path = two(friction=contact.Coulomb(0.0, cohesion=0.5), passes=passes)
+        problem.solve(8, update=path)
+        dragged.append(problem.reaction(touch))
+    # along the width of the block; the rest is that of the ground that heaps up before it
+    assert dragged[1][0] == pytest.approx(-0.5 * 0.63, rel=0.15)
+    assert dragged[1] == pytest.approx(dragged[0], rel=0.03)
+
+
 @pytest.mark.parametrize("degree", [1, 2])
 def test_tangent_is_the_derivative_of_the_forces(degree):
     problem, touch, path = two(degree=degree)

@@ -32,6 +32,8 @@ class Run(NamedTuple):
         factor: The load factor at t.
         youngs: Young's modulus of each domain of each body, or that of all.
         second: What sets the loads at t in a second stage, or None.
+        contact: The contact, or None.
+        time: End and step of a motion, or None.
     """
 
     problem: Any
@@ -45,6 +47,8 @@ class Run(NamedTuple):
     factor: Any
     youngs: list[Any]
     second: Any = None
+    contact: Any = None
+    time: Any = None
 
 
 def grid(comm, lower, upper, n, cell, diagonal):
@@ -218,6 +222,45 @@ def make_material(data, stress):
     ), stress
 
 
+def shape_of(data):
+    """Return an obstacle."""
+    name, size, radius = data["shape"], data["size"], data["radius"]
+    if name == "plane":
+        return mpm.contact.plane(data["point"], data["normal"])
+    c = np.array(data["centre"])
+    if name == "disc":
+        kind = mpm.contact.disc if len(c) == 2 else mpm.contact.sphere
+        return kind(c, size)
+    if name == "cylinder":
+        return mpm.contact.cylinder(c, (0.0, 0.0, 1.0), size)
+    if name == "box":
+        return mpm.contact.box(c - size, c + size, radius)
+    if name == "polygon":
+        corners = c + size * np.array([[0.0, -1.0], [0.9, 0.2], [0.5, 1.0], [-0.6, 0.7]])
+        return mpm.contact.polygon(corners, radius)
+    if name == "cavity":
+        return mpm.contact.cavity(mpm.contact.disc(c, size))
+    assert name == "ellipse"
+
+    def capsule(y):
+        arm = y - c
+        arm = arm - np.clip(arm[:, :1], -0.4 * size, 0.4 * size) * np.array([1.0, 0.0])
+        return np.linalg.norm(arm, axis=1) - 0.6 * size
+
+    return mpm.contact.signed_distance(capsule, c)
+
+
+def make_contact(scene, bodies):
+    """Return the contact of a scene."""
+    data = scene["contact"]
+    law = mpm.contact.Coulomb(data["friction"], cohesion=data["cohesion"])
+    if "obstacle" in data:
+        shape = shape_of(data["obstacle"])
+        return mpm.contact.Rigid(bodies[0], shape, law, penalty=data["penalty"])
+    passes, penalty = data["passes"], data["penalty"]
+    return mpm.contact.Pair(bodies[1], bodies[0], law, passes=passes, penalty=penalty)
+
+
 def make(scene, comm) -> Run:
     """Return the problem of a scene (collective).
 
@@ -250,8 +293,19 @@ def make(scene, comm) -> Run:
         options["domain_update"] = scene["update"]
     if "domain_degree" in scene:
         options["degree"] = scene["domain_degree"]
-    bodies = [mpm.Particles(body, V, **options) for body in meshes]
-    held = supports(V, support, low, high, lower, h)
+    pair = "passes" in scene.get("contact", {})
+    spaces = [V for _ in meshes]
+    if pair:
+        spaces[1] = fem.functionspace(background, ("Lagrange", scene.get("degree", 1), (dim,)))
+    bodies = [mpm.Particles(body, W, **options) for body, W in zip(meshes, spaces, strict=True)]
+    if support == "press":
+        held = [
+            hold(V, lambda x: x[1] < low[1] + 0.5 * h),
+            hold(spaces[1], lambda x: x[1] > high[1] - 0.6 * h),
+        ]
+    else:
+        held = supports(V, support, low, high, lower, h)
+    touch = make_contact(scene, bodies) if "contact" in scene else None
     bcs = [bc for bc, _ in held]
     motion = length * np.array(scene.get("motion", [0.0] * dim))
     if held and "motion" in scene:
@@ -267,6 +321,10 @@ def make(scene, comm) -> Run:
     def update(t):
         for body in bodies:
             body.load.value = factor(t)
+        if touch is not None and "obstacle" in scene["contact"]:
+            touch.move(t * np.array(scene["contact"]["way"]), t * scene["contact"]["turn"])
+        elif support == "press":
+            held[-1][1].value[:] = t * np.array(scene["contact"]["way"])
         if "motion" in scene:
             held[-1][1].value[:] = factor(t) * motion
 
@@ -285,13 +343,25 @@ def make(scene, comm) -> Run:
         gravity[:] = (1.0 - t) * np.array(scene["weight"]) + t * np.array(scene["second_weight"])
         force.value[:] = gravity
 
-    problem = mpm.QuasiStaticProblem(
+    kind, more, time = mpm.QuasiStaticProblem, {}, None
+    if touch is not None:
+        more = {"terms": [touch]}
+    if "motion_of" in scene:
+        about, kind = scene["motion_of"], mpm.DynamicProblem
+        speeds = [(0.0, about["speed"])] + [(0.1 * about["speed"], 0.0)] * (len(bodies) - 1)
+        more |= {
+            "velocity": speeds if len(bodies) > 1 else speeds[0],
+            **{k: about[k] for k in ("scheme", "out_of_range")},
+        }
+        time = about["time"], about["time"] / scene["steps"]
+    problem = kind(
         bodies if len(bodies) > 1 else bodies[0],
         material,
         density=density,
         body_force=force,
         bcs=bcs,
         petsc_options_prefix=f"stress_{scene['number']}_",
+        **more,
         **scene.get("options", {}),
     )
     return Run(
@@ -302,8 +372,10 @@ def make(scene, comm) -> Run:
         material,
         young,
         bcs,
-        None if scene["path"] == "ramp" else update,
+        None if scene["path"] == "ramp" or time is not None else update,
         factor,
         youngs,
         second if "second_weight" in scene else None,
+        touch,
+        time,
     )

@@ -246,6 +246,23 @@ def elastic_stress(law, young, poisson, F):
     return stress, energy
 
 
+def distance(data, y):
+    """Return the signed distance of points from an obstacle, or None where it is not known here."""
+    name, size, radius = data["shape"], data["size"], data["radius"]
+    if name == "plane":
+        return (y - np.array(data["point"])) @ np.array(data["normal"])
+    arm = y - np.array(data["centre"])
+    if name == "cavity":
+        return size - np.linalg.norm(arm, axis=1)
+    if name in ("disc", "cylinder"):
+        return np.linalg.norm(arm[:, : 2 if name == "cylinder" else None], axis=1) - size
+    if name == "box":
+        over = np.abs(arm) - (size - radius)
+        inner = np.minimum(over.max(axis=1), 0.0)
+        return np.linalg.norm(np.maximum(over, 0.0), axis=1) + inner - radius
+    return None
+
+
 class Observer:
     """Follows a run step by step and judges what it leaves.
 
@@ -272,6 +289,7 @@ class Observer:
         self.f_bar = options.get("f_bar", "none")
         self._summed = (
             scene.get("outside") != "delete"
+            and "contact" not in scene
             and self.f_bar in ("none", "domain")
             and scene.get("degree", 1) == 1
             and options.get("stabilisation", "auto") == "auto"
@@ -310,6 +328,10 @@ class Observer:
             arrays[f"load {i}"] = np.array(body.load.value)
         for i, bc in enumerate(self.run.bcs):
             arrays[f"reaction {i}"] = self.run.problem.reaction(bc)
+        if (touch := self.run.contact) is not None:
+            arrays["contact"] = self.run.problem.reaction(touch)
+            arrays["gap"] = np.where(np.isfinite(touch.gap), touch.gap, 1e300)
+            arrays["traction"] = touch.traction
         return {key: np.array(value) for key, value in arrays.items()}
 
     def changes(self):
@@ -447,7 +469,11 @@ class Observer:
         if self.steps and not any(self.comm.allgather(bool(found))):
             if self.exact:
                 self._check_balance(found, figures)
-            if (self.whole and not self.exact) or "contrast" in self.scene:
+            if self.run.contact is not None:
+                self._check_contact(found, figures)
+            if self.run.time is not None:
+                self._check_account(found, figures)
+            elif (self.whole and not self.exact) or "contrast" in self.scene:
                 self._check_total(found, figures)
             # Round-off of stiff stresses does work on whole displacements.
             if self.is_elastic and self._summed and "contrast" not in self.scene:
@@ -558,6 +584,8 @@ class Observer:
             size += float(np.abs(self._by_domain[0]).sum())
         loads, size = self.comm.allreduce(loads), self.comm.allreduce(size)
         forces = sum((self.run.problem.reaction(bc) for bc in self.run.bcs), np.zeros(dim))
+        if self.run.contact is not None and len(self.run.bodies) == 1:
+            forces = forces + self.run.problem.reaction(self.run.contact)
         if self.domains[0].axisymmetric:  # along the axis; hoop stress bears the rest
             loads, forces = loads[1:], forces[1:]
         gap = np.abs(loads + forces).max()
@@ -566,9 +594,56 @@ class Observer:
             *(np.abs(self.run.problem.reaction(b)).max() for b in self.run.bcs),
             0.0,
         )
+        if self.run.contact is not None:  # (bodies that touch nothing are moved by no force)
+            size += 1e-3 * self.run.young
         figures["total"] = gap / scale if scale > 0 else 0.0
         if not gap <= 1e-7 * scale + 1e-10 * size:
             found.append(f"loads and supports do not add up to zero by {figures['total']:.1e}")
+
+    def _check_contact(self, found, figures):
+        """Look at what each point of a contact tells: gap, pressure and friction."""
+        touch, data = self.run.contact, self.scene["contact"]
+        pressure, gap = touch.pressure, touch.gap
+        size = np.linalg.norm(touch.traction, axis=1)
+        shear = np.sqrt(np.maximum(size**2 - pressure**2, 0.0))
+        stiff = self.run.young
+        floor = 1e-7 * stiff * max(np.abs(gap[np.isfinite(gap)]).max(initial=0.0), 1e-12)
+        moves = self.run.time is not None and self.scene["motion_of"]["scheme"] != "euler"
+        if (pressure < -floor).any():
+            found.append("a contact pulls")
+        if not moves and (pressure[gap > 1e-9] > 0.0).any():
+            found.append("a contact acts at a gap")
+        most = data["friction"] * pressure + data["cohesion"]
+        if moves and data["friction"] == data["cohesion"] == 0.0:
+            most = most + size  # (a direction of the whole step)
+        # (told is the vector alone: where it is nearly normal, its square loses digits)
+        if not moves and (shear > most + floor + 1e-7 * size).any():
+            found.append("friction is beyond Coulomb's cone")
+        if "obstacle" in data and data["turn"] == 0.0:
+            exact = distance(data["obstacle"], touch.points - touch.offset)
+            if exact is not None and np.abs(exact - gap).max(initial=0.0) > 1e-9:
+                found.append("a gap is wrong")
+        figures["depth"] = self.comm.allreduce(float(-gap.min(initial=0.0)), MPI.MAX)
+        if not moves and self.run.time is None and len(self.run.bodies) == 2:
+            force = self.run.problem.reaction(touch)
+            held = [np.asarray(self.run.problem.reaction(bc)) for bc in self.run.bcs]
+            scale = max(np.abs(f).max() for f in (force, *held))
+            error = max(np.abs(held[1] + force).max(), np.abs(held[0] - force).max())
+            if error > 1e-7 * scale + 1e-10 * self.run.young:
+                found.append(f"a pair is out of balance by {error / scale:.1e}")
+
+    def _check_account(self, found, figures):
+        """Look at the account of energies of a motion: it closes, and nothing is won."""
+        energies = self.run.problem.history.energies
+        balance = np.array([energy.balance for energy in energies])
+        whole = np.array([energy.kinetic + energy.strain for energy in energies])
+        figures["account"] = float(np.abs(balance - balance[0]).max() / whole[0])
+        figures["won"] = float(whole.max() / whole[0] - 1.0)
+        if figures["account"] > 1e-9:
+            found.append(f"the account of energies does not close by {figures['account']:.1e}")
+        # (midpoint: energy of large strains to second order)
+        if figures["won"] > (0.05 if self.scene["motion_of"]["scheme"] == "midpoint" else 1e-7):
+            found.append(f"energy is won, {figures['won']:.1e}")
 
     def _check_energy(self, found, figures):
         """Compare the stored energy with the work of stress along the path.

@@ -673,3 +673,126 @@ def folded(rng: Random, index: int) -> Scene:
         support="stand",
         steps=1,
     )
+
+
+# -- Contact -----------------------------------------------------------------------------------
+
+
+def obstacle(rng: Random, dim: int, name: str, top: list[float], gap: float) -> Scene:
+    """Return a shape that is a gap above a point."""
+    size = float(rng.uniform(0.15, 0.6))
+    data: Scene = {"shape": name, "radius": float(pick(rng, 0.02, 0.1)), "size": size}
+    up = np.eye(dim)[1]
+    middle = np.array(top) + gap * up
+    if name == "plane":
+        turn = float(rng.uniform(-0.3, 0.3)) if dim == 2 else 0.0
+        normal = [np.sin(turn), -np.cos(turn), 0.0][:dim]
+        middle = middle + up * 0.5 * abs(np.tan(turn))
+        return {**data, "point": middle.tolist(), "normal": normal}
+    if name == "cavity":
+        # the body is inside of a large disc, which comes down on it
+        size = float(rng.uniform(1.5, 3.0))
+        low = middle - up * (size - size * (1.0 - np.sqrt(1.0 - (0.5 / size) ** 2)))
+        return {**data, "size": size, "centre": low.tolist()}
+    high = {"polygon": 1.0, "ellipse": 0.6}.get(name, 1.0)
+    return {**data, "centre": (middle + high * size * up).tolist()}
+
+
+def press(rng: Random, dim: int = 2) -> Scene:
+    """Return how an obstacle goes on: slowly or in leaps, straight, sideways or turning."""
+    depth = between(rng, 5e-3, 1.5)
+    way = [float(rng.uniform(-1.0, 1.0)) * depth, -depth, 0.0][:dim]
+    turn = float(pick(rng, 0.0, 0.0, rng.uniform(-1.0, 1.0)))
+    return {"way": way, "turn": turn if dim == 2 else 0.0}
+
+
+def rubbing(rng: Random) -> Scene:
+    return {
+        "friction": float(pick(rng, 0.0, 0.1, 0.3, 0.6, 1.0, 2.0)),
+        "cohesion": float(pick(rng, 0.0, 0.0, 0.0, 1e-3)),
+        "penalty": float(pick(rng, 1.0, 1.0, 1.0, 4.0)),
+    }
+
+
+ROUND = ("plane", "disc", "box", "polygon", "cavity", "ellipse")
+
+
+@scene_class(40)
+def obstacles(rng: Random, index: int) -> Scene:
+    """Obstacles of every shape, far into bodies or through them, at a gap or in overlap."""
+    dim = 3 if index % 5 == 4 else 2
+    name = ROUND[index % 6] if dim == 2 else ("plane", "disc", "cylinder", "box")[index // 5 % 4]
+    height = 0.6
+    size = [1.0, height, 0.5][:dim]
+    gap = float(pick(rng, 0.0, 0.0, 1e-13, 0.01, 0.1, -0.01, -0.3))
+    plastic = bool(rng.integers(2))
+    return assembled(
+        rng,
+        dim,
+        body=body(rng, dim, shape=pick(rng, "block", "jitter"), size=size),
+        material=von_mises(rng, between(rng, 3e-3, 3e-2)) if plastic else hencky(rng),
+        method=pick(rng, "cpdi2", "cpdi2", "cpdi2", "cpdi", "mpm") if dim == 2 else "cpdi2",
+        contact={
+            **rubbing(rng),
+            **press(rng, dim),
+            "obstacle": obstacle(rng, dim, name, [0.5, height, 0.25][:dim], gap),
+        },
+        support=pick(rng, "stand", "roll"),
+        path="contact",
+        steps=int(pick(rng, 2, 6, 12)),
+        limit=180.0,
+    )
+
+
+@scene_class(25)
+def touching(rng: Random, index: int) -> Scene:
+    """Two bodies with fields of their own, pressed on each other and dragged."""
+    gap = float(pick(rng, 0.0, 0.0, 1e-13, 0.02, 0.1, -0.01, -0.3))
+    lower = [1.0, 0.5]
+    shape = pick(rng, "block", "jitter", "disc", "turned")
+    height = {"turned": 0.25}.get(shape, 0.0)
+    plastic = bool(rng.integers(2))
+    return assembled(
+        rng,
+        body=body(rng, shape=pick(rng, "block", "jitter"), size=lower),
+        second=body(rng, shape=shape, size=[0.5, 0.4], origin=[0.25, 0.5 + gap + height]),
+        background=background(rng, room=1.0),
+        material=von_mises(rng, between(rng, 3e-3, 3e-2)) if plastic else hencky(rng),
+        contact={**rubbing(rng), **press(rng), "passes": int(pick(rng, 1, 2, 2))},
+        support="press",
+        path="contact",
+        steps=int(pick(rng, 3, 8, 16)),
+        limit=180.0,
+    )
+
+
+@scene_class(15)
+def bouncing(rng: Random, index: int) -> Scene:
+    """Bodies that hit an obstacle, or each other, at some speed."""
+    pair = index % 2 == 1
+    name = ROUND[index // 2 % 4]
+    speed = between(rng, 1e-3, 1.0)
+    second = body(rng, shape=pick(rng, "block", "disc"), size=[0.5, 0.4], origin=[0.25, 0.62])
+    about = {**rubbing(rng), "way": [0.0, 0.0], "turn": 0.0}
+    if pair:
+        about["passes"] = int(pick(rng, 1, 2))
+    else:
+        about["obstacle"] = obstacle(rng, 2, name, [0.5, 0.5], 0.05)
+    return assembled(
+        rng,
+        body=body(rng, shape=pick(rng, "block", "jitter"), size=[1.0, 0.5]),
+        **({"second": second} if pair else {}),
+        background=background(rng, room=1.2),
+        material=pick(rng, hencky(rng), von_mises(rng, 1e-2)),
+        contact=about,
+        motion_of={
+            "scheme": ("conserving", "midpoint", "euler")[index % 3],
+            "out_of_range": pick(rng, "project", "reflect"),
+            "speed": speed,
+            "time": min(20.0, 0.6 / speed),
+        },
+        support="none",
+        path="contact",
+        steps=20,
+        limit=180.0,
+    )

@@ -46,7 +46,8 @@ def run(scene, comm=MPI.COMM_WORLD):
             observer = checks.Observer(scene, made)
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", message="The run ")
-                for _ in problem.steps(scene["steps"], made.update):
+                ends = (scene["steps"],) if made.time is None else made.time
+                for _ in problem.steps(*ends, made.update):
                     observer.step()
                 if made.second is not None:
                     for _ in problem.steps(scene["second_steps"], made.second):
