@@ -20,6 +20,7 @@ from .particles.particles import Particles  # noqa: E402
 from .problems.dynamic import DynamicParticleProblem, DynamicProblem  # noqa: E402
 from .problems.initial_stress import geostatic  # noqa: E402
 from .problems.particle_problem import ParticleProblem  # noqa: E402
+from .problems.porous import PorousProblem  # noqa: E402
 from .problems.quasistatic import QuasiStaticProblem  # noqa: E402
 from .problems.strength import StrengthReduction, strength_reduction  # noqa: E402
 from .stepping.displacement_control import DisplacementControl  # noqa: E402
@@ -44,6 +45,7 @@ __all__ = [
     "ParticleOutsideError",
     "ParticleProblem",
     "Particles",
+    "PorousProblem",
     "QuasiStaticProblem",
     "Stage",
     "Statistics",

@@ -22,7 +22,7 @@ from ..boundary.supports import Support
 from ..constitutive.groups import background_cells
 from ..constitutive.points import MaterialPoints
 from ..constitutive.step_stress import StepStress
-from ..constitutive.strain import strain_of
+from ..constitutive.strain import Strain, strain_of
 from ..errors import DomainDistortionError, MPMError, agree, agreed, warn
 from ..io.checkpoint import Snapshot
 from ..parallel.given import require_same
@@ -523,6 +523,9 @@ class QuasiStaticProblem(ParticleProblem):
         loads += [s.at_body(history.initial_modulus, strain.turn, share) for s in given.supports]
         if given.pressures:
             loads.append(work.pressures(given.pressures, given.facet_tags))
+        further, plain = self._further_work(given, strain)
+        loads += further
+        symmetric = symmetric and plain
         slopes = [
             ufl.derivative(load, body.displacement)
             for load in loads
@@ -546,6 +549,18 @@ class QuasiStaticProblem(ParticleProblem):
             of_step,
         )
 
+    def _further_work(self, given: BodySetup, strain: Strain) -> tuple[list[ufl.Form], bool]:
+        """Return forms of the residual besides those of stress and loads (collective).
+
+        Args:
+            given: The body, what it is made of and loaded by.
+            strain: What it is strained in.
+
+        Returns:
+            The forms, and whether the tangent of all that they belong to is symmetric.
+        """
+        return [], True
+
     def _in_time(
         self, history: MaterialPoints, supports: Sequence[Support]
     ) -> tuple[MaterialPoints | StepStress, Sequence[StepForce]]:
@@ -560,7 +575,7 @@ class QuasiStaticProblem(ParticleProblem):
     def _couplings(self, contributions: Sequence[Contribution]) -> list[FieldTerm]:
         """See :meth:`ParticleProblem._couplings`."""
         if self.setup.mixed is None:
-            return []
+            return super()._couplings(contributions)
         return [
             PressureTerm(body, CarriedField(field), acting)
             for body, field, acting in zip(self.bodies, self.pressure, self._acting, strict=True)

@@ -1,0 +1,549 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Consolidation: bodies with water in their pores, whose materials are laws of effective stress.
+
+On the undeformed body, with the pore pressure p (compression is positive), the deformation gradient
+F and J = det F, a step of the duration dt solves (Biot 1941; Carter, Small & Booker 1977)
+
+    int P'(F) : grad v - p J F^-T : grad v dX = loads . v
+    int q (J - J_n) + q S (p - p_n) - dt W . grad q dX = dt (what flows in) . q
+    W = -J F^-1 k F^-T (grad p - rho_f F^T b),
+
+which is backward Euler. Laws of small strains have ``1 + div d`` for J and the unit tensor for F.
+A pressure of p_D on a drained part of the body's own boundary is asked for in the sense of Nitsche
+(1971); where nothing is said the boundary is impervious.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import ufl
+from dolfinx import fem
+from ufl.algorithms import extract_coefficients
+from ufl.core.expr import Expr
+
+from ..assembly.inputs import as_expression, facet_measure
+from ..constitutive.strain import Strain
+from ..errors import MPMError, agree, as_ours
+from ..materials.base import Material
+from ..parallel.given import require_same
+from ..particles.field import ParticleField
+from ..particles.particles import Particles
+from .arguments import as_bodies
+from .particle_problem import Contribution
+from .quasistatic import QuasiStaticProblem
+from .setup import BodySetup
+from .through_time import TimeProblem
+
+__all__ = ["PorousProblem"]
+
+#: Factor of Nitsche's penalty ``k / h``, h the size of the domains at the boundary.
+PENALTY = 5.0
+
+
+@dataclass(frozen=True)
+class _Pores:
+    """What the pores of a body are like; see :class:`PorousProblem` for each."""
+
+    permeability: Any
+    storage: Any
+    drained: Sequence[Any]
+    inflow: Sequence[Any]
+
+
+@dataclass
+class _Filled:
+    """The water in a body on its present mesh.
+
+    Attributes:
+        particles: The body.
+        field: Its pressure.
+        before: The displacement at the last converged step.
+        dt: Duration of the step.
+        residual: The balance of mass.
+    """
+
+    particles: Particles
+    field: ParticleField
+    before: fem.Function
+    dt: fem.Constant
+    residual: ufl.Form | None = None
+
+
+class PorousProblem(TimeProblem, QuasiStaticProblem):
+    """Consolidation of saturated bodies: equilibrium, and the flow of water through their pores.
+
+    Displacement and pore pressure are unknowns together (the pair of Taylor & Hood 1973), in finite
+    strain where the materials are of finite strain. ``material`` is the law of the effective stress
+    (Terzaghi 1943): total stress is that of the law less the pore pressure. Loads act in full from
+    the beginning unless a path sets others: ``problem.solve(time, dt, update)``.
+
+    Args:
+        particles: The body, or a list of bodies, of degree 2 or 3 on a background of degree 2 or 3.
+        material: As in :class:`QuasiStaticProblem`, for the effective stress.
+        permeability: Hydraulic conductivity over the specific weight of water (length^2 over
+            pressure and time), positive: a number, a Constant or Function, UFL on the body mesh, or
+            a function of the volume ratio J that returns UFL, ``lambda J: k * J**3``. ``None`` for
+            a body without water, such as a footing. A list has one for each body.
+        density: Mass of soil and water per undeformed volume.
+        storage: Change of the water's volume by its pressure, per undeformed volume (one over a
+            pressure): the porosity times the compressibility of water; one for all or a list.
+        fluid_density: Mass per volume of the water, on which ``body_force`` acts as well; 0 where p
+            is the excess over the hydrostatic pressure.
+        drained: Pairs of a pore pressure (number or UFL) and a tag of ``facet_tags``, where water
+            comes and goes at this pressure; with several bodies one list for each.
+        inflow: Pairs of a volume of water that flows in per undeformed area and time, and a tag.
+        pore_pressure: At the beginning: a number, or a function of coordinates ``(3, n)`` that
+            returns ``(n,)``; one for all or a list.
+        pressure_space: Background space of the pore pressure, for Dirichlet conditions on it in
+            ``bcs``; ``None``: continuous, of one degree less than V on its mesh.
+        **options: All else that :class:`QuasiStaticProblem` has but ``mixed``, ``background``,
+            ``predictor`` and ``linear_solver``.
+
+    Attributes:
+        pore_pressure: Of each body with water, a :class:`mpm_dolfinx.ParticleField` at its nodes.
+
+    Raises:
+        MPMError: As there; and what does not go with water.
+    """
+
+    _gradual = False
+
+    def __init__(
+        self,
+        particles: Particles | Sequence[Particles],
+        material: Any,
+        permeability: Any,
+        density: Any = 1.0,
+        *,
+        storage: Any = 0.0,
+        fluid_density: float = 0.0,
+        drained: Sequence[Any] = (),
+        inflow: Sequence[Any] = (),
+        pore_pressure: Any = 0.0,
+        pressure_space: fem.FunctionSpace | None = None,
+        **options: Any,
+    ) -> None:
+        bodies = as_bodies(particles)
+        require_same(
+            bodies[0].V.mesh.comm,
+            permeability=permeability,
+            storage=storage,
+            fluid_density=fluid_density,
+            drained=drained,
+            inflow=inflow,
+            pore_pressure=pore_pressure,
+            pressure_space=pressure_space,
+        )
+        for name in ("mixed", "background", "predictor", "linear_solver", "fields"):
+            if name in options:
+                raise MPMError(f"A PorousProblem has no {name}=; leave it out.")
+        count = len(bodies) if isinstance(particles, list | tuple) else 0
+        self._pores = [
+            (body, _Pores(*values))
+            for body, *values in zip(
+                bodies,
+                _of_bodies("permeability", permeability, count),
+                _of_bodies("storage", storage, count),
+                _lists("drained", drained, count),
+                _lists("inflow", inflow, count),
+                strict=True,
+            )
+        ]
+        if all(pores.permeability is None for _, pores in self._pores):
+            raise MPMError("A PorousProblem needs a permeability for one of its bodies at least.")
+        for body, pores in self._pores:
+            _require(body, pores)
+        self._fluid_density = _number("fluid_density", fluid_density)
+        self._spaces_of_water = _spaces(self._pores, pressure_space)
+        self._filled: list[_Filled] = []
+        super().__init__(particles, material, density, predictor=False, **options)
+        start = _of_bodies("pore_pressure", pore_pressure, count)
+        for (body, _), value in zip(self._pores, start, strict=True):
+            for filled in self._filled:
+                if filled.particles is body:
+                    _begin_with(filled.field, value)
+
+    @property
+    def pore_pressure(self) -> list[ParticleField]:
+        """The pore pressure of each body with water; new Functions after a repartition."""
+        return [filled.field for filled in self._filled]
+
+    # -- The system -----------------------------------------------------------------------
+
+    def _made_of(self) -> list[str]:
+        """See :meth:`ParticleProblem._made_of`."""
+        wet = [filled.particles for filled in self._filled]
+        words = zip(super()._made_of(), self.bodies, strict=True)
+        return [f"{own}; water" if any(b is w for w in wet) else own for own, b in words]
+
+    def _spaces_of_fields(self) -> list[fem.FunctionSpace]:
+        """See :meth:`ParticleProblem._spaces_of_fields`."""
+        spaces: list[fem.FunctionSpace] = []
+        for _, V in self._spaces_of_water:
+            if all(V is not known for known in spaces):
+                spaces.append(V)
+        return spaces
+
+    def _contributions(self) -> list[Contribution]:
+        """See :meth:`ParticleProblem._contributions`."""
+        self._filled = [self._water(body) for body, pores in self._porous()]
+        contributions = super()._contributions()
+        self.fields = self.pore_pressure
+        self._of_fields = [f.residual for f in self._filled if f.residual is not None]
+        return contributions
+
+    def _porous(self) -> list[tuple[Particles, _Pores]]:
+        """Return the bodies with water that the problem has."""
+        own = [given.particles for given in self.setup.bodies]
+        return [
+            (body, pores)
+            for body, pores in self._pores
+            if pores.permeability is not None and any(body is known for known in own)
+        ]
+
+    def _water(self, body: Particles) -> _Filled:
+        """Return the water of a body, with the same pressure while its mesh is the same.
+
+        Raises:
+            MPMError: The body may lose particles.
+        """
+        if body.deletion is not None:
+            raise MPMError(
+                "Particles cannot be taken from a body with water, whose pressure lives at nodes."
+            )
+        for known in self._filled:
+            if known.particles is body and known.field.W.mesh is body.mesh:
+                return known
+        V = next(V for its, V in self._spaces_of_water if its is body)
+        return _Filled(
+            body,
+            body.field(V, at="nodes", name="pore_pressure"),
+            fem.Function(body.W, name="displacement before"),
+            fem.Constant(body.mesh, 1.0),
+        )
+
+    def _further_work(self, given: BodySetup, strain: Strain) -> tuple[list[ufl.Form], bool]:
+        """See :meth:`QuasiStaticProblem._further_work`."""
+        body = given.particles
+        filled = next((f for f in self._filled if f.particles is body), None)
+        if filled is None:
+            return [], True
+        pores = next(pores for its, pores in self._pores if its is body)
+        small = [_is_small(law) for law in _laws(given.material)]
+        if any(small) != all(small):
+            raise MPMError(
+                "The materials of a body with water must be all of small strains or all of finite "
+                "ones, as the change of its volume is either."
+            )
+        flow = _Flow(filled, strain, all(small))
+        storage = as_expression(pores.storage, body, "storage", ())
+        k = self._permeability(pores.permeability, body, flow.J)
+        given_values = [storage, k, *(value for value, _ in (*pores.drained, *pores.inflow))]
+        filled.residual = self._balance(given, pores, flow, storage, k)
+        held = [c for v in given_values if isinstance(v, Expr) for c in extract_coefficients(v)]
+        follows = any(c is unknown for c in held for unknown in (body.displacement, flow.p))
+        return [flow.work_of_pressure()], all(small) and not follows
+
+    def _balance(
+        self, given: BodySetup, pores: _Pores, flow: _Flow, storage: Any, k: Any
+    ) -> ufl.Form:
+        """Return the balance of mass, with the other sign, in which small strains are symmetric."""
+        body, p, q, dt = given.particles, flow.p, flow.q, flow.dt
+        weight = None
+        if given.body_force is not None and self._fluid_density:
+            dim = body.mesh.geometry.dim
+            b = as_expression(given.body_force, body, "body_force", (dim,))
+            weight = body.load * self._fluid_density * b
+        stored = q * (flow.J - flow.J_n) + q * storage * (p - flow.p_n)
+        flux = flow.flux(k, p, weight)
+        turn = flow.strain.turn
+        R: ufl.Form = turn * (-stored + dt * ufl.dot(flux, ufl.grad(q))) * body.dx
+        normal = ufl.FacetNormal(body.mesh)
+        if pores.drained:
+            ds = facet_measure(body, given.facet_tags, pores.drained, "drained")
+            inside = flow.conductivity(k) * normal
+            size = PENALTY / _sizes(body)
+            for value, tag in pores.drained:
+                gap = p - as_expression(value, body, "a drained pressure", ())
+                out = -q * ufl.dot(flux, normal) + gap * ufl.dot(ufl.grad(q), inside)
+                out -= size * ufl.dot(normal, inside) * gap * q
+                R += turn * dt * out * ds(tag)
+        if pores.inflow:
+            ds = facet_measure(body, given.facet_tags, pores.inflow, "inflow")
+            for value, tag in pores.inflow:
+                R += turn * dt * as_expression(value, body, "an inflow", ()) * q * ds(tag)
+        return R
+
+    @staticmethod
+    def _permeability(value: Any, body: Particles, J: Any) -> Any:
+        """Return the permeability as UFL.
+
+        Raises:
+            MPMError: It is something else, or the function that gives it fails.
+        """
+        if not callable(value) or isinstance(value, Expr):
+            return as_expression(value, body, "permeability", ())
+        with agree(body.mesh.comm):
+            try:
+                made = value(J)
+            except Exception as error:
+                raise as_ours(error, "The function that gives permeability") from error
+        return as_expression(made, body, "permeability", ())
+
+    # -- Through time ---------------------------------------------------------------------
+
+    def _aim(self, t: float) -> None:
+        """See :meth:`TimeProblem._aim`."""
+        for filled in self._filled:
+            np.copyto(filled.dt.value, t - self.history.time)
+
+    def begin_step(self) -> None:
+        """See :meth:`ParticleProblem.begin_step`."""
+        super().begin_step()
+        for filled in self._filled:
+            before = filled.particles.converged_displacement
+            filled.before.x.array[:] = before.ravel()
+
+    def add(  # type: ignore[override]
+        self,
+        particles: Particles,
+        material: Any,
+        permeability: Any = None,
+        density: Any = 1.0,
+        *args: Any,
+        storage: Any = 0.0,
+        drained: Sequence[Any] = (),
+        inflow: Sequence[Any] = (),
+        **options: Any,
+    ) -> None:
+        """Add a body: see :meth:`QuasiStaticProblem.add`; what changes does so at once.
+
+        Args:
+            particles: The body.
+            material: As in the constructor.
+            permeability: As in the constructor; ``None``: without water.
+            density: As in the constructor.
+            *args: As in :meth:`QuasiStaticProblem.add`.
+            storage: As in the constructor.
+            drained: As in the constructor.
+            inflow: As in the constructor.
+            **options: As in :meth:`QuasiStaticProblem.add`.
+        """
+        if not isinstance(particles, Particles):
+            raise MPMError(f"add() needs mpm.Particles, not a {type(particles).__name__}.")
+        pores = _Pores(permeability, storage, drained, inflow)
+        _require(particles, pores)
+        before = list(self._pores), list(self._spaces_of_water)
+        self._pores.append((particles, pores))
+        known = {id(body.V): V for body, V in self._spaces_of_water}
+        self._spaces_of_water = _spaces(self._pores, None, known)
+        try:
+            super().add(particles, material, density, *args, **options)
+        except BaseException:
+            self._pores, self._spaces_of_water = before
+            raise
+
+
+class _Flow:
+    """What the balance of a body's water is written in.
+
+    Args:
+        filled: The water.
+        strain: What the body is strained in.
+        small: Whether strains are small.
+    """
+
+    def __init__(self, filled: _Filled, strain: Strain, small: bool) -> None:
+        body = strain.particles
+        self.strain, self._small = strain, small
+        self.p, self.p_n, self.dt = filled.field, filled.field.previous, filled.dt
+        self.q = ufl.TestFunction(filled.field.W)
+        self._v = ufl.TestFunction(body.W)
+        d, unit = body.displacement, ufl.Identity(strain.dim)
+        self._gradient = strain.ufl_gradient(d)
+        before = strain.ufl_gradient(filled.before)
+        self.J, self.J_n = (
+            1.0 + ufl.tr(g) if small else ufl.det(unit + g) for g in (self._gradient, before)
+        )
+        self._F = ufl.Identity(body.mesh.geometry.dim) + ufl.grad(d)
+
+    def work_of_pressure(self) -> ufl.Form:
+        """Return the virtual work of the pore pressure."""
+        test = self.strain.ufl_gradient(self._v)
+        if self._small:
+            change = ufl.tr(test)
+        else:
+            change = ufl.inner(_cofactors(ufl.Identity(self.strain.dim) + self._gradient), test)
+        work: ufl.Form = -self.strain.turn * self.p * change * self.strain.particles.dx
+        return work
+
+    def conductivity(self, k: Any) -> Any:
+        """Return the permeability with respect to the undeformed body, a tensor."""
+        if self._small:
+            return k * ufl.Identity(self._F.ufl_shape[0])
+        cofactors, ratio = _cofactors(self._F), ufl.det(self._F)
+        return k * self.J / ratio**2 * cofactors.T * cofactors
+
+    def flux(self, k: Any, p: Any, weight: Any) -> Any:
+        """Return the flux of water through the undeformed body.
+
+        Args:
+            k: Permeability.
+            p: Pore pressure.
+            weight: Weight of water per volume, or ``None``.
+        """
+        drive = ufl.grad(p)
+        if weight is not None:
+            drive = drive - (weight if self._small else self._F.T * weight)
+        return -self.conductivity(k) * drive
+
+
+def _cofactors(F: Any) -> Any:
+    """Return ``det(F) F^-T`` without a quotient, which compiles to less code."""
+    if F.ufl_shape[0] == 2:
+        return ufl.as_tensor([[F[1, 1], -F[1, 0]], [-F[0, 1], F[0, 0]]])
+    rows = [[F[i, j] for j in range(3)] for i in range(3)]
+    return ufl.as_tensor([_cross(rows[(i + 1) % 3], rows[(i + 2) % 3]) for i in range(3)])
+
+
+def _cross(a: Sequence[Any], b: Sequence[Any]) -> list[Any]:
+    return [a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3] for i in range(3)]
+
+
+# -- What is given ---------------------------------------------------------------------------
+
+
+def _laws(material: Any) -> list[Material]:
+    """Return the laws among what is given as a material, or as one for each body."""
+    if isinstance(material, list | tuple):
+        return [law for one in material for law in _laws(one)]
+    if isinstance(material, Mapping):
+        return list(material.values())
+    return [material]
+
+
+def _is_small(material: Material) -> bool:
+    """Return whether a law is of small strains."""
+    return getattr(material, "kinematics", None) == "small"
+
+
+def _of_bodies(name: str, value: Any, count: int) -> list[Any]:
+    """Return one value for each of ``count`` bodies (0: one body that is not in a list)."""
+    if not isinstance(value, list) or count == 0:
+        return [value] * max(count, 1)
+    if len(value) != count:
+        raise MPMError(f"There are {count} bodies, but a list of {len(value)} for {name}.")
+    return value
+
+
+def _lists(name: str, value: Any, count: int) -> list[Any]:
+    """Return one list of pairs for each of ``count`` bodies."""
+    if not isinstance(value, list | tuple):
+        raise MPMError(f"{name} must be a list of pairs of a value and a tag, not {value!r}.")
+    if count == 0 or not value or not all(isinstance(part, list) for part in value):
+        return [value] * max(count, 1)
+    return _of_bodies(name, list(value), count)
+
+
+def _number(name: str, value: Any) -> float:
+    known = isinstance(value, float | int | np.number) and not isinstance(value, bool)
+    if not known or not 0.0 <= value < np.inf:
+        raise MPMError(f"{name} must be a number that is not negative, not {value!r}.")
+    return float(value)
+
+
+def _require(body: Particles, pores: _Pores) -> None:
+    """Raise an error unless a body can have such pores."""
+    if pores.permeability is None:
+        if pores.drained or pores.inflow:
+            raise MPMError("drained= and inflow= need a body with a permeability.")
+        return
+    degrees = [space.ufl_element().degree for space in (body.V, body.W)]
+    if min(degrees) < 2:
+        raise MPMError(
+            "A PorousProblem needs a background and particles of degree 2 or 3 (degree=2), not "
+            f"{degrees[0]} and {degrees[1]}: with displacements of degree 1 the pressure would "
+            "oscillate while no water can leave."
+        )
+    for name in ("permeability", "storage"):
+        value = getattr(pores, name)
+        if isinstance(value, float | int | np.number):
+            least = "positive" if name == "permeability" else "not negative"
+            if not (0.0 < value < np.inf or (value == 0.0 and name == "storage")):
+                raise MPMError(f"{name} must be {least}, not {value!r}.")
+
+
+def _spaces(
+    pores: Sequence[tuple[Particles, _Pores]],
+    given: fem.FunctionSpace | None,
+    known: Mapping[int, fem.FunctionSpace] | None = None,
+) -> list[tuple[Particles, fem.FunctionSpace]]:
+    """Return the background space of the pressure of each body with water (collective).
+
+    Bodies that move by one V have one, so that water flows from one to the other.
+
+    Args:
+        pores: All bodies.
+        given: A space of the user's.
+        known: Spaces by the identity of V.
+    """
+    made = dict(known or {})
+    found = []
+    for body, its in pores:
+        if its.permeability is None:
+            continue
+        V = body.V
+        if id(V) not in made:
+            if given is not None and made:
+                raise MPMError("pressure_space= is for bodies that share one V.")
+            made[id(V)] = given or fem.functionspace(
+                V.mesh, ("Lagrange", V.ufl_element().degree - 1)
+            )
+        found.append((body, made[id(V)]))
+    return found
+
+
+def _begin_with(field: ParticleField, value: Any) -> None:
+    """Set a pressure before the first step (collective).
+
+    Raises:
+        MPMError: It is neither a number nor a function of coordinates, or not finite.
+    """
+    with agree(field.W.mesh.comm):
+        if isinstance(value, float | int | np.number):
+            values: Any = float(value)
+        elif callable(value):
+            x = field.W.tabulate_dof_coordinates().T
+            try:
+                values = np.asarray(value(x), dtype=np.float64)
+            except Exception as error:
+                raise as_ours(error, "The function that gives pore_pressure") from error
+            if values.shape != x.shape[1:]:
+                raise MPMError(
+                    f"pore_pressure must return values of the shape {x.shape[1:]} for coordinates "
+                    f"{x.shape}, not {values.shape}."
+                )
+        else:
+            raise MPMError(
+                f"pore_pressure must be a number or a function of coordinates, not {value!r}."
+            )
+        if not np.isfinite(values).all():
+            raise MPMError("pore_pressure must be finite.")
+    field.set(values)
+
+
+def _sizes(body: Particles) -> fem.Function:
+    """Return the size of each domain, a piecewise constant Function (collective)."""
+    domain = body.mesh
+    sizes = fem.Function(fem.functionspace(domain, ("Discontinuous Lagrange", 0)), name="size")
+    dim = domain.topology.dim
+    cells = domain.topology.index_map(dim)
+    every = np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
+    sizes.x.array[:] = domain.h(dim, every) / np.sqrt(dim)
+    return sizes
