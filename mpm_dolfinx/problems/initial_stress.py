@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,54 @@ from ..particles.particles import Particles
 __all__ = ["geostatic", "initial_stress_at_points", "of_all_ranks"]
 
 type Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Geostatic:
+    """The stress of level ground, a function of coordinates.
+
+    Attributes:
+        surface: Level of the ground.
+        strength: Size of gravity.
+        down: Its direction, shape ``(3,)``.
+        tops: Depth at which each layer begins, shape ``(m,)``.
+        densities: Of each layer.
+        ratios: K0 of each layer.
+        loads: Vertical pressure where each begins.
+    """
+
+    surface: float
+    strength: float
+    down: Array
+    tops: Array
+    densities: Array
+    ratios: Array
+    loads: Array
+
+    def numbers(self) -> list[float]:
+        """Return all that it is made of."""
+        parts = (self.down, self.tops, self.densities, self.ratios, self.loads)
+        return [self.surface, self.strength, *np.concatenate(parts).tolist()]
+
+    def require_for(self, gdim: int) -> None:
+        """Raise an error where gravity does not lie in a body's plane."""
+        if np.any(self.down[gdim:] != 0.0):
+            raise MPMError(
+                f"geostatic has gravity with a third component, but the body has {gdim} "
+                "dimensions; give it the body_force."
+            )
+
+    def __call__(self, x: Array) -> Array:
+        depth = self.surface + self.down @ x
+        layer = np.clip(np.searchsorted(self.tops, depth, side="right") - 1, 0, None)
+        unit = self.densities[layer] * self.strength
+        vertical = self.loads[layer] + unit * (depth - self.tops[layer])
+        vertical = np.where(depth >= 0.0, vertical, 0.0)
+        along = np.outer(self.down, self.down)
+        return np.asarray(
+            -np.multiply.outer(along, vertical)
+            - np.multiply.outer(np.eye(3) - along, self.ratios[layer] * vertical)
+        )
 
 
 def geostatic(
@@ -49,7 +98,7 @@ def geostatic(
         above the surface they are zero.
 
     Raises:
-        MPMError: Values that are not finite, layers without thickness, or no gravity.
+        MPMError: Values that are not finite or negative, layers without thickness, or no gravity.
     """
     try:
         g = np.zeros(3)
@@ -67,32 +116,22 @@ def geostatic(
     known = [g, densities, ratios, numbers, tops]
     if not all(np.isfinite(values).all() for values in known) or (thickness <= 0.0).any():
         raise MPMError("geostatic needs finite numbers, and layers with a positive thickness.")
+    if (densities < 0.0).any() or (ratios < 0.0).any():
+        raise MPMError("geostatic needs densities and K0 that are not negative.")
     strength = float(np.linalg.norm(g))
     if strength == 0.0:
         raise MPMError("geostatic needs gravity that is not zero.")
-    down = g / strength
-    loads = surcharge + np.concatenate([[0.0], np.cumsum(densities[:-1] * np.diff(tops))]) * (
-        strength
-    )
-
-    def stress(x: Array) -> Array:
-        depth = surface + down @ x
-        layer = np.clip(np.searchsorted(tops, depth, side="right") - 1, 0, None)
-        vertical = loads[layer] + densities[layer] * strength * (depth - tops[layer])
-        vertical = np.where(depth >= 0.0, vertical, 0.0)
-        across = np.eye(3) - np.outer(down, down)
-        return np.asarray(
-            -np.multiply.outer(np.outer(down, down), vertical)
-            - np.multiply.outer(across, ratios[layer] * vertical)
-        )
-
-    return stress
+    weights = np.cumsum(densities[:-1] * np.diff(tops)) * strength
+    loads = float(surcharge) + np.concatenate([[0.0], weights])
+    return _Geostatic(float(surface), strength, g / strength, tops, densities, ratios, loads)
 
 
 def of_all_ranks(value: Any) -> Any:
     """Return what ranks must have in common of an initial stress, or of a list of them."""
     if isinstance(value, list) and not np.isscalar(value[0] if value else 0.0):
         return [of_all_ranks(entry) for entry in value]
+    if isinstance(value, _Geostatic):
+        return value.numbers()
     return "its own part" if isinstance(value, np.ndarray) and value.ndim > 2 else value
 
 
@@ -131,6 +170,8 @@ def initial_stress_at_points(value: Any, particles: Particles) -> Array:
 
 def _at_points(value: Any, particles: Particles) -> Array:
     n, nq = particles.num_local, particles.num_points
+    if isinstance(value, _Geostatic):
+        value.require_for(particles.mesh.geometry.dim)
     if callable(value):
         x = np.zeros((3, n * nq))
         points = particles.initial_points

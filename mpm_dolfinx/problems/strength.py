@@ -72,6 +72,8 @@ def strength_reduction(
     numbers = [step, tolerance, most, 1.0 if displacement is None else displacement]
     if not all(isinstance(n, float | int) and n > 0.0 for n in numbers):
         raise MPMError("step, tolerance, most and displacement must be positive numbers.")
+    if most <= 1.0:
+        raise MPMError(f"most= is a factor at which to stop, above 1, not {most:g}.")
     if any(body.load.value < 1.0 for body in problem.bodies) or problem.held_back > 0.0:
         raise MPMError("strength_reduction() begins at the whole load; call solve() first.")
     start = [body.converged_displacement.copy() for body in problem.bodies]

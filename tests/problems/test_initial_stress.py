@@ -9,6 +9,7 @@ from scenes import (
     PLANE,
     QUADRILATERAL,
     TRIANGLE,
+    WORLD,
     at,
     box,
     facet_tags,
@@ -189,6 +190,18 @@ def test_what_is_refused():
         mpm.geostatic(0.0, [(0.0, 1.0)], 0.5, GRAVITY)
     with pytest.raises(mpm.MPMError, match="level"):
         mpm.geostatic("top", 1.0, 0.5, GRAVITY)
+    with pytest.raises(mpm.MPMError, match="not negative"):
+        mpm.geostatic(0.0, -1.0, 0.5, GRAVITY)
+    with pytest.raises(mpm.MPMError, match="not negative"):
+        mpm.geostatic(0.0, 1.0, [-0.5], GRAVITY)
+    with pytest.raises(mpm.MPMError, match="third component, but the body has 2"):
+        ground(law, stress=mpm.geostatic(HEIGHT, DENSITY, 0.5, (0.0, 0.0, -10.0)))
+
+
+@pytest.mark.skipif(WORLD.size == 1, reason="needs two ranks or more")
+def test_ground_that_differs_between_ranks():
+    with pytest.raises(mpm.MPMError, match="initial_stress differs between the ranks"):
+        ground(LAWS[1], stress=mpm.geostatic(HEIGHT, DENSITY, 0.5 + 0.1 * WORLD.rank, GRAVITY))
 
 
 def test_what_is_not_in_equilibrium_goes_with_the_load():
