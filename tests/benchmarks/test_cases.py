@@ -163,10 +163,15 @@ RUNS = {
         },
     ),
     "vortex": ("vortex", "", {"displacement_error": 4.6e-2, "velocity_error": 1.26e-1}),
+    "sand": (
+        "sand_column",
+        "--aspect 0.5 --cells 6",
+        {"ratio": 1.15, "kinetic_left": 0.05},
+    ),
     "column": ("column_dynamic", "--time 0.4", {"cutbacks": 0, "balance_error": 1e-12}),
 }
 #: Cases that go through time, whose load is that.
-IN_TIME = {"flying_bar", "spinning_block", "colliding_discs", "column_dynamic"}
+IN_TIME = {"sand_column", "flying_bar", "spinning_block", "colliding_discs", "column_dynamic"}
 KEYS = {
     "compaction": {"error", "error_position", "particles"},
     "cantilever": {"shortening", "deflection", "error"},
@@ -189,6 +194,7 @@ KEYS = {
     "colliding_discs": {"energy_change", "rebound", "momentum_error"},
     "vortex": {"displacement_error", "velocity_error"},
     "column_dynamic": {"toe", "top"},
+    "sand_column": {"run_out", "experiment", "ratio", "front", "height_at_wall"},
     "strength": {"factor", "exact", "ratio", "particles"},
     "consolidation": {"error", "degree", "error_degree", "particles"},
     "snap_through": {"limit", "valley", "crown", "error"},
@@ -232,6 +238,8 @@ def test_numbers(case, capfd):
         assert abs(numbers["height"] - 1.2) < 1e-3
     if name == "strength":
         assert numbers["ratio"] > 0.9
+    if name == "sand_column":
+        assert numbers["ratio"] > 0.85
     if name in ("compaction", "column_roller") and "--elements 8" in arguments:
         each = 2 if "tri" in arguments or "hex" in arguments else 1
         assert numbers["particles"] == 32 * each
@@ -351,6 +359,7 @@ def test_case_is_a_program(name, tmp_path):
         "colliding_discs": "--steps 4",
         "vortex": "--steps 8",
         "column_dynamic": "--cell 1 --steps 20",
+        "sand_column": "--cells 4 --time 0.1 --steps 5",
     }.get(name, "--elements 4 --steps 4")
     done = subprocess.run(
         [sys.executable, str(CASES / f"{name}.py"), *small.split(), "--json"],

@@ -1,0 +1,165 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""A column of dry sand that is let go, beside the run-out of experiments.
+
+demos/demo_sand_column.py is its simplest form. `run_out` is how far the outermost corner has come,
+over the column's width, `experiment` that of Lube, Huppert, Sparks & Freundt (2005) between plane
+walls: 1.2 a for aspects a = height/width below 1.8, 1.9 a^(2/3) above 2.8 (straight in between).
+`front` is the same for the place up to which 99 % of the sand lies.
+"""
+
+from math import ceil, sqrt
+
+from mpi4py import MPI
+
+import kit
+import numpy as np
+
+from dolfinx import fem, mesh
+
+import mpm_dolfinx as mpm
+
+parser = kit.Parser("A column of dry sand that is let go.")
+parser.add_argument("--aspect", type=kit.positive, default=1.0, help="height over width")
+parser.add_argument("--cells", type=kit.whole, default=8, help="background cells in the width")
+parser.add_argument("--particles-per-cell", type=kit.whole, default=2, help="each way")
+parser.add_argument("--domain", choices=("tri", "quad"), default="tri", help="particle domains")
+parser.add_argument("--law", choices=("mohr-coulomb", "drucker-prager"), default="mohr-coulomb")
+parser.add_argument("--friction-angle", type=kit.positive, default=30.0, help="degrees")
+parser.add_argument("--dilation-angle", type=float, default=0.0, help="degrees")
+parser.add_argument("--cohesion", type=float, default=0.0, help="Pa")
+parser.add_argument("--young", type=kit.positive, default=1e6, help="Pa")
+parser.add_argument("--no-volume-correction", action="store_true", help="what opens stays open")
+parser.add_argument("--dt", type=kit.positive, default=0.01, help="time step, s")
+parser.add_argument("--time", type=kit.positive, help="until when, s; by default until it rests")
+parser.add_argument("--steps", type=kit.whole, help="time steps; by time and dt")
+args = parser.parse()
+
+comm = MPI.COMM_WORLD
+width, density, gravity = 1.0, 2000.0, 10.0  # m, kg/m3, m/s2
+a, h = args.aspect, width / args.cells
+height = a * width
+
+
+def experiment(aspect: float) -> float:
+    """The run-out of Lube et al. (2005), over the width."""
+    low, high = 1.2 * 1.8, 1.9 * 2.8 ** (2.0 / 3.0)
+    if aspect <= 1.8:
+        return 1.2 * aspect
+    if aspect >= 2.8:
+        return float(1.9 * aspect ** (2.0 / 3.0))
+    return float(np.interp(aspect, [1.8, 2.8], [low, high]))
+
+
+known = experiment(a)
+
+# The base is a rough floor of cells that are held, so that a corner which falls onto it between two
+# steps stays where it is.
+
+cells = [ceil((1.0 + 1.6 * known) * width / h) + 4, ceil(height / h) + 3]
+background = mesh.create_rectangle(
+    comm,
+    [[0.0, -h], [cells[0] * h, (cells[1] - 1) * h]],
+    cells,
+    mesh.CellType.quadrilateral,
+)
+V = fem.functionspace(background, ("Lagrange", 1, (2,)))
+background.topology.create_connectivity(1, 2)
+floor = mesh.locate_entities(background, 1, lambda x: x[1] < 1e-9)
+wall = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[0], 0.0))
+bcs = [
+    fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 1, facets), V.sub(i))
+    for i, facets in ((0, floor), (1, floor), (0, wall))
+]
+n = args.particles_per_cell * args.cells
+body = kit.box([width, height], [n, max(1, round(n * a))], kit.DOMAINS[args.domain])
+particles = mpm.Particles(body, V)
+
+correction = not args.no_volume_correction
+strength = (args.cohesion, args.friction_angle, args.dilation_angle)
+sand = (
+    mpm.materials.MohrCoulomb(args.young, 0.3, *strength, volume_correction=correction)
+    if args.law == "mohr-coulomb"
+    else mpm.materials.DruckerPrager(
+        args.young, 0.3, *strength, match="plane_strain", volume_correction=correction
+    )
+)
+problem = mpm.DynamicProblem(
+    particles,
+    sand,
+    density=density,
+    body_force=(0.0, -gravity),
+    bcs=bcs,
+    scheme="euler",
+    initial_stress=mpm.geostatic(height, density, 0.5, (0.0, -gravity)),
+)
+end = args.time or 3.5 * sqrt(height / gravity) + sqrt(known * width / gravity)
+steps = args.steps or ceil(end / args.dt)
+
+X = particles.W.tabulate_dof_coordinates()[:, :2]
+path, failure = [(0.0, 0.0)], None
+try:
+    for step in kit.progress(problem.steps(end, end / steps), steps, args):
+        x = X + particles.displacement.x.array.reshape(-1, 2)
+        path.append((step.time, kit.largest(x[:, 0]) / width - 1.0))
+except mpm.MPMError as error:
+    failure = error
+
+
+def front(share: float) -> float:
+    """Up to where a share of the sand lies."""
+    x = np.concatenate(comm.allgather(particles.centroid[:, 0]))
+    volume = np.concatenate(comm.allgather(particles.initial_volume))
+    order = np.argsort(x)
+    total = np.cumsum(volume[order])
+    return float(x[order][np.searchsorted(total, share * total[-1])])
+
+
+history, run_out = problem.history, path[-1][1]
+kinetic = [energy.kinetic for energy in history.energies]
+at_wall = np.isclose(X[:, 0], 0.0)
+top = kit.largest((X[:, 1] + particles.displacement.x.array[1::2])[at_wall])
+numbers = {
+    **kit.outcome(history, failure),
+    "run_out": run_out,
+    "experiment": known,
+    "ratio": run_out / known,
+    "front": front(0.99) / width - 1.0,
+    "height_at_wall": top,
+    "kinetic_left": kinetic[-1] / max(kinetic),
+    "iterations_per_step": float(np.mean(history.iterations)),
+    "particles": particles.num_global,
+}
+rows = [
+    ("column", f"aspect {a:g}, {args.cells} cells wide, {particles.num_global} {args.domain}"),
+    ("steps", f"{len(history.steps)}, {history.cutbacks} cutbacks"),
+    ("linear solves in a step", f"{numbers['iterations_per_step']:.1f}"),
+    ("run-out over width", f"{run_out:.3f}, experiment {known:.3f}"),
+    ("99 % of the sand", f"{numbers['front']:.3f}"),
+    ("kinetic energy left", f"{numbers['kinetic_left']:.1e} of its largest"),
+]
+
+if args.plot:
+    fig, axes = kit.figure(13.0, 4.5, [["body", "path"]], width_ratios=[2.2, 1.0])
+    mpm.plot.background(V, ax=axes["body"], color="0.93")
+    colours = mpm.plot.domains(
+        particles, particles.plastic_strain, ax=axes["body"], cmap="YlOrBr", vmin=0.0, vmax=4.0
+    )
+    if comm.rank == 0:
+        ax = axes["body"]
+        ax.plot([0.0, width, width], [height, height, 0.0], color="0.4", ls="--", lw=1.0)
+        ax.plot([width * (1.0 + known)] * 2, [0.0, 0.3 * height], color=kit.COLOURS["blue"])
+        reach = width * (1.3 + max(known, run_out))
+        ax.set(xlim=(0.0, reach), ylim=(-h, 1.05 * height), xlabel="x, m", ylabel="y, m")
+        fig.colorbar(colours, ax=ax, label="plastic strain", shrink=0.7)
+        ax = axes["path"]
+        ax.axhline(known, color=kit.COLOURS["blue"], label="experiment")
+        ax.plot(*np.array(path).T, color=kit.COLOURS["orange"], label="outermost corner")
+        ax.set(xlabel="time, s", ylabel="run-out over width", ylim=(0.0, None))
+        ax.legend()
+    kit.save(fig, args)
+
+kit.report(args, numbers, rows, failure)
+
+if args.default:
+    assert numbers["completed"] and abs(numbers["ratio"] - 1.0) < 0.15
