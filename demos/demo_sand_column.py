@@ -21,8 +21,8 @@
 # \frac{r_\infty - r_0}{r_0} = 1.9\, a^{2/3} \quad (a > 2.8). \tag{1}
 # $$
 #
-# The sand is Mohr-Coulomb's with $\varphi$ = 30°, without cohesion and dilation. Pulled apart it has
-# no stress; what has opened closes again without resistance, and then bears pressure as before.
+# The sand is Mohr-Coulomb's with $\varphi$ = 30°, without cohesion and dilation. Pulled apart, it
+# has no stress; what has opened closes again without resistance, and then bears pressure as before.
 #
 # ## Implementation
 

@@ -106,7 +106,7 @@ right.legend()
 if comm.rank == 0:
     figure.savefig("slump.png", dpi=150)
 
-# The half of the column has moved half as far again as without inertia. All energy is accounted for.
+# The column has moved half as far again as without inertia. All energy is accounted for.
 
 assert toes[-1] > 1.4 * 8.01
 assert drift < 1e-11
