@@ -9,7 +9,7 @@ so that the cost grows with the number of points and facets, not with its square
 from __future__ import annotations
 
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -21,7 +21,7 @@ import basix
 from ..parallel.exchange import swap
 from .surface import Surface, global_dofs, normals
 
-__all__ = ["Closest", "NearFacets"]
+__all__ = ["Closest", "NearFacets", "solved"]
 
 #: Cosine of the angle of two normals below which surfaces face each other.
 FACING = -0.1
@@ -76,6 +76,7 @@ class NearFacets:
         self._surface = surface
         self._comm: MPI.Comm = surface.particles.mesh.comm
         self.gdim, self.element = surface.gdim, surface.element
+        self._flat = self.element.degree == 1 and self.element.dim == self.gdim
         empty = np.full((1, self.gdim), np.inf)
         low = np.append(points, empty, axis=0).min(axis=0) - around
         high = np.append(points, -empty, axis=0).max(axis=0) + around
@@ -149,6 +150,12 @@ class NearFacets:
             nodes: Nodes of the facet of each, shape ``(n, k, gdim)``.
             place: Where to begin, shape ``(n, e)``.
         """
+        if self._flat:  # lines and planes, on which no steps are needed
+            N, dN, _ = self.tabulate(place)
+            r = points - np.einsum("nk,nki->ni", N, nodes)
+            A = np.einsum("nek,nki->nei", dN, nodes)
+            step = solved(A @ A.swapaxes(1, 2), np.einsum("nei,ni->ne", A, r))
+            return np.asarray(np.clip(place + step, -3.0, 4.0))
         place = place.copy()
         left = np.arange(len(points))
         for _ in range(PROJECTIONS):
@@ -208,6 +215,7 @@ class NearFacets:
         if apart is not None:
             away = np.linalg.norm(apart[0][which] - self.middle[facets], axis=1) > apart[1]
             which, facets = which[away], facets[away]
+        which, facets = self._nearest(points, nodes, which, facets)
         if len(which) == 0:
             return Closest(facet, place, gap, near, beside)
         x, X = points[which], nodes[facets]
@@ -241,6 +249,24 @@ class NearFacets:
         near[who] = ~off
         beside[who] = over / size
         return Closest(facet, place, gap, near, beside)
+
+    def _nearest(
+        self,
+        points: NDArray[np.float64],
+        nodes: NDArray[np.float64],
+        which: NDArray[np.int64],
+        facets: NDArray[np.int64],
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the pairs in which a facet may be the closest, by balls around flat facets."""
+        if not self._flat or len(which) == 0:
+            return which, facets
+        middle = nodes.mean(axis=1)
+        size = np.linalg.norm(nodes - middle[:, None], axis=2).max(axis=1)
+        far = np.linalg.norm(points[which] - middle[facets], axis=1)
+        most = np.full(len(points), np.inf)
+        np.minimum.at(most, which, far)
+        good = far - size[facets] <= most[which] * (1.0 + 1e-9)
+        return which[good], facets[good]
 
     def _facing(
         self,
@@ -314,3 +340,13 @@ class NearFacets:
         x = points[which]
         good = ((x >= low[facet]) & (x <= high[facet])).all(axis=1)
         return which[good], facet[good]
+
+
+def solved(G: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+    """Return what positive matrices ``(n, e, e)`` of one or two rows give as ``b``, ``(n, e)``."""
+    if G.shape[1] == 1:
+        return np.asarray(b / G[:, 0])
+    det = G[:, 0, 0] * G[:, 1, 1] - G[:, 0, 1] * G[:, 1, 0]
+    x = G[:, 1, 1] * b[:, 0] - G[:, 0, 1] * b[:, 1]
+    y = G[:, 0, 0] * b[:, 1] - G[:, 1, 0] * b[:, 0]
+    return np.asarray(np.stack([x, y], axis=1) / det[:, None])

@@ -30,7 +30,7 @@ from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..system.term import PointMaterial
 from .contact import Contact, Outcome, stiffness
-from .facets import Closest, NearFacets
+from .facets import Closest, NearFacets, solved
 from .law import Coulomb, Points, Traction, as_friction, traction
 from .shapes import as_positive
 from .surface import Blocks, PointMatrix, Surface, global_dofs, normals
@@ -80,18 +80,22 @@ class _Memory(NamedTuple):
     anchors: NDArray[np.float64]
 
 
+type _Table = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+
+
 class _Start(NamedTuple):
     """Where a step of a motion begins, at some points.
 
     Attributes:
         x: Positions of points and nodes of their facets, shape ``(n, 1 + k, gdim)``.
-        place: Their projections on facets in the middle of the step, shape ``(n, e)``.
+        table: Shape functions with derivatives where the points are projected in the middle of the
+            step: see :meth:`NearFacets.tabulate`.
         gap: The gap, infinite where nothing was near, shape ``(n,)``.
         offset: As that of :class:`_Memory`.
     """
 
     x: NDArray[np.float64]
-    place: NDArray[np.float64]
+    table: _Table
     gap: NDArray[np.float64]
     offset: NDArray[np.float64]
 
@@ -102,7 +106,8 @@ class _Stencil(NamedTuple):
     Attributes:
         which: The points.
         place: Their projections on facets.
-        anchored: Places of their anchors.
+        table: Shape functions with derivatives there: see :meth:`NearFacets.tabulate`.
+        anchored: Shape functions at their anchors.
         x: Positions of points, nodes of their facets and of those of their anchors, ``(n, k, i)``.
         points: Stiffness and memory.
         outward: As that of :class:`Surface`.
@@ -111,6 +116,7 @@ class _Stencil(NamedTuple):
 
     which: NDArray[np.int64]
     place: NDArray[np.float64]
+    table: _Table
     anchored: NDArray[np.float64]
     x: NDArray[Any]
     points: Points
@@ -351,7 +357,8 @@ class _Pass:
         if len(lost):
             facet, place, gap = found.facet.copy(), found.place.copy(), found.gap.copy()
             place[lost] = self._near_place(x[lost], nodes[at])
-            foot = self._foot(place[lost], x[lost], nodes[at], near.outward[at])
+            table = near.tabulate(place[lost])
+            foot = self._foot(table, x[lost], nodes[at], near.outward[at])
             facet[lost], gap[lost] = at, foot.gap
             found = found._replace(facet=facet, place=place, gap=gap)
         sideways = within & ~memory.within & (memory.gap < -self.touch)
@@ -412,11 +419,13 @@ class _Pass:
             before = np.concatenate([memory.points[which][:, None], self._before[facet]], axis=1)
             middle = 0.5 * (before + np.concatenate(parts[:2], axis=1))
             place = near.project(middle[:, 0], middle[:, 1:], found.place[which])
-            start = _Start(before, place, memory.gap[which], memory.offset[which])
+            table = near.tabulate(place)
+            start = _Start(before, table, memory.gap[which], memory.offset[which])
         return _Stencil(
             which,
             found.place[which],
-            anchored,
+            near.tabulate(found.place[which]),
+            near.tabulate(anchored)[0],
             np.concatenate(parts, axis=1),
             points,
             near.outward[facet],
@@ -425,7 +434,7 @@ class _Pass:
 
     def _foot(
         self,
-        place: NDArray[np.float64],
+        table: _Table,
         x: NDArray[Any],
         X: NDArray[Any],
         outward: NDArray[np.float64],
@@ -433,19 +442,18 @@ class _Pass:
         """Return projections of points ``(n, i)`` on facets with nodes ``(n, k, i)``.
 
         Args:
-            place: Where they are, shape ``(n, e)``.
+            table: Shape functions with derivatives there.
             x: The points, real or with a small imaginary part.
             X: The nodes.
             outward: As that of :class:`Surface`.
         """
-        assert self._near is not None
-        N, dN, ddN = self._near.tabulate(place)
+        N, dN, ddN = table
         # One step of Newton's method has the derivative of the projection exactly.
         r = x - np.einsum("nk,nki->ni", N, X)
         A = np.einsum("nek,nki->nei", dN, X)
         B = np.einsum("nefk,nki->nefi", ddN, X)
         G = (A @ A.swapaxes(1, 2) - np.einsum("nefi,ni->nef", B, r)).real
-        ds = np.linalg.solve(G.astype(x.dtype), np.einsum("nei,ni->ne", A, r)[:, :, None])[:, :, 0]
+        ds = solved(G, np.einsum("nei,ni->ne", A, r))
         N = N + np.einsum("nek,ne->nk", dN, ds)
         dN = dN + np.einsum("nefk,nf->nek", ddN, ds)
         r = x - np.einsum("nk,nki->ni", N, X)
@@ -465,17 +473,16 @@ class _Pass:
         assert near is not None
         both = z[:, : 1 + near.element.dim]
         x, X = both[:, 0], both[:, 1:]
-        foot = self._foot(stencil.place, x, X, stencil.outward)
+        foot = self._foot(stencil.table, x, X, stencil.outward)
         delta = np.zeros_like(x)
         if not self.law.smooth:
-            at, _, _ = near.tabulate(stencil.anchored)
-            delta = x - np.einsum("nk,nki->ni", at, z[:, 1 + near.element.dim :])
+            delta = x - np.einsum("nk,nki->ni", stencil.anchored, z[:, 1 + near.element.dim :])
         if start is None:
             acts = traction(self.law, stencil.points, delta, foot.gap, foot.n, self.touch)
             gradient = _gradient(foot)
         else:
             gap, middle, change = foot.gap, 0.5 * (start.x + both), both - start.x
-            foot = self._foot(start.place, middle[:, 0], middle[:, 1:], stencil.outward)
+            foot = self._foot(start.table, middle[:, 0], middle[:, 1:], stencil.outward)
             gradient = _gradient(foot)
             linear = gap - (gradient * change).sum(axis=(1, 2))
             linear = np.where(linear.real > 0.0, linear, 0.0)
@@ -488,7 +495,7 @@ class _Pass:
         pushes = acts.pressure[:, None, None] * gradient
         # the arm g n turns with the facet
         A = foot.along
-        along = np.linalg.solve(A @ A.swapaxes(1, 2), (A @ acts.shear[:, :, None]))[:, :, 0]
+        along = solved(A @ A.swapaxes(1, 2), np.einsum("nei,ni->ne", A, acts.shear))
         turn = -foot.gap[:, None] * np.einsum("nek,ne->nk", foot.dN, along)
         rubs = -(foot.N[:, :, None] * acts.shear[:, None, :] + turn[:, :, None] * foot.n[:, None])
         return _Acting(pushes, np.concatenate([acts.shear[:, None], rubs], axis=1), acts)
@@ -515,13 +522,15 @@ class _Pass:
         D = np.zeros((n, 1 + self._near.element.dim, gdim, count, gdim))
         if n == 0:
             return D
-        for node in range(count):
+        # (nothing acts where all are shifted, so that the points' derivatives follow)
+        for node in range(1, count):
             for j in range(gdim):
                 kept = z[:, node, j].copy()
                 z[:, node, j] += 1j * STEP
                 pushes, rubs, _ = self._act(self.stencil, z)
                 z[:, node, j] = kept
                 D[:, :, :, node, j] = (pushes + rubs).imag / STEP
+        D[:, :, :, 0] = -D[:, :, :, 1:].sum(axis=3)
         return D
 
     def blocks(self, factor: float) -> dict[tuple[int, int], list[Blocks]]:
