@@ -106,8 +106,8 @@ for number in range(LIFTS):
 
 figure, axes = plt.subplot_mosaic(
     [["built", "surface"], ["slide", "surface"]],
-    figsize=(13, 6),
-    width_ratios=[1.7, 1],
+    figsize=(12, 6.3),
+    width_ratios=[1.35, 1],
     layout="constrained",
 )
 
