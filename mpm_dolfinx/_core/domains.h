@@ -67,8 +67,8 @@ struct Target
 void assemble_points(const Domains& domains, const double* support_gradients, const double* A,
                      bool symmetric, const Target& target);
 
-// Add T^T (sum_q w_q G^T A G + sum_m a_m b_m^T) T with the vectors a_1, b_1, a_2, ... of each domain
-// in vectors, (count, 2 pairs, nodes, dim).
+// Add T^T (sum_q w_q G^T A G + sum_m a_m b_m^T) T with the vectors a_1, b_1, a_2, ... of each
+// domain in vectors, (count, 2 pairs, nodes, dim).
 void assemble_domains(const Domains& domains, const double* transfers, const double* A,
                       const double* vectors, int pairs, const Target& target);
 

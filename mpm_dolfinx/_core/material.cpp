@@ -4,9 +4,9 @@
 // Hencky elasticity and laws of plasticity in logarithmic strain, point by point.
 //
 // The same algorithms as mpm_dolfinx.materials (kinematics, von_mises, mohr_coulomb,
-// drucker_prager, cam_clay), which are their oracles. All are isotropic, so stress and strain share the axes
-// of the trial elastic b, and tangents have 8 (plane) or 21 (space) entries other than zero in that
-// frame.
+// drucker_prager, cam_clay), which are their oracles. All are isotropic, so stress and strain share
+// the axes of the trial elastic b, and tangents have 8 (plane) or 21 (space) entries other than
+// zero in that frame.
 
 #include "material.h"
 #include "hot_loop.h"
@@ -250,12 +250,7 @@ struct MohrCoulomb
     return {sum + 2.0 * shear * e[0], sum + 2.0 * shear * e[1], sum + 2.0 * shear * e[2]};
   }
 
-  enum Where
-  {
-    plane,
-    compression,
-    extension
-  };
+  enum Where { plane, compression, extension };
 
   // The average over the two equal values of an edge.
   static Vector averaged(Where where, const Vector& x)
@@ -314,8 +309,7 @@ struct MohrCoulomb
       answer.elastic[a] = given[a] ? (values[a] - lame * trace) / unit : strain[a];
       answer.stress[a] = given[a] ? values[a] : lame * trace + unit * strain[a];
       for (int b = 0; b < 3; ++b)
-        answer.normal[a][b]
-            = given[a] || given[b] ? 0.0 : lame * slope + (a == b ? unit : 0.0);
+        answer.normal[a][b] = given[a] || given[b] ? 0.0 : lame * slope + (a == b ? unit : 0.0);
     }
     return answer;
   }
@@ -365,8 +359,7 @@ struct MohrCoulomb
         misfit = largest({-p[0], -p[1], -p[2]});
         break;
       case 3:
-        misfit = largest(
-            {p[2], -ratio * p[2] - p[0], (s[1] - t) / unit, (least - s[1]) / unit});
+        misfit = largest({p[2], -ratio * p[2] - p[0], (s[1] - t) / unit, (least - s[1]) / unit});
         break;
       case 4:
         misfit = largest({p[2], -p[0], -p[1], -ratio * p[2] - p[0] - p[1]});
@@ -445,8 +438,8 @@ struct MohrCoulomb
     }
     r.plastic = true;
     r.variables[0] += root_two_thirds * norm_of_difference(strain, answer.elastic);
-    const double near
-        = 1e-12 * std::max(std::max(std::abs(strain[0]), std::abs(strain[1])), std::abs(strain[2]));
+    const double near =
+        1e-12 * std::max(std::max(std::abs(strain[0]), std::abs(strain[1])), std::abs(strain[2]));
     for (int a = 0; a < 3; ++a)
     {
       r.stress[order[a]] = answer.stress[a];
@@ -579,8 +572,7 @@ struct CamClay
     {
       const double slope = v.p / swelling, hardening = v.p_c / plastic;
       return {1.0 + y * (2.0 * slope + hardening), 2.0 * v.p - v.p_c,
-              (2.0 * v.p - v.p_c) * slope + v.p * hardening,
-              -2.0 * v.q * v.q * softness / v.left};
+              (2.0 * v.p - v.p_c) * slope + v.p * hardening, -2.0 * v.q * v.q * softness / v.left};
     }
 
     double volume_at(double y, double low, double high) const
@@ -664,8 +656,10 @@ struct CamClay
     }
     size = std::sqrt(size);
     const double shear = modulus / p_c;
-    const Point point{plastic, swelling, ratio,  shear, pressure / p_c, 6.0 * shear / (ratio * ratio),
-                      -trace,  root_two_thirds * size};
+    const Point point{plastic,        swelling,
+                      ratio,          shear,
+                      pressure / p_c, 6.0 * shear / (ratio * ratio),
+                      -trace,         root_two_thirds * size};
     double x = -trace, y = 0.0;
     Point::Values v = point.at(x, y);
     r.plastic = v.f > tolerance;
@@ -701,9 +695,10 @@ struct CamClay
       for (int b = 0; b < 3; ++b)
       {
         r.shear[a][b] = secant;
-        r.normal[a][b] = secant * ((a == b ? 1.0 : 0.0) - 1.0 / 3.0)
-                         + (2.0 / 3.0 * q_s * p_c - secant) * direction[a] * direction[b]
-                         + p_c * (p_v - root_two_thirds * (p_s * direction[b] + q_v * direction[a]));
+        r.normal[a][b] =
+            secant * ((a == b ? 1.0 : 0.0) - 1.0 / 3.0)
+            + (2.0 / 3.0 * q_s * p_c - secant) * direction[a] * direction[b]
+            + p_c * (p_v - root_two_thirds * (p_s * direction[b] + q_v * direction[a]));
       }
   }
 };
@@ -864,7 +859,8 @@ std::vector<std::int64_t> update_all(const core::Update& u)
   constexpr int size = dim * dim, m = dim == 2 ? 4 : 6;
   std::vector<std::int64_t> invalid;
   const bool history = u.old_gradient != nullptr;
-  const std::size_t parameters = core::num_parameters(u.law), variables = core::num_variables(u.law);
+  const std::size_t parameters = core::num_parameters(u.law),
+                    variables = core::num_variables(u.law);
   for (std::size_t p = 0; p < u.count; ++p)
   {
     double values[core::max_parameters];
@@ -873,11 +869,11 @@ std::vector<std::int64_t> update_all(const core::Update& u)
     Response r;
     for (std::size_t k = 0; k < variables; ++k)
       r.variables[k] = u.old_variables[k][p];
-    const bool valid = update_point<dim>(
-        u.gradient + p * size, history ? u.old_gradient + p * size : nullptr,
-        history ? u.old_c + p * m : nullptr, Law(values), u.tolerance, r, u.P + p * size,
-        u.A == nullptr ? nullptr : u.A + p * size * size, u.stress + p * m,
-        history ? u.c + p * m : nullptr);
+    const bool valid =
+        update_point<dim>(u.gradient + p * size, history ? u.old_gradient + p * size : nullptr,
+                          history ? u.old_c + p * m : nullptr, Law(values), u.tolerance, r,
+                          u.P + p * size, u.A == nullptr ? nullptr : u.A + p * size * size,
+                          u.stress + p * m, history ? u.c + p * m : nullptr);
     for (std::size_t k = 0; k < variables; ++k)
       u.variables[k][p] = r.variables[k];
     if (!valid)

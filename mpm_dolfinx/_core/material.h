@@ -17,13 +17,12 @@ struct Parameter
   double operator()(std::size_t point) const { return values[point * stride]; }
 };
 
-enum class Law
-{
-  hencky,       // bulk, shear
-  von_mises,    // bulk, shear, rho_y, hardening
-  mohr_coulomb, // bulk, shear, sin(phi), sin(psi), 2 c cos(phi), cut-off, volume correction
+enum class Law {
+  hencky,         // bulk, shear
+  von_mises,      // bulk, shear, rho_y, hardening
+  mohr_coulomb,   // bulk, shear, sin(phi), sin(psi), 2 c cos(phi), cut-off, volume correction
   drucker_prager, // bulk, shear, eta, eta_psi, xi c, largest mean stress, volume correction
-  cam_clay // compression, swelling, M, shear, reference pressure
+  cam_clay        // compression, swelling, M, shear, reference pressure
 };
 
 constexpr std::size_t max_parameters = 7;

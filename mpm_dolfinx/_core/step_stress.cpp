@@ -76,8 +76,7 @@ void set_tangent(const double* A, const Matrix<dim>& G, const Matrix<dim>& S, co
 // Add Gonzalez' correction c E to the second Piola stress M of the step, which is the mean of S and
 // that at the beginning, and to the tangent what does not come by M.
 template <int dim>
-class Correction
-{
+class Correction {
 public:
   Correction(const StepEnds& ends, std::size_t p, const Matrix<dim>& F, const Matrix<dim>& mean,
              const Matrix<dim>& change, const Matrix<dim>& S, Matrix<dim>& M)
@@ -141,8 +140,7 @@ public:
             square += mean[a][I] * F[k][I];
           for (int L = 0; L < dim; ++L)
             tangent[a * rest + (J * dim + k) * dim + L] +=
-                left[a][J] * dc[k][L]
-                + 0.5 * _c * ((J == L ? square : 0.0) + mean[a][L] * F[k][J]);
+                left[a][J] * dc[k][L] + 0.5 * _c * ((J == L ? square : 0.0) + mean[a][L] * F[k][J]);
         }
   }
 

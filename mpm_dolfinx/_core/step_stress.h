@@ -10,8 +10,7 @@
 namespace core
 {
 // Which stress of a whole step a point has.
-enum class Step : std::uint8_t
-{
+enum class Step : std::uint8_t {
   mean_of_stresses, // a law of small strains
   simo_tarnow,
   gonzalez // with an energy
@@ -30,8 +29,8 @@ struct StepEnds
   double factor;                     // of stress and tangent
 };
 
-// Set stress (count, dim, dim) and tangent (count, dim, dim, dim, dim) of the step; return the points
-// whose F is singular. See mpm_dolfinx.constitutive.step_stress, which is the oracle.
+// Set stress (count, dim, dim) and tangent (count, dim, dim, dim, dim) of the step; return the
+// points whose F is singular. See mpm_dolfinx.constitutive.step_stress, which is the oracle.
 std::vector<std::int64_t> step_stress(const StepEnds& ends, int dim, double* stress,
                                       double* tangent);
 } // namespace core
