@@ -6,7 +6,7 @@
     python docs/studies/make.py               all but those of run times
     python docs/studies/make.py --check       what does not follow: runs the quick rows
     python docs/studies/make.py --still       the same without any run
-    python docs/studies/make.py --stamp PAGE  tables of other commands were measured just now
+    python docs/studies/make.py --stamp NAME  scripts have changed in what does not matter to it
 
 NAME is a table, as ``locking/cantilever``, or the beginning of several, as ``locking``. A comment
 above each table of measured numbers tells where it comes from:
@@ -17,7 +17,8 @@ above each table of measured numbers tells where it comes from:
 
 The first number is a hash of the scripts that made the table, the second one of its rows. A table
 does not follow where the scripts have changed since, where it was edited by hand, or where its
-quick rows come out otherwise.
+quick rows come out otherwise. ``--stamp`` takes the name of a page too, and writes both numbers
+anew: for tables copied by hand from what another program has printed.
 """
 
 from __future__ import annotations
@@ -202,12 +203,14 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help="a table, or its beginning")
     parser.add_argument("--check", action="store_true", help="change nothing, run the quick rows")
     parser.add_argument("--still", action="store_true", help="change nothing, run nothing")
-    parser.add_argument("--stamp", metavar="PAGE", help="tables by other commands are new")
+    parser.add_argument("--stamp", metavar="NAME", help="write the hashes of a table or page")
     parser.add_argument("--times", action="store_true", help="also tables of run times")
     args = parser.parse_args()
     if args.stamp:
-        for found in list(found_in(args.stamp)):
-            if found.source.startswith("by "):
+        chosen = [f for f in all_found() if f.source not in ("", "once")]
+        for found in chosen:
+            mine = found.source == args.stamp
+            if mine or (found.page == args.stamp and found.source.startswith("by ")):
                 put(found, found.rows)
         return
     unknown = [n for n in args.names if not any(t.startswith(n) for t in TABLES)]

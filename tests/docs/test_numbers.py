@@ -17,3 +17,20 @@ def test_the_table_of_the_readme_follows():
         [sys.executable, str(SCRIPT), "--check"], capture_output=True, text=True, timeout=60
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skip_in_parallel
+def test_tables_of_the_documentation_come_from_somewhere():
+    """Whether they are new is what ``make studies ARGS=--check`` tells."""
+    make = Path(__file__).parents[2] / "docs" / "studies" / "make.py"
+    done = subprocess.run(
+        [sys.executable, str(make), "--still"], capture_output=True, text=True, timeout=120
+    )
+    *told, total = done.stdout.splitlines()
+    assert int(total.split()[0]) > 80
+    late = (
+        "have changed since it was made",
+        "no comment says where its numbers come from",
+        "it has not been made yet",
+    )
+    assert not [line for line in told if not line.endswith(late)]
