@@ -63,7 +63,7 @@ class Shot:
         cells: Polygons of the backgrounds in the plane.
         marks: Points of contact ``(m, gdim)`` and their pressures ``(m,)``.
         extent: Corners of the box around all domains, shape ``(2, gdim)``.
-        around: That around the backgrounds.
+        around: That around the backgrounds, if they are drawn.
         obstacles: What rigid obstacles tell of where they are: signed distance, bounds and facets.
     """
 
@@ -72,7 +72,7 @@ class Shot:
     cells: list[NDArray[np.float64]]
     marks: tuple[NDArray[np.float64], NDArray[np.float64]] | None
     extent: NDArray[np.float64]
-    around: NDArray[np.float64]
+    around: NDArray[np.float64] | None
     obstacles: list[Any]
 
     @property
@@ -202,7 +202,7 @@ def take(
         [cell for cell in cells if cell is not None],
         marks,
         extent,
-        around if background else extent,
+        around if background else None,
         obstacles,
     )
 
@@ -407,13 +407,14 @@ def _rendered(shot: Shot, look: Look, limits: tuple[float, float]) -> NDArray[np
                 show_scalar_bar=False,
             )
         for obstacle in shot.obstacles:
-            solid = _solid(pyvista, obstacle, _with_obstacles(shot.around, shot.obstacles))
+            near = shot.extent if shot.around is None else shot.around
+            solid = _solid(pyvista, obstacle, _with_obstacles(near, shot.obstacles))
             if solid is not None and solid.n_cells:
                 look_of = {"smooth_shading": True, "split_sharp_edges": True}
                 plotter.add_mesh(solid, color=OBSTACLE, ambient=0.35, diffuse=0.65, **look_of)
-        low, high = shot.around
-        box = pyvista.Box(np.column_stack([low, high]).ravel())
-        plotter.add_mesh(box, style="wireframe", color="#999999", line_width=1.0)
+        if shot.around is not None:
+            box = pyvista.Box(shot.around.T.ravel())
+            plotter.add_mesh(box, style="wireframe", color="#999999", line_width=1.0)
         plotter.enable_parallel_projection()
         if look.camera is None:
             plotter.view_vector((1.0, -1.6, 0.8), viewup=(0.0, 0.0, 1.0))

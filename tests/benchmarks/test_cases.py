@@ -121,6 +121,12 @@ RUNS = {
         "--case footing --cell 0.5 --steps 10",
         {"ratio": 1.2, "cutbacks": 0},
     ),
+    "rounded-footing": (
+        "penetration",
+        "--obstacle footing --cell 0.25 --steps 10",
+        {"ratio": 1.17, "cutbacks": 0, "iterations": 50, "penetration": 0.01},
+    ),
+    "disc": ("penetration", "", {"cutbacks": 0, "iterations": 520, "force": 7.0}),
     "snap-through": ("snap_through", "--steps 12", {"error": 5e-3, "cutbacks": 0}),
     "roller-patch": (
         "column_roller",
@@ -197,6 +203,7 @@ KEYS = {
     "sand_column": {"run_out", "experiment", "ratio", "front", "height_at_wall"},
     "strength": {"factor", "exact", "ratio", "particles"},
     "consolidation": {"error", "degree", "error_degree", "particles"},
+    "penetration": {"force", "depth", "ratio", "iterations_per_step", "penetration"},
     "snap_through": {"limit", "valley", "crown", "error"},
 }
 

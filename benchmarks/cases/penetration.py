@@ -1,0 +1,175 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""A rigid pile, disc, wedge or footing is pressed into undrained clay.
+
+demos/demo_pipe.py is its simplest form.
+"""
+
+import kit
+import numpy as np
+
+from dolfinx import fem, mesh
+
+import mpm_dolfinx as mpm
+
+parser = kit.Parser("A rigid obstacle is pressed into von Mises soil.")
+parser.add_argument("--obstacle", choices=("pile", "disc", "wedge", "footing"), default="disc")
+parser.add_argument("--friction", type=float, default=0.0, help="coefficient of friction")
+parser.add_argument("--depth", type=kit.positive, help="0.6, 0.03 of the footing by default")
+parser.add_argument("--angle", type=kit.positive, default=45.0, help="half angle of the wedge")
+parser.add_argument("--cell", type=kit.positive, default=0.125, help="background cell size")
+parser.add_argument("--domain", choices=("quad", "tri"), default="quad", help="particle domains")
+parser.add_argument("--penalty", type=kit.positive, default=1.0, help="of the contact")
+parser.add_argument(
+    "--tangential-penalty", type=kit.positive, default=0.1, help="shear over confined modulus"
+)
+parser.add_argument("--steps", type=kit.whole, help="a hundredth of a width each by default")
+parser.add_f_bar("patch")
+args = parser.parse()
+
+# The right half of a soil 8 m wide and 2.5 m deep; obstacles are 1 m wide but for the wedge.
+
+wide, deep, h = 4.0, 2.5, args.cell
+young, poisson, cohesion = 500.0, 0.45, 1.0
+depth = args.depth or (0.03 if args.obstacle == "footing" else 0.6)
+steps = args.steps or (20 if args.obstacle == "footing" else round(100.0 * depth))
+
+
+def lines(end: float, fine: float) -> np.ndarray:
+    """Places from 0 to `end`, at first `h` apart, then each a fifth farther, 0.5 at most."""
+    cells = [h] * round(fine / h)
+    while sum(cells) < end - 1e-9:
+        cells.append(min(1.2 * cells[-1], 0.5))
+    tail = np.array(cells[round(fine / h) :])
+    tail *= (end - fine) / tail.sum()
+    return np.concatenate([h * np.arange(round(fine / h) + 1), fine + np.cumsum(tail)])
+
+
+def divided(along: np.ndarray) -> np.ndarray:
+    """Lines that divide each interval of others in two."""
+    return np.interp(np.arange(2 * len(along) - 1) / 2, np.arange(len(along)), along)
+
+
+def grid(x: np.ndarray, y: np.ndarray, kind: mesh.CellType) -> mesh.Mesh:
+    """A mesh with given lines."""
+    domain = kit.box([len(x) - 1.0, len(y) - 1.0], [len(x) - 1, len(y) - 1], kind)
+    for axis, along in enumerate((x, y)):
+        place = domain.geometry.x[:, axis]
+        place[:] = np.interp(place, np.arange(len(along)), along)
+    return domain
+
+
+across, up = lines(wide, 1.5), -lines(deep, 1.0)[::-1]
+room = np.append(up, h * np.arange(1, round(1.0 / h) + 1))
+V = fem.functionspace(grid(across, room, mesh.CellType.quadrilateral), ("Lagrange", 1, (2,)))
+rule = 2 if args.domain == "quad" and args.quadrature_degree is None else args.quadrature_degree
+soil = mpm.Particles(
+    grid(divided(across), divided(up), kit.DOMAINS[args.domain]), V, quadrature_degree=rule
+)
+
+
+def rounded(radius: float):
+    """A block of half width 0.5 on the ground."""
+    return mpm.contact.box((-0.5, 0.0), (0.5, 4.0), radius)
+
+
+slope = np.tan(np.radians(args.angle))
+shape = {
+    "pile": lambda: rounded(0.05),
+    "footing": lambda: rounded(0.01),
+    "disc": lambda: mpm.contact.disc((0.0, 0.5), 0.5),
+    "wedge": lambda: mpm.contact.polygon([(0, 0), (3 * slope, 3), (-3 * slope, 3)]),
+}[args.obstacle]()
+ground = mesh.locate_entities_boundary(soil.mesh, 1, lambda x: np.isclose(x[1], 0.0))
+tags = mesh.meshtags(soil.mesh, 1, np.sort(ground), np.full(len(ground), 1, np.int32))
+obstacle = mpm.contact.Rigid(
+    soil,
+    shape,
+    args.friction,
+    facet_tags=tags,
+    tag=1,
+    penalty=args.penalty,
+    tangential_penalty=args.tangential_penalty,
+)
+
+
+def held(component: int, where) -> fem.DirichletBC:
+    dofs = fem.locate_dofs_geometrical((V.sub(component), V.sub(component).collapse()[0]), where)
+    return fem.dirichletbc(fem.Function(V.sub(component).collapse()[0]), dofs, V.sub(component))
+
+
+problem = mpm.QuasiStaticProblem(
+    soil,
+    mpm.materials.VonMises(young, poisson, rho_y=np.sqrt(2.0) * cohesion),
+    bcs=[
+        held(0, lambda x: np.isclose(x[0], 0.0) | np.isclose(x[0], wide)),
+        held(0, lambda x: np.isclose(x[1], -deep)),
+        held(1, lambda x: np.isclose(x[1], -deep)),
+    ],
+    f_bar=args.f_bar,
+    terms=[obstacle],
+)
+
+
+def hill() -> float:
+    """Force of half a smooth wedge over depth and cohesion (Hill, Lee & Tupper 1947)."""
+    beta = np.radians(args.angle)
+
+    def rest(turn: float) -> float:
+        return float(np.cos(2 * beta - turn) - np.cos(turn) / (1 + np.sin(turn)))
+
+    low, high = 0.0, 2 * beta
+    for _ in range(80):
+        middle = (low + high) / 2
+        low, high = (middle, high) if rest(low) * rest(middle) > 0 else (low, middle)
+    return 2 * (1 + low) * np.sin(beta) / (np.cos(beta) - np.sin(beta - low))
+
+
+path, failure = [(0.0, 0.0)], None
+run = problem.steps(steps, update=lambda t: obstacle.move((0.0, -depth * t)))
+try:
+    for step in kit.progress(run, steps, args):
+        path.append((depth * step.load, float(-problem.reaction(obstacle)[1])))
+except mpm.MPMError as error:
+    failure = error
+reached, force = np.array(path).T
+exact = None
+if args.obstacle == "footing":
+    exact = (2.0 + np.pi) * cohesion * 0.5
+if args.obstacle == "wedge" and args.friction == 0.0:
+    exact = hill() * reached[-1]
+history = problem.history
+most = max(history.iterations, default=0)
+numbers = {
+    **kit.outcome(history, failure),
+    "depth": float(reached[-1]),
+    "force": 2.0 * float(force[-1]) / cohesion,
+    "ratio": None if exact is None else float(force[-1]) / exact,
+    "iterations_per_step": float(np.mean(history.iterations)) if history.iterations else 0.0,
+    "iterations_most": most,
+    "penetration": kit.largest(-obstacle.gap) / h,
+    "particles": soil.num_global,
+}
+rows = [
+    (args.obstacle, f"{soil.num_global} domains, cells of {h:g}, friction {args.friction:g}"),
+    ("depth", f"{reached[-1]:.3f} in {len(history.steps)} steps, {history.cutbacks} cutbacks"),
+    ("linear solves", f"{history.total_iterations}, {numbers['iterations_per_step']:.1f} a step"),
+    ("force over c and 1 m", f"{numbers['force']:.3f}"),
+    ("penetration in cells", f"{numbers['penetration']:.1e}"),
+]
+if exact is not None:
+    rows.append(("force over the exact one", f"{numbers['ratio']:.4f}"))
+
+if args.plot:
+    fig, axes = kit.figure(12.0, 5.0, [["soil", "force"]])
+    mpm.plot.scene(problem, "plastic_strain", ax=axes["soil"], background=False)
+    if fig is not None:
+        axes["soil"].set(xlim=(0.0, 2.0), ylim=(-1.6, 0.7), xlabel="x, m", ylabel="y, m")
+        axes["force"].plot(2.0 * force / cohesion, -reached, color=kit.COLOURS["blue"])
+        axes["force"].set(xlabel="force over c and 1 m", ylabel="depth, m")
+    kit.save(fig, args)
+
+kit.report(args, numbers, rows, failure)
+
+if args.default:
+    assert numbers["completed"] and numbers["cutbacks"] <= 2
