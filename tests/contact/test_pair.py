@@ -305,6 +305,50 @@ def test_a_cube_is_dragged_on_another(cell):
     assert np.abs(on_b - force).max() < 1e-6 * force[2]
 
 
+@pytest.mark.parametrize("passes", [1, 2])
+def test_a_slit_in_a_body_opens_and_closes(passes):
+    # Two leaves on fields of their own, tied at the root. Closed, with a tie as soft as contact,
+    # the slit bears an even pressure as if there were none; open, it bears nothing.
+    Va, Vb = spaces([-0.4, -0.3], [2.4, 1.8], [14, 11])
+    upper = scenes.box([0.0, 0.5], [2.0, 1.0], [16, 4], QUADRILATERAL)
+    lower = scenes.box([0.0, 0.0], [2.0, 0.5], [16, 4], QUADRILATERAL)
+
+    def tagged(body, other):
+        root = lambda x: np.isclose(x[1], 0.5) & (x[0] < 0.51)  # noqa: E731
+        slit = lambda x: np.isclose(x[1], 0.5) & (x[0] > 0.49)  # noqa: E731
+        return scenes.facet_tags(body, root, slit, scenes.at(1, other))
+
+    tags = [tagged(upper, 1.0), tagged(lower, 0.0)]
+    a, b = (mpm.Particles(m, V, quadrature_degree=2) for m, V in ((upper, Va), (lower, Vb)))
+    k = YOUNG / (2 * 0.125)  # of a layer of domains on each side
+    root = mpm.Tie(a, b, tags[0], 1, k)
+    slit = contact.Pair(a, b, facet_tags=tags, tags=(2, 2), passes=passes)
+    load = fem.Constant(upper, (0.0, 0.0))
+    problem = mpm.QuasiStaticProblem(
+        [a, b],
+        LinearElastic(YOUNG, 0.0),
+        tractions=[[(load, 3)], []],
+        facet_tags=tags,
+        supports=[mpm.boundary.fixed(b, tags[1], 3)],
+        terms=[root, slit],
+    )
+
+    def path(t):
+        load.value[:] = 0.0, 0.01 * np.sin(2 * np.pi * t)
+        for body in (a, b):
+            body.load.value = 1.0
+
+    for step in problem.steps(4, update=path):
+        force = problem.reaction(slit)
+        if step.load == 0.25:
+            assert not slit.touches.any() and not force.any()
+            assert WORLD.allreduce(slit.gap.max(initial=0.0), scenes.MPI.MAX) > 1e-5
+        if step.load == 0.75:
+            assert force == pytest.approx([0.0, 0.01 * 1.5], abs=1e-4 * 0.01)
+            for body in (a, b):
+                assert scenes.largest(body.stress[:, 1, 1] + 0.01) < 2e-3 * 0.01
+
+
 def test_bodies_that_overlap_at_the_beginning_are_refused():
     Va, Vb = spaces([-0.5, -0.5], [1.5, 2.0], [8, 10])
     a = mpm.Particles(scenes.box([0.2, 0.9], [0.8, 1.5], [4, 4], QUADRILATERAL), Va)
