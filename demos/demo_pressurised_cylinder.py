@@ -13,8 +13,7 @@
 #
 # A long thick tube of inner radius $a = 1$ m and outer radius $b = 2$ m is blown up by a pressure
 # $p = 80$ kPa inside; it cannot lengthen. The material is Hencky's, $E = 1$ MPa and $\nu = 0.3$.
-# The pressure acts on the inner surface as it is at each moment: on the undeformed one, with
-# normal $N$, that is the traction
+# The pressure acts on the inner surface as it is: on the undeformed one, with normal $N$, by
 #
 # $$
 # t = -p\, J F^{-T} N, \qquad J = \det F, \tag{1}
@@ -22,8 +21,7 @@
 #
 # whose derivative is part of the tangent, which is not symmetric. The tube is computed twice: as
 # a strip in the $(r, z)$ plane, one background cell high, whose deformation gradient has the hoop
-# stretch $1 + d_r / R$; and as a quarter of the ring in the $(x, y)$ plane, on a grid of squares
-# that knows nothing of circles.
+# stretch $1 + d_r / R$; and as a quarter of the ring in the $(x, y)$ plane, on a grid of squares.
 #
 # ## Reference
 #
@@ -92,8 +90,6 @@ ring = problem_of(
     axisymmetric=False,
 )
 
-# ## Result
-
 
 def radius_of(problem, at):
     particles = problem.particles
@@ -110,7 +106,6 @@ for name, problem in (("strip", strip), ("ring", ring)):
     errors[name] = [abs(radius_of(problem, at) / exact - 1.0) for at, exact in EXACT.items()]
     if comm.rank == 0:
         print(f"{name:6s} errors of r(a) and r(b):", *(f"{e:.1e}" for e in errors[name]))
-
 
 x, sigma = ring.particles.centroid, ring.particles.stress
 across = np.column_stack([-x[:, 1], x[:, 0]]) / np.linalg.norm(x, axis=1, keepdims=True)
