@@ -367,6 +367,7 @@ def test_case_is_a_program(name, tmp_path):
         "vortex": "--steps 8",
         "column_dynamic": "--cell 1 --steps 20",
         "sand_column": "--cells 4 --time 0.1 --steps 5",
+        "penetration": "--cell 0.25 --depth 0.05 --steps 4",
     }.get(name, "--elements 4 --steps 4")
     done = subprocess.run(
         [sys.executable, str(CASES / f"{name}.py"), *small.split(), "--json"],
