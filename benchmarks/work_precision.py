@@ -1,11 +1,12 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Run time against error: elastic and elasto-plastic columns, a cantilever, a collapse.
+"""Run time against error: columns, a cantilever, flow, contact, motion, beside finite elements.
 
 Each point is a process of its own on one thread. Its CPU seconds (user and system) are those of
 start-up (imports, meshes, forms from FFCx's cache), of the run (load steps), and of the whole
 process; of several processes the one that took least counts. A process that compiled a form is
-run again. Other codes' points are CPU seconds of their whole processes on the same cases.
+run again. Other codes' points are CPU seconds of their whole processes on the same cases. Finite
+elements are those of stock DOLFINx on the mesh of the body (`finite_elements.py`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import argparse
 import json
 import math
 import os
+import platform
 import resource
 import subprocess
 import sys
@@ -48,9 +50,19 @@ KINDS = {
     "quad2": Kind("quad", "cpdi2", 2, "quads, degree 2", "#D55E00", "s"),
     "tri2": Kind("tri", "cpdi2", 2, "triangles, degree 2", "#E69F00", ">"),
     "quad3": Kind("quad", "cpdi2", 3, "quads, degree 3", "#882255", "P"),
+    "hex1": Kind("hex", "cpdi2", 1, "CPDI2 hexahedra, degree 1", "#0072B2", "o"),
+    "hexf": Kind("hex", "cpdi2", 1, "CPDI2 hexahedra, F-bar", "#332288", "X", "domain"),
+    "hex2": Kind("hex", "cpdi2", 2, "hexahedra, degree 2", "#D55E00", "s"),
+    "equal": Kind("quad", "cpdi2", 1, "equal steps", "#0072B2", "o"),
+    "auto": Kind("quad", "cpdi2", 1, "automatic steps", "#D55E00", "s"),
+    "equal-tri": Kind("tri", "cpdi2", 1, "equal steps, triangles", "#56B4E9", "^"),
+    "auto-tri": Kind("tri", "cpdi2", 1, "automatic steps, triangles", "#E69F00", ">"),
+    "fem1": Kind("", "fem", 1, "finite elements, degree 1", "0.0", "o"),
+    "fem2": Kind("", "fem", 2, "finite elements, degree 2", "0.0", "s"),
 }
 
-# Background cells over the height (A, B) or size of a cell in m (C, E), coarse to fine.
+# Coarse to fine: background cells over the height (A, B), over the width (D), over 1 m (P, V), in
+# half of the width that touches (H); size of a cell in m (C, E); steps or tolerances (F).
 SIZES: dict[str, dict[str, list[float]]] = {
     "A": {
         "quad1": [16, 64, 256, 1024, 4096],
@@ -77,6 +89,14 @@ SIZES: dict[str, dict[str, list[float]]] = {
         "gimp": [1.0, 0.5],
         "quad2": [2.0, 1.0, 0.5],
         "tri2": [2.0, 1.0],
+        "fem1": [2.0, 1.0, 0.5, 0.25],
+        "fem2": [2.0, 1.0, 0.5],
+    },
+    "D": {
+        "hex1": [1, 2, 4, 8],
+        "hex2": [1, 2, 4],
+        "fem1": [1, 2, 4, 8],
+        "fem2": [1, 2],
     },
     "E": {
         "quad1": [0.5, 0.25, 0.125, 0.0625],
@@ -86,15 +106,52 @@ SIZES: dict[str, dict[str, list[float]]] = {
         "quad2": [1.0, 0.5, 0.25],
         "tri2": [1.0, 0.5, 0.25],
         "quad3": [1.0, 0.5],
+        "fem1": [0.5, 0.25, 0.125, 0.0625],
+        "fem2": [1.0, 0.5, 0.25],
+    },
+    "F": {
+        "equal": [10, 20, 40, 80, 160],
+        "auto": [0.04, 0.02, 0.01, 0.005],
+        "equal-tri": [10, 20, 40, 80, 160],
+        "auto-tri": [0.04, 0.02, 0.01, 0.005],
+    },
+    "H": {
+        "quad1": [4, 8, 16, 32],
+        "quad2": [2, 4, 8],
+        "fem1": [4, 8, 16, 32],
+        "fem2": [2, 4, 8, 16],
+    },
+    "P": {
+        "hex1": [2, 4, 8],
+        "hexf": [2, 4, 8],
+        "hex2": [1, 2, 4],
+        "fem1": [2, 4, 8],
+        "fem2": [1, 2, 3],
+    },
+    "V": {
+        "quad1": [8, 16, 32],
+        "quad2": [4, 8],
+        "fem1": [8, 16, 32],
+        "fem2": [4, 8, 16],
     },
 }
 SMOKE: dict[str, dict[str, list[float]]] = {
     "A": {"quad1": [4, 8], "quad2": [4]},
     "B": {"quad1": [4]},
     "C": {"quad1": [2.0]},
+    "D": {"hex1": [1], "fem1": [1]},
     "E": {"quad1": [1.0]},
+    "F": {"equal": [4], "auto": [0.1]},
+    "H": {"quad1": [2], "fem1": [2]},
+    "P": {"hex1": [1], "fem1": [1]},
+    "V": {"quad1": [4], "fem1": [4]},
 }
-REFERENCE = {"kind": "fbar", "size": 0.125, "smoke": 1.0}  # of C
+#: The runs that those of C and of both kinds of F are compared with.
+REFERENCES: dict[tuple[str, str], tuple[str, float, float]] = {
+    ("C", ""): ("fbar", 0.125, 1.0),
+    ("F", "equal"): ("equal", 640, 8),
+    ("F", "equal-tri"): ("equal-tri", 640, 8),
+}
 
 #: How much faster AMPLE would be in MATLAB, which it is written for: an estimate.
 MATLAB = 12.0
@@ -110,7 +167,6 @@ PEERS: dict[str, dict[str, list[tuple[float, float]]]] = {
         "AMPLE in Octave, GIMP": [(19, 3.84e-3), (35, 1.49e-3), (75, 5.19e-4)],
         "AMPLE, point MPM": [(18, 1.1e-1), (69, 1.0e-1)],
     },
-    "C": {},
     "E": {"AMPLE in Octave, GIMP, ghost penalty": [(81, 1.01e-2), (314, 4.7e-3), (1255, 1.6e-3)]},
 }
 
@@ -122,6 +178,7 @@ def point(case: str, kind: str, size: float, steps: int | None) -> None:
     """Run a scene in this process and print what it took and what came out."""
     from mpi4py import MPI  # noqa: F401
 
+    import finite_elements
     import scenes
 
     import mpm_dolfinx as mpm
@@ -130,15 +187,18 @@ def point(case: str, kind: str, size: float, steps: int | None) -> None:
     options: dict[str, Any] = {} if steps is None else {"steps": steps}
     if KINDS[kind].f_bar != "none":
         options["f_bar"] = KINDS[kind].f_bar
-    scene = scenes.CASES[case](size, domain, method, degree, **options)
+    scene: Any
+    if method == "fem":
+        scene = finite_elements.CASES[case](size, degree, **options)
+    else:
+        scene = scenes.CASES[case](size, domain, method, degree, **options)
     start = time.process_time()
     failure = None
     try:
-        scene.problem.solve(steps=scene.steps)
+        scene.solve()
     except mpm.MPMError as error:
         failure = type(error).__name__
     end = time.process_time()
-    history = scene.problem.history
     compiler = resource.getrusage(resource.RUSAGE_CHILDREN)
     print(
         json.dumps(
@@ -146,12 +206,9 @@ def point(case: str, kind: str, size: float, steps: int | None) -> None:
                 "startup": start,
                 "run": end - start,
                 "compiler": compiler.ru_utime + compiler.ru_stime,
-                "particles": scene.problem.bodies[0].num_global,
-                "load": history.load[-1] if history.load else 0.0,
-                "iterations": history.total_iterations,
-                "cutbacks": history.cutbacks,
+                **scene.account(),
                 "failure": failure,
-                **{name: float(value) for name, value in scene.measure().items()},
+                **scene.measure(),
             }
         )
     )
@@ -194,17 +251,18 @@ def run(cases: list[str], smoke: bool, repeats: int, quiet: bool) -> list[dict[s
     steps = 4 if smoke else None
     rows: list[dict[str, Any]] = []
 
-    def add(case: str, kind: str, size: float, reference: float | None = None) -> dict[str, Any]:
+    def add(case: str, kind: str, size: float, reference: Any = None) -> dict[str, Any]:
         row = measured(case, kind, size, steps, repeats)
+        rows.append({k: v for k, v in row.items() if k != "displacement"})
         if reference is not None:
-            row["error"] = abs(row["y_mean"] - reference) / reference
-        rows.append(row)
+            rows[-1]["error"] = difference(row, reference)
+        shown = rows[-1]
         if not quiet:
             said = row["failure"] or ", ".join(
-                f"{name} {row[name]:.3e}" for name in ("error", "y_mean") if name in row
+                f"{name} {shown[name]:.3e}" for name in ("error", "y_mean") if name in shown
             )
             print(
-                f"{case} {kind:6s} {size:8g} {row['particles']:8d} particles"
+                f"{case} {kind:9s} {size:8g} {row['particles']:8d} particles"
                 f" {row['startup']:7.2f} {row['run']:8.2f} {row['process']:8.2f} s"
                 f" {row['iterations']:5d} solves {row['cutbacks']:3d} cutbacks  {said}",
                 flush=True,
@@ -215,15 +273,46 @@ def run(cases: list[str], smoke: bool, repeats: int, quiet: bool) -> list[dict[s
         print("CPU seconds of start-up, run, whole process")
     for case in cases:
         reference = None
-        if case == "C":
-            size = float(REFERENCE["smoke" if smoke else "size"])
-            row = add(case, str(REFERENCE["kind"]), size)
-            row["reference"] = True
-            reference = row["y_mean"]
         for kind, sizes in (SMOKE if smoke else SIZES)[case].items():
+            first = "" if reference is None else kind
+            for key in ((case, first), (case, kind)):
+                if key in REFERENCES:
+                    of, size, tiny = REFERENCES[key]
+                    reference = add(case, of, tiny if smoke else size)
+                    rows[-1]["reference"] = True
+                    break
             for size in sizes:
                 add(case, kind, size, reference)
     return rows
+
+
+def difference(row: dict[str, Any], reference: dict[str, Any]) -> float:
+    """Return how far a run ends from its reference: mean heights, or all displacements."""
+    if "y_mean" in row:
+        return float(abs(row["y_mean"] / reference["y_mean"] - 1.0))
+    off = [
+        (a - b) ** 2 for a, b in zip(*(r["displacement"] for r in (row, reference)), strict=True)
+    ]
+    return math.sqrt(sum(off) / sum(b * b for b in reference["displacement"]))
+
+
+def machine() -> dict[str, Any]:
+    """Return what the runs were made on."""
+    from mpi4py import MPI  # noqa: F401
+
+    import dolfinx
+
+    names = [
+        line.partition(":")[2].strip()
+        for line in Path("/proc/cpuinfo").read_text().splitlines()
+        if line.startswith("model name")
+    ]
+    return {
+        "processor": names[0] if names else platform.processor(),
+        "cores": os.cpu_count(),
+        "dolfinx": dolfinx.__version__,
+        "python": platform.python_version(),
+    }
 
 
 def curve(rows: list[dict[str, Any]], case: str, kind: str) -> list[dict[str, Any]]:
@@ -231,7 +320,10 @@ def curve(rows: list[dict[str, Any]], case: str, kind: str) -> list[dict[str, An
     return [
         row
         for row in rows
-        if (row["case"], row["kind"]) == (case, kind) and not row["failure"] and "error" in row
+        if (row["case"], row["kind"]) == (case, kind)
+        and not row["failure"]
+        and "error" in row
+        and "reference" not in row
     ]
 
 
@@ -259,7 +351,17 @@ def seconds_at(points: list[dict[str, Any]], error: float) -> dict[str, Any] | N
     return {"run": run, "process": run + points[-1]["process"] - points[-1]["run"], "at": at}
 
 
-AT = {"A": (1e-4, 1e-5, 1e-6, 1e-7), "B": (1e-4, 1e-5), "C": (2e-2, 1e-2), "E": (1e-3, 2e-4)}
+AT = {
+    "A": (1e-4, 1e-5, 1e-6, 1e-7),
+    "B": (1e-4, 1e-5),
+    "C": (2e-2, 1e-2),
+    "D": (1e-3, 2e-4, 5e-5),
+    "E": (1e-3, 2e-4),
+    "F": (3e-2, 1e-2),
+    "H": (4e-2, 2e-2),
+    "P": (5e-2, 2e-2),
+    "V": (5e-2, 1e-2),
+}
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -282,13 +384,23 @@ TITLES = {
     "A": "Elastic column, compacted to half",
     "B": "Elasto-plastic column between rollers",
     "C": "Elasto-plastic column, collapsing",
+    "D": "Elastic column in space",
     "E": "Cantilever, large deflection",
+    "F": "Column that collapses: load steps",
+    "H": "Rigid disc on an elastic block (Hertz)",
+    "P": "Von Mises block in space, rough plates",
+    "V": "Vortex (dynamics)",
 }
 ERRORS = {
     "A": "mean error of stress",
     "B": "mean error of stress",
     "C": "relative error of mean height",
+    "D": "error of displacements (L2), over the largest",
     "E": "error of the tip, over the length",
+    "F": "error of the displacement, 640 steps as reference",
+    "H": "error of the pressure (L2)",
+    "P": "error of the force on a plate",
+    "V": "error of displacements (L2), over the largest",
 }
 UNSURE = {"C": 1e-2, "E": 1e-4}  # errors below are as large as the reference's own
 GREY = "0.5"
@@ -333,7 +445,7 @@ def panel(ax: Any, rows: list[dict[str, Any]], case: str, key: str) -> None:
     """One case: this package in colours, other codes in grey, each curve with its name."""
     names = []
     if key == "process":
-        for name, points in PEERS[case].items():
+        for name, points in PEERS.get(case, {}).items():
             ax.loglog(*zip(*points, strict=True), "o-", color=GREY, ms=6, lw=1.5, zorder=1)
             names.append((name, points, GREY))
             if name.startswith("AMPLE") and "point" not in name:
@@ -460,7 +572,7 @@ def main() -> None:
         f"results/{RESULTS.name}; with --smoke nowhere)",
         default=argparse.SUPPRESS,
     )
-    parser.add_argument("--cases", default="A,B,C,E", help="which to run, e.g. A,E")
+    parser.add_argument("--cases", default=",".join(SIZES), help="which to run, e.g. A,E")
     parser.add_argument("--smoke", action="store_true", help="a few tiny runs, no pictures")
     parser.add_argument("--repeats", type=int, default=2, help="processes a point, least taken")
     parser.add_argument(
@@ -473,7 +585,9 @@ def main() -> None:
         return
     cases = list(dict.fromkeys(args.cases.split(",")))
     if unknown := [case for case in cases if case not in SIZES]:
-        parser.error(f"argument --cases: there is no case {unknown[0]!r}; choose from A,B,C,E")
+        parser.error(
+            f"argument --cases: there is no case {unknown[0]!r}; choose from {','.join(SIZES)}"
+        )
     if args.repeats < 1:
         parser.error("argument --repeats: must be 1 or more")
     target = getattr(args, "json", None) or (None if args.smoke else str(RESULTS))
@@ -484,7 +598,7 @@ def main() -> None:
         rows = old if args.draw else [row for row in old if row["case"] not in cases]
     if not args.draw:
         rows += run(cases, args.smoke, 1 if args.smoke else args.repeats, target == "-")
-    results = {"points": rows, "summary": summary(rows), "peers": PEERS}
+    results = {"machine": machine(), "points": rows, "summary": summary(rows), "peers": PEERS}
     if target == "-":
         print(json.dumps(results))
     elif target is not None and not args.draw:
@@ -493,6 +607,8 @@ def main() -> None:
     if target is not None and not args.smoke and Path(target) == RESULTS:
         draw(rows, ["A", "E"], "process", IMAGES / "work_precision.png")
         draw(rows, ["A", "B", "C", "E"], "run", IMAGES / "work_precision_run.png")
+        draw(rows, ["D", "P", "V", "H"], "run", IMAGES / "work_precision_more.png")
+        draw(rows, ["F"], "run", IMAGES / "work_precision_steps.png")
 
 
 if __name__ == "__main__":
