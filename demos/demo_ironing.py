@@ -135,9 +135,9 @@ if comm.rank == 0:
     ax.legend(loc="center right")
     figure.savefig("ironing.png", dpi=150)
 
-# Drawn aside by 0.04, the die already slides. From there on both forces are steady, though facets of
-# 0.08 slide over facets of 0.06, and each meets the kinks between the other body's facets. $T / N$ is
-# not quite $\mu$: each point has $|t| = \mu p$ (1), but along facets that incline.
+# Drawn aside by 0.04, the die already slides. From there on both forces are steady, though facets
+# of 0.08 slide over facets of 0.06, and each meets the kinks between the other body's facets.
+# $T / N$ is not quite $\mu$: each point has $|t| = \mu p$ (1), but along facets that incline.
 
 assert scatter < 5e-3 and 0.29 < ratio.min() and ratio.max() < 0.31
 assert problem.history.cutbacks == 0 and np.mean(solves) < 4.0
