@@ -25,6 +25,7 @@ parser.add_argument(
 parser.add_argument("--friction-angle", type=float, default=20.0, help="of slope and footing")
 parser.add_argument("--tolerance", type=kit.positive, default=0.01, help="of the factor of safety")
 parser.add_argument("--steps", type=kit.whole, default=20, help="steps of the footing")
+parser.add_argument("--degree", type=int, choices=(1, 2), default=1, help="of the footing's basis")
 parser.add_f_bar("patch")
 args = parser.parse()
 
@@ -42,9 +43,33 @@ def space(width: float, depth: float) -> fem.FunctionSpace:
     return fem.functionspace(grid, ("Lagrange", 1, (2,)))
 
 
+def lines(fine: float, whole: float) -> np.ndarray:
+    """Grid lines `h` apart up to `fine`, and from there on each cell a fifth longer."""
+    cells = np.full(round(fine / h), h)
+    longer = h * 1.2 ** np.arange(1, 100)
+    longer = longer[: 1 + np.argmax(np.cumsum(longer) >= whole - cells.sum())]
+    longer *= (whole - cells.sum()) / longer.sum()
+    return np.concatenate([[0.0], np.cumsum(cells), cells.sum() + np.cumsum(longer)])
+
+
+def halved(along: np.ndarray) -> np.ndarray:
+    """Lines and the middles between them."""
+    return np.interp(np.arange(2 * len(along) - 1) / 2, np.arange(len(along)), along)
+
+
+def graded(x: np.ndarray, y: np.ndarray, cell: mesh.CellType) -> mesh.Mesh:
+    """A mesh with given grid lines."""
+    grid = kit.box([len(x) - 1.0, len(y) - 1.0], [len(x) - 1, len(y) - 1], cell)
+    for axis, along in enumerate((x, y)):
+        place = grid.geometry.x[:, axis]
+        place[:] = np.interp(place, np.arange(len(along)), along)
+    return grid
+
+
 def held(V: fem.FunctionSpace, component: int, *places: float) -> fem.DirichletBC:
     """A roller on sides (component 0) or on the base (1)."""
-    where = mesh.locate_entities_boundary(
+    V.mesh.topology.create_connectivity(1, 2)
+    where = mesh.locate_entities(
         V.mesh, 1, lambda x: np.isclose(x[component][:, None], places).any(axis=1)
     )
     dofs = fem.locate_dofs_topological(V.sub(component), 1, where)
@@ -86,16 +111,28 @@ elif args.case == "vertical_cut":
     bcs = [held(V, 0, 0.0, wide), *floor(V)]
     exact = 3.776
 else:
+    # As in footing.py a line of the background is a little beyond the strip's edge, and one a
+    # little below the ground.
     young, size = 1e6, 3.0
-    body = kit.box([size, size], [2 * round(size / h)] * 2, kind)
-    V = space(size, size)
+    across, up = lines(1.5, size), size - lines(1.0, size)[::-1]
+    taper = np.clip((size - across) / 1.5, 0.0, 1.0) * (across > 0.0)
+    over = 0.002 * h
+    heights = np.append(up - over * np.clip(up, 0.0, 1.0), size - over + h * np.arange(1, 3))
+    grid = graded(across + 0.04 * h * taper, heights, mesh.CellType.quadrilateral)
+    V = fem.functionspace(grid, ("Lagrange", args.degree, (2,)))
+    body = graded(halved(across), halved(up), kind)
     law = mpm.materials.MohrCoulomb(young, 0.3, 1.0, args.friction_angle, args.friction_angle)
     bcs = [held(V, 0, 0.0, size), held(V, 1, 0.0)]
     tangent = np.tan(np.radians(args.friction_angle))
     N_q = np.exp(np.pi * tangent) * np.tan(np.radians(45.0 + args.friction_angle / 2.0)) ** 2
     exact = (N_q - 1.0) / tangent
 
-particles = mpm.Particles(body, V)
+particles = mpm.Particles(
+    body,
+    V,
+    degree=args.degree if args.case == "footing" else 1,
+    quadrature_degree=args.quadrature_degree,
+)
 supports = []
 if args.case == "footing":
     under = mesh.locate_entities_boundary(

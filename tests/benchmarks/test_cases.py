@@ -118,8 +118,8 @@ RUNS = {
     "vertical-cut": ("strength", "--case vertical_cut --cell 0.125", {"ratio": 1.08}),
     "footing-friction": (
         "strength",
-        "--case footing --cell 0.5 --steps 10",
-        {"ratio": 1.2, "cutbacks": 0},
+        "--case footing --cell 0.25 --degree 2 --steps 10",
+        {"ratio": 1.045, "cutbacks": 0},
     ),
     "rounded-footing": (
         "penetration",
@@ -359,6 +359,7 @@ def test_case_is_a_program(name, tmp_path):
         "block3d": "--elements 2 --steps 4",
         "collapse": "--cell 2 --particles-per-cell 1 --f-bar domain --steps 4",
         "footing": "--cell 0.5 --steps 4",
+        "strength": "--cell 0.5",
         "gmsh_body": "--size 0.3 --body-size 0.3 --steps 2",
         "snap_through": "--cell 1 --steps 4",
         "flying_bar": "--steps 4",
