@@ -21,7 +21,7 @@ spec = spec_from_file_location("benchmark_scenes", SCENES)  # the tests have a m
 assert spec is not None and spec.loader is not None
 scenes = sys.modules["benchmark_scenes"] = module_from_spec(spec)
 spec.loader.exec_module(scenes)
-rollers, kit = scenes._rollers, scenes.kit
+rollers, kit = scenes.rollers, scenes.kit
 
 QUAD = mesh.CellType.quadrilateral
 
