@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2.9
+# Level: 2.12
 
 # # An embankment is shaken
 #
@@ -100,7 +100,7 @@ def update(t):
 
 
 def mean_velocity(number, where):
-    """The mean horizontal velocity of nodes of a body that a marker of its mesh chooses."""
+    """The mean horizontal velocity of nodes that a marker chooses."""
     body = bodies[number]
     chosen = where(body.W.tabulate_dof_coordinates().T)[: body.W.dofmap.index_map.size_local]
     v = problem.velocity[number].x.array.reshape(-1, 2)[: len(chosen), 0]
@@ -131,7 +131,8 @@ if comm.rank == 0:
     print(f"largest velocity of the rock       {np.abs(below).max():8.2f} m/s")
     print(f"settlement of the crest            {100 * settlement:8.1f} cm")
     print(f"largest plastic strain             {most:8.3f}")
-    print(f"dissipated in the clay             {energies[-1].dissipated / 1e3:8.0f} kJ/m")
+    dissipated = energies[-1].dissipated / 1e3
+    print(f"dissipated in the clay             {dissipated:8.0f} kJ/m")
     print(f"kinetic energy, end over largest   {kinetic[-1] / kinetic.max():8.1e}")
 
 figure, (left, right) = plt.subplots(

@@ -101,7 +101,7 @@ for name in ("without", "with"):
     found = mpm.strength_reduction(problem, step=0.2, tolerance=0.01, displacement=limit)
     factors[name] = found.factor
 
-    # The soil that moves is drawn by how far it has moved since the reduction began.
+    # How far the soil has moved since the reduction began.
     moved = problem.particles.displacement.x.array - settled
     way = np.linalg.norm(moved.reshape(-1, 2), axis=1)
     at = problem.particles.W.dofmap.list[: problem.particles.num_local]
