@@ -80,6 +80,9 @@ class Levels(Protocol):
     def rigid_motions(self) -> PETSc.NullSpace:
         """Return the rigid motions in the unknowns."""
 
+    def splits(self) -> Sequence[tuple[str, slice]]:
+        """Return names of the fields, and where their unknowns are among this rank's."""
+
     def interpolations(self, coarsest: int) -> Sequence[PETSc.Mat]:
         """Return what gives the unknowns of each level from those of the next coarser one.
 
@@ -270,7 +273,9 @@ class ShiftedFactor:
             self._refining = None
             if self._symmetric:
                 self.P.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-            if self._ksp.getPC().getType() not in FACTORS:
+            if self._ksp.getPC().getType() == "fieldsplit":
+                self._split(levels.splits())
+            elif self._ksp.getPC().getType() not in FACTORS:
                 self.P.setNearNullSpace(levels.rigid_motions())
         if self._ksp.getPC().getFailedReason():
             self._ksp.getPC().reset()  # MUMPS does not factorise again where it failed
@@ -279,6 +284,22 @@ class ShiftedFactor:
             with _options_refused():
                 self._ksp.setUp()  # where the factor is made, which reads options of its own
             self._give_workspace()
+
+    def _split(self, splits: Sequence[tuple[str, slice]]) -> None:
+        """Tell a PC of type fieldsplit where the unknowns of each field are, by name (collective).
+
+        It is made anew, as it keeps what it was told before.
+        """
+        pc = self._ksp.getPC()
+        pc.setType("none")
+        pc.setType("fieldsplit")
+        first = self.P.getOwnershipRange()[0]
+        for name, part in splits:
+            size = part.stop - part.start
+            where = PETSc.IS().createStride(size, first=first + part.start, comm=self.P.comm)
+            pc.setFieldSplitIS((name, where))
+        with _options_refused(), self._own_options():
+            pc.setFromOptions()
 
     def _make_levels(self, K: PETSc.Mat, levels: Levels, damping: float) -> None:
         """Make the levels of multigrid for K; the shift, which is none of them, matters little."""

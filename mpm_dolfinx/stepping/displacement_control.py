@@ -387,6 +387,10 @@ class ControlledSystem:
         """Return the rigid motions in the unknowns."""
         return self._reduced.rigid_motions()
 
+    def splits(self) -> Sequence[tuple[str, slice]]:
+        """Return names of the fields, and where their unknowns are among this rank's."""
+        return self._reduced.splits()
+
     def interpolations(self, coarsest: int) -> Sequence[PETSc.Mat]:
         """Return what gives the unknowns of each level of multigrid from the next coarser one."""
         return self._reduced.interpolations(coarsest)

@@ -577,6 +577,21 @@ class ReducedSystem:
         assert self._numbering is not None
         return self._numbering.rigid_motions()
 
+    def splits(self) -> Sequence[tuple[str, slice]]:
+        """Return names of the fields, and where their unknowns are among this rank's.
+
+        All displacements are one; they come first.
+        """
+        assert self._numbering is not None
+        moving = len(self.fields) - len(self._value_fields)
+        parts = self._numbering.parts
+        found = [("displacement", slice(0, parts[moving - 1].stop))] if moving else []
+        for field, part in zip(self._value_fields, parts[moving:], strict=True):
+            name = field.carried[0].field.name
+            taken = sum(known.split("_of_")[0] == name for known, _ in found)
+            found.append((f"{name}_of_{taken}" if taken else name, part))
+        return found
+
     def interpolations(self, coarsest: int) -> Sequence[PETSc.Mat]:
         """Return what gives the unknowns of each level of multigrid from the next coarser one.
 

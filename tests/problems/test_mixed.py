@@ -105,6 +105,27 @@ def test_both_routes():
     same_run(outcome(fast), outcome(slow), 1e-9)
 
 
+def test_fields_are_split_by_their_names():
+    """Blocks of displacement and pressure in an iterative solver of PETSc's."""
+    lu = {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
+    options = {
+        "ksp_type": "gmres",
+        "ksp_rtol": 1e-10,
+        "pc_type": "fieldsplit",
+        "pc_fieldsplit_type": "schur",
+        "pc_fieldsplit_schur_fact_type": "full",
+        "pc_fieldsplit_schur_precondition": "selfp",
+        **{f"fieldsplit_displacement_{key}": value for key, value in lu.items()},
+        **{f"fieldsplit_pressure_{key}": value for key, value in lu.items()},
+    }
+    one, two = beam(), beam(petsc_options=options)
+    for problem in (one, two):
+        problem.solve(steps=2)
+    same_run(outcome(one), outcome(two), 1e-9)
+    ksp = two.solver.getKSP()
+    assert ksp.getPC().getType() == "fieldsplit" and 1 < ksp.getIterationNumber() < 60
+
+
 def test_incompressible_to_the_last_digit():
     """The answer no longer depends on the bulk modulus, nor does the number of solves."""
     found = []
