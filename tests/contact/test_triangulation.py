@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import scenes
 from compare import outcome, same_run
-from marks import slow
 from scenes import HEXAHEDRON, QUADRILATERAL, WORLD
 
 from dolfinx import fem
@@ -351,7 +350,7 @@ def on_slope(n, comm=WORLD, triangles=True, friction=0.3, angle=25.0):
     return problem, ground, normal
 
 
-@slow
+@pytest.mark.slow
 def test_a_block_slides_over_triangles_as_over_their_plane():
     speeds = []
     for triangles in (True, False):
