@@ -354,6 +354,37 @@ def test_an_elastic_bar_wins_no_energy_at_any_speed(speed, dt, out):
     assert np.diff([energy.balance for energy in history.energies]).max() < 1e-10 * whole[0]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("out", ["project", "reflect"])
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("speed", [0.0, 0.1, 0.25, 0.37, 0.5, 0.8, 1.0, 1.25])
+def test_a_bar_wins_no_energy_in_a_long_flight(speed, degree, out):
+    # In steps of 0.2 to 16 times what a wave needs for a cell; the bar is of one dimension.
+    h, steps = 0.125, 400
+    for dt in (0.2 * h, 0.8 * h, 2.0 * h, 5.0 * h, 16.0 * h):
+        cells = int(np.ceil((2.3 + speed * dt * steps) / h))
+        V = vectors(box([0.0, 0.0], [cells * h, h], [cells, 1], QUADRILATERAL), degree)
+        body = box([0.3, 0.0], [1.3, h], [16, 2], QUADRILATERAL)
+        across = V.sub(1).collapse()[0]
+        held = fem.locate_dofs_geometrical((V.sub(1), across), lambda x: x[0] > -1.0)
+        problem = mpm.DynamicProblem(
+            mpm.Particles(body, V, degree=degree),
+            LinearElastic(1.0, 0.0),
+            1.0,
+            velocity=lambda x: np.stack([speed + 0.1 * np.cos(np.pi * (x[0] - 0.3)), 0.0 * x[0]]),
+            bcs=[fem.dirichletbc(fem.Function(across), held, V.sub(1))],
+            stabilisation=None,
+            out_of_range=out,
+        )
+        history = problem.solve(steps * dt, dt)
+        whole = np.array([energy.kinetic + energy.strain for energy in history.energies])
+        assert whole.max() <= whole[0] * (1.0 + 1e-10)
+        if out == "reflect":
+            assert whole.min() >= whole[0] * (1.0 - 1e-8)
+        balances = np.array([energy.balance for energy in history.energies])
+        assert np.ptp(balances) < 1e-10 * whole[0]
+
+
 def vibrating(steps, scheme):
     """Return the error of displacement of a bar's first mode, relative to its amplitude."""
     V = vectors(box([0.0, 0.0], [2.5, 3 / 32], [80, 3], QUADRILATERAL))
