@@ -12,8 +12,7 @@
 #
 # Two elastic discs of radius 0.2 fly towards each other (Sulsky, Chen & Schreyer 1994). The
 # material is Hencky's with $E$ = 1000, $\nu$ = 0.3 and $\rho_0$ = 1000; the velocities are
-# $(0.1, 0.1)$ and $(-0.1, -0.1)$. Where both discs are in a cell of the background they share its
-# nodes, and cannot pass through each other: that is all the contact there is. In each step
+# $(0.1, 0.1)$ and $(-0.1, -0.1)$. Contact is that of the nodes which both see in a cell. Each step
 #
 # $$
 # T^T \left[ \tfrac{2}{\Delta t} M \left( \tfrac{1}{\Delta t} T u - v_n \right) + f^* \right] = 0,

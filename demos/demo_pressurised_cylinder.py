@@ -79,9 +79,8 @@ strip = problem_of(
     axisymmetric=True,
 )
 body = mesh.create_rectangle(comm, [[a, 0], [b, np.pi / 2]], [2 * N, 4 * N], quadrilateral)
-R, angle = body.geometry.x[:, 0].copy(), body.geometry.x[:, 1].copy()
-body.geometry.x[:, 0] = np.maximum(R * np.cos(angle), 0.0)
-body.geometry.x[:, 1] = np.maximum(R * np.sin(angle), 0.0)
+R, angle = body.geometry.x[:, :2].T.copy()
+body.geometry.x[:, :2] = np.maximum(R * [np.cos(angle), np.sin(angle)], 0.0).T
 ring = problem_of(
     mesh.create_rectangle(comm, [[0, 0], [2.5, 2.5]], [round(2.5 / h)] * 2, quadrilateral),
     body,

@@ -170,7 +170,8 @@ def complaints(found: Found, still: bool) -> list[str]:
     if kept[0] != inputs(source):
         new.append(f"the scripts of {source!r} have changed since it was made")
     if kept[1] != rows_hash(found.rows):
-        new.append("its rows were changed by hand")
+        copied = f"the rows of {source!r} have changed since it was made"
+        new.append("its rows were changed by hand" if source in TABLES else copied)
     if source in TABLES and not still and not TABLES[source][0].times:
         table, _ = TABLES[source]
         anew = [row(table, label) for label in table.quick]
