@@ -36,3 +36,14 @@ def test_examples_of_a_page_run(page, tmp_path, monkeypatch, logging_as_before):
     for example in EXAMPLE.finditer(PAGES[page]):
         line = PAGES[page][: example.start()].count("\n") + 1
         exec(compile("\n" * line + example[1], page, "exec"), names)
+
+
+@pytest.mark.skip_in_parallel
+def test_law_by_jax():
+    """The example that needs a package of its own, where there is one."""
+    pytest.importorskip("jax", reason="the example is of a law that JAX differentiates")
+    example = re.search(r"^```py\n(.*?)^```", PAGES["materials.md"], re.MULTILINE | re.DOTALL)
+    names = {"__name__": "__main__"}
+    exec(compile(example[1], "materials.md", "exec"), names)
+    for dim in (2, 3):
+        assert names["check_tangent"](names["rubber"], dim=dim, strain=0.1) < 1e-8
