@@ -153,12 +153,13 @@ class MeanStress:
         slope = self._slope(gradient)
         self.strain = self.strain._replace(volume=mean / self._soft, slope=slope)
         stress = first_piola + change[:, None, None] * slope
-        turning = np.where(self._small, 0.0, change)
-        whole = tangent - np.einsum("n,niL,nkJ->niJkL", turning, slope, slope, optimize=True)
-        whole -= np.einsum("n,niJ,nkL->niJkL", self._soft, slope, slope, optimize=True)
+        turning = np.where(self._small, 0.0, change)[:, None, None, None, None]
+        product = slope[:, :, :, None, None] * slope[:, None, None, :, :]
+        whole = tangent - self._soft[:, None, None, None, None] * product
+        whole -= turning * product.swapaxes(2, 4)
         own = []
         for points, before in stresses:
             after = before.copy()
             after[:, :3] += change[points, None]
             own.append(after)
-        return stress, np.ascontiguousarray(whole), own
+        return stress, whole, own

@@ -103,7 +103,7 @@ class PressureTerm(FieldTerm):
         gradients = self._particles.quadrature.gradients
         gdim = gradients.shape[-1]
         slope = slope.reshape(n, nq, *slope.shape[1:])
-        strains = np.einsum("nqkJ,nqiJ->nqki", gradients, slope[:, :, :gdim, :gdim])
+        strains = gradients @ slope[:, :, :gdim, :gdim].swapaxes(2, 3)
         hoop = self._material.hoop
         if hoop is not None:
             strains[:, :, :, 0] += slope[:, :, 2, 2, None] * hoop
