@@ -100,7 +100,7 @@ for (scheme, problem), colour in zip(runs.items(), ("C0", "C3"), strict=True):
     axes[3].plot(times, kinetic / whole[0], colour, ls=":", label=f"{scheme}, kinetic")
     if comm.rank == 0:
         print(f"{scheme:10s}  energy, end over start  {ends[scheme]:.3f}")
-        print(f"{scheme:10s}  kinetic energy, least   {(kinetic / whole[0]).min():.3f}")
+        print(f"{scheme:10s}  kinetic energy, least {min(kinetic) / whole[0]:.3f}")
     assert np.abs(problem.momentum).max() < 1e-11
 axes[3].set(xlabel="time", title="energy over that at the start", ylim=(0.0, 1.05))
 axes[3].legend(fontsize=8)

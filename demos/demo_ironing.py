@@ -90,7 +90,7 @@ figure, axes = plt.subplot_mosaic(
 
 
 def draw(ax):
-    """Draw the largest shear stress in both bodies, and tractions on the die."""
+    """Draw the largest shear stress of both, and tractions on the die."""
     for body in (a, b):
         s = body.stress
         shear = np.hypot(0.5 * (s[:, 0, 0] - s[:, 1, 1]), s[:, 0, 1])
@@ -122,9 +122,8 @@ ratio = shear[slides] / normal[slides]
 if comm.rank == 0:
     print(f"normal force while it slides   {normal[slides].mean():.2f}")
     print(f"its scatter                    {100 * scatter:.2f} %")
-    print(
-        f"T / N, mean (least, most)      {ratio.mean():.3f} ({ratio.min():.3f}, {ratio.max():.3f})"
-    )
+    least, most = ratio.min(), ratio.max()
+    print(f"T / N, mean (least, most)      {ratio.mean():.3f}", f"({least:.3f}, {most:.3f})")
     print(f"linear solves in a step        {np.mean(solves):.1f}")
 
     ax = axes["forces"]

@@ -123,9 +123,11 @@ for dx, dz, turn in zip(np.diff(fine), np.diff(z), np.diff(angle), strict=True):
 exact = fine[len(energy) - 1] - along[0]
 way, fall = along[-1] - along[0], up[0] - up[-1]
 if comm.rank == 0:
-    print(f"{particles.num_global} particles, {problem.history.total_iterations} linear solves")
-    print(f"way {way:.3f} m, of a point {exact:.3f} m, fall over way {fall / way:.3f}")
-    print(f"largest speed {speed.max():.2f} m/s, of a point {np.sqrt(2 * max(energy)):.2f} m/s")
+    solves, fastest = problem.history.total_iterations, np.sqrt(2 * max(energy))
+    print(f"{particles.num_global} particles, {solves} linear solves")
+    fallen = f"fall over way {fall / way:.3f}"
+    print(f"way {way:.3f} m, of a point {exact:.3f} m, {fallen}")
+    print(f"largest speed {speed.max():.2f} m/s, of a point {fastest:.2f} m/s")
 
 # The picture: the slab at five moments, and heights along the way.
 

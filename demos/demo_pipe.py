@@ -65,7 +65,7 @@ def held(component, where):
 
 
 def pressed(friction):
-    """Press the pipe in; return the problem, its contact, and the path of depth and force."""
+    """Press the pipe in; return problem, contact, and depth and force."""
     clay = mpm.Particles(box([0.0, -2.0], [3.0, 0.0], h / 2), V, quadrature_degree=2)
     circle = mpm.contact.disc((0.0, diameter / 2), diameter / 2)
     pipe = mpm.contact.Rigid(clay, circle, friction, tangential_penalty=0.1)
@@ -112,7 +112,8 @@ if comm.rank == 0:
     for friction, (problem, _, (_, V_end)) in runs.items():
         solves = problem.history.total_iterations
         end = V_end[-1] / strength / diameter
-        print(f"friction {friction:.1f}: force {end:.2f} c D at the end, {solves} linear solves")
+        told = f"force {end:.2f} c D at the end, {solves} linear solves"
+        print(f"friction {friction:.1f}: {told}")
     print(f"smooth pipe at small depth: {ratio:.3f} of Prandtl's force")
     print(f"with friction {sliding} of {touching} points slip at the end")
 

@@ -5,6 +5,7 @@
 import ast
 import os
 import re
+import shutil
 import statistics
 import subprocess
 import sys
@@ -32,6 +33,24 @@ def test_text_is_a_lecture_note(name):
     assert "\nassert " in text and "\n# ## Exercises\n" in text
     assert "argparse" not in text
     assert len(text.splitlines()) <= 180
+
+
+@pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("name", NAMES)
+def test_code_fits_into_the_80_columns_of_a_page(name):
+    """Pages have code formatted anew; what the formatter cannot break is too long."""
+    ruff = shutil.which("ruff", path=str(Path(sys.executable).parent)) or shutil.which("ruff")
+    if ruff is None:
+        pytest.skip("ruff formats what pages show")
+    done = subprocess.run(
+        [ruff, "format", "--isolated", "--line-length=80", "-"],
+        input=(DEMOS / f"{name}.py").read_text(),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    lines = [line for line in done.stdout.splitlines() if not line.startswith("#")]
+    assert not [line for line in lines if len(line) > 80]
 
 
 @pytest.mark.skip_in_parallel
