@@ -213,6 +213,21 @@ def make_material(data, stress):
     laws = {"hencky": mpm.materials.Hencky, "linear": mpm.materials.LinearElastic}
     if data["law"] in laws:
         return laws[data["law"]](stress, data["poisson"]), stress
+    if "cohesion" in data:
+        elastic, strength = (stress, data["poisson"]), data["cohesion"] * stress
+        if data["law"] == "tresca":
+            return mpm.materials.Tresca(*elastic, strength), stress
+        laws = {
+            "mohr_coulomb": mpm.materials.MohrCoulomb,
+            "drucker_prager": mpm.materials.DruckerPrager,
+        }
+        return laws[data["law"]](
+            *elastic,
+            strength,
+            data["friction"],
+            data["dilation"],
+            volume_correction=data["volume_correction"],
+        ), stress
     laws = {"von_mises": mpm.materials.VonMises, "small": mpm.materials.SmallStrainVonMises}
     return laws[data["law"]](
         stress,

@@ -263,6 +263,23 @@ def distance(data, y):
     return None
 
 
+def frictional(data, tau, young):
+    """Return the yield function of a soil over its strength, and this strength."""
+    sine, cosine = (fun(np.radians(data["friction"])) for fun in (np.sin, np.cos))
+    cohesion = data["cohesion"] * young
+    if data["law"] == "drucker_prager":  # the cone through the pyramid's outer edges
+        p = np.trace(tau, axis1=-2, axis2=-1) / 3.0
+        dev = tau - p[..., None, None] * np.eye(3)
+        slope = 6.0 / (np.sqrt(3.0) * (3.0 - sine))
+        root = np.sqrt(0.5) * np.linalg.norm(dev, axis=(-2, -1))
+        strength = slope * cosine * cohesion
+        return (root + slope * sine * p) / strength - 1.0, strength
+    values = np.linalg.eigvalsh(tau)
+    low, high = values[..., 0], values[..., -1]
+    strength = cosine * cohesion
+    return 0.5 * (high - low + (high + low) * sine) / strength - 1.0, strength
+
+
 class Observer:
     """Follows a run step by step and judges what it leaves.
 
@@ -668,8 +685,12 @@ class Observer:
             _, _, tau, _ = self._points(i)
             dev = tau - np.trace(tau, axis1=-2, axis2=-1)[..., None, None] / 3 * np.eye(3)
             kappa = body._response.plastic_strain()
-            strength = (data["rho_y"] + np.sqrt(2 / 3) * data["hardening"] * kappa) * self.run.young
-            f = np.linalg.norm(dev, axis=(-2, -1)) / strength - 1.0
+            if "cohesion" in data:
+                f, strength = frictional(data, tau, self.run.young)
+            else:
+                hardened = data["rho_y"] + np.sqrt(2 / 3) * data["hardening"] * kappa
+                strength = hardened * self.run.young
+                f = np.linalg.norm(dev, axis=(-2, -1)) / strength - 1.0
             # Round-off of the pressure, which may be many times the strength.
             floor = EPS * np.abs(tau).max(axis=(-2, -1)) / strength
             worst = max(worst, float((f - 64 * floor)[alive].max(initial=-np.inf)))

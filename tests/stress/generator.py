@@ -796,3 +796,31 @@ def bouncing(rng: Random, index: int) -> Scene:
         steps=20,
         limit=180.0,
     )
+
+
+@scene_class(100, well_posed=True)
+def soils(rng: Random, index: int) -> Scene:
+    """Columns of soil that yield at their base, below the limit load.
+
+    The base yields from a height of 2 c/weight tan(45 + phi/2) on; a vertical cut stands up to 1.9
+    times as high.
+    """
+    height = float(pick(rng, 0.5, 0.75, 1.0))
+    law = ("tresca", "mohr_coulomb", "drucker_prager")[index % 3]
+    cohesion, friction = between(rng, 1e-4, 3e-2), float(rng.uniform(5.0, 40.0))
+    friction = 0.0 if law == "tresca" else friction
+    limit = 2.0 * cohesion * float(np.tan(np.radians(45.0 + 0.5 * friction)))
+    return assembled(
+        rng,
+        body=body(rng, shape=pick(rng, "block", "jitter"), size=[1.0, height]),
+        material={
+            "law": law,
+            "poisson": float(pick(rng, 0.2, 0.3, 0.4)),
+            "cohesion": cohesion,
+            "friction": friction,
+            "dilation": friction * float(pick(rng, 0.0, 0.3, 1.0)),
+            "volume_correction": bool(pick(rng, 0, 1)),
+        },
+        weight=down(float(rng.uniform(1.2, 1.8)) * limit / height),
+        support=pick(rng, "stand", "roll"),
+    )
