@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +35,8 @@ class PointBasis(NamedTuple):
     values: NDArray[np.float64]
     found: NDArray[np.bool_]
     gradients: NDArray[np.float64] | None = None
-    cell: NDArray[np.int64] | None = None
-    rank: NDArray[np.int64] | None = None
+    cell: NDArray[np.integer[Any]] | None = None
+    rank: NDArray[np.integer[Any]] | None = None
 
     def part(self, count: int) -> PointBasis:
         """Return what is known of the first points."""

@@ -44,8 +44,8 @@ class CellTable(NamedTuple):
     vertices: NDArray[np.float64]
     nodes: NDArray[np.int64]
     number: NDArray[np.int64]
-    home: NDArray[np.int64]
-    rank: NDArray[np.int64]
+    home: NDArray[np.integer[Any]]
+    rank: NDArray[np.integer[Any]]
 
     @classmethod
     def owned(cls, V: fem.FunctionSpace) -> CellTable:
@@ -58,8 +58,8 @@ class CellTable(NamedTuple):
             background.geometry.x[corners][:, :, : background.geometry.dim],
             V.dofmap.index_map.local_to_global(dofs.ravel()).reshape(dofs.shape),
             _compat.input_cell_index(background),
-            np.arange(count),
-            np.full(count, background.comm.rank),
+            np.arange(count, dtype=np.int32),
+            np.full(count, background.comm.rank, dtype=np.int32),
         )
 
     def part(self, which: slice | NDArray[np.int64]) -> CellTable:

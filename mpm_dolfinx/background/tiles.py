@@ -77,9 +77,8 @@ class Tiles:
         numbers = np.concatenate(swap(self._comm, whole))
         vertices = np.concatenate(swap(self._comm, [t.vertices for t in told]))
         number, home, rank, nodes = np.split(numbers, [1, 2, 3], axis=1)
-        self.cells = self.cells.joined(
-            CellTable(vertices, nodes, number[:, 0], home[:, 0], rank[:, 0])
-        )
+        where = (home[:, 0].astype(np.int32), rank[:, 0].astype(np.int32))
+        self.cells = self.cells.joined(CellTable(vertices, nodes, number[:, 0], *where))
         return True
 
     def _inside(self, tiles: NDArray[np.int64]) -> CellTable:

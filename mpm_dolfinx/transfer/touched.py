@@ -60,7 +60,8 @@ class TouchedNodes:
             ends = np.cumsum(np.count_nonzero(keep, axis=1))
             mine, numbers = np.split(numbers, [int(ends[-1]) if len(ends) else 0])
             offsets = np.concatenate([[0], ends]).astype(np.int64)
-            self.rows.append(TransferRows(offsets, mine, basis.values[keep]))
+            values = basis.values.ravel() if keep.all() else basis.values[keep]  # no copy if all
+            self.rows.append(TransferRows(offsets, mine, values))
         firsts = self._comm.allgather(first)
         self._ends = np.searchsorted(self.nodes, firsts[1:])
         told = swap(self._comm, self._by_owner(np.column_stack([self.nodes, counts])))
