@@ -204,7 +204,7 @@ class Rigid(Contact):
         self._surface = Surface(
             particles, facet_tags, tag, quadrature_degree, axisymmetric, "A Rigid"
         )
-        self._pose = _Pose(np.zeros(gdim), np.zeros(1 if gdim == 2 else 3))
+        self._pose = self._aim = _Pose(np.zeros(gdim), np.zeros(1 if gdim == 2 else 3))
         self._memory: _Memory | None = None
         self._trial: _Memory | None = None
 
@@ -214,7 +214,8 @@ class Rigid(Contact):
         """Put the obstacle where it is to be at the end of the next step.
 
         It turns about the pivot of its shape, and is shifted then. Both are counted from where it
-        was made, not from where it is.
+        was made, not from where it is. A path, ``update=``, is asked again where a step is made
+        smaller; what was moved without one goes the whole way in the next step, however small.
 
         Args:
             offset: Shape ``(gdim,)``.
@@ -239,7 +240,7 @@ class Rigid(Contact):
                 f"An obstacle moves by an offset of {gdim} numbers and an angle of {count}, not "
                 f"{offset!r} and {angle!r}."
             )
-        self._pose = _Pose(to, turn)
+        self._pose = self._aim = _Pose(to, turn)
 
     @property
     def offset(self) -> NDArray[np.float64]:
@@ -300,8 +301,18 @@ class Rigid(Contact):
         first = self._memory is None
         self._settle()
         if first:
+            self._require_same_shape()
             assert self._memory is not None
             self._require_apart(self._memory)
+
+    def _require_same_shape(self) -> None:
+        """Raise an error where ranks have different shapes, by some distances (collective)."""
+        places = self.shape.pivot + np.vstack(
+            [np.eye(self.shape.dim), -2.0 * np.eye(self.shape.dim)]
+        )
+        with agree(self._comm):
+            distances = self.shape.distance(places)[0].astype(np.float32)
+        require_same(self._comm, shape=[type(self.shape).__name__, *distances.tolist()])
 
     def _settle(self) -> None:
         """Take the present mesh of the body (collective)."""
@@ -352,12 +363,15 @@ class Rigid(Contact):
         self._surface.look_at_deleted()
         assert self._memory is not None
         memory = self._memory
+        self._pose = self._aim
+        require_same(self._comm, offset=self._pose.offset, angle=self._pose.angle)
         self._new_pattern()
         with agree(self._comm):
             x = memory.outcome.positions
             if self._passes(memory, x, self._pose):
                 raise ConvergenceError(
-                    "The obstacle of a Rigid moves through the body in one step; take smaller steps"
+                    "The obstacle of a Rigid moves through the body in one step; move it in "
+                    "smaller ones, by a path (update=)"
                 )
         return ()
 
@@ -650,7 +664,7 @@ class Rigid(Contact):
         surface.restore(columns)
         k = stiffness(surface, self._modulus, self._materials[0], "A Rigid")
         self._stiffness = np.repeat(k[:, None], surface.nq, axis=1)
-        self._pose = pose
+        self._pose = self._aim = pose
         self._begin_anew(pose)
         assert self._memory is not None
         touched = surface.of_column(columns["touches"])

@@ -309,6 +309,8 @@ def as_terms(terms: Any, bodies: Sequence[Particles]) -> list[Term]:
     """
     if not isinstance(terms, list | tuple) or not all(isinstance(t, Term) for t in terms):
         raise MPMError("terms must be a list of mpm.Term, such as mpm.Tie.")
+    if len({id(term) for term in terms}) < len(terms):
+        raise MPMError("A term stands twice in terms, and would act twice; give it once.")
     for term in terms:
         if any(all(own is not body for body in bodies) for own in term.bodies):
             raise MPMError(

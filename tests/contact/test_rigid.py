@@ -449,7 +449,55 @@ def test_a_block_slides_down_an_incline_or_stays(friction, scheme):
         assert abs(speeds[-1]) < (1e-3 if scheme == "euler" else 0.01 * 10.0)
 
 
+def pressed(terms=lambda plate: [plate]):
+    """Return a block 1 x 1 under a plate, and the plate."""
+    V = scenes.vectors(scenes.box([-0.4, 0.0], [1.4, 1.25], [7, 5], QUADRILATERAL))
+    particles = mpm.Particles(scenes.unit(8, QUADRILATERAL), V)
+    plate = contact.Rigid(particles, contact.plane((0.0, 1.0), (0.0, -1.0)))
+    bcs = [scenes.fix(V, scenes.at(1, 0.0))]
+    return mpm.QuasiStaticProblem(
+        particles, Hencky(YOUNG, POISSON), bcs=bcs, terms=terms(plate)
+    ), plate
+
+
+def test_what_is_moved_without_a_path_goes_its_way_or_says_that_it_does_not():
+    problem, plate = pressed()
+    plate.move((0.0, -0.3))  # more than two domains, whatever the load
+    with pytest.raises(mpm.ConvergenceError, match="by a path"):
+        problem.solve(1)
+    assert plate.offset.tolist() == [0.0, 0.0] and problem.history.cutbacks > 0
+    plate.move((0.0, -0.1))
+    problem.solve(1)
+    assert plate.offset.tolist() == [0.0, -0.1]
+    stepwise, other = pressed()
+    stepwise.solve(4, update=lambda t: other.move((0.0, -0.1 * t)))
+    bears = stepwise.reaction(other)[1]
+    assert bears < -0.08 * YOUNG
+    assert problem.reaction(plate)[1] == pytest.approx(bears, rel=0.02)
+
+
 # -- What cannot be ----------------------------------------------------------------------
+
+
+def test_a_contact_that_stands_twice_is_refused():
+    with pytest.raises(mpm.MPMError, match="stands twice in terms"):
+        pressed(lambda plate: [plate, plate])
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("what", ["shape", "offset", "angle"])
+def test_what_differs_between_ranks_is_refused(what):
+    other = 0.1 * (WORLD.rank > 0)
+    if what == "shape":
+        particles = dragged(n=2)[0].particles
+        disc = contact.Rigid(particles, contact.disc((0.5, 5.0), 0.3 + other))
+        with pytest.raises(mpm.MPMError, match=r"shape\S* differs between the ranks"):
+            mpm.QuasiStaticProblem(particles, Hencky(YOUNG, POISSON), terms=[disc])
+        return
+    problem, plate = pressed()
+    plate.move((0.0, -other), 0.0) if what == "offset" else plate.move((0.0, 0.0), other)
+    with pytest.raises(mpm.MPMError, match=f"{what} differs between the ranks"):
+        problem.step()
 
 
 def test_a_body_that_begins_in_an_obstacle_is_refused():
@@ -468,7 +516,9 @@ def test_an_obstacle_does_not_jump_through_a_body():
     problem.solve(2, update=lambda t: die.move((0.0, -0.4 * t)))  # 0.2 is less than a domain
     assert np.abs(die.reaction[1]) > 0.0
     die.move((0.0, -9.0))
-    with pytest.raises(mpm.ConvergenceError, match="moves through the body in one step"):
+    with pytest.raises(
+        mpm.ConvergenceError, match="moves through the body in one step; move it in smaller"
+    ):
         problem.step()
     assert die.offset.tolist() == [0.0, -0.4] and start.tolist() == [0.0, 0.0]
 
