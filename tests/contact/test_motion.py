@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import scenes
 from compare import outcome, same_run
-from marks import slow
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD, box
 
 from dolfinx import fem
@@ -285,7 +284,7 @@ def test_a_contact_of_a_motion_serves_equilibrium_again():
     assert np.abs(still.reaction(ground) + held).max() < 1e-7 * abs(held[1])
 
 
-@slow
+@pytest.mark.slow
 @pytest.mark.parametrize("cell", [TETRAHEDRON, HEXAHEDRON], ids=scenes.name)
 def test_cubes_collide_in_space(cell):
     mesh = box([-0.9] * 3, [1.8] * 3, [6] * 3, HEXAHEDRON)
