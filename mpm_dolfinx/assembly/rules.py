@@ -12,7 +12,8 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from ufl.algorithms.estimate_degrees import estimate_total_polynomial_degree
-from ufl.corealg.traversal import traverse_unique_terminals
+from ufl.classes import Grad
+from ufl.corealg.traversal import traverse_unique_terminals, unique_pre_traversal
 
 from .. import _compat
 from ..errors import MPMError
@@ -83,6 +84,7 @@ def _rule(integral: Any) -> tuple[int, str]:
     metadata = integral.metadata()
     degree = metadata.get("quadrature_degree", -1)
     scheme = str(metadata.get("quadrature_rule", "default"))
+    at_points = False
     for terminal in traverse_unique_terminals(integral.integrand()):
         if not isinstance(terminal, fem.Function | ufl.Argument):
             continue
@@ -90,6 +92,7 @@ def _rule(integral: Any) -> tuple[int, str]:
         element = space.ufl_element()
         if not element.has_custom_quadrature:
             continue
+        at_points = True
         points = element.custom_quadrature()[0]
         if degree == -1:
             degree = element.degree
@@ -102,10 +105,37 @@ def _rule(integral: Any) -> tuple[int, str]:
                 f"point(s) of a domain, with a rule of {len(rule)} point(s); integrate it with "
                 "particles.dx."
             )
+    if at_points:
+        _require_no_gradient(integral)
     if degree == -1:
         estimate = estimate_total_polynomial_degree(_compat.expanded(integral))
         degree = max(estimate) if isinstance(estimate, tuple) else estimate
     return int(degree), scheme
+
+
+def _require_no_gradient(integral: Any) -> None:
+    """Raise an error where an integral has a gradient of what is known at points alone."""
+    for node in unique_pre_traversal(_compat.expanded(integral)):
+        if not isinstance(node, Grad):
+            continue
+        inner = node.ufl_operands[0]
+        if not isinstance(inner, ufl.Coefficient | ufl.Argument):
+            continue
+        element: Any = inner.ufl_element()  # type: ignore[no-untyped-call]
+        if getattr(element, "has_custom_quadrature", False):
+            raise MPMError(
+                f"The form holds a gradient of {_name_of(inner, integral)}, which is known at "
+                "quadrature points alone; for gradients make a field with at='nodes'."
+            )
+
+
+def _name_of(terminal: Any, integral: Any) -> str:
+    """Return what a Function or an argument is called, by its number in the integral."""
+    if isinstance(terminal, ufl.Argument):
+        return "a test or trial function"
+    known = traverse_unique_terminals(integral.integrand())
+    names = [f.name for f in known if isinstance(f, fem.Function) and f.count() == terminal.count()]
+    return f"'{names[0]}'" if names else "a Function"
 
 
 def split_by_rule(form: ufl.Form, *unknowns: fem.Function) -> list[ufl.Form]:

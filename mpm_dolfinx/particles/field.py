@@ -126,11 +126,37 @@ class ParticleField(fem.Function):
         """Set present and converged values, before the first step.
 
         Args:
-            values: A number for all, or an array for the local dofs.
+            values: A number for all, or an array for the local dofs (collective).
+
+        Raises:
+            MPMError: Something else, of another shape, or not finite.
         """
+        with agree(self.particles.mesh.comm):
+            given = self._numbers(values)
         for function in (self, self.previous):
-            function.x.array[:] = values
+            function.x.array[:] = given
             function.x.scatter_forward()
+
+    def _numbers(self, values: Any) -> NDArray[Any]:
+        """Return values that can be set, as an array."""
+        try:
+            given = np.asarray(values)
+        except (TypeError, ValueError):  # such as a list of lists of different lengths
+            given = np.asarray(None)
+        if given.dtype.kind not in "iuf":
+            raise MPMError(
+                f"The values of the field '{self.name}' must be a number or an array of numbers, "
+                f"not {type(values).__name__}."
+            )
+        count = len(self.x.array)
+        if given.shape not in ((), (count,)):
+            raise MPMError(
+                f"The values of the field '{self.name}' have the shape {given.shape}; give a "
+                f"number, or one for each local dof, shape ({count},)."
+            )
+        if not np.isfinite(given).all():
+            raise MPMError(f"The values of the field '{self.name}' must be finite.")
+        return given
 
 
 def _validate(particles: Body, V: Any, at: str, kind: str, name: str) -> None:

@@ -321,6 +321,33 @@ def test_what_does_not_go_together_is_refused():
     raises(make([R_u, R_p], fields=[p], J=R_u), mpm.MPMError, "leave J away")
     wrong = (ufl.div(d) - p) * q * ufl.dx(metadata={"quadrature_degree": 7})
     raises(make([R_u, wrong], fields=[p]), mpm.MPMError, "integrate it with particles.dx")
+    bent = ufl.dot(ufl.grad(p), ufl.grad(d)[0, :]) * q * particles.dx
+    raises(make([R_u, R_p + bent], fields=[p]), mpm.MPMError, "a gradient of 'p', .*at='nodes'")
+    smooth = p * ufl.div(ufl.grad(q)) * particles.dx
+    raises(make([R_u, R_p + smooth], fields=[p]), mpm.MPMError, "a gradient of a test")
+    pushed = ufl.dot(ufl.grad(p.previous), v) * particles.dx
+    raises(make([R_u + pushed, R_p], fields=[p]), mpm.MPMError, "a gradient of 'p before'")
     other = mpm.Particles(body(), scenes.vectors(held_background()))
     foreign = other.field(scalars(other.V.mesh), name="p")
     raises(make([R_u, R_p], fields=[foreign]), mpm.MPMError, "particles that this problem has not")
+
+
+@pytest.mark.parametrize("at", ["points", "nodes"])
+def test_values_that_make_no_sense_are_refused(at):
+    particles = mpm.Particles(body(), scenes.vectors(held_background()))
+    p = particles.field(scalars(particles.V.mesh), at=at, name="p")
+    p.set(np.full(len(p.x.array), 2))
+    one = np.ones(len(p.x.array))
+    last = WORLD.rank == WORLD.size - 1  # what is wrong on one rank is an error on all
+    for values, sentence in [
+        (np.ones(len(one) + 1), "have the shape"),
+        (one[:, None], "have the shape"),
+        ("1.0", "not str"),
+        (None, "not NoneType"),
+        ([[1.0], [1.0, 2.0]], "not list"),
+        (1j, "not complex"),
+        (np.nan, "must be finite"),
+        (np.where(np.arange(len(one)) == 0, np.inf, one), "must be finite"),
+    ]:
+        raises(lambda values=values: p.set(values if last else one), mpm.MPMError, sentence)
+    assert np.array_equal(p.x.array, 2.0 * one) and np.array_equal(p.previous.x.array, 2.0 * one)
