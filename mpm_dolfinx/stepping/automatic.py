@@ -30,6 +30,8 @@ LEAST, MOST, SAFETY = 0.2, 2.0, 0.9
 PROPORTIONAL, INTEGRAL = 0.35, 0.2
 #: Error over the allowed one from which a step is taken back.
 REJECTED = 4.0
+#: How many of the smallest steps with such an error a run takes before it says so.
+MANY = 10
 #: What the error of a step counts in which nothing yields: what is left of it in the end.
 ELASTIC = 0.02
 #: Factor of the tolerance where errors are compared with the motion so far, or with a length.
@@ -139,6 +141,7 @@ class ErrorControl:
         self._before: float | None = None
         self._ratio = 0.0
         self._holds = False
+        self._unkept = 0
 
     @property
     def asked(self) -> list[Any]:
@@ -177,6 +180,11 @@ class ErrorControl:
         return self._first / float(2**MOST_HALVINGS)
 
     @property
+    def _smallest(self) -> bool:
+        """Whether no smaller step than the present one is tried; its size has a round-off."""
+        return self.target - self._now <= self._least * (1.0 + 1e-3)
+
+    @property
     def target(self) -> float:
         """End of the step to try: a level, or no further than halfway to the next."""
         level = self._level
@@ -202,14 +210,31 @@ class ErrorControl:
     def reject(self) -> bool:
         """Make the step smaller that was judged last, if its error is too large; tell whether.
 
-        The first one is not, nor the smallest.
+        The first one is not, nor the smallest, which are counted.
         """
         tried = self.target - self._now
         first = self._before is None
-        if self._ratio <= REJECTED or first or tried <= self._least:
+        if self._ratio <= REJECTED or first:
+            return False
+        if self._smallest:
+            self._unkept += 1
             return False
         self._size = max(tried * max(LEAST, SAFETY / math.sqrt(self._ratio)), self._least)
         return True
+
+    @property
+    def complaint(self) -> str | None:
+        """What to say of the step that was judged last: that the tolerance is not kept, once."""
+        if self._unkept != MANY or self._ratio <= REJECTED or not self._smallest:
+            return None
+        length = "" if self._length is None else f" and length={self._length:g}"
+        return (
+            f"tolerance={self._tolerance:g}{length} cannot be kept: {MANY} steps of the smallest "
+            f"size, {self._least:.3g} of the load, had errors above the allowed one (the last "
+            f"{self._ratio:.3g} times), and the run goes on with them for up to "
+            f"{math.ceil((1.0 - self._now) / self._least)} steps; give larger ones, or a smaller "
+            "first_step."
+        )
 
     def accept(self, iterations: int) -> None:
         """Go to the target, and choose the next step by the error that was judged last."""
@@ -241,7 +266,7 @@ class ErrorControl:
         """
         tried = self.target - self._now
         limit = tried <= self._first / 2**LIMIT_HALVINGS and tried <= LIMIT_WIDTH * self._now
-        if tried <= self._least or (no_equilibrium and limit):
+        if self._smallest or (no_equilibrium and limit):
             return False
         self._size, self._holds = max(0.5 * tried, self._least), True
         return True

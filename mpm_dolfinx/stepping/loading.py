@@ -338,6 +338,8 @@ class Stepper:
         ratio = control.judge(error_of_step(self._reduced, size, self._comm))
         tried = run.size
         if not control.reject():
+            if (sentence := control.complaint) is not None:
+                self.owner.warn(sentence)
             return False
         self._take_back(tried, end, f"its error was estimated {ratio:.3g} times the allowed one")
         self.owner.history.statistics.count("rejected_steps")

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Load steps chosen by a tolerance: their sizes, their errors, and what is taken back."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 import scenes
@@ -84,6 +86,37 @@ def test_a_step_that_failed_is_halved_and_does_not_grow_at_once():
     assert control.target - 0.05 == pytest.approx(0.05 / 1024)
     control.begin_anew()
     assert control.target == pytest.approx(0.1)
+
+
+def test_cutbacks_come_to_an_end_wherever_a_run_is():
+    # The size of a step, an end less a beginning, is the smallest one but for round-off.
+    control = ErrorControl(0.01)
+    for _ in range(50):
+        assert sum(1 for _ in zip(range(100), iter(control.cut_back, False), strict=False)) <= 10
+        control.judge(StepError(0.0, 1.0, True))
+        control.accept(3)
+
+
+def test_a_tolerance_that_cannot_be_kept_is_told_once():
+    control = ErrorControl(1e-3)
+    told = []
+    while not control.finished:
+        control.judge(StepError(1e3 * (control.target - control.share), 1.0, False))
+        if not control.reject():
+            told += [] if control.complaint is None else [(control.share, control.complaint)]
+            control.accept(5)
+    assert len(told) == 1 and told[0][0] < 0.1
+    assert "tolerance=0.001 cannot be kept: 10 steps" in told[0][1]
+
+
+@pytest.mark.parametrize("options", [{"tolerance": 1e-8}, {"length": 1e-9}], ids=str)
+def test_a_run_says_early_that_it_cannot_keep_its_tolerance(options):
+    problem = column(60e3)
+    with pytest.warns(UserWarning, match="cannot be kept") if WORLD.rank == 0 else nullcontext():
+        for number, _ in enumerate(problem.steps("auto", **options)):
+            if number == 15:
+                break
+    assert 0.0 < problem.history.load[-1] < 0.1
 
 
 def test_sizes_follow_the_second_difference():
