@@ -28,7 +28,7 @@ from .system.coupling import Tie  # noqa: E402
 from .system.term import Term  # noqa: E402
 from .transfer.weights import Weights  # noqa: E402
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "AveragedVolumeRatio",
