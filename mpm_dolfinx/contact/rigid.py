@@ -34,8 +34,17 @@ __all__ = ["Placed", "Rigid"]
 DEEP = 1.0
 #: The same for a body as it is given.
 OVERLAP = 0.1
-#: Most places on the way of a point that are looked at.
-MOST_PLACES = 1000
+#: Most places on the way of a point that are looked at, one by one and by steps of the distance.
+MOST_PLACES, MOST_STEPS = 1000, 100
+#: How near to the surface a point is on it, over the thickness of the domain behind.
+ON = 1e-3
+#: Least length of a way through an obstacle, over the same: less is cut off a sharp corner.
+CUT = 0.02
+#: Least cosine between a way and the normal of a surface that it goes through.
+STEEP = 0.1
+#: Product of two normals below which they are those of opposite sides, for a point that touches
+#: one of them, and for one that touches neither before nor after.
+OPPOSITE, OPPOSITE_FREE = -0.5, -0.1
 
 
 class _Pose(NamedTuple):
@@ -376,7 +385,7 @@ class Rigid(Contact):
         return ()
 
     def _passes(self, memory: _Memory, x: NDArray[np.float64], pose: _Pose) -> bool:
-        """Return whether points get deep into the obstacle on a straight way.
+        """Return whether points get deep into the obstacle, or through it, on a straight way.
 
         Args:
             memory: Where they begin.
@@ -396,7 +405,82 @@ class Rigid(Contact):
             phi, _ = self.shape.distance(a[at] + share * (b[at] - a[at]))
             if phi.min() < -deep[at] - max(-memory.gap[at], 0.0):
                 return True
-        return False
+        near = (memory.gap < way) & (way > 0.0) & (surface.weights > 0.0)
+        thickness = deep[near] / DEEP
+        return self._crosses(a[near], b[near], memory.gap[near], memory.normal[near], thickness)
+
+    def _crosses(
+        self,
+        a: NDArray[np.float64],
+        b: NDArray[np.float64],
+        gap: NDArray[np.float64],
+        normal: NDArray[np.float64],
+        thickness: NDArray[np.float64],
+    ) -> bool:
+        """Return whether points go into the shape on one side and out of it on the opposite one.
+
+        The way is a straight one in the shape's frame. A point that slides past a corner goes in
+        and out by sides whose normals are not opposite, or cuts off a little of a sharp corner.
+
+        Args:
+            a: Where points begin, shape ``(n, dim)``.
+            b: Where they end.
+            gap: Their distances at the beginning, shape ``(n,)``.
+            normal: Normals there.
+            thickness: Of the domains behind them, shape ``(n,)``.
+        """
+        on = ON * thickness
+
+        def left(along: NDArray[np.float64], phi: Any, n: Any, sign: float) -> NDArray[np.bool_]:
+            """Return which points are off the surface, or go through it."""
+            cosine = sign * (n * along).sum(axis=1) / np.linalg.norm(along, axis=1)
+            return np.asarray((phi > on[which]) | (cosine > STEEP))
+
+        which = np.arange(len(a))
+        which = which[left(b - a, gap, normal, -1.0)]
+        if len(which) == 0:
+            return False
+        which = which[left((b - a)[which], *self.shape.distance(b[which]), 1.0)]
+        first, enters = self._reached(a[which], b[which], on[which])
+        goes = first < 1.0
+        which, first, enters = which[goes], first[goes], enters[goes]
+        last, leaves = self._reached(b[which], a[which], on[which])
+        way = b[which] - a[which]
+        size = np.linalg.norm(way, axis=1)
+        free = (first > 0.0) & (last > 0.0)
+        through = (enters * leaves).sum(axis=1) < np.where(free, OPPOSITE_FREE, OPPOSITE)
+        through &= -(enters * way).sum(axis=1) > STEEP * size
+        through &= (leaves * way).sum(axis=1) > STEEP * size
+        through &= (1.0 - first - last) * size > CUT * thickness[which]
+        return bool(through.any())
+
+    def _reached(
+        self, a: NDArray[np.float64], b: NDArray[np.float64], on: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return how much of their ways points go before they are on the shape, and normals there.
+
+        A point goes on by its distance, within which there is no surface (J. C. Hart, "Sphere
+        tracing", Vis. Comput. 12, 1996).
+
+        Args:
+            a: Where they begin, in the frame of the shape, shape ``(n, dim)``.
+            b: Where they end.
+            on: Distance at which a point is on the shape, shape ``(n,)``.
+        """
+        way = b - a
+        size = np.linalg.norm(way, axis=1)
+        share, normals = np.zeros(len(a)), np.zeros_like(a)
+        going = np.arange(len(a))
+        for _ in range(MOST_STEPS):
+            if len(going) == 0:
+                break
+            phi, normals[going] = self.shape.distance(a[going] + share[going, None] * way[going])
+            off = phi > on[going]
+            going, phi = going[off], phi[off]
+            share[going] = np.minimum(share[going] + phi / size[going], 1.0)
+            going = going[share[going] < 1.0]
+        share[going] = 1.0
+        return share, normals
 
     def update(self) -> MPMError | None:
         """See :meth:`Term.update`."""
@@ -600,14 +684,17 @@ class Rigid(Contact):
         before, trial = self._memory, self._trial
         assert before is not None and trial is not None
         failure: MPMError | None = None
-        if self.shape.costly:
-            trial = self._in_full(trial)
-        turned = (before.normal * trial.normal).sum(axis=2) < -0.5
-        flipped = before.touched & trial.touched & turned
-        if flipped.any() or self._passes(before, trial.outcome.positions, trial.pose):
-            failure = ConvergenceError(
-                "A body goes through the obstacle of a Rigid in one step; take smaller steps"
-            )
+        try:
+            if self.shape.costly:
+                trial = self._in_full(trial)
+            turned = (before.normal * trial.normal).sum(axis=2) < OPPOSITE
+            flipped = before.touched & trial.touched & turned
+            if flipped.any() or self._passes(before, trial.outcome.positions, trial.pose):
+                failure = ConvergenceError(
+                    "A body goes through the obstacle of a Rigid in one step; take smaller steps"
+                )
+        except MPMError as error:
+            failure = error
         if (failure := agreed(self._comm, failure)) is not None:
             raise failure
         self._memory = trial
