@@ -106,6 +106,9 @@ class GhostPenalty(Cure):
     def _penalties(self, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the matrices of pairs of cells, each shape of a pair computed once for all.
 
+        What is kept is known by its vertices to the last bit, so that a run that goes on from a
+        checkpoint has the same matrices as one that has kept them.
+
         Args:
             vertices: Geometry nodes of both cells, shape ``(n, 2, m, gdim)``.
         """
@@ -114,7 +117,7 @@ class GhostPenalty(Cure):
         shape = (vertices - vertices[:, :1, :1]) / size[:, None, None, None]
         keys = np.round(shape.reshape(n, vertices[:1].size), 9)
         _, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        names = [key.tobytes() for key in keys[first]]
+        names = [one.tobytes() for one in shape[first]]
         new = [i for i, name in enumerate(names) if name not in self._known]
         if len(new) > 0:
             if len(self._known) + len(new) > MOST_SHAPES:
