@@ -65,12 +65,13 @@ def _expression(value: Any, particles: Particles, name: str, shape: tuple[int, .
     return value
 
 
-class Density:
-    """The mass per undeformed volume of a body, which must not be negative anywhere.
+class NotNegative:
+    """Something of a body that must not be negative anywhere, whatever values it gets.
 
     Args:
         value: Numbers or UFL, or a function that makes UFL from the body mesh.
         particles: The body.
+        name: What it is called in a message.
 
     Attributes:
         value: UFL on the body mesh.
@@ -79,9 +80,11 @@ class Density:
         MPMError: See :func:`as_expression`.
     """
 
-    def __init__(self, value: Any, particles: Particles) -> None:
-        self.value = as_expression(value, particles, "density", ())
-        self._particles = particles
+    def __init__(self, value: Any, particles: Particles, name: str) -> None:
+        self.value = as_expression(value, particles, name, ())
+        if not ufl.domain.extract_domains(self.value):  # UFL that is a number
+            self.value = as_expression(float(self.value), particles, name, ())
+        self._particles, self._name = particles, name
         self._at_points: fem.Expression | None = None
         if not isinstance(self.value, fem.Constant | fem.Function):
             degree = particles.dx_exact.metadata()["quadrature_degree"]
@@ -108,9 +111,17 @@ class Density:
         with agree(particles.mesh.comm):
             if wrong.any():
                 raise MPMError(
-                    f"density must not be negative, not {least[wrong][0]:g} (at {{particles}}).",
+                    f"{self._name} must not be negative, not {least[wrong][0]:g} "
+                    "(at {particles}).",
                     particles.global_index[wrong],
                 )
+
+
+class Density(NotNegative):
+    """The mass per undeformed volume of a body; see :class:`NotNegative`."""
+
+    def __init__(self, value: Any, particles: Particles) -> None:
+        super().__init__(value, particles, "density")
 
 
 def functions_of(assignment: Any) -> list[fem.Function]:

@@ -185,7 +185,13 @@ def adopt(
                 raise MPMError(f"{source} does not know {{particles}}.", lost)
         found.append({name: exchange(values) for name, values in table.columns.items()})
     spaces = spaces_of(bodies) if spaces is None else spaces
-    for V, table in zip(spaces, snapshot.tables[len(bodies) :], strict=True):
+    backgrounds = snapshot.tables[len(bodies) :]
+    if len(backgrounds) != len(spaces):
+        raise MPMError(
+            f"{source} is of another problem: it has {len(backgrounds)} background spaces, of "
+            f"displacements and other fields, and this problem {len(spaces)}."
+        )
+    for V, table in zip(spaces, backgrounds, strict=True):
         exchange = RowExchange(comm, table.rows, _compat.input_cell_index(V.mesh))
         found.append({name: exchange(values) for name, values in table.columns.items()})
     keys = [thing.key for thing in things]

@@ -179,6 +179,7 @@ class FrictionalMaterial(IsotropicElastic):
     def initial_state(self, n: int, dim: int) -> State:
         """See :meth:`Material.initial_state`."""
         _require_less_dilation(*(self.parameters[angle] for angle in _ANGLES))
+        _require_softening(self.parameters)
         return super().initial_state(n, dim)
 
     def _sines(self) -> tuple[Parameter, Parameter, Parameter]:

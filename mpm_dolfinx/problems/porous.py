@@ -27,7 +27,7 @@ from dolfinx import fem
 from ufl.algorithms import extract_coefficients
 from ufl.core.expr import Expr
 
-from ..assembly.inputs import as_expression, facet_measure
+from ..assembly.inputs import NotNegative, as_expression, facet_measure
 from ..constitutive.strain import Strain
 from ..errors import MPMError, agree, as_ours
 from ..materials.base import Material
@@ -42,7 +42,8 @@ from .through_time import TimeProblem
 
 __all__ = ["PorousProblem"]
 
-#: Factor of Nitsche's penalty ``k / h``, h the size of the domains at the boundary.
+#: Factor of Nitsche's penalty ``k m / h``, h the size of the domains across the boundary and m the
+#: degree of the pressure; inverse inequalities ask for up to 4 in simplices.
 PENALTY = 5.0
 
 
@@ -66,6 +67,7 @@ class _Filled:
         before: The displacement at the last converged step.
         dt: Duration of the step.
         residual: The balance of mass.
+        checked: Permeability and storage, which must not be negative.
     """
 
     particles: Particles
@@ -73,6 +75,7 @@ class _Filled:
     before: fem.Function
     dt: fem.Constant
     residual: ufl.Form | None = None
+    checked: Sequence[NotNegative] = ()
 
 
 class PorousProblem(TimeProblem, QuasiStaticProblem):
@@ -87,9 +90,10 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         particles: The body, or a list of bodies, of degree 2 or 3 on a background of degree 2 or 3.
         material: As in :class:`QuasiStaticProblem`, for the effective stress.
         permeability: Hydraulic conductivity over the specific weight of water (length^2 over
-            pressure and time), positive: a number, a Constant or Function, UFL on the body mesh, or
-            a function of the volume ratio J that returns UFL, ``lambda J: k * J**3``. ``None`` for
-            a body without water, such as a footing. A list has one for each body.
+            pressure and time): a positive number, or what must not be negative anywhere when a step
+            begins: a Constant or Function, UFL on the body mesh, or a function of the volume ratio
+            J that returns UFL, ``lambda J: k * J**3``. ``None`` for a body without water, such as a
+            footing. A list has one for each body.
         density: Mass of soil and water per undeformed volume.
         storage: Change of the water's volume by its pressure, per undeformed volume (one over a
             pressure): the porosity times the compressibility of water; one for all or a list.
@@ -242,8 +246,11 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
                 "ones, as the change of its volume is either."
             )
         flow = _Flow(filled, strain, all(small))
-        storage = as_expression(pores.storage, body, "storage", ())
-        k = self._permeability(pores.permeability, body, flow.J)
+        filled.checked = [
+            NotNegative(pores.storage, body, "storage"),
+            NotNegative(_evaluated(pores.permeability, body, flow.J), body, "permeability"),
+        ]
+        storage, k = (one.value for one in filled.checked)
         given_values = [storage, k, *(value for value, _ in (*pores.drained, *pores.inflow))]
         filled.residual = self._balance(given, pores, flow, storage, k)
         held = [c for v in given_values if isinstance(v, Expr) for c in extract_coefficients(v)]
@@ -268,33 +275,18 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         if pores.drained:
             ds = facet_measure(body, given.facet_tags, pores.drained, "drained")
             inside = flow.conductivity(k) * normal
-            size = PENALTY / _sizes(body)
+            degree = flow.p.W.ufl_element().degree
+            penalty = PENALTY * degree * _inverse_size(body, normal)
             for value, tag in pores.drained:
                 gap = p - as_expression(value, body, "a drained pressure", ())
                 out = -q * ufl.dot(flux, normal) + gap * ufl.dot(ufl.grad(q), inside)
-                out -= size * ufl.dot(normal, inside) * gap * q
+                out -= penalty * ufl.dot(normal, inside) * gap * q
                 R += turn * dt * out * ds(tag)
         if pores.inflow:
             ds = facet_measure(body, given.facet_tags, pores.inflow, "inflow")
             for value, tag in pores.inflow:
                 R += turn * dt * as_expression(value, body, "an inflow", ()) * q * ds(tag)
         return R
-
-    @staticmethod
-    def _permeability(value: Any, body: Particles, J: Any) -> Any:
-        """Return the permeability as UFL.
-
-        Raises:
-            MPMError: It is something else, or the function that gives it fails.
-        """
-        if not callable(value) or isinstance(value, Expr):
-            return as_expression(value, body, "permeability", ())
-        with agree(body.mesh.comm):
-            try:
-                made = value(J)
-            except Exception as error:
-                raise as_ours(error, "The function that gives permeability") from error
-        return as_expression(made, body, "permeability", ())
 
     # -- Through time ---------------------------------------------------------------------
 
@@ -309,6 +301,8 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         for filled in self._filled:
             before = filled.particles.converged_displacement
             filled.before.x.array[:] = before.ravel()
+            for one in filled.checked:
+                one.require()
 
     def add(  # type: ignore[override]
         self,
@@ -337,7 +331,10 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         """
         if not isinstance(particles, Particles):
             raise MPMError(f"add() needs mpm.Particles, not a {type(particles).__name__}.")
-        pores = _Pores(permeability, storage, drained, inflow)
+        its = (
+            _lists(name, given, 0)[0] for name, given in (("drained", drained), ("inflow", inflow))
+        )
+        pores = _Pores(permeability, storage, *its)
         _require(particles, pores)
         before = list(self._pores), list(self._spaces_of_water)
         self._pores.append((particles, pores))
@@ -416,6 +413,21 @@ def _cross(a: Sequence[Any], b: Sequence[Any]) -> list[Any]:
     return [a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3] for i in range(3)]
 
 
+def _evaluated(permeability: Any, body: Particles, J: Any) -> Any:
+    """Return a permeability, what it is at a volume ratio where it is a function (collective).
+
+    Raises:
+        MPMError: The function that gives it fails.
+    """
+    if not callable(permeability) or isinstance(permeability, Expr):
+        return permeability
+    with agree(body.mesh.comm):
+        try:
+            return permeability(J)
+        except Exception as error:
+            raise as_ours(error, "The function that gives permeability") from error
+
+
 # -- What is given ---------------------------------------------------------------------------
 
 
@@ -447,8 +459,17 @@ def _lists(name: str, value: Any, count: int) -> list[Any]:
     if not isinstance(value, list | tuple):
         raise MPMError(f"{name} must be a list of pairs of a value and a tag, not {value!r}.")
     if count == 0 or not value or not all(isinstance(part, list) for part in value):
-        return [value] * max(count, 1)
-    return _of_bodies(name, list(value), count)
+        lists = [value] * max(count, 1)
+    else:
+        lists = _of_bodies(name, list(value), count)
+    for pairs in lists:
+        for pair in pairs:
+            if not isinstance(pair, list | tuple) or len(pair) != 2:
+                raise MPMError(
+                    f"{name} must be a list of pairs of a value and a tag, such as [(0.0, 1)], "
+                    f"which {pair!r} is not."
+                )
+    return lists
 
 
 def _number(name: str, value: Any) -> float:
@@ -492,7 +513,12 @@ def _spaces(
         pores: All bodies.
         given: A space of the user's.
         known: Spaces by the identity of V.
+
+    Raises:
+        MPMError: The user's space cannot be that of the pressure.
     """
+    if given is not None:
+        _require_space(given, [body.V for body, _ in pores])
     made = dict(known or {})
     found = []
     for body, its in pores:
@@ -507,6 +533,22 @@ def _spaces(
             )
         found.append((body, made[id(V)]))
     return found
+
+
+def _require_space(given: Any, spaces: Sequence[fem.FunctionSpace]) -> None:
+    """Raise an error unless a space can be that of the pore pressure."""
+    if not isinstance(given, fem.FunctionSpace):
+        raise MPMError(
+            f"pressure_space= must be a dolfinx FunctionSpace, not {type(given).__name__}."
+        )
+    element = given.ufl_element()
+    least = min(V.ufl_element().degree for V in spaces)
+    mine = any(given.mesh is V.mesh for V in spaces)
+    if not mine or element.reference_value_shape or element.degree >= least:
+        raise MPMError(
+            "pressure_space= must be a scalar space on the background mesh, of a degree below "
+            f"{least}, that of the displacement; with as many degrees the pressure would oscillate."
+        )
 
 
 def _begin_with(field: ParticleField, value: Any) -> None:
@@ -538,12 +580,12 @@ def _begin_with(field: ParticleField, value: Any) -> None:
     field.set(values)
 
 
-def _sizes(body: Particles) -> fem.Function:
-    """Return the size of each domain, a piecewise constant Function (collective)."""
-    domain = body.mesh
-    sizes = fem.Function(fem.functionspace(domain, ("Discontinuous Lagrange", 0)), name="size")
-    dim = domain.topology.dim
-    cells = domain.topology.index_map(dim)
-    every = np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
-    sizes.x.array[:] = domain.h(dim, every) / np.sqrt(dim)
-    return sizes
+def _inverse_size(body: Particles, normal: Any) -> Any:
+    """Return one over the size of domains across their facets, as UFL.
+
+    It is that across, whatever the length along: what Nitsche's penalty must outweigh is the
+    derivative across the facet, which is large in flat domains. It is one over the height in a
+    parallelogram whose sides are normal to each other, and at least that elsewhere.
+    """
+    across = ufl.JacobianInverse(body.mesh) * normal
+    return ufl.sqrt(ufl.dot(across, across))

@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import ConvergenceError, DomainDistortionError, MPMError, ParticleOutsideError
 from ..parallel.given import require_same
 from .quasistatic import QuasiStaticProblem
+from .through_time import TimeProblem
 
 __all__ = ["StrengthReduction", "strength_reduction"]
 
@@ -63,10 +64,16 @@ def strength_reduction(
         The factor of safety and how it was found.
 
     Raises:
-        MPMError: The problem is not at its whole load, or a material has no strength.
+        MPMError: The problem is not at its whole load, its steps have a duration (PorousProblem,
+            DynamicProblem), or a material has no strength.
     """
     if not isinstance(problem, QuasiStaticProblem):
         raise MPMError("strength_reduction() needs an mpm.QuasiStaticProblem.")
+    if isinstance(problem, TimeProblem):
+        raise MPMError(
+            "strength_reduction() needs an mpm.QuasiStaticProblem, whose steps have no duration, "
+            f"not an mpm.{type(problem).__name__}."
+        )
     comm = problem.bodies[0].V.mesh.comm
     require_same(comm, step=step, tolerance=tolerance, most=most, displacement=displacement)
     numbers = [step, tolerance, most, 1.0 if displacement is None else displacement]

@@ -274,6 +274,28 @@ def _tensor(x, vertical):
     return stress
 
 
+def test_flat_domains_on_a_drained_top():
+    """Nitsche's penalty outweighs what is large in flat domains: pressure stays within the load."""
+    background = scenes.box([0.0, 0.0], [10.0, 1.25], (1, 25), QUADRILATERAL)
+    shape = scenes.box([0.0, 0.0], [10.0, 1.0], (1, 20), QUADRILATERAL)
+    body = mpm.Particles(shape, scenes.vectors(background, 2), degree=2, quadrature_degree=4)
+    walls = [scenes.fix(body.V, scenes.at(0, x), component=0) for x in (0.0, 10.0)]
+    problem = mpm.PorousProblem(
+        body,
+        SOIL,
+        1.0 / confined(SOIL),
+        bcs=[*walls, scenes.fix(body.V, scenes.at(1, 0.0), component=1)],
+        tractions=[((0.0, -1.0), 1)],
+        facet_tags=scenes.facet_tags(shape, scenes.at(1, 1.0), scenes.at(1, 0.0)),
+        drained=[(0.0, 1)],
+    )
+    (p,) = problem.pore_pressure
+    largest = [scenes.largest(p.x.array) for _ in problem.steps(5e-3, 5e-4)]
+    assert max(largest) < 1.01
+    z = 1.0 - p.W.tabulate_dof_coordinates()[:, 1]
+    assert worst(p, terzaghi(z, 5e-3)) < 0.15
+
+
 def test_water_flows_in():
     """Between rigid walls what flows in is stored: pressure rises by time over storage."""
     problem, p, _ = column(
@@ -377,8 +399,17 @@ def test_what_does_not_go_together_is_refused():
     raises(lambda: column(pore_pressure="high"), mpm.MPMError, "pore_pressure must be a number")
     raises(lambda: column(permeability=lambda J: J.none), mpm.MPMError, "that gives permeability")
     raises(lambda: column(permeability=[1.0, 2.0]), mpm.MPMError, "permeability has the shape")
+    raises(lambda: column(drained=(0.0, 1)), mpm.MPMError, "drained must be a list of pairs")
+    raises(lambda: column(inflow=[(0.0, 1, 2)]), mpm.MPMError, "inflow must be a list of pairs")
+    problem, _, _ = column(permeability=lambda J: -J)
+    raises(lambda: problem.step(0.1), mpm.MPMError, "permeability must not be negative, not -1")
+    assert column(permeability=lambda J: 0.0 * J)[0].step(0.1).time == 0.1
+    raises(lambda: mpm.strength_reduction(problem), mpm.MPMError, "not an mpm.PorousProblem")
     problem, _, _ = column()
     body = problem.particles
+    for space in (("Lagrange", 2), ("Lagrange", 1, (2,))):
+        V_p = fem.functionspace(body.V.mesh, space)
+        raises(lambda V_p=V_p: column(pressure_space=V_p), mpm.MPMError, "must be a scalar space")
     raises(lambda: mpm.PorousProblem(body, SOIL, None), mpm.MPMError, "for one of its bodies")
     flat = scenes.unit(2, QUADRILATERAL)
     low = mpm.Particles(flat, scenes.vectors(scenes.unit(2, QUADRILATERAL)))
