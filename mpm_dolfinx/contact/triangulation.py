@@ -478,10 +478,51 @@ def _oriented(
             "inside out)."
         )
     middle = x.mean(axis=0)
-    volume = (_area_vectors(corners) * (corners[:, 0] - middle)).sum()
+    volumes = (_area_vectors(corners) * (corners[:, 0] - middle)).sum(axis=1)
+    volume = volumes.sum()
     if abs(volume) <= SAME * np.ptp(x, axis=0).max() ** dim:
         raise MPMError(f"{what} encloses nothing.")
+    turned = _inside_out(x, facets, np.sign(volume) * volumes)
+    if turned:
+        raise MPMError(
+            f"{what} has {turned} closed parts that are turned inside out beside others; turn "
+            "their facets round, or make them shapes of their own (a part within another one is "
+            "its hole)."
+        )
     return facets if volume > 0.0 else facets[:, ::-1].copy()
+
+
+def _inside_out(
+    x: NDArray[np.float64], facets: NDArray[np.int64], volumes: NDArray[np.float64]
+) -> int:
+    """Return how many closed parts of a surface are turned inside out, and no holes of others.
+
+    Args:
+        x: Corners, shape ``(n, dim)``.
+        facets: Shape ``(m, dim)``.
+        volumes: What each facet has in the volume, shape ``(m,)``.
+    """
+    label = np.arange(len(x))
+    while True:  # the lowest number goes from corner to corner
+        before = label.copy()
+        least = label[facets].min(axis=1)
+        for corner in facets.T:
+            np.minimum.at(label, before[corner], least)
+            np.minimum.at(label, corner, least)
+        label = label[label]
+        if np.array_equal(label, before):
+            break
+    _, part = np.unique(label[facets[:, 0]], return_inverse=True)
+    volume = np.bincount(part, weights=volumes)
+    low, high = np.full((2, len(volume), x.shape[1]), np.inf)
+    for corner in facets.T:
+        np.minimum.at(low, part, x[corner])
+        np.minimum.at(high, part, -x[corner])
+    solid, turned = np.flatnonzero(volume > 0.0), np.flatnonzero(volume < 0.0)
+    return sum(
+        not bool(((low[solid] <= low[k]) & (high[solid] <= high[k])).all(axis=1).any())
+        for k in turned
+    )
 
 
 def _area_vectors(corners: NDArray[np.float64]) -> NDArray[np.float64]:

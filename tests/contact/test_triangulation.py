@@ -362,3 +362,26 @@ def test_a_block_slides_over_triangles_as_over_their_plane():
         pressed = reaction @ normal
         assert np.linalg.norm(reaction - pressed * normal) == pytest.approx(0.3 * pressed, rel=1e-9)
     assert np.abs(speeds[0] - speeds[1]).max() < 1e-8 * np.abs(speeds[1]).max()
+
+
+def test_parts_are_solids_holes_or_refused():
+    corners = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    cube = np.array([t for a, b, c, d in sides for t in ((a, b, c), (a, c, d))])
+
+    def two(first, size, place, turned):
+        """Return a cube of 4 and another one."""
+        other = cube[:, ::-1] if turned else cube
+        first = cube[:, ::-1] if first else cube
+        points = np.vstack([4.0 * corners, size * corners + place])
+        return contact.triangulated(points, np.vstack([first, other + 8]))
+
+    for first in (False, True):
+        hollow = two(first, 2.0, 1.0, not first)
+        phi, _ = hollow.distance(np.array([[0.5, 2.0, 2.0], [1.5, 2.0, 2.0], [-1.0, 2.0, 2.0]]))
+        np.testing.assert_allclose(phi, [-0.5, 0.5, 1.0])
+        both = two(first, 2.0, 5.0, first)
+        phi, _ = both.distance(np.array([[0.5, 2.0, 2.0], [5.5, 6.0, 6.0]]))
+        np.testing.assert_allclose(phi, [-0.5, -0.5])
+        with pytest.raises(mpm.MPMError, match="has 1 closed parts that are turned inside out"):
+            two(first, 2.0, 5.0, not first)
