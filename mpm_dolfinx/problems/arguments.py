@@ -36,6 +36,7 @@ __all__ = [
     "holds",
     "one_for_each",
     "require_background_fields",
+    "require_entity_maps",
     "require_own_fields",
     "residuals_of",
 ]
@@ -317,6 +318,18 @@ def as_terms(terms: Any, bodies: Sequence[Particles]) -> list[Term]:
                 f"A {type(term).__name__} acts on other particles than those of this problem."
             )
     return list(terms)
+
+
+def require_entity_maps(entity_maps: Any) -> None:
+    """Raise an error unless entity_maps= is what ``dolfinx.fem.form`` takes."""
+    listed = isinstance(entity_maps, list | tuple)
+    if entity_maps is not None and not (
+        listed and all(isinstance(one, mesh.EntityMap) for one in entity_maps)
+    ):
+        raise MPMError(
+            "entity_maps must be a list of dolfinx.mesh.EntityMap, such as the second that "
+            "create_submesh returns."
+        )
 
 
 def as_conditions(bcs: Any, spaces: Sequence[fem.FunctionSpace]) -> list[fem.DirichletBC]:

@@ -56,9 +56,9 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         rayleigh: Damping ``(alpha, beta)`` in proportion to mass (one over a time) and to the
             stiffness of the undeformed bodies (a time); not negative.
         after: A quasi-static problem of the same particles, from the state of which the motion
-            begins: equilibrium under loads and supports that should be given here too. Points
-            whose material is the same object go on with its history, others carry their stress.
-            That problem cannot go on then.
+            begins: equilibrium under loads, supports and terms that should be given here too, the
+            same contacts, which know where points stick. Points whose material is the same object
+            go on with its history, others carry their stress. That problem cannot go on then.
         terms: As in :class:`QuasiStaticProblem`.
         **options: All else that :class:`QuasiStaticProblem` has but ``background`` and
             ``predictor``: ``body_force``, ``bcs``, ``tractions``, ``supports``, ``f_bar``, ...
@@ -101,19 +101,25 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         self._energies = []
         self.inertia = Inertia(bodies, start, scheme, out_of_range, alpha, self._energies)
         given = as_terms(terms, bodies)
-        super().__init__(
-            particles,
-            material,
-            density,
-            predictor=False,
-            terms=[self.inertia, *given],
-            **options,
-        )
-        self.history.energies = self._energies
-        self.inertia.settle()
-        if after is not None:
-            for points, before in zip(self.points, after.points, strict=True):
-                points.take_over(before)
+        governed = [body.governed_by for body in bodies]
+        try:
+            super().__init__(
+                particles,
+                material,
+                density,
+                predictor=False,
+                terms=[self.inertia, *given],
+                **options,
+            )
+            self.history.energies = self._energies
+            self.inertia.settle()
+            if after is not None:
+                for points, before in zip(self.points, after.points, strict=True):
+                    points.take_over(before)
+        except BaseException:
+            for body, by in zip(bodies, governed, strict=True):
+                body.governed_by = by
+            raise
 
     _gradual = False
 
@@ -132,6 +138,11 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         )
         if not same:
             raise MPMError("after= needs a problem of the same particles, in the same order.")
+        if not after.governs:
+            raise MPMError(
+                "after= is a problem that no longer governs its particles, as another one was made "
+                "of them since; begin from that, or make all of them anew."
+            )
         if options.get("mixed") is not None or after.setup.mixed is not None:
             raise MPMError("after= does not go with mixed='pressure'; use f_bar=.")
         if options.get("initial_stress") is not None:

@@ -60,6 +60,7 @@ from .arguments import (
     by_space,
     one_for_each,
     require_background_fields,
+    require_entity_maps,
     require_own_fields,
     residuals_of,
 )
@@ -248,6 +249,7 @@ class ParticleProblem:
     ) -> None:
         bodies = as_bodies(particles)
         fields = as_fields(fields, bodies)
+        require_entity_maps(entity_maps)
         require_same(
             bodies[0].V.mesh.comm,
             R=R,
@@ -717,9 +719,14 @@ class ParticleProblem:
         for body in self.bodies:
             body.governed_by = self._reign
 
+    @property
+    def governs(self) -> bool:
+        """Whether no later problem was made of the bodies."""
+        return all(body.governed_by is self._reign for body in self.bodies)
+
     def _require_governing(self) -> None:
         """Raise an error where a later problem has taken a body over."""
-        if any(body.governed_by is not self._reign for body in self.bodies):
+        if not self.governs:
             raise MPMError(
                 "Another problem was made of these particles since, and governs them now; go on "
                 "with that one, or give each problem particles of its own."

@@ -894,12 +894,23 @@ def test_what_a_motion_cannot_begin_with_is_refused():
             mpm.MPMError,
             sentence,
         )
+    raises(
+        lambda: mpm.DynamicProblem(particles, law, 0.0, after=static, **given),
+        mpm.MPMError,
+        "positive",
+    )
     static.step()  # nothing has changed
     moving = mpm.DynamicProblem(particles, law, 2.0, after=static, **given)
     raises(
         lambda: mpm.DynamicProblem(particles, law, 2.0, after=moving, **given),
         mpm.MPMError,
         "needs a QuasiStaticProblem",
+    )
+    moving.solve(0.1, 0.1)  # particles are elsewhere now than that history knows
+    raises(
+        lambda: mpm.DynamicProblem(particles, law, 2.0, after=static, **given),
+        mpm.MPMError,
+        "no longer governs its particles",
     )
 
 

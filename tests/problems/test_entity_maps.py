@@ -104,3 +104,8 @@ def test_what_cannot_be_is_said():
     problem, _, _ = rubbing(QUADRILATERAL, "fast")
     with pytest.raises(mpm.MPMError, match="data on another mesh than the body's"):
         problem.save("never.ckpt")
+    body = problem.particles
+    R = ufl.inner(body.displacement, ufl.TestFunction(body.W)) * body.dx
+    for wrong in (5, ["facets"], "facets"):
+        with pytest.raises(mpm.MPMError, match="must be a list of dolfinx"):
+            mpm.ParticleProblem(R, body, entity_maps=wrong)
