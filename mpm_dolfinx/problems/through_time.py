@@ -189,6 +189,7 @@ class TimeProblem(ParticleProblem):
         Raises:
             MPMError: As in :meth:`solve`.
         """
+        require_same(self._comm, dt=dt)
         if not isinstance(dt, float | int | np.number) or not dt > 0.0:
             raise MPMError(f"dt must be positive, not {dt!r}.")
         for _ in self.steps(self.history.time + dt, 2.0 * dt):

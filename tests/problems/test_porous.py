@@ -401,6 +401,9 @@ def test_what_does_not_go_together_is_refused():
     raises(lambda: column(permeability=[1.0, 2.0]), mpm.MPMError, "permeability has the shape")
     raises(lambda: column(drained=(0.0, 1)), mpm.MPMError, "drained must be a list of pairs")
     raises(lambda: column(inflow=[(0.0, 1, 2)]), mpm.MPMError, "inflow must be a list of pairs")
+    if WORLD.size > 1:
+        short = 0.1 if WORLD.rank == 0 else -0.1
+        raises(lambda: column()[0].step(short), mpm.MPMError, "dt differs between the ranks")
     problem, _, _ = column(permeability=lambda J: -J)
     raises(lambda: problem.step(0.1), mpm.MPMError, "permeability must not be negative, not -1")
     assert column(permeability=lambda J: 0.0 * J)[0].step(0.1).time == 0.1
