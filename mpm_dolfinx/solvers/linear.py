@@ -268,17 +268,20 @@ class ShiftedFactor:
             K.copy(self.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         if diagonal is not None:
             self.P.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
+        pc = self._ksp.getPC()
+        failed = bool(pc.getFailedReason())
+        split = pc.getType() == "fieldsplit"
         if new:
             self.K = K
             self._refining = None
             if self._symmetric:
                 self.P.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-            if self._ksp.getPC().getType() == "fieldsplit":
-                self._split(levels.splits())
-            elif self._ksp.getPC().getType() not in FACTORS:
+            if not split and pc.getType() not in FACTORS:
                 self.P.setNearNullSpace(levels.rigid_motions())
-        if self._ksp.getPC().getFailedReason():
-            self._ksp.getPC().reset()  # MUMPS does not factorise again where it failed
+        if split and (new or failed):
+            self._split(levels.splits())  # what a reset would forget
+        elif failed:
+            pc.reset()  # MUMPS does not factorise again where it failed
         self._ksp.setOperators(K, self.P)
         with self._statistics.phase("factorise"), self._own_options(K.getSize()[0]):
             with _options_refused():

@@ -296,6 +296,33 @@ def test_flat_domains_on_a_drained_top():
     assert worst(p, terzaghi(z, 5e-3)) < 0.15
 
 
+def test_a_field_split_whose_block_is_singular():
+    """The splits are told again where a factor of theirs failed, and smaller steps are tried."""
+    comm = MPI.COMM_SELF
+    background = scenes.box([0.0, 0.0], [0.5, 1.25], (2, 5), QUADRILATERAL, comm)
+    shape = scenes.box([0.0, 0.0], [0.5, 1.0], (1, 1), QUADRILATERAL, comm)
+    body = mpm.Particles(shape, scenes.vectors(background, 2), degree=2)
+    problem = mpm.PorousProblem(
+        body,
+        SOIL,
+        1.0,
+        bcs=[scenes.fix(body.V, scenes.at(1, 0.0), component=1)]
+        + [scenes.fix(body.V, scenes.at(0, x), component=0) for x in (0.0, 0.5)],
+        tractions=[((0.0, -1.0), 1)],
+        facet_tags=scenes.facet_tags(shape, scenes.at(1, 1.0), scenes.at(1, 0.0)),
+        drained=[(0.0, 1)],
+        petsc_options={
+            "ksp_type": "gmres",
+            "pc_type": "fieldsplit",
+            "pc_fieldsplit_type": "schur",
+            "fieldsplit_displacement_pc_type": "lu",
+            "fieldsplit_displacement_pc_factor_mat_solver_type": "petsc",
+            "fieldsplit_pore_pressure_pc_type": "none",
+        },
+    )
+    raises(lambda: problem.step(0.1), mpm.ConvergenceError, "factorisation of the tangent failed")
+
+
 def test_water_flows_in():
     """Between rigid walls what flows in is stored: pressure rises by time over storage."""
     problem, p, _ = column(
