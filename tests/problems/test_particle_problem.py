@@ -388,8 +388,10 @@ def test_a_term_that_is_zero_is_left_out(route):
         problem = mpm.ParticleProblem(R, a, J, bcs, assembly=route)
         problem.solve(2)
         found.append((d.x.array.copy(), problem.history.iterations))
-    np.testing.assert_array_equal(found[0][0], found[1][0])
-    assert found[0][1] == found[1][1] and scenes.largest(found[0][0]) > 1e-4
+    size = scenes.largest(found[0][0])
+    # (A factorisation on several ranks adds up in the order in which messages come.)
+    np.testing.assert_allclose(found[0][0], found[1][0], rtol=0.0, atol=1e-14 * size)
+    assert found[0][1] == found[1][1] and size > 1e-4
 
 
 @pytest.mark.parametrize("route", ["auto", "reference"])
