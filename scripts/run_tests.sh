@@ -27,8 +27,9 @@ if [[ ${1:-} == --all ]]; then
     which=(-m "")
     default="2 3 4"
 elif (($# == 0)); then
-    few=(parallel particles problems system stepping transfer)
-    few=("${few[@]/#/tests/}" tests/io/test_checkpoint.py tests/physics/test_parallel.py)
+    few=(parallel particles system transfer io/test_checkpoint.py physics/test_parallel.py
+        problems/test_fields.py problems/test_remeshing.py stepping/test_loading.py)
+    few=("${few[@]/#/tests/}")
     echo "The quick tests. Those of one folder or file take seconds: make test ARGS=tests/materials," \
         "NP=1 for one rank alone; make test-all runs all, also on four ranks."
 fi
