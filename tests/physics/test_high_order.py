@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Backgrounds and domains of degree 1 to 3: order, rank, patch test, folding, output, ranks."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import scenes
@@ -20,11 +22,12 @@ from scenes import (
     vectors,
 )
 
+import basix.ufl
 import ufl
-from dolfinx import fem
+from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.materials import Hencky, VonMises
+from mpm_dolfinx.materials import Hencky, LinearElastic, VonMises
 
 GOOD = [(1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3)]
 
@@ -192,3 +195,55 @@ def test_points_and_averages():
     assert np.allclose(J, particles.volume, rtol=1e-3)
     assert particles.points.shape == (particles.num_local, 3, 2)
     assert not particles.point_plastic_strain.any()
+
+
+def ring(n, geometry):
+    """Return a quarter of a ring, n x n quadrilaterals with edges of a degree."""
+    count = geometry * n
+    s, t = np.meshgrid(*2 * [np.linspace(0.0, 1.0, count + 1)], indexing="ij")
+    x = (1.0 + s)[..., None] * np.stack([np.cos(0.5 * np.pi * t), np.sin(0.5 * np.pi * t)], -1)
+    corners = [(0, 0), (1, 0), (0, 1), (1, 1)]
+    places = [(geometry * i, geometry * j) for i, j in corners]
+    if geometry == 2:
+        places += [(1, 0), (0, 1), (2, 1), (1, 2), (1, 1)]
+    cells = [
+        [(geometry * i + a) * (count + 1) + geometry * j + b for a, b in places]
+        for i in range(n)
+        for j in range(n)
+    ]
+    element = basix.ufl.element("Lagrange", "quadrilateral", geometry, shape=(2,))
+    return mesh.create_mesh(
+        MPI.COMM_SELF, np.array(cells, dtype=np.int64), ufl.Mesh(element), x.reshape(-1, 2)
+    )
+
+
+def lame(n, geometry, degree):
+    """Return the error of a ring under inner pressure, of its nodes' displacements."""
+    body, m = ring(n, geometry), round(1.43 * n)
+    grid = scenes.box([0.0, 0.0], [2.3, 2.3], [m, m], QUADRILATERAL, MPI.COMM_SELF)
+    V = scenes.vectors(grid, degree)
+    particles = mpm.Particles(body, V, degree=degree)
+    problem = mpm.QuasiStaticProblem(
+        particles,
+        LinearElastic(1e3, 0.3),
+        bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in range(2)],
+        pressures=[(1e-4, 1)],
+        facet_tags=scenes.facet_tags(body, lambda x: np.hypot(x[0], x[1]) < 1.0 + 1e-6),
+    )
+    problem.solve(1)
+    X = particles.W.tabulate_dof_coordinates()[:, :2]
+    r = np.hypot(*X.T)
+    shear = 1e3 / 2.6
+    exact = X / r[:, None] * (1e-4 / 3.0 / (2.0 * shear) * (0.4 * r + 4.0 / r))[:, None]
+    error = particles.displacement.x.array.reshape(-1, 2) - exact
+    return np.linalg.norm(error) / np.linalg.norm(exact)
+
+
+@pytest.mark.skip_in_parallel
+def test_curved_edges_restore_the_order_at_a_rim():
+    # Lame's solution; straight edges are off the circle by h^2.
+    straight = [lame(n, 1, 2) for n in (8, 16)]
+    curved = [lame(n, 2, 2) for n in (8, 16)]
+    assert straight[0] / straight[1] < 4.5
+    assert curved[0] / curved[1] > 5.5 and curved[1] < 0.02 * straight[1]
+    assert lame(8, 2, 3) < 0.05 * curved[0]
