@@ -87,3 +87,36 @@ def error_of_blocks(problem, step=1e-5, size=1e-3):
             error = scenes.largest(product.array_r[part] - differences.array_r[part])
             worst = max(worst, error / own)
     return worst
+
+
+def error_of_a_term(term, bodies, start):
+    """Return the error of a term's tangent, against differences, over the size of its forces.
+
+    The motion is a smooth one of nodes, and the bodies are left where they begin.
+
+    Args:
+        term: The term, which has begun a step.
+        bodies: Its bodies.
+        start: Displacements at which to look, for each body.
+    """
+    some = np.random.default_rng(7)
+    X = [body.W.tabulate_dof_coordinates()[:, :2] for body in bodies]
+    ways = [1e-8 * np.sin(x @ some.uniform(3, 9, (2, 2)) + i).ravel() for i, x in enumerate(X)]
+
+    def forces(factor):
+        for body, d, way in zip(bodies, start, ways, strict=True):
+            body.displacement.x.array[:] = d + factor * way
+        assert term.update() is None
+        return np.concatenate([f.array_r.copy() for f in term.residuals()])
+
+    numeric = (8 * (forces(1.0) - forces(-1.0)) - (forces(2.0) - forces(-2.0))) / 12.0
+    forces(0.0)
+    motions = []
+    for body, way in zip(bodies, ways, strict=True):
+        vector = body.T.createVecLeft()
+        vector.array_w[:] = way[: vector.getLocalSize()]
+        motions.append(vector)
+    exact = np.concatenate([f.array_r.copy() for f in term.stiffness_force(motions)])
+    size = scenes.largest(exact)
+    assert size > 0.0
+    return scenes.largest(exact - numeric) / size
