@@ -36,6 +36,8 @@ DEEP = 1.0
 OVERLAP = 0.1
 #: Most places on the way of a point that are looked at, one by one and by steps of the distance.
 MOST_PLACES, MOST_STEPS = 1000, 100
+#: Most points of each rank at which the shapes of ranks are compared.
+LOOKED_AT = 16
 #: How near to the surface a point is on it, over the thickness of the domain behind.
 ON = 1e-3
 #: Least length of a way through an obstacle, over the same: less is cut off a sharp corner.
@@ -88,6 +90,7 @@ class _Memory:
         normal: Normals, in the frame of the shape.
         outcome: What acted.
         works: What was done against pressure and against friction in the step, if there is motion.
+        step: The step of a motion, at all points, by whose middle the forces are.
     """
 
     pose: _Pose
@@ -97,6 +100,7 @@ class _Memory:
     normal: NDArray[np.float64]
     outcome: Outcome
     works: tuple[float, float] = (0.0, 0.0)
+    step: _Step | None = None
 
 
 class Placed(NamedTuple):
@@ -316,12 +320,14 @@ class Rigid(Contact):
 
     def _require_same_shape(self) -> None:
         """Raise an error where ranks have different shapes, by some distances (collective)."""
-        places = self.shape.pivot + np.vstack(
-            [np.eye(self.shape.dim), -2.0 * np.eye(self.shape.dim)]
-        )
+        if self._comm.size == 1:
+            return
+        x = self._surface.positions(converged=True).reshape(-1, self.shape.dim)
+        places = np.concatenate(self._comm.allgather(x[:: 1 + len(x) // LOOKED_AT]))
         with agree(self._comm):
-            distances = self.shape.distance(places)[0].astype(np.float32)
-        require_same(self._comm, shape=[type(self.shape).__name__, *distances.tolist()])
+            distances = self.shape.distance(self._framed(places, self._pose))[0]
+        told = distances.astype(np.float32).tolist()
+        require_same(self._comm, shape=[type(self.shape).__name__, *told])
 
     def _settle(self) -> None:
         """Take the present mesh of the body (collective)."""
@@ -548,6 +554,7 @@ class Rigid(Contact):
             n.reshape(x.shape),
             outcome,
             works,
+            step,
         )
 
     def _distance(
@@ -648,14 +655,14 @@ class Rigid(Contact):
         surface, gdim, Q = self._surface, self._surface.gdim, trial.pose.Q
         y = self._framed(trial.outcome.positions, trial.pose).reshape(-1, gdim)
         n, gap = trial.normal.reshape(-1, gdim)[flat], trial.gap.ravel()[flat]
-        every = self._points(memory)
-        points = every.of(flat)
+        points = self._points(memory).of(flat)
         delta = y[flat] - points.anchor
         touch, law = surface.touch, self.friction
         if not self._of_step:
             H = self.shape.curvature(y[flat])
             return np.asarray(Q @ derivative(law, points, delta, gap, n, H, touch) @ Q.T)
-        step = _Step(*(part[flat] for part in self._step(every, memory, y, trial.gap.ravel())))
+        assert trial.step is not None
+        step = _Step(*(part[flat] for part in trial.step))
         H = 0.5 * self.shape.curvature(step.middle)
         slope = pressure_slope(points.stiffness, step.before, gap, touch)
         size = (step.change**2).sum(axis=1)
@@ -697,7 +704,7 @@ class Rigid(Contact):
             failure = error
         if (failure := agreed(self._comm, failure)) is not None:
             raise failure
-        self._memory = trial
+        self._memory = replace(trial, step=None)
 
         def undo() -> None:
             self._memory = before
