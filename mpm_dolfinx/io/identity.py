@@ -40,7 +40,6 @@ class Identifiable(Protocol):
     """What tells a problem from others."""
 
     bodies: list[Particles]
-    identity: dict[str, Any] | None
 
     @property
     def carried(self) -> list[CarriedField]:
@@ -51,12 +50,10 @@ class Identifiable(Protocol):
 
 
 def identity(problem: Identifiable) -> dict[str, Any]:
-    """Return what two problems must share for a state of one to be one of the other.
+    """Return what two problems must share for a state of one to be one of the other (collective).
 
-    It is that of the problem before domains were split (collective).
+    It is that of the problem as it is now: see :class:`ProblemState` for what it was made as.
     """
-    if problem.identity is not None:
-        return problem.identity
     found: dict[str, Any] = {"the number of bodies": len(problem.bodies)}
     spaces = spaces_of(problem.bodies)
     for i, V in enumerate(spaces):

@@ -7,7 +7,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -27,10 +27,10 @@ from ..boundary.supports import Support
 from ..constitutive.averaging import Linearised
 from ..contact.contact import Contact
 from ..errors import MPMError, agree, warn
-from ..history import History, Stage, Step
-from ..io import checkpoint, identity
-from ..io.series import Output, read_series
-from ..io.snapshot import Kept, adopt, capture, merged, require_key, spaces_of
+from ..history import History, Step
+from ..io import checkpoint
+from ..io.series import Output
+from ..io.snapshot import Kept, spaces_of
 from ..parallel.garbage import Cleaner
 from ..parallel.given import require_same
 from ..particles.field import CarriedField, ParticleField
@@ -38,20 +38,18 @@ from ..particles.particles import Particles
 from ..solvers.newton import NewtonSolver
 from ..stabilisation.choice import stabilisation_of
 from ..stepping.automatic import ErrorControl
-from ..stepping.control import Run
 from ..stepping.diagnosis import crossed
 from ..stepping.displacement_control import DisplacementControl
 from ..stepping.loading import Mender, Stepper
 from ..stepping.progress import with_bar
 from ..system.body import BodyTerm, PointHistory, StepForce
-from ..system.conditions import fixed_dofs, force_at
+from ..system.conditions import force_at
 from ..system.field import Field, ValueField
 from ..system.predictor import Predictor
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
 from ..system.term import PointMaterial, Term, UserTerm
 from ..system.values import FieldTerm, FormsTerm
-from . import kept
 from .arguments import (
     as_bodies,
     as_conditions,
@@ -65,9 +63,11 @@ from .arguments import (
     residuals_of,
 )
 from .setup import Numerics
+from .staging import Change, Staging
+from .state import ProblemState
 from .summary import in_one_line, on_a_screen
 
-__all__ = ["Change", "Contribution", "Law", "ParticleProblem"]
+__all__ = ["Contribution", "Law", "ParticleProblem"]
 
 #: What goes with automatic steps, and is of no meaning to others.
 AUTOMATIC = {"tolerance": 1e-2, "output_at": (), "first_step": 0.05, "length": None}
@@ -97,55 +97,6 @@ class Contribution(NamedTuple):
     injected: tuple[fem.Function, fem.Function] | None = None
     contact: bool = False
     of_step: Sequence[StepForce] = ()
-
-
-class Change(Protocol):
-    """What a stage changes of a problem. All calls are collective.
-
-    Attributes:
-        kind: What kind of change it is.
-    """
-
-    kind: str
-
-    def make(self) -> None:
-        """Change what the problem is made of."""
-
-    def settle(self) -> None:
-        """Give what is new its state; the system is built, the bodies are where they were."""
-
-    def renews(self, body: int | None, name: str) -> bool:
-        """Return whether something of a state is new, and not as it was.
-
-        Args:
-            body: Number of the body, or ``None`` for numbers.
-            name: What it is called in a state.
-        """
-
-    def undo(self) -> None:
-        """Take back what was changed."""
-
-
-class _Standing(NamedTuple):
-    """Forces before a stage: of what, and where.
-
-    Attributes:
-        moved: What each force acts on.
-        forces: On own dofs of its W.
-        spaces: The backgrounds.
-        gathered: Forces on their own dofs, of bodies whose nodes go with their cells.
-        left: What is held back there.
-        reactions: Reactions there, if any are known.
-        fixed: Dofs with a condition.
-    """
-
-    moved: list[tuple[int, str]]
-    forces: list[NDArray[np.float64]]
-    spaces: list[fem.FunctionSpace]
-    gathered: list[NDArray[np.float64]]
-    left: list[NDArray[np.float64]]
-    reactions: list[NDArray[np.float64]] | None
-    fixed: list[NDArray[np.bool_]]
 
 
 type Law = tuple[str, dict[str, Any]]
@@ -257,35 +208,24 @@ class ParticleProblem:
             J=J,
             bcs=bcs,
             background=background,
+            symmetric=symmetric,
+            terms=terms,
+            fields=[field.name for field in fields],
+        )
+        numerics = Numerics.agreed(
+            bodies[0].V.mesh.comm,
             petsc_options_prefix=petsc_options_prefix,
             petsc_options=petsc_options,
             form_compiler_options=form_compiler_options,
             jit_options=jit_options,
             assembly=assembly,
-            symmetric=symmetric,
             shift=shift,
             line_search=line_search,
             dependent_dofs=dependent_dofs,
             predictor=predictor,
             stabilisation=stabilisation,
             linear_solver=linear_solver,
-            terms=terms,
-            fields=[field.name for field in fields],
-            entity_maps=entity_maps is None,
-        )
-        numerics = Numerics(
-            petsc_options_prefix,
-            petsc_options or {},
-            form_compiler_options,
-            jit_options,
-            assembly,
-            shift,
-            line_search,
-            dependent_dofs,
-            predictor,
-            stabilisation,
-            linear_solver,
-            entity_maps,
+            entity_maps=entity_maps,
         )
         residuals, self._of_fields = residuals_of(R, bodies, fields)
         if fields and J is not None:
@@ -328,17 +268,15 @@ class ParticleProblem:
         self.bcs = as_conditions(bcs, spaces)
         self.terms = as_terms(terms, self.bodies)
         self.history = History()
-        self.identity: dict[str, Any] | None = None
         self._comm: MPI.Comm = self.bodies[0].V.mesh.comm
         self._background, self._numerics = background, numerics
         self._output = Output()
-        self._kept: list[tuple[Term | None, Kept]] = []
         self._held = Release()
-        self._stages: list[str] = []
-        self._first_identity: dict[str, Any] = {}
         self._stepper = Stepper(self, self._held, mender)
+        self._state = ProblemState(self, self._stepper, self._held, self._output, self._history_at)
+        self._staging = Staging(self, self._state, self._stepper, self._held)
         self._build()
-        self._keep_terms()
+        self._state.keep_terms()
 
     def _build(self) -> None:
         """Make the system and its solver for the present meshes of the bodies (collective).
@@ -541,19 +479,29 @@ class ParticleProblem:
         self,
         change: Callable[[], None],
         carry: Callable[[checkpoint.Snapshot], checkpoint.Snapshot],
+        undo: Callable[[], None] | None = None,
     ) -> None:
-        """Build the problem on other meshes of the same bodies, in the same state (collective).
+        """Make the problem again, in the same state: on other meshes, of other things (collective).
 
         Args:
-            change: Gives the particles their meshes.
-            carry: Makes of the state before the one on these meshes.
+            change: Changes what the problem is made of: gives the particles their meshes.
+            carry: Makes of the state before the one of the problem as it is then.
+            undo: Takes the change back where something fails, and all stays as it was.
         """
-        snapshot = self._snapshot()
+        snapshot = self._state.capture()
         seconds = self.history.statistics.seconds
         self._release()
-        change()
-        self._build()
-        self._adopt(carry(snapshot), (), "The state before")
+        try:
+            change()
+            self._build()
+            self._state.adopt(carry(snapshot))
+        except BaseException:
+            if undo is not None:
+                undo()
+                self._release()
+                self._build()
+                self._state.adopt(snapshot)
+            raise
         self.history.statistics.update(seconds)
 
     # -- Stages ---------------------------------------------------------------------------
@@ -573,116 +521,12 @@ class ParticleProblem:
             MPMError: What is to be changed does not go together.
         """
         self._require_governing()
-        if sudden and self._held.remaining > 0.0:
-            raise MPMError(
-                f"{100 * self._held.remaining:.3g} % of what the last stage changes is held back "
-                "yet; finish it with solve() before a sudden one."
-            )
-        first = self._first_identity if self._stages else identity.identity(self)
-        before = None if sudden else self._standing_forces()
-        spaces, snapshot = self._spaces(), self._snapshot()
-        seconds, kept = self.history.statistics.seconds, list(self._kept)
-        count = len(self.bodies)
-        self._release()
-        try:
-            change.make()
-            self._build()
-            self._keep_terms()
-            change.settle()
-            numbers = (count, len(self.bodies))
-            backgrounds = [_number_of(V, spaces) for V in self._spaces()]
-            state = merged(snapshot, self._snapshot(), numbers, backgrounds, change.renews)
-            state.numbers.update({"past": [], "release remaining": 0.0})
-            self._adopt(state, (), "The state before")
-        except BaseException:
-            change.undo()
-            self._kept = kept
-            self._release()
-            self._build()
-            self._adopt(snapshot, (), "The state before")
-            raise
-        self.history.statistics.update(seconds)
-        self._stepper.begin_stage()
-        self._first_identity = first
-        self._stages.append(f"{change.kind} {name!r}")
-        self.history.stages.append(Stage(name, self.history.stage))
-        if before is not None:
-            self._hold_difference(before)
-
-    def _moved(self) -> list[Particles | CarriedField]:
-        """Return all that has unknowns, in the order of :meth:`ReducedSystem.nodal_forces`."""
-        return [*self.bodies, *self.carried]
-
-    def _standing_forces(self) -> _Standing:
-        """Return the forces of the last converged state (collective)."""
-        reduced = self.reduced
-        forces = reduced.nodal_forces()
-        return _Standing(
-            [_identity(one) for one in self._moved()],
-            forces,
-            self._spaces(),
-            self._gathered(forces),
-            self._held.left(),
-            self._stepper.converged.reactions,
-            [fixed_dofs(field.conditions, field.V) for field in reduced.fields],
-        )
-
-    def _hold_difference(self, before: _Standing) -> None:
-        """Hold back what the forces are other now than before a stage (collective)."""
-        after = self.reduced.nodal_forces()
-        freed = self._gathered(after)
-        for one, new in zip(self._moved(), after, strict=True):
-            if (known := _identity(one)) in before.moved:
-                new -= before.forces[before.moved.index(known)]
-            new *= one.shares_nodes
-        for field, new in zip(self.reduced.fields, freed, strict=True):
-            number = _number_of(field.V, before.spaces)
-            if number is None:
-                continue
-            new -= before.gathered[number]
-            new += before.left[number]
-            if before.reactions is not None:
-                dofs = before.fixed[number] & ~fixed_dofs(field.conditions, field.V)
-                new[dofs] += before.reactions[number][dofs]
-        self._held.hold(after, freed)
+        self._staging.begin(name, change, sudden)
 
     @property
     def held_back(self) -> float:
         """How much of what the last stage changes is held back yet, from 1 to 0."""
         return self._held.remaining
-
-    def _gathered(self, forces: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
-        """Return forces on bodies whose nodes go with their cells, on the dofs of each background.
-
-        Where a cell is taken away its own nodes are of no use to hold its force.
-
-        Args:
-            forces: On this rank's own dofs of W of each body, and of each of its fields.
-        """
-        totals = []
-        for field in self.reduced.fields:
-            total = np.zeros(field.V.dofmap.index_map.size_local * field.V.dofmap.index_map_bs)
-            for body, force in zip(self._moved(), forces, strict=True):
-                if body.V is field.V and not body.shares_nodes:
-                    vector, part = body.T.createVecLeft(), body.T.createVecRight()
-                    vector.array_w[:] = force
-                    body.T.multTranspose(vector, part)
-                    total += part.array_r
-            totals.append(total)
-        return totals
-
-    def _hold_back(self) -> None:
-        """Hold the forces back that bodies are under now; they go as loads come (collective)."""
-        V = [field.V.dofmap for field in self.reduced.fields]
-        none = [np.zeros(m.index_map.size_local * m.index_map_bs) for m in V]
-        self._held.hold(self.reduced.nodal_forces(), none)
-
-    def _keep_terms(self) -> None:
-        """Let what terms keep go with the problem, if it does not yet."""
-        for term in [*self.terms, self._held]:
-            if all(owner is not term for owner, _ in self._kept):
-                for thing in term.kept():
-                    self._keep(thing, term)
 
     # -- PETSc objects --------------------------------------------------------------------
 
@@ -934,7 +778,7 @@ class ParticleProblem:
 
     def keep_identity(self) -> None:
         """Note what this problem is known by, before its body meshes change (collective)."""
-        self.identity = identity.identity(self)
+        self._state.before_remeshing()
 
     def warn(self, sentence: str) -> None:
         """Warn the user, on one rank (collective)."""
@@ -974,82 +818,20 @@ class ParticleProblem:
             MPMError: The file cannot be written, or functions that cannot be kept.
         """
         self._require_governing()
-        checkpoint.write(self._comm, Path(path), self._snapshot(functions))
-
-    def _snapshot(self, functions: Sequence[fem.Function] = ()) -> checkpoint.Snapshot:
-        """Return the state at the last converged step (collective).
-
-        Args:
-            functions: As in :meth:`save`.
-
-        Raises:
-            MPMError: Functions that cannot be kept, or that are missing.
-        """
-        if functions and self.identity is not None:
-            raise MPMError(
-                "Domains were split or the body rebased, so functions= on its new mesh could not "
-                "be restored; save the state without them."
-            )
-        things, _ = self._all_kept(functions)
-        snapshot = capture(things, self.bodies, self._spaces())
-        known = self._first_identity if self._stages else identity.identity(self)
-        snapshot.numbers["identity"] = known | {"the stages": list(self._stages)}
-        snapshot.numbers["series"] = self._output.written()
-        return snapshot
+        self._state.save(Path(path), functions)
 
     def capture(self) -> checkpoint.Snapshot:
         """Return the state at the last converged step, for :meth:`return_to` (collective)."""
-        return self._snapshot()
+        return self._state.capture()
 
     def return_to(self, snapshot: checkpoint.Snapshot) -> None:
         """Return to a state of this problem on the present meshes (collective)."""
-        self._adopt(snapshot, (), "The state before")
-
-    def _all_kept(
-        self, functions: Sequence[fem.Function], whole: bool = True
-    ) -> tuple[list[Kept], kept.Standing]:
-        """Return all that goes with the problem, and what knows how far it is.
-
-        Args:
-            functions: As in :meth:`save`.
-            whole: Whether data at points must be among them.
-
-        Raises:
-            MPMError: Functions that cannot be kept, or that are missing.
-        """
-        standing = kept.Standing(
-            self._stepper.progress(), [field.V for field in self.reduced.fields], self.history
-        )
-        carried = [[one for one in self.carried if one.mesh is body.mesh] for body in self.bodies]
-        things = [
-            kept.Bodies(self.bodies),
-            kept.Material(self.converged_state, self.set_converged_state, self._history_at),
-            kept.Functions(functions, self.bodies, self.data_at_points() if whole else set()),
-            kept.Values(carried, self.reduced),
-            kept.Increments(self.reduced, self.bodies, carried),
-            kept.Past(self.history, self.reduced, self._comm),
-            *(thing for owner, thing in self._kept if self._is_mine(owner)),
-            standing,
-        ]
-        return things, standing
+        self._state.adopt(snapshot)
 
     @property
     def carried(self) -> list[CarriedField]:
         """The unknowns besides displacements, as the system moves them."""
         return [one for term in self._field_terms for one in term.fields]
-
-    def _spaces(self) -> list[fem.FunctionSpace]:
-        """Return all background spaces."""
-        return [field.V for field in self.reduced.fields]
-
-    def _adopt(
-        self, snapshot: checkpoint.Snapshot, functions: Sequence[fem.Function], source: str
-    ) -> Run | None:
-        """Go to a state, and return the run that was going on (collective)."""
-        things, standing = self._all_kept(functions)
-        adopt(things, self.bodies, snapshot, source, self._spaces())
-        self._stepper.take(standing.progress)
-        return standing.progress.run
 
     def keep(self, thing: Kept) -> None:
         """Let something of the user's own go with the problem.
@@ -1062,19 +844,7 @@ class ParticleProblem:
         Raises:
             MPMError: It is something else, or its key is taken.
         """
-        if not isinstance(thing, Kept) or not isinstance(thing.key, str):
-            raise MPMError(f"keep() needs an heir of mpm_dolfinx.io.Kept, not {thing!r}.")
-        self._keep(thing, None)
-
-    def _keep(self, thing: Kept, owner: Term | None) -> None:
-        """Let something go with the problem, as long as a term that owns it is one of its own."""
-        things, _ = self._all_kept((), whole=False)
-        require_key(thing.key, things, len(self.bodies))
-        self._kept.append((owner, thing))
-
-    def _is_mine(self, owner: Term | None) -> bool:
-        """Return whether a term acts in this problem; the user's own things have no owner."""
-        return owner is None or any(owner is term for term in [*self.terms, self._held])
+        self._state.keep(thing)
 
     def restore(
         self, path: str | Path, functions: Sequence[fem.Function] = (), resume: bool = True
@@ -1098,24 +868,7 @@ class ParticleProblem:
                 be read; the state is what it was.
         """
         self._require_governing()
-        snapshot, source = checkpoint.read(self._comm, Path(path)), f"The checkpoint '{path}'"
-        with agree(self._comm):
-            stages = snapshot.numbers["identity"].get("the stages", [])
-            if stages != self._stages:
-                raise MPMError(
-                    f"{source} was made after the stages {stages}, and this problem has gone "
-                    f"through {self._stages}; make it as at first and repeat the calls of stage, "
-                    "remove and add."
-                )
-        known = self._first_identity if self._stages else identity.identity(self)
-        identity.require_same(known, snapshot, source, self._comm)
-        written = snapshot.numbers.get("series", {})
-        series = read_series(self._comm, written)
-        self.cut_as(snapshot, bool(functions), source)
-        run = self._adopt(snapshot, functions, source)
-        self._stepper.resume(run if resume else None)
-        steps = len(self.history.steps)
-        self._output.go_back(series, written, self.history.time, steps)
+        self._state.restore(Path(path), functions, resume)
 
     def cut_as(self, snapshot: checkpoint.Snapshot, functions: bool, source: str) -> None:
         """Split the domains that were split in a state (collective).
@@ -1216,18 +969,6 @@ class ParticleProblem:
         """Return Functions at quadrature points that the forms hold and no history keeps."""
         keeps = type(self).converged_state is not ParticleProblem.converged_state
         return set() if keeps else self._data
-
-
-def _identity(one: Particles | CarriedField) -> tuple[int, str]:
-    """Return what a body, or a field on it, is known by through stages."""
-    if isinstance(one, CarriedField):
-        return id(one.field.particles), one.field.name
-    return id(one), ""
-
-
-def _number_of(V: fem.FunctionSpace, spaces: Sequence[fem.FunctionSpace]) -> int | None:
-    """Return the number of a background among others, if it is one of them."""
-    return next((number for number, known in enumerate(spaces) if known is V), None)
 
 
 def _as_list(background: Any) -> list[Any]:

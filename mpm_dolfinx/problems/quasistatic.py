@@ -157,8 +157,15 @@ class QuasiStaticProblem(ParticleProblem):
             supports=supports,
             background=background,
             f_bar=f_bar,
+            initial_stress=of_all_ranks(initial_stress),
+            terms=terms,
+        )
+        numerics = Numerics.agreed(
+            bodies[0].V.mesh.comm,
             petsc_options_prefix=petsc_options_prefix,
             petsc_options=petsc_options,
+            form_compiler_options=form_compiler_options,
+            jit_options=jit_options,
             assembly=assembly,
             shift=shift,
             line_search=line_search,
@@ -166,10 +173,6 @@ class QuasiStaticProblem(ParticleProblem):
             predictor=predictor,
             stabilisation=stabilisation,
             linear_solver=linear_solver,
-            form_compiler_options=form_compiler_options,
-            jit_options=jit_options,
-            initial_stress=of_all_ranks(initial_stress),
-            terms=terms,
         )
         supports = as_supports(supports, bodies)
         count = len(bodies) if isinstance(particles, list | tuple) else 0
@@ -202,19 +205,6 @@ class QuasiStaticProblem(ParticleProblem):
         self._left: dict[int, tuple[fem.Function, NDArray[np.float64]]] = {}
         self._remeshing = Remeshing(self)
         self._compiled = is_fast(assembly)
-        numerics = Numerics(
-            petsc_options_prefix,
-            petsc_options or {},
-            form_compiler_options,
-            jit_options,
-            assembly,
-            shift,
-            line_search,
-            dependent_dofs,
-            predictor,
-            stabilisation,
-            linear_solver,
-        )
         self._begin(particles, bcs, background, numerics, terms, self._remeshing)
         self._carry_stress(stresses)
         for body in bodies:
@@ -232,7 +222,7 @@ class QuasiStaticProblem(ParticleProblem):
             if stress is not None:
                 points.begin_with(initial_stress_at_points(stress, body))
         if self._gradual:
-            self._hold_back()
+            self._staging.hold_all()
 
     #: Whether loads and stages act little by little.
     _gradual = True

@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 
 import ufl
@@ -20,6 +22,7 @@ from ..assembly.fused import is_fast
 from ..boundary.supports import Support
 from ..constitutive.averaging import F_BARS
 from ..errors import MPMError
+from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..solvers.linear import LINEAR_SOLVERS
 from ..system.term import Term
@@ -49,6 +52,23 @@ class Numerics:
     stabilisation: str | None
     linear_solver: str
     entity_maps: Any = None
+
+    @classmethod
+    def agreed(
+        cls, comm: MPI.Comm, *, petsc_options: dict[str, Any] | None, **options: Any
+    ) -> Numerics:
+        """Return them from a user's keywords, which are the same on all ranks (collective).
+
+        Args:
+            comm: The ranks.
+            petsc_options: As below, or ``None`` for none.
+            **options: All others, by the names of the attributes.
+
+        Raises:
+            MPMError: They differ between ranks, or there is no such thing.
+        """
+        require_same(comm, petsc_options=petsc_options, **options)
+        return cls(petsc_options=petsc_options or {}, **options)
 
     def __post_init__(self) -> None:
         """Say so where something is unknown."""

@@ -65,17 +65,17 @@ class _Change:
         self._was = problem.setup, problem.bcs, problem.terms, problem.bodies, problem.particles
 
     def make(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
 
     def settle(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
 
     def renews(self, body: int | None, name: str) -> bool:
-        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         return False
 
     def undo(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         p = self.problem
         p.setup, p.bcs, p.terms, p.bodies, p.particles = self._was
 
@@ -108,7 +108,7 @@ class Given(_Change):
         self._points = list(problem.points)
 
     def make(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         problem = self.problem
         setups = [
             replace(known, **changes)
@@ -118,7 +118,7 @@ class Given(_Change):
         problem.bcs, problem.terms = self._bcs, self._terms
 
     def settle(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         for changes, points, before in zip(
             self._bodies, self.problem.points, self._points, strict=True
         ):
@@ -126,7 +126,7 @@ class Given(_Change):
                 points.take_over(before)
 
     def renews(self, body: int | None, name: str) -> bool:
-        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         if body is None:
             return name == "moduli" and any("material" in changes for changes in self._bodies)
         other = self._bodies[body].keys() & {"material", "cell_tags"}
@@ -151,15 +151,15 @@ class Removal(_Change):
         self._deletable = self._body.deletion is not None
 
     def make(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         self._body.remove(self._cells)
 
     def renews(self, body: int | None, name: str) -> bool:
-        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         return body == self._number and name in ("deleted", "kept")
 
     def undo(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         super().undo()
         self._body.allow_deletion(self._deletable)
 
@@ -181,7 +181,7 @@ class Addition(_Change):
         self._given, self._stress = given, stress
 
     def make(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         problem = self.problem
         bodies = (*problem.setup.bodies, self._given)
         problem.setup = replace(problem.setup, bodies=bodies)
@@ -189,13 +189,13 @@ class Addition(_Change):
         problem.particles = list(self._bodies)
 
     def settle(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         if self._stress is not None:
             body, points = self._given.particles, self.problem.points[-1]
             points.begin_with(initial_stress_at_points(self._stress, body))
 
     def renews(self, body: int | None, name: str) -> bool:
-        """See :class:`~mpm_dolfinx.problems.particle_problem.Change`."""
+        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         return body is None and name in ("moduli", "cuts", "fields units")
 
 

@@ -243,7 +243,7 @@ def test_what_does_not_say_where_it_lives_is_refused(mpi_tmp_path):
     ):
         with pytest.raises(mpm.MPMError, match=r"'history velocity' is kept but does not say"):
             attempt()
-    assert problem.identity is None and problem.particles.num_global == 9
+    assert problem.particles.num_global == 9
     problem.at = "nodes"
     problem.split([4])
     assert problem.particles.num_global == 10

@@ -1,0 +1,270 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The state of a problem at its last converged step: captured, returned to, saved and restored."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from mpi4py import MPI
+
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from ..errors import MPMError, agree
+from ..history import History
+from ..io import checkpoint, identity
+from ..io.series import Output, read_series
+from ..io.snapshot import Kept, adopt, capture, require_key
+from ..particles.field import CarriedField
+from ..particles.particles import Particles
+from ..stepping.control import Run
+from ..stepping.loading import Stepper
+from ..system.reduced import ReducedSystem
+from ..system.release import Release
+from ..system.term import Term
+from . import kept
+
+__all__ = ["ProblemState", "Stateful"]
+
+
+class Stateful(Protocol):
+    """A problem that has a state; see :class:`ParticleProblem` for each.
+
+    Attributes:
+        bodies: The bodies.
+        history: What was computed.
+        terms: What else acts on the bodies.
+    """
+
+    bodies: list[Particles]
+    history: History
+    terms: list[Term]
+
+    @property
+    def reduced(self) -> ReducedSystem:
+        """The system."""
+
+    @property
+    def carried(self) -> list[CarriedField]:
+        """The unknowns besides displacements."""
+
+    def laws(self) -> list[list[tuple[str, dict[str, Any]]]]:
+        """Return name and parameters of each body's materials."""
+
+    def converged_state(self) -> list[dict[str, Any]]:
+        """Return the history at the points of each body."""
+
+    def set_converged_state(self, states: list[dict[str, NDArray[Any]]]) -> None:
+        """Take it again."""
+
+    def data_at_points(self) -> set[fem.Function]:
+        """Return Functions at quadrature points that no history keeps."""
+
+    def cut_as(self, snapshot: checkpoint.Snapshot, functions: bool, source: str) -> None:
+        """Split the domains that were split in a state (collective)."""
+
+
+class ProblemState:
+    """All that goes with a problem: on other meshes, to other ranks, into files and back.
+
+    It outlives the meshes of the bodies. What a state is known by is the problem as it was made at
+    first, before domains were split and before the first stage.
+
+    Args:
+        problem: The problem, which is not kept alive.
+        stepper: Knows how far it is.
+        release: What stages hold back, a term that every problem has.
+        output: The time series that it writes.
+        history_at: Where arrays of the problem's ``converged_state`` live that do not say it;
+            ``None``: they must.
+
+    Attributes:
+        kept: What goes with the problem besides what every problem has, and the term that it
+            belongs to, if any.
+    """
+
+    def __init__(
+        self,
+        problem: Stateful,
+        stepper: Stepper,
+        release: Release,
+        output: Output,
+        history_at: str | None,
+    ) -> None:
+        self._reference = weakref.ref(problem)
+        self._stepper, self._release = stepper, release
+        self._output, self._history_at = output, history_at
+        self.kept: list[tuple[Term | None, Kept]] = []
+        self._stages: list[str] = []
+        self._identity: dict[str, Any] | None = None
+        self._remeshed = False
+
+    @property
+    def _problem(self) -> Stateful:
+        problem = self._reference()
+        assert problem is not None
+        return problem
+
+    @property
+    def _comm(self) -> MPI.Comm:
+        comm: MPI.Comm = self._problem.bodies[0].V.mesh.comm
+        return comm
+
+    @property
+    def spaces(self) -> list[fem.FunctionSpace]:
+        """All background spaces."""
+        return [field.V for field in self._problem.reduced.fields]
+
+    # -- What goes with it ----------------------------------------------------------------
+
+    def keep(self, thing: Kept, owner: Term | None = None) -> None:
+        """Let something go with the problem.
+
+        Args:
+            thing: What to keep.
+            owner: The term that it belongs to: it goes as long as that acts in the problem.
+
+        Raises:
+            MPMError: It is something else, or its key is taken.
+        """
+        if not isinstance(thing, Kept) or not isinstance(thing.key, str):
+            raise MPMError(f"keep() needs an heir of mpm_dolfinx.io.Kept, not {thing!r}.")
+        things, _ = self._all((), whole=False)
+        require_key(thing.key, things, len(self._problem.bodies))
+        self.kept.append((owner, thing))
+
+    def keep_terms(self) -> None:
+        """Let what terms keep go with the problem, if it does not yet."""
+        for term in [*self._problem.terms, self._release]:
+            if all(owner is not term for owner, _ in self.kept):
+                for thing in term.kept():
+                    self.keep(thing, term)
+
+    def _acts(self, owner: Term | None) -> bool:
+        """Return whether a term acts in the problem; the user's own things have no owner."""
+        terms = [*self._problem.terms, self._release]
+        return owner is None or any(owner is term for term in terms)
+
+    def _all(
+        self, functions: Sequence[fem.Function], whole: bool = True
+    ) -> tuple[list[Kept], kept.Standing]:
+        """Return all that goes with the problem, and what knows how far it is.
+
+        Args:
+            functions: As in :meth:`ParticleProblem.save`.
+            whole: Whether data at points must be among them.
+
+        Raises:
+            MPMError: Functions that cannot be kept, or that are missing.
+        """
+        problem = self._problem
+        standing = kept.Standing(self._stepper.progress(), self.spaces, problem.history)
+        carried = [
+            [one for one in problem.carried if one.mesh is body.mesh] for body in problem.bodies
+        ]
+        needed = problem.data_at_points() if whole else set()
+        things = [
+            kept.Bodies(problem.bodies),
+            kept.Material(problem.converged_state, problem.set_converged_state, self._history_at),
+            kept.Functions(functions, problem.bodies, needed),
+            kept.Values(carried, problem.reduced),
+            kept.Increments(problem.reduced, problem.bodies, carried),
+            kept.Past(problem.history, problem.reduced, self._comm),
+            *(thing for owner, thing in self.kept if self._acts(owner)),
+            standing,
+        ]
+        return things, standing
+
+    # -- What it is known by --------------------------------------------------------------
+
+    def identity(self) -> dict[str, Any]:
+        """Return what the problem is known by, as it was made at first (collective)."""
+        return identity.identity(self._problem) if self._identity is None else self._identity
+
+    def before_remeshing(self) -> None:
+        """Note what the problem is known by, before its body meshes change (collective)."""
+        self._identity = self.identity()
+        self._remeshed = True
+
+    def after_stage(self, name: str, first: dict[str, Any]) -> None:
+        """Note that the problem is another one now.
+
+        Args:
+            name: What was done, and the name of the stage.
+            first: What the problem was known by before.
+        """
+        self._identity = first
+        self._stages.append(name)
+
+    # -- To a state and back --------------------------------------------------------------
+
+    def capture(self, functions: Sequence[fem.Function] = ()) -> checkpoint.Snapshot:
+        """Return the state at the last converged step (collective).
+
+        Args:
+            functions: As in :meth:`ParticleProblem.save`.
+
+        Raises:
+            MPMError: Functions that cannot be kept, or that are missing.
+        """
+        if functions and self._remeshed:
+            raise MPMError(
+                "Domains were split or the body rebased, so functions= on its new mesh could not "
+                "be restored; save the state without them."
+            )
+        things, _ = self._all(functions)
+        snapshot = capture(things, self._problem.bodies, self.spaces)
+        snapshot.numbers["identity"] = self.identity() | {"the stages": list(self._stages)}
+        snapshot.numbers["series"] = self._output.written()
+        return snapshot
+
+    def adopt(
+        self,
+        snapshot: checkpoint.Snapshot,
+        functions: Sequence[fem.Function] = (),
+        source: str = "The state before",
+    ) -> Run | None:
+        """Go to a state, and return the run that was going on (collective).
+
+        Args:
+            snapshot: The state, one of this problem on its present meshes.
+            functions: As in :meth:`ParticleProblem.restore`.
+            source: What to call it in an error.
+
+        Raises:
+            MPMError: It is that of another problem; the state is what it was.
+        """
+        things, standing = self._all(functions)
+        adopt(things, self._problem.bodies, snapshot, source, self.spaces)
+        self._stepper.take(standing.progress)
+        return standing.progress.run
+
+    def save(self, path: Path, functions: Sequence[fem.Function]) -> None:
+        """Write a checkpoint: see :meth:`ParticleProblem.save`."""
+        checkpoint.write(self._comm, path, self.capture(functions))
+
+    def restore(self, path: Path, functions: Sequence[fem.Function], resume: bool) -> None:
+        """Return to the state of a checkpoint: see :meth:`ParticleProblem.restore`."""
+        problem = self._problem
+        snapshot, source = checkpoint.read(self._comm, path), f"The checkpoint '{path}'"
+        with agree(self._comm):
+            stages = snapshot.numbers["identity"].get("the stages", [])
+            if stages != self._stages:
+                raise MPMError(
+                    f"{source} was made after the stages {stages}, and this problem has gone "
+                    f"through {self._stages}; make it as at first and repeat the calls of stage, "
+                    "remove and add."
+                )
+        identity.require_same(self.identity(), snapshot, source, self._comm)
+        written = snapshot.numbers.get("series", {})
+        series = read_series(self._comm, written)
+        problem.cut_as(snapshot, bool(functions), source)
+        run = self.adopt(snapshot, functions, source)
+        self._stepper.resume(run if resume else None)
+        history = problem.history
+        self._output.go_back(series, written, history.time, len(history.steps))
