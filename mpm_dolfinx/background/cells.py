@@ -242,6 +242,7 @@ class RegularGrid:
     def __init__(self, lines: list[NDArray[np.float64]], table: NDArray[np.int64]) -> None:
         self._lines = lines
         self._table = table
+        self._sizes = [_even(line) for line in lines]
 
     @classmethod
     def of(cls, vertices: NDArray[np.float64]) -> RegularGrid | None:
@@ -268,10 +269,11 @@ class RegularGrid:
         return cls(lines, table)
 
     @staticmethod
-    def _place(line: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+    def _place(
+        line: NDArray[np.float64], size: float | None, x: NDArray[np.float64]
+    ) -> NDArray[np.int64]:
         """Return the interval of a line that holds each coordinate, or is next to it."""
-        size = (line[-1] - line[0]) / (len(line) - 1)
-        if np.ptp(np.diff(line)) > 1e-6 * size:
+        if size is None:
             return np.asarray(np.clip(np.searchsorted(line, x, "right") - 1, 0, len(line) - 2))
         place = np.clip((x - line[0]) / size, 0, len(line) - 2).astype(np.int64)
         place -= (x < line[place]) & (place > 0)
@@ -288,14 +290,17 @@ class RegularGrid:
             index: Input index of each cell; on a facet the first cell wins.
         """
         low, high = [], []
-        for line, x in zip(self._lines, points.T, strict=True):
-            place = self._place(line, x)
+        for line, size, x in zip(self._lines, self._sizes, points.T, strict=True):
+            place = self._place(line, size, x)
             reach = FACET * (line[place + 1] - line[place])
             low.append(np.where(x - line[place] <= reach, np.maximum(place - 1, 0), place))
             beyond = np.minimum(place + 1, len(line) - 2)
             high.append(np.where(line[place + 1] - x <= reach, beyond, place))
         cell = self._table[tuple(high)]
-        between = np.flatnonzero(np.any([a != b for a, b in zip(low, high, strict=True)], axis=0))
+        differ = low[0] != high[0]
+        for a, b in zip(low[1:], high[1:], strict=True):
+            differ |= a != b
+        between = np.flatnonzero(differ)
         for pick in product(*zip(low, high, strict=True)) if len(between) else ():
             other = self._table[tuple(p[between] for p in pick)]
             mine = cell[between]
@@ -303,6 +308,12 @@ class RegularGrid:
             cell[between[better]] = other[better]
         inside = np.flatnonzero(cell >= 0)
         return inside, cell[inside]
+
+
+def _even(line: NDArray[np.float64]) -> float | None:
+    """Return the size of a line's intervals where all have the same."""
+    size = float((line[-1] - line[0]) / (len(line) - 1))
+    return None if np.ptp(np.diff(line)) > 1e-6 * size else size
 
 
 def _solve(matrix: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
-from xml.etree import ElementTree as ET
 
 from mpi4py import MPI
 
@@ -143,6 +142,8 @@ def _grid(particles: Particles) -> dict[str, dict[str, NDArray[Any]]]:
 
 def _write_grid(comm: MPI.Comm, path: Path, grid: dict[str, dict[str, NDArray[Any]]]) -> None:
     """Write a grid as one ``.vtu`` file, to which all ranks add their rows (collective)."""
+    from xml.etree import ElementTree as ET
+
     root = ET.Element(
         "VTKFile",
         type="UnstructuredGrid",
@@ -269,6 +270,8 @@ def read_series(comm: MPI.Comm, names: Iterable[str]) -> dict[str, list[Entry]]:
 
 def _read(path: Path) -> list[Entry]:
     """Return the entries of a ``.pvd`` file, none where it is missing."""
+    from xml.etree import ElementTree as ET
+
     damaged = MPMError(f"'{path}' should be the time series so far but cannot be read; remove it.")
     if (kind := kind_of(path)) != "a file":
         if kind is None:
@@ -286,6 +289,8 @@ def _read(path: Path) -> list[Entry]:
 
 def _index(states: Sequence[Entry]) -> bytes:
     """Return the content of a ``.pvd`` file."""
+    from xml.etree import ElementTree as ET
+
     root = ET.Element("VTKFile", type="Collection", version="1.0")
     collection = ET.SubElement(root, "Collection")
     for time, file, step in states:

@@ -53,6 +53,9 @@ def unit_sized(v: PETSc.Vec) -> tuple[PETSc.Vec, int]:
 
 def norm(v: PETSc.Vec) -> float:
     """Return the Euclidean norm of a vector, whatever its size (collective)."""
+    size = float(v.norm())
+    if _is_safe(size):
+        return size
     scaled, exponent = unit_sized(v)
     return float(np.ldexp(scaled.norm(), exponent))
 

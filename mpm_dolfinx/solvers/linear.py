@@ -283,10 +283,14 @@ class ShiftedFactor:
         elif failed:
             pc.reset()  # MUMPS does not factorise again where it failed
         self._ksp.setOperators(K, self.P)
-        with self._statistics.phase("factorise"), self._own_options(K.getSize()[0]):
-            with _options_refused():
+        with self._statistics.phase("factorise"):
+            if not (new or failed or split) and self._ksp.getPC().getType() in FACTORS:
+                self._ksp.setUp()  # numbers alone, which reads no options
+                if not self._lacks_workspace():
+                    return
+            with self._own_options(K.getSize()[0]), _options_refused():
                 self._ksp.setUp()  # where the factor is made, which reads options of its own
-            self._give_workspace()
+                self._give_workspace()
 
     def _split(self, splits: Sequence[tuple[str, slice]]) -> None:
         """Tell a PC of type fieldsplit where the unknowns of each field are, by name (collective).
@@ -432,13 +436,18 @@ class ShiftedFactor:
         self._statistics["krylov_iterations"] += ksp.getIterationNumber()
         return bool(ksp.getConvergedReason() > 0)
 
+    def _lacks_workspace(self) -> bool:
+        """Return whether MUMPS ran out of workspace."""
+        pc = self._ksp.getPC()
+        if pc.getType() not in FACTORS or pc.getFactorSolverType() != "mumps":
+            return False
+        return pc.getFactorMatrix().getMumpsInfog(1) in OUT_OF_WORKSPACE
+
     def _give_workspace(self) -> None:
         """Factorise again with more workspace where MUMPS ran out of it."""
         pc = self._ksp.getPC()
-        if pc.getType() not in FACTORS or pc.getFactorSolverType() != "mumps":
-            return
         for percent in (100, 200, 400, 800):
-            if pc.getFactorMatrix().getMumpsInfog(1) not in OUT_OF_WORKSPACE:
+            if not self._lacks_workspace():
                 return
             pc.reset()
             self._ksp.setOperators(self.K, self.P)

@@ -25,7 +25,8 @@ def dirichlet_values(bcs: Sequence[fem.DirichletBC], V: fem.FunctionSpace) -> ND
     Raises:
         MPMError: Some are not finite.
     """
-    values: NDArray[np.float64] = np.array(fem.Function(V).x.array)
+    layout = V.dofmap.index_map
+    values = np.zeros((layout.size_local + layout.num_ghosts) * V.dofmap.index_map_bs)
     for bc in bcs:
         bc.set(values, None, 1.0)
     if not V.mesh.comm.allreduce(bool(np.isfinite(values).all()), MPI.LAND):
