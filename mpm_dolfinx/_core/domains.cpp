@@ -366,6 +366,49 @@ HOT_LOOP void core::assemble_domains(const Domains& domains, const double* trans
   });
 }
 
+HOT_LOOP void core::assemble_masses(const Domains& domains, const double* transfers,
+                                    const double* M, const Target& target)
+{
+  const int nodes = domains.nodes;
+  std::vector<double> weights, product(nodes);
+  std::vector<int> places, ends;
+  for_each_support(domains.count, target,
+                   [&](std::size_t p, std::size_t size, const std::int32_t* positions) {
+    const double* transfer = transfers + target.offsets[p] * nodes;
+    const double* mass = M + p * nodes * nodes;
+    weights.resize(size * nodes);
+    places.resize(size * nodes);
+    ends.assign(1, 0);
+    int end = 0;
+    for (std::size_t a = 0; a < size; ++a) // T is sparse: zeros are passed over
+    {
+      for (int c = 0; c < nodes; ++c)
+        if (transfer[a * nodes + c] != 0.0)
+        {
+          weights[end] = transfer[a * nodes + c];
+          places[end++] = c;
+        }
+      ends.push_back(end);
+    }
+    for (std::size_t a = 0; a < size; ++a)
+    {
+      std::fill(product.begin(), product.end(), 0.0);
+      for (int n = ends[a]; n < ends[a + 1]; ++n)
+        for (int c = 0; c < nodes; ++c)
+          product[c] += weights[n] * mass[places[n] * nodes + c];
+      for (std::size_t b = a; b < size; ++b)
+      {
+        double sum = 0.0;
+        for (int n = ends[b]; n < ends[b + 1]; ++n)
+          sum += weights[n] * product[places[n]];
+        target.values[positions[a * size + b]] += sum;
+        if (b != a)
+          target.values[positions[b * size + a]] += sum;
+      }
+    }
+  });
+}
+
 HOT_LOOP void core::assemble_form(const Form& form, const Domains& domains, const double* transfers,
                                   const Target& target)
 {

@@ -72,6 +72,11 @@ void assemble_points(const Domains& domains, const double* support_gradients, co
 void assemble_domains(const Domains& domains, const double* transfers, const double* A,
                       const double* vectors, int pairs, const Target& target);
 
+// Add T^T M T with matrices M between the nodes of each domain, (count, nodes, nodes) and symmetric,
+// that are the same for all components: one number for each block in target.values.
+void assemble_masses(const Domains& domains, const double* transfers, const double* M,
+                     const Target& target);
+
 using Kernel = void (*)(double*, const double*, const double*, const double*, const int*,
                         const std::uint8_t*, void*);
 

@@ -286,6 +286,18 @@ NB_MODULE(_loops, m)
         "offsets"_a, "positions"_a, "values"_a.noconvert(),
         "Add the reduced tangents of domains with any number of points.");
 
+  m.def("assemble_masses",
+        [](Indices dofmap, Reals gradients, Reals transfers, Reals M, Offsets offsets,
+           Indices positions, RealsOut values) {
+    const Domains domains = domains_of(dofmap, gradients, nullptr);
+    require(M.size() == domains.count * domains.nodes * domains.nodes, "M (n, k, k)");
+    assemble_masses(domains, transfers.data(), M.data(),
+                    target_of(domains, offsets, positions, values));
+  },
+        "dofmap"_a, "gradients"_a, "transfers"_a, "M"_a, "offsets"_a, "positions"_a,
+        "values"_a.noconvert(),
+        "Add the reduced masses of domains: one number for each block.");
+
   m.def("assemble_form",
         [](std::uintptr_t kernel, Indices entities, Reals coefficients, Reals constants, Reals x,
            Indices geometry, Indices dofmap, Reals gradients, Reals transfers, Offsets offsets,

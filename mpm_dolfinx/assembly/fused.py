@@ -24,7 +24,7 @@ from ..particles.particles import Particles
 from ..transfer.touched import TouchedNodes, TransferRows
 from .body_forms import BodyForms, no_values
 
-__all__ = ["ROUTES", "FusedTangent", "Restriction", "is_fast"]
+__all__ = ["ROUTES", "FusedTangent", "Masses", "Restriction", "is_fast"]
 
 ROUTES = ("auto", "fast", "reference")
 
@@ -91,6 +91,19 @@ class _Loops:
         pairs = zip(term.left, term.right, strict=True)
         return np.stack([vector for pair in pairs for vector in pair], axis=1)
 
+    def add_masses(
+        self, masses: NDArray[np.float64], rows: TransferRows, values: NDArray[np.float64]
+    ) -> None:
+        """Add the body's reduced mass, one number for each of the pattern's blocks."""
+        if self._whole:
+            transfers = self._transfers
+        else:
+            transfers = np.empty((len(self.nodes), self._particles.domain_nodes.shape[1]))
+            loops.local_transfers(*self._domains, *rows, self.offsets, self.nodes, transfers)
+        loops.assemble_masses(
+            *self._domains, transfers, masses, self.offsets, self.positions, values
+        )
+
     def add(self, values: NDArray[np.float64]) -> None:
         """Add the body's reduced tangent to the values of the pattern's blocks."""
         target = (self.offsets, self.positions, values)
@@ -145,6 +158,10 @@ class Restriction(NamedTuple):
     rows: Sequence[TransferRows]
     numbers: NDArray[np.int32]
     part: slice
+
+
+type Masses = Sequence[tuple[Particles, NDArray[np.float64]]]
+"""Bodies, and for each of their domains a matrix between its nodes, ``(n, k, k)``."""
 
 
 class FusedTangent:
@@ -221,15 +238,35 @@ class FusedTangent:
             comm=self._comm,
         )
 
-    def assemble(self, keep: Sequence[bool]) -> PETSc.Mat:
+    def weigh(self, masses: Masses) -> PETSc.Mat:
+        """Return ``T^T M T``, and keep it for :meth:`assemble` in this step (collective).
+
+        What :meth:`assemble` has returned is overwritten.
+
+        Args:
+            masses: M of domains.
+        """
+        assert self._A is not None
+        for block in self._blocks:
+            block.weigh(masses)
+        self._A.assemble()
+        # Of all components of two nodes, masses join equal ones.
+        offsets, columns, values = self._A.getValuesCSR()
+        kept = values != 0.0
+        ends = np.concatenate([[0], np.cumsum(kept)])[offsets]
+        csr = (ends.astype(PETSc.IntType), columns[kept], values[kept])
+        return PETSc.Mat().createAIJ(self._A.getSizes(), csr=csr, comm=self._comm)
+
+    def assemble(self, keep: Sequence[bool], factor: float = 0.0) -> PETSc.Mat:
         """Return ``T^T K T``; the same object as long as the pattern lasts (collective).
 
         Args:
             keep: Whether :meth:`multiply_add` will be called, for each field.
+            factor: How often the masses of :meth:`weigh` are added, if there are any.
         """
         assert self._A is not None
         for block, kept in zip(self._blocks, keep, strict=True):
-            block.assemble(kept)
+            block.assemble(kept, factor)
         self._A.assemble()
         return self._A
 
@@ -270,7 +307,9 @@ class _Block:
 
     def __init__(self, comm: MPI.Comm, bodies: Sequence[tuple[Particles, BodyForms]]) -> None:
         self._comm = comm
+        self._bodies = [particles for particles, _ in bodies]
         self._loops = [_Loops(*body) for body in bodies]
+        self._masses: NDArray[np.float64] | None = None
         self._bs = bodies[0][0].V.dofmap.index_map_bs if bodies else 1
         self._touched: TouchedNodes | None = None
         self._numbers: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
@@ -290,8 +329,30 @@ class _Block:
 
     def transfer(self, rows: Sequence[TransferRows]) -> None:
         """Take over the values of T."""
+        self._rows, self._masses = rows, None
         for body, own in zip(self._loops, rows, strict=True):
             body.transfer(own)
+
+    def weigh(self, masses: Masses) -> None:
+        """Write the masses into the field's rows, and keep them (collective)."""
+        if not self._loops:
+            return
+        self._masses = np.zeros(len(self._blocks))
+        for body, loop, rows in zip(self._bodies, self._loops, self._rows, strict=True):
+            for particles, own in masses:
+                if particles is body:
+                    loop.add_masses(own, rows, self._masses)
+        values = np.zeros(len(self._blocks) * self._bs**2 + 1)
+        self._add_masses(1.0, values)
+        self._write(values)
+
+    def _add_masses(self, factor: float, values: NDArray[np.float64]) -> None:
+        """Add the masses, if any, to the values of the pattern's blocks."""
+        if self._masses is None:
+            return
+        blocks = values[:-1].reshape(-1, self._bs, self._bs)
+        for i in range(self._bs):
+            blocks[:, i, i] += factor * self._masses
 
     def make_pattern(
         self, own: tuple[int, int], lasts: NDArray[np.int64]
@@ -352,17 +413,25 @@ class _Block:
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
         return offsets, np.ascontiguousarray(received[self._order, 1])
 
-    def assemble(self, keep: bool) -> None:
+    def assemble(self, keep: bool, factor: float) -> None:
         """Write the field's rows (collective).
 
         Args:
             keep: Whether :meth:`multiply_add` will be called.
+            factor: Of the masses.
         """
         if not self._loops:
             return
         values = np.zeros(len(self._blocks) * self._bs**2 + 1)
         for body in self._loops:
             body.add(values)
+        if factor != 0.0:
+            self._add_masses(factor, values)
+        self._write(values)
+        self._values = values[:-1] if keep else None
+
+    def _write(self, values: NDArray[np.float64]) -> None:
+        """Write the values of the pattern's blocks, summed over ranks, into the field's rows."""
         for sources, entries in zip(self._sources, self.entries, strict=True):
             loops.gather(values, sources, entries)
         if self._comm.size > 1:
@@ -370,7 +439,6 @@ class _Block:
             received = received[self._order]
             np.add.at(self.entries[0], self._places[0], received[self._within])
             np.add.at(self.entries[1], self._places[1], received[~self._within])
-        self._values = values[:-1] if keep else None
 
     def multiply_add(self, u: PETSc.Vec, force: PETSc.Vec) -> None:
         """Add the last ``T^T K T u`` on all active dofs of V, fixed ones too (collective)."""

@@ -24,7 +24,6 @@ __all__ = [
     "assembled",
     "blocked",
     "marked",
-    "of_same_components",
 ]
 
 # Their types name the first of several dispatched signatures only.
@@ -97,26 +96,6 @@ def blocked(
     indices = (nodes[place] * bs + component).astype(PETSc.IntType)
     csr = (indptr.astype(PETSc.IntType), indices, data[place])
     return PETSc.Mat().createAIJ((sizes, sizes), csr=csr, comm=V.mesh.comm)
-
-
-def of_same_components(matrix: PETSc.Mat, bs: int) -> PETSc.Mat:
-    """Return a matrix between dofs of nodes without its entries between different components.
-
-    Forms between vectors have places for these, and products with others take them along.
-
-    Args:
-        matrix: Rows and columns are dofs of nodes, ``bs`` of each.
-        bs: Number of components.
-
-    Returns:
-        A new matrix (collective).
-    """
-    offsets, columns, values = matrix.getValuesCSR()
-    rows = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
-    kept = rows % bs == columns % bs
-    ends = np.concatenate([[0], np.cumsum(kept)])[offsets]
-    csr = (ends.astype(PETSc.IntType), columns[kept], values[kept])
-    return PETSc.Mat().createAIJ(matrix.getSizes(), csr=csr, comm=matrix.comm)
 
 
 class MatrixSum:

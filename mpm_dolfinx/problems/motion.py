@@ -14,13 +14,13 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
+import basix.ufl
 import ufl
 from dolfinx import fem
-from dolfinx.fem import petsc as fem_petsc
 
 from .. import _compat
+from ..assembly.fused import Masses
 from ..assembly.inputs import as_expression
-from ..assembly.petsc import of_same_components
 from ..boundary.supports import Support
 from ..contact.contact import Contact
 from ..errors import MPMError, agree, as_ours
@@ -53,7 +53,8 @@ class MovingProblem(TimeProblem):
         others = [*self.body_terms, *(term for term in self.terms if term is not self.inertia)]
         followed = Followed(
             others,
-            weakly(self._mass_matrix),
+            weakly(self._masses),
+            weakly(self._reduced_masses),
             weakly(self._works),
             weakly(self._stored),
             weakly(self._changes),
@@ -67,6 +68,10 @@ class MovingProblem(TimeProblem):
         for term in self.terms:
             if term is not self.inertia:
                 term.pace(self.inertia.dt, self.inertia.share)
+
+    def _reduced_masses(self, masses: Masses) -> tuple[list[PETSc.Mat], list[Particles]]:
+        """Return :meth:`ReducedSystem.masses` (collective)."""
+        return self.reduced.masses(masses)
 
     def _works(self) -> NDArray[np.float64]:
         """Return the works of the last increment on the backgrounds (collective)."""
@@ -91,20 +96,23 @@ class MovingProblem(TimeProblem):
     def _mass_form(self, number: int, product: Any) -> ufl.Form:
         """Return the integral of a body's density times a product of functions."""
 
-    def _mass_matrix(self, number: int) -> PETSc.Mat:
-        """Return the consistent mass of a body on its W (collective)."""
+    def _masses(self, number: int) -> NDArray[np.float64]:
+        """Return the consistent mass of each owned domain of a body, ``(n, k, k)`` (collective)."""
         body = self.bodies[number]
-        product = ufl.inner(ufl.TrialFunction(body.W), ufl.TestFunction(body.W))
+        (element,) = set(body.W.ufl_element().sub_elements)
+        broken = basix.ufl.element(
+            "Lagrange", element.cell_type, element.degree, discontinuous=True
+        )
+        space = fem.functionspace(body.mesh, broken)
+        product = ufl.inner(ufl.TrialFunction(space), ufl.TestFunction(space))
         if body.mass_share is not None:
             product = body.mass_share * product
         form = self._mass_form(number, product)
         if body.deletion is not None:
             form = body.deletion.present_only(form)
-        compiled = fem.form(form, **self._numerics.of_forms)
-        matrix = fem_petsc.create_matrix(compiled)
-        fem_petsc.assemble_matrix(matrix, compiled)
-        matrix.assemble()
-        return of_same_components(matrix, body.W.dofmap.index_map_bs)
+        matrix = fem.assemble_matrix(fem.form(form, **self._numerics.of_forms))
+        n, k = body.domain_nodes.shape
+        return np.array(matrix.data[: n * k * k].reshape(n, k, k))
 
     # -- Velocities ---------------------------------------------------------------------------
 

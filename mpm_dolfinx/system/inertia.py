@@ -33,6 +33,8 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
+from ..assembly.fused import Masses
+from ..assembly.petsc import blocked
 from ..errors import ConvergenceError, MPMError
 from ..history import Energy
 from ..io.snapshot import Kept, Taken, fill, of_cells, spaces_of
@@ -45,7 +47,7 @@ __all__ = ["OUT_OF_RANGE", "SCHEMES", "Inertia"]
 SCHEMES = ("midpoint", "conserving", "euler")
 OUT_OF_RANGE = ("project", "reflect")
 #: What the residual of a projection falls to, and the most iterations and refinements of it.
-PROJECTED, MOST_ITERATIONS, REFINEMENTS = 1e-13, 300, 6
+PROJECTED, MOST_ITERATIONS, REFINEMENTS = 1e-13, 100, 6
 #: The same for one that has come to the end of what round-off lets it do.
 AT_ROUND_OFF = 1e-10
 #: How often what the shift holds back is let go.
@@ -63,8 +65,10 @@ TOTALS = (
 #: Those among them that are given to the bodies.
 GIVEN = ("external", "prescribed")
 
-type MassMatrix = Callable[[int], PETSc.Mat]
-"""Assembles the consistent mass of a body on its W, by its number."""
+type DomainMasses = Callable[[int], NDArray[np.float64]]
+"""Returns the consistent mass of each owned domain of a body, ``(n, k, k)``, by its number."""
+type ReducedMasses = Callable[[Masses], tuple[list[PETSc.Mat], list[Particles]]]
+"""Reduces masses of domains by compiled loops; see :meth:`ReducedSystem.masses`."""
 type Works = Callable[[], NDArray[np.float64]]
 """Returns the works of the last increment on the backgrounds; see :meth:`Field.works`."""
 type Changes = Callable[[], list[NDArray[np.float64]]]
@@ -80,7 +84,8 @@ class Followed(NamedTuple):
 
     Attributes:
         terms: All other terms.
-        mass: Assembles the mass.
+        mass: Returns the mass of domains.
+        reduced: Reduces it by compiled loops.
         works: Returns the works of the last increment on the backgrounds.
         stored: Returns the elastic energy at the last converged step, and the work done against
             stress in the last step.
@@ -89,7 +94,8 @@ class Followed(NamedTuple):
     """
 
     terms: Sequence[Term]
-    mass: MassMatrix
+    mass: DomainMasses
+    reduced: ReducedMasses
     works: Works
     stored: Stored
     changes: Changes
@@ -203,7 +209,11 @@ class Inertia(Term):
         if deleted == self._deleted:
             return
         self._deleted = deleted
-        self.masses = [self._followed.mass(number) for number in range(len(self.bodies))]
+        self._transferred = []
+        self._domain_masses = [self._followed.mass(number) for number in range(len(self.bodies))]
+        self.masses = [
+            _on_nodes(body, own) for body, own in zip(self.bodies, self._domain_masses, strict=True)
+        ]
         for body, M in zip(self.bodies, self.masses, strict=True):
             _require_mass(body, M)
         kinetic = self.kinetic()
@@ -397,11 +407,15 @@ class Inertia(Term):
 
     def _reduce(self, Ts: Sequence[PETSc.Mat]) -> None:
         """Reduce the mass by T, and prepare to solve with it."""
-        parts = [M.ptap(T) for M, T in zip(self.masses, Ts, strict=True)]
-        self._A = parts[0]
-        for part in parts[1:]:
-            self._A.axpy(1.0, part, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        self._scaled = self._A.copy()
+        given = list(zip(self.bodies, self._domain_masses, strict=True))
+        known, bodies = self._followed.reduced(given)
+        self._apart = [all(body is not one for one in bodies) for body in self.bodies]
+        others = [
+            M.ptap(T) for M, T, apart in zip(self.masses, Ts, self._apart, strict=True) if apart
+        ]
+        self._others_A = _sum(others) if others else None
+        self._A = _sum([*known, *([] if self._others_A is None else [self._others_A])])
+        self._scaled = None if self._others_A is None else self._others_A.copy()
         self._unit = scale = self._A.getDiagonal()
         values = scale.array_w
         values[:] = np.where(values > 0.0, values, 1.0) ** -0.5
@@ -413,8 +427,9 @@ class Inertia(Term):
         values[:] = np.where(values > 0.0, SHIFT, 1.0)
         shifted.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
         self._shifted, self._held = shifted, diagonal
+        self._incomplete: PETSc.KSP | None = None
         self._factor: PETSc.KSP | None = None
-        self._iterates = max(body.V.ufl_element().degree for body in self.bodies) == 1
+        self._iterates = True
 
     def _solve(self, right: PETSc.Vec, result: PETSc.Vec) -> None:
         """Solve for the unknowns of a projection (collective).
@@ -458,7 +473,9 @@ class Inertia(Term):
         What is left is judged by a size.
         """
         if self._iterates:
-            ksp = _solver(self._shifted, "cg", "none")
+            if self._incomplete is None:
+                self._incomplete = _incomplete(self._shifted)
+            ksp = self._incomplete
             ksp.setTolerances(rtol=0.0, atol=PROJECTED * size, max_it=MOST_ITERATIONS)
             ksp.solve(right, y)
             if ksp.getConvergedReason() > 0:
@@ -514,15 +531,26 @@ class Inertia(Term):
         return forces
 
     def reduced_tangents(self, transfer: Transfer) -> Sequence[PETSc.Mat]:
-        """See :meth:`Term.reduced_tangents`."""
+        """See :meth:`Term.reduced_tangents`: the mass of bodies that fused forms do not have."""
         self._follow(transfer)
-        self._A.copy(self._scaled, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        if self._others_A is None or self._scaled is None:
+            return []
+        self._others_A.copy(self._scaled, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         self._scaled.scale(self._factors[0])
         return [self._scaled]
 
+    @property
+    def mass_factor(self) -> float:
+        """See :attr:`Term.mass_factor`."""
+        return self._factors[0]
+
     def reduced_product(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.reduced_product`."""
-        return self.stiffness_force(motions)
+        forces = self.stiffness_force(motions)
+        for force, apart in zip(forces, self._apart, strict=True):
+            if not apart:
+                force.set(0.0)
+        return forces
 
     def stiffness_force(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.stiffness_force`."""
@@ -716,12 +744,42 @@ class _Velocities(Kept):
         self._inertia.take(taken)
 
 
+def _on_nodes(body: Particles, masses: NDArray[np.float64]) -> PETSc.Mat:
+    """Return masses of domains summed up on W (collective)."""
+    nodes = body.W.dofmap.index_map.local_to_global(body.domain_nodes.ravel())
+    nodes = nodes.reshape(body.domain_nodes.shape)
+    rows = np.broadcast_to(nodes[:, :, None], masses.shape).ravel()
+    columns = np.broadcast_to(nodes[:, None, :], masses.shape).ravel()
+    return blocked(body.W, rows, columns, masses.ravel(), body.W.dofmap.index_map_bs)
+
+
+def _sum(parts: Sequence[PETSc.Mat]) -> PETSc.Mat:
+    """Return the sum of matrices, in the first (collective)."""
+    total = parts[0]
+    for part in parts[1:]:
+        total.axpy(1.0, part, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+    return total
+
+
 def _solver(A: PETSc.Mat, kind: str, preconditioner: str) -> PETSc.KSP:
     """Return a solver with a matrix (collective)."""
     ksp = PETSc.KSP().create(A.comm)
     ksp.setType(kind)
     ksp.setOperators(A)
     ksp.getPC().setType(preconditioner)
+    return ksp
+
+
+def _incomplete(A: PETSc.Mat) -> PETSc.KSP:
+    """Return conjugate gradients with an incomplete factor on each rank (collective)."""
+    ksp = _solver(A, "cg", "icc" if A.comm.size == 1 else "asm")
+    if A.comm.size > 1:
+        pc = ksp.getPC()
+        pc.setASMOverlap(0)
+        ksp.setUp()
+        for part in pc.getASMSubKSP():
+            part.setType("preonly")
+            part.getPC().setType("icc")
     return ksp
 
 

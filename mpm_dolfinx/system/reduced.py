@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assembly.body_forms import BodyForms
-from ..assembly.fused import FusedTangent
+from ..assembly.fused import FusedTangent, Masses
 from ..assembly.petsc import MatrixSum
 from ..errors import DomainDistortionError, MPMError, agree, agreed, as_ours
 from ..history import Statistics
@@ -457,6 +457,7 @@ class ReducedSystem:
     def tangent(self) -> PETSc.Mat:
         """Return the tangent at the x of the last residual, one object within a step."""
         with self._statistics.phase("assemble"):
+            reduced = [K for term in self._terms for K in term.reduced_tangents(self._free_T)]
             parts = [self._fused_tangent(number) for number in range(len(self.fused))]
             self._tangents = [term.tangents() for term in self._terms]
             self._sizes_of = {}
@@ -467,8 +468,7 @@ class ReducedSystem:
                 )
                 for pair, K in tangents.items()
             ]
-            for term in self._terms:
-                parts += term.reduced_tangents(self._free_T)
+            parts += reduced
             for field in self.fields:
                 parts += field.tangents(partial(self._stiffness, field))
             if self._value_fields:
@@ -532,12 +532,35 @@ class ReducedSystem:
 
     def _fused_tangent(self, number: int) -> PETSc.Mat:
         fused, (group, _) = self.fused[number], self._groups[number]
-        whole = fused.assemble([field.prescribes for field in group])
+        factor = sum(term.mass_factor for term in self._terms)
+        whole = fused.assemble([field.prescribes for field in group], factor)
         if not group[0].extends:
             return whole
         result = whole.ptap(group[0].prolongation, result=self._extended[number])
         self._extended[number] = result
         return result
+
+    def masses(self, masses: Masses) -> tuple[list[PETSc.Mat], list[Particles]]:
+        """Reduce the mass of bodies by the compiled loops, as far as these know them (collective).
+
+        From now on, in this step, tangents have it :attr:`Term.mass_factor` times.
+
+        Args:
+            masses: Of domains.
+
+        Returns:
+            Matrices of all unknowns, of which the sum is the reduced mass, and the bodies of which.
+        """
+        parts, known = [], []
+        for fused, (group, pairs) in zip(self.fused, self._groups, strict=True):
+            bodies = [body for own in pairs for body, _ in own]
+            its = [(body, own) for body, own in masses if any(body is one for one in bodies)]
+            if not its:
+                continue
+            whole = fused.weigh(its)
+            parts.append(whole.ptap(group[0].prolongation) if group[0].extends else whole)
+            known += [body for body, _ in its]
+        return parts, known
 
     def _product(self, term: Term, number: int, pair: tuple[int, int], K: PETSc.Mat) -> PETSc.Mat:
         """Return ``T_a^T K T_b`` in the unknowns, the same object for the same K."""
