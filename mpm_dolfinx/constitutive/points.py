@@ -251,6 +251,8 @@ class MaterialPoints:
                 state if whole else self._mixed(group, kept, state, kirchhoff, gradient)
                 for group, (whole, kept, state) in zip(self._groups, known, strict=True)
             ]
+        if self.mean_stress is not None and before.mean_stress is not None:
+            self.mean_stress.begin_with(before.mean_stress.values)
         self._settle(states)
 
     def histories(self) -> list[tuple[Material, NDArray[np.int64], State]]:

@@ -143,11 +143,9 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
                 "after= is a problem that no longer governs its particles, as another one was made "
                 "of them since; begin from that, or make all of them anew."
             )
-        if options.get("mixed") is not None or after.setup.mixed is not None:
-            raise MPMError("after= does not go with mixed='pressure'; use f_bar=.")
         if options.get("initial_stress") is not None:
             raise MPMError("after= brings its stress with it; leave initial_stress= out.")
-        for name, default in (("axisymmetric", False), ("f_bar", "none")):
+        for name, default in (("axisymmetric", False), ("f_bar", "none"), ("mixed", None)):
             its = getattr(after.setup, name)
             if options.get(name, default) != its:
                 raise MPMError(f"after= is a problem with {name}={its!r}; give the same here.")

@@ -55,6 +55,7 @@ class MovingProblem(TimeProblem):
             others,
             weakly(self._masses),
             weakly(self._reduced_masses),
+            weakly(self._weigh),
             weakly(self._works),
             weakly(self._stored),
             weakly(self._changes),
@@ -72,6 +73,10 @@ class MovingProblem(TimeProblem):
     def _reduced_masses(self, masses: Masses) -> tuple[list[PETSc.Mat], list[Particles]]:
         """Return :meth:`ReducedSystem.masses` (collective)."""
         return self.reduced.masses(masses)
+
+    def _weigh(self, factor: float) -> None:
+        """Say how often tangents have the masses that the compiled loops have reduced."""
+        self.reduced.mass_factor = factor
 
     def _works(self) -> NDArray[np.float64]:
         """Return the works of the last increment on the backgrounds (collective)."""

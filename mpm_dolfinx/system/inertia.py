@@ -86,6 +86,7 @@ class Followed(NamedTuple):
         terms: All other terms.
         mass: Returns the mass of domains.
         reduced: Reduces it by compiled loops.
+        weigh: Says how often tangents have what these have reduced.
         works: Returns the works of the last increment on the backgrounds.
         stored: Returns the elastic energy at the last converged step, and the work done against
             stress in the last step.
@@ -96,6 +97,7 @@ class Followed(NamedTuple):
     terms: Sequence[Term]
     mass: DomainMasses
     reduced: ReducedMasses
+    weigh: Callable[[float], None]
     works: Works
     stored: Stored
     changes: Changes
@@ -533,16 +535,12 @@ class Inertia(Term):
     def reduced_tangents(self, transfer: Transfer) -> Sequence[PETSc.Mat]:
         """See :meth:`Term.reduced_tangents`: the mass of bodies that fused forms do not have."""
         self._follow(transfer)
+        self._followed.weigh(self._factors[0])
         if self._others_A is None or self._scaled is None:
             return []
         self._others_A.copy(self._scaled, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         self._scaled.scale(self._factors[0])
         return [self._scaled]
-
-    @property
-    def mass_factor(self) -> float:
-        """See :attr:`Term.mass_factor`."""
-        return self._factors[0]
 
     def reduced_product(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.reduced_product`."""

@@ -54,7 +54,10 @@ class ReducedSystem:
         fused: The tangents that the compiled loops reduce: one of all fields together, and one of
             each field in which dofs follow others.
         predictor: As given.
+        mass_factor: How often tangents have the masses that :meth:`masses` has reduced.
     """
+
+    mass_factor = 0.0
 
     def __init__(
         self,
@@ -532,8 +535,7 @@ class ReducedSystem:
 
     def _fused_tangent(self, number: int) -> PETSc.Mat:
         fused, (group, _) = self.fused[number], self._groups[number]
-        factor = sum(term.mass_factor for term in self._terms)
-        whole = fused.assemble([field.prescribes for field in group], factor)
+        whole = fused.assemble([field.prescribes for field in group], self.mass_factor)
         if not group[0].extends:
             return whole
         result = whole.ptap(group[0].prolongation, result=self._extended[number])
@@ -543,7 +545,7 @@ class ReducedSystem:
     def masses(self, masses: Masses) -> tuple[list[PETSc.Mat], list[Particles]]:
         """Reduce the mass of bodies by the compiled loops, as far as these know them (collective).
 
-        From now on, in this step, tangents have it :attr:`Term.mass_factor` times.
+        From now on, in this step, tangents have it :attr:`mass_factor` times.
 
         Args:
             masses: Of domains.

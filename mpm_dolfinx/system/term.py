@@ -81,14 +81,6 @@ class Term:
         return ()
 
     @property
-    def mass_factor(self) -> float:
-        """How often the tangents of :attr:`fused` forms have the mass that this term has reduced.
-
-        See :meth:`ReducedSystem.masses`.
-        """
-        return 0.0
-
-    @property
     def follows_load(self) -> bool:
         """Whether what the load factor does depends on the displacement."""
         return False

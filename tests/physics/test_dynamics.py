@@ -907,6 +907,29 @@ def test_a_body_in_equilibrium_stays_at_rest(scheme, out, f_bar):
     raises(static.step, mpm.MPMError, "Another problem was made of these particles")
 
 
+@pytest.mark.parametrize("scheme", ["midpoint", "conserving"])
+def test_a_body_with_a_pressure_of_its_own_stays_at_rest_in_equilibrium(scheme):
+    law, weight = Hencky(100.0, 0.4999), {"body_force": (0.0, -1.0)}
+    V = vectors(box([0.0, 0.0], [2.0, 1.5], [6, 5], QUADRILATERAL), 2)
+    feet = fix(V, at(1, 0.0))
+    body = box([0.47, 0.0], [1.47, 1.0], [6, 6], QUADRILATERAL)
+    particles = mpm.Particles(body, V, degree=2)
+    given = {**weight, "bcs": [feet], "mixed": "pressure", "stabilisation": "aggregate"}
+    static = mpm.QuasiStaticProblem(particles, law, 2.0, **given)
+    static.solve(2)
+    for _ in range(4):
+        static.step()
+    settled = nodal(particles.displacement).copy()
+    pressure = static.pressure[0].x.array.copy()
+    problem = mpm.DynamicProblem(particles, law, 2.0, scheme=scheme, after=static, **given)
+    np.testing.assert_array_equal(problem.pressure[0].x.array, pressure)
+    history = problem.solve(0.2, 0.05)
+    assert largest(nodal(particles.displacement) - settled) < 1e-8
+    np.testing.assert_allclose(problem.pressure[0].x.array, pressure, atol=1e-6)
+    assert problem.kinetic_energy < 1e-14 and WORLD.allreduce(float(pressure.min())) < -1.0
+    assert history.cutbacks == 0
+
+
 def test_a_body_let_go_from_equilibrium_moves_as_its_energy_says():
     # Without weight the body springs up: what it stored is in motion and strain.
     law = Hencky(40.0, 0.3)
@@ -932,7 +955,7 @@ def test_what_a_motion_cannot_begin_with_is_refused():
         ("with f_bar='none'", particles, {"f_bar": "patch"}),
         ("with axisymmetric=False", particles, {"axisymmetric": True}),
         ("leave initial_stress= out", particles, {"initial_stress": lambda x: x}),
-        ("does not go with mixed=", particles, {"mixed": "pressure"}),
+        ("with mixed=None; give the same", particles, {"mixed": "pressure"}),
     ):
         every = {"after": static, **given, **options}
         raises(
