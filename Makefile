@@ -33,7 +33,7 @@ demo: ## Install what is needed, run the first demo, make its picture
 	cd output && "$(abspath $(BIN)/python)" ../demos/demo_column_roller.py
 	@echo "The picture is output/column_roller.png"
 
-test: ## Minutes: the quick tests on 1, then on NP="2 3" ranks (ARGS=tests/materials: seconds)
+test: ## Six minutes: the quick tests on 1, then on NP="2 3" ranks (ARGS=tests/materials: seconds)
 	@$(SETUP) wheel plot test
 	@bash scripts/run_tests.sh $(ARGS)
 

@@ -7,10 +7,12 @@
 # Run the tests of the environment $VENV on one rank, then on each number of ranks of the list
 # $NP (default: 2 3, with --all 2 3 4; 1 is no more than the first run). The first run that fails ends
 # it. The last line is pytest's summary, after launchers' messages too. $TEST_TIMEOUT is the time
-# limit of each run in seconds; $MPIRUN another launcher.
+# limit of each run in seconds; $MPIRUN another launcher. The run of everything on one rank is shared
+# out among two processes, where pytest-xdist is installed.
 #
-# Without --all, tests marked slow are left out, and more ranks than two run the folders where
-# ranks have most to do with each other. Arguments, such as a folder, are run on all ranks.
+# Without --all, tests marked slow are left out, and several ranks run the folders where they have
+# something to do with each other: of whole runs those that are compared with one rank, and on more
+# ranks than two the least. Arguments, such as a folder, are run on all ranks.
 set -uo pipefail
 
 cd "$(dirname "$0")/.." || exit 1
@@ -27,14 +29,20 @@ if [[ ${1:-} == --all ]]; then
     which=(-m "")
     default="2 3 4"
 elif (($# == 0)); then
-    few=(parallel particles system transfer io/test_checkpoint.py physics/test_parallel.py
-        problems/test_fields.py problems/test_remeshing.py stepping/test_loading.py)
+    few=(parallel particles transfer physics/test_parallel.py problems/test_fields.py
+        system/test_coupling.py system/test_fields.py)
     few=("${few[@]/#/tests/}")
     echo "The quick tests. Those of one folder or file take seconds: make test ARGS=tests/materials," \
         "NP=1 for one rank alone; make test-all runs all, also on four ranks."
 fi
 if (($# == 0)); then
     alone=(--ignore=tests/materials --ignore=tests/benchmarks --ignore=tests/demos)
+    if ((${#which[@]} == 0)); then
+        for file in tests/physics/test_*.py; do
+            [[ $file == */test_parallel.py || $file == */test_combinations.py ]] ||
+                alone+=("--ignore=$file")
+        done
+    fi
 fi
 
 read -ra numbers <<<"${NP:-$default}"
@@ -72,7 +80,12 @@ run() {
     fi
 }
 
-MPM_DOLFINX_RANKS=1 run "$venv/bin/python" -m pytest "${which[@]}" "$@"
+cores=$(env -u OMP_NUM_THREADS nproc) # which it would say instead
+processes=()
+if (($# == 0 && cores > 1)) && "$venv/bin/python" -c 'import xdist' 2>/dev/null; then
+    processes=(-n 2 --dist worksteal)
+fi
+MPM_DOLFINX_RANKS=1 run "$venv/bin/python" -m pytest "${processes[@]}" "${which[@]}" "$@"
 
 # Open MPI refuses more ranks than cores unless it is told so.
 export PRTE_MCA_rmaps_default_mapping_policy=:oversubscribe
@@ -83,7 +96,6 @@ if [[ -n ${MPIRUN:-} ]]; then
 elif [[ ! -x ${launcher[0]} ]]; then
     launcher=(mpirun)
 fi
-cores=$(env -u OMP_NUM_THREADS nproc) # which it would say instead
 for ranks in "${numbers[@]}"; do
     ((ranks > 1)) || continue
     waiting=() chosen=()

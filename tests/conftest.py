@@ -25,6 +25,8 @@ from petsc4py import PETSc
 import numpy as np
 import pytest
 
+from dolfinx import jit
+
 comm = MPI.COMM_WORLD.Dup()
 
 # How long a rank on which a test failed waits for the others, which may be stuck in a
@@ -66,6 +68,10 @@ def pytest_configure(config: pytest.Config) -> None:
             "the launcher does not belong to the MPI library of mpi4py",
             returncode=4,
         )
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        # Two processes may want one form: the second waits until the first has compiled it.
+        _, what = jit.DOLFINX_DEFAULT_JIT_OPTIONS["timeout"]
+        jit.DOLFINX_DEFAULT_JIT_OPTIONS["timeout"] = (300, what)
     if comm.rank > 0:
         config.pluginmanager.unregister(name="terminalreporter")
         reporter = pytest.TerminalReporter(config, State.quiet)
