@@ -116,7 +116,7 @@ class MaterialPoints:
         self.dim = strain.dim
         self._points = particles.num_local * particles.num_points
         self._given: list[_Given] = []
-        self.mean_stress = None
+        self.mean_stress: MeanStress | None = None
         if pressure is not None:
             self.mean_stress = MeanStress(pressure, (self._points, self.dim))
         self._weakening = 1.0
@@ -450,7 +450,8 @@ class MaterialPoints:
             for group in self._groups:
                 tangent = self._undeformed_tangent(group)
                 result[group.points] = np.einsum("niiii->ni", tangent).max(axis=1, initial=0.0)
-        return result.reshape(self._particles.num_local, -1).mean(axis=1)
+        shape = (self._particles.num_local, self._particles.num_points)
+        return result.reshape(shape).mean(axis=1)
 
     def undeformed_tangent(self) -> NDArray[np.float64]:
         """Return dP/dF of all points where nothing is strained, ``(n nq, dim, dim, dim, dim)``."""

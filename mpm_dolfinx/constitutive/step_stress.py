@@ -33,7 +33,7 @@ from ..errors import ConvergenceError
 from .averaging import Linearised, LowRankTerm, VolumeAveraging
 from .groups import Groups
 from .points import MaterialPoints
-from .pressure import VolumeStrain
+from .pressure import MeanStress, VolumeStrain
 
 __all__ = ["StepStress"]
 
@@ -113,6 +113,16 @@ class StepStress:
     def hoop(self) -> Array | None:
         """Hoop strains of a body of revolution's nodes, or ``None``."""
         return self._points.hoop
+
+    @property
+    def averaging(self) -> VolumeAveraging | None:
+        """F-bar, or ``None``."""
+        return self._points.averaging
+
+    @property
+    def mean_stress(self) -> MeanStress | None:
+        """A pressure of its own in place of the mean stress, or ``None``."""
+        return self._points.mean_stress
 
     @property
     def volume_strain(self) -> VolumeStrain:

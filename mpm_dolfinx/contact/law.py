@@ -22,9 +22,12 @@ from ..errors import MPMError
 __all__ = [
     "Coulomb",
     "Points",
+    "Push",
     "Traction",
     "as_friction",
     "derivative",
+    "nitsche",
+    "push_derivative",
     "shear_derivative",
     "traction",
 ]
@@ -114,18 +117,64 @@ class Traction(NamedTuple):
     slips: NDArray[np.bool_]
 
 
+class Push(NamedTuple):
+    """Pressures ``<n . T - k g>`` with a traction T of the body (Nitsche's method).
+
+    Attributes:
+        pressure: Shape ``(n,)``.
+        acts: Whether each is more than nothing, or about to be, shape ``(n,)``.
+        by_position: Derivative by the position, T being as it is, shape ``(n, gdim)``.
+    """
+
+    pressure: NDArray[Any]
+    acts: NDArray[np.bool_]
+    by_position: NDArray[np.float64]
+
+    def of(self, which: Any) -> Push:
+        """Return some of them."""
+        return Push(*(values[which] for values in self))
+
+
+def nitsche(
+    points: Points,
+    behind: NDArray[Any],
+    gap: NDArray[Any],
+    n: NDArray[Any],
+    touch: float,
+    H: NDArray[np.float64] | None = None,
+) -> Push:
+    """Return pressures that a traction of the body bears, but for what gaps are left.
+
+    Args:
+        points: The points.
+        behind: Tractions of the body at its facets, shape ``(n, gdim)``.
+        gap: Shape ``(n,)``.
+        n: Normals, towards the points, shape ``(n, gdim)``.
+        touch: Gap at which points touch.
+        H: Derivatives of the normals, where those of the pressure are asked for.
+    """
+    p = (n * behind).sum(axis=1) - points.stiffness * gap
+    acts = p.real >= -points.stiffness * touch
+    slope = np.zeros(n.shape)
+    if H is not None:
+        slope = np.einsum("nij,ni->nj", H, behind) - points.stiffness[:, None] * n
+        slope = np.where(acts[:, None], slope, 0.0)
+    return Push(np.where(p.real > 0.0, p, 0.0), acts, slope)
+
+
 def _since_touch(
     points: Points, gap: NDArray[Any], touch: float
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return which share of its way a point has been in contact, and the derivative by the gap.
 
     That is all of it where it was before, and the part behind the surface where it has come from
-    outside, on a straight line.
+    outside, on a straight line: none where it is pressed with a gap left.
     """
-    came = ~points.touched & (points.gap > 10.0 * touch) & (gap.real < 0.0)
-    span = np.where(came, points.gap - gap, 1.0)
-    share = np.where(came, -gap / span, 1.0)
-    return share, np.where(came, -points.gap / span**2, 0.0)
+    came = ~points.touched & (points.gap > 10.0 * touch)
+    behind = came & (gap.real < 0.0)
+    span = np.where(behind, points.gap - gap, 1.0)
+    share = np.where(behind, -gap / span, np.where(came, 0.0, 1.0))
+    return share, np.where(behind, -points.gap / span**2, 0.0)
 
 
 def _trial(
@@ -155,8 +204,8 @@ def traction(
         gap: Shape ``(n,)``.
         n: Normals, towards the points, shape ``(n, gdim)``.
         touch: Gap at which points touch: round-off of positions.
-        pressure: That of a whole step, which may act where there is a gap at its end; ``None`` is
-            that of the gap.
+        pressure: That of a whole step or of Nitsche's method, which may act where there is a gap at
+            the end; ``None`` is that of the gap.
     """
     inside = gap.real <= touch
     if pressure is None:
@@ -182,6 +231,7 @@ def derivative(
     n: NDArray[np.float64],
     H: NDArray[np.float64],
     touch: float,
+    push: Push | None = None,
 ) -> NDArray[np.float64]:
     """Return the derivative of ``p n + t`` by positions of points that are all in contact.
 
@@ -193,16 +243,51 @@ def derivative(
         n: As there.
         H: Derivatives of the normals, shape ``(n, gdim, gdim)``.
         touch: As there.
+        push: A pressure that is not of the gap alone.
 
     Returns:
         Shape ``(n, gdim, gdim)``.
     """
-    acts = traction(law, points, delta, gap, n, touch)
-    dp = -points.stiffness[:, None] * n
+    acts = traction(law, points, delta, gap, n, touch, None if push is None else push.pressure)
+    dp = -points.stiffness[:, None] * n if push is None else push.by_position
     D = n[:, :, None] * dp[:, None, :] + acts.pressure[:, None, None] * H
     if law.smooth:
         return D
     return D + shear_derivative(law, points, delta, gap, n, H, touch, acts, dp, n)
+
+
+def push_derivative(
+    law: Coulomb,
+    points: Points,
+    delta: NDArray[np.float64],
+    gap: NDArray[np.float64],
+    n: NDArray[np.float64],
+    touch: float,
+    push: Push,
+) -> NDArray[np.float64]:
+    """Return the derivative of ``p n + t`` by the traction's part in the pressure.
+
+    Args:
+        law: As for :func:`derivative`, as all that is not said here.
+        points: As there.
+        delta: As there.
+        gap: As there.
+        n: As there.
+        touch: As there.
+        push: The pressure.
+
+    Returns:
+        Shape ``(n, gdim)``.
+    """
+    found = n.copy()
+    acts = traction(law, points, delta, gap, n, touch, push.pressure)
+    if acts.slips.any():
+        s = acts.slips
+        trial = _trial(points, delta, gap, n, touch)[s]
+        _, grows = law.bound(acts.pressure[s])
+        tau = trial / np.linalg.norm(trial, axis=1)[:, None]
+        found[s] += np.asarray(grows)[:, None] * tau
+    return np.asarray(found * push.acts[:, None])
 
 
 def shear_derivative(

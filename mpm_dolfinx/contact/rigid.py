@@ -21,14 +21,27 @@ from ..meshes.remesh import Column
 from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..system.term import PointMaterial
+from .behind import Behind, ThroughGroups
 from .contact import Contact, Outcome, stiffness
-from .law import Coulomb, Points, as_friction, derivative, shear_derivative, traction
+from .law import (
+    Coulomb,
+    Points,
+    Push,
+    as_friction,
+    derivative,
+    nitsche,
+    push_derivative,
+    shear_derivative,
+    traction,
+)
 from .shapes import Shape, as_positive
 from .surface import Blocks, PointMatrix, Surface, global_dofs
 from .whole_step import corrected, mean_pressure, pressure_slope
 
 __all__ = ["Placed", "Rigid"]
 
+#: What the pressure is made of.
+LAWS = ("penalty", "nitsche")
 #: Penetration, over the thickness of the domain behind, from which a body is in an obstacle
 #: rather than on it.
 DEEP = 1.0
@@ -91,6 +104,7 @@ class _Memory:
         outcome: What acted.
         works: What was done against pressure and against friction in the step, if there is motion.
         step: The step of a motion, at all points, by whose middle the forces are.
+        behind: Tractions by the stress behind the facets, where these count, ``(m, nq, gdim)``.
     """
 
     pose: _Pose
@@ -101,6 +115,7 @@ class _Memory:
     outcome: Outcome
     works: tuple[float, float] = (0.0, 0.0)
     step: _Step | None = None
+    behind: NDArray[np.float64] | None = None
 
 
 class Placed(NamedTuple):
@@ -169,6 +184,9 @@ class Rigid(Contact):
         quadrature_degree: Degree of the rule on each facet; ``None`` is one more than twice the
             degree of the shape functions.
         axisymmetric: Whether ``x[0]`` is a radius.
+        law: ``"penalty"``, or ``"nitsche"``: the pressure is that of the stress behind the facet,
+            and the penalty holds the gap at zero. It takes the body's material, and a solver for
+            tangents that are not symmetric.
 
     Raises:
         MPMError: What makes no sense.
@@ -187,6 +205,7 @@ class Rigid(Contact):
         tangential_penalty: float = 1.0,
         quadrature_degree: int | None = None,
         axisymmetric: bool = False,
+        law: str = "penalty",
     ) -> None:
         if not isinstance(particles, Particles):
             raise MPMError(f"A contact needs mpm.Particles, not {type(particles).__name__}.")
@@ -198,18 +217,24 @@ class Rigid(Contact):
             )
         if shape.dim != gdim:
             raise MPMError(f"The shape is one in {shape.dim} dimensions, the body in {gdim}.")
-        law = as_friction(friction)
+        rubs = as_friction(friction)
+        if law not in LAWS:
+            raise MPMError(f"law must be one of {', '.join(map(repr, LAWS))}, not {law!r}.")
         require_same(
             particles.mesh.comm,
-            friction=[law.friction, law.cohesion, law.limit],
+            friction=[rubs.friction, rubs.cohesion, rubs.limit],
             tag=tag,
             modulus=modulus,
             penalty=penalty,
             tangential_penalty=tangential_penalty,
             quadrature_degree=quadrature_degree,
             axisymmetric=axisymmetric,
+            law=law,
         )
-        super().__init__([particles], law, axisymmetric)
+        super().__init__([particles], rubs, axisymmetric)
+        self._nitsche = law == "nitsche"
+        self._behind: Behind | None = None
+        self._groups: ThroughGroups | None = None
         self.shape = shape
         self._modulus = None if modulus is None else as_positive(modulus, "modulus")
         self._penalty = as_positive(penalty, "penalty")
@@ -311,12 +336,52 @@ class Rigid(Contact):
     ) -> None:
         """See :meth:`Term.take_part`."""
         super().take_part(number, bodies, materials)
+        if self._nitsche:
+            self._require_stress()
+        self._behind = self._groups = None
         first = self._memory is None
         self._settle()
         if first:
             self._require_same_shape()
             assert self._memory is not None
             self._require_apart(self._memory)
+
+    def _require_stress(self) -> None:
+        """Raise an error where no material gives the stress behind the facets.
+
+        Raises:
+            MPMError: There is none, or it is no stress of the displacement alone.
+        """
+        instead = "use law='penalty'"
+        material = self._materials[0]
+        if material is None:
+            raise MPMError(
+                "law='nitsche' of a Rigid takes the stress of the body's material, which is in the "
+                f"forms of this problem alone; use a QuasiStaticProblem, or {instead}."
+            )
+        if material.mean_stress is not None:
+            raise MPMError(
+                "law='nitsche' of a Rigid does not go with mixed='pressure', whose stress depends "
+                f"on another field; {instead}, or f_bar='patch'."
+            )
+
+    def pace(self, dt: float, share: float) -> None:
+        """See :meth:`Term.pace`.
+
+        Raises:
+            MPMError: The forces of the scheme are no ones of a step's end.
+        """
+        if self._nitsche and share < 1.0:
+            raise MPMError(
+                "law='nitsche' of a Rigid has forces of a step's end, and would add energy with "
+                "each impact in this scheme; use scheme='euler', or law='penalty'."
+            )
+        super().pace(dt, share)
+
+    @property
+    def symmetric(self) -> bool:
+        """See :attr:`Term.symmetric`."""
+        return super().symmetric and not self._nitsche
 
     def _require_same_shape(self) -> None:
         """Raise an error where ranks have different shapes, by some distances (collective)."""
@@ -335,6 +400,7 @@ class Rigid(Contact):
             k = stiffness(self._surface, self._modulus, self._materials[0], "A Rigid")
             self._stiffness = np.repeat(k[:, None], self._surface.nq, axis=1)
             self._new_pattern()
+            self._behind = self._groups = None
             self._begin_anew(self._pose)
 
     def _begin_anew(self, pose: _Pose) -> None:
@@ -514,20 +580,29 @@ class Rigid(Contact):
         x = self._surface.positions()
         m, nq, gdim = x.shape
         y = self._framed(x, pose).reshape(-1, gdim)
-        phi, n = self._distance(y, memory)
         points = self._points(memory)
+        touch = self._surface.touch
+        behind, reach = None, np.full(len(y), touch)
+        if self._nitsche:
+            behind = self._stress_behind().tractions(self._material)
+            reach = touch + np.linalg.norm(behind, axis=2).ravel() / points.stiffness
+        phi, n = self._distance(y, memory, reach)
         pushes, step, Q = n, None, pose.Q
+        pressure = None
+        if behind is not None:
+            pressure = nitsche(points, (behind @ Q).reshape(-1, gdim), phi, n, touch).pressure
         if self._of_step:
             step = self._step(points, memory, y, phi)
             pushes, Q = step.gradient, memory.pose.middle(pose).Q
+            pressure = step.pressure
         acts = traction(
             self.friction,
             points,
             y - points.anchor,
             phi,
             n if step is None else step.normal,
-            self._surface.touch,
-            None if step is None else step.pressure,
+            touch,
+            pressure,
         )
         shape = (m, nq)
         normal, shear = (
@@ -543,7 +618,7 @@ class Rigid(Contact):
             phi.reshape(shape),
             acts.pressure.reshape(shape),
             force,
-            (phi <= self._surface.touch).reshape(shape),
+            (acts.inside if behind is not None else phi <= touch).reshape(shape),
             acts.slips.reshape(shape),
         )
         return _Memory(
@@ -555,18 +630,31 @@ class Rigid(Contact):
             outcome,
             works,
             step,
+            behind,
         )
 
+    def _stress_behind(self) -> Behind:
+        """Return what takes the stress at the points of domains to their facets."""
+        if self._behind is None:
+            self._behind = Behind(self._surface)
+        return self._behind
+
     def _distance(
-        self, y: NDArray[np.float64], memory: _Memory
+        self, y: NDArray[np.float64], memory: _Memory, reach: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return gaps and normals of points; of a costly shape what they are at least if far."""
+        """Return gaps and normals of points; of a costly shape what they are at least if far.
+
+        Args:
+            y: The points, in the frame of the shape.
+            memory: What is known of the last converged step.
+            reach: Gap within which a point may be pressed.
+        """
         phi, n = np.zeros(len(y)), memory.normal.reshape(y.shape).copy()
         near = np.ones(len(y), dtype=bool)
         if self.shape.costly:
             before = self._framed(memory.outcome.positions, memory.pose).reshape(y.shape)
             phi = memory.gap.ravel() - np.linalg.norm(y - before, axis=1)
-            near = ~(phi > self._surface.touch)
+            near = ~(phi > reach)
         try:
             phi[near], n[near] = self.shape.distance(y[near])
         except MPMError:
@@ -633,6 +721,9 @@ class Rigid(Contact):
         acting = trial.touched
         if self._of_step:
             acting = acting | (memory.gap <= surface.touch)
+        if trial.behind is not None:
+            every = np.arange(acting.size)
+            acting = acting | self._push(trial, memory, every).acts.reshape(acting.shape)
         which = np.flatnonzero(
             acting.any(axis=1) & (surface.weights.max(axis=1, initial=0.0) > 0.0)
         )
@@ -645,8 +736,96 @@ class Rigid(Contact):
         k = N.shape[1] * surface.gdim
         blocks = np.einsum("mq,qa,qb,mqij->maibj", -w, N, N, D, optimize=True)
         dofs = global_dofs(self.bodies[0].W, surface.nodes[which])
-        K = self._matrix.of([Blocks(which[:, None], dofs, dofs, blocks.reshape(-1, k, k))])
+        parts = [Blocks(which[:, None], dofs, dofs, blocks.reshape(-1, k, k))]
+        if trial.behind is None:
+            K = self._matrix.of(parts)
+            return {} if K is None else {(0, 0): K}
+        force = np.zeros_like(trial.behind)
+        force.reshape(-1, surface.gdim)[flat] = self._by_stress(trial, memory, flat)
+        force *= -surface.weights[:, :, None]
+        K = self._matrix.of([*parts, self._blocks_behind(trial, which, dofs, force)])
+        averaging = self._material.averaging
+        if K is not None and averaging is not None:
+            if self._groups is None:
+                self._groups = ThroughGroups(self._stress_behind(), surface, averaging)
+            K = self._groups.added_to(K, trial.normal @ trial.pose.Q.T, force)
         return {} if K is None else {(0, 0): K}
+
+    @property
+    def _material(self) -> PointMaterial:
+        material = self._materials[0]
+        assert material is not None
+        return material
+
+    def _blocks_behind(
+        self,
+        trial: _Memory,
+        which: NDArray[np.int64],
+        rows: NDArray[np.int64],
+        force: NDArray[np.float64],
+    ) -> Blocks:
+        """Return what residuals have from displacements of the domains behind some facets.
+
+        Args:
+            trial: What acts.
+            which: The facets.
+            rows: Dofs of their nodes.
+            force: What residuals have at all points by traction along the normal.
+        """
+        behind, N = self._stress_behind(), self._surface.shapes
+        along = (trial.normal @ trial.pose.Q.T)[which]
+        slopes = behind.slopes(self._material, along, which)
+        blocks = np.einsum("qa,mqi,mqbj->maibj", N, force[which], slopes, optimize=True)
+        columns = global_dofs(self.bodies[0].W, behind.nodes[which])
+        shape = (len(which), rows.shape[1], columns.shape[1])
+        return Blocks(which[:, None], rows, columns, blocks.reshape(shape))
+
+    def _push(
+        self, trial: _Memory, memory: _Memory, flat: NDArray[np.int64], bent: bool = False
+    ) -> Push:
+        """Return the pressure of Nitsche's method at some points.
+
+        Args:
+            trial: What acts.
+            memory: What is known of the last converged step.
+            flat: Their numbers.
+            bent: Whether the derivative of the pressure is asked for.
+        """
+        gdim, pose = self._surface.gdim, trial.pose
+        assert trial.behind is not None
+        H = None
+        if bent:
+            x = trial.outcome.positions.reshape(-1, gdim)[flat]
+            H = self.shape.curvature(self._framed(x, pose))
+        return nitsche(
+            self._points(memory).of(flat),
+            trial.behind.reshape(-1, gdim)[flat] @ pose.Q,
+            trial.gap.ravel()[flat],
+            trial.normal.reshape(-1, gdim)[flat],
+            self._surface.touch,
+            H,
+        )
+
+    def _by_stress(
+        self, trial: _Memory, memory: _Memory, flat: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return the derivative of the traction at some points by that of the stress behind.
+
+        Of the latter by its part along the normal, shape ``(n, gdim)``.
+        """
+        gdim, pose = self._surface.gdim, trial.pose
+        points = self._points(memory).of(flat)
+        y = self._framed(trial.outcome.positions.reshape(-1, gdim)[flat], pose)
+        force = push_derivative(
+            self.friction,
+            points,
+            y - points.anchor,
+            trial.gap.ravel()[flat],
+            trial.normal.reshape(-1, gdim)[flat],
+            self._surface.touch,
+            self._push(trial, memory, flat),
+        )
+        return np.asarray(force @ pose.Q.T)
 
     def _derivative(
         self, trial: _Memory, memory: _Memory, flat: NDArray[np.int64]
@@ -660,7 +839,8 @@ class Rigid(Contact):
         touch, law = surface.touch, self.friction
         if not self._of_step:
             H = self.shape.curvature(y[flat])
-            return np.asarray(Q @ derivative(law, points, delta, gap, n, H, touch) @ Q.T)
+            push = None if trial.behind is None else self._push(trial, memory, flat, bent=True)
+            return np.asarray(Q @ derivative(law, points, delta, gap, n, H, touch, push) @ Q.T)
         assert trial.step is not None
         step = _Step(*(part[flat] for part in trial.step))
         H = 0.5 * self.shape.curvature(step.middle)
@@ -736,12 +916,16 @@ class Rigid(Contact):
             return {}
         assert self._memory is not None
         memory, surface = self._memory, self._surface
-        return {
+        known = {
             **surface.columns(),
             "anchor": surface.column(memory.anchor),
             "touches": surface.column(memory.touched),
             "slips": surface.column(memory.outcome.slips),
         }
+        if self._nitsche:
+            known["pressure"] = surface.column(memory.outcome.pressure)
+            known["traction"] = surface.column(memory.outcome.traction)
+        return known
 
     def numbers(self) -> dict[str, Any]:
         """Return where the obstacle was."""
@@ -756,6 +940,7 @@ class Rigid(Contact):
         surface = self._surface
         self._settle()
         surface.restore(columns)
+        self._behind = self._groups = None
         k = stiffness(surface, self._modulus, self._materials[0], "A Rigid")
         self._stiffness = np.repeat(k[:, None], surface.nq, axis=1)
         self._pose = self._aim = pose
@@ -767,18 +952,14 @@ class Rigid(Contact):
         )
         found = self._memory
         self._memory = _Memory(pose, touched, anchor, found.gap, found.normal, found.outcome)
-        now = self._evaluated_at_converged()
-        outcome = Outcome(
-            now.outcome.positions,
-            now.outcome.gap,
-            now.outcome.pressure,
-            now.outcome.traction,
-            touched,
-            surface.of_column(columns["slips"]),
-        )
-        self._memory = self._trial = _Memory(
-            pose, touched, anchor, found.gap, found.normal, outcome
-        )
+        outcome = found.outcome
+        if self._nitsche:
+            told = {name: surface.of_column(columns[name]) for name in ("pressure", "traction")}
+            outcome = replace(outcome, **told)
+        else:
+            outcome = self._evaluated_at_converged().outcome
+        outcome = replace(outcome, inside=touched, slips=surface.of_column(columns["slips"]))
+        self._memory = self._trial = replace(self._memory, outcome=outcome)
 
     def _evaluated_at_converged(self) -> _Memory:
         body = self.bodies[0]

@@ -180,7 +180,11 @@ class Surface:
             self.nodes[here] = W.dofmap.list[self.cells[here]][:, own]
         edges = np.einsum("jqk,mki->mqij", self.slopes, x[self.nodes])
         area = np.sqrt(np.linalg.det(edges.swapaxes(2, 3) @ edges)) * weights
-        self._plain = area
+        self._plain = self._in_mesh = area
+        self._edges, self._places = edges, []
+        for side in range(count):
+            at = corners[sides[side]]
+            self._places.append(at[0] + np.asarray(points) @ (at[1 : dim + 1] - at[0]))
         middle = x[W.dofmap.list[self.cells]].mean(axis=1)
         centre = (self.shapes @ x[self.nodes]).mean(axis=1)
         n = normals(edges).mean(axis=1)
@@ -209,6 +213,21 @@ class Surface:
         assert self._space is not None
         x = self._space.tabulate_dof_coordinates()[:, : self.gdim]
         return np.asarray(self.shapes @ x[self.nodes])
+
+    @property
+    def reference_points(self) -> list[NDArray[np.float64]]:
+        """The points on each facet of the reference cell, each of shape ``(nq, tdim)``."""
+        return self._places
+
+    @property
+    def mesh_area_ratio(self) -> NDArray[np.float64]:
+        """Area in the present mesh over that of the undeformed body, shape ``(m, nq)``."""
+        return np.asarray(self._in_mesh / self._plain)
+
+    def mesh_normals(self) -> NDArray[np.float64]:
+        """Return outward unit normals in the present mesh, shape ``(m, nq, gdim)``."""
+        n = self.outward[:, None, None] * normals(self._edges)
+        return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
 
     def node_positions(self, converged: bool = False) -> NDArray[np.float64]:
         """Return positions of this rank's nodes of W, shape ``(N, gdim)``."""

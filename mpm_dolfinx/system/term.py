@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from ..assembly.body_forms import BodyForms
+from ..constitutive.averaging import VolumeAveraging
+from ..constitutive.pressure import MeanStress
 from ..errors import MPMError
 from ..io.snapshot import Kept
 from ..particles.particles import Particles
@@ -32,6 +34,26 @@ class PointMaterial(Protocol):
 
     def initial_modulus(self) -> NDArray[np.float64]:
         """Return the modulus of each undeformed domain in one direction, ``(n,)`` (collective)."""
+
+    @property
+    def first_piola(self) -> NDArray[np.float64]:
+        """First Piola stress of the last update, shape ``(n nq, dim, dim)``."""
+
+    @property
+    def tangent(self) -> NDArray[np.float64]:
+        """Its derivative by F, ``(n nq, dim, dim, dim, dim)``; with F-bar the pointwise part."""
+
+    @property
+    def hoop(self) -> NDArray[np.float64] | None:
+        """Hoop strains of a body of revolution's nodes, shape ``(n, nq, k)``, or ``None``."""
+
+    @property
+    def averaging(self) -> VolumeAveraging | None:
+        """F-bar, or ``None``."""
+
+    @property
+    def mean_stress(self) -> MeanStress | None:
+        """A pressure of its own in place of the mean stress, or ``None``."""
 
 
 class Term:

@@ -63,6 +63,38 @@ def test_tangent_is_that_of_the_complex_step(law, dim):
         assert np.abs(D[:, :, i] - exact).max() < 1e-12 * np.abs(D).max()
 
 
+def pushed(law, body, points, y, behind):
+    phi, n = body.distance(y)
+    push = laws.nitsche(points, behind, phi, n, TOUCH)
+    acts = laws.traction(law, points, y - points.anchor, phi, n, TOUCH, push.pressure)
+    return acts, acts.pressure[:, None] * n + acts.shear
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_nitsches_tangent_is_that_of_the_complex_step(friction, dim):
+    law = contact.Coulomb(friction)
+    body, points, y = scene(dim)
+    phi, n = body.distance(y)
+    y = y + np.random.default_rng(5).uniform(0.0, 0.03, len(y))[:, None] * n  # some have a gap
+    phi, n = body.distance(y)
+    behind = np.random.default_rng(6).normal(0.0, 2.0, y.shape)
+    acts, _ = pushed(law, body, points, y, behind)
+    assert (acts.inside & (phi > TOUCH)).any() and (acts.inside & (phi < 0)).any()
+    assert (~acts.inside).any() and (acts.pressure[phi < 0] == 0.0).any()
+    push = laws.nitsche(points, behind, phi, n, TOUCH, body.curvature(y))
+    some = acts.inside
+    given = law, points.of(some), (y - points.anchor)[some], phi[some], n[some]
+    D = laws.derivative(*given, body.curvature(y[some]), TOUCH, push.of(some))
+    by_stress = laws.push_derivative(*given, TOUCH, push.of(some))
+    for i, e in enumerate(np.eye(dim)):
+        exact = pushed(law, body, points, y + 1e-30j * e, behind)[1].imag[some] / 1e-30
+        assert np.abs(D[:, :, i] - exact).max() < 1e-12 * np.abs(D).max()
+        exact = pushed(law, body, points, y, behind + 1e-30j * e)[1].imag[some] / 1e-30
+        found = by_stress * n[some, i : i + 1]
+        assert np.abs(found - exact).max() < 1e-12 * np.abs(by_stress).max()
+
+
 def test_shear_stays_within_coulombs_cone():
     law = contact.Coulomb(0.5, cohesion=0.1, limit=0.7)
     acts, _ = acting(law, *scene(2))
