@@ -7,6 +7,7 @@
 #include "hot_loop.h"
 
 #include <algorithm>
+#include <cmath>
 #include <type_traits>
 
 namespace
@@ -156,6 +157,26 @@ void add_element(const double* K, int nodes, const double* transfer, std::size_t
     }
 }
 
+// Set strains (nodes, dim) to w S : G at one point, with the hoop's part where there is one.
+template <int dim>
+inline void point_strains(const Domains& domains, const double* slope, std::size_t point,
+                          double* strains)
+{
+  const int strain = domains.strain();
+  const double* S = slope + point * strain * strain;
+  const double* gradients = domains.gradients + point * domains.nodes * dim;
+  for (int c = 0; c < domains.nodes; ++c)
+    for (int i = 0; i < dim; ++i)
+    {
+      double sum = 0.0;
+      for (int J = 0; J < dim; ++J)
+        sum += S[i * strain + J] * gradients[c * dim + J];
+      if (domains.hoop != nullptr && i == 0)
+        sum += S[8] * domains.hoop[point * domains.nodes + c];
+      strains[c * dim + i] = domains.weights[point] * sum;
+    }
+}
+
 // Go through domains with their supports.
 template <typename F>
 void for_each_support(std::size_t count, const Target& target, F&& f)
@@ -220,18 +241,18 @@ void core::internal_force(const Domains& domains, const double* P, double* force
   });
 }
 
-core::Supports core::supports(const Domains& domains, const Rows& rows)
+core::Supports core::supports(const Dofmap& dofmap, const Rows& rows)
 {
   Supports result;
-  result.offsets.reserve(domains.count + 1);
+  result.offsets.reserve(dofmap.count + 1);
   result.offsets.push_back(0);
   std::vector<std::int32_t> support;
-  for (std::size_t p = 0; p < domains.count; ++p)
+  for (std::size_t p = 0; p < dofmap.count; ++p)
   {
     support.clear();
-    for (int c = 0; c < domains.nodes; ++c)
+    for (int c = 0; c < dofmap.nodes; ++c)
     {
-      const std::int32_t row = domains.dofmap[p * domains.nodes + c];
+      const std::int32_t row = dofmap.values[p * dofmap.nodes + c];
       support.insert(support.end(), rows.nodes + rows.offsets[row],
                      rows.nodes + rows.offsets[row + 1]);
     }
@@ -243,18 +264,18 @@ core::Supports core::supports(const Domains& domains, const Rows& rows)
   return result;
 }
 
-void core::local_transfers(const Domains& domains, const Rows& rows, const std::int64_t* offsets,
+void core::local_transfers(const Dofmap& dofmap, const Rows& rows, const std::int64_t* offsets,
                            const std::int32_t* nodes, double* transfers)
 {
-  std::fill(transfers, transfers + offsets[domains.count] * domains.nodes, 0.0);
-  for (std::size_t p = 0; p < domains.count; ++p)
+  std::fill(transfers, transfers + offsets[dofmap.count] * dofmap.nodes, 0.0);
+  for (std::size_t p = 0; p < dofmap.count; ++p)
   {
-    double* transfer = transfers + offsets[p] * domains.nodes;
-    for (int c = 0; c < domains.nodes; ++c)
+    double* transfer = transfers + offsets[p] * dofmap.nodes;
+    for (int c = 0; c < dofmap.nodes; ++c)
     {
-      const std::int32_t row = domains.dofmap[p * domains.nodes + c];
+      const std::int32_t row = dofmap.values[p * dofmap.nodes + c];
       for (std::int64_t e = rows.offsets[row]; e < rows.offsets[row + 1]; ++e)
-        transfer[slot(nodes + offsets[p], nodes + offsets[p + 1], rows.nodes[e]) * domains.nodes
+        transfer[slot(nodes + offsets[p], nodes + offsets[p + 1], rows.nodes[e]) * dofmap.nodes
                  + c] = rows.values[e];
     }
   }
@@ -405,6 +426,100 @@ HOT_LOOP void core::assemble_masses(const Domains& domains, const double* transf
         if (b != a)
           target.values[positions[b * size + a]] += sum;
       }
+    }
+  });
+}
+
+HOT_LOOP void core::assemble_slopes(const Domains& domains, const double* slope,
+                                    const Transfers& displacement, const Transfers& pressure,
+                                    const Between& target)
+{
+  with_dimension(domains.dim, [&](auto constant) {
+    constexpr int dim = constant;
+    const int nodes = domains.nodes, points = domains.points;
+    std::vector<double> strains, reduced; // of the nodes of W, and of those of V
+    std::size_t pairs = 0;
+    for (std::size_t p = 0; p < domains.count; ++p)
+    {
+      const std::size_t size = displacement.offsets[p + 1] - displacement.offsets[p];
+      const std::size_t rows = pressure.offsets[p + 1] - pressure.offsets[p];
+      const double* T = displacement.values + displacement.offsets[p] * nodes;
+      const double* T_p = pressure.values + pressure.offsets[p] * points;
+      const int width = nodes * dim;
+      const std::size_t reduced_width = size * dim;
+      strains.resize(width);
+      reduced.assign(points * reduced_width, 0.0);
+      for (int q = 0; q < points; ++q)
+      {
+        const std::size_t point = p * points + q;
+        if (domains.weights[point] <= 0.0)
+          continue;
+        point_strains<dim>(domains, slope, point, strains.data());
+        double* out = reduced.data() + q * reduced_width;
+        for (std::size_t b = 0; b < size; ++b)
+          for (int c = 0; c < nodes; ++c)
+            if (const double t = T[b * nodes + c]; t != 0.0)
+              for (int i = 0; i < dim; ++i)
+                out[b * dim + i] += t * strains[c * dim + i];
+      }
+      for (std::size_t a = 0; a < rows; ++a)
+        for (std::size_t b = 0; b < size; ++b)
+        {
+          double sum[dim] = {};
+          for (int q = 0; q < points; ++q)
+            for (int i = 0; i < dim; ++i)
+              sum[i] += T_p[a * points + q] * reduced[q * reduced_width + b * dim + i];
+          const auto add = [&](const std::int32_t* positions, std::size_t pair, double* values) {
+            if (positions == nullptr)
+              return;
+            double* out = values + static_cast<std::size_t>(positions[pairs + pair]) * dim;
+            for (int i = 0; i < dim; ++i)
+              out[i] += sum[i];
+          };
+          add(target.of_pressure, a * size + b, target.pressure_values);
+          add(target.of_displacement, b * rows + a, target.displacement_values);
+        }
+      pairs += rows * size;
+    }
+  });
+}
+
+void core::assemble_diagonal(std::size_t count, int points, const double* factors,
+                             const Transfers& pressure, const std::int32_t* positions,
+                             double* values)
+{
+  std::size_t pairs = 0;
+  for (std::size_t p = 0; p < count; ++p)
+  {
+    const std::size_t size = pressure.offsets[p + 1] - pressure.offsets[p];
+    const double* T = pressure.values + pressure.offsets[p] * points;
+    for (std::size_t a = 0; a < size; ++a)
+      for (std::size_t b = 0; b < size; ++b)
+      {
+        double sum = 0.0;
+        for (int q = 0; q < points; ++q)
+          sum += factors[p * points + q] * T[a * points + q] * T[b * points + q];
+        values[positions[pairs + a * size + b]] += sum;
+      }
+    pairs += size * size;
+  }
+}
+
+void core::slope_sizes(const Domains& domains, const double* slope, const double* u, double* sizes)
+{
+  with_dimension(domains.dim, [&](auto constant) {
+    constexpr int dim = constant;
+    std::vector<double> strains(domains.nodes * dim);
+    for (std::size_t point = 0; point < domains.count * domains.points; ++point)
+    {
+      sizes[point] = 0.0;
+      if (domains.weights[point] <= 0.0)
+        continue;
+      const std::int32_t* nodes = domains.dofmap + point / domains.points * domains.nodes;
+      point_strains<dim>(domains, slope, point, strains.data());
+      for (int c = 0; c < domains.nodes; ++c)
+        for (int i = 0; i < dim; ++i)
+          sizes[point] += std::abs(strains[c * dim + i] * u[nodes[c] * dim + i]);
     }
   });
 }

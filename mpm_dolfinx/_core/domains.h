@@ -39,16 +39,24 @@ struct Rows
   const double* values;
 };
 
+// The nodes of W of each domain: (count, nodes).
+struct Dofmap
+{
+  std::size_t count;
+  int nodes;
+  const std::int32_t* values;
+};
+
 // The background nodes of each domain, sorted, in compressed rows.
 struct Supports
 {
   std::vector<std::int64_t> offsets;
   std::vector<std::int32_t> nodes;
 };
-Supports supports(const Domains& domains, const Rows& rows);
+Supports supports(const Dofmap& dofmap, const Rows& rows);
 
 // T of each domain: (support size, nodes) one domain after the other.
-void local_transfers(const Domains& domains, const Rows& rows, const std::int64_t* offsets,
+void local_transfers(const Dofmap& dofmap, const Rows& rows, const std::int64_t* offsets,
                      const std::int32_t* nodes, double* transfers);
 
 // The gradients of the background basis that a domain's single point sees: (support size, dim).
@@ -76,6 +84,33 @@ void assemble_domains(const Domains& domains, const double* transfers, const dou
 // that are the same for all components: one number for each block in target.values.
 void assemble_masses(const Domains& domains, const double* transfers, const double* M,
                      const Target& target);
+
+// T of a field on each domain, and its supports: (support size, nodes) one after the other.
+struct Transfers
+{
+  const std::int64_t* offsets;
+  const double* values;
+};
+
+// Where the blocks between a pressure and a displacement go, of which both may be null: those with
+// rows of the pressure, and those with rows of the displacement.
+struct Between
+{
+  const std::int32_t *of_pressure, *of_displacement;
+  double *pressure_values, *displacement_values;
+};
+
+// Add w T_p^T (S : G) T, and its transpose, for a slope S at the points (count, points, strain,
+// strain): what a pressure at the points does with the displacement.
+void assemble_slopes(const Domains& domains, const double* slope, const Transfers& displacement,
+                     const Transfers& pressure, const Between& target);
+
+// Add T_p^T diag(factors) T_p with factors at the points, (count, points).
+void assemble_diagonal(std::size_t count, int points, const double* factors,
+                       const Transfers& pressure, const std::int32_t* positions, double* values);
+
+// Set sizes at the points to w |S : G| |u|, term by term, with u at the nodes.
+void slope_sizes(const Domains& domains, const double* slope, const double* u, double* sizes);
 
 using Kernel = void (*)(double*, const double*, const double*, const double*, const int*,
                         const std::uint8_t*, void*);

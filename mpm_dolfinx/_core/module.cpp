@@ -4,6 +4,7 @@
 // The compiled loops as Python functions: arrays and addresses of kernels, nothing else.
 
 #include <string>
+#include <tuple>
 #include <type_traits>
 #include <utility>
 #include <vector>
@@ -39,10 +40,24 @@ auto to_numpy(Entries&& entries)
                          to_numpy(std::move(entries.sources)));
 }
 
-Numbered numbered(const Indices& offsets, const Indices& nodes, int dim, const Indices& numbers)
+// Offsets, nodes and dofs a node of a pattern, and the numbers of its columns.
+using Part = std::tuple<Indices, Indices, int, Indices>;
+
+Numbered numbered(const std::vector<Part>& parts, int dim, const Indices& numbers)
 {
-  require(numbers.size() == (offsets.size() - 1) * dim, "numbers of all rows");
-  return {offsets.data(), nodes.data(), offsets.size() - 1, dim, numbers.data()};
+  Numbered result{numbers.size() / dim, dim, numbers.data(), {}};
+  for (const auto& [offsets, nodes, columns, their_numbers] : parts)
+  {
+    require(numbers.size() == (offsets.size() - 1) * dim, "numbers of all rows");
+    result.parts.push_back({offsets.data(), nodes.data(), columns, their_numbers.data()});
+  }
+  return result;
+}
+
+Dofmap dofmap_of(const Indices& dofmap)
+{
+  require(dofmap.ndim() == 2, "dofmap (n, k)");
+  return {dofmap.shape(0), static_cast<int>(dofmap.shape(1)), dofmap.data()};
 }
 
 Domains domains_of(const Indices& dofmap, const Reals& gradients, const Reals* weights)
@@ -175,25 +190,22 @@ NB_MODULE(_loops, m)
   }, "P"_a, "dofmap"_a, "gradients"_a, "weights"_a, "hoop"_a, "force"_a.noconvert(),
         "Add the integral of P : grad v to the force at the nodes.");
 
-  m.def("supports",
-        [](Indices dofmap, Reals gradients, Offsets offsets, Indices nodes, Reals values) {
-    Supports result =
-        supports(domains_of(dofmap, gradients, nullptr), rows_of(offsets, nodes, values));
+  m.def("supports", [](Indices dofmap, Offsets offsets, Indices nodes, Reals values) {
+    Supports result = supports(dofmap_of(dofmap), rows_of(offsets, nodes, values));
     return std::make_pair(to_numpy(std::move(result.offsets)), to_numpy(std::move(result.nodes)));
-  }, "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a,
+  }, "dofmap"_a, "offsets"_a, "nodes"_a, "values"_a,
         "Return the background nodes of each domain, sorted, in compressed rows.");
 
   m.def("local_transfers",
-        [](Indices dofmap, Reals gradients, Offsets offsets, Indices nodes, Reals values,
-           Offsets support_offsets, Indices support_nodes, RealsOut transfers) {
-    const Domains domains = domains_of(dofmap, gradients, nullptr);
+        [](Indices dofmap, Offsets offsets, Indices nodes, Reals values, Offsets support_offsets,
+           Indices support_nodes, RealsOut transfers) {
+    const Dofmap domains = dofmap_of(dofmap);
     require(transfers.size() == support_nodes.size() * domains.nodes, "transfers");
     local_transfers(domains, rows_of(offsets, nodes, values), support_offsets.data(),
                     support_nodes.data(), transfers.data());
   },
-        "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a, "support_offsets"_a,
-        "support_nodes"_a, "transfers"_a.noconvert(),
-        "Set the values of T of each domain's nodes.");
+        "dofmap"_a, "offsets"_a, "nodes"_a, "values"_a, "support_offsets"_a, "support_nodes"_a,
+        "transfers"_a.noconvert(), "Set the values of T of each domain's nodes.");
 
   m.def("support_gradients",
         [](Indices dofmap, Reals gradients, Offsets offsets, Indices nodes, Reals values,
@@ -209,36 +221,43 @@ NB_MODULE(_loops, m)
         "Set the gradients of the background basis at each domain's single point.");
 
   m.def("pattern",
-        [](Offsets offsets, Indices nodes, std::size_t num_nodes) {
-    require(offsets.size() > 0, "offsets of supports (n + 1)");
-    Pattern result = pattern(offsets.data(), nodes.data(), offsets.size() - 1, num_nodes);
+        [](Offsets row_offsets, Indices row_nodes, std::size_t num_rows, Offsets column_offsets,
+           Indices column_nodes, std::size_t num_columns) {
+    require(row_offsets.size() > 0 && row_offsets.size() == column_offsets.size(),
+            "offsets of supports (n + 1)");
+    Pattern result = pattern({row_offsets.data(), row_nodes.data(), num_rows},
+                             {column_offsets.data(), column_nodes.data(), num_columns},
+                             row_offsets.size() - 1);
     return std::make_tuple(to_numpy(std::move(result.offsets)), to_numpy(std::move(result.nodes)),
                            to_numpy(std::move(result.positions)));
-  }, "offsets"_a, "nodes"_a, "num_nodes"_a,
-        "Return the sparsity of a sum over supports, and the place of each pair of their nodes.");
+  },
+        "row_offsets"_a, "row_nodes"_a, "num_rows"_a, "column_offsets"_a, "column_nodes"_a,
+        "num_columns"_a,
+        "Return the sparsity of a sum over domains, and the place of each pair of the nodes of "
+        "two fields that one sees.");
 
   m.def("reduce",
-        [](Indices offsets, Indices nodes, int dim, Indices numbers, std::pair<int, int> range,
-           Indices further_offsets, Indices further_columns) {
-    require(further_offsets.size() == static_cast<std::size_t>(range.second - range.first) + 1,
+        [](const std::vector<Part>& parts, int dim, Indices numbers, std::pair<int, int> rows,
+           std::pair<int, int> rank, Indices further_offsets, Indices further_columns) {
+    require(further_offsets.size() == static_cast<std::size_t>(rows.second - rows.first) + 1,
             "offsets of further entries, one for each row of the range");
-    Reduced result = reduce(numbered(offsets, nodes, dim, numbers), {range.first, range.second},
-                            further_offsets.data(), further_columns.data());
+    Reduced result =
+        reduce(numbered(parts, dim, numbers), {rows.first, rows.second},
+               {rank.first, rank.second}, further_offsets.data(), further_columns.data());
     return std::make_tuple(to_numpy(std::move(result.inside)), to_numpy(std::move(result.outside)),
                            to_numpy(std::move(result.places)));
   },
-        "offsets"_a, "nodes"_a, "dim"_a, "numbers"_a, "range"_a, "further_offsets"_a,
+        "parts"_a, "dim"_a, "numbers"_a, "rows"_a, "rank"_a, "further_offsets"_a,
         "further_columns"_a,
-        "Return the rows of a pattern of blocks that are numbered in a range: their columns in "
-        "the range, the other columns, and the places of further entries among both.");
+        "Return the rows of patterns of blocks that are numbered in a range: their columns of the "
+        "rank, the other columns, and the places of further entries among both.");
 
   m.def("foreign_rows",
-        [](Indices offsets, Indices nodes, int dim, Indices numbers, std::pair<int, int> range) {
-    auto [rows, entries] =
-        foreign_rows(numbered(offsets, nodes, dim, numbers), {range.first, range.second});
+        [](const std::vector<Part>& parts, int dim, Indices numbers, std::pair<int, int> range) {
+    auto [rows, entries] = foreign_rows(numbered(parts, dim, numbers), {range.first, range.second});
     return std::make_tuple(to_numpy(std::move(rows)), to_numpy(std::move(entries)));
-  }, "offsets"_a, "nodes"_a, "dim"_a, "numbers"_a, "range"_a,
-        "Return the numbered rows of a pattern of blocks that are not in a range.");
+  }, "parts"_a, "dim"_a, "numbers"_a, "range"_a,
+        "Return the numbered rows of patterns of blocks that are not in a range.");
 
   m.def("gather", [](Reals values, Array<const std::uint32_t> sources, RealsOut entries) {
     require(entries.size() == sources.size(), "sources and entries");
@@ -297,6 +316,51 @@ NB_MODULE(_loops, m)
         "dofmap"_a, "gradients"_a, "transfers"_a, "M"_a, "offsets"_a, "positions"_a,
         "values"_a.noconvert(),
         "Add the reduced masses of domains: one number for each block.");
+
+  m.def("assemble_slopes",
+        [](Indices dofmap, Reals gradients, Reals weights, Reals hoop, Reals slope, Offsets offsets,
+           Reals transfers, Offsets pressure_offsets, Reals pressure_transfers,
+           Indices of_pressure, RealsOut pressure_values, Indices of_displacement,
+           RealsOut displacement_values) {
+    Domains domains = domains_of(dofmap, gradients, &weights);
+    revolve(domains, hoop);
+    const int strain = domains.strain();
+    require(slope.size() == num_points(domains) * strain * strain, "slopes (n, nq, dim, dim)");
+    require(offsets.size() == domains.count + 1 && pressure_offsets.size() == offsets.size(),
+            "offsets of supports (n + 1)");
+    const Between target{of_pressure.size() > 0 ? of_pressure.data() : nullptr,
+                         of_displacement.size() > 0 ? of_displacement.data() : nullptr,
+                         pressure_values.data(), displacement_values.data()};
+    assemble_slopes(domains, slope.data(), {offsets.data(), transfers.data()},
+                    {pressure_offsets.data(), pressure_transfers.data()}, target);
+  },
+        "dofmap"_a, "gradients"_a, "weights"_a, "hoop"_a, "slope"_a, "offsets"_a, "transfers"_a,
+        "pressure_offsets"_a, "pressure_transfers"_a, "of_pressure"_a,
+        "pressure_values"_a.noconvert(), "of_displacement"_a, "displacement_values"_a.noconvert(),
+        "Add the blocks between a pressure at the points and the displacement.");
+
+  m.def("assemble_diagonal",
+        [](Reals factors, Offsets offsets, Reals transfers, Indices positions, RealsOut values) {
+    require(factors.ndim() == 2 && offsets.size() == factors.shape(0) + 1, "factors (n, nq)");
+    assemble_diagonal(factors.shape(0), static_cast<int>(factors.shape(1)), factors.data(),
+                      {offsets.data(), transfers.data()}, positions.data(), values.data());
+  },
+        "factors"_a, "offsets"_a, "transfers"_a, "positions"_a, "values"_a.noconvert(),
+        "Add the block of a pressure with factors at the points.");
+
+  m.def("slope_sizes",
+        [](Indices dofmap, Reals gradients, Reals weights, Reals hoop, Reals slope, Reals u,
+           RealsOut sizes) {
+    Domains domains = domains_of(dofmap, gradients, &weights);
+    revolve(domains, hoop);
+    const int strain = domains.strain();
+    require(slope.size() == num_points(domains) * strain * strain
+                && sizes.size() == num_points(domains),
+            "slopes (n, nq, dim, dim) and sizes (n, nq)");
+    slope_sizes(domains, slope.data(), u.data(), sizes.data());
+  },
+        "dofmap"_a, "gradients"_a, "weights"_a, "hoop"_a, "slope"_a, "u"_a, "sizes"_a.noconvert(),
+        "Set sizes to those of slopes times strains at the points, summed up without signs.");
 
   m.def("assemble_form",
         [](std::uintptr_t kernel, Indices entities, Reals coefficients, Reals constants, Reals x,

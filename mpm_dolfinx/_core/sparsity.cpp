@@ -7,13 +7,12 @@
 #include <numeric>
 #include <stdexcept>
 
-core::Pattern core::pattern(const std::int64_t* offsets, const std::int32_t* nodes,
-                            std::size_t count, std::size_t num_nodes)
+core::Pattern core::pattern(const Seen& rows, const Seen& columns, std::size_t count)
 {
   // Which domains see a node, and as which of theirs.
-  std::vector<std::int64_t> first(num_nodes + 1, 0);
-  for (std::int64_t e = 0; e < offsets[count]; ++e)
-    ++first[nodes[e] + 1];
+  std::vector<std::int64_t> first(rows.num_nodes + 1, 0);
+  for (std::int64_t e = 0; e < rows.offsets[count]; ++e)
+    ++first[rows.nodes[e] + 1];
   std::partial_sum(first.begin(), first.end(), first.begin());
   struct Visit
   {
@@ -21,34 +20,34 @@ core::Pattern core::pattern(const std::int64_t* offsets, const std::int32_t* nod
     std::size_t pairs;
     std::int32_t slot;
   };
-  std::vector<Visit> visits(offsets[count]);
+  std::vector<Visit> visits(rows.offsets[count]);
   std::vector<std::int64_t> next(first.begin(), first.end() - 1);
   std::size_t pairs = 0;
   for (std::size_t p = 0; p < count; ++p)
   {
-    const std::size_t size = offsets[p + 1] - offsets[p];
+    const std::size_t size = rows.offsets[p + 1] - rows.offsets[p];
     for (std::size_t a = 0; a < size; ++a)
-      visits[next[nodes[offsets[p] + a]]++] = {static_cast<std::int64_t>(p), pairs,
-                                               static_cast<std::int32_t>(a)};
-    pairs += size * size;
+      visits[next[rows.nodes[rows.offsets[p] + a]]++] = {static_cast<std::int64_t>(p), pairs,
+                                                         static_cast<std::int32_t>(a)};
+    pairs += size * (columns.offsets[p + 1] - columns.offsets[p]);
   }
 
   Pattern result;
-  result.offsets.reserve(num_nodes + 1);
+  result.offsets.reserve(rows.num_nodes + 1);
   result.offsets.push_back(0);
   result.positions.resize(pairs);
-  std::vector<std::int32_t> place(num_nodes, -1);
-  for (std::size_t row = 0; row < num_nodes; ++row)
+  std::vector<std::int32_t> place(columns.num_nodes, -1);
+  for (std::size_t row = 0; row < rows.num_nodes; ++row)
   {
     const auto start = static_cast<std::int32_t>(result.nodes.size());
     for (std::int64_t v = first[row]; v < first[row + 1]; ++v)
     {
       const std::int64_t p = visits[v].domain;
-      for (std::int64_t e = offsets[p]; e < offsets[p + 1]; ++e)
-        if (place[nodes[e]] < start)
+      for (std::int64_t e = columns.offsets[p]; e < columns.offsets[p + 1]; ++e)
+        if (place[columns.nodes[e]] < start)
         {
-          place[nodes[e]] = start;
-          result.nodes.push_back(nodes[e]);
+          place[columns.nodes[e]] = start;
+          result.nodes.push_back(columns.nodes[e]);
         }
     }
     std::sort(result.nodes.begin() + start, result.nodes.end());
@@ -57,10 +56,10 @@ core::Pattern core::pattern(const std::int64_t* offsets, const std::int32_t* nod
     for (std::int64_t v = first[row]; v < first[row + 1]; ++v)
     {
       const std::int64_t p = visits[v].domain;
-      const std::size_t size = offsets[p + 1] - offsets[p];
+      const std::size_t size = columns.offsets[p + 1] - columns.offsets[p];
       for (std::size_t b = 0; b < size; ++b)
         result.positions[visits[v].pairs + visits[v].slot * size + b] =
-            place[nodes[offsets[p] + b]];
+            place[columns.nodes[columns.offsets[p] + b]];
     }
     // Every place of a row is at or after its start, so the next row finds none of them new.
     for (std::size_t e = start; e < result.nodes.size(); ++e)
@@ -72,39 +71,53 @@ core::Pattern core::pattern(const std::int64_t* offsets, const std::int32_t* nod
 
 namespace
 {
-// Call f(column, source) for the entries of a row of scalars.
-template <typename F>
-void for_each_entry(const core::Numbered& pattern, std::size_t row, F&& f)
+// The number of values of a pattern.
+std::size_t num_values(const core::Numbered& patterns, const core::Columns& part)
 {
-  const std::size_t dim = pattern.dim, node = row / dim, i = row % dim;
-  for (std::int32_t e = pattern.offsets[node]; e < pattern.offsets[node + 1]; ++e)
-    for (std::size_t j = 0; j < dim; ++j)
-    {
-      const std::int32_t column = pattern.numbers[pattern.nodes[e] * dim + j];
-      if (column >= 0)
-        f(column, static_cast<std::uint32_t>((e * dim + i) * dim + j));
-    }
+  return static_cast<std::size_t>(part.offsets[patterns.num_nodes]) * patterns.dim * part.dim;
 }
 
-std::size_t num_values(const core::Numbered& pattern)
+// The number of values of all patterns.
+std::size_t num_values(const core::Numbered& patterns)
 {
-  const std::size_t count =
-      static_cast<std::size_t>(pattern.offsets[pattern.num_nodes]) * pattern.dim * pattern.dim;
+  std::size_t count = 0;
+  for (const core::Columns& part : patterns.parts)
+    count += num_values(patterns, part);
   if (count >= UINT32_MAX)
     throw std::overflow_error("too many entries for one rank; use more ranks");
   return count;
 }
+
+// Call f(column, source) for the entries of a row of scalars.
+template <typename F>
+void for_each_entry(const core::Numbered& patterns, std::size_t row, F&& f)
+{
+  const std::size_t rows = patterns.dim, node = row / rows, i = row % rows;
+  std::size_t first = 0;
+  for (const core::Columns& part : patterns.parts)
+  {
+    const std::size_t dim = part.dim;
+    for (std::int32_t e = part.offsets[node]; e < part.offsets[node + 1]; ++e)
+      for (std::size_t j = 0; j < dim; ++j)
+      {
+        const std::int32_t column = part.numbers[part.nodes[e] * dim + j];
+        if (column >= 0)
+          f(column, static_cast<std::uint32_t>(first + (e * rows + i) * dim + j));
+      }
+    first += num_values(patterns, part);
+  }
+}
 } // namespace
 
-core::Reduced core::reduce(const Numbered& pattern, Range range,
+core::Reduced core::reduce(const Numbered& patterns, Range rows, Range rank,
                            const std::int32_t* further_offsets, const std::int32_t* further_columns)
 {
-  const auto none = static_cast<std::uint32_t>(num_values(pattern));
-  const std::int32_t count = range.last - range.first;
+  const auto none = static_cast<std::uint32_t>(num_values(patterns));
+  const std::int32_t count = rows.last - rows.first;
   std::vector<std::int64_t> row_of(count, -1);
-  for (std::size_t row = 0; row < pattern.num_nodes * pattern.dim; ++row)
-    if (pattern.numbers[row] >= range.first && pattern.numbers[row] < range.last)
-      row_of[pattern.numbers[row] - range.first] = static_cast<std::int64_t>(row);
+  for (std::size_t row = 0; row < patterns.num_nodes * patterns.dim; ++row)
+    if (patterns.numbers[row] >= rows.first && patterns.numbers[row] < rows.last)
+      row_of[patterns.numbers[row] - rows.first] = static_cast<std::int64_t>(row);
 
   Reduced result;
   result.places.reserve(further_offsets[count]);
@@ -113,7 +126,7 @@ core::Reduced core::reduce(const Numbered& pattern, Range range,
   {
     line.clear();
     if (row_of[r] >= 0)
-      for_each_entry(pattern, row_of[r], [&](std::int32_t column, std::uint32_t source) {
+      for_each_entry(patterns, row_of[r], [&](std::int32_t column, std::uint32_t source) {
         line.emplace_back(column, source);
       });
     for (std::int32_t e = further_offsets[r]; e < further_offsets[r + 1]; ++e)
@@ -127,19 +140,19 @@ core::Reduced core::reduce(const Numbered& pattern, Range range,
       if (column == last)
         continue;
       last = column;
-      const bool inside = column >= range.first && column < range.last;
+      const bool inside = column >= rank.first && column < rank.last;
       Entries& part = inside ? result.inside : result.outside;
-      part.columns.push_back(inside ? column - range.first : column);
+      part.columns.push_back(inside ? column - rank.first : column);
       part.sources.push_back(source);
     }
     // Places outside are counted below zero until the number of those inside is known.
     for (std::int32_t e = further_offsets[r]; e < further_offsets[r + 1]; ++e)
     {
       const std::int32_t column = further_columns[e];
-      const bool inside = column >= range.first && column < range.last;
+      const bool inside = column >= rank.first && column < rank.last;
       const auto& columns = inside ? result.inside.columns : result.outside.columns;
       const auto place = std::lower_bound(columns.begin() + start[inside ? 0 : 1], columns.end(),
-                                          inside ? column - range.first : column)
+                                          inside ? column - rank.first : column)
                          - columns.begin();
       result.places.push_back(inside ? place : -1 - place);
     }
@@ -153,18 +166,18 @@ core::Reduced core::reduce(const Numbered& pattern, Range range,
   return result;
 }
 
-std::pair<std::vector<std::int32_t>, core::Entries> core::foreign_rows(const Numbered& pattern,
+std::pair<std::vector<std::int32_t>, core::Entries> core::foreign_rows(const Numbered& patterns,
                                                                        Range range)
 {
-  num_values(pattern);
+  num_values(patterns);
   std::pair<std::vector<std::int32_t>, Entries> result;
   auto& [rows, entries] = result;
-  for (std::size_t row = 0; row < pattern.num_nodes * pattern.dim; ++row)
+  for (std::size_t row = 0; row < patterns.num_nodes * patterns.dim; ++row)
   {
-    const std::int32_t number = pattern.numbers[row];
+    const std::int32_t number = patterns.numbers[row];
     if (number < 0 || (number >= range.first && number < range.last))
       continue;
-    for_each_entry(pattern, row, [&](std::int32_t column, std::uint32_t source) {
+    for_each_entry(patterns, row, [&](std::int32_t column, std::uint32_t source) {
       entries.columns.push_back(column);
       entries.sources.push_back(source);
     });

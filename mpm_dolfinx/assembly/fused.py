@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -20,11 +20,20 @@ from ..constitutive.averaging import LowRankTerm
 from ..errors import MPMError
 from ..history import Statistics
 from ..parallel.exchange import swap
+from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..transfer.touched import TouchedNodes, TransferRows
 from .body_forms import BodyForms, no_values
 
-__all__ = ["ROUTES", "FusedTangent", "Masses", "Restriction", "is_fast"]
+__all__ = [
+    "ROUTES",
+    "CoupledBlocks",
+    "Coupling",
+    "FusedTangent",
+    "Masses",
+    "Restriction",
+    "is_fast",
+]
 
 ROUTES = ("auto", "fast", "reference")
 
@@ -51,37 +60,60 @@ def is_fast(route: str) -> bool:
     return route == "fast"
 
 
+class Support:
+    """The background nodes that each domain of a body sees, and T of its nodes.
+
+    Args:
+        dofmap: Local nodes of W of each domain, shape ``(n, k)``.
+
+    Attributes:
+        offsets: Where the nodes of each domain begin, shape ``(n + 1,)``.
+        nodes: Numbers of these among the touched nodes.
+    """
+
+    def __init__(self, dofmap: NDArray[np.int32]) -> None:
+        self._dofmap = dofmap
+        self.offsets: NDArray[np.int64] = np.zeros(1, dtype=np.int64)
+        self.nodes: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
+
+    def find(self, rows: TransferRows) -> bool:
+        """Find the nodes; return whether they are the old ones."""
+        offsets, nodes = loops.supports(self._dofmap, *rows)
+        same = np.array_equal(offsets, self.offsets) and np.array_equal(nodes, self.nodes)
+        self.offsets, self.nodes = offsets, nodes
+        return same
+
+    def transfers(self, rows: TransferRows) -> NDArray[np.float64]:
+        """Return T of each domain, ``(number of nodes, k)`` one after the other."""
+        found = np.empty((len(self.nodes), self._dofmap.shape[1]))
+        loops.local_transfers(self._dofmap, *rows, self.offsets, self.nodes, found)
+        return found
+
+
 class _Loops:
     """One body's domains, their background nodes and where their tangents go."""
 
-    def __init__(self, particles: Particles, forms: BodyForms) -> None:
-        self._particles = particles
+    def __init__(self, particles: Particles, forms: BodyForms, coupled: bool) -> None:
+        self.particles = particles
         self._forms = forms
         self._domains = (particles.domain_nodes, particles.quadrature.gradients)
         internal = forms.internal
         one = particles.num_points == 1
         self._points = internal is not None and one and internal.hoop is None
-        self._whole = bool(forms.fused) or (internal is not None and not self._points)
-        self.offsets: NDArray[np.int64] = np.zeros(1, dtype=np.int64)
-        self.nodes: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
-        self.positions: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
-
-    def support(self, rows: TransferRows) -> bool:
-        """Find the background nodes of each domain; return whether they are the old ones."""
-        offsets, nodes = loops.supports(*self._domains, *rows)
-        same = np.array_equal(offsets, self.offsets) and np.array_equal(nodes, self.nodes)
-        self.offsets, self.nodes = offsets, nodes
-        return same
+        whole = bool(forms.fused) or (internal is not None and not self._points)
+        self._whole = whole or coupled
+        self.support = Support(particles.domain_nodes)
+        self.transfers: NDArray[np.float64] = no_values
 
     def transfer(self, rows: TransferRows) -> None:
         """Take over the values of T."""
-        given = (*self._domains, *rows, self.offsets, self.nodes)
+        support = self.support
         if self._points:
-            self._gradients = np.empty((len(self.nodes), self._domains[1].shape[-1]))
+            self._gradients = np.empty((len(support.nodes), self._domains[1].shape[-1]))
+            given = (*self._domains, *rows, support.offsets, support.nodes)
             loops.support_gradients(*given, self._gradients)
         if self._whole:
-            self._transfers = np.empty((len(self.nodes), self._particles.domain_nodes.shape[1]))
-            loops.local_transfers(*given, self._transfers)
+            self.transfers = support.transfers(rows)
 
     @staticmethod
     def _vectors(term: LowRankTerm | None) -> NDArray[np.float64]:
@@ -92,21 +124,20 @@ class _Loops:
         return np.stack([vector for pair in pairs for vector in pair], axis=1)
 
     def add_masses(
-        self, masses: NDArray[np.float64], rows: TransferRows, values: NDArray[np.float64]
+        self,
+        masses: NDArray[np.float64],
+        rows: TransferRows,
+        positions: NDArray[np.int32],
+        values: NDArray[np.float64],
     ) -> None:
         """Add the body's reduced mass, one number for each of the pattern's blocks."""
-        if self._whole:
-            transfers = self._transfers
-        else:
-            transfers = np.empty((len(self.nodes), self._particles.domain_nodes.shape[1]))
-            loops.local_transfers(*self._domains, *rows, self.offsets, self.nodes, transfers)
-        loops.assemble_masses(
-            *self._domains, transfers, masses, self.offsets, self.positions, values
-        )
+        transfers = self.transfers if self._whole else self.support.transfers(rows)
+        offsets = self.support.offsets
+        loops.assemble_masses(*self._domains, transfers, masses, offsets, positions, values)
 
-    def add(self, values: NDArray[np.float64]) -> None:
+    def add(self, positions: NDArray[np.int32], values: NDArray[np.float64]) -> None:
         """Add the body's reduced tangent to the values of the pattern's blocks."""
-        target = (self.offsets, self.positions, values)
+        target = (self.support.offsets, positions, values)
         internal = self._forms.internal
         if internal is not None and self._points:
             loops.assemble_points(
@@ -122,12 +153,12 @@ class _Loops:
                 *self._domains,
                 internal.weights,
                 no_values if internal.hoop is None else internal.hoop,
-                self._transfers,
+                self.transfers,
                 internal.tangent,
                 self._vectors(self._forms.low_rank_of_domains()),
                 *target,
             )
-        body = self._particles.mesh
+        body = self.particles.mesh
         geometry = (body.geometry.x, _compat.geometry_dofmap(body))
         for form in self._forms.fused:
             constants, packed = _compat.packed(form)
@@ -139,9 +170,38 @@ class _Loops:
                     constants,
                     *geometry,
                     *self._domains,
-                    self._transfers,
+                    self.transfers,
                     *target,
                 )
+
+
+class Coupling(Protocol):
+    """What a body's displacement and a field on it do to each other, for the compiled loops."""
+
+    @property
+    def places(self) -> tuple[Particles, CarriedField]:
+        """The body and the field."""
+
+    def add(self, blocks: CoupledBlocks) -> None:
+        """Add the reduced tangent but for the block of the displacement itself."""
+
+
+class CoupledBlocks(NamedTuple):
+    """Where a coupling goes: T of each domain, and places and values of three blocks.
+
+    Attributes:
+        displacement: T of the body's nodes, and where that of each domain begins.
+        field: T of the field's values, the same way.
+        of_field: Positions and values of the block with rows of the field.
+        of_displacement: Those of the block with rows of the displacement.
+        alone: Those of the field's own block.
+    """
+
+    displacement: tuple[NDArray[np.int64], NDArray[np.float64]]
+    field: tuple[NDArray[np.int64], NDArray[np.float64]]
+    of_field: tuple[NDArray[np.int32], NDArray[np.float64]]
+    of_displacement: tuple[NDArray[np.int32], NDArray[np.float64]]
+    alone: tuple[NDArray[np.int32], NDArray[np.float64]]
 
 
 class Restriction(NamedTuple):
@@ -152,12 +212,14 @@ class Restriction(NamedTuple):
         rows: Their rows of T, of each part of the tangent.
         numbers: For each own dof of V its number among all unknowns, or -1.
         part: Where the field's unknowns are among this rank's.
+        factor: Value on V of an unknown of size 1.
     """
 
     touched: TouchedNodes
     rows: Sequence[TransferRows]
     numbers: NDArray[np.int32]
     part: slice
+    factor: float = 1.0
 
 
 type Masses = Sequence[tuple[Particles, NDArray[np.float64]]]
@@ -170,11 +232,14 @@ class FusedTangent:
     Each rank adds its own domains' ``T_p^T K_p T_p`` to blocks between the background nodes
     that they touch, of whatever rank. The pattern, and with it the matrix, lasts until a node
     of a body enters another cell. Off-rank rows travel once for each assembly. The fields are
-    blocks on the diagonal of one matrix, into which each writes.
+    blocks on the diagonal of one matrix, into which each writes; what couples a body and a field on
+    it has blocks beside these.
 
     Args:
         comm: The ranks.
-        fields: Bodies with their forms, those of each field.
+        fields: Bodies with their forms, those of each field; of fields that are no displacements
+            those of ``couplings`` are known.
+        couplings: What couples a displacement and another field, with the numbers of both.
         statistics: Where to count.
     """
 
@@ -182,10 +247,18 @@ class FusedTangent:
         self,
         comm: MPI.Comm,
         fields: Sequence[Sequence[tuple[Particles, BodyForms]]],
+        couplings: Sequence[tuple[int, int, Coupling]],
         statistics: Statistics,
     ) -> None:
         self._comm = comm
-        self._blocks = [_Block(comm, bodies) for bodies in fields]
+        coupled = [coupling.places[0] for _, _, coupling in couplings]
+        self._blocks = [
+            _Block(comm, [_Loops(*body, any(body[0] is one for one in coupled)) for body in bodies])
+            for bodies in fields
+        ]
+        self._couplings = [
+            _Coupled(self._blocks[i], self._blocks[j], coupling) for i, j, coupling in couplings
+        ]
         self._statistics = statistics
         self._A: PETSc.Mat | None = None
 
@@ -203,7 +276,7 @@ class FusedTangent:
             self._make_matrix(fields, sizes)
             self._statistics.count("patterns")
         for block, field in zip(self._blocks, fields, strict=True):
-            block.transfer(field.rows)
+            block.transfer(field)
 
     def forget(self) -> None:
         """Make the pattern anew in the next step."""
@@ -212,15 +285,14 @@ class FusedTangent:
     def _make_matrix(self, fields: Sequence[Restriction], sizes: tuple[int, int]) -> None:
         lasts = np.cumsum(self._comm.allgather(sizes[0]))
         start = int(lasts[self._comm.rank]) - sizes[0]
+        for block in self._blocks:
+            block.make_patterns()
         found = [
-            block.make_pattern((start + field.part.start, start + field.part.stop), lasts)
+            block.make_rows((start + field.part.start, start + field.part.stop), start, lasts)
             for block, field in zip(self._blocks, fields, strict=True)
         ]
         parts = [field.part for field in fields]
-        inside = [
-            (starts, part.start + columns)
-            for part, ((starts, columns), _) in zip(parts, found, strict=True)
-        ]
+        inside = [own for own, _ in found]
         outside = [others for _, others in found]
         csr = [_stacked(parts, entries, sizes[0]) for entries in (inside, outside)]
         values = [np.zeros(len(columns)) for _, columns in csr]
@@ -265,6 +337,10 @@ class FusedTangent:
             factor: How often the masses of :meth:`weigh` are added, if there are any.
         """
         assert self._A is not None
+        for block in self._blocks:
+            block.begin()
+        for coupled in self._couplings:
+            coupled.add()
         for block, kept in zip(self._blocks, keep, strict=True):
             block.assemble(kept, factor)
         self._A.assemble()
@@ -272,6 +348,8 @@ class FusedTangent:
 
     def multiply_add(self, field: int, u: PETSc.Vec, force: PETSc.Vec) -> None:
         """Add a field's last ``T^T K T u`` on all active dofs, fixed ones too (collective).
+
+        What couples it with other fields has no part in it.
 
         Args:
             field: Its number.
@@ -294,8 +372,89 @@ def _stacked(
     return np.cumsum(counts, dtype=PETSc.IntType), columns.astype(PETSc.IntType)
 
 
+class _Pattern:
+    """Blocks between the nodes of one field and those of another, or of the same.
+
+    Args:
+        rows: The field of the rows.
+        columns: The field of the columns.
+    """
+
+    def __init__(self, rows: _Block, columns: _Block) -> None:
+        self._rows, self.columns = rows, columns
+        self._pairs: list[tuple[Support, Support]] = []
+        self.values: NDArray[np.float64] = no_values
+
+    def take(self, rows: Support, columns: Support) -> int:
+        """Take over domains that see nodes of both fields; return their number."""
+        self._pairs.append((rows, columns))
+        return len(self._pairs) - 1
+
+    def make(self) -> None:
+        """Find the blocks, and the place of each pair of nodes of a domain among them."""
+        rows, columns = (_joined([pair[side] for pair in self._pairs]) for side in range(2))
+        sizes = self._rows.num_touched, self.columns.num_touched
+        self.offsets, self.nodes, positions = loops.pattern(*rows, sizes[0], *columns, sizes[1])
+        counts = [
+            int((np.diff(one.offsets) * np.diff(other.offsets)).sum()) for one, other in self._pairs
+        ]
+        self.positions = np.split(positions, np.cumsum(counts)[:-1])
+
+    @property
+    def size(self) -> int:
+        """Number of values."""
+        return len(self.nodes) * self._rows.bs * self.columns.bs
+
+    def of(self, number: int) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        """Return positions of the domains that were taken over with this number, and the values."""
+        return self.positions[number], self.values
+
+    @property
+    def part(self) -> tuple[Any, ...]:
+        """What the compiled loops must know of it."""
+        return self.offsets, self.nodes, self.columns.bs, self.columns.numbers
+
+
+def _joined(supports: Sequence[Support]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Return offsets and nodes of supports one after the other."""
+    ends = np.cumsum([0, *(one.offsets[-1] for one in supports)])
+    offsets = [one.offsets[1:] + end for one, end in zip(supports, ends, strict=False)]
+    nodes = np.concatenate([one.nodes for one in supports])
+    return np.concatenate([[0], *offsets]).astype(np.int64), nodes
+
+
+class _Coupled:
+    """What couples a displacement and another field, and its places in the rows of both."""
+
+    def __init__(self, moving: _Block, other: _Block, coupling: Coupling) -> None:
+        self._coupling = coupling
+        particles, carried = coupling.places
+        self._body = moving.loops_of(particles)
+        self._number = other.take(carried)
+        self._other = other
+        mine, its = self._body.support, other.supports[self._number]
+        self._of_field = other.beside(moving), other.beside(moving).take(its, mine)
+        self._of_displacement = moving.beside(other), moving.beside(other).take(mine, its)
+        self._alone = other.beside(other), other.beside(other).take(its, its)
+
+    def add(self) -> None:
+        """Add the blocks to the values of the patterns."""
+        its = self._other.supports[self._number]
+        places = [
+            pattern.of(number)
+            for pattern, number in (self._of_field, self._of_displacement, self._alone)
+        ]
+        self._coupling.add(
+            CoupledBlocks(
+                (self._body.support.offsets, self._body.transfers),
+                (its.offsets, self._other.transfers[self._number]),
+                *places,
+            )
+        )
+
+
 class _Block:
-    """The tangent of one field.
+    """The rows of one field.
 
     Args:
         comm: The ranks.
@@ -303,59 +462,101 @@ class _Block:
 
     Attributes:
         entries: Values of the field's rows in the matrix: in columns of this rank, and in others.
+        bs: Number of dofs at a node.
+        numbers: Number of the unknown of each touched dof, or -1.
+        num_touched: Number of touched nodes.
+        supports: Those of its bodies, or of the values that it carries.
+        transfers: T of these values.
     """
 
-    def __init__(self, comm: MPI.Comm, bodies: Sequence[tuple[Particles, BodyForms]]) -> None:
+    entries: tuple[NDArray[np.float64], NDArray[np.float64]]
+
+    def __init__(self, comm: MPI.Comm, bodies: Sequence[_Loops]) -> None:
         self._comm = comm
-        self._bodies = [particles for particles, _ in bodies]
-        self._loops = [_Loops(*body) for body in bodies]
+        self._loops = list(bodies)
         self._masses: NDArray[np.float64] | None = None
-        self._bs = bodies[0][0].V.dofmap.index_map_bs if bodies else 1
+        self.bs = 1
         self._touched: TouchedNodes | None = None
-        self._numbers: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
-        self.entries: tuple[NDArray[np.float64], NDArray[np.float64]]
+        self.numbers: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
+        self.num_touched = 0
+        self.supports = [body.support for body in self._loops]
+        self.transfers: list[NDArray[np.float64]] = []
+        self._patterns: list[_Pattern] = []
+        for support in self.supports:
+            self.beside(self).take(support, support)
+
+    def loops_of(self, particles: Particles) -> _Loops:
+        """Return the loops of a body."""
+        return next(body for body in self._loops if body.particles is particles)
+
+    def take(self, carried: CarriedField) -> int:
+        """Take over values on a body; return their number among those of the field."""
+        self.supports.append(Support(carried.domain_nodes))
+        return len(self.supports) - 1
+
+    def beside(self, other: _Block) -> _Pattern:
+        """Return the pattern of the blocks with the columns of a field."""
+        for pattern in self._patterns:
+            if pattern.columns is other:
+                return pattern
+        self._patterns.append(_Pattern(self, other))
+        return self._patterns[-1]
 
     def restrict(self, field: Restriction) -> bool:
         """Take over the present unknowns; return whether their pattern is the old one."""
         self._touched = field.touched
-        if not self._loops:
+        if not self.supports:
             return True
-        numbers = field.touched.spread(field.numbers.reshape(-1, self._bs)).ravel()
-        same = bool(np.array_equal(numbers, self._numbers))
-        self._numbers = numbers
-        for body, own in zip(self._loops, field.rows, strict=True):
-            same &= body.support(own)
+        self.bs = field.touched.block_size
+        numbers = field.touched.spread(field.numbers.reshape(-1, self.bs)).ravel()
+        same = bool(np.array_equal(numbers, self.numbers))
+        self.numbers, self.num_touched = numbers, len(field.touched.nodes)
+        for support, rows in zip(self.supports, field.rows, strict=True):
+            same &= support.find(rows)
         return same
 
-    def transfer(self, rows: Sequence[TransferRows]) -> None:
+    def transfer(self, field: Restriction) -> None:
         """Take over the values of T."""
-        self._rows, self._masses = rows, None
-        for body, own in zip(self._loops, rows, strict=True):
-            body.transfer(own)
+        self._rows, self._masses = field.rows, None
+        if self._loops:
+            for body, rows in zip(self._loops, field.rows, strict=True):
+                body.transfer(rows)
+            return
+        self.transfers = [
+            support.transfers(rows._replace(values=field.factor * rows.values))
+            for support, rows in zip(self.supports, field.rows, strict=True)
+        ]
 
     def weigh(self, masses: Masses) -> None:
         """Write the masses into the field's rows, and keep them (collective)."""
-        if not self._loops:
+        if not self.supports:
             return
-        self._masses = np.zeros(len(self._blocks))
-        for body, loop, rows in zip(self._bodies, self._loops, self._rows, strict=True):
-            for particles, own in masses:
-                if particles is body:
-                    loop.add_masses(own, rows, self._masses)
-        values = np.zeros(len(self._blocks) * self._bs**2 + 1)
-        self._add_masses(1.0, values)
-        self._write(values)
+        self.begin()
+        if self._loops:
+            own = self.beside(self)
+            self._masses = np.zeros(len(own.nodes))
+            for number, (body, rows) in enumerate(zip(self._loops, self._rows, strict=True)):
+                for particles, mass in masses:
+                    if particles is body.particles:
+                        body.add_masses(mass, rows, own.positions[number], self._masses)
+            self._add_masses(1.0)
+        self._write()
 
-    def _add_masses(self, factor: float, values: NDArray[np.float64]) -> None:
+    def _add_masses(self, factor: float) -> None:
         """Add the masses, if any, to the values of the pattern's blocks."""
         if self._masses is None:
             return
-        blocks = values[:-1].reshape(-1, self._bs, self._bs)
-        for i in range(self._bs):
+        blocks = self.beside(self).values.reshape(-1, self.bs, self.bs)
+        for i in range(self.bs):
             blocks[:, i, i] += factor * self._masses
 
-    def make_pattern(
-        self, own: tuple[int, int], lasts: NDArray[np.int64]
+    def make_patterns(self) -> None:
+        """Find the blocks of the field's rows."""
+        for pattern in self._patterns:
+            pattern.make()
+
+    def make_rows(
+        self, own: tuple[int, int], start: int, lasts: NDArray[np.int64]
     ) -> tuple[
         tuple[NDArray[np.int32], NDArray[np.int32]], tuple[NDArray[np.int32], NDArray[np.int32]]
     ]:
@@ -363,31 +564,20 @@ class _Block:
 
         Args:
             own: Range of the numbers of this rank's unknowns of the field.
+            start: First number of this rank's unknowns of all fields.
             lasts: End of the range of all unknowns of each rank.
 
         Returns:
-            Entries in these columns, counted from the first of them, and in all others.
+            Entries in columns of this rank, counted from the first of them, and in all others.
         """
-        assert self._touched is not None
-        if not self._loops:
+        if not self.supports:
             none = np.zeros(own[1] - own[0] + 1, dtype=np.int32), np.zeros(0, dtype=np.int32)
             return none, none
-        ends = np.cumsum([0, *(body.offsets[-1] for body in self._loops)])
-        offsets = np.concatenate(
-            [[0], *(s.offsets[1:] + end for s, end in zip(self._loops, ends, strict=False))]
-        )
-        nodes = np.concatenate([body.nodes for body in self._loops])
-        self._pattern, self._blocks, positions = loops.pattern(
-            offsets.astype(np.int64), nodes, len(self._touched.nodes)
-        )
-        pairs = [int((np.diff(body.offsets) ** 2).sum()) for body in self._loops]
-        split = np.split(positions, np.cumsum(pairs)[:-1])
-        for body, part in zip(self._loops, split, strict=True):
-            body.positions = part
-        self._values: NDArray[np.float64] | None = None
-        blocks = (self._pattern, self._blocks, self._bs, self._numbers)
+        self._kept: NDArray[np.float64] | None = None
+        blocks = ([pattern.part for pattern in self._patterns], self.bs, self.numbers)
         starts, columns = self._exchange_rows(blocks, own, lasts)
-        inside, outside, places = loops.reduce(*blocks, own, starts, columns)
+        rank = start, int(lasts[self._comm.rank])
+        inside, outside, places = loops.reduce(*blocks, own, rank, starts, columns)
         self._sources = inside[2], outside[2]
         shift = len(inside[2])
         self._within = places < shift
@@ -413,6 +603,16 @@ class _Block:
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
         return offsets, np.ascontiguousarray(received[self._order, 1])
 
+    def begin(self) -> None:
+        """Begin an assembly: no domain has added anything."""
+        if not self.supports:
+            return
+        ends = np.cumsum([pattern.size for pattern in self._patterns])
+        self._all: NDArray[np.float64] = np.zeros(ends[-1] + 1)
+        values = np.split(self._all[:-1], ends[:-1])
+        for pattern, part in zip(self._patterns, values, strict=True):
+            pattern.values = part
+
     def assemble(self, keep: bool, factor: float) -> None:
         """Write the field's rows (collective).
 
@@ -420,32 +620,35 @@ class _Block:
             keep: Whether :meth:`multiply_add` will be called.
             factor: Of the masses.
         """
-        if not self._loops:
+        if not self.supports:
             return
-        values = np.zeros(len(self._blocks) * self._bs**2 + 1)
-        for body in self._loops:
-            body.add(values)
+        for number, body in enumerate(self._loops):
+            body.add(*self.beside(self).of(number))
         if factor != 0.0:
-            self._add_masses(factor, values)
-        self._write(values)
-        self._values = values[:-1] if keep else None
+            self._add_masses(factor)
+        self._kept = self.beside(self).values if keep and self._loops else None
+        self._write()
 
-    def _write(self, values: NDArray[np.float64]) -> None:
-        """Write the values of the pattern's blocks, summed over ranks, into the field's rows."""
+    def _write(self) -> None:
+        """Write the values of the patterns, summed over ranks, into the field's rows."""
         for sources, entries in zip(self._sources, self.entries, strict=True):
-            loops.gather(values, sources, entries)
+            loops.gather(self._all, sources, entries)
         if self._comm.size > 1:
-            received = np.concatenate(swap(self._comm, [values[part] for part in self._sent]))
+            received = np.concatenate(swap(self._comm, [self._all[part] for part in self._sent]))
             received = received[self._order]
             np.add.at(self.entries[0], self._places[0], received[self._within])
             np.add.at(self.entries[1], self._places[1], received[~self._within])
+        self._all = no_values
+        for pattern in self._patterns:
+            pattern.values = no_values
 
     def multiply_add(self, u: PETSc.Vec, force: PETSc.Vec) -> None:
         """Add the last ``T^T K T u`` on all active dofs of V, fixed ones too (collective)."""
         if not self._loops:
             return
-        assert self._values is not None and self._touched is not None
-        local = self._touched.spread(u.array_r.reshape(-1, self._bs))
+        assert self._kept is not None and self._touched is not None
+        local = self._touched.spread(u.array_r.reshape(-1, self.bs))
         result = np.empty_like(local)
-        loops.multiply(self._pattern, self._blocks, self._bs, self._values, local, result)
+        own = self.beside(self)
+        loops.multiply(own.offsets, own.nodes, self.bs, self._kept, local, result)
         force.array_w[:] += self._touched.collect(result).ravel()

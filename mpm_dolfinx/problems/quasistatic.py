@@ -567,7 +567,7 @@ class QuasiStaticProblem(ParticleProblem):
         if self.setup.mixed is None:
             return super()._couplings(contributions)
         return [
-            PressureTerm(body, CarriedField(field), acting)
+            PressureTerm(body, CarriedField(field), acting, self._compiled)
             for body, field, acting in zip(self.bodies, self.pressure, self._acting, strict=True)
         ]
 

@@ -244,7 +244,8 @@ class Field:
             return Restriction(self.touched, rows, every, slice(0, last - first)), self.u.getSizes()
         numbers = np.full(self._owned, -1, dtype=np.int32)
         numbers[self.dofs] = self._numbers
-        return Restriction(self.touched, rows, numbers, self._part_of_x), self._sizes
+        found = Restriction(self.touched, rows, numbers, self._part_of_x, self.factor)
+        return found, self._sizes
 
     @property
     def prolongation(self) -> PETSc.Mat:

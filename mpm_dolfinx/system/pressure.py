@@ -5,43 +5,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
 
 from petsc4py import PETSc
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..constitutive.pressure import VolumeStrain
+from ..assembly.fused import Coupling
+from ..assembly.pressure_blocks import PressureBlocks, PressurePoints
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from .values import FieldTerm
 
 __all__ = ["PressureTerm"]
-
-
-class PressurePoints(Protocol):
-    """A material whose mean stress is a pressure of its own."""
-
-    @property
-    def weights(self) -> NDArray[np.float64]:
-        """Undeformed volume of each point, shape ``(n, nq)``; 0 where deleted."""
-
-    @property
-    def hoop(self) -> NDArray[np.float64] | None:
-        """Hoop strains of a body of revolution's nodes, shape ``(n, nq, k)``, or ``None``."""
-
-    @property
-    def volume_strain(self) -> VolumeStrain:
-        """Volume strain, its derivative and the compliance, as they were seen last."""
-
-    @property
-    def by_pressure(self) -> NDArray[np.float64]:
-        """Derivative of the acting first Piola stress by the pressure, ``(n nq, dim, dim)``."""
-
-    @property
-    def symmetric(self) -> bool:
-        """Whether the tangents of all materials are symmetric."""
 
 
 class PressureTerm(FieldTerm):
@@ -54,12 +30,18 @@ class PressureTerm(FieldTerm):
         particles: The body.
         pressure: p, at its points.
         material: The material at its points.
+        fast: Whether the compiled loops reduce the tangent.
     """
 
     def __init__(
-        self, particles: Particles, pressure: CarriedField, material: PressurePoints
+        self,
+        particles: Particles,
+        pressure: CarriedField,
+        material: PressurePoints,
+        fast: bool = False,
     ) -> None:
         super().__init__(particles, [pressure])
+        self._coupling = PressureBlocks(particles, pressure, material) if fast else None
         self._particles, self._pressure, self._material = particles, pressure, material
         nodes = particles.domain_nodes
         gdim = particles.mesh.geometry.dim
@@ -80,6 +62,17 @@ class PressureTerm(FieldTerm):
     def symmetric(self) -> bool:
         """See :attr:`Term.symmetric`."""
         return self._material.symmetric
+
+    @property
+    def coupling(self) -> Coupling | None:
+        """See :attr:`Term.coupling`."""
+        return self._coupling
+
+    def absolute_product(self, changes: Sequence[NDArray[np.float64]]) -> Sequence[PETSc.Vec]:
+        """See :meth:`Term.absolute_product`; forces on the body's nodes are left out."""
+        assert self._coupling is not None
+        self._force.array_w[:] = self._coupling.sizes(*changes)
+        return [self._none, self._force]
 
     def residuals(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.residuals`."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assembly.body_forms import BodyForms
-from ..assembly.fused import FusedTangent, Masses
+from ..assembly.fused import Coupling, FusedTangent, Masses
 from ..assembly.petsc import MatrixSum
 from ..errors import DomainDistortionError, MPMError, agree, agreed, as_ours
 from ..history import Statistics
@@ -81,17 +81,52 @@ class ReducedSystem:
         self._start: PETSc.Vec | None = None
         groups = [[field for field in fields if not field.extends]]
         groups += [[field] for field in fields if field.extends]
+        self._coupled = [self._is_fused(term.coupling) for term in terms]
         self._groups = [
             (group, pairs)
             for group in groups
             if any(pairs := [self._fused_on(field) for field in group])
         ]
-        self.fused = [FusedTangent(self._comm, pairs, statistics) for _, pairs in self._groups]
+        self.fused = [
+            FusedTangent(self._comm, pairs, self._couplings_in(group), statistics)
+            for group, pairs in self._groups
+        ]
 
     def _fused_on(self, field: Field) -> list[tuple[Particles, BodyForms]]:
         """Return the forms on bodies of a field that the compiled loops reduce."""
         every = [pair for term in self._terms for pair in term.fused]
         return [pair for pair in every if any(pair[0] is body for body in field.bodies)]
+
+    def _is_fused(self, coupling: Coupling | None) -> bool:
+        """Return whether the compiled loops reduce what couples a body and a field on it.
+
+        Not where dofs follow others: then the tangent of a displacement is made by itself.
+        """
+        if coupling is None:
+            return False
+        moving, other = (self._place(place)[0] for place in coupling.places)
+        reduced = any(body is coupling.places[0] for body, _ in self._fused_on(moving))
+        return reduced and not moving.extends and not other.extends
+
+    def _couplings_in(self, group: Sequence[Field]) -> list[tuple[int, int, Coupling]]:
+        """Return what the compiled loops reduce between fields of a group, with their numbers."""
+        found = []
+        for term, coupled in zip(self._terms, self._coupled, strict=True):
+            if coupled and term.coupling is not None:
+                i, j = (self._place(place)[0] for place in term.coupling.places)
+                if i in group:
+                    found.append((group.index(i), group.index(j), term.coupling))
+        return found
+
+    def _reduced_on(self, field: Field) -> list[Particles | CarriedField]:
+        """Return the bodies of a field with rows of T that the compiled loops take."""
+        carried = [
+            term.coupling.places[1]
+            for term, coupled in zip(self._terms, self._coupled, strict=True)
+            if coupled and term.coupling is not None
+        ]
+        bodies: list[Particles | CarriedField] = [body for body, _ in self._fused_on(field)]
+        return bodies + [body for body in carried if self._place(body)[0] is field]
 
     def _place(self, particles: Particles | CarriedField) -> tuple[Field, Motion]:
         """Return the field that moves a body, and how."""
@@ -280,10 +315,10 @@ class ReducedSystem:
         self._extended: list[PETSc.Mat | None] = [None] * len(self.fused)
         self._tangents: list[Tangents] = []
         self._sizes_of: dict[tuple[int, int, int], PETSc.Mat] = {}
-        for fused, (group, pairs) in zip(self.fused, self._groups, strict=True):
+        for fused, (group, _) in zip(self.fused, self._groups, strict=True):
             found = [
-                field.restriction([_rows(field, body) for body, _ in own])
-                for field, own in zip(group, pairs, strict=True)
+                field.restriction([_rows(field, body) for body in self._reduced_on(field)])
+                for field in group
             ]
             fused.restrict([restriction for restriction, _ in found], found[0][1])
         self._count(numbering)
@@ -462,7 +497,10 @@ class ReducedSystem:
         with self._statistics.phase("assemble"):
             reduced = [K for term in self._terms for K in term.reduced_tangents(self._free_T)]
             parts = [self._fused_tangent(number) for number in range(len(self.fused))]
-            self._tangents = [term.tangents() for term in self._terms]
+            self._tangents = [
+                {} if coupled else term.tangents()
+                for term, coupled in zip(self._terms, self._coupled, strict=True)
+            ]
             self._sizes_of = {}
             parts += [
                 self._product(term, number, pair, K)
@@ -474,9 +512,19 @@ class ReducedSystem:
             parts += reduced
             for field in self.fields:
                 parts += field.tangents(partial(self._stiffness, field))
-            if self._value_fields:
+            if not self._has_diagonal:
                 parts.append(self._entries_on_diagonal)
             return self._sum.of(parts)
+
+    @property
+    def _has_diagonal(self) -> bool:
+        """Whether the compiled loops have places on the diagonal for all unknowns of values."""
+        own = [carried for field in self._value_fields for carried in field.carried]
+        return all(self._reduced_by_loops(carried) for carried in own)
+
+    def _reduced_by_loops(self, carried: CarriedField) -> bool:
+        """Return whether the compiled loops reduce what couples a field on a body with it."""
+        return any(body is carried for body in self._reduced_on(self._place(carried)[0]))
 
     @property
     def _entries_on_diagonal(self) -> PETSc.Mat:
@@ -648,9 +696,11 @@ class ReducedSystem:
                 K.mult(motion.of(field.u), force)
                 target = forces[self.fields.index(self._place(term.bodies[a])[0])]
                 term.bodies[a].T.multTransposeAdd(force, target, target)
-        for term in self._terms:
+        for term, coupled in zip(self._terms, self._coupled, strict=True):
             motions = [motion.of(field.u) for field, motion in map(self._place, term.bodies)]
             self._add(term, term.reduced_product(motions), forces)
+            if coupled:
+                self._add(term, term.stiffness_force(motions), forces)
         for field, force in zip(self.fields, forces, strict=True):
             field.gather_extended(force)
         return self.restricted(forces)
@@ -693,6 +743,11 @@ class ReducedSystem:
         total = field.force.duplicate()
         total.set(0.0)
         for number, (term, tangents) in enumerate(zip(self._terms, self._tangents, strict=False)):
+            if self._coupled[number]:
+                changes = [self._place(body)[1].change() for body in term.bodies]
+                for body, force in zip(term.bodies, term.absolute_product(changes), strict=True):
+                    if self._place(body)[0] is field:
+                        body.T.multTransposeAdd(force, total, total)
             for (a, b), K in tangents.items():
                 its, motion = self._place(term.bodies[a])
                 if its is not field:
@@ -817,7 +872,7 @@ def _absolute(matrix: PETSc.Mat) -> PETSc.Mat:
     return PETSc.Mat().createAIJ(matrix.getSizes(), csr=csr, comm=matrix.comm)
 
 
-def _rows(field: Field, particles: Particles) -> TransferRows:
+def _rows(field: Field, particles: Particles | CarriedField) -> TransferRows:
     """Return the rows of T of one of a field's bodies."""
     number = next(i for i, body in enumerate(field.bodies) if body is particles)
     return field.touched.rows[number]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from ..assembly.body_forms import BodyForms
+from ..assembly.fused import Coupling
 from ..constitutive.averaging import VolumeAveraging
 from ..constitutive.pressure import MeanStress
 from ..errors import MPMError
@@ -101,6 +102,11 @@ class Term:
     def fused(self) -> Sequence[tuple[Particles, BodyForms]]:
         """Forms whose tangent the compiled loops reduce domain by domain, with their bodies."""
         return ()
+
+    @property
+    def coupling(self) -> Coupling | None:
+        """What the compiled loops make of all of :meth:`tangents`; ``None``: nothing."""
+        return None
 
     @property
     def follows_load(self) -> bool:
@@ -205,7 +211,7 @@ class Term:
         Returns:
             Matrices on W_a x W_b by the numbers (a, b) of these in :attr:`bodies`; the same object
             in each call as long as its sparsity is the same. Without what :attr:`fused` and
-            :meth:`reduced_tangents` have.
+            :meth:`reduced_tangents` have; not asked for where :attr:`coupling` has it all.
         """
         return {}
 
@@ -238,6 +244,14 @@ class Term:
                 forces[a].set(0.0)
             K.multAdd(motions[b], forces[a], forces[a])
         return [forces[a] for a in range(len(self.bodies))] if forces else ()
+
+    def absolute_product(self, changes: Sequence[NDArray[np.float64]]) -> Sequence[PETSc.Vec]:
+        """Return what :attr:`coupling` is with absolute values, times changes of each body.
+
+        Args:
+            changes: Sizes of changes on this rank's own dofs of W of each body.
+        """
+        return ()
 
     def absolute_contributions(self) -> Sequence[PETSc.Vec]:
         """Return the sums of absolute values of what the residuals consist of, or nothing."""

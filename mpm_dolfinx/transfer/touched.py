@@ -39,6 +39,7 @@ class TouchedNodes:
     Attributes:
         nodes: The touched nodes, global numbers, sorted.
         rows: The rows of T of each body, in numbers of the touched nodes.
+        block_size: Number of dofs at a node of V.
         num_own: Number of this rank's own nodes of V.
         active: This rank's own nodes of V that any rank touches, local numbers, sorted.
         homes: For each of these the rank that touches it most often.
@@ -51,7 +52,7 @@ class TouchedNodes:
         self._owned = owned
         first, last = V.dofmap.index_map.local_range
         self.num_own: int = last - first
-        self._bs = V.dofmap.index_map_bs
+        self.block_size: int = V.dofmap.index_map_bs
         kept = [basis.values != 0.0 for basis in bases]
         every = np.concatenate([basis.nodes[keep] for basis, keep in zip(bases, kept, strict=True)])
         self.nodes, numbers, counts = _distinct(every)
@@ -84,7 +85,7 @@ class TouchedNodes:
 
     def on_dofs(self, nodes: NDArray[Any]) -> NDArray[Any]:
         """Return values of this rank's own nodes of V at its own dofs."""
-        return np.repeat(nodes, self._bs)
+        return np.repeat(nodes, self.block_size)
 
     def _by_owner(self, values: NDArray[Any]) -> list[NDArray[Any]]:
         return np.split(values, self._ends)

@@ -105,6 +105,67 @@ def test_both_routes():
     same_run(outcome(fast), outcome(slow), 1e-9)
 
 
+def driven(**options):
+    """Return a beam whose end is moved by nodes of the background."""
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.5, 2.0], (5, 4), QUADRILATERAL), 2)
+    body = mpm.Particles(scenes.box([0.0, 0.61], [2.0, 1.11], (8, 2), QUADRILATERAL), V, degree=2)
+    bcs = [scenes.fix(V, scenes.at(0, 0.0), value=np.array([0.05, -0.02]))]
+    return mpm.QuasiStaticProblem(body, YIELDING, bcs=bcs, mixed="pressure", **options)
+
+
+def two_lifts(**options):
+    """Return two bodies, one of them stiffer, on the same background, and under their weight."""
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 3.0], (2, 3), QUADRILATERAL), 2)
+    parts = [
+        mpm.Particles(scenes.box([0.0, low], [1.5, low + 1.0], (3, 2), QUADRILATERAL), V, degree=2)
+        for low in (0.0, 1.0)
+    ]
+    bcs = [scenes.fix(V, scenes.at(1, 0.0))]
+    options |= {"bcs": bcs, "body_force": (0.0, -1.0), "density": 1.0, "mixed": "pressure"}
+    return mpm.QuasiStaticProblem(parts, [STIFF, YIELDING], **options)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        driven,
+        two_lifts,
+        lambda **options: beam(cell=TETRAHEDRON, **options),
+        lambda **options: beam(stabilisation="aggregate", **options),
+        lambda **options: shell(cells=2, **options),
+        lambda **options: turning("midpoint", **options),
+    ],
+    ids=["driven", "two lifts", "in space", "aggregate", "revolution", "motion"],
+)
+def test_the_tangent_by_both_routes(make):
+    """What the compiled loops add up domain by domain are products of matrices, to round-off."""
+    found = []
+    for assembly in ("fast", "reference"):
+        problem = make(assembly=assembly)
+        reduced = problem.reduced
+        ends = [np.zeros(len(field.bodies[0].increment.x.array)) for field in reduced.fields]
+        for end, field in zip(ends, reduced.fields, strict=True):
+            for bc in field.conditions:
+                bc.set(end)
+        reduced.begin(ends, 1.0)
+        reduced.impose()
+        x = reduced.restricted(reduced.forces)
+        x.array_w[:] = 1e-3 * np.sin(37.0 * np.arange(*x.getOwnershipRange()))
+        force = x.duplicate()
+        assert reduced.residual(x, force) is None
+        reduced.scale(force)  # before there is a tangent
+        K = reduced.tangent()
+        scale, lift = reduced.scale(force), reduced.lift()
+        found.append((K * x, reduced.diagonal(K), lift, reduced.stiffness(x), scale))
+    for one, other in zip(*found, strict=True):
+        if isinstance(one, float):
+            assert one == pytest.approx(other, rel=1e-10)
+            continue
+        size = max(scenes.largest(other.array_r), 1e-30)
+        assert scenes.largest(one.array_r - other.array_r) <= 1e-11 * size
+    assert len(found) == 2 and (make is not driven or scenes.largest(found[0][2].array_r) > 0.0)
+
+
 def test_fields_are_split_by_their_names():
     """Blocks of displacement and pressure in an iterative solver of PETSc's."""
     lu = {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
@@ -137,7 +198,7 @@ def test_incompressible_to_the_last_digit():
     assert found[0][1] == found[1][1]
 
 
-def shell(law=VonMises(3.0 * 3.8e3, 0.4997, yield_stress=0.5), cells=4):
+def shell(law=VonMises(3.0 * 3.8e3, 0.4997, yield_stress=0.5), cells=4, **options):
     """Return a problem of a thick cylinder, one slice of it, that is blown up."""
     inner, outer, height = 1.0, 2.0, 1.0 / cells
     background = scenes.box([0.0, 0.0], [4.0, height], (4 * cells, 1), QUADRILATERAL)
@@ -157,6 +218,7 @@ def shell(law=VonMises(3.0 * 3.8e3, 0.4997, yield_stress=0.5), cells=4):
         facet_tags=tags,
         bcs=bcs,
         mixed="pressure",
+        **options,
     )
     return problem
 

@@ -1,0 +1,113 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The fast route for a pressure at a body's points: its blocks, reduced domain by domain."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from .._core import loops
+from ..constitutive.pressure import VolumeStrain
+from ..particles.field import CarriedField
+from ..particles.particles import Particles
+from .body_forms import no_values
+from .fused import CoupledBlocks
+
+__all__ = ["PressureBlocks", "PressurePoints"]
+
+#: Where nothing is to be added.
+NOWHERE: tuple[NDArray[np.int32], NDArray[np.float64]] = np.zeros(0, dtype=np.int32), no_values
+
+
+class PressurePoints(Protocol):
+    """A material whose mean stress is a pressure of its own."""
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Undeformed volume of each point, shape ``(n, nq)``; 0 where deleted."""
+
+    @property
+    def hoop(self) -> NDArray[np.float64] | None:
+        """Hoop strains of a body of revolution's nodes, shape ``(n, nq, k)``, or ``None``."""
+
+    @property
+    def volume_strain(self) -> VolumeStrain:
+        """Volume strain, its derivative and the compliance, as they were seen last."""
+
+    @property
+    def by_pressure(self) -> NDArray[np.float64]:
+        """Derivative of the acting first Piola stress by the pressure, ``(n nq, dim, dim)``."""
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the tangents of all materials are symmetric."""
+
+
+class PressureBlocks:
+    """What a pressure and the displacement of its body do to each other.
+
+    Args:
+        particles: The body.
+        pressure: The pressure, at its points.
+        material: The material at its points.
+    """
+
+    def __init__(
+        self, particles: Particles, pressure: CarriedField, material: PressurePoints
+    ) -> None:
+        self._particles, self._pressure, self._material = particles, pressure, material
+        self._change = fem.Function(particles.W)
+
+    @property
+    def places(self) -> tuple[Particles, CarriedField]:
+        """The body and the pressure."""
+        return self._particles, self._pressure
+
+    @property
+    def _domains(self) -> tuple[NDArray[np.int32], *tuple[NDArray[np.float64], ...]]:
+        """What the loops must know of the domains."""
+        hoop = self._material.hoop
+        return (
+            self._particles.domain_nodes,
+            self._particles.quadrature.gradients,
+            self._material.weights,
+            no_values if hoop is None else hoop,
+        )
+
+    def add(self, blocks: CoupledBlocks) -> None:
+        """Add the blocks (see :class:`~mpm_dolfinx.assembly.fused.Coupling`)."""
+        found, places = self._material.volume_strain, (*blocks.displacement, *blocks.field)
+        beside = NOWHERE if not self._material.symmetric else blocks.of_displacement
+        loops.assemble_slopes(*self._domains, found.slope, *places, *blocks.of_field, *beside)
+        if not self._material.symmetric:
+            slope = np.ascontiguousarray(self._material.by_pressure)
+            loops.assemble_slopes(*self._domains, slope, *places, *NOWHERE, *blocks.of_displacement)
+        weights = self._material.weights
+        factors = -weights * found.compliance.reshape(weights.shape)
+        loops.assemble_diagonal(factors, *blocks.field, *blocks.alone)
+
+    def sizes(
+        self, moved: NDArray[np.float64], pressed: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return what changes add to the constraint at each point, in sizes (collective).
+
+        Args:
+            moved: Sizes of changes of displacement, on own dofs of W.
+            pressed: Those of changes of the pressure at own points.
+
+        Returns:
+            Shape ``(n nq,)``.
+        """
+        found, weights = self._material.volume_strain, self._material.weights
+        values = self._change.x
+        values.array[: len(moved)] = moved
+        values.scatter_forward()
+        result = np.empty(weights.size)
+        loops.slope_sizes(*self._domains, found.slope, values.array, result)
+        of_pressure = weights.ravel() * found.compliance * pressed[: weights.size]
+        return np.asarray(result + np.abs(of_pressure))
