@@ -100,8 +100,9 @@ def error_of_a_term(term, bodies, start):
         start: Displacements at which to look, for each body.
     """
     some = np.random.default_rng(7)
-    X = [body.W.tabulate_dof_coordinates()[:, :2] for body in bodies]
-    ways = [1e-8 * np.sin(x @ some.uniform(3, 9, (2, 2)) + i).ravel() for i, x in enumerate(X)]
+    dim = bodies[0].mesh.geometry.dim
+    X = [body.W.tabulate_dof_coordinates()[:, :dim] for body in bodies]
+    ways = [1e-8 * np.sin(x @ some.uniform(3, 9, (dim, dim)) + i).ravel() for i, x in enumerate(X)]
 
     def forces(factor):
         for body, d, way in zip(bodies, start, ways, strict=True):

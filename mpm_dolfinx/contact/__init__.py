@@ -9,6 +9,7 @@ whatever the background's cells. A contact is a term: give it to a problem as ``
 from .law import Coulomb
 from .pair import Pair
 from .rigid import Rigid
+from .rigid_body import RigidBody
 from .shapes import (
     Shape,
     box,
@@ -26,6 +27,7 @@ __all__ = [
     "Coulomb",
     "Pair",
     "Rigid",
+    "RigidBody",
     "Shape",
     "box",
     "cavity",

@@ -128,7 +128,12 @@ class Contact(Term):
 
     def kept(self) -> Sequence[Kept]:
         """See :meth:`Term.kept`."""
-        return [_Anchors(self, f"contact{self._number}")]
+        return [_Anchors(self, self._key)]
+
+    @property
+    def _key(self) -> str:
+        """What it is known by in a checkpoint."""
+        return f"contact{self._number}"
 
     def numbers(self) -> dict[str, Any]:
         """Return what is kept besides columns; see :class:`Kept`."""

@@ -34,6 +34,7 @@ from .law import (
     shear_derivative,
     traction,
 )
+from .rotation import Pose
 from .shapes import Shape, as_positive
 from .surface import Blocks, PointMatrix, Surface, global_dofs
 from .whole_step import corrected, mean_pressure, pressure_slope
@@ -62,35 +63,6 @@ STEEP = 0.1
 OPPOSITE, OPPOSITE_FREE = -0.5, -0.1
 
 
-class _Pose(NamedTuple):
-    """Where a shape is: ``x = pivot + offset + Q (y - pivot)``.
-
-    Attributes:
-        offset: Shape ``(gdim,)``.
-        angle: Angle, ``(1,)``, or vector of rotation ``(3,)``.
-    """
-
-    offset: NDArray[np.float64]
-    angle: NDArray[np.float64]
-
-    def middle(self, other: _Pose) -> _Pose:
-        """Return the pose halfway to another."""
-        return _Pose(0.5 * (self.offset + other.offset), 0.5 * (self.angle + other.angle))
-
-    @property
-    def Q(self) -> NDArray[np.float64]:
-        """The rotation (by Rodrigues' formula in space)."""
-        if len(self.angle) == 1:
-            c, s = np.cos(self.angle[0]), np.sin(self.angle[0])
-            return np.array([[c, -s], [s, c]])
-        size = float(np.linalg.norm(self.angle))
-        if size == 0.0:
-            return np.eye(3)
-        x, y, z = self.angle / size
-        W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        return np.asarray(np.eye(3) + np.sin(size) * W + (1.0 - np.cos(size)) * W @ W)
-
-
 @dataclass(frozen=True)
 class _Memory:
     """What is known of the last converged step.
@@ -107,7 +79,7 @@ class _Memory:
         behind: Tractions by the stress behind the facets, where these count, ``(m, nq, gdim)``.
     """
 
-    pose: _Pose
+    pose: Pose
     touched: NDArray[np.bool_]
     anchor: NDArray[np.float64]
     gap: NDArray[np.float64]
@@ -242,7 +214,7 @@ class Rigid(Contact):
         self._surface = Surface(
             particles, facet_tags, tag, quadrature_degree, axisymmetric, "A Rigid"
         )
-        self._pose = self._aim = _Pose(np.zeros(gdim), np.zeros(1 if gdim == 2 else 3))
+        self._pose = self._aim = Pose(np.zeros(gdim), np.zeros(1 if gdim == 2 else 3))
         self._memory: _Memory | None = None
         self._trial: _Memory | None = None
 
@@ -278,7 +250,7 @@ class Rigid(Contact):
                 f"An obstacle moves by an offset of {gdim} numbers and an angle of {count}, not "
                 f"{offset!r} and {angle!r}."
             )
-        self._pose = self._aim = _Pose(to, turn)
+        self._pose = self._aim = Pose(to, turn)
 
     @property
     def offset(self) -> NDArray[np.float64]:
@@ -322,7 +294,7 @@ class Rigid(Contact):
             raise MPMError(f"Points have the shape (n, {self.shape.dim}), not {points.shape}.")
         return self.placed().distance(points)
 
-    def _framed(self, x: NDArray[Any], pose: _Pose) -> NDArray[Any]:
+    def _framed(self, x: NDArray[Any], pose: Pose) -> NDArray[Any]:
         """Return positions in the frame of the shape."""
         return (x - self.shape.pivot - pose.offset) @ pose.Q + self.shape.pivot
 
@@ -403,7 +375,7 @@ class Rigid(Contact):
             self._behind = self._groups = None
             self._begin_anew(self._pose)
 
-    def _begin_anew(self, pose: _Pose) -> None:
+    def _begin_anew(self, pose: Pose) -> None:
         """Take the converged positions for those of points that nothing has touched yet."""
         x = self._surface.positions(converged=True)
         m, nq, gdim = x.shape
@@ -456,7 +428,7 @@ class Rigid(Contact):
                 )
         return ()
 
-    def _passes(self, memory: _Memory, x: NDArray[np.float64], pose: _Pose) -> bool:
+    def _passes(self, memory: _Memory, x: NDArray[np.float64], pose: Pose) -> bool:
         """Return whether points get deep into the obstacle, or through it, on a straight way.
 
         Args:
@@ -593,7 +565,7 @@ class Rigid(Contact):
             pressure = nitsche(points, (behind @ Q).reshape(-1, gdim), phi, n, touch).pressure
         if self._of_step:
             step = self._step(points, memory, y, phi)
-            pushes, Q = step.gradient, memory.pose.middle(pose).Q
+            pushes, Q = step.gradient, memory.pose.mean(pose)
             pressure = step.pressure
         acts = traction(
             self.friction,
@@ -718,18 +690,8 @@ class Rigid(Contact):
         """See :meth:`Term.tangents`."""
         assert self._trial is not None and self._memory is not None
         trial, memory, surface = self._trial, self._memory, self._surface
-        acting = trial.touched
-        if self._of_step:
-            acting = acting | (memory.gap <= surface.touch)
-        if trial.behind is not None:
-            every = np.arange(acting.size)
-            acting = acting | self._push(trial, memory, every).acts.reshape(acting.shape)
-        which = np.flatnonzero(
-            acting.any(axis=1) & (surface.weights.max(axis=1, initial=0.0) > 0.0)
-        )
+        which, inside, flat = self._acting(trial, memory)
         D = np.zeros((len(which), surface.nq, surface.gdim, surface.gdim))
-        inside = acting[which]
-        flat = (which[:, None] * surface.nq + np.arange(surface.nq))[inside]
         if len(flat):
             D[inside] = self._derivative(trial, memory, flat) / self._share
         N, w = surface.shapes, surface.weights[which]
@@ -827,11 +789,38 @@ class Rigid(Contact):
         )
         return np.asarray(force @ pose.Q.T)
 
+    def _acting(
+        self, trial: _Memory, memory: _Memory
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.int64]]:
+        """Return facets that touch, which of their points do, and the numbers of these points."""
+        surface, acting = self._surface, trial.touched
+        if self._of_step:
+            acting = acting | (memory.gap <= surface.touch)
+        if trial.behind is not None:
+            every = np.arange(acting.size)
+            acting = acting | self._push(trial, memory, every).acts.reshape(acting.shape)
+        which = np.flatnonzero(
+            acting.any(axis=1) & (surface.weights.max(axis=1, initial=0.0) > 0.0)
+        )
+        inside = acting[which]
+        return which, inside, (which[:, None] * surface.nq + np.arange(surface.nq))[inside]
+
     def _derivative(
         self, trial: _Memory, memory: _Memory, flat: NDArray[np.int64]
     ) -> NDArray[np.float64]:
         """Return the derivative of the traction by positions at some points that touch."""
-        surface, gdim, Q = self._surface, self._surface.gdim, trial.pose.Q
+        Q = self._rotation(trial, memory)
+        return np.asarray(Q @ self._derivative_within(trial, memory, flat) @ trial.pose.Q.T)
+
+    def _rotation(self, trial: _Memory, memory: _Memory) -> NDArray[np.float64]:
+        """Return what turns tractions out of the frame of the shape."""
+        return memory.pose.mean(trial.pose) if self._of_step else trial.pose.Q
+
+    def _derivative_within(
+        self, trial: _Memory, memory: _Memory, flat: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return :meth:`_derivative` in the frame of the shape."""
+        surface, gdim = self._surface, self._surface.gdim
         y = self._framed(trial.outcome.positions, trial.pose).reshape(-1, gdim)
         n, gap = trial.normal.reshape(-1, gdim)[flat], trial.gap.ravel()[flat]
         points = self._points(memory).of(flat)
@@ -840,7 +829,7 @@ class Rigid(Contact):
         if not self._of_step:
             H = self.shape.curvature(y[flat])
             push = None if trial.behind is None else self._push(trial, memory, flat, bent=True)
-            return np.asarray(Q @ derivative(law, points, delta, gap, n, H, touch, push) @ Q.T)
+            return derivative(law, points, delta, gap, n, H, touch, push)
         assert trial.step is not None
         step = _Step(*(part[flat] for part in trial.step))
         H = 0.5 * self.shape.curvature(step.middle)
@@ -858,7 +847,7 @@ class Rigid(Contact):
             acts = traction(law, points, delta, gap, step.normal, touch, step.pressure)
             dp = slope[:, None] * n
             D = D + shear_derivative(law, points, delta, gap, step.normal, H, touch, acts, dp, n)
-        return np.asarray(memory.pose.middle(trial.pose).Q @ D @ Q.T)
+        return np.asarray(D)
 
     # -- What it remembers ------------------------------------------------------------------------
 
@@ -936,7 +925,7 @@ class Rigid(Contact):
     def take(self, taken: Taken) -> None:
         """Take what was kept (collective)."""
         columns = taken.columns[self._places[0]]
-        pose = _Pose(*(np.array(taken.numbers[name]) for name in ("offset", "angle")))
+        pose = Pose(*(np.array(taken.numbers[name]) for name in ("offset", "angle")))
         surface = self._surface
         self._settle()
         surface.restore(columns)

@@ -346,13 +346,18 @@ class PointMatrix:
     """A matrix on W of bodies by dense blocks, whose pattern grows as blocks come up.
 
     Args:
-        rows: Space of its rows.
+        rows: Space of its rows, or their number, if all are on the first rank.
         columns: Space of its columns.
     """
 
-    def __init__(self, rows: fem.FunctionSpace, columns: fem.FunctionSpace) -> None:
-        self._spaces = rows, columns
-        self._comm: MPI.Comm = rows.mesh.comm
+    def __init__(self, rows: fem.FunctionSpace | int, columns: fem.FunctionSpace) -> None:
+        self._comm: MPI.Comm = columns.mesh.comm
+        self._sizes = tuple(
+            (space if self._comm.rank == 0 else 0, space)
+            if isinstance(space, int)
+            else _sizes_of(space)
+            for space in (rows, columns)
+        )
         self._matrix: PETSc.Mat | None = None
         self._places: dict[tuple[int, ...], int] = {}
         self._size = 0
@@ -396,17 +401,19 @@ class PointMatrix:
 
     def _make(self) -> PETSc.Mat:
         matrix = PETSc.Mat().create(self._comm)
-        sizes = []
-        for space in self._spaces:
-            index, bs = space.dofmap.index_map, space.dofmap.index_map_bs
-            sizes.append((index.size_local * bs, index.size_global * bs))
-        matrix.setSizes(tuple(sizes))
+        matrix.setSizes(self._sizes)
         matrix.setType("aij")
         none = np.zeros(0, dtype=PETSc.IntType)
         i = np.concatenate([none, *self._i]).astype(PETSc.IntType)
         j = np.concatenate([none, *self._j]).astype(PETSc.IntType)
         _compat.set_entry_places(matrix, i, j)
         return matrix
+
+
+def _sizes_of(W: fem.FunctionSpace) -> tuple[int, int]:
+    """Return the number of dofs of this rank and of all ranks."""
+    index, bs = W.dofmap.index_map, W.dofmap.index_map_bs
+    return index.size_local * bs, index.size_global * bs
 
 
 def global_dofs(W: fem.FunctionSpace, nodes: NDArray[np.int64]) -> NDArray[np.int64]:

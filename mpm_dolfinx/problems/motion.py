@@ -23,6 +23,7 @@ from ..assembly.fused import Masses
 from ..assembly.inputs import as_expression
 from ..boundary.supports import Support
 from ..contact.contact import Contact
+from ..contact.rigid_body import RigidBody
 from ..errors import MPMError, agree, as_ours
 from ..history import Energy
 from ..parallel.garbage import weakly
@@ -162,7 +163,7 @@ class MovingProblem(TimeProblem):
         """See :meth:`TimeProblem._resume_run`."""
         self.inertia.resume()
 
-    def reaction(self, bc: fem.DirichletBC | Support | Contact) -> NDArray[np.float64]:
+    def reaction(self, bc: fem.DirichletBC | Support | Contact | RigidBody) -> NDArray[np.float64]:
         """Return the force of a support on the body: of a Dirichlet condition in the last step.
 
         That is the mean over the step, but with ``scheme="euler"``, as is that of a contact;
@@ -170,7 +171,9 @@ class MovingProblem(TimeProblem):
         :meth:`ParticleProblem.reaction`.
         """
         force = super().reaction(bc)
-        return force if isinstance(bc, Support | Contact) else self.inertia.share * force
+        return (
+            force if isinstance(bc, Support | Contact | RigidBody) else self.inertia.share * force
+        )
 
 
 def initial_velocities(

@@ -26,6 +26,7 @@ from ..assembly.rules import data_at_points
 from ..boundary.supports import Support
 from ..constitutive.averaging import Linearised
 from ..contact.contact import Contact
+from ..contact.rigid_body import RigidBody
 from ..errors import MPMError, agree, warn
 from ..history import History, Step
 from ..io import checkpoint
@@ -717,7 +718,7 @@ class ParticleProblem:
 
     # -- Results --------------------------------------------------------------------------
 
-    def reaction(self, bc: fem.DirichletBC | Support | Contact) -> NDArray[np.float64]:
+    def reaction(self, bc: fem.DirichletBC | Support | Contact | RigidBody) -> NDArray[np.float64]:
         """Return the force of a support on the body at the last converged load.
 
         The force at each dof of the condition counts once, however often the condition names
@@ -733,7 +734,7 @@ class ParticleProblem:
         Raises:
             MPMError: The condition is not one of the problem's.
         """
-        if isinstance(bc, Contact):
+        if isinstance(bc, Contact | RigidBody):
             if all(bc is not term for term in self.terms):
                 raise MPMError("reaction() needs one of the contacts of this problem.")
             return bc.reaction
