@@ -81,6 +81,7 @@ class BodyForms:
         follows_load: Whether what the load factor does depends on the displacement.
         K: The stock parts of the tangent, on W, as assembled last; on the reference route with
             the low-rank part.
+        factor: How often the reduced tangent has the fused and internal parts.
 
     Raises:
         MPMError: A form with other arguments, or rules that do not go together.
@@ -101,6 +102,7 @@ class BodyForms:
         self._fast = fast
         self._particles = particles
         self.internal = internal
+        self.factor = 1.0
         d = particles.displacement
         parts: list[ufl.Form] = []
         self._average = average_in(R)

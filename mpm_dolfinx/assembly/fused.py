@@ -105,6 +105,11 @@ class _Loops:
         self.support = Support(particles.domain_nodes)
         self.transfers: NDArray[np.float64] = no_values
 
+    @property
+    def factor(self) -> float:
+        """How often the tangent counts."""
+        return self._forms.factor
+
     def transfer(self, rows: TransferRows) -> None:
         """Take over the values of T."""
         support = self.support
@@ -623,7 +628,13 @@ class _Block:
         if not self.supports:
             return
         for number, body in enumerate(self._loops):
-            body.add(*self.beside(self).of(number))
+            positions, values = self.beside(self).of(number)
+            if body.factor == 1.0:
+                body.add(positions, values)
+            else:
+                own = np.zeros_like(values)
+                body.add(positions, own)
+                values += body.factor * own
         if factor != 0.0:
             self._add_masses(factor)
         self._kept = self.beside(self).values if keep and self._loops else None

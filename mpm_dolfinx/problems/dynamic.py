@@ -26,6 +26,7 @@ from .arguments import as_bodies, as_supports, as_terms
 from .motion import MovingProblem, initial_velocities, rayleigh_of, require_motion
 from .particle_problem import Contribution
 from .quasistatic import QuasiStaticProblem
+from .setup import BodySetup
 
 __all__ = ["DynamicParticleProblem", "DynamicProblem"]
 
@@ -59,6 +60,8 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
             begins: equilibrium under loads, supports and terms that should be given here too, the
             same contacts, which know where points stick. Points whose material is the same object
             go on with its history, others carry their stress. That problem cannot go on then.
+        quasi_static: Bodies among these that have no inertia, beside others that move: they are in
+            equilibrium at the end of each step, whatever the scheme, and have no velocity given.
         terms: As in :class:`QuasiStaticProblem`.
         **options: All else that :class:`QuasiStaticProblem` has but ``background`` and
             ``predictor``: ``body_force``, ``bcs``, ``tractions``, ``supports``, ``f_bar``, ...
@@ -81,10 +84,12 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         out_of_range: str = "project",
         rayleigh: tuple[float, float] = (0.0, 0.0),
         after: QuasiStaticProblem | None = None,
+        quasi_static: Sequence[Particles] = (),
         terms: Sequence[Term] = (),
         **options: Any,
     ) -> None:
         bodies = as_bodies(particles)
+        static = _static_among(bodies, quasi_static, velocity, options)
         if after is not None:
             self._require_before(after, bodies, options)
         require_same(
@@ -93,13 +98,17 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
             scheme=scheme,
             out_of_range=out_of_range,
             rayleigh=rayleigh,
+            quasi_static=[number for number, body in enumerate(bodies) if body in static],
             terms=terms,
         )
         alpha, self._viscosity = rayleigh_of(rayleigh)
         require_motion("DynamicProblem", options)
         start = initial_velocities(velocity, particles)
         self._energies = []
-        self.inertia = Inertia(bodies, start, scheme, out_of_range, alpha, self._energies)
+        for body, its in zip(bodies, start, strict=True):
+            if body in static:
+                its.x.array[:] = 0.0
+        self.inertia = Inertia(bodies, start, scheme, out_of_range, alpha, self._energies, static)
         given = as_terms(terms, bodies)
         governed = [body.governed_by for body in bodies]
         try:
@@ -173,8 +182,9 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         self, history: MaterialPoints, supports: Sequence[Support]
     ) -> tuple[StepStress, Sequence[StepForce]]:
         """See :meth:`QuasiStaticProblem._in_time`."""
-        conserving, share = self.inertia.scheme == "conserving", self.inertia.share
-        stress = StepStress(history, conserving, self._viscosity, share)
+        body = history.strain.particles
+        whole = self.inertia.scheme == "conserving" and not self.inertia.is_static(body)
+        stress = StepStress(history, whole, self._viscosity, self._force_share(body))
         self._step_stresses.append(stress)
         return stress, (stress, *supports)
 
@@ -183,10 +193,14 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         self._step_stresses: list[StepStress] = []
         return super()._contributions()
 
-    @property
-    def _force_share(self) -> float:
-        """See :attr:`QuasiStaticProblem._force_share`."""
-        return self.inertia.share
+    def _force_share(self, body: Particles) -> float:
+        """See :meth:`QuasiStaticProblem._force_share`."""
+        return 1.0 if self.inertia.is_static(body) else self.inertia.share
+
+    def _contribution(self, given: BodySetup) -> Contribution:
+        """See :meth:`QuasiStaticProblem._contribution`."""
+        static = self.inertia.is_static(given.particles)
+        return super()._contribution(given)._replace(static=static)
 
     def _stored(self) -> tuple[float, float]:
         """Return elastic energy, and the work done against stress in the last step (collective)."""
@@ -310,6 +324,34 @@ class DynamicParticleProblem(MovingProblem):
         super().begin_step()
         for density in self._densities:
             density.require()
+
+
+def _static_among(
+    bodies: Sequence[Particles], given: Any, velocity: Any, options: dict[str, Any]
+) -> tuple[Particles, ...]:
+    """Return the bodies without inertia.
+
+    Raises:
+        MPMError: They are no bodies of the problem, all of them, or do not go with what is given.
+    """
+    if isinstance(given, Particles):
+        given = [given]
+    if not isinstance(given, list | tuple) or not all(
+        any(body is one for one in bodies) for body in given
+    ):
+        raise MPMError("quasi_static= needs a list of some of the problem's own particles.")
+    if given and options.get("mixed") is not None:
+        raise MPMError("quasi_static= does not go with mixed='pressure'; use f_bar= there.")
+    if given and all(any(body is one for one in given) for body in bodies):
+        raise MPMError(
+            "With quasi_static= at least one body must move; where none does, make a "
+            "QuasiStaticProblem."
+        )
+    velocities = velocity if isinstance(velocity, list) else [None] * len(bodies)
+    for body, its in zip(bodies, velocities, strict=False):
+        if its is not None and any(body is one for one in given):
+            raise MPMError("A body of quasi_static= has no velocity; give None for it.")
+    return tuple(given)
 
 
 def _no_moduli() -> NDArray[np.float64]:

@@ -87,6 +87,7 @@ class Contribution(NamedTuple):
         injected: Functions in the forms for stress and tangent of the material, or ``None``.
         contact: Whether the forms have one-sided supports.
         of_step: What among its forces may be of a whole step in time.
+        static: Whether the body is in equilibrium at each step's end, in a motion of others.
     """
 
     residual: ufl.Form | None
@@ -98,6 +99,7 @@ class Contribution(NamedTuple):
     injected: tuple[fem.Function, fem.Function] | None = None
     contact: bool = False
     of_step: Sequence[StepForce] = ()
+    static: bool = False
 
 
 type Law = tuple[str, dict[str, Any]]
@@ -330,6 +332,7 @@ class ParticleProblem:
                 c.injected,
                 c.contact,
                 c.of_step,
+                c.static,
             )
             for body, c in zip(self.bodies, contributions, strict=True)
             if self._moves(c)

@@ -509,7 +509,7 @@ class QuasiStaticProblem(ParticleProblem):
         if given.tractions:
             loads.append(-work.tractions(given.tractions, given.facet_tags))
             symmetric = symmetric and not depends_on(loads[-1], body.displacement)
-        share = self._force_share
+        share = self._force_share(body)
         loads += [s.at_body(history.initial_modulus, strain.turn, share) for s in given.supports]
         if given.pressures:
             loads.append(work.pressures(given.pressures, given.facet_tags))
@@ -557,9 +557,8 @@ class QuasiStaticProblem(ParticleProblem):
         """Return what stress acts on a body, and what among its forces is of a whole step."""
         return history, ()
 
-    @property
-    def _force_share(self) -> float | None:
-        """What of the forces at a step's end is force, in a motion; ``None`` in none."""
+    def _force_share(self, body: Particles) -> float | None:
+        """Return what of a body's forces at a step's end is force; ``None`` without motion."""
         return None
 
     def _couplings(self, contributions: Sequence[Contribution]) -> list[FieldTerm]:

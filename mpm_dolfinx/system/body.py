@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 from petsc4py import PETSc
 
@@ -69,6 +69,8 @@ class BodyTerm(Term):
             these by Functions.
         contact: Whether one-sided supports act on it.
         of_step: What among its forces may be of a whole step.
+        static: Whether, in a motion of others, the body is in equilibrium at each step's end: its
+            forces there count for the whole step.
 
     Attributes:
         particles: As given.
@@ -85,8 +87,10 @@ class BodyTerm(Term):
         injected: tuple[fem.Function, fem.Function] | None = None,
         contact: bool = False,
         of_step: Sequence[StepForce] = (),
+        static: bool = False,
     ) -> None:
         super().__init__([particles])
+        self._static, self._work = static, 0.0
         self._of_step = tuple(of_step)
         self.particles = particles
         self.forms = forms
@@ -119,11 +123,17 @@ class BodyTerm(Term):
 
     def pace(self, dt: float, share: float) -> None:
         """See :meth:`Term.pace`."""
+        if self._static:
+            self.forms.factor, share = 1.0 / share, 1.0
         for part in self._of_step:
             part.pace(dt, share)
 
     def end_forces(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.end_forces`."""
+        if self._static:
+            for part in self._of_step:
+                part.settle()
+            return ()
         for part in self._of_step:
             part.mute(True)
         self._inject()
@@ -138,7 +148,8 @@ class BodyTerm(Term):
         """See :meth:`Term.step_work`."""
         works = np.array([part.step_work() for part in self._of_step]).reshape(-1, 2)
         total = self.particles.mesh.comm.allreduce(works.sum(axis=0))
-        return float(total[0]), float(total[1])
+        done = self._work - total[1] if self._static else total[0]
+        return float(done), float(total[1])
 
     def update(self) -> MPMError | None:
         """See :meth:`Term.update`."""
@@ -163,11 +174,24 @@ class BodyTerm(Term):
 
     def residuals(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.residuals`."""
-        return [self.forms.assemble_residual()]
+        force = self.forms.assemble_residual()
+        if self._static:
+            motion = force.duplicate()
+            own = slice(0, motion.getLocalSize())
+            displacement = self.particles.displacement.x.array[own]
+            motion.array_w[:] = displacement - self.particles.converged_displacement[own]
+            self._work = float(force.dot(motion))
+        return [self._counted(force)]
+
+    def _counted(self, result: Any) -> Any:
+        """Return forces, or a part of the tangent, as often as they count (in place)."""
+        if self.forms.factor != 1.0:
+            result.scale(self.forms.factor)
+        return result
 
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
         """See :meth:`Term.tangents`."""
-        return {(0, 0): self.forms.assemble_tangent()} if self.forms.stock else {}
+        return {(0, 0): self._counted(self.forms.assemble_tangent())} if self.forms.stock else {}
 
     def reduced_tangents(self, transfer: Transfer) -> Sequence[PETSc.Mat]:
         """See :meth:`Term.reduced_tangents`: low-rank parts apart from others."""
@@ -177,15 +201,17 @@ class BodyTerm(Term):
         if T is not self._T:
             self._T, self._low_rank = T, None
         self._low_rank = self.forms.low_rank.reduced(T, self._low_rank)
-        return self._low_rank.parts
+        return [self._counted(part) for part in self._low_rank.parts]
 
     def reduced_product(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.reduced_product`."""
-        return [] if self.forms.low_rank is None else [self.forms.low_rank_force(motions[0])]
+        if self.forms.low_rank is None:
+            return []
+        return [self._counted(self.forms.low_rank_force(motions[0]))]
 
     def absolute_contributions(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.absolute_contributions`."""
-        return [self.forms.absolute_contributions(self.particles.domain_nodes)]
+        return [self._counted(self.forms.absolute_contributions(self.particles.domain_nodes))]
 
     def load_derivative(self, order: int) -> tuple[Sequence[PETSc.Vec], float]:
         """See :meth:`Term.load_derivative`."""
@@ -194,7 +220,7 @@ class BodyTerm(Term):
 
     def stiffness_force(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.stiffness_force`."""
-        return [self.forms.stiffness_force(motions[0])]
+        return [self._counted(self.forms.stiffness_force(motions[0]))]
 
     def shear_modulus(self) -> float:
         """Return the stiffness of the body to simple shear: its mean at the present state.

@@ -117,8 +117,11 @@ class Inertia(Term):
         out_of_range: ``"project"`` or ``"reflect"``; of no meaning to ``"euler"``.
         damping: Damping in proportion to the mass, one over a time.
         energies: Where the account is kept, one entry for each step.
+        static: Bodies among these that have no inertia: they are in equilibrium at each step's end,
+            and their velocity is the mean of the step.
 
     Attributes:
+        static: As given.
         velocities: At the last converged step, on W of each body.
         dt: Duration of the step.
         time: Time of the last converged step.
@@ -134,6 +137,7 @@ class Inertia(Term):
         out_of_range: str,
         damping: float,
         energies: list[Energy],
+        static: Sequence[Particles] = (),
     ) -> None:
         if scheme not in SCHEMES:
             raise MPMError(f"Unknown scheme={scheme!r}; choose one of {', '.join(SCHEMES)}.")
@@ -144,6 +148,7 @@ class Inertia(Term):
         super().__init__(bodies)
         self.scheme, self.out_of_range = scheme, out_of_range
         self._damping = damping
+        self.static = tuple(static)
         self.velocities = list(velocities)
         self.dt, self.time = 1.0, 0.0
         self._end = 1.0
@@ -212,16 +217,26 @@ class Inertia(Term):
             return
         self._deleted = deleted
         self._transferred = []
-        self._domain_masses = [self._followed.mass(number) for number in range(len(self.bodies))]
+        self._domain_masses = [
+            np.zeros((body.num_local, *2 * body.domain_nodes.shape[1:]))
+            if self.is_static(body)
+            else self._followed.mass(number)
+            for number, body in enumerate(self.bodies)
+        ]
         self.masses = [
             _on_nodes(body, own) for body, own in zip(self.bodies, self._domain_masses, strict=True)
         ]
         for body, M in zip(self.bodies, self.masses, strict=True):
-            _require_mass(body, M)
+            if not self.is_static(body):
+                _require_mass(body, M)
         kinetic = self.kinetic()
         if self._energies:
             self._totals[TOTALS.index("lost")] += self._kinetic - kinetic
         self._kinetic = kinetic
+
+    def is_static(self, body: Particles) -> bool:
+        """Return whether a body has no inertia."""
+        return any(body is one for one in self.static)
 
     def _present_deleted(self) -> list[int]:
         """Return how many particles of each body are deleted (collective)."""
@@ -570,9 +585,11 @@ class Inertia(Term):
             factor = 2.0
         lost = [v.copy() for v in self._v]
         new = [w.copy() for w in self._w]
-        for v, before, out in zip(new, taken, lost, strict=True):
-            v.scale(factor / self.dt)
-            v.axpy(-1.0, before)
+        for body, v, before, out in zip(self.bodies, new, taken, lost, strict=True):
+            still = self.is_static(body)
+            v.scale((1.0 if still else factor) / self.dt)
+            if not still:
+                v.axpy(-1.0, before)
             out.axpy(-1.0, v if self.scheme == "euler" else before)
         out_of_range = self._times_mass(lost)
         loss = 0.5 * _dot(lost, out_of_range)
@@ -649,6 +666,7 @@ class Inertia(Term):
         """Return scheme, time and account, for a checkpoint."""
         return {
             "scheme": [self.scheme, self.out_of_range],
+            "static": [number for number, body in enumerate(self.bodies) if self.is_static(body)],
             "time": self.time,
             "energies": [list(vars(energy).values()) for energy in self._energies],
             "totals": self._totals.tolist(),
@@ -735,6 +753,8 @@ class _Velocities(Kept):
                 f"{source} was made with scheme={its[0]!r}, out_of_range={its[1]!r}, and this "
                 f"problem with {mine[0]!r}, {mine[1]!r}."
             )
+        if taken.numbers.get("static", []) != self._inertia.numbers()["static"]:
+            raise MPMError(f"{source} has other bodies without inertia than quasi_static= says.")
         super().require(source, taken)
 
     def restore(self, taken: Taken) -> None:
@@ -794,6 +814,6 @@ def _require_mass(body: Particles, M: PETSc.Mat) -> None:
         light &= ~body.deletion.dead[: len(light)]
     if body.mesh.comm.allreduce(bool(light.any())):
         raise MPMError(
-            "A DynamicProblem needs a positive density at all nodes; a body without mass belongs "
-            "into a QuasiStaticProblem."
+            "A DynamicProblem needs a positive density at all nodes of bodies that move; one that "
+            "shall have no inertia belongs into quasi_static=."
         )

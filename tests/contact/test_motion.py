@@ -103,6 +103,37 @@ def test_friction_takes_energy_and_says_how_much():
     assert account(history) < 1e-10
 
 
+@pytest.mark.parametrize("scheme", ["midpoint", "conserving"])
+def test_a_block_falls_on_a_mat_without_inertia(scheme):
+    # What the block loses of its momentum, the mat's floor has; both halves of the contact count.
+    spaces = [scenes.vectors(box([-0.6, 0.0], [1.6, 2.0], [8, 8], QUADRILATERAL)) for _ in range(2)]
+    block = mpm.Particles(box([0.1, 0.55], [0.9, 1.2], [5, 4], TRIANGLE), spaces[0])
+    mat = mpm.Particles(box([-0.3, 0.0], [1.3, 0.5], [13, 4], QUADRILATERAL), spaces[1])
+    floor = scenes.fix(spaces[1], scenes.at(1, 0.0))
+    problem = mpm.DynamicProblem(
+        [block, mat],
+        [Hencky(100.0, 0.3), Hencky(30.0, 0.3)],
+        1.0,
+        velocity=[(0.0, -0.3), None],
+        scheme=scheme,
+        bcs=[floor],
+        terms=[contact.Pair(block, mat)],
+        quasi_static=[mat],
+        **TIGHT,
+    )
+    before, pushed, lowest = problem.momentum, 0, 0.0
+    for step in problem.steps(0.8, 0.02):
+        force = problem.reaction(floor)
+        np.testing.assert_allclose((problem.momentum - before)[1], 0.02 * force[1], atol=1e-10)
+        before, pushed = problem.momentum, pushed + bool(force[1] > 0.0)
+        lowest = min(lowest, float(mat.displacement.x.array.min(initial=0.0)))
+        assert step.iterations < 10
+    history = problem.history
+    assert pushed > 3 and problem.momentum[1] > 0.0 and history.cutbacks == 0
+    assert WORLD.allreduce(lowest) < -0.01
+    assert account(history) < 1e-10
+
+
 @pytest.mark.parametrize("friction", [0.0, 0.5])
 @pytest.mark.parametrize("what", ["rigid", "pair"])
 def test_tangent_is_the_derivative_of_the_forces(what, friction):

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Motion: momentum, energy and order, against exact solutions; splits, ranks and restarts."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from compare import EXACT, raises
@@ -864,6 +866,142 @@ def test_two_fields_fly_apart_as_if_each_were_alone():
             np.testing.assert_allclose(
                 found[f"{name} {number}"], own[f"{name} 0"], atol=1e-8 * size, err_msg=name
             )
+
+
+def standing(f_bar="none"):
+    """Return a body that stands on a floor, on a V of its own, and what loads and holds it."""
+    V = vectors(box([0.0, 0.0], [3.0, 2.0], [12, 8], QUADRILATERAL))
+    body = box([0.6, 0.0], [1.6, 1.0], [8, 8], QUADRILATERAL)
+    rule = 2 if f_bar == "domain" else None
+    particles = mpm.Particles(body, V, quadrature_degree=rule)
+    top = np.sort(mesh.locate_entities_boundary(body, 1, at(1, 1.0)))
+    tags = mesh.meshtags(body, 1, top, np.full(len(top), 1, dtype=np.int32))
+    push = fem.Constant(body, 0.0)
+    tractions = [(ufl.as_vector([0.5 * push, -push]), 1)]
+    return particles, push, tractions, tags, [fix(V, at(1, 0.0))]
+
+
+@pytest.mark.parametrize(
+    ("scheme", "out", "f_bar", "assembly"),
+    [
+        ("midpoint", "project", "none", "fast"),
+        ("midpoint", "reflect", "domain", "fast"),
+        ("conserving", "project", "none", "reference"),
+        ("conserving", "reflect", "none", "fast"),
+        ("euler", "project", "none", "fast"),
+    ],
+)
+def test_a_body_without_inertia_beside_one_that_moves(scheme, out, f_bar, assembly):
+    # Apart, each goes its own way: in equilibrium under a load that comes and goes, and as alone.
+    law, times = VonMises(40.0, 0.3, rho_y=2.0), np.arange(1, 6) * 0.05
+    options = {"body_force": (0.0, -1.0), "assembly": assembly, "f_bar": f_bar}
+    options |= {"petsc_options": {"snes_rtol": 1e-12}}
+
+    def load(t):
+        return 0.8 * np.sin(10.0 * t)
+
+    particles, push, tractions, tags, bcs = standing(f_bar)
+    static = mpm.QuasiStaticProblem(
+        particles, law, 2.0, tractions=tractions, facet_tags=tags, bcs=bcs, **options
+    )
+    alone = []
+
+    def path(s):
+        particles.load.value = 1.0
+        push.value = load(s * times[-1])
+
+    for _ in static.steps(len(times), path):
+        alone.append(nodal(particles.displacement).copy())
+    rule = 2 if f_bar == "domain" else None
+    given = {"scheme": scheme, "out_of_range": out, **options}
+    free = spinning(square(quadrature_degree=rule), law, **given)
+    free.solve(times[-1], times[0])
+
+    body, weight, tractions, tags, bcs = standing(f_bar)
+    pair = [square(quadrature_degree=rule), body]
+    problem = spinning(
+        pair,
+        law,
+        velocity=[spin, None],
+        tractions=[[], tractions],
+        facet_tags=[None, tags],
+        bcs=bcs,
+        quasi_static=[body],
+        **given,
+    )
+
+    def update(t):
+        weight.value = load(t)
+
+    found = []
+    for _ in problem.steps(times[-1], times[0], update):
+        found.append(nodal(body.displacement).copy())
+    np.testing.assert_allclose(found, alone, atol=1e-9)
+    assert WORLD.allreduce(float(body.plastic_strain.max(initial=0.0)), MPI.MAX) > 1e-3
+    np.testing.assert_allclose(
+        nodal(pair[0].displacement), nodal(free.particles.displacement), atol=1e-9
+    )
+    mean = (found[-1] - found[-2]) / times[0]
+    np.testing.assert_allclose(nodal(problem.velocity[1]), mean, atol=1e-9)
+    assert problem.kinetic_energy == pytest.approx(free.kinetic_energy, rel=1e-9)
+    energies = problem.history.energies
+    assert np.ptp([energy.balance for energy in energies]) < 1e-10 * energies[0].kinetic
+    assert energies[-1].dissipated > free.history.energies[-1].dissipated + 1e-4
+
+
+def test_a_mass_on_a_spring_without_inertia_swings_in_its_period(tmp_path):
+    # A heavy stiff block on a light bar, both on one background: of first order, as forces of the
+    # bar are those at the end of each step.
+    V = vectors(box([0.0, 0.0], [2.0, 0.25], [16, 2], QUADRILATERAL))
+    across = V.sub(1).collapse()[0]
+    held = fem.locate_dofs_geometrical((V.sub(1), across), lambda x: x[0] > -1.0)
+    bar = mpm.Particles(box([0.0, 0.0], [1.0, 0.25], [16, 4], QUADRILATERAL), V)
+    block = mpm.Particles(box([1.0, 0.0], [1.5, 0.25], [8, 4], QUADRILATERAL), V)
+
+    def made(static, first=None):
+        return mpm.DynamicProblem(
+            [bar, block],
+            [LinearElastic(1.0, 0.0), LinearElastic(1e4, 0.0)],
+            2.0,
+            velocity=[first, (0.02, 0.0)],
+            bcs=[fix(V, at(0, 0.0)), fem.dirichletbc(fem.Function(across), held, V.sub(1))],
+            quasi_static=static,
+        )
+
+    problem = made([bar])
+    omega = 1.0  # of the mass 0.25 on the stiffness 0.25
+    history = problem.solve(np.pi / omega / 2.0, 0.02)
+    middle = nodal(block.displacement)[:, 0].mean()
+    if WORLD.size == 1:
+        assert middle == pytest.approx(0.02 / omega, rel=0.015)
+    energies = history.energies
+    assert np.ptp([energy.balance for energy in energies]) < 1e-10 * energies[0].kinetic
+    first, last = energies[0], energies[-1]
+    assert last.kinetic < 1e-3 * first.kinetic and last.strain < first.kinetic
+    assert last.strain + last.dissipated == pytest.approx(first.kinetic, rel=1e-3)
+    assert 0.01 < last.dissipated / first.kinetic < 0.02
+    path = WORLD.bcast(tmp_path) / "one.ckpt"
+    problem.save(path)
+    other = made([], (0.0, 0.0))
+    raises(lambda: other.restore(path), mpm.MPMError, "other bodies without inertia than quasi_st")
+
+
+@pytest.mark.parametrize(
+    ("message", "options"),
+    [
+        ("needs a list of some of the problem's own particles", {"quasi_static": "all"}),
+        ("at least one body must move", {"quasi_static": ...}),
+        ("has no velocity; give None", {"velocity": (0.0, 1.0)}),
+        ("does not go with mixed='pressure'", {"mixed": "pressure"}),
+    ],
+)
+def test_what_bodies_without_inertia_do_not_go_with(message, options):
+    pair = [square(), square()]
+    given = {"quasi_static": pair[:1], **options}
+    if given["quasi_static"] is ...:
+        given["quasi_static"] = pair
+    velocity = given.pop("velocity", None)
+    raises(lambda: spinning(pair, velocity=[velocity, None], **given), mpm.MPMError, message)
 
 
 def resting(law, **options):
