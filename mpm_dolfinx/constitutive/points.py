@@ -183,6 +183,11 @@ class MaterialPoints:
         if changed and self.averaging is not None:
             self.averaging.modulus = self._resistance()
 
+    @property
+    def weakening(self) -> float:
+        """What the strength of all materials is divided by."""
+        return self._weakening
+
     def weaken(self, factor: float) -> None:
         """Divide the strength of all materials by a factor from now on, 1 at first (collective).
 
@@ -218,7 +223,7 @@ class MaterialPoints:
         """Go on from the last converged step of the same points with other materials (collective).
 
         Points whose material is the same object go on with its history; the others carry the
-        stress that they had, and no other history.
+        stress that they had, and no other history. Strength is divided by what it was divided by.
 
         Args:
             before: The points, on the same mesh.
@@ -226,6 +231,8 @@ class MaterialPoints:
         Raises:
             MPMError: A material cannot bear its stress; ``particles`` are global indices.
         """
+        if before.weakening != self._weakening:
+            self.weaken(before.weakening)
         gradient = before.strain.gradient().reshape(-1, self.dim, self.dim)
         kirchhoff = before.cauchy_stress().reshape(self._points, 3, 3)
         kirchhoff *= np.linalg.det(np.eye(self.dim) + gradient)[:, None, None]

@@ -747,7 +747,11 @@ class Pair(Contact):
             if not isinstance(body, Particles):
                 raise MPMError(f"A contact needs mpm.Particles, not {type(body).__name__}.")
         if a is b:
-            raise MPMError("A Pair needs two bodies, not the same one twice.")
+            raise MPMError(
+                "A Pair needs two bodies, not the same one twice: places of one body that are in "
+                "one cell of its V move together and never meet. Cut the body in two where it is "
+                "to touch itself, with a V for each part, and tie them where they hang together."
+            )
         if a.V is b.V:
             raise MPMError(
                 "The bodies of a Pair are on the same V, which makes them stick; give each its "

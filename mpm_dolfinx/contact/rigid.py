@@ -48,8 +48,9 @@ LAWS = ("penalty", "nitsche")
 DEEP = 1.0
 #: The same for a body as it is given.
 OVERLAP = 0.1
-#: Most places on the way of a point that are looked at, one by one and by steps of the distance.
-MOST_PLACES, MOST_STEPS = 1000, 100
+#: Most places on the way of a point that are looked at, of all points at once, and by steps of
+#: the distance.
+MOST_PLACES, MOST_AT_ONCE, MOST_STEPS = 1000, 100_000, 100
 #: Most points of each rank at which the shapes of ranks are compared.
 LOOKED_AT = 16
 #: How near to the surface a point is on it, over the thickness of the domain behind.
@@ -442,16 +443,41 @@ class Rigid(Contact):
         b = self._framed(x, pose)
         way = np.linalg.norm(b - a, axis=2)
         reached = memory.gap - way < -deep
-        for which in np.argwhere(reached & (surface.weights > 0.0)):
-            at = tuple(which)
-            count = min(int(np.ceil(2.0 * way[at] / deep[at])) + 1, MOST_PLACES)
-            share = np.linspace(0.0, 1.0, count + 1)[:, None]
-            phi, _ = self.shape.distance(a[at] + share * (b[at] - a[at]))
-            if phi.min() < -deep[at] - max(-memory.gap[at], 0.0):
-                return True
+        if self._gets_deep(a, b, memory.gap, deep, reached & (surface.weights > 0.0)):
+            return True
         near = (memory.gap < way) & (way > 0.0) & (surface.weights > 0.0)
         thickness = deep[near] / DEEP
         return self._crosses(a[near], b[near], memory.gap[near], memory.normal[near], thickness)
+
+    def _gets_deep(
+        self,
+        a: NDArray[np.float64],
+        b: NDArray[np.float64],
+        gap: NDArray[np.float64],
+        deep: NDArray[np.float64],
+        reached: NDArray[np.bool_],
+    ) -> bool:
+        """Return whether points are deep in the shape anywhere on a straight way in its frame.
+
+        Args:
+            a: Where points begin, shape ``(m, nq, dim)``.
+            b: Where they end.
+            gap: Their distances at the beginning, shape ``(m, nq)``.
+            deep: What is deep, shape ``(m, nq)``.
+            reached: Which points may have been so.
+        """
+        a, way, deep, gap = a[reached], (b - a)[reached], deep[reached], gap[reached]
+        steps = np.ceil(2.0 * np.linalg.norm(way, axis=1) / deep) + 1.0
+        count = np.minimum(steps, MOST_PLACES).astype(np.int64) + 1
+        for part in np.array_split(np.arange(len(a)), 1 + count.sum() // MOST_AT_ONCE):
+            number = count[part]
+            which = np.repeat(part, number)
+            place = np.arange(len(which)) - np.repeat(np.cumsum(number) - number, number)
+            share = place / (count[which] - 1.0)
+            phi = self.shape.distance(a[which] + share[:, None] * way[which])[0]
+            if np.any(phi < -deep[which] - np.maximum(-gap[which], 0.0)):
+                return True
+        return False
 
     def _crosses(
         self,

@@ -332,6 +332,8 @@ def read_surface(
             :func:`triangulated`.
     """
     factor = as_positive(scale, "scale")
+    if not isinstance(path, str | Path):
+        raise MPMError(f"read_surface needs the path of a file, not {path!r}.")
     found: tuple[NDArray[np.float64], NDArray[np.int64]] | None = None
     with agree(comm):
         if comm.rank == 0:

@@ -251,6 +251,8 @@ def test_the_boundary_of_a_volume_in_a_file(mpi_tmp_path):
 
 def test_files_that_hold_no_surface_are_refused(mpi_tmp_path):
     pyvista = pytest.importorskip("pyvista")
+    with pytest.raises(mpm.MPMError, match="needs the path of a file, not 5"):
+        contact.read_surface(5)
     with pytest.raises(mpm.MPMError, match="There is no file"):
         contact.read_surface(mpi_tmp_path / "nothing.stl")
     if WORLD.rank == 0:

@@ -1045,6 +1045,28 @@ def test_a_body_in_equilibrium_stays_at_rest(scheme, out, f_bar):
     raises(static.step, mpm.MPMError, "Another problem was made of these particles")
 
 
+def test_what_was_weakened_in_equilibrium_stays_weak_in_motion():
+    law = VonMises(40.0, 0.3, rho_y=1.5)
+    particles, static, given = resting(law, cell=QUADRILATERAL, quadrature_degree=2)
+    static.points[0].weaken(1.5)
+    static.step()
+    strength = 1.0
+
+    def most():
+        """Return the largest size of a deviatoric Kirchhoff stress on any rank."""
+        J = np.linalg.det(particles.deformation_gradient)
+        tau = J[:, None, None] * particles.stress.reshape(-1, 3, 3)
+        tau = tau - np.trace(tau, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
+        return largest(np.linalg.norm(tau, axis=(1, 2)))
+
+    assert strength * 0.9 < most() < 1.05 * strength
+    given["body_force"] = (0.0, -3.0)
+    problem = mpm.DynamicProblem(particles, law, 2.0, scheme="euler", after=static, **given)
+    problem.solve(0.2, 0.05)
+    assert problem.points[0].weakening == 1.5
+    assert strength * 0.95 < most() < 1.05 * strength  # (means over domains)
+
+
 @pytest.mark.parametrize("scheme", ["midpoint", "conserving"])
 def test_a_body_with_a_pressure_of_its_own_stays_at_rest_in_equilibrium(scheme):
     law, weight = Hencky(100.0, 0.4999), {"body_force": (0.0, -1.0)}
