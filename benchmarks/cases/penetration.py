@@ -19,6 +19,9 @@ parser.add_argument("--depth", type=kit.positive, help="0.6, 0.03 of the footing
 parser.add_argument("--angle", type=kit.positive, default=45.0, help="half angle of the wedge")
 parser.add_argument("--cell", type=kit.positive, default=0.125, help="background cell size")
 parser.add_argument("--domain", choices=("quad", "tri"), default="quad", help="particle domains")
+parser.add_argument("--young", type=kit.positive, default=500.0, help="modulus over cohesion")
+parser.add_argument("--radius", type=kit.positive, help="of corners: 0.05, 0.01 of the footing")
+parser.add_argument("--law", choices=("penalty", "nitsche"), default="penalty", help="of contact")
 parser.add_argument("--penalty", type=kit.positive, default=1.0, help="of the contact")
 parser.add_argument(
     "--tangential-penalty", type=kit.positive, default=0.1, help="shear over confined modulus"
@@ -30,7 +33,7 @@ args = parser.parse()
 # The right half of a soil 8 m wide and 2.5 m deep; obstacles are 1 m wide but for the wedge.
 
 wide, deep, h = 4.0, 2.5, args.cell
-young, poisson, cohesion = 500.0, 0.45, 1.0
+young, poisson, cohesion = args.young, 0.45, 1.0
 depth = args.depth or (0.03 if args.obstacle == "footing" else 0.6)
 steps = args.steps or (20 if args.obstacle == "footing" else round(100.0 * depth))
 
@@ -75,8 +78,8 @@ def rounded(radius: float):
 
 slope = np.tan(np.radians(args.angle))
 shape = {
-    "pile": lambda: rounded(0.05),
-    "footing": lambda: rounded(0.01),
+    "pile": lambda: rounded(args.radius or 0.05),
+    "footing": lambda: rounded(args.radius or 0.01),
     "disc": lambda: mpm.contact.disc((0.0, 0.5), 0.5),
     "wedge": lambda: mpm.contact.polygon([(0, 0), (3 * slope, 3), (-3 * slope, 3)]),
 }[args.obstacle]()
@@ -89,6 +92,7 @@ obstacle = mpm.contact.Rigid(
     facet_tags=tags,
     tag=1,
     penalty=args.penalty,
+    law=args.law,
     tangential_penalty=args.tangential_penalty,
 )
 

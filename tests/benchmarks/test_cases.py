@@ -22,6 +22,7 @@ LONG = {
     *("vortex", "discs", "discs-contact", "column"),
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
     *("slope", "vertical-cut", "footing-friction"),
+    *("stiff-footing", "hertz", "hertz-penalty"),
     *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
 }
 COMMON = {"completed", "load", "iterations", "cutbacks", "failure"}
@@ -126,6 +127,26 @@ RUNS = {
         "--obstacle footing --cell 0.25 --steps 10",
         {"ratio": 1.17, "cutbacks": 0, "iterations": 50, "penetration": 0.01},
     ),
+    "stiff-footing": (
+        "penetration",
+        "--obstacle footing --young 5e4 --depth 6e-4 --radius 0.002 --law nitsche",
+        {"ratio": 1.03, "cutbacks": 0, "iterations": 260, "penetration": 1e-4},
+    ),
+    "hertz": (
+        "hertz",
+        "--law nitsche",
+        {"error_force": 0.03, "error_radius": 0.03, "error_pressure": 0.08, "iterations": 20},
+    ),
+    "hertz-penalty": (
+        "hertz",
+        "",
+        {"error_force": 0.03, "error_radius": 0.03, "error_pressure": 0.08, "iterations": 26},
+    ),
+    "hertz-coarse": (
+        "hertz",
+        "--cells 3 --law nitsche --penalty 0.5",
+        {"error_force": 0.04, "error_radius": 0.01, "error_pressure": 0.08},
+    ),
     "disc": ("penetration", "", {"cutbacks": 0, "iterations": 520, "force": 7.0}),
     "snap-through": ("snap_through", "--steps 12", {"error": 5e-3, "cutbacks": 0}),
     "roller-patch": (
@@ -204,6 +225,7 @@ KEYS = {
     "strength": {"factor", "exact", "ratio", "particles"},
     "consolidation": {"error", "degree", "error_degree", "particles"},
     "penetration": {"force", "depth", "ratio", "iterations_per_step", "penetration"},
+    "hertz": {"force", "error_force", "error_radius", "error_pressure", "error_most"},
     "snap_through": {"limit", "valley", "crown", "error"},
 }
 
@@ -368,6 +390,7 @@ def test_case_is_a_program(name, tmp_path):
         "vortex": "--steps 8",
         "column_dynamic": "--cell 1 --steps 20",
         "sand_column": "--cells 4 --time 0.1 --steps 5",
+        "hertz": "--cells 2 --steps 2",
         "penetration": "--cell 0.25 --depth 0.05 --steps 4",
     }.get(name, "--elements 4 --steps 4")
     done = subprocess.run(
