@@ -6,7 +6,8 @@ The column is a quarter of an elastoplastic block of 8 x 8 x 4 on hexahedra, who
 20 kN/m3 in four steps: elastic, two thirds plastic, nine tenths plastic. ``--fem`` solves linear
 elasticity of stock DOLFINx on a mesh of about as many unknowns with GAMG, as DOLFINx's demo of
 elasticity does, in the same process, and compares it with multigrid on the column's last tangent.
-Seconds are this process's CPU time.
+``--saddle`` runs scenes with a pressure or water beside the displacements instead. Seconds are
+this process's CPU time.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
-from solvers import HEXAHEDRON, box, rollers
+from solvers import HEXAHEDRON, QUADRILATERAL, box, rollers
 
 import ufl
-from dolfinx import fem
+from dolfinx import fem, mesh
 from dolfinx.fem import petsc as fem_petsc
 
 import mpm_dolfinx as mpm
@@ -184,6 +185,83 @@ def elasticity(unknowns: float) -> dict[str, Any]:
     return {"unknowns": A.getSize()[0], "row": entries / A.getSize()[0], **timed(ksp, A, b, make)}
 
 
+def squeezed(dim: int, n: int, law: mpm.materials.Material, solver: str) -> mpm.QuasiStaticProblem:
+    """Return a heavy body of degree 2 with a pressure, half as wide as its background."""
+    cell, domain = (QUADRILATERAL, mesh.CellType.triangle) if dim == 2 else (HEXAHEDRON, HEXAHEDRON)
+    V = fem.functionspace(box([8.0] * dim, [2 * n] * dim, cell), ("Lagrange", 2, (dim,)))
+    rule = None if dim == 2 else 4
+    body = box([4.0] * dim, [n] * dim, domain)
+    return mpm.QuasiStaticProblem(
+        mpm.Particles(body, V, degree=2, quadrature_degree=rule),
+        law,
+        density=1.0,
+        body_force=(*[0.0] * (dim - 1), -8e3),
+        bcs=rollers(V, *PLANES[:dim]),
+        mixed="pressure",
+        linear_solver=solver,
+    )
+
+
+def drained(n: int, solver: str) -> mpm.PorousProblem:
+    """Return a block with water under a load, drained on its top."""
+    V = fem.functionspace(box([1.5] * 2, [3 * n // 2] * 2, QUADRILATERAL), ("Lagrange", 2, (2,)))
+    body = box([1.0] * 2, [2 * n] * 2, QUADRILATERAL)
+    body.geometry.x[:, 1] += 0.01
+    top = mesh.locate_entities_boundary(body, 1, lambda x: np.isclose(x[1], 1.01))
+    base = mesh.locate_entities_boundary(body, 1, lambda x: np.isclose(x[1], 0.01))
+    facets = np.concatenate([top, base])
+    order = np.argsort(facets)
+    tags = np.repeat([1, 2], [len(top), len(base)]).astype(np.int32)
+    markers = mesh.meshtags(body, 1, facets[order], tags[order])
+    particles = mpm.Particles(body, V, degree=2, quadrature_degree=4)
+    return mpm.PorousProblem(
+        particles,
+        mpm.materials.LinearElastic(1e3, 0.25),
+        1e-3,
+        bcs=rollers(V, (0, 0.0)),
+        supports=[mpm.boundary.roller(particles, markers, 2, (0.0, -1.0))],
+        tractions=[((0.0, -1.0), 1)],
+        facet_tags=markers,
+        drained=[(0.0, 1)],
+        linear_solver=solver,
+    )
+
+
+def saddles(small: bool) -> list[dict[str, Any]]:
+    """Run the scenes with a pressure or water by either solver; return what they took."""
+    laws = mpm.materials
+    plastic, elastic = laws.VonMises(1e6, 0.4999, rho_y=20e3), laws.Hencky(1e6, 0.4999)
+    scenes: list[tuple[str, Any, int]] = [
+        ("plane column, pressure", lambda s: squeezed(2, 9 if small else 18, plastic, s), 2),
+        ("elastic block, pressure", lambda s: squeezed(3, 3 if small else 7, elastic, s), 1),
+        ("plane block, water", lambda s: drained(8 if small else 32, s), 2),
+    ]
+    if not small:
+        scenes.append(("column in space, pressure", lambda s: squeezed(3, 6, plastic, s), 3))
+    rows = []
+    for name, make, steps in scenes:
+        for solver in ("direct", "multigrid"):
+            problem = make(solver)
+            before = time.process_time()
+            if isinstance(problem, mpm.PorousProblem):
+                problem.solve(0.2, 0.2 / steps)
+            else:
+                problem.solve(steps=steps)
+            counts = problem.history.statistics
+            rows.append(
+                {
+                    "scene": name,
+                    "solver": solver,
+                    "unknowns": counts["free_dofs"],
+                    "seconds": time.process_time() - before,
+                    "solves": problem.history.total_iterations,
+                    "its": counts["krylov_iterations"] / counts["factorisations"],
+                    "failures": counts["multigrid_failures"],
+                }
+            )
+    return rows
+
+
 def show(name: str, row: dict[str, Any]) -> None:
     """Print what one linear system takes."""
     print(
@@ -203,10 +281,16 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=3, help="load steps of four")
     parser.add_argument("--solver", choices=["direct", "multigrid"], action="append")
     parser.add_argument("--fem", action="store_true", help="stock finite elements beside it")
+    parser.add_argument("--saddle", action="store_true", help="scenes with a pressure or water")
     args = parser.parse_args()
     quiet = args.json or COMM.rank > 0
     results: dict[str, Any] = {"runs": [], "tangents": []}
-    for n in args.size or ([5] if args.smoke else [8, 16]):
+    if args.saddle:
+        results["saddles"] = saddles(args.smoke)
+        for row in results["saddles"] if not quiet else ():
+            print("{scene:26s} {solver:10s} {unknowns:7.0f} unknowns".format(**row), end=" ")
+            print("{seconds:6.2f} s, {solves} solves, {its:.1f} its each".format(**row))
+    for n in () if args.saddle else args.size or ([5] if args.smoke else [8, 16]):
         for solver in args.solver or ["direct", "multigrid"]:
             problem, row = run(n, solver, 2 if args.smoke else args.steps)
             results["runs"].append(row)

@@ -154,9 +154,10 @@ class ParticleProblem:
             the bodies have hardly more nodes than the background (not beside ``background=``
             or ``dependent_dofs="remove"``).
         linear_solver: ``"direct"``: a factorisation by MUMPS; ``"multigrid"``: conjugate gradients
-            (generalised minimal residuals where the tangent is not symmetric) with multigrid on
-            boxes of the background; ``"auto"``: multigrid from as many unknowns on as it takes less
-            time, unless ``petsc_options`` has a ``ksp_type`` or ``pc_type``.
+            (generalised minimal residuals where the tangent is not symmetric or there are
+            ``fields``) with multigrid on boxes of the background; ``"auto"``: multigrid from as
+            many unknowns on as it takes less time, unless there are ``fields``, or
+            ``petsc_options`` has a ``ksp_type`` or ``pc_type``.
         terms: What else acts on the bodies: a list of :class:`mpm_dolfinx.Term`.
         fields: Unknowns besides displacements, made by :meth:`Particles.field`. Those on the same
             background space are one there, where bodies touch.
@@ -356,11 +357,6 @@ class ParticleProblem:
             for group, forms in zip(groups, on_backgrounds, strict=True)
         ]
         fields += [ValueField(group, self.bcs) for group in by_space(carried)]
-        if carried and numerics.linear_solver == "multigrid":
-            raise MPMError(
-                "linear_solver='multigrid' solves for displacements alone; leave it out beside "
-                "other fields, such as a pressure."
-            )
         statistics = self.history.statistics
         self._held.follow([*self.bodies, *carried], [field.V for field in fields])
         reduced = ReducedSystem(

@@ -106,8 +106,8 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
             returns ``(n,)``; one for all or a list.
         pressure_space: Background space of the pore pressure, for Dirichlet conditions on it in
             ``bcs``; ``None``: continuous, of one degree less than V on its mesh.
-        **options: All else that :class:`QuasiStaticProblem` has but ``mixed``, ``background``,
-            ``predictor`` and ``linear_solver``.
+        **options: All else that :class:`QuasiStaticProblem` has but ``mixed``, ``background``
+            and ``predictor``.
 
     Attributes:
         pore_pressure: Of each body with water, a :class:`mpm_dolfinx.ParticleField` at its nodes.
@@ -144,7 +144,7 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
             pore_pressure=pore_pressure,
             pressure_space=pressure_space,
         )
-        for name in ("mixed", "background", "predictor", "linear_solver", "fields"):
+        for name in ("mixed", "background", "predictor", "fields"):
             if name in options:
                 raise MPMError(f"A PorousProblem has no {name}=; leave it out.")
         count = len(bodies) if isinstance(particles, list | tuple) else 0

@@ -17,6 +17,7 @@ from ..errors import MPMError
 from ..history import Statistics
 from ..parallel.magnitudes import unit_sized
 from .multigrid import SHIFT, Multigrid
+from .saddle import Fields, SaddleMultigrid
 
 __all__ = ["LINEAR_SOLVERS", "Indefinite", "Levels", "ShiftedFactor"]
 
@@ -71,24 +72,11 @@ class Indefinite(Exception):
     """A tangent is not positive definite, for which a smaller step is the best cure."""
 
 
-class Levels(Protocol):
+class Levels(Fields, Protocol):
     """What a linear solver must know of the unknowns. All calls are collective."""
-
-    def diagonal(self, K: PETSc.Mat) -> PETSc.Vec:
-        """Return sizes of a tangent's diagonal with the signs of the shift, none zero."""
 
     def rigid_motions(self) -> PETSc.NullSpace:
         """Return the rigid motions in the unknowns."""
-
-    def splits(self) -> Sequence[tuple[str, slice]]:
-        """Return names of the fields, and where their unknowns are among this rank's."""
-
-    def interpolations(self, coarsest: int) -> Sequence[PETSc.Mat]:
-        """Return what gives the unknowns of each level from those of the next coarser one.
-
-        Args:
-            coarsest: Number of unknowns below which no coarser level is made.
-        """
 
 
 class ShiftedFactor:
@@ -132,7 +120,8 @@ class ShiftedFactor:
         self._own_rtol = self._own_type = False
         self._failures = 0  # steps in a row
         self._shifts = False  # what multigrid sweeps over
-        self._multigrid: Multigrid | None = None
+        self._multigrid: Multigrid | SaddleMultigrid | None = None
+        self._constrained = False
         self._levels: Levels | None = None
         self._told: tuple[Any, Any] = None, None
         self._linear_solver = linear_solver
@@ -190,10 +179,11 @@ class ShiftedFactor:
         Args:
             size: Number of all unknowns.
             constrained: Whether there are others than displacements, as such that enforce
-                constraints, which multigrid does not solve for.
+                constraints.
         """
         self.D = None
-        iterates = self._prefers_multigrid(size) and not constrained
+        self._constrained = constrained
+        iterates = self._prefers_multigrid(size)
         if iterates != self.iterates:
             self._choose(iterates)
 
@@ -204,7 +194,8 @@ class ShiftedFactor:
             return False
         if self._linear_solver != "auto":
             return self._linear_solver == "multigrid"
-        return self._symmetric and size >= CROSSOVER.get(self._dim, np.inf)
+        plain = self._symmetric and not self._constrained
+        return plain and size >= CROSSOVER.get(self._dim, np.inf)
 
     def _choose(self, iterates: bool) -> None:
         """Set up the KSP for multigrid or for a factorisation (collective)."""
@@ -213,7 +204,8 @@ class ShiftedFactor:
         ksp.reset()
         self._multigrid = self._flexible = self._refining = self.K = None
         if iterates:
-            ksp.setType("cg" if self._symmetric else "fgmres")
+            plain = self._symmetric and not self._constrained
+            ksp.setType("cg" if plain else "fgmres")
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
             ksp.setTolerances(rtol=ACCURATE, atol=0.0, max_it=ITERATIONS)
             ksp.setGMRESRestart(KRYLOV)
@@ -316,10 +308,14 @@ class ShiftedFactor:
         with self._statistics.phase("factorise"), self._own_options(), _options_refused():
             if not known:
                 self._refining = self._flexible = self._shifted = None
-                self._multigrid = Multigrid(
-                    self._ksp.getPC(), levels.interpolations(COARSEST), self._symmetric
-                )
-                self._ksp.getPC().setFromOptions()
+                pc, symmetric = self._ksp.getPC(), self._symmetric
+                moves = levels.splits()[0][0] == "displacement"
+                if self._constrained and moves:
+                    self._multigrid = SaddleMultigrid(pc, levels, COARSEST, symmetric, self._dim)
+                else:
+                    interpolations = levels.interpolations(COARSEST, values=not moves)
+                    self._multigrid = Multigrid(pc, interpolations, symmetric)
+                    pc.setFromOptions()
             assert self._multigrid is not None
             relative = damping if damped else SHIFT if self._shifts else TINY
             if damped or self._shifts or not self._multigrid.levels or _has_zeros(K):

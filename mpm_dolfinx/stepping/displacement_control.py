@@ -391,9 +391,13 @@ class ControlledSystem:
         """Return names of the fields, and where their unknowns are among this rank's."""
         return self._reduced.splits()
 
-    def interpolations(self, coarsest: int) -> Sequence[PETSc.Mat]:
-        """Return what gives the unknowns of each level of multigrid from the next coarser one."""
-        return self._reduced.interpolations(coarsest)
+    def interpolations(self, coarsest: int, values: bool = False) -> Sequence[PETSc.Mat]:
+        """See :class:`Levels`."""
+        return self._reduced.interpolations(coarsest, values)
+
+    def mass(self) -> PETSc.Mat:
+        """See :class:`Levels`."""
+        return self._reduced.mass()
 
     def extent(self) -> float:
         """Return the size of the positions of all nodes."""

@@ -665,13 +665,45 @@ class ReducedSystem:
             found.append((f"{name}_of_{taken}" if taken else name, part))
         return found
 
-    def interpolations(self, coarsest: int) -> Sequence[PETSc.Mat]:
+    def interpolations(self, coarsest: int, values: bool = False) -> Sequence[PETSc.Mat]:
         """Return what gives the unknowns of each level of multigrid from the next coarser one.
 
         See :func:`.hierarchy.interpolations` (collective).
+
+        Args:
+            coarsest: Number of unknowns below which no coarser level is made.
+            values: Whether of those that are no displacements; either kind is numbered alone.
         """
-        dofs = [field.level() for field in self.fields]
-        return interpolations(self._comm, self.sizes[0], dofs, coarsest)
+        first, last = self._kinds[values]
+        dofs = [field.level() for field in self.fields if isinstance(field, ValueField) == values]
+        alone = [one._replace(numbers=one.numbers - first) for one in dofs]
+        return interpolations(self._comm, last - first, alone, coarsest)
+
+    @property
+    def _kinds(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Where displacements begin and end among this rank's unknowns, and where the rest does."""
+        assert self._numbering is not None
+        moving = len(self.fields) - len(self._value_fields)
+        first = self._numbering.parts[moving - 1].stop if moving else 0
+        return (0, first), (first, self.sizes[0])
+
+    def mass(self) -> PETSc.Mat:
+        """Return the mass matrix of the unknowns that are no displacements (collective)."""
+        found: PETSc.Mat | None = None
+        for field in self._value_fields:
+            for carried in field.carried:
+                T = self._free_T(carried)
+                root = T.createVecLeft()
+                root.array_w[:] = np.sqrt(np.repeat(carried.weights, carried.W.dofmap.index_map_bs))
+                scaled = T.copy()
+                scaled.diagonalScale(L=root)
+                mass = scaled.transposeMatMult(scaled)
+                found = mass if found is None else found + mass
+        assert found is not None
+        start, stop = found.getOwnershipRange()
+        first, _ = self._kinds[True]
+        own = PETSc.IS().createStride(stop - start - first, first=start + first, comm=self._comm)
+        return found.createSubMatrix(own, own)
 
     def impose(self) -> bool:
         """Impose the step's Dirichlet values from now on; return whether there are any."""

@@ -16,6 +16,7 @@ import ufl
 from dolfinx import fem
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.solvers import linear
 
 TIGHT = {"snes_rtol": 1e-12}
 # A body that fills its background leaves it in the last step, which is a warning.
@@ -158,6 +159,32 @@ def test_heat_alone_against_stock_finite_elements(cell):
         before.x.array[:] = t.x.array
     same_values(T, t)
     assert len(problem.history.steps) == 3
+
+
+def test_heat_alone_by_multigrid(monkeypatch):
+    monkeypatch.setattr(linear, "COARSEST", 20)
+    found = []
+    for name in ("direct", "multigrid"):
+        problem, T, hot = heat(QUADRILATERAL, petsc_options=TIGHT, linear_solver=name)
+        hot.value = 2.0
+        problem.solve(steps=1)
+        found.append(scenes.own(T))
+        assert (problem.history.statistics["krylov_iterations"] > 0) == (name == "multigrid")
+        assert problem.history.statistics["multigrid_failures"] == 0
+    assert scenes.largest(found[0] - found[1]) < 1e-9 * scenes.largest(found[0])
+
+
+@leaves
+def test_a_pressure_at_nodes_by_multigrid(monkeypatch):
+    monkeypatch.setattr(linear, "COARSEST", 50)
+    found = []
+    for name in ("direct", "multigrid"):
+        problem, p = taylor_hood(QUADRILATERAL, petsc_options=TIGHT, linear_solver=name)
+        problem.solve(steps=1)
+        found.append((scenes.own(problem.particles.displacement), scenes.own(p)))
+        assert problem.history.statistics["multigrid_failures"] == 0
+    for a, b in zip(*found, strict=True):
+        assert scenes.largest(a - b) < 1e-8 * scenes.largest(a)
 
 
 def immersed(at="points", kind="total", cells=QUADRILATERAL, outside="error", comm=WORLD, **given):
