@@ -80,7 +80,8 @@ class Support:
         """Find the nodes; return whether they are the old ones."""
         offsets, nodes = loops.supports(self._dofmap, *rows)
         same = np.array_equal(offsets, self.offsets) and np.array_equal(nodes, self.nodes)
-        self.offsets, self.nodes = offsets, nodes
+        if not same:
+            self.offsets, self.nodes = offsets, nodes
         return same
 
     def transfers(self, rows: TransferRows) -> NDArray[np.float64]:

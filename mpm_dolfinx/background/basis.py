@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from .. import _compat
-from .cells import DROP, TOLERANCE, Cells, CellTable
+from .cells import BLOCK, DROP, TOLERANCE, Cells, CellTable
 from .tiles import Tiles
 
 __all__ = ["BackgroundBasis", "PointBasis"]
@@ -82,16 +82,25 @@ class BackgroundBasis:
             none = np.zeros(n, dtype=np.int64)
             nodes = np.zeros((n, k), dtype=np.int64)
             return PointBasis(nodes, np.zeros((n, k)), none > 0, slopes, none, none)
-        cell, reference, violation = cells.locate(points)
-        reference = cells.clip(reference)
-        table = _compat.tabulated(self._basis, int(gradients), reference)
-        found = violation <= TOLERANCE
-        inside = found[:, None]
-        values = np.where((np.abs(table[0]) >= DROP) & inside, table[0], 0.0)
-        slopes = None
-        if gradients:
-            jacobian = cells.jacobians(cell, reference)
-            slopes = np.einsum("jpk,pji->pki", table[1:], np.linalg.inv(jacobian))
-            slopes = np.where(inside[:, :, None], slopes, 0.0)
-        nodes = cells.nodes[cell]
-        return PointBasis(nodes, values, found, slopes, cells.home[cell], cells.rank[cell])
+        nodes, values = np.empty((n, k), dtype=np.int64), np.empty((n, k))
+        slopes = np.empty((n, k, points.shape[1])) if gradients else None
+        found = np.empty(n, dtype=bool)
+        home, rank = np.empty(n, dtype=cells.home.dtype), np.empty(n, dtype=cells.rank.dtype)
+        for start in range(0, n, BLOCK):  # what is on the way is large
+            part = slice(start, start + BLOCK)
+            cell, reference, violation = cells.locate(points[part])
+            reference = cells.clip(reference)
+            table = _compat.tabulated(self._basis, int(gradients), reference)
+            found[part] = violation <= TOLERANCE
+            inside = found[part, None]
+            values[part] = np.where((np.abs(table[0]) >= DROP) & inside, table[0], 0.0)
+            if slopes is not None:
+                inverse = np.linalg.inv(cells.jacobians(cell, reference))
+                own = np.einsum("jpk,pji->pki", table[1:], inverse)
+                slopes[part] = np.where(inside[:, :, None], own, 0.0)
+            nodes[part], home[part], rank[part] = (
+                cells.nodes[cell],
+                cells.home[cell],
+                cells.rank[cell],
+            )
+        return PointBasis(nodes, values, found, slopes, home, rank)

@@ -516,6 +516,8 @@ class MaterialPoints:
         Raises:
             MPMError: An update fails; ``particles`` are global indices.
         """
+        # Two tries at a time would be the most that a step holds in memory.
+        self._trial, self._trial_gradient = self._states, self._gradient
         gradient = self.strain.gradient()
         if self.averaging is None:
             gradient = gradient.reshape(-1, self.dim, self.dim)

@@ -73,7 +73,9 @@ class CompiledMaterial(StrainMaterial):
             b,
             variables,
         )
-        new = {"stress": stress, "displacement_gradient": H.copy(), "elastic_b_minus_identity": b}
+        # What cannot be written to is kept as it is: it is given away for good.
+        gradient = H.copy() if H.flags.writeable else H
+        new = {"stress": stress, "displacement_gradient": gradient, "elastic_b_minus_identity": b}
         return new | dict(zip(names, variables, strict=True)), invalid
 
 

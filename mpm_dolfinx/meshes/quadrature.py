@@ -23,8 +23,12 @@ __all__ = [
     "quadrature_element",
     "quadrature_rule",
     "volume_ratio",
+    "volumes_and_averages",
     "with_hoop",
 ]
+
+#: Domains of which values at points are made at a time.
+BLOCK = 1 << 14
 
 
 def exact_degree(cell: str, degree: int) -> int:
@@ -81,15 +85,9 @@ class DomainQuadrature:
     """
 
     def __init__(self, body: mesh.Mesh, shape_functions: Any, degree: int) -> None:
-        cell = body.basix_cell()
-        gdim = body.geometry.dim
-        points, weights = quadrature_rule(cell, degree)
-        count = body.topology.index_map(body.topology.dim).size_local
-        nodes = body.geometry.x[_compat.geometry_dofmap(body)[:count], :gdim]
-        coordinate_map = basix.ufl.element(
-            "Lagrange", cell.name, _compat.geometry_degree(body)
-        ).basix_element
-        slopes = coordinate_map.tabulate(1, points)[1:, :, :, 0]
+        points, weights = quadrature_rule(body.basix_cell(), degree)
+        nodes, slopes = _geometry(body, points)
+        gdim = nodes.shape[2]
         jacobian = np.einsum("jqk,nki->nqij", slopes, nodes)
         table = shape_functions.tabulate(1, points)[:, :, :, 0]
         self.shapes: NDArray[np.float64] = table[0]
@@ -128,6 +126,52 @@ class DomainQuadrature:
         gradient = np.empty((n, nq, gdim, gdim))
         loops.displacement_gradient(displacement, domain_nodes, self.gradients, gradient)
         return gradient
+
+
+def volumes_and_averages(
+    body: mesh.Mesh, shape_functions: Any, degree: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return volumes of the domains this rank owns, and averages of shape functions over them.
+
+    Args:
+        body: The body mesh.
+        shape_functions: basix element of W.
+        degree: Degree of a rule that is exact for both.
+
+    Returns:
+        Shapes ``(n,)`` and ``(n, k)``.
+    """
+    points, weights = quadrature_rule(body.basix_cell(), degree)
+    nodes, slopes = _geometry(body, points)
+    shapes = shape_functions.tabulate(0, points)[0, :, :, 0]
+    volumes, averages = np.empty(len(nodes)), np.empty((len(nodes), shapes.shape[1]))
+    for start in range(0, len(nodes), BLOCK):  # the Jacobians are many times the size of a body
+        part = slice(start, start + BLOCK)
+        jacobian = np.einsum("jqk,nki->nqij", slopes, nodes[part])
+        sizes = weights * np.abs(np.linalg.det(jacobian))
+        volumes[part] = sizes.sum(axis=1)
+        averages[part] = sizes @ shapes / volumes[part, None]
+    return volumes, averages
+
+
+def _geometry(
+    body: mesh.Mesh, points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return geometry nodes of owned cells, ``(n, k, gdim)``, and slopes of their map.
+
+    Args:
+        body: The mesh.
+        points: Reference points, shape ``(nq, tdim)``.
+
+    Returns:
+        The nodes, and derivatives of the map's shape functions, shape ``(tdim, nq, k)``.
+    """
+    cell = body.basix_cell()
+    count = body.topology.index_map(body.topology.dim).size_local
+    nodes = body.geometry.x[_compat.geometry_dofmap(body)[:count], : body.geometry.dim]
+    degree = _compat.geometry_degree(body)
+    element = basix.ufl.element("Lagrange", cell.name, degree).basix_element
+    return nodes, element.tabulate(1, points)[1:, :, :, 0]
 
 
 def nodal_forces(

@@ -256,6 +256,7 @@ class Domains:
             return self._whole_gradient(self.quadrature.displacement_gradient(self._nodal()))
         if self._gradient is not None and np.array_equal(self._gradient[0], d):
             return self._gradient[1]
+        self._gradient = None  # one at a time in memory
         gradient = self.quadrature.gradient_of(np.asarray(d), self.domain_nodes)
         gradient = self._whole_gradient(gradient)
         self._gradient = np.array(d, dtype=np.float64), gradient

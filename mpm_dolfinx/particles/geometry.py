@@ -16,7 +16,13 @@ from dolfinx import fem, mesh
 from .. import _compat
 from ..errors import DomainDistortionError, agree
 from ..meshes.jacobian_bound import JacobianBound
-from ..meshes.quadrature import DomainQuadrature, default_degree, exact_degree, quadrature_element
+from ..meshes.quadrature import (
+    DomainQuadrature,
+    default_degree,
+    exact_degree,
+    quadrature_element,
+    volumes_and_averages,
+)
 
 __all__ = ["RING", "Geometry"]
 
@@ -111,15 +117,18 @@ class Geometry:
         return np.asarray(self.nodes[self.domain_nodes])
 
     @cached_property
+    def _volumes_and_averages(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return volumes_and_averages(self.mesh, self.shape_functions, self.exact_degree)
+
+    @property
     def volumes(self) -> NDArray[np.float64]:
         """Volume of each domain, shape ``(n,)``; an area in the plane."""
-        return np.asarray(self.exact_rule().weights.sum(axis=1))
+        return self._volumes_and_averages[0]
 
-    @cached_property
+    @property
     def averages(self) -> NDArray[np.float64]:
         """Averages of the shape functions over the domains, shape ``(n, k)``."""
-        exact = self.exact_rule()
-        return np.asarray(exact.weights @ exact.shapes / exact.weights.sum(axis=1)[:, None])
+        return self._volumes_and_averages[1]
 
     def require_volume(self, rule: DomainQuadrature) -> None:
         """Raise an error unless all domains have a volume at the points of a rule (collective).
