@@ -73,6 +73,26 @@ class _Answer(NamedTuple):
     state: State
 
 
+class _Converged(NamedTuple):
+    """What is known of the points at the last converged step.
+
+    Attributes:
+        states: What the material of each group keeps.
+        gradient: ``F - I`` that the materials have seen, shape ``(n nq, dim, dim)``.
+        stress: First Piola stress, of the same shape.
+        volume: Volume strain, where a pressure takes the place of the mean stress.
+        recovery: See :attr:`MaterialPoints.recovery`.
+        resisted: Energy that F-bar resists, shape ``(n nq,)``.
+    """
+
+    states: list[State]
+    gradient: NDArray[np.float64]
+    stress: NDArray[np.float64]
+    volume: NDArray[np.float64]
+    recovery: NDArray[np.float64] | float
+    resisted: NDArray[np.float64]
+
+
 class MaterialPoints:
     """The history of all points of a body, kept apart from the update being tried.
 
@@ -94,8 +114,6 @@ class MaterialPoints:
         first_piola: First Piola stress of the last update, shape ``(n nq, dim, dim)``.
         tangent: Its derivative by F, shape ``(n nq, dim, dim, dim, dim)``; with F-bar the
             pointwise part of it.
-        recovery: What the recovery of averaged stresses adds to the particles' Cauchy stress,
-            shape ``(n, 3, 3)``, or 0.
 
     Raises:
         MPMError: Materials, tags or parameters that do not go together.
@@ -122,17 +140,13 @@ class MaterialPoints:
         self._weakening = 1.0
         with agree(particles.mesh.comm):
             self._groups = self._group(assignment, cell_tags)
-            self._states = [self._initial_state(group) for group in self._groups]
+            states = [self._initial_state(group) for group in self._groups]
         shape = (self._points, self.dim, self.dim)
-        self._gradient = np.zeros(shape)
+        none = np.zeros(self._points)
+        self._last = _Converged(states, np.zeros(shape), np.zeros(shape), none, 0.0, none)
         self.first_piola = np.zeros(shape)
         self.tangent = np.zeros((*shape, self.dim, self.dim))
-        self._trial: list[State] = self._states
-        self._trial_gradient = self._gradient
-        self._stress = self.first_piola.copy()
-        self._volume = np.zeros(self._points)
-        self.recovery: NDArray[np.float64] | float = 0.0
-        self._resisted = np.zeros(self._points)
+        self._trial, self._trial_gradient = states, self._last.gradient
         self.averaging: VolumeAveraging | None = None
         if f_bar != "none":
             material = np.zeros(particles.num_local, dtype=np.int64)
@@ -266,7 +280,9 @@ class MaterialPoints:
         """Return each material as given, its points and their last converged state."""
         return [
             (given.material, group.points, state)
-            for given, group, state in zip(self._given, self._groups, self._states, strict=True)
+            for given, group, state in zip(
+                self._given, self._groups, self._last.states, strict=True
+            )
         ]
 
     def _mixed(
@@ -304,20 +320,43 @@ class MaterialPoints:
 
     def _settle(self, states: list[State]) -> None:
         """Take states for those of the last converged step, at the present displacement."""
-        self._states = self._trial = states
+        self._last = self._last._replace(states=states)
         with agree(self._particles.mesh.comm) if self.averaging is None else nullcontext():
             self.update()
-        self._trial, self._gradient = self._states, self._trial_gradient
-        self._stress = self.first_piola.copy()
-        self._keep_volume()
-        self._recover()
+        self._trial = states
+        self._make_last(states, self.first_piola.copy())
 
-    def _recover(self) -> None:
-        if self.averaging is not None:
+    def _make_last(self, states: list[State], stress: NDArray[np.float64]) -> None:
+        """Take the last update for the converged one (collective with F-bar).
+
+        Args:
+            states: What materials keep of it.
+            stress: Its first Piola stress, given away for good.
+        """
+        before = self._last
+        volume = before.volume if self.mean_stress is None else self.mean_stress.strain.volume
+        self._last = before._replace(
+            states=states, gradient=self._trial_gradient, stress=stress, volume=volume
+        )
+        if self.averaging is None:
+            return
+        try:
             with agree(self._particles.mesh.comm):
-                stress = self.strain.average(self.cauchy_stress())
-            self.recovery = self.averaging.recover(stress) - stress
-            self._resisted = self.averaging.energy().ravel()
+                average = self.strain.average(self.cauchy_stress())
+            recovery = self.averaging.recover(average) - average
+            resisted = self.averaging.energy().ravel()
+        except BaseException:
+            self._last = before
+            raise
+        self._last = self._last._replace(recovery=recovery, resisted=resisted)
+
+    @property
+    def recovery(self) -> NDArray[np.float64] | float:
+        """What the recovery of averaged stresses adds to the particles' Cauchy stress.
+
+        Shape ``(n, 3, 3)``, or 0.
+        """
+        return self._last.recovery
 
     @property
     def grouped(self) -> VolumeAveraging | None:
@@ -349,7 +388,7 @@ class MaterialPoints:
     def converged_pressure(self) -> NDArray[np.float64]:
         """Mean of the laws' own stress at the last converged step, shape ``(n nq,)``."""
         result = np.zeros(self._points)
-        for group, state in zip(self._groups, self._states, strict=True):
+        for group, state in zip(self._groups, self._last.states, strict=True):
             result[group.points] = state["stress"][:, :3].sum(axis=1) / 3.0
         return result
 
@@ -478,13 +517,15 @@ class MaterialPoints:
             know it.
         """
         result = np.full(self._points, np.nan)
-        for group, state in zip(self._groups, self._trial if trial else self._states, strict=True):
+        for group, state in zip(
+            self._groups, self._trial if trial else self._last.states, strict=True
+        ):
             energy = group.material.strain_energy(state)
             if energy is not None:
                 self._require(group, "strain energy", energy, (len(group.points),))
                 result[group.points] = energy
         if self.averaging is not None:
-            result += self.averaging.energy().ravel() if trial else self._resisted
+            result += self.averaging.energy().ravel() if trial else self._last.resisted
         return result
 
     @property
@@ -517,7 +558,7 @@ class MaterialPoints:
             MPMError: An update fails; ``particles`` are global indices.
         """
         # Two tries at a time would be the most that a step holds in memory.
-        self._trial, self._trial_gradient = self._states, self._gradient
+        self._forget_trial()
         gradient = self.strain.gradient()
         if self.averaging is None:
             gradient = gradient.reshape(-1, self.dim, self.dim)
@@ -575,7 +616,7 @@ class MaterialPoints:
 
     def _update_materials(self, gradient: NDArray[np.float64]) -> None:
         trial = []
-        for group, state in zip(self._groups, self._states, strict=True):
+        for group, state in zip(self._groups, self._last.states, strict=True):
             everywhere = len(group.points) == self._points
             part = gradient if everywhere else gradient[group.points]
             answer = self._answer(group, part, state)
@@ -689,7 +730,7 @@ class MaterialPoints:
 
     def elastic(self) -> bool:
         """Return whether no internal variable has changed in the last update: nothing yields."""
-        for group, before, after in zip(self._groups, self._states, self._trial, strict=True):
+        for group, before, after in zip(self._groups, self._last.states, self._trial, strict=True):
             if before.keys() == {"stress"} or not getattr(group.material, "inelastic", True):
                 continue
             variables = getattr(group.material, "internal_variables", ())
@@ -703,48 +744,30 @@ class MaterialPoints:
         Returns:
             A function that makes the history of before that again.
         """
-        before = (
-            self._states,
-            self._gradient,
-            self._stress,
-            self.recovery,
-            self._resisted,
-            self._volume,
-        )
+        before = self._last
         tried = self._trial, self._trial_gradient, self.first_piola
 
         def undo() -> None:
-            (
-                self._states,
-                self._gradient,
-                self._stress,
-                self.recovery,
-                self._resisted,
-                self._volume,
-            ) = before
+            self._last = before
             self._trial, self._trial_gradient, self.first_piola = tried
 
-        self._states = [
+        self._trial = [
             state if _is_own(group.material) else {k: v.copy() for k, v in state.items()}
             for group, state in zip(self._groups, self._trial, strict=True)
         ]
-        self._trial, self._gradient = self._states, self._trial_gradient
         alone = len(self._groups) == 1 and _is_own(self._groups[0].material)
-        self._stress = self.first_piola if alone else self.first_piola.copy()
-        self._keep_volume()
-        self._recover()
+        self._make_last(self._trial, self.first_piola if alone else self.first_piola.copy())
         return undo
-
-    def _keep_volume(self) -> None:
-        if self.mean_stress is not None:
-            self._volume = self.mean_stress.strain.volume
 
     def roll_back(self) -> None:
         """Forget the last update."""
-        self._trial, self._trial_gradient = self._states, self._gradient
-        self.first_piola = self._stress.copy()
+        self._forget_trial()
+        self.first_piola = self._last.stress.copy()
         if self.mean_stress is not None:
-            self.mean_stress.return_to(self._volume, self._gradient)
+            self.mean_stress.return_to(self._last.volume, self._last.gradient)
+
+    def _forget_trial(self) -> None:
+        self._trial, self._trial_gradient = self._last.states, self._last.gradient
 
     def converged_state(self) -> dict[str, Column]:
         """Return the history of the last converged step.
@@ -753,26 +776,26 @@ class MaterialPoints:
             Columns ``(n, nq, ...)`` by name (``recovery``: ``(n, 3, 3)``); a variable of the
             materials has the numbers of those that have it in its name.
         """
-        whole: dict[str, NDArray[Any]] = {"gradient": self._gradient}
-        whole["first_piola"] = self._stress
+        whole: dict[str, NDArray[Any]] = {"gradient": self._last.gradient}
+        whole["first_piola"] = self._last.stress
         if self.mean_stress is not None:
-            whole["volume_strain"] = self._volume
+            whole["volume_strain"] = self._last.volume
         owners: dict[tuple[str, tuple[int, ...], np.dtype[Any]], list[int]] = {}
-        for number, state in enumerate(self._states):
+        for number, state in enumerate(self._last.states):
             for name, values in state.items():
                 owners.setdefault((name, values.shape[1:], values.dtype), []).append(number)
         for (name, shape, dtype), numbers in owners.items():
             values = np.zeros((self._points, *shape), dtype)
             for number in numbers:
-                values[self._groups[number].points] = self._states[number][name]
+                values[self._groups[number].points] = self._last.states[number][name]
             whole[f"{name}@{','.join(map(str, numbers))}"] = values
         n, nq = self._particles.num_local, self._particles.num_points
         columns = {
             name: Column(v.reshape(n, nq, *v.shape[1:]), "points") for name, v in whole.items()
         }
         if self.averaging is not None:
-            columns["recovery"] = Column(np.broadcast_to(self.recovery, (n, 3, 3)), "cells")
-            columns["resisted"] = Column(self._resisted.reshape(n, nq), "points")
+            columns["recovery"] = Column(np.broadcast_to(self._last.recovery, (n, 3, 3)), "cells")
+            columns["resisted"] = Column(self._last.resisted.reshape(n, nq), "points")
         return columns
 
     def set_converged_state(self, arrays: dict[str, NDArray[Any]]) -> None:
@@ -782,15 +805,20 @@ class MaterialPoints:
             for name, v in arrays.items()
             if name not in ("recovery", "resisted")
         }
-        self.recovery = arrays.get("recovery", 0.0)
-        self._resisted = arrays.get("resisted", self._resisted).reshape(self._points)
-        self._gradient, self._stress = flat.pop("gradient"), flat.pop("first_piola")
-        self._volume = flat.pop("volume_strain", self._volume)
-        self._states = [{} for _ in self._groups]
+        states: list[State] = [{} for _ in self._groups]
+        last = self._last._replace(
+            states=states,
+            gradient=flat.pop("gradient"),
+            stress=flat.pop("first_piola"),
+            volume=flat.pop("volume_strain", self._last.volume),
+            recovery=arrays.get("recovery", 0.0),
+            resisted=arrays.get("resisted", self._last.resisted).reshape(self._points),
+        )
         for key, values in flat.items():
             name, numbers = key.rsplit("@", 1)
             for number in map(int, numbers.split(",")):
-                self._states[number][name] = values[self._groups[number].points]
+                states[number][name] = values[self._groups[number].points]
+        self._last = last
 
     def laws(self) -> list[tuple[str, dict[str, Any]]]:
         """Return name and parameters of each material; arrays with the indices of their points."""
@@ -816,7 +844,7 @@ class MaterialPoints:
         def value(group: _Group, state: State) -> Any:
             received = {name: _read_only(values) for name, values in state.items()}
             stress = group.material.cauchy_stress(
-                _read_only(self._gradient[group.points]), received
+                _read_only(self._last.gradient[group.points]), received
             )
             shape = (len(group.points), 3, 3)
             if np.shape(stress) != shape:
@@ -844,7 +872,7 @@ class MaterialPoints:
         Raises:
             MPMError: No material has it.
         """
-        shapes = {s[name].shape[1:] for s in self._states if name in s}
+        shapes = {s[name].shape[1:] for s in self._last.states if name in s}
         if not shapes:
             if name == "plastic_strain":
                 shapes = {()}
@@ -866,7 +894,7 @@ class MaterialPoints:
 
     def _collect(self, shape: tuple[int, ...], value: Any, what: str = "") -> NDArray[np.float64]:
         result = np.zeros((self._points, *shape))
-        for group, state in zip(self._groups, self._states, strict=True):
+        for group, state in zip(self._groups, self._last.states, strict=True):
             try:
                 result[group.points] = value(group, state)
             except MPMError:

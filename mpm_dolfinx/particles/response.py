@@ -27,13 +27,11 @@ class Kinematics(Protocol):
 
 
 class Response(Protocol):
-    """What answers for the stress and internal variables of a body, at its points.
+    """What answers for the stress and internal variables of a body, at its points."""
 
-    Attributes:
-        recovery: What is added to the mean stress of each domain, shape ``(n, 3, 3)``, or 0.
-    """
-
-    recovery: NDArray[np.float64] | float
+    @property
+    def recovery(self) -> NDArray[np.float64] | float:
+        """What is added to the mean stress of each domain, shape ``(n, 3, 3)``, or 0."""
 
     @property
     def strain(self) -> Kinematics:

@@ -171,4 +171,24 @@ def test_how_much_of_an_answer_is_read_to_find_what_is_not_finite(law, monkeypat
         assert {(2, 2), (2, 2, 2, 2), ()} <= kinds
     # A law of the package gives its arrays away: its history is not copied at each step.
     stress = problem._stresses[0]
-    assert (stress._stress is stress.first_piola) == (law is VonMises)
+    assert (stress._last.stress is stress.first_piola) == (law is VonMises)
+
+
+def test_an_update_that_fails_leaves_the_last_converged_step():
+    problem = scenes.block(VonMises(1e3, 0.3, rho_y=60.0))
+    problem.solve(steps=1)
+    (body,), (stress,) = problem.bodies, problem.points
+    at_rest = stress.strain_energy()
+    good = body.displacement.x.array.copy()
+    x = body.W.tabulate_dof_coordinates()[:, :2]
+    body.displacement.x.array[:] += 0.3 * x.ravel()
+    stress.update()
+    assert not stress.elastic() and (stress.strain_energy(trial=True) != at_rest).any()
+    body.displacement.x.array[:] = (-2.0 * x).ravel()
+    with pytest.raises(mpm.MPMError):
+        stress.update()
+    assert stress.elastic()
+    np.testing.assert_array_equal(stress.strain_energy(trial=True), at_rest)
+    body.displacement.x.array[:] = good
+    stress.roll_back()
+    np.testing.assert_array_equal(stress.strain_energy(), at_rest)

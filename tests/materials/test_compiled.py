@@ -114,3 +114,15 @@ def test_shapes_that_do_not_fit_are_refused():
     empty = np.empty(0)
     with pytest.raises(ValueError, match="one parameter"):
         loops.update_hencky(H, np.ones(2), np.ones(1), H, empty, empty)
+
+
+def test_a_gradient_that_may_be_written_to_is_copied():
+    """What is read-only is given away, as by the points of a body; what one may change is not."""
+    law = VonMises(1e3, 0.3, rho_y=10.0)
+    H = np.full((3, 2, 2), 0.01)
+    own = law.update(H, law.initial_state(3, 2)).state["displacement_gradient"]
+    H[:] = 0.5
+    np.testing.assert_array_equal(own, 0.01)
+    H.flags.writeable = False
+    given = law.update(H, law.initial_state(3, 2)).state["displacement_gradient"]
+    assert np.shares_memory(given, H)
