@@ -184,7 +184,7 @@ def test_an_update_that_fails_leaves_the_last_converged_step():
     body.displacement.x.array[:] += 0.3 * x.ravel()
     stress.update()
     assert not stress.elastic() and (stress.strain_energy(trial=True) != at_rest).any()
-    body.displacement.x.array[:] = (-2.0 * x).ravel()
+    body.displacement.x.array[:] = (x * (-2.0, 0.0)).ravel()  # turned inside out
     with pytest.raises(mpm.MPMError):
         stress.update()
     assert stress.elastic()
