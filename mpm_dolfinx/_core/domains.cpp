@@ -437,7 +437,9 @@ HOT_LOOP void core::assemble_slopes(const Domains& domains, const double* slope,
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
     const int nodes = domains.nodes, points = domains.points;
-    std::vector<double> strains, reduced; // of the nodes of W, and of those of V
+    std::vector<double> strains(nodes * dim), reduced, line; // strains of nodes of W; of V
+    std::vector<double> weights;                             // T without its zeros
+    std::vector<int> places, ends;
     std::size_t pairs = 0;
     for (std::size_t p = 0; p < domains.count; ++p)
     {
@@ -445,40 +447,53 @@ HOT_LOOP void core::assemble_slopes(const Domains& domains, const double* slope,
       const std::size_t rows = pressure.offsets[p + 1] - pressure.offsets[p];
       const double* T = displacement.values + displacement.offsets[p] * nodes;
       const double* T_p = pressure.values + pressure.offsets[p] * points;
-      const int width = nodes * dim;
-      const std::size_t reduced_width = size * dim;
-      strains.resize(width);
-      reduced.assign(points * reduced_width, 0.0);
+      const std::size_t width = size * dim;
+      weights.resize(size * nodes);
+      places.resize(size * nodes);
+      ends.assign(1, 0);
+      int end = 0;
+      for (std::size_t b = 0; b < size; ++b)
+      {
+        for (int c = 0; c < nodes; ++c)
+          if (T[b * nodes + c] != 0.0)
+          {
+            weights[end] = T[b * nodes + c];
+            places[end++] = c * dim;
+          }
+        ends.push_back(end);
+      }
+      reduced.assign(points * width, 0.0);
       for (int q = 0; q < points; ++q)
       {
         const std::size_t point = p * points + q;
         if (domains.weights[point] <= 0.0)
           continue;
         point_strains<dim>(domains, slope, point, strains.data());
-        double* out = reduced.data() + q * reduced_width;
+        double* out = reduced.data() + q * width;
         for (std::size_t b = 0; b < size; ++b)
-          for (int c = 0; c < nodes; ++c)
-            if (const double t = T[b * nodes + c]; t != 0.0)
-              for (int i = 0; i < dim; ++i)
-                out[b * dim + i] += t * strains[c * dim + i];
+          for (int n = ends[b]; n < ends[b + 1]; ++n)
+            for (int i = 0; i < dim; ++i)
+              out[b * dim + i] += weights[n] * strains[places[n] + i];
       }
       for (std::size_t a = 0; a < rows; ++a)
-        for (std::size_t b = 0; b < size; ++b)
-        {
-          double sum[dim] = {};
-          for (int q = 0; q < points; ++q)
-            for (int i = 0; i < dim; ++i)
-              sum[i] += T_p[a * points + q] * reduced[q * reduced_width + b * dim + i];
-          const auto add = [&](const std::int32_t* positions, std::size_t pair, double* values) {
-            if (positions == nullptr)
-              return;
-            double* out = values + static_cast<std::size_t>(positions[pairs + pair]) * dim;
-            for (int i = 0; i < dim; ++i)
-              out[i] += sum[i];
-          };
-          add(target.of_pressure, a * size + b, target.pressure_values);
-          add(target.of_displacement, b * rows + a, target.displacement_values);
-        }
+      {
+        line.assign(width, 0.0);
+        for (int q = 0; q < points; ++q)
+          if (const double t = T_p[a * points + q]; t != 0.0)
+            for (std::size_t k = 0; k < width; ++k)
+              line[k] += t * reduced[q * width + k];
+        const auto add = [&](std::int32_t position, std::size_t b, double* values) {
+          double* out = values + static_cast<std::size_t>(position) * dim;
+          for (int i = 0; i < dim; ++i)
+            out[i] += line[b * dim + i];
+        };
+        if (target.of_pressure != nullptr)
+          for (std::size_t b = 0; b < size; ++b)
+            add(target.of_pressure[pairs + a * size + b], b, target.pressure_values);
+        if (target.of_displacement != nullptr)
+          for (std::size_t b = 0; b < size; ++b)
+            add(target.of_displacement[pairs + b * rows + a], b, target.displacement_values);
+      }
       pairs += rows * size;
     }
   });

@@ -17,6 +17,7 @@
 #include "arrays.h"
 #include "domains.h"
 #include "material.h"
+#include "mean_stress.h"
 #include "sparsity.h"
 #include "step_stress.h"
 
@@ -416,6 +417,35 @@ NB_MODULE(_loops, m)
         "tolerance"_a, "P"_a.noconvert(), "A"_a.noconvert(), "stress"_a.noconvert(),
         "c"_a.noconvert(), "variables"_a.noconvert(),
         "Update a law with a history; return the points whose domains are inverted.");
+
+  m.def("replace_mean_stress",
+        [](Reals gradient, Reals P, Reals A, Reals stress, Reals pressure, Reals bulk,
+           Array<const std::uint8_t> small, RealsOut new_P, RealsOut new_A, RealsOut new_stress,
+           RealsOut volume, RealsOut slope) {
+    require(gradient.ndim() == 3 && stress.ndim() == 2,
+            "displacement gradients (n, dim, dim) and stresses (n, components)");
+    const std::size_t count = gradient.shape(0);
+    const auto dim = static_cast<int>(gradient.shape(2));
+    require(dim == 2 || dim == 3, "two or three dimensions");
+    require(P.size() == gradient.size() && A.size() == count * dim * dim * dim * dim
+                && new_P.size() == P.size() && new_A.size() == A.size()
+                && slope.size() == P.size(),
+            "stresses and slopes (n, dim, dim), tangents (n, dim, dim, dim, dim)");
+    require(stress.shape(0) == count && stress.shape(1) >= 3 && new_stress.size() == stress.size()
+                && pressure.size() == count && bulk.size() == count && small.size() == count
+                && volume.size() == count,
+            "values (n,)");
+    replace_mean_stress({count, gradient.data(), P.data(), A.data(), stress.data(),
+                         static_cast<int>(stress.shape(1)), pressure.data(), bulk.data(),
+                         small.data()},
+                        dim,
+                        {new_P.data(), new_A.data(), new_stress.data(), volume.data(),
+                         slope.data()});
+  },
+        "gradient"_a, "P"_a, "A"_a, "stress"_a, "pressure"_a, "bulk"_a, "small"_a,
+        "new_P"_a.noconvert(), "new_A"_a.noconvert(), "new_stress"_a.noconvert(),
+        "volume"_a.noconvert(), "slope"_a.noconvert(),
+        "Let a pressure take the place of the mean stress of a law.");
 
   m.def("step_stress",
         [](Reals gradient, Reals old_gradient, Reals P, Reals old_P, Reals A, Reals energy,

@@ -21,11 +21,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .._core import loops
 from ..errors import MPMError
 from ..materials.base import Material, StrainMaterial
 from ..particles.field import ParticleField
 
-__all__ = ["MeanStress", "VolumeStrain", "require_split", "without_bulk"]
+__all__ = ["MeanStress", "VolumeStrain", "require_split", "with_pressure", "without_bulk"]
 
 
 class VolumeStrain(NamedTuple):
@@ -108,13 +109,7 @@ class MeanStress:
             volume: Volume strain, shape ``(n,)``.
             gradient: ``F - I``, shape ``(n, dim, dim)``.
         """
-        self.strain = self.strain._replace(volume=volume, slope=self._slope(gradient))
-
-    def _slope(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
-        eye = np.eye(gradient.shape[-1])
-        slope = np.linalg.inv(gradient + eye).swapaxes(1, 2)
-        slope[self._small] = eye
-        return slope
+        self.strain = self.strain._replace(volume=volume, slope=_slope(gradient, self._small))
 
     def follow(self, points: NDArray[np.int64], material: Material, bulk: Any, soft: Any) -> None:
         """Take over a law's moduli at some points.
@@ -146,20 +141,73 @@ class MeanStress:
         Returns:
             First Piola stress and derivative at constant pressure, and the laws' own stresses.
         """
-        mean = np.zeros(len(self._soft))
-        for points, stress in stresses:
-            mean[points] = stress[:, :3].sum(axis=1) / 3.0
-        change = self.values - mean
-        slope = self._slope(gradient)
-        self.strain = self.strain._replace(volume=mean / self._soft, slope=slope)
-        stress = first_piola + change[:, None, None] * slope
-        turning = np.where(self._small, 0.0, change)[:, None, None, None, None]
-        product = slope[:, :, :, None, None] * slope[:, None, None, :, :]
-        whole = tangent - self._soft[:, None, None, None, None] * product
-        whole -= turning * product.swapaxes(2, 4)
-        own = []
-        for points, before in stresses:
-            after = before.copy()
-            after[:, :3] += change[points, None]
-            own.append(after)
-        return stress, whole, own
+        whole = stresses[0][1]
+        if len(stresses) > 1:
+            whole = np.empty((len(self._soft), whole.shape[1]))
+            for points, stress in stresses:
+                whole[points] = stress
+        answer = (gradient, first_piola, tangent, whole)
+        found = with_pressure(answer, self.values, self._soft, self._small)
+        self.strain = self.strain._replace(volume=found.volume, slope=found.slope)
+        own = [found.stress[points] for points, _ in stresses]
+        return found.first_piola, found.tangent, own if len(own) > 1 else [found.stress]
+
+
+class Pressed(NamedTuple):
+    """The answer of a law with a pressure in place of its mean stress.
+
+    Attributes:
+        first_piola: Shape ``(n, dim, dim)``.
+        tangent: Its derivative at constant pressure.
+        stress: Mandel vectors, shape ``(n, components)``.
+        volume: Volume strain, shape ``(n,)``.
+        slope: Its derivative by F, shape ``(n, dim, dim)``.
+    """
+
+    first_piola: NDArray[np.float64]
+    tangent: NDArray[np.float64]
+    stress: NDArray[np.float64]
+    volume: NDArray[np.float64]
+    slope: NDArray[np.float64]
+
+
+def with_pressure(
+    answer: tuple[NDArray[np.float64], ...],
+    pressure: NDArray[np.float64],
+    bulk: NDArray[np.float64],
+    small: NDArray[np.bool_],
+    compiled: bool = True,
+) -> Pressed:
+    """Let a pressure take the place of the mean stress of a law that is linear in volume.
+
+    Args:
+        answer: ``F - I``, first Piola stress and tangent of the law, and its Mandel stress.
+        pressure: Shape ``(n,)``.
+        bulk: Bulk modulus of the law, shape ``(n,)``.
+        small: Whether it is one of small strains, shape ``(n,)``.
+        compiled: Whether to use the compiled loop, where it was built.
+    """
+    gradient, first_piola, tangent, stress = answer
+    if compiled and loops is not None:
+        shapes = (first_piola.shape, tangent.shape, stress.shape, pressure.shape, gradient.shape)
+        found = Pressed(*(np.empty(shape) for shape in shapes))
+        loops.replace_mean_stress(*answer, pressure, bulk, small.view(np.uint8), *found)
+        return found
+    mean = stress[:, :3].sum(axis=1) / 3.0
+    change = pressure - mean
+    slope = _slope(gradient, small)
+    turning = np.where(small, 0.0, change)[:, None, None, None, None]
+    product = slope[:, :, :, None, None] * slope[:, None, None, :, :]
+    whole = tangent - bulk[:, None, None, None, None] * product
+    whole -= turning * product.swapaxes(2, 4)
+    own = stress.copy()
+    own[:, :3] += change[:, None]
+    return Pressed(first_piola + change[:, None, None] * slope, whole, own, mean / bulk, slope)
+
+
+def _slope(gradient: NDArray[np.float64], small: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the derivative of the volume strain by F."""
+    eye = np.eye(gradient.shape[-1])
+    slope = np.linalg.inv(gradient + eye).swapaxes(1, 2)
+    slope[small] = eye
+    return np.asarray(slope)
