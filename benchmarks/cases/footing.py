@@ -25,6 +25,13 @@ parser.add_argument(
 parser.add_f_bar("patch")
 parser.add_mixed()
 parser.add_order()
+parser.add_argument(
+    "--strip",
+    choices=("body", "background"),
+    default="body",
+    help="what the strip holds: facets of the soil, or nodes of the background",
+)
+parser.add_argument("--small-strain", action="store_true", help="material of small strain")
 parser.add_argument("--steps", type=kit.whole, default=40, help="steps")
 args = parser.parse()
 
@@ -72,9 +79,11 @@ across, up = lines(1.75), size - lines(1.0)[::-1]
 # line, as it is pressed outwards by up to 1 mm, the next cell is held too. So a line is 0.04 cells
 # beyond the edge. And the soil beside the strip can only leave it behind where the two lie on
 # different sides of a horizontal line; if that happens late, the pressure falls. So the ground
-# starts 0.1 mm above a line, which the strip passes at once.
+# starts 0.1 mm above a line, which the strip passes at once. A strip on nodes of the background has
+# lines at its edge and at the ground.
 
-beyond, over = 0.04 * h, 1e-4  # m
+on_body = args.strip == "body"
+beyond, over = (0.04 * h, 1e-4) if on_body else (0.0, 0.0)  # m
 taper = np.clip((size - across) / 2.0, 0.0, 1.0) * (across > 0.0)
 heights = np.append(up - over * np.clip(up, 0.0, 1.0), size - over + h * np.arange(1, 3))
 background = grid(across + beyond * taper, heights, mesh.CellType.quadrilateral)
@@ -88,31 +97,41 @@ if args.quadrature_degree is None and args.domain == "quad" and args.degree == 1
     args.quadrature_degree = 2
 particles = mpm.Particles(body, V, **kit.order(args))
 
-# Rollers on grid lines, and the strip: it presses on the facets of the body that lie under it.
+# Rollers on grid lines, and the strip: it presses on the facets of the body that lie under it, or
+# moves the nodes of the background that lie there at first.
 
 background.topology.create_connectivity(1, 2)
 
 
-def held(component: int, where) -> fem.DirichletBC:
+def held(component: int, where, value: float = 0.0) -> fem.DirichletBC:
     facets = mesh.locate_entities(background, 1, where)
     dofs = fem.locate_dofs_topological(V.sub(component), 1, facets)
-    return fem.dirichletbc(0.0, dofs, V.sub(component))
+    return fem.dirichletbc(value, dofs, V.sub(component))
 
 
-under = mesh.locate_entities_boundary(
-    body, 1, lambda x: np.isclose(x[1], size) & (x[0] < half_width * (1.0 + 1e-9))
-)
+def strip(x: np.ndarray) -> np.ndarray:
+    """The strip's points on the ground."""
+    return np.isclose(x[1], size) & (x[0] < half_width * (1.0 + 1e-9))
+
+
+under = mesh.locate_entities_boundary(body, 1, strip)
 tags = mesh.meshtags(body, 1, np.sort(under), np.full(len(under), 1, np.int32))
-footing = mpm.boundary.roller(particles, tags, 1, normal=(0.0, -1.0), value=settlement)
+footing = (
+    mpm.boundary.roller(particles, tags, 1, normal=(0.0, -1.0), value=settlement)
+    if on_body
+    else held(1, strip, -settlement)
+)
+law = mpm.materials.SmallStrainVonMises if args.small_strain else mpm.materials.VonMises
 
 problem = mpm.QuasiStaticProblem(
     particles,
-    mpm.materials.VonMises(young, poisson, rho_y=np.sqrt(2.0) * cohesion),
+    law(young, poisson, rho_y=np.sqrt(2.0) * cohesion),
     bcs=[
         held(0, lambda x: np.isclose(x[0], 0.0) | np.isclose(x[0], size)),
         held(1, lambda x: np.isclose(x[1], 0.0)),
+        *([] if on_body else [footing]),
     ],
-    supports=[footing],
+    supports=[footing] if on_body else [],
     f_bar=args.f_bar if args.mixed == "none" else "none",
     mixed=None if args.mixed == "none" else args.mixed,
     stabilisation=kit.stabilisation(args),

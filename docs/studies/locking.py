@@ -22,6 +22,12 @@ FOOTING = {
     'degree 2, `"domain"`': "--f-bar domain --degree 2",
     'degree 2, `mixed="pressure"`': "--mixed pressure --degree 2",
 }
+STRIPS = {
+    "facets of the soil": "--strip body",
+    "facets, small strain": "--strip body --small-strain",
+    "nodes of the background": "--strip background",
+    "nodes, small strain": "--strip background --small-strain",
+}
 BEAM = {
     'one point, `"patch"`': "--quadrature-degree 1 --f-bar patch",
     '2 by 2 points, `"patch"`': "--quadrature-degree 2 --f-bar patch",
@@ -49,6 +55,16 @@ def footing(options: str) -> list[Any]:
     for cell in (0.25, 0.125):
         r = run("footing", "--cell", cell, *options.split())
         found += [share(r, f"{r['ratio']:.3f} ({100 * r['plateau']:.1f} %)"), r["iterations"]]
+    return found
+
+
+def strip(options: str) -> list[Any]:
+    found: list[Any] = []
+    for cell in (0.25, 0.125):
+        asked = ["--mixed", "pressure", "--degree", 2, *options.split()]
+        r = run("footing", "--cell", cell, *asked)
+        found.append(share(r, f"{r['peak']:.4f}, {r['ratio']:.4f} ({100 * r['drop']:.2f} %)"))
+        found.append(f"{r['iterations']} ({r['most_solves']})")
     return found
 
 
@@ -90,6 +106,12 @@ def tables() -> dict[str, Table]:
             "locking",
             ["", *beside],
             {name: partial(footing, options) for name, options in FOOTING.items()},
+            cases=["footing"],
+        ),
+        "locking/strip": Table(
+            "locking",
+            ["the strip holds", *beside],
+            {name: partial(strip, options) for name, options in STRIPS.items()},
             cases=["footing"],
         ),
         "locking/cantilever": Table(

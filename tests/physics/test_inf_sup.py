@@ -49,17 +49,22 @@ def inf_sup(cell, n, offset):
     values, vectors = np.linalg.eigh(M)
     seen = values > 1e-12 * values.max()  # others are no pressure anywhere
     B = (vectors[:, seen] / np.sqrt(values[seen])).T @ B
-    return float(np.sqrt(np.linalg.eigvalsh(B @ np.linalg.solve(A, B.T))[0]))
+    # Where a corner of the block alone sees two nodes of the background, on an edge, they can move
+    # so that it does not. That is no motion, and it must not change the volume.
+    values, vectors = np.linalg.eigh(A)
+    felt = values > 1e-12 * values.max()
+    assert np.abs(B @ vectors[:, ~felt]).max(initial=0.0) <= 1e-12
+    return float(
+        np.linalg.svd((B @ vectors[:, felt]) / np.sqrt(values[felt]), compute_uv=False)[-1]
+    )
 
 
 @pytest.mark.parametrize("cell", [TRIANGLE, QUADRILATERAL], ids=scenes.name)
 def test_the_constant_in_the_plane(cell):
     coarse, fine = ([inf_sup(cell, n, offset) for offset in OFFSETS] for n in (3, 6))
-    assert min(coarse) >= 0.4 and min(fine) >= 0.4
-    for offset, one, other in zip(OFFSETS, coarse, fine, strict=True):
-        # A sliver of triangles takes a part of it on one of the grids, with an offset of 1e-9.
-        if cell is QUADRILATERAL or offset != 1e-9:
-            assert other >= 0.9 * one
+    assert min(*coarse, *fine) >= (0.8 if cell is TRIANGLE else 0.97)
+    for one, other in zip(coarse, fine, strict=True):
+        assert other >= 0.9 * one
 
 
 @pytest.mark.parametrize("cell", [TETRAHEDRON, HEXAHEDRON], ids=scenes.name)
