@@ -27,6 +27,8 @@ parser.add_argument("--tolerance", type=kit.positive, default=0.01, help="of the
 parser.add_argument("--steps", type=kit.whole, default=20, help="steps of the footing")
 parser.add_argument("--degree", type=int, choices=(1, 2), default=1, help="of the footing's basis")
 parser.add_f_bar("patch")
+parser.add_mixed()
+parser.add_argument("--dilation-angle", type=float, help="of the footing's soil, else associated")
 args = parser.parse()
 
 comm, kind = MPI.COMM_WORLD, kit.DOMAINS[args.domain]
@@ -121,7 +123,8 @@ else:
     grid = graded(across + 0.04 * h * taper, heights, mesh.CellType.quadrilateral)
     V = fem.functionspace(grid, ("Lagrange", args.degree, (2,)))
     body = graded(halved(across), halved(up), kind)
-    law = mpm.materials.MohrCoulomb(young, 0.3, 1.0, args.friction_angle, args.friction_angle)
+    dilation = args.friction_angle if args.dilation_angle is None else args.dilation_angle
+    law = mpm.materials.MohrCoulomb(young, 0.3, 1.0, args.friction_angle, dilation)
     bcs = [held(V, 0, 0.0, size), held(V, 1, 0.0)]
     tangent = np.tan(np.radians(args.friction_angle))
     N_q = np.exp(np.pi * tangent) * np.tan(np.radians(45.0 + args.friction_angle / 2.0)) ** 2
@@ -149,7 +152,8 @@ problem = mpm.QuasiStaticProblem(
     body_force=(0.0, -1.0),
     bcs=bcs,
     supports=supports,
-    f_bar=args.f_bar,
+    f_bar=args.f_bar if args.mixed == "none" else "none",
+    mixed=None if args.mixed == "none" else args.mixed,
     petsc_options_prefix="strength_",
 )
 

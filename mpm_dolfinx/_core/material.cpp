@@ -703,6 +703,96 @@ struct CamClay
   }
 };
 
+// The volume strain at which a law answers a pressure, and what the tangent has of it; the
+// algorithm of mpm_dolfinx.materials.given_pressure, point by point.
+struct VolumeAtPressure
+{
+  static constexpr double tolerance = 1e-13, nearly = 1e-8, stride = 0.05;
+  static constexpr int iterations = 100;
+
+  double gap, compliance;
+  std::array<double, 3> slope, by_pressure;
+
+  // Set the answer of a law; return whether there is one.
+  template <typename Law>
+  bool solve(const Law& law, const std::array<double, 3>& trial, double yield_tolerance,
+             double pressure, double augmentation, Response& r)
+  {
+    const std::array<double, core::max_variables> before = r.variables;
+    const double theta = trial[0] + trial[1] + trial[2];
+    double x = theta, reach = stride;
+    double low = -std::numeric_limits<double>::infinity(), high = -low;
+    bool near = false;
+    for (int k = 0; k < iterations; ++k, reach *= 2.0)
+    {
+      const double shift = (x - theta) / 3.0;
+      r.variables = before;
+      law({trial[0] + shift, trial[1] + shift, trial[2] + shift}, yield_tolerance, r);
+      const double mean = (r.stress[0] + r.stress[1] + r.stress[2]) / 3.0;
+      const double extra = augmentation * (x - theta), over = mean + extra - pressure;
+      double stiffness = augmentation;
+      for (int a = 0; a < 3; ++a)
+        for (int b = 0; b < 3; ++b)
+          stiffness += r.normal[a][b] / 9.0;
+      const double size = std::abs(mean) + std::abs(extra) + std::abs(pressure)
+                          + std::abs(stiffness * x);
+      bool open = !(std::abs(over) <= tolerance * size) && !near;
+      near = std::abs(over) <= nearly * size;
+      if (over < 0.0)
+        low = std::max(low, x);
+      if (over > 0.0)
+        high = std::min(high, x);
+      double next = x - std::min(over / stiffness, reach);
+      if (!(next > low && next < high) && std::isfinite(0.5 * (low + high)))
+        next = 0.5 * (low + high);
+      open = open && next != x;
+      if (!open)
+      {
+        finish(theta, x, stiffness, r);
+        return true;
+      }
+      x = next;
+    }
+    return false;
+  }
+
+  void finish(double theta, double x, double stiffness, Response& r)
+  {
+    gap = theta - x;
+    compliance = 1.0 / stiffness;
+    std::array<double, 3> column{};
+    slope = {};
+    for (int a = 0; a < 3; ++a)
+      for (int b = 0; b < 3; ++b)
+      {
+        column[a] += r.normal[a][b] / 3.0;
+        slope[b] += r.normal[a][b] / 3.0 / stiffness;
+      }
+    for (int a = 0; a < 3; ++a)
+    {
+      by_pressure[a] = column[a] / stiffness;
+      r.elastic_strain[a] += gap / 3.0;
+      for (int b = 0; b < 3; ++b)
+        r.normal[a][b] -= column[a] * slope[b];
+    }
+  }
+};
+
+// Set the first Piola stress of principal Kirchhoff stresses.
+template <int dim>
+void first_piola(const std::array<double, 3>& values, const Matrix<dim>& axes,
+                 const Matrix<dim>& inverse_F, double* P)
+{
+  const Matrix<dim> tau = from_principal<dim>(values, axes);
+  for (int i = 0; i < dim; ++i)
+    for (int J = 0; J < dim; ++J)
+    {
+      P[i * dim + J] = 0.0;
+      for (int j = 0; j < dim; ++j)
+        P[i * dim + J] += tau[i][j] * inverse_F[J][j];
+    }
+}
+
 // P = tau F^-T and dP/dF, put together from the dyads Q_a (F^-1 Q)_b.
 //
 // With l = dF F^-1, d eps_ab = g_ab (b_b l_ab + b_a l_ba) in the principal frame, g_ab the
@@ -749,7 +839,7 @@ void tangent(const Response& r, const std::array<double, dim>& principal, const 
 template <int dim, typename Law>
 bool update_point(const double* gradient, const double* old_gradient, const double* old_c,
                   const Law& law, double tolerance, Response& r, double* P, double* A,
-                  double* stress, double* c)
+                  double* stress, double* c, const core::GivenPressure* given, std::size_t point)
 {
   constexpr int m = dim == 2 ? 4 : 6;
   Matrix<dim> H, inverse_F;
@@ -822,16 +912,25 @@ bool update_point(const double* gradient, const double* old_gradient, const doub
   if (!valid)
     return false;
 
-  law(strain, tolerance, r);
-  const Matrix<dim> tau = from_principal<dim>(r.stress, axes);
-  for (int i = 0; i < dim; ++i)
-    for (int J = 0; J < dim; ++J)
+  if (given == nullptr)
+    law(strain, tolerance, r);
+  else
+  {
+    constexpr std::size_t size = dim * dim;
+    VolumeAtPressure volume;
+    if (!volume.solve(law, strain, tolerance, given->pressure[point], given->augmentation(point),
+                      r))
     {
-      P[i * dim + J] = 0.0;
-      for (int j = 0; j < dim; ++j)
-        P[i * dim + J] += tau[i][j] * inverse_F[J][j];
+      given->gap[point] = std::numeric_limits<double>::quiet_NaN();
+      return false;
     }
-  pack<dim>(tau, stress);
+    given->gap[point] = volume.gap;
+    given->compliance[point] = volume.compliance;
+    first_piola<dim>(volume.slope, axes, inverse_F, given->slope + point * size);
+    first_piola<dim>(volume.by_pressure, axes, inverse_F, given->by_pressure + point * size);
+  }
+  first_piola<dim>(r.stress, axes, inverse_F, P);
+  pack<dim>(from_principal<dim>(r.stress, axes), stress);
   if constexpr (dim == 2)
     stress[2] = r.stress[2];
   if (A != nullptr)
@@ -873,7 +972,7 @@ std::vector<std::int64_t> update_all(const core::Update& u)
         update_point<dim>(u.gradient + p * size, history ? u.old_gradient + p * size : nullptr,
                           history ? u.old_c + p * m : nullptr, Law(values), u.tolerance, r,
                           u.P + p * size, u.A == nullptr ? nullptr : u.A + p * size * size,
-                          u.stress + p * m, history ? u.c + p * m : nullptr);
+                          u.stress + p * m, history ? u.c + p * m : nullptr, u.given, p);
     for (std::size_t k = 0; k < variables; ++k)
       u.variables[k][p] = r.variables[k];
     if (!valid)

@@ -48,6 +48,16 @@ constexpr std::size_t num_variables(Law law)
   return law == Law::hencky ? 0 : law == Law::cam_clay ? 2 : 1;
 }
 
+// What takes the place of the mean stress at each point, and what comes of it: a pressure, the
+// modulus of the augmentation, and the gap of volume with its compliance and derivatives (see
+// mpm_dolfinx.materials.given_pressure).
+struct GivenPressure
+{
+  const double* pressure;
+  Parameter augmentation;
+  double *gap, *compliance, *slope, *by_pressure;
+};
+
 // Input and output of an update of many points; see update_plastic in module.cpp. Without
 // old_gradient there is no history.
 struct Update
@@ -60,8 +70,10 @@ struct Update
   double tolerance;
   double *P, *A, *stress, *c;
   double* variables[max_variables];
+  const GivenPressure* given = nullptr;
 };
 
-// Update all points; return those whose det F or trial b is not positive and finite.
+// Update all points; return those whose det F or trial b is not positive and finite, or, with a
+// given pressure, that have no volume strain for it.
 std::vector<std::int64_t> update_logarithmic(const Update& update, int dim);
 } // namespace core

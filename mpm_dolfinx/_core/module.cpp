@@ -132,7 +132,7 @@ auto update_with_history(Law law, const Reals& gradient, const Reals& old_gradie
                          const Reals& old_c, const std::vector<Reals>& old_variables,
                          const std::vector<Reals>& parameters, double tolerance, RealsOut& P,
                          RealsOut& A, RealsOut& stress, RealsOut& c,
-                         std::vector<RealsOut>& variables)
+                         std::vector<RealsOut>& variables, const GivenPressure* given = nullptr)
 {
   require(gradient.ndim() == 3 && old_gradient.size() == gradient.size()
               && old_c.shape(0) == gradient.shape(0),
@@ -160,6 +160,7 @@ auto update_with_history(Law law, const Reals& gradient, const Reals& old_gradie
   u.A = A.size() > 0 ? A.data() : nullptr;
   u.stress = stress.data();
   u.c = c.data();
+  u.given = given;
   return to_numpy(update_logarithmic(u, static_cast<int>(gradient.shape(2))));
 }
 
@@ -446,6 +447,28 @@ NB_MODULE(_loops, m)
         "new_P"_a.noconvert(), "new_A"_a.noconvert(), "new_stress"_a.noconvert(),
         "volume"_a.noconvert(), "slope"_a.noconvert(),
         "Let a pressure take the place of the mean stress of a law.");
+
+  m.def("update_at_pressure",
+        [](const std::string& law, Reals gradient, Reals old_gradient, Reals old_c,
+           const std::vector<Reals>& old_variables, const std::vector<Reals>& parameters,
+           double tolerance, Reals pressure, Reals augmentation, RealsOut P, RealsOut A,
+           RealsOut stress, RealsOut c, std::vector<RealsOut> variables, RealsOut gap,
+           RealsOut compliance, RealsOut slope, RealsOut by_pressure) {
+    const std::size_t count = gradient.shape(0);
+    require(pressure.size() == count && gap.size() == count && compliance.size() == count
+                && slope.size() == gradient.size() && by_pressure.size() == gradient.size(),
+            "pressures and volumes (n,), and their derivatives (n, dim, dim)");
+    const GivenPressure given{pressure.data(),   parameter_of(augmentation, count),
+                              gap.data(),        compliance.data(),
+                              slope.data(),      by_pressure.data()};
+    return update_with_history(law_of(law), gradient, old_gradient, old_c, old_variables,
+                               parameters, tolerance, P, A, stress, c, variables, &given);
+  },
+        "law"_a, "gradient"_a, "old_gradient"_a, "old_c"_a, "old_variables"_a, "parameters"_a,
+        "tolerance"_a, "pressure"_a, "augmentation"_a, "P"_a.noconvert(), "A"_a.noconvert(),
+        "stress"_a.noconvert(), "c"_a.noconvert(), "variables"_a.noconvert(), "gap"_a.noconvert(),
+        "compliance"_a.noconvert(), "slope"_a.noconvert(), "by_pressure"_a.noconvert(),
+        "Update a law with a history at given pressures; return the points where it fails.");
 
   m.def("step_stress",
         [](Reals gradient, Reals old_gradient, Reals P, Reals old_P, Reals A, Reals energy,

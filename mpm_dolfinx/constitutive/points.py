@@ -17,13 +17,20 @@ from dolfinx import fem, mesh
 
 from .. import _compat
 from ..errors import ConvergenceError, MPMError, agree, as_ours
-from ..materials.base import Material, Refused, State, Update, check_parameter
+from ..materials.base import (
+    Material,
+    Refused,
+    State,
+    StrainMaterial,
+    Update,
+    check_parameter,
+)
 from ..materials.compiled import CompiledMaterial
 from ..materials.mandel import num_components
 from ..meshes.remesh import Column
 from ..particles.field import ParticleField
 from .averaging import VolumeAveraging
-from .pressure import MeanStress, VolumeStrain, require_split, without_bulk
+from .pressure import MeanStress, VolumeStrain, is_split, without_bulk
 from .strain import Strain
 
 __all__ = ["MaterialPoints"]
@@ -39,6 +46,7 @@ class _Group(NamedTuple):
     material: Material
     points: NDArray[np.int64]
     law: Material  # what is evaluated: the material, or it without its bulk modulus
+    at_pressure: bool = False  # whether it is evaluated at a pressure, as it does not come apart
 
 
 class _Given(NamedTuple):
@@ -217,6 +225,11 @@ class MaterialPoints:
 
     # -- A stress that is there at first ---------------------------------------------------
 
+    def begin_with_pressure(self) -> None:
+        """Let the pressure be that of materials where nothing is strained yet (collective)."""
+        assert self.mean_stress is not None
+        self.mean_stress.begin_with(self.converged_pressure)
+
     def begin_with(self, cauchy_stress: NDArray[np.float64]) -> None:
         """Let the points, which have not moved, carry a stress (collective).
 
@@ -359,6 +372,11 @@ class MaterialPoints:
         return self._last.recovery
 
     @property
+    def comes_apart(self) -> bool:
+        """Whether mean stresses depend on the volume alone, so that a pressure can replace them."""
+        return not any(group.at_pressure for group in self._groups)
+
+    @property
     def grouped(self) -> VolumeAveraging | None:
         """What knows what the tangent has from other points of a group; ``None`` without F-bar."""
         return self.averaging
@@ -395,7 +413,7 @@ class MaterialPoints:
     @property
     def by_pressure(self) -> NDArray[np.float64]:
         """Derivative of the stress by a pressure of its own, ``(n nq, dim, dim)``."""
-        return self.volume_strain.slope
+        return self.volume_strain.by_pressure
 
     def _group(self, assignment: Assignment, cell_tags: mesh.MeshTags | None) -> list[_Group]:
         if isinstance(assignment, Material):
@@ -438,7 +456,10 @@ class MaterialPoints:
         """Return a material with its points, without its mean stress where a pressure is that."""
         if self.mean_stress is None:
             return _Group(material, points, material)
-        require_split(material)
+        if not is_split(material):
+            group = _Group(material, points, material, at_pressure=True)
+            self.mean_stress.shear[points] = self._undeformed_tangent(group)[:, 0, 1, 0, 1]
+            return group
         law, bulk, soft = without_bulk(material)
         self.mean_stress.follow(points, material, bulk, soft)
         return _Group(material, points, law)
@@ -563,8 +584,6 @@ class MaterialPoints:
         if self.averaging is None:
             gradient = gradient.reshape(-1, self.dim, self.dim)
             self._update_materials(gradient)
-            if self.mean_stress is not None:
-                self._take_pressure(gradient)
             return
         gradient = self.averaging.average(gradient)
         try:
@@ -600,26 +619,16 @@ class MaterialPoints:
         tangent = np.einsum("niJkL,nMJ,nNL->niMkN", tangent, G, G, optimize=True)
         return stress, tangent / volume[:, :, :, None, None]
 
-    def _take_pressure(self, gradient: NDArray[np.float64]) -> None:
-        """Let the pressure take the place of the mean stress in the last update."""
-        assert self.mean_stress is not None
-        stresses = [
-            (group.points, state["stress"])
-            for group, state in zip(self._groups, self._trial, strict=True)
-        ]
-        self.first_piola, self.tangent, own = self.mean_stress.replace(
-            gradient, self.first_piola, self.tangent, stresses
-        )
-        self._trial = [
-            {**state, "stress": stress} for state, stress in zip(self._trial, own, strict=True)
-        ]
-
     def _update_materials(self, gradient: NDArray[np.float64]) -> None:
-        trial = []
+        trial, volumes = [], []
         for group, state in zip(self._groups, self._last.states, strict=True):
             everywhere = len(group.points) == self._points
             part = gradient if everywhere else gradient[group.points]
-            answer = self._answer(group, part, state)
+            if self.mean_stress is None:
+                answer = self._answer(group, part, state)
+            else:
+                answer, volume = self._at_pressure(group, part, state)
+                volumes.append((group.points, volume))
             if everywhere:
                 self.first_piola, self.tangent = answer.first_piola, answer.tangent
             else:
@@ -627,6 +636,35 @@ class MaterialPoints:
                 self.tangent[group.points] = answer.tangent
             trial.append(answer.state)
         self._trial, self._trial_gradient = trial, gradient
+        if self.mean_stress is not None:
+            self.mean_stress.see(volumes)
+
+    def _at_pressure(
+        self, group: _Group, gradient: NDArray[np.float64], state: State
+    ) -> tuple[_Answer, VolumeStrain]:
+        """Return what a material answers at the pressure of its points, and its volume strain."""
+        assert self.mean_stress is not None
+        if not group.at_pressure:
+            own = Update(*self._answer(group, gradient, state))
+            replaced, strain = self.mean_stress.replace(group.points, gradient, own)
+            P, A, new = replaced
+            assert A is not None
+            return _Answer(P, A, new), strain
+        assert isinstance(group.law, StrainMaterial)
+        p = self.mean_stress.values[group.points]
+        law, shear = type(group.law).__name__, self.mean_stress.shear[group.points]
+        received = {name: _read_only(values) for name, values in state.items()}
+        try:
+            found = group.law.at_pressure(_read_only(gradient), received, p, shear)
+        except MPMError as error:
+            raise self._named(error, group) from None
+        except np.linalg.LinAlgError as error:
+            raise ConvergenceError(f"The update of {law} broke down ({error})") from error
+        except Exception as error:
+            raise as_ours(error, f"The update of {law}") from error
+        answer = self._checked(group, state, Update(*found[:2], found.state))
+        volume = found.gap + found.compliance * p
+        return answer, VolumeStrain(volume, found.slope, found.compliance, found.by_pressure)
 
     def _initial_state(self, group: _Group) -> State:
         """Return the state of a material's points where nothing is strained yet.
@@ -682,6 +720,15 @@ class MaterialPoints:
                 f"The update of {law} must return a materials.Update, not a "
                 f"{type(answer).__name__}."
             )
+        return self._checked(group, state, answer)
+
+    def _checked(self, group: _Group, state: State, answer: Update) -> _Answer:
+        """Return what a law answered to a state, if it is finite and of the right shape and type.
+
+        Raises:
+            MPMError: It is not.
+        """
+        law = type(group.material).__name__
         n, dim = len(group.points), self.dim
         self._require(group, "stress P", answer.first_piola, (n, dim, dim))
         self._require(group, "tangent", answer.tangent, (n, dim, dim, dim, dim))

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 
 from .._core import loops
 from ..errors import MPMError
-from ..materials.base import Material, StrainMaterial
+from ..materials.base import Material, StrainMaterial, Update
 from ..particles.field import ParticleField
 
-__all__ = ["MeanStress", "VolumeStrain", "require_split", "with_pressure", "without_bulk"]
+__all__ = ["MeanStress", "VolumeStrain", "is_split", "with_pressure", "without_bulk"]
 
 
 class VolumeStrain(NamedTuple):
@@ -36,33 +36,39 @@ class VolumeStrain(NamedTuple):
         volume: Elastic volumetric strain theta, shape ``(n,)``.
         slope: Its derivative by F, shape ``(n, dim, dim)``.
         compliance: 1/K, shape ``(n,)``.
+        by_pressure: Derivative of the stress by the pressure, shape ``(n, dim, dim)``.
     """
 
     volume: NDArray[np.float64]
     slope: NDArray[np.float64]
     compliance: NDArray[np.float64]
+    by_pressure: NDArray[np.float64]
 
 
-def require_split(material: Any) -> None:
-    """Raise an error unless a law's mean stress can be replaced by a pressure.
+def is_split(material: Material) -> bool:
+    """Return whether a law's mean stress is a modulus times the volume strain, and nothing else.
 
     Raises:
-        MPMError: Its mean stress does not depend on the volume alone, or it does not say so.
+        MPMError: The law is not written in strain space, so no pressure can stand in it.
     """
-    known = isinstance(material, StrainMaterial)
-    if not known or not vars(type(material)).get("linear_in_volume", False):
+    if not isinstance(material, StrainMaterial):
         raise MPMError(
-            f"mixed='pressure' needs a law whose mean stress is the bulk modulus times the volume "
-            f"strain, such as Hencky or VonMises, not {type(material).__name__}; use f_bar='patch' "
-            "for others."
+            f"mixed='pressure' needs a law in strain space (a StrainMaterial), not "
+            f"{type(material).__name__}; use f_bar='patch' for others."
         )
+    if not material.rises_with_volume:
+        raise MPMError(
+            f"mixed='pressure' needs a law whose mean stress rises with the volume: a "
+            f"{type(material).__name__} may soften under a given shape; use f_bar='patch'."
+        )
+    return bool(vars(type(material)).get("linear_in_volume", False))
 
 
 def without_bulk(material: Material) -> tuple[Material, Any, Any]:
     """Return a law with the same shear response and a bulk modulus of its size.
 
     Args:
-        material: A law for which :func:`require_split` holds.
+        material: A law for which :func:`is_split` holds.
 
     Returns:
         The law, the bulk modulus of the given one, and that of the returned one.
@@ -82,12 +88,15 @@ class MeanStress:
 
     Attributes:
         strain: Volume strain of the last update, and the compliance.
+        shear: Shear modulus of unstrained points whose law is evaluated at the pressure, ``(n,)``.
     """
 
     def __init__(self, pressure: ParticleField, shape: tuple[int, int]) -> None:
         self._pressure = pressure
         count, dim = shape
-        self.strain = VolumeStrain(np.zeros(count), np.zeros((count, dim, dim)), np.zeros(count))
+        zero = np.zeros((count, dim, dim))
+        self.strain = VolumeStrain(np.zeros(count), zero, np.zeros(count), zero)
+        self.shear = np.zeros(count)
         self._soft = np.zeros(count)
         self._small = np.zeros(count, dtype=bool)
 
@@ -109,7 +118,8 @@ class MeanStress:
             volume: Volume strain, shape ``(n,)``.
             gradient: ``F - I``, shape ``(n, dim, dim)``.
         """
-        self.strain = self.strain._replace(volume=volume, slope=_slope(gradient, self._small))
+        slope = _slope(gradient, self._small)
+        self.strain = self.strain._replace(volume=volume, slope=slope, by_pressure=slope)
 
     def follow(self, points: NDArray[np.int64], material: Material, bulk: Any, soft: Any) -> None:
         """Take over a law's moduli at some points.
@@ -125,32 +135,38 @@ class MeanStress:
 
     def replace(
         self,
+        points: NDArray[np.int64],
         gradient: NDArray[np.float64],
-        first_piola: NDArray[np.float64],
-        tangent: NDArray[np.float64],
-        stresses: Sequence[tuple[NDArray[np.int64], NDArray[np.float64]]],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return stress and tangent with the pressure in place of the mean stress.
+        answer: Update,
+    ) -> tuple[Update, VolumeStrain]:
+        """Return the answer of a law with the pressure in place of its mean stress.
 
         Args:
+            points: Where the law governs, ``n`` of them.
             gradient: ``F - I``, shape ``(n, dim, dim)``.
-            first_piola: Of the laws in use.
-            tangent: Its derivative.
-            stresses: Their own stresses, Mandel vectors, with the points where they are.
+            answer: Of the law in use, with a tangent.
 
         Returns:
-            First Piola stress and derivative at constant pressure, and the laws' own stresses.
+            The answer, whose tangent is that at constant pressure, and the volume strain.
         """
-        whole = stresses[0][1]
-        if len(stresses) > 1:
-            whole = np.empty((len(self._soft), whole.shape[1]))
-            for points, stress in stresses:
-                whole[points] = stress
-        answer = (gradient, first_piola, tangent, whole)
-        found = with_pressure(answer, self.values, self._soft, self._small)
-        self.strain = self.strain._replace(volume=found.volume, slope=found.slope)
-        own = [found.stress[points] for points, _ in stresses]
-        return found.first_piola, found.tangent, own if len(own) > 1 else [found.stress]
+        assert answer.tangent is not None
+        values = gradient, answer.first_piola, answer.tangent, answer.state["stress"]
+        found = with_pressure(values, self.values[points], self._soft[points], self._small[points])
+        compliance = self.strain.compliance[points]
+        seen = VolumeStrain(found.volume, found.slope, compliance, found.slope)
+        state = {**answer.state, "stress": found.stress}
+        return Update(found.first_piola, found.tangent, state), seen
+
+    def see(self, parts: Sequence[tuple[NDArray[np.int64], VolumeStrain]]) -> None:
+        """Take the volume strains of the laws, each with its points, for those of the update."""
+        if len(parts) == 1:
+            self.strain = parts[0][1]
+            return
+        whole = VolumeStrain(*(np.empty_like(values) for values in self.strain))
+        for points, part in parts:
+            for values, its in zip(whole, part, strict=True):
+                values[points] = its
+        self.strain = whole
 
 
 class Pressed(NamedTuple):

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._core import loops
-from ..errors import ConvergenceError
+from ..errors import ConvergenceError, MPMError
 from .averaging import Linearised, LowRankTerm, VolumeAveraging
 from .groups import Groups
 from .points import MaterialPoints
@@ -91,6 +91,12 @@ class StepStress:
         self._muted = False
         self._work = (0.0, 0.0, 0.0)
         self._splits = points.mean_stress is not None and share < 1.0
+        if self._splits and not points.comes_apart:
+            raise MPMError(
+                "mixed='pressure' in a motion with the scheme 'midpoint' or 'conserving' is for "
+                "laws whose mean stress is the bulk modulus times the volume strain, such as "
+                "Hencky or VonMises; use scheme='euler', or f_bar='patch'."
+            )
         self._undeformed: Array | None = None
         self._small = points.has_small_strain
         self._exact = points.is_hyperelastic & ~self._small

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError, agree
+from .given_pressure import AtPressure, at_pressure
 from .kinematics import KINEMATICS, Kinematics
 from .mandel import norm, num_components, to_tensor, to_vector
 
@@ -292,11 +293,14 @@ class StrainMaterial(Material):
             elastic logarithmic strain, Kirchhoff stress.
         inelastic: Whether elastic strain and strain may differ, so that history is kept.
         internal_variables: Shape per point of each of the law's own internal variables.
+        rises_with_volume: Whether the mean stress never falls as volume grows in a step of the same
+            shape, so that a pressure may stand for it (``mixed="pressure"``).
     """
 
     kinematics: ClassVar[Literal["small", "logarithmic"]] = "logarithmic"
     inelastic: ClassVar[bool] = False
     internal_variables: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType({})
+    rises_with_volume: ClassVar[bool] = True
 
     @abstractmethod
     def integrate(
@@ -382,6 +386,26 @@ class StrainMaterial(Material):
             new |= frame.history(elastic_strain)
         A = None if D is None else frame.tangent(stress, D)
         return Update(frame.first_piola(stress), A, new)
+
+    def at_pressure(
+        self,
+        displacement_gradient: NDArray[np.float64],
+        state: State,
+        pressure: NDArray[np.float64],
+        shear: NDArray[np.float64],
+    ) -> AtPressure:
+        """Return what the law answers where its mean stress is given, for ``mixed="pressure"``.
+
+        Args:
+            displacement_gradient: As in :meth:`update`.
+            state: As in :meth:`update`.
+            pressure: Mean of the law's own stress, shape ``(n,)``, positive in tension.
+            shear: Shear modulus of the unstrained points, shape ``(n,)``.
+
+        Raises:
+            MPMError: As :meth:`update`.
+        """
+        return at_pressure(self, displacement_gradient, state, pressure, shear)
 
     def cauchy_stress(
         self, displacement_gradient: NDArray[np.float64], state: State

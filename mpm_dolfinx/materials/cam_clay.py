@@ -64,6 +64,7 @@ class ModifiedCamClay(CompiledMaterial):
     symmetric = False
     kinematics: ClassVar[Literal["small", "logarithmic"]] = "logarithmic"
     inelastic: ClassVar[bool] = True
+    rises_with_volume: ClassVar[bool] = False
     internal_variables: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType(
         {"plastic_strain": (), "preconsolidation": ()}
     )

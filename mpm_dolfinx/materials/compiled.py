@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._core import loops
+from ..errors import ConvergenceError
 from .base import Parameter, State, StrainMaterial, Update
+from .given_pressure import ALPHA, AtPressure
 from .kinematics import require_valid
 from .mandel import num_components
 
@@ -51,15 +53,55 @@ class CompiledMaterial(StrainMaterial):
         require_valid(valid)
         return Update(P, A if tangent else None, new)
 
+    def at_pressure(
+        self, displacement_gradient: Array, state: State, pressure: Array, shear: Array
+    ) -> AtPressure:
+        """See :meth:`StrainMaterial.at_pressure`."""
+        loop = vars(type(self)).get("_loop")
+        remembers = "displacement_gradient" in state
+        if loop is None or loops is None or not self.compiled or not remembers:
+            return super().at_pressure(displacement_gradient, state, pressure, shear)
+        H = np.ascontiguousarray(displacement_gradient)
+        n, dim, _ = H.shape
+        P, A = np.empty_like(H), np.empty((n, dim, dim, dim, dim))
+        gap, compliance = np.zeros(n), np.zeros(n)
+        slope, by_pressure = np.zeros_like(H), np.zeros_like(H)
+        given = np.ascontiguousarray(pressure), ALPHA * shear
+        seen = gap, compliance, slope, by_pressure
+        parameters = [_values(parameter) for parameter in self._constants()]
+        new, invalid = self._with_history(loop, parameters, H, state, P, A, given, seen)
+        lost = invalid[np.isnan(gap[invalid])]
+        if len(lost):
+            raise ConvergenceError(
+                f"{type(self).__name__} found no volume strain for the pressure", lost
+            )
+        valid = np.ones(n, dtype=bool)
+        valid[invalid] = False
+        require_valid(valid)
+        return AtPressure(P, A, by_pressure, gap, slope, compliance, new)
+
     def _with_history(
-        self, loop: str, parameters: list[Array], H: Array, state: State, P: Array, A: Array
+        self,
+        loop: str,
+        parameters: list[Array],
+        H: Array,
+        state: State,
+        P: Array,
+        A: Array,
+        given: tuple[Array, ...] = (),
+        seen: tuple[Array, ...] = (),
     ) -> tuple[State, NDArray[np.int64]]:
-        """Set P and A; return the new state and the points that are impossible."""
+        """Set P, A, and at a given pressure what is seen then.
+
+        Returns:
+            The new state, and the points that are impossible.
+        """
         n, dim, _ = H.shape
         names, m = tuple(self.internal_variables), num_components(dim)
         stress, b = np.empty((n, m)), np.empty((n, m))
         variables = [np.empty(n) for _ in names]
-        invalid = loops.update_plastic(
+        run = loops.update_at_pressure if given else loops.update_plastic
+        invalid = run(
             loop,
             H,
             np.ascontiguousarray(state["displacement_gradient"]),
@@ -67,11 +109,13 @@ class CompiledMaterial(StrainMaterial):
             [np.ascontiguousarray(state[name]) for name in names],
             parameters,
             getattr(self, "yield_tolerance", 0.0),
+            *given,
             P,
             A,
             stress,
             b,
             variables,
+            *seen,
         )
         # What cannot be written to is kept as it is: it is given away for good.
         gradient = H.copy() if H.flags.writeable else H

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import MPMError
 from .base import Field, Integration, Parameter, State, Update, check_parameter
 from .elastic import IsotropicElastic
+from .given_pressure import AtPressure
 from .mandel import to_tensor
 from .principal import axes_in_order, from_axes, shear_quotients, tangent_from_axes
 
@@ -144,6 +145,15 @@ class FrictionalMaterial(IsotropicElastic):
             law = self.softened(state["plastic_strain"])
             return law.update(displacement_gradient, state, tangent)
         return super().update(displacement_gradient, state, tangent)
+
+    def at_pressure(
+        self, displacement_gradient: Array, state: State, pressure: Array, shear: Array
+    ) -> AtPressure:
+        """See :meth:`StrainMaterial.at_pressure`."""
+        if "decay" in self.parameters:
+            law = self.softened(state["plastic_strain"])
+            return law.at_pressure(displacement_gradient, state, pressure, shear)
+        return super().at_pressure(displacement_gradient, state, pressure, shear)
 
     def with_parameters(self, **parameters: Parameter) -> Self:
         """See :meth:`Material.with_parameters`."""

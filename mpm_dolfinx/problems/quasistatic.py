@@ -98,8 +98,9 @@ class QuasiStaticProblem(ParticleProblem):
             What it is not in equilibrium with goes in proportion, as loads come, in the first run.
         mixed: ``"pressure"``: the pressure is an unknown besides the displacement, continuous and
             of one degree less on the same background mesh (the pair of Taylor & Hood 1973), so that
-            nothing locks however little volume changes; for laws that are linear in the volume
-            (Hencky, von Mises), backgrounds and particles of degree 2 or 3, instead of ``f_bar``.
+            nothing locks however little volume changes; for laws in strain space (Hencky,
+            von Mises, Mohr-Coulomb, Drucker-Prager, your own), backgrounds and particles of degree
+            2 or 3, instead of ``f_bar``.
 
     Attributes:
         pressure: With ``mixed``, the pressure of each body: a :class:`mpm_dolfinx.ParticleField` at
@@ -466,7 +467,9 @@ class QuasiStaticProblem(ParticleProblem):
         self._acting: list[MaterialPoints | StepStress] = []
         self._density: list[tuple[VirtualWork, Density]] = []
         bodies = [given.particles for given in self.setup.bodies]
+        known = self.pressure
         self.pressure = [self._pressure_of(body) for body in bodies if self.setup.mixed]
+        self._new_pressures = [p for p in self.pressure if all(p is not other for other in known)]
         return [self._contribution(given) for given in self.setup.bodies]
 
     def _pressure_of(self, body: Particles) -> ParticleField:
@@ -492,6 +495,8 @@ class QuasiStaticProblem(ParticleProblem):
             self._compiled,
             next((field for field in self.pressure if field.particles is body), None),
         )
+        if any(field.particles is body for field in self._new_pressures):
+            history.begin_with_pressure()
         self._stresses.append(history)
         work = VirtualWork(strain)
         density = Density(given.density, body)
