@@ -27,6 +27,8 @@ LINEAR_SOLVERS = ("auto", "direct", "multigrid")
 COARSEST = 600
 #: Unknowns from which on multigrid takes less time than a factorisation, by dimension of space.
 CROSSOVER = {2: 40000, 3: 2000}
+#: The same in a motion, where the mass takes it three times the iterations.
+CROSSOVER_IN_MOTION = {2: 40000, 3: 5000}
 
 #: Values of MUMPS's INFOG(1) that more workspace cures.
 OUT_OF_WORKSPACE = (-8, -9)
@@ -173,29 +175,31 @@ class ShiftedFactor:
             for key in options:
                 database.delValue(key)
 
-    def begin(self, size: int, constrained: bool = False) -> None:
+    def begin(self, size: int, constrained: bool = False, in_motion: bool = False) -> None:
         """Begin a step (collective).
 
         Args:
             size: Number of all unknowns.
             constrained: Whether there are others than displacements, as such that enforce
                 constraints.
+            in_motion: Whether the tangent has masses.
         """
         self.D = None
         self._constrained = constrained
-        iterates = self._prefers_multigrid(size)
+        iterates = self._prefers_multigrid(size, in_motion)
         if iterates != self.iterates:
             self._choose(iterates)
 
-    def _prefers_multigrid(self, size: int) -> bool:
+    def _prefers_multigrid(self, size: int, in_motion: bool) -> bool:
         if size <= COARSEST:
             return False  # a factor is all that its levels would be
         if self._own_type or self._failures >= ENDURED:
             return False
         if self._linear_solver != "auto":
             return self._linear_solver == "multigrid"
+        crossover = CROSSOVER_IN_MOTION if in_motion else CROSSOVER
         plain = self._symmetric and not self._constrained
-        return plain and size >= CROSSOVER.get(self._dim, np.inf)
+        return plain and size >= crossover.get(self._dim, np.inf)
 
     def _choose(self, iterates: bool) -> None:
         """Set up the KSP for multigrid or for a factorisation (collective)."""

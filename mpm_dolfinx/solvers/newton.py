@@ -224,7 +224,7 @@ class NewtonSolver:
         self.no_equilibrium = False
         if self._search is not None:
             self._search.begin(self._symmetric and problem.has_potential())
-        self._factor.begin(sizes[1], problem.constrained)
+        self._factor.begin(sizes[1], problem.constrained, self.lets_go)
         # What an iterative solve that fails means is for _pre_check to say.
         self.snes.setMaxLinearSolveFailures(1000 if self._factor.iterates else 1)
         self._tolerance = 0.0

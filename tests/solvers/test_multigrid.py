@@ -195,6 +195,14 @@ def test_many_unknowns_are_for_multigrid(monkeypatch):
     run = heavy(20, linear_solver="auto", petsc_options={"pc_type": "lu"})
     run.solve(steps=1)
     assert run.history.statistics["krylov_iterations"] == 0
+    for crossover, used in (({2: 2000}, False), ({2: 700}, True)):
+        monkeypatch.setattr(linear, "CROSSOVER_IN_MOTION", crossover)
+        still = heavy(20)
+        motion = mpm.DynamicProblem(
+            still.particles, PLASTIC, 1.0, body_force=(0.0, -8e3), bcs=still.bcs
+        )
+        motion.step(1e-3)
+        assert (motion.history.statistics["krylov_iterations"] > 0) == used
 
 
 @pytest.mark.parametrize(
