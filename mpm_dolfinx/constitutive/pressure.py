@@ -118,7 +118,11 @@ class MeanStress:
             volume: Volume strain, shape ``(n,)``.
             gradient: ``F - I``, shape ``(n, dim, dim)``.
         """
-        slope = _slope(gradient, self._small)
+        # by what updates it, so that a run goes on bit for bit
+        n, dim, _ = gradient.shape
+        none = np.zeros_like(gradient), np.zeros((n, *(dim,) * 4)), np.zeros((n, 3))
+        answer = np.ascontiguousarray(gradient), *none
+        slope = with_pressure(answer, np.zeros(n), np.ones(n), self._small).slope
         self.strain = self.strain._replace(volume=volume, slope=slope, by_pressure=slope)
 
     def follow(self, points: NDArray[np.int64], material: Material, bulk: Any, soft: Any) -> None:
