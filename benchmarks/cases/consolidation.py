@@ -41,48 +41,34 @@ body = mesh.create_rectangle(
 )
 V = fem.functionspace(background, ("Lagrange", 2, (2,)))
 particles = mpm.Particles(body, V, degree=2, quadrature_degree=4)
-p = particles.field(fem.functionspace(background, ("Lagrange", 1)), at="nodes", name="pressure")
 
-# The skeleton: linear elastic, of the oedometric modulus that gives the settlement. Terzaghi's
-# effective stress, and the mass of the water over a step. The top is drained by Nitsche's method,
-# and the bottom held by a penalty, as both lie on the body.
+# The skeleton: linear elastic, of the oedometric modulus that gives the settlement, and of a
+# permeability with which the coefficient of consolidation is 1. Both ends lie on the body: the top
+# is drained and loaded, the bottom stands on a roller.
 
 modulus, poisson = 1.0 / args.settlement, 0.25
-shear = modulus * (1.0 - 2.0 * poisson) / 2.0 / (1.0 - poisson)
-permeability = args.settlement
-
-d, v, q = particles.displacement, ufl.TestFunction(particles.W), ufl.TestFunction(p.W)
-d_n, dt = fem.Function(particles.W), fem.Constant(body, args.time / args.steps)
+young = modulus * (1.0 + poisson) * (1.0 - 2.0 * poisson) / (1.0 - poisson)
 ends = mesh.locate_entities_boundary(
     body, 1, lambda x: np.isclose(x[1], 1.0 + low) | np.isclose(x[1], low)
 )
 ends.sort()
 middle = mesh.compute_midpoints(body, 1, ends)[:, 1]
 tags = mesh.meshtags(body, 1, ends, np.where(middle > 0.5 + low, 1, 2).astype(np.int32))
-ds, normal = ufl.Measure("ds", domain=body, subdomain_data=tags), ufl.FacetNormal(body)
-
-strain = ufl.sym(ufl.grad(d))
-stress = 2.0 * shear * strain
-stress += ((modulus - 2.0 * shear) * ufl.tr(strain) - p) * ufl.Identity(2)
-R_u = ufl.inner(stress, ufl.grad(v)) * particles.dx + v[1] * ds(1)
-R_u += 1e4 * modulus / h * d[1] * v[1] * ds(2)
-flow = dt * permeability
-R_p = -(q * ufl.div(d - d_n) + flow * ufl.dot(ufl.grad(p), ufl.grad(q))) * particles.dx
-R_p += flow * (ufl.dot(ufl.grad(p), normal) * q + ufl.dot(ufl.grad(q), normal) * p) * ds(1)
-R_p -= flow * 10.0 / h * p * q * ds(1)
-
 side = mesh.locate_entities_boundary(
     background, 1, lambda x: np.isclose(x[0], 0.0) | np.isclose(x[0], 2 * h)
 )
-bc = fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(0), 1, side), V.sub(0))
-problem = mpm.ParticleProblem(
-    [R_u, R_p],
+problem = mpm.PorousProblem(
     particles,
-    bcs=[bc],
-    fields=[p],
-    symmetric=True,
+    mpm.materials.LinearElastic(young, poisson),
+    permeability=args.settlement,
+    bcs=[fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(0), 1, side), V.sub(0))],
+    supports=[mpm.boundary.roller(particles, tags, 2, normal=(0.0, -1.0))],
+    tractions=[((0.0, -1.0), 1)],
+    drained=[(0.0, 1)],
+    facet_tags=tags,
     petsc_options_prefix="consolidation_",
 )
+(p,) = problem.pore_pressure
 
 
 def terzaghi(z: np.ndarray, time: float) -> np.ndarray:
@@ -91,17 +77,15 @@ def terzaghi(z: np.ndarray, time: float) -> np.ndarray:
     return (2.0 / M * np.sin(np.outer(z, M)) * np.exp(-M * M * time)).sum(axis=1)
 
 
-particles.load.value = 1.0  # all of it from the start
 failure = None
 depth = 1.0 + low - p.W.tabulate_dof_coordinates()[:, 1]
 profiles = []
+run = problem.steps(args.time, args.time / args.steps)
 try:
-    for number in range(args.steps):
-        problem.step()
-        d_n.x.array[:] = d.x.array
-        if args.plot and (number + 1) % max(1, args.steps // 4) == 0:
+    for number, step in enumerate(run, start=1):
+        if args.plot and number % max(1, args.steps // 4) == 0:
             profile = np.column_stack([depth, p.x.array])[: p.W.dofmap.index_map.size_local]
-            profiles.append(((number + 1) * float(dt.value), kit.gathered(profile)))
+            profiles.append((step.time, kit.gathered(profile)))
 except mpm.MPMError as told:
     failure = told
 
@@ -114,6 +98,8 @@ squares = [
     kit.total(fem.assemble_scalar(fem.form(f**2 * particles.dx))) for f in (p - exact, exact)
 ]
 error = float(np.sqrt(squares[0] / squares[1]))
+d = particles.displacement
+ds = ufl.Measure("ds", domain=body, subdomain_data=tags)
 area = kit.total(fem.assemble_scalar(fem.form(fem.Constant(body, 1.0) * ds(1))))
 sunk = -kit.total(fem.assemble_scalar(fem.form(d[1] * ds(1)))) / area / args.settlement
 M = (2.0 * np.arange(2000) + 1.0) * np.pi / 2.0

@@ -198,7 +198,14 @@ RUNS = {
     "column": ("column_dynamic", "--time 0.4", {"cutbacks": 0, "balance_error": 1e-12}),
 }
 #: Cases that go through time, whose load is that.
-IN_TIME = {"sand_column", "flying_bar", "spinning_block", "colliding_discs", "column_dynamic"}
+IN_TIME = {
+    "sand_column",
+    "flying_bar",
+    "spinning_block",
+    "consolidation",
+    "colliding_discs",
+    "column_dynamic",
+}
 KEYS = {
     "compaction": {"error", "error_position", "particles"},
     "cantilever": {"shortening", "deflection", "error"},
@@ -381,6 +388,7 @@ def test_case_is_a_program(name, tmp_path):
         "block3d": "--elements 2 --steps 4",
         "collapse": "--cell 2 --particles-per-cell 1 --f-bar domain --steps 4",
         "footing": "--cell 0.5 --steps 4",
+        "consolidation": "--cells 4 --steps 2",
         "strength": "--cell 0.5",
         "gmsh_body": "--size 0.3 --body-size 0.3 --steps 2",
         "snap_through": "--cell 1 --steps 4",
