@@ -31,6 +31,7 @@ assemble_vector: Any = fem_petsc.assemble_vector
 assemble_matrix: Any = fem_petsc.assemble_matrix
 SUBSET = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
 DIFFERENT = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
+SAME = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
 
 
 def assemble_into(
@@ -104,6 +105,7 @@ class MatrixSum:
     def __init__(self) -> None:
         self._parts: list[PETSc.Mat] = []
         self._total: PETSc.Mat | None = None
+        self._holds = False  # whether the first has a place for each entry of the others
 
     def of(self, parts: Sequence[PETSc.Mat]) -> PETSc.Mat:
         """Return the sum, the same object for the same parts (collective).
@@ -119,10 +121,21 @@ class MatrixSum:
         if not known or self._total is None:
             self._parts = list(parts)
             self._total = parts[0].copy()
+            before = _num_entries(self._total)
             for part in parts[1:]:
                 self._total.axpy(1.0, part, structure=DIFFERENT)
+            self._holds = _num_entries(self._total) == before
             return self._total
-        self._total.zeroEntries()
-        for part in parts:
+        if self._holds:
+            parts[0].copy(self._total, structure=SAME)
+        else:
+            self._total.zeroEntries()
+            self._total.axpy(1.0, parts[0], structure=SUBSET)
+        for part in parts[1:]:
             self._total.axpy(1.0, part, structure=SUBSET)
         return self._total
+
+
+def _num_entries(matrix: PETSc.Mat) -> float:
+    """Return the number of entries of a matrix that have a place (collective)."""
+    return float(matrix.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"])

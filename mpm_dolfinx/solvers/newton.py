@@ -218,7 +218,7 @@ class NewtonSolver:
         self._stalled = self._ended = self._refines = False
         self._goes_on = 0
         self._shrinks = True
-        self._norm = np.inf
+        self._norm = self._internal = np.inf  # the size of internal forces, once it is known
         self._first = 0.0
         self._norms: list[float] = []
         self.no_equilibrium = False
@@ -416,9 +416,10 @@ class NewtonSolver:
         if iteration >= 2 and size > max(0.25 * self._norm, rtol * scale):
             self._stalled = True
         if self._stalled or scale == 0.0:
-            internal = self._problem.internal_scale()
-            if scale < 1e-6 * internal:
-                scale = internal
+            if scale < 1e-5 * self._internal:
+                self._internal = self._problem.internal_scale()
+            if scale < 1e-6 * self._internal:
+                scale = self._internal
         self._norm = size
         self._norms.append(size)
         self.residuals.append(size / scale if scale > 0 else size)
