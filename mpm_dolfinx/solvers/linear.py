@@ -42,6 +42,10 @@ SADDLE = {"mat_mumps_icntl_8": 7}
 #: PORD orders plane graphs three times as fast as METIS and no worse, in space worse; from that
 #: many unknowns on, as it ends the process where all unknowns are neighbours of each other.
 PORD, PORD_FROM = {"mat_mumps_icntl_7": 4}, 10000
+#: Blocks of low rank of MUMPS's factors, to what share of their size, and unknowns in space from
+#: which on they are used; and the relative residual to which such a factor is iterated with.
+LOW_RANK, LOW_RANK_FROM = {"mat_mumps_icntl_35": 1, "mat_mumps_cntl_7": 1e-4}, 20000
+COMPRESSED = 1e-10
 #: Unknowns up to which a factorisation takes over where multigrid comes to nothing, and steps in
 #: a row in which it may before no step begins with multigrid.
 TAKEN_OVER, ENDURED = {2: 500000, 3: 50000}, 3
@@ -164,7 +168,8 @@ class ShiftedFactor:
         """Put the options into PETSc's database, for what reads them inside the block."""
         database = PETSc.Options()
         plane = self._dim == 2 and size >= PORD_FROM
-        chosen = (SADDLE if self.num_negative else MUMPS) | (PORD if plane else {})
+        chosen: dict[str, Any] = {**(SADDLE if self.num_negative else MUMPS)}
+        chosen |= (PORD if plane else {}) | (LOW_RANK if self._compresses(size) else {})
         defaults = {self._prefix + k: v for k, v in chosen.items()}
         options = {k: v for k, v in defaults.items() if not database.hasName(k)} | self._options
         for key, value in options.items():
@@ -189,6 +194,26 @@ class ShiftedFactor:
         iterates = self._prefers_multigrid(size, in_motion)
         if iterates != self.iterates:
             self._choose(iterates)
+        if not iterates:
+            self._iterate_with_factor(size)
+
+    def _compresses(self, size: int) -> bool:
+        """Return whether factors have blocks of low rank."""
+        if self._dim < 3 or size < LOW_RANK_FROM or self._own_type:
+            return False
+        _, factor, package = self._direct
+        return factor in FACTORS and package == "mumps"
+
+    def _iterate_with_factor(self, size: int) -> None:
+        """Let a factor with blocks of low rank precondition, others solve (collective)."""
+        if self._compresses(size):
+            self._ksp.setType("fgmres")
+            self._ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+            self._ksp.setTolerances(rtol=COMPRESSED, atol=0.0, max_it=ITERATIONS)
+            self._ksp.setGMRESRestart(KRYLOV)
+        elif self._ksp.getType() != self._direct[0]:
+            self._ksp.setType(self._direct[0])
+            self._ksp.setNormType(PETSc.KSP.NormType.NORM_DEFAULT)
 
     def _prefers_multigrid(self, size: int, in_motion: bool) -> bool:
         if size <= COARSEST:
@@ -407,6 +432,7 @@ class ShiftedFactor:
             return False
         self._failures += 1
         self._choose(False)
+        self._iterate_with_factor(K.getSize()[0])
         self._factorise(K, levels)
         self._statistics.count("multigrid_failures")
         self._ksp.solve(b, x)

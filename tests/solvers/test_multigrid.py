@@ -73,6 +73,21 @@ def test_displacements_are_those_of_a_factorisation(n, options):
     assert_same(*runs)
 
 
+def test_factors_of_low_rank_give_the_same(monkeypatch):
+    full = heavy(5, cell=HEXAHEDRON, linear_solver="direct")
+    full.solve(steps=2)
+    monkeypatch.setattr(linear, "LOW_RANK_FROM", 100)
+    monkeypatch.setattr(linear, "LOW_RANK", {"mat_mumps_icntl_35": 1, "mat_mumps_cntl_7": 1e-2})
+    run = heavy(5, cell=HEXAHEDRON, linear_solver="direct")
+    run.solve(steps=2)
+    a, b = scenes.own(full.particles.displacement), scenes.own(run.particles.displacement)
+    assert scenes.largest(a - b) < 1e-9 * scenes.largest(a)
+    assert run.history.total_iterations == full.history.total_iterations
+    given = heavy(3, cell=HEXAHEDRON, petsc_options={"pc_type": "lu"})
+    given.solve(steps=1)
+    assert given.history.statistics["factorisations"] > 0
+
+
 @pytest.mark.parametrize(
     ("n", "law"), [(8, VonMises(1e6, 0.4999, rho_y=20e3)), (12, Hencky(1e6, 0.499999))]
 )
