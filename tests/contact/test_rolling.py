@@ -28,8 +28,11 @@ def round_body(dim, n, centre):
     return body
 
 
-def rolled(dim, friction, n, cell, dt, steps):
-    """Let a round body go down an incline; return its acceleration and T / N in the last half."""
+def rolled(dim, friction, n, cell, dt, steps, scheme="euler", rests=False):
+    """Let a round body go down an incline; return its acceleration and T / N in the last half.
+
+    It is let go where it touches, or where it rests with its weight on the incline.
+    """
     c, s = np.cos(ANGLE), np.sin(ANGLE)
     along, normal = np.zeros(dim), np.zeros(dim)
     along[[0, -1]], normal[[0, -1]] = (c, -s), (s, c)
@@ -39,16 +42,23 @@ def rolled(dim, friction, n, cell, dt, steps):
     cells = np.ceil((high - low) / cell).astype(int)
     kind = QUADRILATERAL if dim == 2 else HEXAHEDRON
     V = scenes.vectors(scenes.box(low, low + cell * cells, cells, kind))
-    body = round_body(dim, n, normal * RADIUS * (1.0 + 1e-9))
+    body = round_body(dim, n, normal * RADIUS * (1.0 + (-6e-3 if rests else 1e-9)))
     particles = mpm.Particles(body, V, quadrature_degree=2)
     ground = contact.Rigid(particles, contact.plane(np.zeros(dim), normal), friction)
+    law, force = Hencky(1e6, 0.3), fem.Constant(body, -GRAVITY * c * normal)
+    before = None
+    if rests:
+        before = mpm.QuasiStaticProblem(particles, law, 1000.0, body_force=force, terms=[ground])
+        before.solve(4)
+    weight = np.append(np.zeros(dim - 1), -GRAVITY)
     problem = mpm.DynamicProblem(
         particles,
-        Hencky(1e6, 0.3),
+        law,
         1000.0,
-        scheme="euler",
-        body_force=(*np.zeros(dim - 1), -GRAVITY),
+        scheme=scheme,
+        body_force=fem.Constant(body, weight),
         terms=[ground],
+        after=before,
     )
     mass = 1000.0 * WORLD.allreduce(particles.initial_volume.sum())
     speeds, ratios = [], []
@@ -65,6 +75,13 @@ def rolled(dim, friction, n, cell, dt, steps):
 def test_a_cylinder_rolls_with_two_thirds_of_the_acceleration():
     found, _ = rolled(2, 0.5, 12, 0.125, 0.01, 60)
     assert found == pytest.approx(2 / 3 * GRAVITY * np.sin(ANGLE), rel=0.03)
+
+
+@pytest.mark.slow
+def test_a_cylinder_that_rests_on_its_ground_rolls_without_bouncing():
+    # (let go where it touches it bounces for ever in this scheme, slips as it lands, and has 0.96)
+    found, _ = rolled(2, 0.5, 12, 0.125, 0.01, 60, "conserving", rests=True)
+    assert found == pytest.approx(2 / 3 * GRAVITY * np.sin(ANGLE), rel=0.015)
 
 
 @pytest.mark.slow
