@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Contact of two deformable bodies: points of one against facets of the other.
 
-With two passes each body's points meet the other's facets, at half the stiffness each. The reaction
+With two passes each body's points meet the other's facets, at half the stiffness each where facets
+are alike in size, at more of it for the points of much finer ones. The reaction
 acts on the facet as if the point were fixed to it by a rigid arm along its normal, so that forces
 and moments of both bodies balance, also where friction acts at a gap.
 """
@@ -48,6 +49,8 @@ LINGER = 0.1
 OVERLAP = 0.1
 #: Step of the complex derivative.
 STEP = 1e-40
+#: Ratio of the sizes of facets up to which two passes bear the same, and the least that one bears.
+ALIKE, LEAST = 1.5, 0.2
 #: Degree of the rule on a facet, by the dimension of space: the other body's facets have kinks.
 DEGREES = {2: 9, 3: 5}
 
@@ -162,11 +165,11 @@ class _Pass:
     Args:
         source: The points.
         target: The facets.
-        law: Friction.
+        law: Friction, of both passes.
         penalties: In the normal direction and along the surface.
-        share: Share of the stiffness.
 
     Attributes:
+        share: Share of what both passes bear.
         of_step: Whether forces are those of whole steps of a motion.
         works: This rank's work against pressure and against friction in such a step.
     """
@@ -177,10 +180,10 @@ class _Pass:
         target: Surface,
         law: Coulomb,
         penalties: tuple[float, float],
-        share: float,
     ) -> None:
         self.source, self.target = source, target
-        self.law, self._penalties, self._share = law, penalties, share
+        self.law = self._whole = law
+        self._penalties, self.share = penalties, 1.0
         self._comm: MPI.Comm = source.particles.mesh.comm
         self.memory: _Memory | None = None
         self.stencil: _Stencil | None = None
@@ -188,10 +191,21 @@ class _Pass:
         self.works = (0.0, 0.0)
         self._near: NearFacets | None = None
 
-    def settle(self, source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
-        """Take stiffnesses of the facets of both surfaces, shape ``(m,)`` each (collective)."""
+    def settle(
+        self, source: NDArray[np.float64], target: NDArray[np.float64], share: float
+    ) -> None:
+        """Take stiffnesses of the facets of both surfaces, shape ``(m,)`` each (collective).
+
+        Args:
+            source: That of the points' facets.
+            target: That of the others.
+            share: Share of what both passes bear.
+        """
+        # (pressure has its share by stiffness)
+        law, self.share = self._whole, share
+        self.law = replace(law, cohesion=share * law.cohesion, limit=share * law.limit)
         facing = float(np.median(np.concatenate(self._comm.allgather(target))))
-        k = self._share / (1.0 / source + 1.0 / facing) if len(source) else source
+        k = share / (1.0 / source + 1.0 / facing) if len(source) else source
         self._stiffness = np.repeat(k, self.source.nq)
         self.reach = REACH * max(
             float(np.median(np.concatenate(self._comm.allgather(surface.sizes))))
@@ -785,11 +799,8 @@ class Pair(Contact):
             Surface(body, some, tag, degree, axisymmetric, "A Pair")
             for body, some, tag in zip((a, b), facet_tags, tags, strict=True)
         ]
-        # (each pass bears its share: pressure has it by stiffness)
-        own = replace(law, cohesion=law.cohesion / passes, limit=law.limit / passes)
         self._passes = [
-            _Pass(self._surfaces[i], self._surfaces[1 - i], own, penalties, 1.0 / passes)
-            for i in range(passes)
+            _Pass(self._surfaces[i], self._surfaces[1 - i], law, penalties) for i in range(passes)
         ]
         self._made, self._begins = False, True
         self._last: list[Outcome] | None = None
@@ -820,11 +831,29 @@ class Pair(Contact):
                 self._surfaces, self._moduli, self._materials, strict=True
             )
         ]
+        shares = self._shares()
         for i, each in enumerate(self._passes):
-            each.settle(k[i], k[1 - i])
+            each.settle(k[i], k[1 - i], shares[i])
             each.begin_anew()
         self._made, self._last = True, None
         self._new_pattern()
+
+    def _shares(self) -> list[float]:
+        """Return what each pass bears (collective).
+
+        Points on facets of a size h see kinks of the other body's shape functions with an error of
+        the order of h^2, so that the points of facets that are much finer bear more.
+        """
+        if len(self._passes) == 1:
+            return [1.0]
+        squares = [
+            float(np.median(np.concatenate(self._comm.allgather(surface.sizes)))) ** 2
+            for surface in self._surfaces
+        ]
+        if max(squares) < ALIKE**2 * min(squares):
+            return [0.5, 0.5]
+        first = float(np.clip(squares[1] / sum(squares), LEAST, 1.0 - LEAST))
+        return [first, 1.0 - first]
 
     def _new_pattern(self) -> None:
         spaces = [body.W for body in self.bodies]
@@ -951,9 +980,9 @@ class Pair(Contact):
         """Return what the points of a tell: with two passes they bear their share alone."""
         if not self._made:
             raise MPMError("A contact belongs to no problem yet; give it as terms=[contact].")
-        told, count = self._told()[0], len(self._passes)
+        told, share = self._told()[0], self._passes[0].share
         return self._surfaces[0], replace(
-            told, pressure=count * told.pressure, traction=count * told.traction
+            told, pressure=told.pressure / share, traction=told.traction / share
         )
 
     def _forces(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
