@@ -389,6 +389,7 @@ def test_the_page_has_each_pair():
     cells = np.array(list(table.values()))
     assert np.array_equal(cells, cells.T)
     used = {*cells.ravel(), *(cell for row in motions().values() for cell in row)}
+    used |= {*waters().values()}
     assert used == {"+", "-", *sentences}
     assert (cells.diagonal() == "+").all()
     for row, wanted in zip(cells, FEATURES.values(), strict=True):
@@ -502,6 +503,84 @@ def test_a_feature_in_motion(feature, mpi_tmp_path, monkeypatch):
         except BaseException as error:
             error.add_note(f"{feature} with scheme={scheme!r}: {cell}")
             raise
+
+
+# -- With water --------------------------------------------------------------------------
+
+
+class Wet(Scene):
+    """The same scene of degree 2 with water in its pores, which cannot leave.
+
+    Args:
+        wanted: Options of the features.
+    """
+
+    def __init__(self, wanted):
+        super().__init__({"degree": 2} | wanted)
+
+    def kind(self, bodies, law, **options):
+        """Return the problem."""
+        if options["background"] is None:
+            del options["background"]
+        return mpm.PorousProblem(bodies, law, 1e-2, **options)
+
+    def require_its_volume(self):
+        """Compare the volume of each body with that of the beginning, as no water has left."""
+        for body in self.problem.bodies:
+            if any(p.particles is body for p in self.problem.pore_pressure):
+                volume = WORLD.allreduce(float(body.point_volumes().sum()))
+                before = WORLD.allreduce(float(body.initial_volume.sum()))
+                assert volume == pytest.approx(before, rel=1e-7)
+
+
+def consolidate(wanted, directory):
+    """Run a scene with water: two steps, what changes its meshes, two more, perhaps from a file."""
+
+    def path(t):
+        scene.wall.value[-1] = -0.3 * t if "delete" in wanted else 0.02 * t
+
+    scene = Wet(wanted)
+    scene.problem.solve(0.2, 0.1, path)
+    scene.require_equilibrium()
+    scene.change()
+    if "checkpoint" in wanted:
+        scene.problem.save(directory / "state")
+    scene.problem.solve(0.4, 0.1, path)
+    scene.require_equilibrium()
+    scene.require_its_volume()
+    if "checkpoint" in wanted:
+        whole, scene = scene, Wet(wanted)
+        scene.problem.restore(directory / "state")
+        scene.problem.solve(0.4, 0.1, path)
+        one, two = (s.problem.bodies[0] for s in (whole, scene))
+        assert np.array_equal(one.centroid, two.centroid)
+
+
+def waters():
+    """Return the rows of the page's table of consolidation by feature."""
+    text = PAGE.read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([^|]+?) \| ([^|]+) \|$", text, re.MULTILINE)
+    rows = [row for row in rows if row[0] not in ("---", "with water")]
+    return {feature.replace("`", ""): cell for feature, cell in rows}
+
+
+def test_the_page_has_each_feature_with_water():
+    table, sentences = waters(), page()[1]
+    assert list(table) == [feature for feature in FEATURES if feature not in STILL]
+    assert set(table.values()) <= {"+", *sentences}
+
+
+@pytest.mark.parametrize(
+    "feature", all_but(("support", "repartition"), [f for f in FEATURES if f not in STILL])
+)
+def test_a_feature_with_water(feature, mpi_tmp_path, monkeypatch):
+    monkeypatch.setattr(linear, "COARSEST", 12)
+    cell, wanted = waters()[feature], FEATURES[feature]
+    if cell == "+":
+        consolidate(wanted, mpi_tmp_path)
+        return
+    with pytest.raises(mpm.MPMError, match=re.escape(page()[1][cell])):
+        consolidate(wanted, mpi_tmp_path)
 
 
 # -- Stages ------------------------------------------------------------------------------
