@@ -67,7 +67,8 @@ FEATURES = {
     "automatic steps": {"automatic": True},
     "mixed pressure": {"mixed": "pressure", "degree": 2},
     "multigrid": {"linear_solver": "multigrid"},
-    "contact": {"contact": True},
+    "contact": {"contact": "penalty"},
+    "contact, Nitsche": {"contact": "nitsche"},
 }
 
 
@@ -209,6 +210,7 @@ class Scene:
                 mpm.contact.plane(inward, -inward),
                 0.3,
                 axisymmetric="axisymmetric" in wanted,
+                law=wanted["contact"],
             )
             terms.append(self.contact)
         background = None
