@@ -356,6 +356,11 @@ class Rigid(Contact):
         """See :attr:`Term.symmetric`."""
         return super().symmetric and not self._nitsche
 
+    @property
+    def takes_stress(self) -> bool:
+        """See :attr:`Term.takes_stress`."""
+        return self._nitsche
+
     def _require_same_shape(self) -> None:
         """Raise an error where ranks have different shapes, by some distances (collective)."""
         if self._comm.size == 1:

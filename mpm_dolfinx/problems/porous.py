@@ -34,6 +34,7 @@ from ..materials.base import Material
 from ..parallel.given import require_same
 from ..particles.field import ParticleField
 from ..particles.particles import Particles
+from ..system.term import PointMaterial
 from .arguments import as_bodies
 from .particle_problem import Contribution
 from .quasistatic import QuasiStaticProblem
@@ -201,6 +202,17 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         self.fields = self.pore_pressure
         self._of_fields = [f.residual for f in self._filled if f.residual is not None]
         return contributions
+
+    def _let_take_part(self, materials: Sequence[PointMaterial | None]) -> None:
+        """See :meth:`ParticleProblem._let_take_part`."""
+        wet = [filled.particles for filled in self._filled]
+        for term in self.terms:
+            if term.takes_stress and any(body is its for body in wet for its in term.bodies):
+                raise MPMError(
+                    "law='nitsche' takes the stress of the material, which does not know the pore "
+                    "pressure of a body with water; use law='penalty'."
+                )
+        super()._let_take_part(materials)
 
     def _porous(self) -> list[tuple[Particles, _Pores]]:
         """Return the bodies with water that the problem has."""

@@ -99,6 +99,11 @@ class Term:
         return True
 
     @property
+    def takes_stress(self) -> bool:
+        """Whether it takes the material's stress for all that its bodies bear."""
+        return False
+
+    @property
     def fused(self) -> Sequence[tuple[Particles, BodyForms]]:
         """Forms whose tangent the compiled loops reduce domain by domain, with their bodies."""
         return ()
