@@ -486,8 +486,8 @@ NB_MODULE(_loops, m)
     require(kind.size() == count || kind.size() == 1, "one kind, or one for each point");
     const bool known = energy.size() == count && old_energy.size() == count;
     for (std::size_t p = 0; p < kind.size(); ++p)
-      require(kind.data()[p] <= static_cast<std::uint8_t>(Step::gonzalez)
-                  && (known || kind.data()[p] != static_cast<std::uint8_t>(Step::gonzalez)),
+      require(kind.data()[p] <= static_cast<std::uint8_t>(Step::dissipative)
+                  && (known || kind.data()[p] < static_cast<std::uint8_t>(Step::gonzalez)),
               "kinds, and energies (n,) where they are asked for");
     const StepEnds ends{count,
                         gradient.data(),

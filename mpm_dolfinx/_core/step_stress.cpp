@@ -78,8 +78,9 @@ void set_tangent(const double* A, const Matrix<dim>& G, const Matrix<dim>& S, co
 template <int dim>
 class Correction {
 public:
-  Correction(const StepEnds& ends, std::size_t p, const Matrix<dim>& F, const Matrix<dim>& mean,
-             const Matrix<dim>& change, const Matrix<dim>& S, Matrix<dim>& M)
+  Correction(const StepEnds& ends, std::size_t p, bool one_sided, const Matrix<dim>& F,
+             const Matrix<dim>& mean, const Matrix<dim>& change, const Matrix<dim>& S,
+             Matrix<dim>& M)
   {
     for (int I = 0; I < dim; ++I)
       for (int J = 0; J < dim; ++J)
@@ -90,6 +91,9 @@ public:
       }
     _size = contraction<dim>(_E, _E) + ends.small * ends.small;
     _c = (ends.energy[p] - ends.old_energy[p] - contraction<dim>(M, _E)) / _size;
+    _acts = !one_sided || _c > 0.0;
+    if (!_acts)
+      return;
     Matrix<dim> X;
     for (int I = 0; I < dim; ++I)
       for (int J = 0; J < dim; ++J)
@@ -109,6 +113,8 @@ public:
   void add(const double* A, const Matrix<dim>& F, const Matrix<dim>& mean,
            const Matrix<dim>& inverted, const Matrix<dim>& S, double* tangent) const
   {
+    if (!_acts)
+      return;
     constexpr int rest = dim * dim * dim;
     // E_IJ dM_IJ of the mean alone: 1/2 (B_iJ A_iJkL - B_kJ S_LJ) with B = F^-T E.
     Matrix<dim> B, dc = _slope, left = product<dim>(mean, _E);
@@ -147,6 +153,7 @@ public:
 private:
   Matrix<dim> _E, _slope;
   double _size, _c;
+  bool _acts;
 };
 
 template <int dim>
@@ -192,9 +199,10 @@ std::vector<std::int64_t> step_stress_of(const StepEnds& ends, double* stress, d
       for (int J = 0; J < dim; ++J)
         M[I][J] = 0.5 * (S[I][J] + old_S[I][J]);
     const Matrix<dim> G = product<dim>(mean, inverted);
-    if (kind == Step::gonzalez)
+    if (kind != Step::simo_tarnow)
     {
-      const Correction<dim> correction(ends, p, F, mean, change, S, M);
+      const bool one_sided = kind == Step::dissipative;
+      const Correction<dim> correction(ends, p, one_sided, F, mean, change, S, M);
       set_tangent<dim>(A, G, S, M, slope);
       correction.add(A, F, mean, inverted, S, slope);
     }

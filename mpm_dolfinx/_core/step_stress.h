@@ -13,7 +13,8 @@ namespace core
 enum class Step : std::uint8_t {
   mean_of_stresses, // a law of small strains
   simo_tarnow,
-  gonzalez // with an energy
+  gonzalez,   // with an energy
+  dissipative // the same, where else the stress would give more than the energy has
 };
 
 // Stress of the material and displacement gradients at both ends of a step, all (count, dim, dim),

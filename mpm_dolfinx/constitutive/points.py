@@ -555,6 +555,11 @@ class MaterialPoints:
         return self._where(lambda law: getattr(law, "kinematics", None) == "small")
 
     @property
+    def may_part(self) -> NDArray[np.bool_]:
+        """Which points have a law whose pressure may vanish by yielding, shape ``(n nq,)``."""
+        return self._where(lambda law: not vars(type(law)).get("linear_in_volume", False))
+
+    @property
     def is_hyperelastic(self) -> NDArray[np.bool_]:
         """Which points have a stress that derives from an energy, ``(n nq,)``.
 

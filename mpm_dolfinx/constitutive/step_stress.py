@@ -12,12 +12,16 @@ c = 0 (Simo & Tarnow 1992), or, where the stress derives from an energy W of the
     c = (W_1 - W_n - (S_n + S_1)/2 : (E_1 - E_n)) / |E_1 - E_n|^2
 
 (Gonzalez 2000), so that the work P* : (F_1 - F_n) is W_1 - W_n. As S* is symmetric, angular
-momentum is kept. With F-bar, W is the energy of a group of domains and depends on F at all of its
-points, with the effective stress P as its derivative; numerator and denominator of c are integrals
-over the group then, and so is W_1 - W_n what is exact. A law of small strains takes the mean of its
-stresses, which has the same two merits as far as they go there. Damping in proportion to the
-stiffness C of the undeformed body is ``P_v = F_m (beta C : (E_1 - E_n) / dt)``: it resists no
-rotation and never gives energy.
+momentum is kept. Where a law whose pressure may vanish by yielding (sand) knows its elastic energy
+W, c is that of Gonzalez if it is positive, and 0 otherwise: the mean of two stresses that yield is
+not one that does, and could give back more work than there was energy, as where a body falls apart.
+So P* : (F_1 - F_n) >= W_1 - W_n at each of its points. (The tangent takes the stress for the
+derivative of W there, which is exact where the point has become free of stress.) With F-bar, W is
+the energy of a group of domains and depends on F at all of its points, with the effective stress P
+as its derivative; numerator and denominator of c are integrals over the group then, and so is what
+is said of W. A law of small strains takes the mean of its stresses, which has the same two merits
+as far as they go there. Damping in proportion to the stiffness C of the undeformed body is
+``P_v = F_m (beta C : (E_1 - E_n) / dt)``: it resists no rotation and never gives energy.
 """
 
 from __future__ import annotations
@@ -53,7 +57,8 @@ class _Ends(NamedTuple):
         before: At its beginning.
         tangent: Derivative of that at its end.
         potentials: At its end and at its beginning, or ``None``.
-        kind: 0: of small strains; 2: the work is to be the change of the potential; else 1.
+        kind: 0: of small strains; 2: the work is to be the change of the potential; 3: or more
+            than that; else 1.
     """
 
     stress: Array
@@ -100,7 +105,9 @@ class StepStress:
         self._undeformed: Array | None = None
         self._small = points.has_small_strain
         self._exact = points.is_hyperelastic & ~self._small
-        self._kind = np.where(self._small, 0, np.where(self._exact, 2, 1)).astype(np.uint8)
+        bounded = points.may_part & ~np.isnan(points.strain_energy())
+        self._kind = np.where(bounded, 3, 1).astype(np.uint8)
+        self._kind[self._exact], self._kind[self._small] = 2, 0
         plain = not conserving and viscosity == 0.0 and not self._splits
         self.symmetric: bool = points.symmetric and (plain or bool(self._small.all()))
         self.settle()
@@ -240,7 +247,7 @@ class StepStress:
     def _whole_step(self) -> tuple[Array, Array]:
         """Return P* and its derivative by F at the step's end, over the share."""
         energies = None
-        if self._exact.any():
+        if (self._kind >= 2).any():
             energy = self._points.strain_energy(trial=True)
             if self._splits:
                 p, found = self._present_pressure()[0], self._points.volume_strain
@@ -324,12 +331,14 @@ class StepStress:
     def _correct(self, S: Array, S_mean: Array, dS_mean: Array, ends: _Ends) -> None:
         """Add Gonzalez' correction to S* and its derivative, in place."""
         assert ends.potentials is not None
-        where = ends.kind == 2
-        S, mean = S[where], S_mean[where]
+        where = np.flatnonzero(ends.kind >= 2)
         change, slope = _strain(self._tried[where], self._H[where])
         size = np.einsum("nIJ,nIJ->n", change, change) + SMALL**2
         work = ends.potentials[0][where] - ends.potentials[1][where]
-        c = (work - np.einsum("nIJ,nIJ->n", mean, change)) / size
+        c = (work - np.einsum("nIJ,nIJ->n", S_mean[where], change)) / size
+        acts = (ends.kind[where] == 2) | (c > 0.0)
+        where, change, slope, size, c = (part[acts] for part in (where, change, slope, size, c))
+        S, mean = S[where], S_mean[where]
         dc = np.einsum("nIJ,nIJkL->nkL", S - mean - 2.0 * c[:, None, None] * change, slope)
         dc -= np.einsum("nIJ,nIJkL->nkL", change, dS_mean[where])
         dc /= size[:, None, None]
@@ -366,7 +375,7 @@ class StepStress:
         whole = h[:, None, None, None] * gamma + left
         energy = np.zeros(len(S))
         if ends.potentials is not None:
-            energy = np.where(self._exact, ends.potentials[0] - ends.potentials[1], 0.0)
+            energy = np.where(ends.kind >= 2, ends.potentials[0] - ends.potentials[1], 0.0)
         square = np.einsum("nIJ,nIJ->n", change, change) + SMALL**2
         own = [
             (energy - np.einsum("nIJ,nIJ->n", S_mean, change)).reshape(volumes.shape),
@@ -376,8 +385,10 @@ class StepStress:
         ]
         sums = averaging.groups.sum(np.stack([(volumes * part).sum(axis=1) for part in own], 1))
         size = np.where(sums[:, 1] > 0.0, sums[:, 1], 1.0)
-        exact = self._exact.reshape(volumes.shape)[:, 0]
-        c = np.where(exact, sums[:, 0] / size, 0.0)
+        kind = ends.kind.reshape(volumes.shape)[:, 0]
+        c = sums[:, 0] / size
+        exact = (kind == 2) | ((kind == 3) & (c > 0.0))
+        c = np.where(exact, c, 0.0)
         each = np.repeat(c, volumes.shape[1])[:, None, None]
         X = np.einsum("nIJ,nIJkL->nkL", S - S_mean - 2.0 * each * change, slope)
         X -= np.einsum("nIJ,nIJkL->nkL", change, dS_mean)
@@ -452,7 +463,10 @@ class StepStress:
             A function that takes it back.
         """
         points = self._points
-        before = self._H, self._P, self._energy, self._work
+        settled = ["_H", "_P", "_energy", "_elastic", "_work"]
+        if self._splits:
+            settled += ["_volume", "_slope", "_of_pressure", "_own"]
+        before = {name: getattr(self, name) for name in settled}
         H = self._gradient() - self._H
         viscous = 0.0 if self._viscous is None else self._viscous
         whole: Array | float = 0.0
@@ -477,7 +491,7 @@ class StepStress:
 
         def undo() -> None:
             taken()
-            self._H, self._P, self._energy, self._work = before
+            vars(self).update(before)
 
         return undo
 
