@@ -3,8 +3,8 @@
 """Strength of soils: a slope, a vertical cut, and a strip footing on soil with friction.
 
 `factor` is what is found and `exact` what is known: the factor of safety of Griffiths & Lane's
-first slope (1999), gamma H/c of a vertical cut in undrained soil (bounds 3.775 and 3.786), and N_c
-of Prandtl and Reissner.
+first slope (1999), gamma H/c of a vertical cut in undrained soil (bounds 3.775 and 3.786), N_c
+of Prandtl and Reissner, and N_gamma of soil with weight and without cohesion (Martin 2005).
 """
 
 from mpi4py import MPI
@@ -17,7 +17,8 @@ from dolfinx import fem, mesh
 import mpm_dolfinx as mpm
 
 parser = kit.Parser("Strength of soils: slope, vertical cut, footing.")
-parser.add_argument("--case", choices=("slope", "vertical_cut", "footing"), default="slope")
+CASES = ("slope", "vertical_cut", "footing", "footing_weight")
+parser.add_argument("--case", choices=CASES, default="slope")
 parser.add_argument("--domain", choices=("quad", "tri"), default="quad", help="particle domains")
 parser.add_argument(
     "--cell", type=kit.positive, default=0.1, help="background cells, over the height or half width"
@@ -26,13 +27,15 @@ parser.add_argument("--friction-angle", type=float, default=20.0, help="of slope
 parser.add_argument("--tolerance", type=kit.positive, default=0.01, help="of the factor of safety")
 parser.add_argument("--steps", type=kit.whole, default=20, help="steps of the footing")
 parser.add_argument("--degree", type=int, choices=(1, 2), default=1, help="of the footing's basis")
+parser.add_argument("--rough", action="store_true", help="a rough strip, not a smooth one")
 parser.add_f_bar("patch")
 parser.add_mixed()
 parser.add_argument("--dilation-angle", type=float, help="of the footing's soil, else associated")
 args = parser.parse()
 
 comm, kind = MPI.COMM_WORLD, kit.DOMAINS[args.domain]
-height = 0.5 if args.case == "footing" else 1.0  # of slope and cut, or half width of the footing
+has_strip = args.case.startswith("footing")
+height = 0.5 if has_strip else 1.0  # of slope and cut, or half width of the strip
 h = height / round(1.0 / args.cell)
 
 
@@ -87,7 +90,7 @@ def floor(V: fem.FunctionSpace) -> list[fem.DirichletBC]:
     ]
 
 
-# Each has a cohesion of 1 and a stiffness with which it hardly moves before it fails.
+# Each but the last has a cohesion of 1, and a stiffness with which it hardly moves before it fails.
 
 young, weight, exact = 1e5, 0.0, np.nan
 if args.case == "slope":
@@ -123,27 +126,42 @@ else:
     grid = graded(across + 0.04 * h * taper, heights, mesh.CellType.quadrilateral)
     V = fem.functionspace(grid, ("Lagrange", args.degree, (2,)))
     body = graded(halved(across), halved(up), kind)
+    cohesion = 1.0 if args.case == "footing" else 0.0
     dilation = args.friction_angle if args.dilation_angle is None else args.dilation_angle
-    law = mpm.materials.MohrCoulomb(young, 0.3, 1.0, args.friction_angle, dilation)
+    law = mpm.materials.MohrCoulomb(young, 0.3, cohesion, args.friction_angle, dilation)
     bcs = [held(V, 0, 0.0, size), held(V, 1, 0.0)]
     tangent = np.tan(np.radians(args.friction_angle))
     N_q = np.exp(np.pi * tangent) * np.tan(np.radians(45.0 + args.friction_angle / 2.0)) ** 2
     exact = (N_q - 1.0) / tangent
+    settlement = 1.2e-4
+    if args.case == "footing_weight":
+        weight = 1.0
+        known = {
+            (20.0, False): 1.579,
+            (30.0, False): 7.653,
+            (20.0, True): 2.839,
+            (30.0, True): 14.754,
+        }
+        exact = known.get((args.friction_angle, args.rough), np.nan)
+        settlement = 1e-5 * height * np.nan_to_num(exact, nan=10.0)
 
 particles = mpm.Particles(
     body,
     V,
-    degree=args.degree if args.case == "footing" else 1,
+    degree=args.degree if has_strip else 1,
     quadrature_degree=args.quadrature_degree,
 )
 supports = []
-if args.case == "footing":
+if has_strip:
     under = mesh.locate_entities_boundary(
         body, 1, lambda x: np.isclose(x[1], size) & (x[0] < height * (1.0 + 1e-9))
     )
     tags = mesh.meshtags(body, 1, np.sort(under), np.full(len(under), 1, np.int32))
-    settlement = 1.2e-4 * height / 0.5
-    supports = [mpm.boundary.roller(particles, tags, 1, normal=(0.0, -1.0), value=settlement)]
+    supports = [
+        mpm.boundary.fixed(particles, tags, 1, value=(0.0, -settlement))
+        if args.rough
+        else mpm.boundary.roller(particles, tags, 1, normal=(0.0, -1.0), value=settlement)
+    ]
 
 problem = mpm.QuasiStaticProblem(
     particles,
@@ -155,16 +173,18 @@ problem = mpm.QuasiStaticProblem(
     f_bar=args.f_bar if args.mixed == "none" else "none",
     mixed=None if args.mixed == "none" else args.mixed,
     petsc_options_prefix="strength_",
+    initial_stress=mpm.geostatic(size, weight, 0.5, (0.0, -1.0)) if has_strip and weight else None,
 )
 
 # The footing is pushed down; slope and cut carry their weight, and then their strength is reduced.
 
 failure, factor, path = None, np.nan, [(0.0, 0.0)]
 try:
-    if args.case == "footing":
+    if has_strip:
         for step in kit.progress(problem.steps(args.steps), args.steps, args):
             pressure = -problem.reaction(supports[0])[1] / height
-            path.append((step.load * settlement, pressure))
+            unit = weight * height if weight else 1.0  # or the cohesion
+            path.append((step.load * settlement, pressure / unit))
         factor = path[-1][1]
     else:
         problem.solve(2)

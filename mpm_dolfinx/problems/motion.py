@@ -50,7 +50,7 @@ class MovingProblem(TimeProblem):
         """See :meth:`ParticleProblem._build`."""
         self.inertia.join(self.bodies)
         super()._build()
-        self._stepper.newton.lets_go = True
+        self._stepper.newton.lets_go = self._stepper.newton.gives_up_early = True
         others = [*self.body_terms, *(term for term in self.terms if term is not self.inertia)]
         followed = Followed(
             others,

@@ -20,14 +20,18 @@ __all__ = ["LineSearch", "stalled"]
 #: Most halvings of a Newton step, and the drop in work that needs none.
 HALVINGS = 8
 SUFFICIENT = 0.8
+#: Halvings after which a step is taken if its end can be evaluated, in a solve that hurries.
+FEW_HALVINGS = 3
 #: Share of its start that the work may keep where a potential is followed, and most evaluations
 #: that look for such a step.
 SHARP = 0.3
 SECANTS = 4
 #: Steps that may follow one which is taken on trust until the residual is below that before it.
 TRUST = 7
-#: Iterations within which the smallest residual must fall, and to what share of itself.
+#: Iterations within which the smallest residual must fall, in a solve that hurries too, and to what
+#: share of itself.
 PATIENCE = 15
+LITTLE_PATIENCE = 7
 HEADWAY = 0.7
 
 
@@ -106,13 +110,14 @@ class LineSearch:
         self._statistics = statistics
         self.begin()
 
-    def begin(self, potential: bool = False) -> None:
+    def begin(self, potential: bool = False, hurries: bool = False) -> None:
         """Begin a solve.
 
         Args:
             potential: Whether the residual is the gradient of a potential.
+            hurries: Whether a solve that is hard is better given up: see :func:`stalled`.
         """
-        self._potential = potential
+        self._potential, self._hurries = potential, hurries
         self._trusted: _Step | None = None
         self._since = 0  # iterations
         self._may_trust = True
@@ -197,6 +202,8 @@ class LineSearch:
             if self._reduces(step, F, trial):
                 self._sharpen(step, 2.0 ** (halvings + 1), F, trial)
                 break
+            if self._hurries and halvings + 1 >= FEW_HALVINGS and np.isfinite(norm(F)):
+                break
 
     def _sharpen(self, step: _Step, longest: float, F: PETSc.Vec, trial: PETSc.Vec) -> bool:
         """Go on to where the work has fallen far enough, where there is a potential.
@@ -245,8 +252,16 @@ class LineSearch:
         return found[1] != 1.0
 
 
-def stalled(norms: Sequence[float]) -> bool:
-    """Return whether the norms of the residuals so far stopped falling."""
-    if len(norms) <= PATIENCE:
+def stalled(norms: Sequence[float], hurries: bool = False) -> bool:
+    """Return whether the norms of the residuals so far stopped falling.
+
+    Args:
+        norms: The norms.
+        hurries: Whether to say so soon. Where the residual is no gradient, as with plastic flow
+            that is not associated, iterations may go round in a circle over a few kinks for ever;
+            in a motion half of the step is much easier, as there is twice the mass in it.
+    """
+    patience = LITTLE_PATIENCE if hurries else PATIENCE
+    if len(norms) <= patience:
         return False
-    return min(norms[-PATIENCE:]) > HEADWAY * min(norms[:-PATIENCE])
+    return min(norms[-patience:]) > HEADWAY * min(norms[:-patience])

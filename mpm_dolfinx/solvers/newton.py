@@ -141,6 +141,8 @@ class NewtonSolver:
         no_equilibrium: Whether the last attempt's iterations came to nothing.
         lets_go: Whether what the proximal term holds back is let go once however little it is: in
             a motion it is a viscosity, and the same in each step.
+        gives_up_early: Whether a solve whose residual is not the gradient of a potential is given
+            up soon where it makes no headway: in a motion half of the step is much easier.
     """
 
     def __init__(
@@ -174,7 +176,7 @@ class NewtonSolver:
         self.no_equilibrium = False
         self.x: PETSc.Vec | None = None
         self.F: PETSc.Vec | None = None
-        self.lets_go = False
+        self.lets_go = self.gives_up_early = self._hurries = False
         self._centre: PETSc.Vec | None = None
         self._failure: MPMError | None = None
         self._raised: BaseException | None = None
@@ -223,7 +225,9 @@ class NewtonSolver:
         self._norms: list[float] = []
         self.no_equilibrium = False
         if self._search is not None:
-            self._search.begin(self._symmetric and problem.has_potential())
+            potential = self._symmetric and problem.has_potential()
+            self._hurries = self.gives_up_early and shorten and not potential
+            self._search.begin(potential, self._hurries)
         self._factor.begin(sizes[1], problem.constrained, self.lets_go)
         # What an iterative solve that fails means is for _pre_check to say.
         self.snes.setMaxLinearSolveFailures(1000 if self._factor.iterates else 1)
@@ -445,7 +449,9 @@ class NewtonSolver:
                 return reasons.CONVERGED_FNORM_RELATIVE
             self.statistics.count("converged_at_round_off")
             return reasons.CONVERGED_SNORM_RELATIVE
-        if self._search is not None and stalled(self._norms):
+        if self._search is not None and stalled(
+            self._norms, self._hurries and not self._search.trusts
+        ):
             self.no_equilibrium = True
             lowest = min(self.residuals)
             self._failure = ConvergenceError(

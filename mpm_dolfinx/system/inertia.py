@@ -372,13 +372,15 @@ class Inertia(Term):
         return self._staying
 
     def start(self, transfer: Transfer, prescribed: Motion) -> PETSc.Vec | None:
-        """See :meth:`Term.start`: the M-projection of ``dt v_n``, where that is needed at all.
+        """See :meth:`Term.start`: the M-projection of ``dt v_n``, unless all is at rest.
 
         From zero the solver's proximal term takes energy, if any; from elsewhere it may give some.
-        Where nothing is projected, and nothing lost, steps therefore start from zero.
+        Where velocities out of range are reflected, and nothing is lost, steps therefore start from
+        zero. With ``"euler"``, which loses energy, they do not: at zero all points look elastic,
+        and those that flow would have to find out again.
         """
         Ts = self._follow(transfer)
-        if self.scheme == "euler" or self.out_of_range != "project":
+        if self.scheme != "euler" and self.out_of_range != "project":
             return None
         driven = self._driven()
         v = [v.copy() for v in self._v]
@@ -388,12 +390,15 @@ class Inertia(Term):
         right.set(0.0)
         for T, force in zip(Ts, self._times_mass(v), strict=True):
             T.multTransposeAdd(force, right, right)
+        if self.scheme == "euler" and right.norm() == 0.0:
+            return None
         y = right.duplicate()
         if y.getSize() > 0:
             self._solve(right, y)
-        self._projected = [v.duplicate() for v in self._v] if driven is None else driven
-        for T, part in zip(Ts, self._projected, strict=True):
-            T.multAdd(y, part, part) if driven else T.mult(y, part)
+        if self.scheme != "euler":
+            self._projected = [v.duplicate() for v in self._v] if driven is None else driven
+            for T, part in zip(Ts, self._projected, strict=True):
+                T.multAdd(y, part, part) if driven else T.mult(y, part)
         y.scale(self.dt)
         return y
 

@@ -122,6 +122,11 @@ RUNS = {
         "--case footing --cell 0.25 --degree 2 --steps 10",
         {"ratio": 1.045, "cutbacks": 0},
     ),
+    "footing-weight": (
+        "strength",
+        "--case footing_weight --cell 0.25 --friction-angle 30 --degree 2 --steps 12",
+        {"ratio": 1.35, "cutbacks": 0},
+    ),
     "rounded-footing": (
         "penetration",
         "--obstacle footing --cell 0.25 --steps 10",
@@ -228,7 +233,7 @@ KEYS = {
     "colliding_discs": {"energy_change", "rebound", "momentum_error"},
     "vortex": {"displacement_error", "velocity_error"},
     "column_dynamic": {"toe", "top"},
-    "sand_column": {"run_out", "experiment", "ratio", "front", "height_at_wall"},
+    "sand_column": {"run_out", "experiment", "ratio", "deposit", "front", "height_at_wall"},
     "strength": {"factor", "exact", "ratio", "particles"},
     "consolidation": {"error", "degree", "error_degree", "particles"},
     "penetration": {"force", "depth", "ratio", "iterations_per_step", "penetration"},
