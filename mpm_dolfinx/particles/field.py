@@ -177,8 +177,8 @@ def _validate(particles: Body, V: Any, at: str, kind: str, name: str) -> None:
         raise MPMError("The space of a field must be on a mesh of the body's dimension.")
     if V.mesh is particles.mesh and kind != "body":
         raise MPMError("A field whose space is on the body mesh needs kind='body'.")
-    if V.ufl_element().family_name != "P":
-        raise MPMError("A field needs a Lagrange space, continuous or not.")
+    if V.ufl_element().family_name not in ("P", "DPC"):
+        raise MPMError("A field needs a space of polynomials: Lagrange, DG or DPC.")
     if at == "nodes" and not particles.shares_nodes:
         raise MPMError(
             "Fields at nodes need particles that hang together, as with method='cpdi2'; use "

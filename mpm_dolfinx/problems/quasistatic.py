@@ -100,7 +100,8 @@ class QuasiStaticProblem(ParticleProblem):
             of one degree less on the same background mesh (the pair of Taylor & Hood 1973), so that
             nothing locks however little volume changes; for laws in strain space (Hencky,
             von Mises, Mohr-Coulomb, Drucker-Prager, your own), backgrounds and particles of degree
-            2 or 3, instead of ``f_bar``.
+            2 or 3, instead of ``f_bar``. ``"discontinuous pressure"``: a polynomial of that degree
+            in each quadrilateral or hexahedron of the background, so that it may jump.
 
     Attributes:
         pressure: With ``mixed``, the pressure of each body: a :class:`mpm_dolfinx.ParticleField` at
@@ -479,7 +480,8 @@ class QuasiStaticProblem(ParticleProblem):
                 return known
         V = next((V for its, V in self._spaces_of_pressure if its is body), None)
         if V is None:
-            V = fem.functionspace(body.V.mesh, ("Lagrange", body.V.ufl_element().degree - 1))
+            family = "Lagrange" if self.setup.mixed == "pressure" else "DPC"
+            V = fem.functionspace(body.V.mesh, (family, body.V.ufl_element().degree - 1))
             self._spaces_of_pressure.append((body, V))
         return body.field(V, at="points", name="pressure")
 

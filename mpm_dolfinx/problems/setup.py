@@ -29,7 +29,12 @@ from ..system.term import Term
 from .arguments import carried, holds
 from .summary import counted
 
-__all__ = ["BodySetup", "Numerics", "Setup"]
+__all__ = ["MIXED", "BodySetup", "Numerics", "Setup"]
+
+#: What may be an unknown beside displacements.
+MIXED = ("pressure", "discontinuous pressure")
+#: Cells of the background in which a pressure may be linear by itself.
+WHOLE = ("quadrilateral", "hexahedron")
 
 
 @dataclass(frozen=True)
@@ -195,7 +200,7 @@ class Setup:
         axisymmetric: Whether ``x[0]`` is the radius of a body of revolution.
         f_bar: Average of the volume ratio that materials see.
         terms: What else acts on the bodies.
-        mixed: What else is an unknown: ``None`` or ``"pressure"``.
+        mixed: What else is an unknown: ``None``, or one of ``MIXED``.
 
     Raises:
         MPMError: An average that there is not, or a term that takes the bodies for others.
@@ -224,10 +229,11 @@ class Setup:
 
     def _require_mixed(self) -> None:
         """Raise an error unless a pressure can be an unknown of all bodies."""
-        if self.mixed != "pressure":
-            raise MPMError(f"Unknown mixed={self.mixed!r}; choose 'pressure' or None.")
+        if self.mixed not in MIXED:
+            known = ", ".join(map(repr, MIXED))
+            raise MPMError(f"Unknown mixed={self.mixed!r}; choose {known} or None.")
         if self.f_bar != "none":
-            raise MPMError("mixed='pressure' takes the place of f_bar; leave f_bar='none'.")
+            raise MPMError(f"mixed={self.mixed!r} takes the place of f_bar; leave f_bar='none'.")
         for body in (given.particles for given in self.bodies):
             degrees = [space.ufl_element().degree for space in (body.V, body.W)]
             if min(degrees) < 2:
@@ -235,6 +241,12 @@ class Setup:
                     "mixed='pressure' needs a background and particles of degree 2 or 3 "
                     f"(degree=2), not {degrees[0]} and {degrees[1]}: with displacements of degree "
                     "1 the pressure would oscillate; use f_bar='patch' there."
+                )
+            if self.mixed != "pressure" and body.V.mesh.topology.cell_name() not in WHOLE:
+                raise MPMError(
+                    "mixed='discontinuous pressure' needs a background of quadrilaterals or "
+                    "hexahedra: linear in each triangle or tetrahedron it would oscillate; use "
+                    "mixed='pressure' there."
                 )
 
     def carried(self) -> Setup:
