@@ -36,6 +36,8 @@ from .strain import Strain
 __all__ = ["MaterialPoints"]
 
 FLOAT = np.dtype(np.float64)
+#: What a law answers first of all.
+STRESS = "stress P"
 
 type Assignment = Material | Mapping[int, Material]
 
@@ -735,7 +737,7 @@ class MaterialPoints:
         """
         law = type(group.material).__name__
         n, dim = len(group.points), self.dim
-        self._require(group, "stress P", answer.first_piola, (n, dim, dim))
+        self._require(group, STRESS, answer.first_piola, (n, dim, dim))
         self._require(group, "tangent", answer.tangent, (n, dim, dim, dim, dim))
         assert answer.tangent is not None
         if not isinstance(answer.state, dict) or answer.state.keys() != state.keys():
@@ -763,9 +765,9 @@ class MaterialPoints:
             raise MPMError(
                 f"{answered} {_told(values)}; it must have the shape {shape} and the type {dtype}."
             )
-        # The laws of this package are tested; their stress, the smallest part, is looked at all the
+        # The laws of this package are tested; their stress, a small part, is looked at all the
         # same. To read the rest takes a tenth of a step.
-        known = _is_own(group.material) and values.ndim != 3
+        known = _is_own(group.material) and what != STRESS
         if values.dtype.kind != "f" or known or _all_finite(values):
             return
         bad = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))

@@ -36,7 +36,7 @@ from ..particles.field import ParticleField
 from ..particles.particles import Particles
 from ..system.term import PointMaterial
 from .arguments import as_bodies
-from .particle_problem import Contribution
+from .particle_problem import Contribution, Law
 from .quasistatic import QuasiStaticProblem
 from .setup import BodySetup
 from .through_time import TimeProblem
@@ -173,6 +173,25 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
             for filled in self._filled:
                 if filled.particles is body:
                     _begin_with(filled.field, value)
+
+    def laws(self) -> list[list[Law]]:
+        """See :meth:`ParticleProblem.laws`; what pores are like goes with the material."""
+        found = super().laws()
+        for own, body in zip(found, self.bodies, strict=True):
+            pores = next(pores for its, pores in self._pores if its is body)
+            if pores.permeability is not None:
+                water: dict[str, Any] = {
+                    name: value
+                    if isinstance(value, float | int | np.number)
+                    else type(value).__name__  # it may have changed since, as loads may
+                    for name, value in (
+                        ("permeability", pores.permeability),
+                        ("storage", pores.storage),
+                        ("fluid_density", self._fluid_density),
+                    )
+                }
+                own.append(("water", water))
+        return found
 
     @property
     def pore_pressure(self) -> list[ParticleField]:

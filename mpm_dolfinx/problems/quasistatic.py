@@ -384,6 +384,8 @@ class QuasiStaticProblem(ParticleProblem):
         """Begin a stage in which a body comes: a lift, or a structure (collective).
 
         It is undeformed where it is placed; on the same V it sticks to the bodies that it touches.
+        Where it overlaps one of those they are welded: both fill the same space with their weight
+        and stiffness; take away what was there first (:meth:`remove`), unless that is meant.
         Its loads come over the next run. ``problem.particles`` is a list from then on.
 
         Args:

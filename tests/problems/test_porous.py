@@ -440,6 +440,9 @@ def test_restart_and_a_step_that_fails(mpi_tmp_path):
     other.solve(0.1, 0.025)
     same_run(outcome(other), end, EXACT)
     assert scenes.largest(its.x.array - pressure) <= EXACT
+    for change in ({"permeability": 0.5}, {"storage": 1e-3}, {"fluid_density": 1.0}):
+        another, _, _ = column(LAWS[1], load=1.5, **change)
+        raises(lambda a=another: a.restore(mpi_tmp_path / "half"), mpm.MPMError, "material is not")
     tired, its, _ = column(LAWS[1], load=1.5, petsc_options={"snes_max_it": 1})
     raises(lambda: tired.solve(1.0, 1.0), mpm.ConvergenceError, "Newton")
     assert not its.x.array.any() and not its.previous.x.array.any()
