@@ -6,7 +6,10 @@ import logging
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from mpm_dolfinx.materials import check_tangent, mandel
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -47,3 +50,21 @@ def test_law_by_jax():
     exec(compile(example[1], "materials.md", "exec"), names)
     for dim in (2, 3):
         assert names["check_tangent"](names["rubber"], dim=dim, strain=0.1) < 1e-8
+
+
+@pytest.mark.skip_in_parallel
+def test_law_by_numba():
+    """The loop that numba compiles, beside the same law in NumPy, where there is numba."""
+    pytest.importorskip("numba", reason="the example is of a law that numba compiles")
+    page = PAGES["materials.md"]
+    blocks = re.findall(r"^```py(?:thon)?\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    by_numba = {"__name__": "__main__"}
+    by_numpy = {"np": np, "mandel": mandel, "check_tangent": check_tangent}
+    exec(next(b for b in blocks if "class CompiledClay" in b), by_numba)
+    exec(next(b for b in blocks if "class SofteningClay" in b), by_numpy)
+    for m in (4, 6):
+        strain = 0.05 * np.random.default_rng(m).standard_normal((50, m))
+        names = ((by_numba, "CompiledClay"), (by_numpy, "SofteningClay"))
+        one, other = (n[law](2e6, 1e6, 0.05).integrate(strain, {}, True) for n, law in names)
+        np.testing.assert_allclose(one.stress, other.stress, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(one.tangent, other.tangent, rtol=0.0, atol=1e-8)
