@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 from petsc4py import PETSc
@@ -51,6 +51,9 @@ OVERLAP = 0.1
 #: Most places on the way of a point that are looked at, of all points at once, and by steps of
 #: the distance.
 MOST_PLACES, MOST_AT_ONCE, MOST_STEPS = 1000, 100_000, 100
+#: Gap, over the thickness of the domain behind, up to which a facet may touch in a step; and share
+#: of facets that do so up to which others are left out.
+NEAR, MOST_NEAR = 2.0, 0.7
 #: Most points of each rank at which the shapes of ranks are compared.
 LOOKED_AT = 16
 #: How near to the surface a point is on it, over the thickness of the domain behind.
@@ -78,6 +81,7 @@ class _Memory:
         works: What was done against pressure and against friction in the step, if there is motion.
         step: The step of a motion, at all points, by whose middle the forces are.
         behind: Tractions by the stress behind the facets, where these count, ``(m, nq, gdim)``.
+        whole: Whether all facets were looked at, not those alone that may touch.
     """
 
     pose: Pose
@@ -89,6 +93,72 @@ class _Memory:
     works: tuple[float, float] = (0.0, 0.0)
     step: _Step | None = None
     behind: NDArray[np.float64] | None = None
+    whole: bool = True
+
+    def of(self, which: NDArray[np.int64]) -> _Memory:
+        """Return what is known of some facets."""
+        outcome = Outcome(*(getattr(self.outcome, field.name)[which] for field in fields(Outcome)))
+        return _Memory(
+            self.pose,
+            self.touched[which],
+            self.anchor[which],
+            self.gap[which],
+            self.normal[which],
+            outcome,
+        )
+
+    def among(self, which: NDArray[np.int64], last: _Memory) -> _Memory:
+        """Return it as what acts on some facets, with nothing that acts on the others.
+
+        Args:
+            which: Their numbers.
+            last: What is known of all of them.
+        """
+        m, nq = last.gap.shape
+
+        def spread(values: Any, base: Any) -> Any:
+            """Return values in their places, and others elsewhere."""
+            found = np.zeros((m, *values.shape[1:]), values.dtype) if base is None else base.copy()
+            found[which] = values
+            return found
+
+        mine, its = self.outcome, last.outcome
+        outcome = Outcome(
+            spread(mine.positions, its.positions),
+            spread(mine.gap, last.gap),
+            *(spread(v, None) for v in (mine.pressure, mine.traction, mine.inside, mine.slips)),
+        )
+        step = self.step
+        if step is not None:
+            parts = (part.reshape(len(which), nq, *part.shape[1:]) for part in step)
+            step = _Step(*(spread(p, None).reshape(m * nq, *p.shape[2:]) for p in parts))
+        return _Memory(
+            self.pose,
+            outcome.inside,
+            spread(self.anchor, last.anchor),
+            outcome.gap,
+            spread(self.normal, last.normal),
+            outcome,
+            self.works,
+            step,
+            whole=False,
+        )
+
+
+class _Near(NamedTuple):
+    """Facets that may touch in a step.
+
+    Attributes:
+        which: Their numbers.
+        memory: What is known of them.
+        nodes: Where the nodes of all facets begin, in the frame of the shape.
+        margin: How far nodes may move until others could touch.
+    """
+
+    which: NDArray[np.int64]
+    memory: _Memory
+    nodes: NDArray[np.float64]
+    margin: float
 
 
 class Placed(NamedTuple):
@@ -218,6 +288,7 @@ class Rigid(Contact):
         self._pose = self._aim = Pose(np.zeros(gdim), np.zeros(1 if gdim == 2 else 3))
         self._memory: _Memory | None = None
         self._trial: _Memory | None = None
+        self._near: _Near | None = None
 
     # -- The path -------------------------------------------------------------------------------
 
@@ -383,6 +454,7 @@ class Rigid(Contact):
 
     def _begin_anew(self, pose: Pose) -> None:
         """Take the converged positions for those of points that nothing has touched yet."""
+        self._near = None
         x = self._surface.positions(converged=True)
         m, nq, gdim = x.shape
         with agree(self._comm):
@@ -432,6 +504,7 @@ class Rigid(Contact):
                     "The obstacle of a Rigid moves through the body in one step; move it in "
                     "smaller ones, by a path (update=)"
                 )
+        self._look_near()
         return ()
 
     def _passes(self, memory: _Memory, x: NDArray[np.float64], pose: Pose) -> bool:
@@ -565,8 +638,9 @@ class Rigid(Contact):
             return error
         return None
 
-    def _points(self, memory: _Memory) -> Points:
-        k = self._stiffness.ravel()
+    def _points(self, memory: _Memory, which: NDArray[np.int64] | None = None) -> Points:
+        """Return the points of some facets, of which something is known; ``None``: of all."""
+        k = (self._stiffness if which is None else self._stiffness[which]).ravel()
         gdim = memory.anchor.shape[2]
         return Points(
             self._penalty * k,
@@ -576,14 +650,58 @@ class Rigid(Contact):
             memory.gap.ravel(),
         )
 
-    def _evaluated(self) -> _Memory:
-        """Return what acts at the present positions."""
-        memory, pose = self._memory, self._pose
+    def _evaluated(self, whole: bool = False) -> _Memory:
+        """Return what acts at the present positions.
+
+        Args:
+            whole: Whether to look at facets as well that are too far to touch.
+        """
+        memory = self._memory
         assert memory is not None
-        x = self._surface.positions()
+        near = None if whole else self._within_reach()
+        if near is None:
+            return self._evaluated_on(memory, None)
+        return self._evaluated_on(near.memory, near.which).among(near.which, memory)
+
+    def _look_near(self) -> None:
+        """Note which facets may touch in a step, and what others may move until they could."""
+        self._near = None
+        memory, surface = self._memory, self._surface
+        assert memory is not None
+        if self._nitsche or not self.shape.measures or memory.gap.size == 0:
+            return
+        least = memory.gap.min(axis=1)
+        near = least <= NEAR * surface.thickness
+        if near.mean() > MOST_NEAR:
+            return
+        which = np.flatnonzero(near)
+        self._near = _Near(
+            which,
+            memory.of(which),
+            self._framed(surface.own_nodes(converged=True), memory.pose),
+            (float(least[~near].min()) - surface.touch) / surface.spread,
+        )
+
+    def _within_reach(self) -> _Near | None:
+        """Return what may touch at the present positions; ``None``: all."""
+        if self._near is None:
+            return None
+        change = self._framed(self._surface.own_nodes(), self._pose) - self._near.nodes
+        moved = float((change * change).sum(axis=1).max(initial=0.0)) ** 0.5
+        return self._near if moved < self._near.margin else None
+
+    def _evaluated_on(self, memory: _Memory, which: NDArray[np.int64] | None) -> _Memory:
+        """Return what acts on some facets, or on all.
+
+        Args:
+            memory: What is known of these.
+            which: Their numbers; ``None``: all.
+        """
+        pose = self._pose
+        x = self._surface.positions(which=which)
         m, nq, gdim = x.shape
         y = self._framed(x, pose).reshape(-1, gdim)
-        points = self._points(memory)
+        points = self._points(memory, which)
         touch = self._surface.touch
         behind, reach = None, np.full(len(y), touch)
         if self._nitsche:
@@ -614,7 +732,8 @@ class Rigid(Contact):
         force = normal + shear
         works = (0.0, 0.0)
         if step is not None:
-            moves = self._surface.weights[:, :, None] * (x - memory.outcome.positions)
+            weights = self._surface.weights if which is None else self._surface.weights[which]
+            moves = weights[:, :, None] * (x - memory.outcome.positions)
             works = -float((normal * moves).sum()), -float((shear * moves).sum())
         outcome = Outcome(
             x,
@@ -852,13 +971,13 @@ class Rigid(Contact):
     ) -> NDArray[np.float64]:
         """Return :meth:`_derivative` in the frame of the shape."""
         surface, gdim = self._surface, self._surface.gdim
-        y = self._framed(trial.outcome.positions, trial.pose).reshape(-1, gdim)
+        y = self._framed(trial.outcome.positions.reshape(-1, gdim)[flat], trial.pose)
         n, gap = trial.normal.reshape(-1, gdim)[flat], trial.gap.ravel()[flat]
         points = self._points(memory).of(flat)
-        delta = y[flat] - points.anchor
+        delta = y - points.anchor
         touch, law = surface.touch, self.friction
         if not self._of_step:
-            H = self.shape.curvature(y[flat])
+            H = self.shape.curvature(y)
             push = None if trial.behind is None else self._push(trial, memory, flat, bent=True)
             return derivative(law, points, delta, gap, n, H, touch, push)
         assert trial.step is not None
@@ -892,6 +1011,8 @@ class Rigid(Contact):
         assert before is not None and trial is not None
         failure: MPMError | None = None
         try:
+            if not trial.whole:
+                trial = self._evaluated(whole=True)
             if self.shape.costly:
                 trial = self._in_full(trial)
             turned = (before.normal * trial.normal).sum(axis=2) < OPPOSITE
@@ -905,6 +1026,7 @@ class Rigid(Contact):
         if (failure := agreed(self._comm, failure)) is not None:
             raise failure
         self._memory = replace(trial, step=None)
+        self._near = None
 
         def undo() -> None:
             self._memory = before
@@ -924,6 +1046,7 @@ class Rigid(Contact):
         assert self._memory is not None
         self._trial = self._memory
         self._pose = self._memory.pose
+        self._near = None
 
     def _outcome(self) -> tuple[Surface, Outcome]:
         if self._memory is None:

@@ -170,16 +170,21 @@ class BodyContact(Rigid):
         self._settle()
         self._surface.look_at_deleted()
         self._new_pattern()
+        self._look_near()
         return ()
 
-    def put(self, pose: Pose) -> None:
+    def put(self, pose: Pose, whole: bool = False) -> None:
         """Evaluate what acts with the shape in some place.
+
+        Args:
+            pose: The place.
+            whole: Whether gaps are asked for that are too wide to matter.
 
         Raises:
             MPMError: That cannot be.
         """
         self._pose = self._aim = pose
-        self._trial = self._evaluated()
+        self._trial = self._evaluated(whole)
 
     @property
     def extent(self) -> float:
@@ -196,21 +201,23 @@ class BodyContact(Rigid):
             Force, moment about the centre, size of the force: shape ``(gdim + nr + 1,)``.
         """
         assert self._trial is not None
-        surface, outcome = self._surface, self._trial.outcome
-        f = surface.weights[:, :, None] * outcome.traction
-        arm = self._arms(outcome.positions, centres)
+        outcome = self._trial.outcome
+        which = np.flatnonzero(outcome.traction.any(axis=(1, 2)))
+        f = self._surface.weights[which, :, None] * outcome.traction[which]
+        arm = self._arms(which, centres)
         moments = np.einsum("mqij,mqi->j", crossing(arm), f)
         size = np.linalg.norm(f, axis=2).sum()
         return np.concatenate([f.sum(axis=(0, 1)), moments, [size]])
 
     def _arms(
-        self, after: NDArray[np.float64], centres: tuple[NDArray[np.float64], ...]
+        self, which: NDArray[np.int64], centres: tuple[NDArray[np.float64], ...]
     ) -> NDArray[np.float64]:
         """Return arms from the centre, those of the middle where forces are of whole steps."""
-        assert self._memory is not None
+        assert self._memory is not None and self._trial is not None
+        after = self._trial.outcome.positions[which]
         if not self._of_step:
             return after - centres[1]
-        before = self._memory.outcome.positions
+        before = self._memory.outcome.positions[which]
         return np.asarray(0.5 * (before - centres[0] + after - centres[1]))
 
     def works(self, motion: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Any:
@@ -268,7 +275,11 @@ class BodyContact(Rigid):
         )
 
     def blocks(
-        self, acting: _Acting, centres: tuple[NDArray[np.float64], ...], theta: NDArray[np.float64]
+        self,
+        acting: _Acting,
+        centres: tuple[NDArray[np.float64], ...],
+        theta: NDArray[np.float64],
+        on_nodes: bool = True,
     ) -> _Blocks:
         """Return the derivatives by a step of the rigid body.
 
@@ -276,6 +287,7 @@ class BodyContact(Rigid):
             acting: What :meth:`acting` has returned.
             centres: As for :meth:`total`.
             theta: Cayley vector of the step.
+            on_nodes: Whether those by and of nodes are asked for.
         """
         trial, memory = self._trial, self._memory
         assert trial is not None and memory is not None
@@ -293,6 +305,9 @@ class BodyContact(Rigid):
         turning = share * crossing(acting.force).swapaxes(2, 3)
         own = (w * (rigid.swapaxes(2, 3) @ by_s)).sum(axis=(0, 1))
         own[gdim:, :gdim] += (w * turning).sum(axis=(0, 1))
+        if not on_nodes:
+            nothing = np.zeros((0, 0, 0))
+            return _Blocks(own, nothing, nothing)
         rows = rigid.swapaxes(2, 3) @ by_x
         rows[:, :, gdim:] -= turning
         N, m, n = acting.shapes, len(arm), len(own)
@@ -603,13 +618,15 @@ class RigidBody(Term):
         gdim = self.shape.dim
         return np.concatenate([forces[:gdim], forces[gdim:] / self._lever])
 
-    def _slopes(self, state: _State, theta: NDArray[np.float64]) -> tuple[NDArray[Any], list[Any]]:
+    def _slopes(
+        self, state: _State, theta: NDArray[np.float64], on_nodes: bool
+    ) -> tuple[NDArray[Any], list[Any]]:
         """Return the derivative of the balance by s, and what contacts have (collective)."""
         centres, n = self._centres(state), len(state.place) + len(theta)
         parts, own = [], np.zeros((n, n))
         for contact in self.contacts:
             acting = contact.acting()
-            blocks = contact.blocks(acting, centres, theta)
+            blocks = contact.blocks(acting, centres, theta, on_nodes)
             parts.append((acting, blocks))
             own += blocks.own
         K = self._comm.allreduce(own) + self._inertial_slopes(state, theta)
@@ -666,7 +683,7 @@ class RigidBody(Term):
         for _ in range(MOST_ITERATIONS):
             if norm <= BALANCED * size:
                 break
-            K, _ = self._slopes(state, s[gdim:])
+            K, _ = self._slopes(state, s[gdim:], False)
             inverse, onto = self._inverse(K)
             left = self._size_of(R - onto @ R)
             if left > AT_ROUND_OFF * size:
@@ -711,14 +728,11 @@ class RigidBody(Term):
         way[self.shape.dim :] = 0.0
         size = float(np.linalg.norm(way))
         far = 2.0 * max(contact.extent for contact in self.contacts)
-        gap = self._comm.allreduce(min(contact.least() for contact in self.contacts), MPI.MIN)
-        gone = 0.0
+        gap, gone = self._least_gap(s), 0.0
         while size > 0.0 and 0.0 < gap and gone < far:
             gone += gap
             s = s + gap / size * way
-            self._put(s)
-            before = gap
-            gap = self._comm.allreduce(min(contact.least() for contact in self.contacts), MPI.MIN)
+            before, gap = gap, self._least_gap(s)
             if gap < NEAR * far:
                 return np.asarray(s + (max(gap, 0.0) + NEAR * far) / size * way)
             if gap > before:
@@ -727,6 +741,15 @@ class RigidBody(Term):
             f"Nothing holds a RigidBody against {share:.1e} of its forces; let it begin in touch, "
             "or give it a mass in a DynamicProblem"
         )
+
+    def _least_gap(self, s: NDArray[np.float64]) -> float:
+        """Return the least gap of all points after some step (collective)."""
+        pose = self._pose(self._stepped(s))
+        with agree(self._comm):
+            for contact in self.contacts:
+                contact.put(pose, whole=True)
+        gaps = [contact.least() for contact in self.contacts]
+        return float(self._comm.allreduce(min(gaps), MPI.MIN))
 
     def _size_of(self, R: NDArray[np.float64]) -> float:
         """Return the size of a residual in what is free."""
@@ -819,7 +842,7 @@ class RigidBody(Term):
 
     def _condense(self) -> None:
         """Find what the body adds by yielding (collective)."""
-        K, parts = self._slopes(self._trial, self._found[self.shape.dim :])
+        K, parts = self._slopes(self._trial, self._found[self.shape.dim :], True)
         inverse, _ = self._inverse(K)
         assert self._condensed is not None
         self._condensed.set(self._found, inverse, parts, self._share)

@@ -49,9 +49,12 @@ class Shape:
         costly: Whether looking for the distance takes long, so that it is not done in each
             iteration for points that cannot have come near; it must not change faster than its
             points move then.
+        measures: Whether what it calls a distance is one everywhere: it changes no faster than
+            points move.
     """
 
     costly = False
+    measures = True
 
     def __init__(self, dim: int, pivot: Any) -> None:
         self.dim = dim
@@ -231,7 +234,7 @@ class _Cavity(Shape):
     def __init__(self, shape: Shape) -> None:
         super().__init__(shape.dim, shape.pivot)
         self._shape = shape
-        self.costly = shape.costly
+        self.costly, self.measures = shape.costly, shape.measures
 
     @property
     def outline(self) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
@@ -247,6 +250,8 @@ class _Cavity(Shape):
 
 class _Given(Shape):
     """A shape by a user's distance, whose derivatives are differences."""
+
+    measures = False
 
     def __init__(self, function: Callable[..., Any], dim: int, pivot: Any) -> None:
         super().__init__(dim, pivot)

@@ -178,6 +178,9 @@ class Surface:
             places = at[0] + self.element.points @ (at[1 : dim + 1] - at[0])
             own = np.linalg.norm(places[:, None] - element.points, axis=2).argmin(axis=1)
             self.nodes[here] = W.dofmap.list[self.cells[here]][:, own]
+        self._own, places = np.unique(self.nodes, return_inverse=True)
+        self._of_facets = places.reshape(self.nodes.shape)
+        self._own_mesh = x[self._own]
         edges = np.einsum("jqk,mki->mqij", self.slopes, x[self.nodes])
         area = np.sqrt(np.linalg.det(edges.swapaxes(2, 3) @ edges)) * weights
         self._plain = self._in_mesh = area
@@ -202,6 +205,11 @@ class Surface:
         """Take the weight from facets of domains that are deleted."""
         there = ~self.particles.deleted[self.cells]
         self.weights = self._plain * self._around * there[:, None]
+
+    @property
+    def spread(self) -> float:
+        """How far a point moves at most where none of the nodes of its facet moves more than 1."""
+        return float(np.abs(self.shapes).sum(axis=1).max())
 
     @property
     def touch(self) -> float:
@@ -237,9 +245,24 @@ class Surface:
         d = self.particles.displacement.x.array.reshape(-1, self.gdim)
         return np.asarray(self._space.tabulate_dof_coordinates()[:, : self.gdim] + d)
 
-    def positions(self, converged: bool = False) -> NDArray[np.float64]:
-        """Return the points as the body is displaced, shape ``(m, nq, gdim)``."""
-        return np.asarray(self.shapes @ self.node_positions(converged)[self.nodes])
+    def positions(
+        self, converged: bool = False, which: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return the points as the body is displaced, shape ``(m, nq, gdim)``.
+
+        Args:
+            converged: Whether those at the last converged step are meant.
+            which: Numbers of facets; ``None``: all.
+        """
+        places = self._of_facets if which is None else self._of_facets[which]
+        return np.asarray(self.shapes @ self.own_nodes(converged)[places])
+
+    def own_nodes(self, converged: bool = False) -> NDArray[np.float64]:
+        """Return positions of the nodes of all facets, each once, shape ``(n, gdim)``."""
+        if converged:
+            return self.particles.node_positions[self._own]
+        d = self.particles.displacement.x.array.reshape(-1, self.gdim)
+        return np.asarray(self._own_mesh + d[self._own])
 
     @property
     def sizes(self) -> NDArray[np.float64]:
@@ -260,8 +283,9 @@ class Surface:
             tractions: Per undeformed area, shape ``(m, nq, gdim)``.
             sign: What they are multiplied by.
         """
-        forces = self.shapes.T @ (sign * self.weights[:, :, None] * tractions)
-        return nodal_vector(self.particles.W, self.nodes, forces)
+        acting = np.flatnonzero(tractions.any(axis=(1, 2)))
+        forces = self.shapes.T @ (sign * self.weights[acting, :, None] * tractions[acting])
+        return nodal_vector(self.particles.W, self.nodes[acting], forces)
 
     # -- What is kept ---------------------------------------------------------------------------
 
