@@ -82,6 +82,7 @@ class _Memory:
         step: The step of a motion, at all points, by whose middle the forces are.
         behind: Tractions by the stress behind the facets, where these count, ``(m, nq, gdim)``.
         whole: Whether all facets were looked at, not those alone that may touch.
+        exact: Whether all gaps are known, and not only what some are at least.
     """
 
     pose: Pose
@@ -94,6 +95,7 @@ class _Memory:
     step: _Step | None = None
     behind: NDArray[np.float64] | None = None
     whole: bool = True
+    exact: bool = True
 
     def of(self, which: NDArray[np.int64]) -> _Memory:
         """Return what is known of some facets."""
@@ -151,13 +153,15 @@ class _Near(NamedTuple):
     Attributes:
         which: Their numbers.
         memory: What is known of them.
-        nodes: Where the nodes of all facets begin, in the frame of the shape.
-        margin: How far nodes may move until others could touch.
+        nodes: Where the nodes of all facets begin.
+        radius: Largest distance of these from where the shape has its pivot.
+        margin: How far points may come nearer until others could touch.
     """
 
     which: NDArray[np.int64]
     memory: _Memory
     nodes: NDArray[np.float64]
+    radius: float
     margin: float
 
 
@@ -368,7 +372,8 @@ class Rigid(Contact):
 
     def _framed(self, x: NDArray[Any], pose: Pose) -> NDArray[Any]:
         """Return positions in the frame of the shape."""
-        return (x - self.shape.pivot - pose.offset) @ pose.Q + self.shape.pivot
+        arms = x.reshape(-1, x.shape[-1]) - (self.shape.pivot + pose.offset)
+        return (arms @ pose.Q + self.shape.pivot).reshape(x.shape)
 
     # -- The term -------------------------------------------------------------------------------
 
@@ -524,8 +529,10 @@ class Rigid(Contact):
         if self._gets_deep(a, b, memory.gap, deep, reached & (surface.weights > 0.0)):
             return True
         near = (memory.gap < way) & (way > 0.0) & (surface.weights > 0.0)
-        thickness = deep[near] / DEEP
-        return self._crosses(a[near], b[near], memory.gap[near], memory.normal[near], thickness)
+        thickness, gap, normal = deep[near] / DEEP, memory.gap[near], memory.normal[near]
+        if len(gap) and not memory.exact:
+            gap, normal = self.shape.distance(a[near])
+        return self._crosses(a[near], b[near], gap, normal, thickness)
 
     def _gets_deep(
         self,
@@ -660,6 +667,8 @@ class Rigid(Contact):
         assert memory is not None
         near = None if whole else self._within_reach()
         if near is None:
+            if not (whole or memory.exact):
+                self._memory = memory = self._exact(memory)
             return self._evaluated_on(memory, None)
         return self._evaluated_on(near.memory, near.which).among(near.which, memory)
 
@@ -675,20 +684,30 @@ class Rigid(Contact):
         if near.mean() > MOST_NEAR:
             return
         which = np.flatnonzero(near)
-        self._near = _Near(
-            which,
-            memory.of(which),
-            self._framed(surface.own_nodes(converged=True), memory.pose),
-            (float(least[~near].min()) - surface.touch) / surface.spread,
-        )
+        nodes = surface.own_nodes(converged=True)
+        arms = nodes - self.shape.pivot - memory.pose.offset
+        radius = float(np.linalg.norm(arms, axis=1).max())
+        margin = float(least[~near].min()) - surface.touch
+        self._near = _Near(which, memory.of(which), nodes, radius, margin)
 
     def _within_reach(self) -> _Near | None:
         """Return what may touch at the present positions; ``None``: all."""
-        if self._near is None:
+        near, memory, pose = self._near, self._memory, self._pose
+        if near is None or memory is None:
             return None
-        change = self._framed(self._surface.own_nodes(), self._pose) - self._near.nodes
-        moved = float((change * change).sum(axis=1).max(initial=0.0)) ** 0.5
-        return self._near if moved < self._near.margin else None
+        shifted = float(np.linalg.norm(pose.offset - memory.pose.offset))
+        turned = float(np.linalg.norm(pose.Q - memory.pose.Q, 2)) * near.radius
+        moved = self._surface.spread * (self._largest_change(near) + turned) + shifted
+        return near if moved < near.margin else None
+
+    def _largest_change(self, near: _Near) -> float:
+        """Return how far a node of the facets has moved in the step at most."""
+        change = self._surface.own_nodes() - near.nodes
+        return float(np.sqrt((change * change).sum(axis=1).max(initial=0.0)))
+
+    def _positions(self, which: NDArray[np.int64] | None) -> NDArray[np.float64]:
+        """Return where points of some facets are, ``None``: of all."""
+        return self._surface.positions(which=which)
 
     def _evaluated_on(self, memory: _Memory, which: NDArray[np.int64] | None) -> _Memory:
         """Return what acts on some facets, or on all.
@@ -698,7 +717,7 @@ class Rigid(Contact):
             which: Their numbers; ``None``: all.
         """
         pose = self._pose
-        x = self._surface.positions(which=which)
+        x = self._positions(which)
         m, nq, gdim = x.shape
         y = self._framed(x, pose).reshape(-1, gdim)
         points = self._points(memory, which)
@@ -1014,7 +1033,9 @@ class Rigid(Contact):
             if not trial.whole:
                 trial = self._evaluated(whole=True)
             if self.shape.costly:
-                trial = self._in_full(trial)
+                least = trial.gap.min(axis=1, initial=np.inf)
+                near = np.flatnonzero(least <= NEAR * self._surface.thickness)
+                trial = self._exact(trial, near)
             turned = (before.normal * trial.normal).sum(axis=2) < OPPOSITE
             flipped = before.touched & trial.touched & turned
             if flipped.any() or self._passes(before, trial.outcome.positions, trial.pose):
@@ -1033,13 +1054,24 @@ class Rigid(Contact):
 
         return undo
 
-    def _in_full(self, trial: _Memory) -> _Memory:
-        """Return what there is with the gaps of all points."""
-        x = trial.outcome.positions
-        phi, n = self.shape.distance(self._framed(x, trial.pose).reshape(-1, x.shape[2]))
-        gap = phi.reshape(trial.gap.shape)
-        outcome = replace(trial.outcome, gap=gap)
-        return replace(trial, gap=gap, normal=n.reshape(x.shape), outcome=outcome)
+    def _exact(self, memory: _Memory, which: NDArray[np.int64] | None = None) -> _Memory:
+        """Return what is known with the gaps of all points of some facets, or of all facets."""
+        chosen = slice(None) if which is None else which
+        x = memory.outcome.positions[chosen]
+        phi, n = self.shape.distance(self._framed(x, memory.pose).reshape(-1, x.shape[2]))
+        gap, normal = memory.gap.copy(), memory.normal.copy()
+        gap[chosen], normal[chosen] = phi.reshape(x.shape[:2]), n.reshape(x.shape)
+        outcome = replace(memory.outcome, gap=gap)
+        return replace(memory, gap=gap, normal=normal, outcome=outcome, exact=which is None)
+
+    @property
+    def gap(self) -> NDArray[np.float64]:
+        """See :class:`Contact`."""
+        self._outcome()
+        assert self._memory is not None
+        if not self._memory.exact:
+            self._memory = self._exact(self._memory)
+        return super().gap
 
     def roll_back(self) -> None:
         """See :meth:`Term.roll_back`."""

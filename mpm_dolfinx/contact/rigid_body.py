@@ -151,6 +151,7 @@ class BodyContact(Rigid):
                 "by which its forces balance."
             )
         self._place = place
+        self._seen: tuple[float, NDArray[np.float64]] | None = None
 
     @property
     def _key(self) -> str:
@@ -171,7 +172,24 @@ class BodyContact(Rigid):
         self._surface.look_at_deleted()
         self._new_pattern()
         self._look_near()
+        self._seen = None
         return ()
+
+    def look(self) -> None:
+        """Look where the body is now, for all places in which the shape is tried."""
+        self._seen = None
+        if self._near is not None:
+            near = self._near
+            self._seen = super()._largest_change(near), self._surface.positions(which=near.which)
+
+    def _largest_change(self, near: Any) -> float:
+        """See :class:`Rigid`."""
+        return super()._largest_change(near) if self._seen is None else self._seen[0]
+
+    def _positions(self, which: NDArray[np.int64] | None) -> NDArray[np.float64]:
+        """See :class:`Rigid`."""
+        seen = None if which is None else self._seen
+        return super()._positions(which) if seen is None else seen[1]
 
     def put(self, pose: Pose, whole: bool = False) -> None:
         """Evaluate what acts with the shape in some place.
@@ -243,8 +261,8 @@ class BodyContact(Rigid):
     def least(self) -> float:
         """Return the least gap of this rank's points, as they were evaluated last."""
         assert self._trial is not None
-        there = self._surface.weights > 0.0
-        return float(self._trial.gap[there].min(initial=np.inf))
+        trial = self._exact(self._trial) if self.shape.costly else self._trial
+        return float(trial.gap[self._surface.weights > 0.0].min(initial=np.inf))
 
     def energy(self) -> float:
         """Return this rank's energy of penetration at the last converged step."""
@@ -661,6 +679,8 @@ class RigidBody(Term):
 
     def update(self) -> MPMError | None:
         """See :meth:`Term.update`: find where the body is for what the others have."""
+        for contact in self.contacts:
+            contact.look()
         starts = [self._guess()]
         if not self._begins:
             assert self._condensed is not None
@@ -701,6 +721,7 @@ class RigidBody(Term):
                     break
                 step *= 0.5
             else:
+                R, size, state = self._put(s)
                 break
             slow = floor and found > 0.5 * norm
             s, norm = s - step, found
@@ -711,7 +732,6 @@ class RigidBody(Term):
             raise ConvergenceError(
                 f"The forces on a RigidBody do not balance: {norm / size:.1e} of them are left"
             )
-        R, size, state = self._put(s)
         self._found, self._trial = s, state
 
     def _fallen(
