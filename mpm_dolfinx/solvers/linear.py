@@ -26,7 +26,7 @@ LINEAR_SOLVERS = ("auto", "direct", "multigrid")
 #: Most unknowns of the coarsest level of multigrid, which is factorised.
 COARSEST = 600
 #: Unknowns from which on multigrid takes less time than a factorisation, by dimension of space.
-CROSSOVER = {2: 40000, 3: 2000}
+CROSSOVER = {2: 40000, 3: 3000}
 #: The same in a motion, where the mass takes it three times the iterations.
 CROSSOVER_IN_MOTION = {2: 40000, 3: 5000}
 
