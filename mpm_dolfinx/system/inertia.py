@@ -48,6 +48,8 @@ SCHEMES = ("midpoint", "conserving", "euler")
 OUT_OF_RANGE = ("project", "reflect")
 #: What the residual of a projection falls to, and the most iterations and refinements of it.
 PROJECTED, MOST_ITERATIONS, REFINEMENTS = 1e-13, 100, 6
+#: What iterations go on to beyond it, so that momentum does not wander in thousands of steps.
+BEYOND = 0.01
 #: The same for one that has come to the end of what round-off lets it do.
 AT_ROUND_OFF = 1e-10
 #: How often what the shift holds back is let go.
@@ -469,7 +471,7 @@ class Inertia(Term):
             self._solve_scaled(scaled, y, size)
             rest = self._rest(scaled, y)
             for _ in range(RELEASES):
-                if rest.norm() <= 2.0 * PROJECTED * size:
+                if rest.norm() <= 2.0 * BEYOND * PROJECTED * size:
                     break
                 part = y.duplicate()
                 self._solve_scaled(rest, part, size)
@@ -498,7 +500,7 @@ class Inertia(Term):
             if self._incomplete is None:
                 self._incomplete = _incomplete(self._shifted)
             ksp = self._incomplete
-            ksp.setTolerances(rtol=0.0, atol=PROJECTED * size, max_it=MOST_ITERATIONS)
+            ksp.setTolerances(rtol=0.0, atol=BEYOND * PROJECTED * size, max_it=MOST_ITERATIONS)
             ksp.solve(right, y)
             if ksp.getConvergedReason() > 0:
                 return
