@@ -343,7 +343,7 @@ class RigidBody(Term):
 
         footing = mpm.contact.RigidBody(soil, shape, friction=0.5)
         problem = mpm.QuasiStaticProblem(soil, law, terms=[footing])
-        problem.solve(20, update=lambda t: footing.push((0.0, -300.0 * t), moment=-20.0 * t))
+        problem.solve(20, update=lambda t: footing.push((0.0, -300.0 * t), -20.0 * t))
 
     It has two or three displacements and one or three rotations; axisymmetric one displacement
     along the axis. Those that are named as ``fixed`` follow :meth:`move` instead.
