@@ -32,12 +32,13 @@ type Cuts = NDArray[np.int64]
 Diagonal 0 is that of the corners 0 and 3, diagonal 1 that of 1 and 2.
 """
 
-type Place = Literal["cells", "points", "nodes", "facets"]
+type Place = Literal["cells", "points", "nodes", "forces", "facets"]
 """Where kept values live; the first axis is always that of the owned cells.
 
 ``"cells"``: ``(n, ...)``; ``"points"``: at the quadrature points, ``(n, nq, ...)``; ``"nodes"``: at
-each cell's nodes, ``(n, k, ...)``; ``"facets"``: at points of each cell's facets,
-``(n, facets, points, ...)``, in the order of the facet's corners and symmetric about its middle.
+each cell's nodes, ``(n, k, ...)``; ``"forces"``: there too, but of a node that a cut doubles the
+copy has none; ``"facets"``: at points of each cell's facets, ``(n, facets, points, ...)``, in the
+order of the facet's corners and symmetric about its middle.
 """
 
 PLACES: tuple[str, ...] = get_args(Place.__value__)
@@ -146,6 +147,8 @@ class Remesh(Carrier):
         cells[new, np.repeat(DOUBLED, len(cut))] = (
             numbering.local_range[1] + added[comm.rank] + np.arange(len(new))
         )
+        self._copies = np.zeros(self._corners.shape, dtype=bool)
+        self._copies[new, np.repeat(DOUBLED, len(cut))] = True
         points = np.concatenate([x[: numbering.size_local], x[corners[new, -1]]])
 
         ranks = np.full(len(index), comm.rank, dtype=np.int64)
@@ -186,7 +189,10 @@ class Remesh(Carrier):
         and of those facets; there is nothing yet on the facets that the cut has made.
         """
         if column.at != "facets":
-            return Column(self.rows(column.values, nodal=column.at == "nodes"), column.at)
+            rows = self.rows(column.values, nodal=column.at in ("nodes", "forces"))
+            if column.at == "forces":
+                rows[self._copies] = 0.0
+            return Column(rows, column.at)
         taken = column.values[self._parents]
         cell = self.source.basix_cell()
         edges = np.sort(basix.topology(cell)[self.source.topology.dim - 1], axis=1)

@@ -683,12 +683,11 @@ class Inertia(Term):
 
     def columns(self, body: int) -> dict[str, Column]:
         """Return velocity and forces at the nodes of a body."""
-        named = {
-            "velocity": self.velocities,
-            "force": self._forces,
-            "external": self._external,
+        return {
+            "velocity": Column(of_cells(self.velocities[body]), "nodes"),
+            "force": Column(of_cells(self._forces[body]), "forces"),
+            "external": Column(of_cells(self._external[body]), "forces"),
         }
-        return {name: Column(of_cells(f[body]), "nodes") for name, f in named.items()}
 
     def rates(self, number: int) -> dict[str, Column]:
         """Return the rates of Dirichlet values on a background in the last step."""

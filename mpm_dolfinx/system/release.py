@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 from petsc4py import PETSc
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from ..io.snapshot import Kept, Taken, fill, of_cells
-from ..meshes.remesh import Column
+from ..meshes.remesh import Column, Place
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from .term import Term
@@ -160,12 +160,13 @@ class Release(Term):
             for number, name, place in self._of_body(body)
         }
 
-    def _of_body(self, body: int) -> list[tuple[int, str, Literal["points", "nodes"]]]:
+    def _of_body(self, body: int) -> list[tuple[int, str, Place]]:
         """Return the numbers of a body and of its fields, what they are called, and where."""
-        found: list[tuple[int, str, Literal["points", "nodes"]]] = [(body, "force", "nodes")]
+        found: list[tuple[int, str, Place]] = [(body, "force", "forces")]
         for number, one in enumerate(self.bodies):
             if isinstance(one, CarriedField) and one.field.particles is self.bodies[body]:
-                found.append((number, f"force {one.field.name}", one.place))
+                place: Place = "forces" if one.place == "nodes" else one.place
+                found.append((number, f"force {one.field.name}", place))
         return found
 
     def on_cells(self, number: int) -> dict[str, Column]:

@@ -70,7 +70,7 @@ def test_a_checkpoint_of_before_goes_on():
 
 
 class Own(Kept):
-    """A velocity at nodes, a number and a tensor of each cell, one at points, and a slip."""
+    """Velocity and force at nodes, a number of each cell, a vector at points, and a slip."""
 
     key = "own"
 
@@ -80,6 +80,8 @@ class Own(Kept):
         x = p.domains
         self.velocity = fem.Function(p.W)
         fill(self.velocity, velocity(x))
+        self.force = self.velocity.copy()
+        self.total = resultant(self.force)
         middle = x.mean(axis=1)
         self.number = middle[:, 0].copy()
         self.strength = np.tile(middle[:, None, :], (1, p.num_points, 1))
@@ -94,6 +96,7 @@ class Own(Kept):
             return {}
         return {
             "velocity": Column(of_cells(self.velocity), "nodes"),
+            "force": Column(of_cells(self.force), "forces"),
             "number": Column(self.number, "cells"),
             "strength": Column(self.strength, "points"),
             "slip": Column(self.slip, "facets"),
@@ -104,6 +107,8 @@ class Own(Kept):
         (columns, _) = taken.columns
         self.velocity = fem.Function(self.problem.particles.W)
         fill(self.velocity, columns["velocity"])
+        self.force = fem.Function(self.problem.particles.W)
+        fill(self.force, columns["force"])
         self.number, self.strength = columns["number"], columns["strength"]
         self.slip = columns["slip"]
 
@@ -127,10 +132,18 @@ def start(comm=WORLD):
     return problem, thing
 
 
+def resultant(force):
+    """Return the sum over all nodes of a Function on W."""
+    index_map = force.function_space.dofmap.index_map
+    mine = force.x.array[: 2 * index_map.size_local].reshape(-1, 2).sum(axis=0)
+    return index_map.comm.allreduce(mine)
+
+
 def check(problem, thing, x, cut=()):
     """Compare with functions of the corners ``(n, 4, 2)`` where all was defined, by particle."""
     p = problem.particles
     np.testing.assert_allclose(of_cells(thing.velocity), velocity(x), atol=1e-13)
+    np.testing.assert_allclose(resultant(thing.force), thing.total, rtol=1e-13)
     origin = p.origin_index
     whole = ~np.isin(origin, cut)
     middle = x.mean(axis=1)
@@ -189,7 +202,7 @@ def test_what_says_where_it_lives_goes_with_the_problem(mpi_tmp_path):
             its.number[:], its.strength[:], its.slip[:], its.count = 0.0, 0.0, 0.0, 0
             other.restore(mpi_tmp_path / f"{name}.ckpt")
             check(other, its, other.particles.initial_domains, cut)
-    with pytest.raises(mpm.MPMError, match=r"holds \['own number'.*does not keep"):
+    with pytest.raises(mpm.MPMError, match=r"holds \['own force'.*does not keep"):
         made().restore(mpi_tmp_path / "whole.ckpt")
     without = made()
     without.save(mpi_tmp_path / "without.ckpt")

@@ -810,6 +810,18 @@ def test_split_and_rebase_keep_momentum(out, scheme):
     assert change_of_balance(history) < 1e-9
 
 
+@pytest.mark.parametrize("scheme", ["midpoint", "conserving", "euler"])
+def test_a_split_between_two_steps_keeps_momentum(scheme):
+    # The forces at the beginning of the next step are those of before.
+    problem = thrown(scheme=scheme, petsc_options={"snes_rtol": 1e-12})
+    expected = problem.momentum
+    for step in problem.steps(0.3, 0.05):
+        if step.time == pytest.approx(0.15):
+            problem.split(np.arange(0, problem.particles.num_global, 2))
+        fallen = [0.0, step.time * 2.0]
+        np.testing.assert_allclose(problem.momentum, expected - fallen, atol=1e-11)
+
+
 def test_two_bodies_collide_on_one_background():
     # No momentum is lost, and they part by themselves.
     V = vectors(box([-1.0, 0.0], [4.0, 1.5], [20, 6], QUADRILATERAL))
