@@ -91,6 +91,7 @@ class _Converged(NamedTuple):
         gradient: ``F - I`` that the materials have seen, shape ``(n nq, dim, dim)``.
         stress: First Piola stress, of the same shape.
         volume: Volume strain, where a pressure takes the place of the mean stress.
+        compliance: Its own, where a law is evaluated at the pressure.
         recovery: See :attr:`MaterialPoints.recovery`.
         resisted: Energy that F-bar resists, shape ``(n nq,)``.
     """
@@ -99,6 +100,7 @@ class _Converged(NamedTuple):
     gradient: NDArray[np.float64]
     stress: NDArray[np.float64]
     volume: NDArray[np.float64]
+    compliance: NDArray[np.float64]
     recovery: NDArray[np.float64] | float
     resisted: NDArray[np.float64]
 
@@ -153,7 +155,7 @@ class MaterialPoints:
             states = [self._initial_state(group) for group in self._groups]
         shape = (self._points, self.dim, self.dim)
         none = np.zeros(self._points)
-        self._last = _Converged(states, np.zeros(shape), np.zeros(shape), none, 0.0, none)
+        self._last = _Converged(states, np.zeros(shape), np.zeros(shape), none, none, 0.0, none)
         self.first_piola = np.zeros(shape)
         self.tangent = np.zeros((*shape, self.dim, self.dim))
         self._trial, self._trial_gradient = states, self._last.gradient
@@ -349,10 +351,12 @@ class MaterialPoints:
             stress: Its first Piola stress, given away for good.
         """
         before = self._last
-        volume = before.volume if self.mean_stress is None else self.mean_stress.strain.volume
-        self._last = before._replace(
-            states=states, gradient=self._trial_gradient, stress=stress, volume=volume
-        )
+        self._last = before._replace(states=states, gradient=self._trial_gradient, stress=stress)
+        if self.mean_stress is not None:
+            seen = self.mean_stress.strain
+            self._last = self._last._replace(volume=seen.volume)
+            if not self.comes_apart:
+                self._last = self._last._replace(compliance=seen.compliance.copy())
         if self.averaging is None:
             return
         try:
@@ -818,7 +822,8 @@ class MaterialPoints:
         self._forget_trial()
         self.first_piola = self._last.stress.copy()
         if self.mean_stress is not None:
-            self.mean_stress.return_to(self._last.volume, self._last.gradient)
+            last = self._last
+            self.mean_stress.return_to(last.volume, last.compliance, last.gradient)
 
     def _forget_trial(self) -> None:
         self._trial, self._trial_gradient = self._last.states, self._last.gradient
@@ -834,6 +839,8 @@ class MaterialPoints:
         whole["first_piola"] = self._last.stress
         if self.mean_stress is not None:
             whole["volume_strain"] = self._last.volume
+            if not self.comes_apart:
+                whole["compliance"] = self._last.compliance
         owners: dict[tuple[str, tuple[int, ...], np.dtype[Any]], list[int]] = {}
         for number, state in enumerate(self._last.states):
             for name, values in state.items():
@@ -865,6 +872,7 @@ class MaterialPoints:
             gradient=flat.pop("gradient"),
             stress=flat.pop("first_piola"),
             volume=flat.pop("volume_strain", self._last.volume),
+            compliance=flat.pop("compliance", self._last.compliance),
             recovery=arrays.get("recovery", 0.0),
             resisted=arrays.get("resisted", self._last.resisted).reshape(self._points),
         )

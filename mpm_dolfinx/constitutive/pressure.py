@@ -111,11 +111,20 @@ class MeanStress:
         whole[: len(values)] = values
         self._pressure.set(whole)
 
-    def return_to(self, volume: NDArray[np.float64], gradient: NDArray[np.float64]) -> None:
+    def return_to(
+        self,
+        volume: NDArray[np.float64],
+        compliance: NDArray[np.float64],
+        gradient: NDArray[np.float64],
+    ) -> None:
         """Return to what was seen before.
+
+        The slope is that of laws whose mean stress comes apart; others say theirs in an update.
 
         Args:
             volume: Volume strain, shape ``(n,)``.
+            compliance: That of laws that are evaluated at the pressure, shape ``(n,)``; for others
+                it is that of their moduli.
             gradient: ``F - I``, shape ``(n, dim, dim)``.
         """
         # by what updates it, so that a run goes on bit for bit
@@ -123,7 +132,8 @@ class MeanStress:
         none = np.zeros_like(gradient), np.zeros((n, *(dim,) * 4)), np.zeros((n, 3))
         answer = np.ascontiguousarray(gradient), *none
         slope = with_pressure(answer, np.zeros(n), np.ones(n), self._small).slope
-        self.strain = self.strain._replace(volume=volume, slope=slope, by_pressure=slope)
+        own = np.where(self.shear > 0.0, compliance, self.strain.compliance)
+        self.strain = VolumeStrain(volume, slope, own, slope)
 
     def follow(self, points: NDArray[np.int64], material: Material, bulk: Any, soft: Any) -> None:
         """Take over a law's moduli at some points.

@@ -258,9 +258,19 @@ def test_what_does_not_say_where_it_lives_is_refused(mpi_tmp_path):
             attempt()
     assert problem.particles.num_global == 9
     problem.at = "nodes"
+    # it is the problem that it was: functions on its first mesh go into a file yet
+    colour = fem.Function(fem.functionspace(problem.particles.mesh, ("DG", 0)))
+    colour.interpolate(lambda x: x[0])
+    problem.save(mpi_tmp_path / "whole.ckpt", functions=[colour])
+    values = colour.x.array.copy()
+    colour.x.array[:] = 0.0
+    problem.restore(mpi_tmp_path / "whole.ckpt", functions=[colour])
+    np.testing.assert_array_equal(colour.x.array, values)
     problem.split([4])
     assert problem.particles.num_global == 10
     np.testing.assert_allclose(problem.velocity, velocity(problem.particles.domains), atol=1e-13)
+    with pytest.raises(mpm.MPMError, match=r"Domains were split"):
+        problem.save(mpi_tmp_path / "split.ckpt", functions=[colour])
 
 
 def test_keys_of_what_is_kept():

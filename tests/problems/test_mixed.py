@@ -480,6 +480,38 @@ def pressed_again(problem, laws, tags):
     )
 
 
+@pytest.mark.parametrize("name", ["mohr-coulomb", "drucker-prager"])
+def test_soil_in_a_stage(name, mpi_tmp_path):
+    """A stage that changes nothing holds nothing back, from a file and after a failure too."""
+    ends = []
+    for way in ("plain", "on", "file", "failure"):
+        problem = pressed(SOILS[name], 0.5, push=0.01, density=1.0, body_force=(0.0, -1.0))
+        if way != "file":
+            problem.solve(steps=2)
+            assert scenes.largest(problem.particles.plastic_strain) > 1e-3
+        if way == "on":
+            problem.save(mpi_tmp_path / "soil")
+        elif way == "file":
+            problem.restore(mpi_tmp_path / "soil")
+        elif way == "failure":
+            forces = problem.reduced.nodal_forces()
+            problem.particles.load.value = 1e4
+            with pytest.raises(mpm.MPMError):
+                problem.step()
+            problem.particles.load.value = 1.0
+            for now, then in zip(problem.reduced.nodal_forces(), forces, strict=True):
+                np.testing.assert_array_equal(now, then)
+        if way == "plain":
+            problem.step()
+        else:
+            problem.stage("nothing")
+            next(problem.steps(2))
+        ends.append(outcome(problem))
+    same_run(ends[1], ends[0], 1e-9)
+    same_run(ends[2], ends[1], EXACT)
+    same_run(ends[3], ends[1], EXACT)
+
+
 def test_soil_in_motion():
     """By backward Euler, whose stress is that at the step's end."""
     problem = turning("euler", SOILS["drucker-prager"].with_parameters(young=30.0, cohesion=0.05))
