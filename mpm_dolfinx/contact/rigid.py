@@ -1097,7 +1097,7 @@ class Rigid(Contact):
             "touches": surface.column(memory.touched),
             "slips": surface.column(memory.outcome.slips),
         }
-        if self._nitsche:
+        if self._tells_more:
             known["pressure"] = surface.column(memory.outcome.pressure)
             known["traction"] = surface.column(memory.outcome.traction)
         return known
@@ -1128,13 +1128,18 @@ class Rigid(Contact):
         found = self._memory
         self._memory = _Memory(pose, touched, anchor, found.gap, found.normal, found.outcome)
         outcome = found.outcome
-        if self._nitsche:
+        if self._tells_more:
             told = {name: surface.of_column(columns[name]) for name in ("pressure", "traction")}
             outcome = replace(outcome, **told)
         else:
             outcome = self._evaluated_at_converged().outcome
         outcome = replace(outcome, inside=touched, slips=surface.of_column(columns["slips"]))
         self._memory = self._trial = replace(self._memory, outcome=outcome)
+
+    @property
+    def _tells_more(self) -> bool:
+        """Whether tractions were other ones than positions tell: by stress, or of whole steps."""
+        return self._nitsche or self._of_step
 
     def _evaluated_at_converged(self) -> _Memory:
         body = self.bodies[0]

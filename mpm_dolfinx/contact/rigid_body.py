@@ -266,6 +266,7 @@ class BodyContact(Rigid):
 
     def energy(self) -> float:
         """Return this rank's energy of penetration at the last converged step."""
+        self._outcome()
         assert self._memory is not None
         points, gap = self._points(self._memory), self._memory.gap.ravel()
         pressed = np.where(gap <= self._surface.touch, gap, 0.0)
@@ -427,7 +428,7 @@ class RigidBody(Term):
             gravity=self._gravity,
             velocity=still.velocity,
             spin=still.spin,
-            fixed=list(fixed),
+            fixed=self._held,
         )
         self._memory = self._trial = still
         self._found = np.zeros(gdim + nr)
@@ -488,7 +489,7 @@ class RigidBody(Term):
 
     @property
     def velocity(self) -> NDArray[np.float64]:
-        """Velocity of its centre, shape ``(gdim,)``."""
+        """Velocity of its centre, shape ``(gdim,)``; in what is ``fixed`` the mean of the step."""
         return self._memory.velocity.copy()
 
     @property
@@ -565,10 +566,11 @@ class RigidBody(Term):
         u, theta = s[:gdim], s[gdim:]
         velocity, spin = last.velocity, last.spin
         if self._dt is not None:
-            c = 2.0 if self._share < 1.0 else 1.0
-            velocity = c * u / self._dt - (c - 1.0) * velocity
+            # (what follows a path has the mean of the step, or a jump of it would swing for ever)
+            c = np.where(self._held, 1.0, 2.0 if self._share < 1.0 else 1.0)
+            velocity = c[:gdim] * u / self._dt - (c[:gdim] - 1.0) * velocity
             own = theta if len(theta) == 1 else self._Q(last).T @ theta
-            spin = c * own / self._dt - (c - 1.0) * spin
+            spin = c[gdim:] * own / self._dt - (c[gdim:] - 1.0) * spin
         return _State(last.place + u, last.turn.turned(theta), velocity, spin, *self._push)
 
     def _centres(self, state: _State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -1092,7 +1094,10 @@ def _held(fixed: Any, gdim: int, axisymmetric: bool) -> NDArray[np.bool_]:
         MPMError: Names that are none.
     """
     names = [*NAMES[:gdim], TURNS]
-    given = [fixed] if isinstance(fixed, str) else list(fixed)
+    try:
+        given = [fixed] if isinstance(fixed, str) else list(fixed)
+    except TypeError:
+        given = [fixed]
     for name in given:
         if name not in names:
             raise MPMError(
@@ -1119,10 +1124,13 @@ def _as_rotation(value: Any, name: str, gdim: int) -> NDArray[np.float64]:
     if count == 3 and found.shape == (1,) and found[0] == 0.0:
         found = np.zeros(3)
     if found.shape != (count,) or not np.isfinite(found).all():
-        raise MPMError(
-            f"{name} of a RigidBody must be {count} finite numbers, not {_shown(value)}."
-        )
+        raise MPMError(f"{name} of a RigidBody must be {_finite(count)}, not {_shown(value)}.")
     return found
+
+
+def _finite(count: int) -> str:
+    """Return how many numbers are asked for, in words."""
+    return "a finite number" if count == 1 else f"{count} finite numbers"
 
 
 def _shown(value: Any) -> str:
@@ -1144,6 +1152,7 @@ def _as_inertia(value: Any, gdim: int) -> NDArray[np.float64]:
     if found.shape == ():
         found = found * np.eye(count)
     good = found.shape == (count, count) and bool(np.isfinite(found).all())
+    good = good and not isinstance(value, bool)
     if not good or np.abs(found - found.T).max() > 1e-12 * np.abs(found).max():
         raise MPMError(
             f"inertia of a RigidBody must be a number{'' if gdim == 2 else ' or (3, 3) numbers'}, "

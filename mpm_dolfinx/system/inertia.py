@@ -329,14 +329,22 @@ class Inertia(Term):
             Energy(self.time, self._kinetic, strain=strain, dissipated=dissipated, **sums)
         )
 
-    def _note_forces(self) -> None:
-        """Keep the forces of all other terms, as they are now."""
+    def _note_forces(self, balanced: bool = False) -> None:
+        """Keep the forces of all other terms, as they are now.
+
+        Args:
+            balanced: Whether they are those of a step that has converged, which a term that begins
+                anew may find otherwise, as where points of contact have stayed with their facets.
+        """
         for functions in (self._forces, self._external):
             for function in functions:
                 function.x.array[:] = 0.0
         for term in self._others:
+            if balanced:
+                self._gather(term, term.end_forces(), self._forces)
             self._gather(term, term.begin(), self._external)
-            self._gather(term, term.end_forces(), self._forces)
+            if not balanced:
+                self._gather(term, term.end_forces(), self._forces)
         for function in (*self._forces, *self._external):
             function.x.scatter_forward()
 
@@ -608,7 +616,7 @@ class Inertia(Term):
         whole, resisted = np.sum([term.step_work() for term in self._others], axis=0)
         parts = [self._forces, self._external]
         before = [self._vectors(functions) for functions in parts]
-        self._note_forces()
+        self._note_forces(balanced=True)
         begin, end = (0.0, 1.0) if self.scheme == "euler" else (0.5, 0.5)
         ends, loads = (
             begin * _dot(self._w, old) + end * _dot(self._w, self._vectors(functions))

@@ -338,10 +338,27 @@ def test_a_checkpoint_in_an_impact_goes_on_as_the_run_does(mpi_tmp_path):
     assert np.abs(force).max() > 0.0
     other, again = thrown("box", 0.3)
     other.restore(mpi_tmp_path / "half.ckpt")
+    assert np.abs(other.reaction(again) - force).max() <= 1e-14 * np.abs(force).max()
     other.solve(0.12, 0.02, output_at=[0.06])
     for name in ("offset", "angle", "velocity", "spin", "reaction"):
         assert np.abs(getattr(again, name) - getattr(ball, name)).max() < 1e-9, name
     same_run(outcome(other), outcome(problem), 1e-9)
+
+
+@pytest.mark.parametrize("scheme", ["midpoint", "euler"])
+def test_what_follows_a_path_has_its_velocity_from_the_first_step_on(scheme):
+    V = scenes.vectors(box([-1.0, -1.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
+    particles = mpm.Particles(box([0.0, 0.0], [1.0, 1.0], [3, 3], QUADRILATERAL), V)
+    disc = contact.disc((0.5, 1.7), RADIUS)
+    tool = contact.RigidBody(
+        particles, disc, MASS, inertia=TURNING, fixed=("x", "rotation"), velocity=(0.0, 0.3)
+    )
+    problem = mpm.DynamicProblem(
+        particles, Hencky(YOUNG, POISSON), 1.0, terms=[tool], scheme=scheme
+    )
+    for _ in problem.steps(0.1, 0.02, update=lambda t: tool.move((0.5 * t, 0.0), 0.1 * t)):
+        assert np.abs(tool.velocity - (0.5, 0.3)).max() < 1e-12
+        assert tool.spin[0] == pytest.approx(0.1, rel=1e-6)
 
 
 def test_a_step_that_fails_leaves_it_where_it_was():
@@ -461,8 +478,11 @@ def test_what_makes_no_sense_is_refused():
         (made(1.0, inertia=-1.0), "must be positive"),
         (made(1.0, inertia=np.eye(3)), "inertia of a RigidBody must be a number"),
         (made(gravity=(0.0, -9.81)), "needs its mass="),
+        (made(1.0, inertia=True), "inertia of a RigidBody must be a number"),
         (made(1.0, fixed=("z",)), "names among 'x', 'y', 'rotation'"),
-        (made(1.0, spin=(1.0, 2.0, 3.0)), "spin of a RigidBody must be 1 finite"),
+        (made(1.0, fixed=2), "names among 'x', 'y', 'rotation', not 2"),
+        (lambda: made(1.0)().contact_energy, "belongs to no problem yet"),
+        (made(1.0, spin=(1.0, 2.0, 3.0)), "spin of a RigidBody must be a finite number"),
         (made(1.0, centre=(0.0, np.inf)), "centre must be 2 finite numbers"),
         (made(1.0, law="nitsche"), "law='nitsche' is for a Rigid that moves on a path"),
         (lambda: contact.RigidBody([], disc), "needs one body"),
