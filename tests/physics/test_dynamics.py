@@ -379,7 +379,7 @@ def test_a_ball_bounces_off_a_plane():
 @pytest.mark.slow
 def test_a_ball_bounces_as_high_as_a_finer_one():
     # What is missing is in its vibrations, which a few facets of contact know roughly.
-    assert bounced(6, 0.01) == pytest.approx(bounced(10, 0.0075), rel=0.03)
+    assert bounced(6, 0.005) == pytest.approx(bounced(10, 0.005), rel=0.02)
 
 
 @pytest.mark.parametrize(("scheme", "out"), [("midpoint", "reflect"), ("conserving", "project")])
