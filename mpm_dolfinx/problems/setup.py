@@ -77,6 +77,20 @@ class Numerics:
 
     def __post_init__(self) -> None:
         """Say so where something is unknown."""
+        for name in ("line_search", "predictor"):
+            if not isinstance(getattr(self, name), bool | np.bool_):
+                raise MPMError(f"{name} must be True or False, not {getattr(self, name)!r}.")
+        if not isinstance(self.petsc_options_prefix, str):
+            raise MPMError(
+                f"petsc_options_prefix must be a string, not {self.petsc_options_prefix!r}."
+            )
+        for name in ("petsc_options", "form_compiler_options", "jit_options"):
+            given = getattr(self, name)
+            if given is None or (
+                isinstance(given, dict) and all(isinstance(k, str) for k in given)
+            ):
+                continue
+            raise MPMError(f"{name} must be a dictionary of options by their names, not {given!r}.")
         if self.dependent_dofs not in ("shift", "remove"):
             raise MPMError(
                 f"Unknown dependent_dofs={self.dependent_dofs!r}; choose 'shift' or 'remove'."
@@ -86,8 +100,10 @@ class Numerics:
                 f"Unknown linear_solver={self.linear_solver!r}; choose one of "
                 f"{', '.join(map(repr, LINEAR_SOLVERS))}."
             )
-        if not isinstance(self.shift, float | int) or not 0.0 <= self.shift < 1.0:
+        if not isinstance(self.shift, float | int | np.floating) or not 0.0 <= self.shift < 1.0:
             raise MPMError(f"shift must be at least 0 and below 1, not {self.shift!r}.")
+        # a number of NumPy's would make arrays of PETSc's vectors
+        object.__setattr__(self, "shift", float(self.shift))
 
     def in_words(self) -> dict[str, str]:
         """Return how the problem is solved, for a reader."""
@@ -229,7 +245,7 @@ class Setup:
 
     def _require_mixed(self) -> None:
         """Raise an error unless a pressure can be an unknown of all bodies."""
-        if self.mixed not in MIXED:
+        if not isinstance(self.mixed, str) or self.mixed not in MIXED:
             known = ", ".join(map(repr, MIXED))
             raise MPMError(f"Unknown mixed={self.mixed!r}; choose {known} or None.")
         if self.f_bar != "none":
