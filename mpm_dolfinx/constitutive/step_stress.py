@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 from .._core import loops
 from ..errors import ConvergenceError, MPMError
+from ..particles.reference import Reference
 from .averaging import Linearised, LowRankTerm, VolumeAveraging
 from .groups import Groups
 from .points import MaterialPoints
@@ -166,6 +167,8 @@ class StepStress:
     def pace(self, dt: float, share: float) -> None:
         """See :meth:`system.term.Term.pace`."""
         self._dt, self._share = dt, share
+        if self._present_reference() is not self._reference:
+            self.settle()
 
     def mute(self, muted: bool) -> None:
         """Leave out, or take in again, what belongs to the whole step."""
@@ -174,6 +177,8 @@ class StepStress:
     def settle(self) -> None:
         """Take the last converged step for the beginning of the next."""
         points = self._points
+        # (a body that was rebased or split learns what its mesh is strained by after that)
+        self._reference = self._present_reference()
         self._H = self._gradient()
         self._P = points.first_piola.copy()
         self._energy = self._elastic = points.strain_energy()
@@ -186,6 +191,11 @@ class StepStress:
             self._own = self._P
         if self._viscosity > 0.0:
             self._undeformed = points.undeformed_tangent()
+
+    def _present_reference(self) -> Reference | None:
+        """Return what the body's mesh is strained by now, the same object while it is the same."""
+        particles = self._points.strain.particles
+        return particles.reference if particles.rebased else None
 
     def _gradient(self) -> Array:
         """Return F - I at the points at the present displacement."""

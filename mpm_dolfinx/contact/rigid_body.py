@@ -569,7 +569,8 @@ class RigidBody(Term):
             # (what follows a path has the mean of the step, or a jump of it would swing for ever)
             c = np.where(self._held, 1.0, 2.0 if self._share < 1.0 else 1.0)
             velocity = c[:gdim] * u / self._dt - (c[:gdim] - 1.0) * velocity
-            own = theta if len(theta) == 1 else self._Q(last).T @ theta
+            turn = Turn.none(gdim).turned(theta).angle if self._held[-1] else theta
+            own = turn if gdim == 2 else self._Q(last).T @ turn
             spin = c[gdim:] * own / self._dt - (c[gdim:] - 1.0) * spin
         return _State(last.place + u, last.turn.turned(theta), velocity, spin, *self._push)
 
@@ -813,7 +814,11 @@ class RigidBody(Term):
             contact.pace(dt, share)
 
     def begin(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.begin`."""
+        """See :meth:`Term.begin`.
+
+        Raises:
+            ConvergenceError: It is to turn by half a turn or more, which no Cayley vector tells.
+        """
         require_same(
             self._comm,
             force=self._push[0],
@@ -821,6 +826,12 @@ class RigidBody(Term):
             offset=self._aim.offset,
             angle=self._aim.angle,
         )
+        turn = self._aim.angle - self._memory.turn.angle
+        if self._held[-1] and len(turn) == 1 and abs(turn[0]) >= np.pi:
+            raise ConvergenceError(
+                "A RigidBody turns by half a turn or more in one step; turn it by less, on a path "
+                "(update=)"
+            )
         for contact in self.contacts:
             contact.begin()
         self._begins = True

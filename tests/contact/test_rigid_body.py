@@ -358,7 +358,21 @@ def test_what_follows_a_path_has_its_velocity_from_the_first_step_on(scheme):
     )
     for _ in problem.steps(0.1, 0.02, update=lambda t: tool.move((0.5 * t, 0.0), 0.1 * t)):
         assert np.abs(tool.velocity - (0.5, 0.3)).max() < 1e-12
-        assert tool.spin[0] == pytest.approx(0.1, rel=1e-6)
+        assert tool.spin[0] == pytest.approx(0.1, rel=1e-9)
+
+
+def test_what_turns_on_a_path_turns_by_less_than_half_a_turn_in_a_step():
+    particles = mpm.Particles(
+        box([0.0, 0.0], [1.0, 1.0], [2, 2], QUADRILATERAL),
+        scenes.vectors(box([-1.0, -1.0], [2.0, 2.0], [4, 4], QUADRILATERAL)),
+    )
+    tool = contact.RigidBody(particles, contact.disc((5.0, 0.5), 0.3), MASS, fixed="rotation")
+    problem = mpm.DynamicProblem(particles, Hencky(YOUNG, POISSON), 1.0, terms=[tool])
+    tool.move((0.0, 0.0), 4.0)
+    raises(lambda: problem.step(0.1), mpm.ConvergenceError, "half a turn or more in one step")
+    assert tool.angle[0] == 0.0
+    problem.solve(0.4, 0.1, update=lambda t: tool.move((0.0, 0.0), 20.0 * t))
+    assert tool.angle[0] == pytest.approx(8.0, rel=1e-12)
 
 
 def test_a_step_that_fails_leaves_it_where_it_was():

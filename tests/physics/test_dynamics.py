@@ -822,6 +822,32 @@ def test_a_split_between_two_steps_keeps_momentum(scheme):
         np.testing.assert_allclose(problem.momentum, expected - fallen, atol=1e-11)
 
 
+@pytest.mark.parametrize("what", ["split", "rebase"])
+@pytest.mark.parametrize("damping", [0.0, 1e-3])
+def test_other_meshes_between_two_steps_are_no_other_run(what, damping):
+    # Stresses of whole steps know what the new mesh is strained by, also within one run.
+    def change(problem):
+        if what == "rebase":
+            problem.rebase()
+        else:
+            problem.split(np.arange(0, problem.particles.num_global, 2))
+
+    runs = []
+    for once in (True, False):
+        problem = thrown(scheme="conserving", rayleigh=(0.0, damping))
+        if once:
+            for step in problem.steps(0.3, 0.05):
+                if step.time == pytest.approx(0.15):
+                    change(problem)
+        else:
+            problem.solve(0.15, 0.05)
+            change(problem)
+            problem.solve(0.3, 0.05)
+        assert change_of_balance(problem.history) < 1e-9
+        runs.append(problem.particles)
+    assert np.abs(runs[0].domains - runs[1].domains).max(initial=0.0) < 1e-9
+
+
 def test_two_bodies_collide_on_one_background():
     # No momentum is lost, and they part by themselves.
     V = vectors(box([-1.0, 0.0], [4.0, 1.5], [20, 6], QUADRILATERAL))
