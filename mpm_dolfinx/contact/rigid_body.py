@@ -428,7 +428,7 @@ class RigidBody(Term):
             gravity=self._gravity,
             velocity=still.velocity,
             spin=still.spin,
-            fixed=self._held,
+            fixed=[name for name, held in zip(_names(gdim), self._held, strict=False) if held],
         )
         self._memory = self._trial = still
         self._found = np.zeros(gdim + nr)
@@ -1098,13 +1098,18 @@ def _changed(factor: PETSc.Mat, body: Particles, before: NDArray[np.float64]) ->
     return change
 
 
+def _names(gdim: int) -> list[str]:
+    """Return the names of what a rigid body can do; all of its rotations have one."""
+    return [*NAMES[:gdim], TURNS]
+
+
 def _held(fixed: Any, gdim: int, axisymmetric: bool) -> NDArray[np.bool_]:
     """Return which of the unknowns of a rigid body follow a path.
 
     Raises:
         MPMError: Names that are none.
     """
-    names = [*NAMES[:gdim], TURNS]
+    names = _names(gdim)
     try:
         given = [fixed] if isinstance(fixed, str) else list(fixed)
     except TypeError:
