@@ -77,7 +77,12 @@ def strength_reduction(
     comm = problem.bodies[0].V.mesh.comm
     require_same(comm, step=step, tolerance=tolerance, most=most, displacement=displacement)
     numbers = [step, tolerance, most, 1.0 if displacement is None else displacement]
-    if not all(isinstance(n, float | int) and n > 0.0 for n in numbers):
+    if not all(
+        isinstance(n, float | int | np.floating | np.integer)
+        and not isinstance(n, bool)
+        and 0.0 < n < np.inf
+        for n in numbers
+    ):
         raise MPMError("step, tolerance, most and displacement must be positive numbers.")
     if most <= 1.0:
         raise MPMError(f"most= is a factor at which to stop, above 1, not {most:g}.")

@@ -140,6 +140,8 @@ def test_stops_where_the_body_moves_too_far():
     assert yields < 0.0  # of the strength that was given
     with pytest.raises(mpm.MPMError, match="positive"):
         mpm.strength_reduction(problem, step=0.0)
+    with pytest.raises(mpm.MPMError, match="positive"):
+        mpm.strength_reduction(problem, tolerance=np.inf)  # of which nothing would be found
     with pytest.raises(mpm.MPMError, match="above 1"):
         mpm.strength_reduction(problem, most=0.5)
     with pytest.raises(mpm.MPMError, match="QuasiStatic"):
