@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+import weakref
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
@@ -381,15 +382,31 @@ def _stacked(
 class _Pattern:
     """Blocks between the nodes of one field and those of another, or of the same.
 
+    Fields have their patterns, and are not kept alive by them: what a problem lets go of must be
+    gone before PETSc's garbage is collected.
+
     Args:
         rows: The field of the rows.
         columns: The field of the columns.
     """
 
     def __init__(self, rows: _Block, columns: _Block) -> None:
-        self._rows, self.columns = rows, columns
+        self._references = weakref.ref(rows), weakref.ref(columns)
         self._pairs: list[tuple[Support, Support]] = []
         self.values: NDArray[np.float64] = no_values
+
+    @property
+    def _rows(self) -> _Block:
+        block = self._references[0]()
+        assert block is not None
+        return block
+
+    @property
+    def columns(self) -> _Block:
+        """The field of the columns."""
+        block = self._references[1]()
+        assert block is not None
+        return block
 
     def take(self, rows: Support, columns: Support) -> int:
         """Take over domains that see nodes of both fields; return their number."""

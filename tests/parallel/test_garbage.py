@@ -7,8 +7,11 @@ import weakref
 
 from mpi4py import MPI
 
+import numpy as np
 import pytest
 import scenes
+
+from dolfinx import fem
 
 import mpm_dolfinx as mpm
 
@@ -89,10 +92,20 @@ def moving():
     mpm.DynamicProblem(body, law, density=2.0, body_force=(0.0, -1.0)).solve(1e-3, 1e-3)
 
 
+def with_a_pressure():
+    V = scenes.vectors(scenes.box([-0.5] * 2, [1.5] * 2, [4, 4], scenes.QUADRILATERAL), 2)
+    body = mpm.Particles(scenes.unit(4, scenes.QUADRILATERAL), V, degree=2)
+    law = mpm.materials.Hencky(1e3, 0.4999)
+    bcs = [fem.dirichletbc(np.zeros(2), fem.locate_dofs_geometrical(V, lambda x: x[1] < 0.1), V)]
+    problem = mpm.QuasiStaticProblem(body, law, 2.0, (0.0, -1.0), bcs=bcs, mixed="pressure")
+    problem.repartition(0.0)
+    problem.solve(1)
+
+
 @pytest.mark.mpi
-@pytest.mark.filterwarnings("ignore:The domains have one quadrature point")
+@pytest.mark.filterwarnings("ignore:The domains have")
 def test_problems_leave_no_communicator():
-    kinds = [loaded, repartitioned, split, on_reference_route, moving]
+    kinds = [loaded, repartitioned, split, on_reference_route, moving, with_a_pressure]
 
     def run(times):
         for _ in range(times):
