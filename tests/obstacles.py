@@ -43,6 +43,30 @@ def on_plane(friction, cell=QUADRILATERAL, angle=0.0, n=3, comm=WORLD, material=
     return problem, ground, force
 
 
+def between_plates(cell, material, n=3, degree=1, law="penalty", **options):
+    """Return a unit block between plates, the lower and the upper one."""
+    dim = 2 if cell in scenes.PLANE else 3
+    grid = QUADRILATERAL if dim == 2 else scenes.HEXAHEDRON
+    lower = np.append(np.zeros(dim - 1), -0.3)
+    V = scenes.vectors(scenes.box(lower, [1.5] * dim, [3] * dim, grid), degree)
+    rule = 2 if "axisymmetric" in options else None
+    particles = mpm.Particles(scenes.unit(n, cell), V, degree=degree, quadrature_degree=rule)
+    up = np.eye(dim)[-1]
+    axisymmetric = options.get("axisymmetric", False)
+    below, above = (
+        contact.Rigid(particles, contact.plane(at, n), law=law, axisymmetric=axisymmetric)
+        for at, n in ((0.0 * up, up), (up, -up))
+    )
+    problem = mpm.QuasiStaticProblem(
+        particles,
+        material,
+        bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in range(dim - 1)],
+        terms=[below, above],
+        **options,
+    )
+    return problem, below, above
+
+
 def turning(force, angle, load, most):
     """Return a path: weight that grows, then turns by an angle at most."""
     t, normal = tilted(angle)

@@ -943,13 +943,14 @@ class RigidBody(Term):
 
     def numbers(self) -> dict[str, Any]:
         """Return where it is and how it moves, for a checkpoint."""
-        state = self._memory._replace(turn=self._memory.turn.values)  # type: ignore[arg-type]
-        return {name: values.tolist() for name, values in state._asdict().items()}
+        values = self._memory._asdict() | {"turn": self._memory.turn.values}
+        return {name: value.tolist() for name, value in values.items()}
 
     def take(self, taken: Taken) -> None:
         """Take what :meth:`numbers` returned."""
         values = {name: np.array(v, dtype=np.float64) for name, v in taken.numbers.items()}
-        self._memory = self._trial = _State(**{**values, "turn": Turn(values["turn"])})  # type: ignore[arg-type]
+        turn = Turn(values.pop("turn"))
+        self._memory = self._trial = _State(turn=turn, **values)
         self._push = self._memory.force, self._memory.moment
         self._aim = Pose(self._memory.place, self._memory.turn.angle)
         self._begins = True

@@ -5,6 +5,7 @@
 import itertools
 
 import numpy as np
+import obstacles
 import pytest
 import scenes
 from compare import error_of_blocks, outcome, same_run
@@ -22,7 +23,7 @@ from obstacles import (
     told,
     turning,
 )
-from scenes import ALL, HEXAHEDRON, PLANE, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
+from scenes import ALL, HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 
 import ufl
 from dolfinx import fem
@@ -34,28 +35,9 @@ from mpm_dolfinx.materials import Hencky, LinearElastic, VonMises
 from mpm_dolfinx.meshes.quadrature import quadrature_rule
 
 
-def between_plates(cell, material, n=3, degree=1, **options):
-    """Return a unit block between plates, the lower and the upper one."""
-    dim = 2 if cell in PLANE else 3
-    grid = QUADRILATERAL if dim == 2 else HEXAHEDRON
-    lower = np.append(np.zeros(dim - 1), -0.3)
-    V = scenes.vectors(scenes.box(lower, [1.5] * dim, [3] * dim, grid), degree)
-    rule = 2 if "axisymmetric" in options else None
-    particles = mpm.Particles(scenes.unit(n, cell), V, degree=degree, quadrature_degree=rule)
-    up = np.eye(dim)[-1]
-    axisymmetric = options.get("axisymmetric", False)
-    below, above = (
-        contact.Rigid(particles, contact.plane(at, n), law="nitsche", axisymmetric=axisymmetric)
-        for at, n in ((0.0 * up, up), (up, -up))
-    )
-    problem = mpm.QuasiStaticProblem(
-        particles,
-        material,
-        bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in range(dim - 1)],
-        terms=[below, above],
-        **options,
-    )
-    return problem, below, above
+def between_plates(cell, material, **options):
+    """Return a unit block between plates by Nitsche's method, the lower and the upper one."""
+    return obstacles.between_plates(cell, material, law="nitsche", **options)
 
 
 @pytest.mark.parametrize("cell", ALL, ids=scenes.name)

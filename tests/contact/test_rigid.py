@@ -12,6 +12,7 @@ from obstacles import (
     CONFINED,
     POISSON,
     YOUNG,
+    between_plates,
     close,
     dragged,
     error_of_facets,
@@ -55,20 +56,9 @@ def test_a_block_sticks_up_to_the_angle_of_friction(friction, angle, cell):
 def test_a_block_between_plates_is_compressed_evenly(cell):
     # The stress is uniform, so the gap of the penalty is known: plates give way by p h / M each.
     dim = 2 if cell in PLANE else 3
-    strain = 0.01
-    grid = QUADRILATERAL if dim == 2 else HEXAHEDRON
-    lower = np.append(np.zeros(dim - 1), -0.3)
-    V = scenes.vectors(scenes.box(lower, [1.5] * dim, [3] * dim, grid))
-    particles = mpm.Particles(scenes.unit(3, cell), V)
-    up = np.eye(dim)[-1]
-    below = contact.Rigid(particles, contact.plane(np.zeros(dim), up))
-    above = contact.Rigid(particles, contact.plane(up, -up))
-    problem = mpm.QuasiStaticProblem(
-        particles,
-        LinearElastic(YOUNG, POISSON),
-        bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in range(dim - 1)],
-        terms=[below, above],
-    )
+    strain, up = 0.01, np.eye(dim)[-1]
+    problem, below, above = between_plates(cell, LinearElastic(YOUNG, POISSON))
+    particles = problem.particles
     p = strain * (YOUNG / (1 - POISSON**2) if dim == 2 else YOUNG)
     h = 1 / {QUADRILATERAL: 3, HEXAHEDRON: 3, TRIANGLE: 6, TETRAHEDRON: 9}[cell]
     shift = strain + 2.0 * p * h / CONFINED

@@ -474,12 +474,17 @@ def move(wanted, scheme, directory):
         assert np.array_equal(one.centroid, two.centroid)
 
 
-def motions():
-    """Return the rows of the page's table of motions by feature."""
+def rows_of(title, columns):
+    """Return the rows of one of the page's tables of features, by feature."""
     text = PAGE.read_text(encoding="utf-8")
-    rows = re.findall(r"^\| ([^|]+?) \| ([^|]+) \| ([^|]+) \| ([^|]+) \|$", text, re.MULTILINE)
-    rows = [row for row in rows if row[0] not in ("---", "in motion")]
+    rows = re.findall(rf"^\|{columns * r' ([^|]+?) \|'}$", text, re.MULTILINE)
+    rows = [row for row in rows if row[0] not in ("---", title)]
     return {feature.replace("`", ""): cells for feature, *cells in rows}
+
+
+def motions():
+    """Return the rows of the page's table of motions."""
+    return rows_of("in motion", 4)
 
 
 def test_the_page_has_each_feature_in_motion():
@@ -559,11 +564,8 @@ def consolidate(wanted, directory):
 
 
 def waters():
-    """Return the rows of the page's table of consolidation by feature."""
-    text = PAGE.read_text(encoding="utf-8")
-    rows = re.findall(r"^\| ([^|]+?) \| ([^|]+) \|$", text, re.MULTILINE)
-    rows = [row for row in rows if row[0] not in ("---", "with water")]
-    return {feature.replace("`", ""): cell for feature, cell in rows}
+    """Return the rows of the page's table of consolidation."""
+    return {feature: cell for feature, (cell,) in rows_of("with water", 2).items()}
 
 
 def test_the_page_has_each_feature_with_water():

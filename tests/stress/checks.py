@@ -362,7 +362,7 @@ class Observer:
 
         With F-bar the first Piola stress is the one that works on F.
         """
-        domains, body = self.domains[i], self.run.bodies[i]
+        domains = self.domains[i]
         F = domains.gradient(self.present[i])
         if self.f_bar == "domain":
             return self._averaged_points(i, F)
@@ -370,12 +370,13 @@ class Observer:
             young = np.reshape(self.run.youngs[i], (-1, 1))
             P, energy = elastic_stress(self.law, young, self.scene["material"]["poisson"], F)
             return F, P, None, energy
+        points = self.run.problem.points[i]
         if self.f_bar != "none":
             F = np.tile(np.eye(3), (*F.shape[:2], 1, 1))
             dim = 3 if domains.axisymmetric else domains.dim
-            kept = self.run.problem.points[i].converged_state()["gradient"].values
+            kept = points.converged_state()["gradient"].values
             F[..., :dim, :dim] += kept.reshape(*F.shape[:2], dim, dim)
-        sigma = body._response.cauchy_stress()
+        sigma = points.cauchy_stress()
         if self.law == "small":
             return F, sigma, sigma, None
         tau = np.linalg.det(F)[..., None, None] * sigma
@@ -399,7 +400,7 @@ class Observer:
             P, energy = elastic_stress(self.law, self.run.young, poisson, bar)
             tau = np.einsum("...ik,...jk->...ij", P, bar)
         else:
-            sigma = self.run.bodies[i]._response.cauchy_stress()
+            sigma = self.run.problem.points[i].cauchy_stress()
             tau = np.linalg.det(bar)[..., None, None] * sigma
         pressure = np.trace(tau[..., :dim, :dim], axis1=-2, axis2=-1) / dim
         shared = J * (w * pressure).sum(axis=1, keepdims=True) / (w * J).sum(axis=1, keepdims=True)

@@ -32,7 +32,8 @@ def child(path):
 
     def say(word, *values):
         if comm.rank == 0:
-            print(word, *values, flush=True)
+            sys.stdout.write(" ".join(map(str, (word, *values))) + "\n")  # in one piece
+            sys.stdout.flush()
 
     problem = scenes.slump(scenes.TRIANGLE, 20e3, h=1.0)
     if path.exists():
@@ -82,7 +83,7 @@ def kill(path, ranks, known, moment):
     for pid in pids:
         with suppress(ProcessLookupError):  # the launcher ends the others
             os.kill(pid, signal.SIGKILL)
-    lines = process.stdout.read().splitlines()
+    *lines, _ = process.stdout.read().split("\n")  # the last one may be cut off
     process.wait()
     for line in lines:
         word, *values = line.split(" ", 1)
