@@ -61,7 +61,6 @@ class NearFacets:
         number: Numbers of the facets that this rank knows, sorted.
         dofs: Their global dofs, shape ``(f, k gdim)``.
         outward: As that of :class:`Surface`.
-        middle: Their middles in the undeformed body, shape ``(f, gdim)``.
         present: Whether the domain behind is there.
     """
 
@@ -89,16 +88,14 @@ class NearFacets:
         ]
         W = surface.particles.W
         dofs = global_dofs(W, surface.nodes)
-        middle = surface.undeformed().mean(axis=1).reshape(-1, self.gdim)
         there = (surface.weights > 0.0).any(axis=1)
         whole = np.column_stack([number, dofs, there])
         told = np.concatenate(swap(self._comm, [whole[which] for which in self._given]))
-        floats = np.column_stack([surface.outward, middle])
-        also = np.concatenate(swap(self._comm, [floats[which] for which in self._given]))
+        outward = swap(self._comm, [surface.outward[which] for which in self._given])
         self._order = np.argsort(told[:, 0], kind="stable")
-        told, also = told[self._order], also[self._order]
+        told = told[self._order]
         self.number, self.dofs, self.present = told[:, 0], told[:, 1:-1], told[:, -1] > 0
-        self.outward, self.middle = also[:, 0], also[:, 1:]
+        self.outward = np.concatenate(outward)[self._order]
 
     def positions(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the nodes of the facets, shape ``(f, k, gdim)`` (collective).
@@ -194,7 +191,6 @@ class NearFacets:
         outward: NDArray[np.float64] | None,
         nodes: NDArray[np.float64],
         reach: float,
-        apart: tuple[NDArray[np.float64], float] | None = None,
     ) -> Closest:
         """Return the closest facet of each point.
 
@@ -204,7 +200,6 @@ class NearFacets:
                 takes facets as they come.
             nodes: Nodes of the facets, of :meth:`positions`.
             reach: How near a facet must be.
-            apart: On the same body, undeformed points and how far a facet must be from them there.
         """
         n, e = len(points), self.gdim - 1
         facet = np.full(n, -1, dtype=np.int64)
@@ -212,9 +207,6 @@ class NearFacets:
         near, beside = np.zeros(n, dtype=bool), np.zeros(n)
         which, facets = self._candidates(points, nodes, reach)
         which, facets = self._facing(points, outward, nodes, which, facets, reach)
-        if apart is not None:
-            away = np.linalg.norm(apart[0][which] - self.middle[facets], axis=1) > apart[1]
-            which, facets = which[away], facets[away]
         which, facets = self._nearest(points, nodes, which, facets)
         if len(which) == 0:
             return Closest(facet, place, gap, near, beside)

@@ -226,7 +226,7 @@ def test_a_collision_is_the_same_on_any_number_of_ranks():
 
 def test_the_account_closes_where_points_have_stayed_with_their_facets(monkeypatch):
     # the forces of a step are those that were in balance, not those of facets looked for again
-    monkeypatch.setattr("mpm_dolfinx.contact.pair.FREEZE", 1)
+    monkeypatch.setattr("mpm_dolfinx.contact.one_pass.FREEZE", 1)
     problem, touch = colliding(0.3, scheme="euler", out_of_range="project")
     pushed = 0
     for _ in problem.steps(0.4, 0.04):

@@ -1,0 +1,198 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What acts between a point and a facet of another body, and its derivative.
+
+A point is projected on the facet; the gap gives the pressure, the way from the anchor the shear.
+What acts on the point acts the other way on the facet's nodes, as if the point were fixed to the
+facet by a rigid arm along its normal. Derivatives are those of a complex step, exact to round-off.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .facets import solved
+from .law import Coulomb, Points, Traction, traction
+from .surface import normals
+from .whole_step import corrected, deformation, mean_pressure
+
+__all__ = ["Acting", "Foot", "Start", "Stencil", "Table", "acting", "derivatives", "projected"]
+
+#: Step of the complex derivative.
+STEP = 1e-40
+
+type Table = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+
+
+class Start(NamedTuple):
+    """Where a step of a motion begins, at some points.
+
+    Attributes:
+        x: Positions of points and nodes of their facets, shape ``(n, 1 + k, gdim)``.
+        table: Shape functions with derivatives where the points are projected in the middle of the
+            step: see :meth:`NearFacets.tabulate`.
+        gap: The gap, infinite where nothing was near, shape ``(n,)``.
+        offset: As that of :class:`_Memory`.
+    """
+
+    x: NDArray[np.float64]
+    table: Table
+    gap: NDArray[np.float64]
+    offset: NDArray[np.float64]
+
+
+class Stencil(NamedTuple):
+    """What the tractions at some points depend on.
+
+    Attributes:
+        which: The points.
+        place: Their projections on facets.
+        table: Shape functions with derivatives there: see :meth:`NearFacets.tabulate`.
+        anchored: Shape functions at their anchors.
+        x: Positions of points, nodes of their facets and of those of their anchors, ``(n, k, i)``.
+        points: Stiffness and memory.
+        outward: As that of :class:`Surface`.
+        start: Where the step begins, if it is one of a motion.
+    """
+
+    which: NDArray[np.int64]
+    place: NDArray[np.float64]
+    table: Table
+    anchored: NDArray[np.float64]
+    x: NDArray[Any]
+    points: Points
+    outward: NDArray[np.float64]
+    start: Start | None
+
+
+class Foot(NamedTuple):
+    """Projections of points on facets, which may have a small imaginary part.
+
+    Attributes:
+        N: Shape functions there, shape ``(n, k)``.
+        dN: Their derivatives, shape ``(n, e, k)``.
+        along: Tangents, shape ``(n, e, gdim)``.
+        n: Normals, shape ``(n, gdim)``.
+        gap: Shape ``(n,)``.
+    """
+
+    N: NDArray[Any]
+    dN: NDArray[Any]
+    along: NDArray[Any]
+    n: NDArray[Any]
+    gap: NDArray[Any]
+
+
+class Acting(NamedTuple):
+    """What acts on points and on nodes of their facets.
+
+    Attributes:
+        pushes: Tractions by pressure on points and nodes, shape ``(n, 1 + k, gdim)``.
+        rubs: The same by friction.
+        acts: Pressure and shear.
+    """
+
+    pushes: NDArray[Any]
+    rubs: NDArray[Any]
+    acts: Traction
+
+
+def projected(table: Table, x: NDArray[Any], X: NDArray[Any], outward: NDArray[np.float64]) -> Foot:
+    """Return projections of points ``(n, i)`` on facets with nodes ``(n, k, i)``.
+
+    Args:
+        table: Shape functions with derivatives there.
+        x: The points, real or with a small imaginary part.
+        X: The nodes.
+        outward: As that of :class:`Surface`.
+    """
+    N, dN, ddN = table
+    # One step of Newton's method has the derivative of the projection exactly.
+    r = x - np.einsum("nk,nki->ni", N, X)
+    A = np.einsum("nek,nki->nei", dN, X)
+    B = np.einsum("nefk,nki->nefi", ddN, X)
+    G = (A @ A.swapaxes(1, 2) - np.einsum("nefi,ni->nef", B, r)).real
+    ds = solved(G, np.einsum("nei,ni->ne", A, r))
+    N = N + np.einsum("nek,ne->nk", dN, ds)
+    dN = dN + np.einsum("nefk,nf->nek", ddN, ds)
+    r = x - np.einsum("nk,nki->ni", N, X)
+    A = np.einsum("nek,nki->nei", dN, X)
+    n = outward[:, None] * normals(A.swapaxes(1, 2))
+    n = n / np.sqrt((n * n).sum(axis=1))[:, None]
+    return Foot(N, dN, A, n, (r * n).sum(axis=1))
+
+
+def _gradient(foot: Foot) -> NDArray[Any]:
+    """Return the gradient of the gap by the point and the nodes of its facet, ``(n, 1 + k, i)``."""
+    n = foot.n[:, None, :]
+    return np.concatenate([n, -foot.N[:, :, None] * n], axis=1)
+
+
+def acting(law: Coulomb, stencil: Stencil, z: NDArray[Any], touch: float, extent: float) -> Acting:
+    """Return what acts on the points and on nodes of their facets.
+
+    Args:
+        law: Friction.
+        stencil: The points.
+        z: Their stencils' positions, real or with a small imaginary part.
+        touch: Gap at which points touch.
+        extent: Largest coordinate of the body of the facets.
+    """
+    start, count = stencil.start, stencil.anchored.shape[1]
+    both = z[:, : 1 + count]
+    x, X = both[:, 0], both[:, 1:]
+    foot = projected(stencil.table, x, X, stencil.outward)
+    delta = np.zeros_like(x)
+    if not law.smooth:
+        delta = x - np.einsum("nk,nki->ni", stencil.anchored, z[:, 1 + count :])
+    if start is None:
+        acts = traction(law, stencil.points, delta, foot.gap, foot.n, touch)
+        gradient = _gradient(foot)
+    else:
+        gap, middle, change = foot.gap, 0.5 * (start.x + both), both - start.x
+        foot = projected(start.table, middle[:, 0], middle[:, 1:], stencil.outward)
+        gradient = _gradient(foot)
+        linear = gap - (gradient * change).sum(axis=(1, 2))
+        linear = np.where(linear.real > 0.0, linear, 0.0)
+        before = np.where(np.isfinite(start.gap), start.gap, linear)
+        v = deformation(middle, change)
+        gradient, _ = corrected(gradient, change, v, gap - before, extent)
+        gap, before = gap - start.offset, before - start.offset
+        p = mean_pressure(stencil.points.stiffness, before, gap, touch)
+        acts = traction(law, stencil.points, delta, gap, foot.n, touch, p)
+    pushes = acts.pressure[:, None, None] * gradient
+    # the arm g n turns with the facet
+    A = foot.along
+    along = solved(A @ A.swapaxes(1, 2), np.einsum("nei,ni->ne", A, acts.shear))
+    turn = -foot.gap[:, None] * np.einsum("nek,ne->nk", foot.dN, along)
+    rubs = -(foot.N[:, :, None] * acts.shear[:, None, :] + turn[:, :, None] * foot.n[:, None])
+    return Acting(pushes, np.concatenate([acts.shear[:, None], rubs], axis=1), acts)
+
+
+def derivatives(law: Coulomb, stencil: Stencil, touch: float, extent: float) -> NDArray[np.float64]:
+    """Return the derivative of all forces at the points' stencils, ``(n, 1 + k, i, z, j)``.
+
+    Args:
+        law: As for :func:`acting`, as all that is not said here.
+        stencil: As there.
+        touch: As there.
+        extent: As there.
+    """
+    z = stencil.x.astype(np.complex128)
+    n, count, gdim = z.shape
+    D = np.zeros((n, 1 + stencil.anchored.shape[1], gdim, count, gdim))
+    if n == 0:
+        return D
+    # (nothing acts where all are shifted, so that the points' derivatives follow)
+    for node in range(1, count):
+        for j in range(gdim):
+            kept = z[:, node, j].copy()
+            z[:, node, j] += 1j * STEP
+            pushes, rubs, _ = acting(law, stencil, z, touch, extent)
+            z[:, node, j] = kept
+            D[:, :, :, node, j] = (pushes + rubs).imag / STEP
+    D[:, :, :, 0] = -D[:, :, :, 1:].sum(axis=3)
+    return D
