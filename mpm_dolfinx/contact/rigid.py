@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from petsc4py import PETSc
@@ -34,9 +34,11 @@ from .law import (
     shear_derivative,
     traction,
 )
+from .memory import Memory, Near, Step
 from .rotation import Pose
 from .shapes import Shape, as_positive
 from .surface import Blocks, PointMatrix, Surface, global_dofs
+from .ways import OPPOSITE, crosses, gets_deep
 from .whole_step import corrected, mean_pressure, pressure_slope
 
 __all__ = ["Placed", "Rigid"]
@@ -48,121 +50,11 @@ LAWS = ("penalty", "nitsche")
 DEEP = 1.0
 #: The same for a body as it is given.
 OVERLAP = 0.1
-#: Most places on the way of a point that are looked at, of all points at once, and by steps of
-#: the distance.
-MOST_PLACES, MOST_AT_ONCE, MOST_STEPS = 1000, 100_000, 100
 #: Gap, over the thickness of the domain behind, up to which a facet may touch in a step; and share
 #: of facets that do so up to which others are left out.
 NEAR, MOST_NEAR = 2.0, 0.7
 #: Most points of each rank at which the shapes of ranks are compared.
 LOOKED_AT = 16
-#: How near to the surface a point is on it, over the thickness of the domain behind.
-ON = 1e-3
-#: Least length of a way through an obstacle, over the same: less is cut off a sharp corner.
-CUT = 0.02
-#: Least cosine between a way and the normal of a surface that it goes through.
-STEEP = 0.1
-#: Product of two normals below which they are those of opposite sides, for a point that touches
-#: one of them, and for one that touches neither before nor after.
-OPPOSITE, OPPOSITE_FREE = -0.5, -0.1
-
-
-@dataclass(frozen=True)
-class _Memory:
-    """What is known of the last converged step.
-
-    Attributes:
-        pose: Where the shape was.
-        touched: Which points were in contact, shape ``(m, nq)``.
-        anchor: Their anchors, or where points were, in the frame of the shape, ``(m, nq, gdim)``.
-        gap: Shape ``(m, nq)``.
-        normal: Normals, in the frame of the shape.
-        outcome: What acted.
-        works: What was done against pressure and against friction in the step, if there is motion.
-        step: The step of a motion, at all points, by whose middle the forces are.
-        behind: Tractions by the stress behind the facets, where these count, ``(m, nq, gdim)``.
-        whole: Whether all facets were looked at, not those alone that may touch.
-        exact: Whether all gaps are known, and not only what some are at least.
-    """
-
-    pose: Pose
-    touched: NDArray[np.bool_]
-    anchor: NDArray[np.float64]
-    gap: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    outcome: Outcome
-    works: tuple[float, float] = (0.0, 0.0)
-    step: _Step | None = None
-    behind: NDArray[np.float64] | None = None
-    whole: bool = True
-    exact: bool = True
-
-    def of(self, which: NDArray[np.int64]) -> _Memory:
-        """Return what is known of some facets."""
-        outcome = Outcome(*(getattr(self.outcome, field.name)[which] for field in fields(Outcome)))
-        return _Memory(
-            self.pose,
-            self.touched[which],
-            self.anchor[which],
-            self.gap[which],
-            self.normal[which],
-            outcome,
-        )
-
-    def among(self, which: NDArray[np.int64], last: _Memory) -> _Memory:
-        """Return it as what acts on some facets, with nothing that acts on the others.
-
-        Args:
-            which: Their numbers.
-            last: What is known of all of them.
-        """
-        m, nq = last.gap.shape
-
-        def spread(values: Any, base: Any) -> Any:
-            """Return values in their places, and others elsewhere."""
-            found = np.zeros((m, *values.shape[1:]), values.dtype) if base is None else base.copy()
-            found[which] = values
-            return found
-
-        mine, its = self.outcome, last.outcome
-        outcome = Outcome(
-            spread(mine.positions, its.positions),
-            spread(mine.gap, last.gap),
-            *(spread(v, None) for v in (mine.pressure, mine.traction, mine.inside, mine.slips)),
-        )
-        step = self.step
-        if step is not None:
-            parts = (part.reshape(len(which), nq, *part.shape[1:]) for part in step)
-            step = _Step(*(spread(p, None).reshape(m * nq, *p.shape[2:]) for p in parts))
-        return _Memory(
-            self.pose,
-            outcome.inside,
-            spread(self.anchor, last.anchor),
-            outcome.gap,
-            spread(self.normal, last.normal),
-            outcome,
-            self.works,
-            step,
-            whole=False,
-        )
-
-
-class _Near(NamedTuple):
-    """Facets that may touch in a step.
-
-    Attributes:
-        which: Their numbers.
-        memory: What is known of them.
-        nodes: Where the nodes of all facets begin.
-        radius: Largest distance of these from where the shape has its pivot.
-        margin: How far points may come nearer until others could touch.
-    """
-
-    which: NDArray[np.int64]
-    memory: _Memory
-    nodes: NDArray[np.float64]
-    radius: float
-    margin: float
 
 
 class Placed(NamedTuple):
@@ -177,28 +69,6 @@ class Placed(NamedTuple):
     distance: Callable[[NDArray[np.float64]], NDArray[np.float64]]
     bounds: NDArray[np.float64] | None
     facets: tuple[NDArray[np.float64], NDArray[np.int64]] | None
-
-
-class _Step(NamedTuple):
-    """A step of a motion, at some points, in the frame of the shape.
-
-    Attributes:
-        change: Of positions, shape ``(n, gdim)``.
-        middle: Positions in the middle.
-        normal: Normals there.
-        gradient: That by which the change of the gap is the one of positions.
-        factor: What of the change is in it.
-        before: Gap at the beginning, shape ``(n,)``.
-        pressure: Mean pressure.
-    """
-
-    change: NDArray[np.float64]
-    middle: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    gradient: NDArray[np.float64]
-    factor: NDArray[np.float64]
-    before: NDArray[np.float64]
-    pressure: NDArray[np.float64]
 
 
 class Rigid(Contact):
@@ -290,9 +160,9 @@ class Rigid(Contact):
             particles, facet_tags, tag, quadrature_degree, axisymmetric, "A Rigid"
         )
         self._pose = self._aim = Pose(np.zeros(gdim), np.zeros(1 if gdim == 2 else 3))
-        self._memory: _Memory | None = None
-        self._trial: _Memory | None = None
-        self._near: _Near | None = None
+        self._memory: Memory | None = None
+        self._trial: Memory | None = None
+        self._near: Near | None = None
 
     # -- The path -------------------------------------------------------------------------------
 
@@ -468,7 +338,7 @@ class Rigid(Contact):
         none = np.zeros((m, nq), dtype=bool)
         nothing = np.zeros((m, nq))
         still = Outcome(x, phi.reshape(m, nq), nothing, np.zeros_like(x), none, none)
-        self._memory = self._trial = _Memory(
+        self._memory = self._trial = Memory(
             pose, none, y.reshape(x.shape), phi.reshape(m, nq), n.reshape(x.shape), still
         )
 
@@ -476,7 +346,7 @@ class Rigid(Contact):
         W = self.bodies[0].W
         self._matrix = PointMatrix(W, W)
 
-    def _require_apart(self, memory: _Memory) -> None:
+    def _require_apart(self, memory: Memory) -> None:
         """Raise an error where the body is in the obstacle from the beginning (collective)."""
         surface = self._surface
         depth = -memory.gap / surface.thickness[:, None]
@@ -512,7 +382,7 @@ class Rigid(Contact):
         self._look_near()
         return ()
 
-    def _passes(self, memory: _Memory, x: NDArray[np.float64], pose: Pose) -> bool:
+    def _passes(self, memory: Memory, x: NDArray[np.float64], pose: Pose) -> bool:
         """Return whether points get deep into the obstacle, or through it, on a straight way.
 
         Args:
@@ -526,116 +396,13 @@ class Rigid(Contact):
         b = self._framed(x, pose)
         way = np.linalg.norm(b - a, axis=2)
         reached = memory.gap - way < -deep
-        if self._gets_deep(a, b, memory.gap, deep, reached & (surface.weights > 0.0)):
+        if gets_deep(self.shape, a, b, memory.gap, deep, reached & (surface.weights > 0.0)):
             return True
         near = (memory.gap < way) & (way > 0.0) & (surface.weights > 0.0)
         thickness, gap, normal = deep[near] / DEEP, memory.gap[near], memory.normal[near]
         if len(gap) and not memory.exact:
             gap, normal = self.shape.distance(a[near])
-        return self._crosses(a[near], b[near], gap, normal, thickness)
-
-    def _gets_deep(
-        self,
-        a: NDArray[np.float64],
-        b: NDArray[np.float64],
-        gap: NDArray[np.float64],
-        deep: NDArray[np.float64],
-        reached: NDArray[np.bool_],
-    ) -> bool:
-        """Return whether points are deep in the shape anywhere on a straight way in its frame.
-
-        Args:
-            a: Where points begin, shape ``(m, nq, dim)``.
-            b: Where they end.
-            gap: Their distances at the beginning, shape ``(m, nq)``.
-            deep: What is deep, shape ``(m, nq)``.
-            reached: Which points may have been so.
-        """
-        a, way, deep, gap = a[reached], (b - a)[reached], deep[reached], gap[reached]
-        steps = np.ceil(2.0 * np.linalg.norm(way, axis=1) / deep) + 1.0
-        count = np.minimum(steps, MOST_PLACES).astype(np.int64) + 1
-        for part in np.array_split(np.arange(len(a)), 1 + count.sum() // MOST_AT_ONCE):
-            number = count[part]
-            which = np.repeat(part, number)
-            place = np.arange(len(which)) - np.repeat(np.cumsum(number) - number, number)
-            share = place / (count[which] - 1.0)
-            phi = self.shape.distance(a[which] + share[:, None] * way[which])[0]
-            if np.any(phi < -deep[which] - np.maximum(-gap[which], 0.0)):
-                return True
-        return False
-
-    def _crosses(
-        self,
-        a: NDArray[np.float64],
-        b: NDArray[np.float64],
-        gap: NDArray[np.float64],
-        normal: NDArray[np.float64],
-        thickness: NDArray[np.float64],
-    ) -> bool:
-        """Return whether points go into the shape on one side and out of it on the opposite one.
-
-        The way is a straight one in the shape's frame. A point that slides past a corner goes in
-        and out by sides whose normals are not opposite, or cuts off a little of a sharp corner.
-
-        Args:
-            a: Where points begin, shape ``(n, dim)``.
-            b: Where they end.
-            gap: Their distances at the beginning, shape ``(n,)``.
-            normal: Normals there.
-            thickness: Of the domains behind them, shape ``(n,)``.
-        """
-        on = ON * thickness
-
-        def left(along: NDArray[np.float64], phi: Any, n: Any, sign: float) -> NDArray[np.bool_]:
-            """Return which points are off the surface, or go through it."""
-            cosine = sign * (n * along).sum(axis=1) / np.linalg.norm(along, axis=1)
-            return np.asarray((phi > on[which]) | (cosine > STEEP))
-
-        which = np.arange(len(a))
-        which = which[left(b - a, gap, normal, -1.0)]
-        if len(which) == 0:
-            return False
-        which = which[left((b - a)[which], *self.shape.distance(b[which]), 1.0)]
-        first, enters = self._reached(a[which], b[which], on[which])
-        goes = first < 1.0
-        which, first, enters = which[goes], first[goes], enters[goes]
-        last, leaves = self._reached(b[which], a[which], on[which])
-        way = b[which] - a[which]
-        size = np.linalg.norm(way, axis=1)
-        free = (first > 0.0) & (last > 0.0)
-        through = (enters * leaves).sum(axis=1) < np.where(free, OPPOSITE_FREE, OPPOSITE)
-        through &= -(enters * way).sum(axis=1) > STEEP * size
-        through &= (leaves * way).sum(axis=1) > STEEP * size
-        through &= (1.0 - first - last) * size > CUT * thickness[which]
-        return bool(through.any())
-
-    def _reached(
-        self, a: NDArray[np.float64], b: NDArray[np.float64], on: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return how much of their ways points go before they are on the shape, and normals there.
-
-        A point goes on by its distance, within which there is no surface (J. C. Hart, "Sphere
-        tracing", Vis. Comput. 12, 1996).
-
-        Args:
-            a: Where they begin, in the frame of the shape, shape ``(n, dim)``.
-            b: Where they end.
-            on: Distance at which a point is on the shape, shape ``(n,)``.
-        """
-        way = b - a
-        size = np.linalg.norm(way, axis=1)
-        share, normals = np.zeros(len(a)), np.zeros_like(a)
-        going = np.arange(len(a))
-        for _ in range(MOST_STEPS):
-            if len(going) == 0:
-                break
-            phi, normals[going] = self.shape.distance(a[going] + share[going, None] * way[going])
-            off = phi > on[going]
-            going, phi = going[off], phi[off]
-            share[going] = np.minimum(share[going] + phi / size[going], 1.0)
-            going = going[share[going] < 1.0]
-        share[going] = 1.0
-        return share, normals
+        return crosses(self.shape, a[near], b[near], gap, normal, thickness)
 
     def update(self) -> MPMError | None:
         """See :meth:`Term.update`."""
@@ -645,7 +412,7 @@ class Rigid(Contact):
             return error
         return None
 
-    def _points(self, memory: _Memory, which: NDArray[np.int64] | None = None) -> Points:
+    def _points(self, memory: Memory, which: NDArray[np.int64] | None = None) -> Points:
         """Return the points of some facets, of which something is known; ``None``: of all."""
         k = (self._stiffness if which is None else self._stiffness[which]).ravel()
         gdim = memory.anchor.shape[2]
@@ -657,7 +424,7 @@ class Rigid(Contact):
             memory.gap.ravel(),
         )
 
-    def _evaluated(self, whole: bool = False) -> _Memory:
+    def _evaluated(self, whole: bool = False) -> Memory:
         """Return what acts at the present positions.
 
         Args:
@@ -688,9 +455,9 @@ class Rigid(Contact):
         arms = nodes - self.shape.pivot - memory.pose.offset
         radius = float(np.linalg.norm(arms, axis=1).max())
         margin = float(least[~near].min()) - surface.touch
-        self._near = _Near(which, memory.of(which), nodes, radius, margin)
+        self._near = Near(which, memory.of(which), nodes, radius, margin)
 
-    def _within_reach(self) -> _Near | None:
+    def _within_reach(self) -> Near | None:
         """Return what may touch at the present positions; ``None``: all."""
         near, memory, pose = self._near, self._memory, self._pose
         if near is None or memory is None:
@@ -700,7 +467,7 @@ class Rigid(Contact):
         moved = self._surface.spread * (self._largest_change(near) + turned) + shifted
         return near if moved < near.margin else None
 
-    def _largest_change(self, near: _Near) -> float:
+    def _largest_change(self, near: Near) -> float:
         """Return how far a node of the facets has moved in the step at most."""
         change = self._surface.own_nodes() - near.nodes
         return float(np.sqrt((change * change).sum(axis=1).max(initial=0.0)))
@@ -709,7 +476,7 @@ class Rigid(Contact):
         """Return where points of some facets are, ``None``: of all."""
         return self._surface.positions(which=which)
 
-    def _evaluated_on(self, memory: _Memory, which: NDArray[np.int64] | None) -> _Memory:
+    def _evaluated_on(self, memory: Memory, which: NDArray[np.int64] | None) -> Memory:
         """Return what acts on some facets, or on all.
 
         Args:
@@ -728,9 +495,10 @@ class Rigid(Contact):
             reach = touch + np.linalg.norm(behind, axis=2).ravel() / points.stiffness
         phi, n = self._distance(y, memory, reach)
         pushes, step, Q = n, None, pose.Q
-        pressure = None
+        pressure, pressed = None, None
         if behind is not None:
-            pressure = nitsche(points, (behind @ Q).reshape(-1, gdim), phi, n, touch).pressure
+            push = nitsche(points, (behind @ Q).reshape(-1, gdim), phi, n, touch)
+            pressure, pressed = push.pressure, push.acts.reshape(m, nq)
         if self._of_step:
             step = self._step(points, memory, y, phi)
             pushes, Q = step.gradient, memory.pose.mean(pose)
@@ -762,7 +530,7 @@ class Rigid(Contact):
             (acts.inside if behind is not None else phi <= touch).reshape(shape),
             acts.slips.reshape(shape),
         )
-        return _Memory(
+        return Memory(
             pose,
             outcome.inside,
             self._anchors(points, y, phi, n, acts.shear, outcome).reshape(x.shape),
@@ -772,6 +540,7 @@ class Rigid(Contact):
             works,
             step,
             behind,
+            pressed,
         )
 
     def _stress_behind(self) -> Behind:
@@ -781,7 +550,7 @@ class Rigid(Contact):
         return self._behind
 
     def _distance(
-        self, y: NDArray[np.float64], memory: _Memory, reach: NDArray[np.float64]
+        self, y: NDArray[np.float64], memory: Memory, reach: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return gaps and normals of points; of a costly shape what they are at least if far.
 
@@ -807,10 +576,10 @@ class Rigid(Contact):
     def _step(
         self,
         points: Points,
-        memory: _Memory,
+        memory: Memory,
         y: NDArray[np.float64],
         gap: NDArray[np.float64],
-    ) -> _Step:
+    ) -> Step:
         """Return what there is of a step to positions and gaps at all points."""
         before = memory.gap.ravel()
         x = memory.outcome.positions
@@ -822,7 +591,7 @@ class Rigid(Contact):
         n[acts] = self.shape.distance(middle[acts])[1]
         gradient, factor = corrected(n, change, change, gap - before, surface.extent)
         pressure = mean_pressure(points.stiffness, before, gap, surface.touch)
-        return _Step(change, middle, n, gradient, factor, before, pressure)
+        return Step(change, middle, n, gradient, factor, before, pressure)
 
     def _works(self) -> tuple[float, float]:
         """See :meth:`Contact._works`."""
@@ -890,7 +659,7 @@ class Rigid(Contact):
 
     def _blocks_behind(
         self,
-        trial: _Memory,
+        trial: Memory,
         which: NDArray[np.int64],
         rows: NDArray[np.int64],
         force: NDArray[np.float64],
@@ -912,7 +681,7 @@ class Rigid(Contact):
         return Blocks(which[:, None], rows, columns, blocks.reshape(shape))
 
     def _push(
-        self, trial: _Memory, memory: _Memory, flat: NDArray[np.int64], bent: bool = False
+        self, trial: Memory, memory: Memory, flat: NDArray[np.int64], bent: bool = False
     ) -> Push:
         """Return the pressure of Nitsche's method at some points.
 
@@ -938,7 +707,7 @@ class Rigid(Contact):
         )
 
     def _by_stress(
-        self, trial: _Memory, memory: _Memory, flat: NDArray[np.int64]
+        self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
     ) -> NDArray[np.float64]:
         """Return the derivative of the traction at some points by that of the stress behind.
 
@@ -959,15 +728,15 @@ class Rigid(Contact):
         return np.asarray(force @ pose.Q.T)
 
     def _acting(
-        self, trial: _Memory, memory: _Memory
+        self, trial: Memory, memory: Memory
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.int64]]:
         """Return facets that touch, which of their points do, and the numbers of these points."""
         surface, acting = self._surface, trial.touched
         if self._of_step:
             acting = acting | (memory.gap <= surface.touch)
         if trial.behind is not None:
-            every = np.arange(acting.size)
-            acting = acting | self._push(trial, memory, every).acts.reshape(acting.shape)
+            assert trial.pressed is not None
+            acting = acting | trial.pressed
         which = np.flatnonzero(
             acting.any(axis=1) & (surface.weights.max(axis=1, initial=0.0) > 0.0)
         )
@@ -975,18 +744,18 @@ class Rigid(Contact):
         return which, inside, (which[:, None] * surface.nq + np.arange(surface.nq))[inside]
 
     def _derivative(
-        self, trial: _Memory, memory: _Memory, flat: NDArray[np.int64]
+        self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
     ) -> NDArray[np.float64]:
         """Return the derivative of the traction by positions at some points that touch."""
         Q = self._rotation(trial, memory)
         return np.asarray(Q @ self._derivative_within(trial, memory, flat) @ trial.pose.Q.T)
 
-    def _rotation(self, trial: _Memory, memory: _Memory) -> NDArray[np.float64]:
+    def _rotation(self, trial: Memory, memory: Memory) -> NDArray[np.float64]:
         """Return what turns tractions out of the frame of the shape."""
         return memory.pose.mean(trial.pose) if self._of_step else trial.pose.Q
 
     def _derivative_within(
-        self, trial: _Memory, memory: _Memory, flat: NDArray[np.int64]
+        self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
     ) -> NDArray[np.float64]:
         """Return :meth:`_derivative` in the frame of the shape."""
         surface, gdim = self._surface, self._surface.gdim
@@ -1000,7 +769,7 @@ class Rigid(Contact):
             push = None if trial.behind is None else self._push(trial, memory, flat, bent=True)
             return derivative(law, points, delta, gap, n, H, touch, push)
         assert trial.step is not None
-        step = _Step(*(part[flat] for part in trial.step))
+        step = Step(*(part[flat] for part in trial.step))
         H = 0.5 * self.shape.curvature(step.middle)
         slope = pressure_slope(points.stiffness, step.before, gap, touch)
         size = (step.change**2).sum(axis=1)
@@ -1054,7 +823,7 @@ class Rigid(Contact):
 
         return undo
 
-    def _exact(self, memory: _Memory, which: NDArray[np.int64] | None = None) -> _Memory:
+    def _exact(self, memory: Memory, which: NDArray[np.int64] | None = None) -> Memory:
         """Return what is known with the gaps of all points of some facets, or of all facets."""
         chosen = slice(None) if which is None else which
         x = memory.outcome.positions[chosen]
@@ -1126,7 +895,7 @@ class Rigid(Contact):
             touched[:, :, None], surface.of_column(columns["anchor"]), self._memory.anchor
         )
         found = self._memory
-        self._memory = _Memory(pose, touched, anchor, found.gap, found.normal, found.outcome)
+        self._memory = Memory(pose, touched, anchor, found.gap, found.normal, found.outcome)
         outcome = found.outcome
         if self._tells_more:
             told = {name: surface.of_column(columns[name]) for name in ("pressure", "traction")}
@@ -1141,7 +910,7 @@ class Rigid(Contact):
         """Whether tractions were other ones than positions tell: by stress, or of whole steps."""
         return self._nitsche or self._of_step
 
-    def _evaluated_at_converged(self) -> _Memory:
+    def _evaluated_at_converged(self) -> Memory:
         body = self.bodies[0]
         present = body.displacement.x.array.copy()
         body.displacement.x.array[:] = body.converged_displacement

@@ -1,0 +1,294 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The equations of motion of a rigid body over a step.
+
+A rigid body has the place of its centre of mass X, an orientation Q, a velocity V and a rate of
+rotation Omega in its own frame. A step changes them by ``dX`` and a Cayley vector theta (see
+:mod:`.rotation`). With tractions f per area on the other bodies at arms r from the centre,
+
+    m (V_1 - V_0) / dt + int f dA = F,
+    (Q_1 J Omega_1 - Q_0 J Omega_0) / dt + int r x f dA = M
+
+hold, where V_1 = 2 dX/dt - V_0 and Omega_1 = 2 Q_0^T theta / dt - Omega_0, and f and r are those of
+the step's middle; or V_1 = dX/dt, Omega_1 = Q_0^T theta / dt, and those of its end
+(``"euler"``); or, in equilibrium, without mass.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import MPMError
+from .rotation import Pose, Turn, cayley_variation, crossing
+
+__all__ = ["RigidMotion", "State", "as_inertia", "as_rotation", "held_of", "names_of"]
+
+NAMES = ("x", "y", "z")
+TURNS = "rotation"
+
+
+class State(NamedTuple):
+    """Where a rigid body is, how it moves, and what drives it.
+
+    Attributes:
+        place: Of its centre, less that at the beginning, shape ``(gdim,)``.
+        turn: Its orientation.
+        velocity: Of its centre.
+        spin: Rate of rotation in its own frame, ``(1,)`` or ``(3,)``.
+        force: Force on it besides its weight.
+        moment: Moment on it about its centre.
+    """
+
+    place: NDArray[np.float64]
+    turn: Turn
+    velocity: NDArray[np.float64]
+    spin: NDArray[np.float64]
+    force: NDArray[np.float64]
+    moment: NDArray[np.float64]
+
+    @property
+    def Q(self) -> NDArray[np.float64]:
+        """Its orientation as a matrix."""
+        return Pose(self.place, self.turn.angle).Q
+
+
+class RigidMotion:
+    """How a rigid body moves.
+
+    Args:
+        mass: Its mass, if it has one.
+        inertia: Moment of inertia about the centre ``(1, 1)``, or the tensor ``(3, 3)``, if it has
+            one.
+        start: Centre of mass at the beginning, shape ``(gdim,)``.
+        gravity: Acceleration by gravity, shape ``(gdim,)``.
+        held: Which of its displacements and rotations follow a path.
+
+    Attributes:
+        held: As given.
+        start: As given.
+        dt: Length of a step, ``None`` in equilibrium.
+        whole: Whether forces are those of a step's middle.
+    """
+
+    def __init__(
+        self,
+        mass: float | None,
+        inertia: NDArray[np.float64] | None,
+        start: NDArray[np.float64],
+        gravity: NDArray[np.float64],
+        held: NDArray[np.bool_],
+    ) -> None:
+        self.held, self.start, self._gravity = held, start, gravity
+        self._gdim = len(start)
+        self._m = 0.0 if mass is None else mass
+        nr = len(held) - self._gdim
+        self._J = np.zeros((nr, nr)) if inertia is None else inertia
+        self.dt: float | None = None
+        self.whole = False
+
+    @property
+    def gyration(self) -> float | None:
+        """Radius of gyration, where it has a mass and an inertia."""
+        mean = float(np.trace(self._J)) / len(self._J)
+        return float(np.sqrt(mean / self._m)) if self._m > 0.0 and mean > 0.0 else None
+
+    # -- What it has in a state -----------------------------------------------------------------
+
+    def centre(self, state: State) -> NDArray[np.float64]:
+        """Return the place of its centre, shape ``(gdim,)``."""
+        return np.asarray(self.start + state.place)
+
+    def kinetic_energy(self, state: State) -> float:
+        """Return its kinetic energy."""
+        turning = 0.5 * float(state.spin @ self._J @ state.spin)
+        return 0.5 * self._m * float(state.velocity @ state.velocity) + turning
+
+    def potential_energy(self, state: State) -> float:
+        """Return its energy in the field of gravity, zero at the beginning."""
+        return -self._m * float(self._gravity @ state.place)
+
+    def momentum(self, state: State) -> NDArray[np.float64]:
+        """Return its momentum, shape ``(gdim,)``."""
+        return self._m * state.velocity
+
+    def angular_momentum(self, state: State) -> NDArray[np.float64]:
+        """Return its angular momentum about the origin, ``(1,)`` or ``(3,)``."""
+        turning = self._J @ state.spin
+        if len(turning) == 3:
+            turning = state.Q @ turning
+        return np.asarray(turning + crossing(self.centre(state)).T @ self.momentum(state))
+
+    # -- A step ---------------------------------------------------------------------------------
+
+    def guess(self, last: State, aim: Pose) -> NDArray[np.float64]:
+        """Return a step to begin with: as it moved before, or the way to go in what is held.
+
+        Args:
+            last: Where it begins.
+            aim: Where it is to be.
+        """
+        gdim = self._gdim
+        s = np.zeros(len(self.held))
+        if self.dt is not None:
+            s[:gdim] = self.dt * last.velocity
+            s[gdim:] = self.dt * (last.spin if gdim == 2 else last.Q @ last.spin)
+        path = np.concatenate([aim.offset - last.place, s[gdim:]])
+        path[gdim:] = last.turn.cayley_to(Turn.of(aim.angle)) if self.held[-1] else 0.0
+        return np.where(self.held, path, s)
+
+    def stepped(
+        self,
+        last: State,
+        s: NDArray[np.float64],
+        push: tuple[NDArray[np.float64], NDArray[np.float64]],
+    ) -> State:
+        """Return where a step leads to.
+
+        Args:
+            last: Where it begins.
+            s: The step: displacement of the centre and Cayley vector.
+            push: Force and moment on it at the step's end.
+        """
+        gdim = self._gdim
+        u, theta = s[:gdim], s[gdim:]
+        velocity, spin = last.velocity, last.spin
+        if self.dt is not None:
+            # (what follows a path has the mean of the step, or a jump of it would swing for ever)
+            c = np.where(self.held, 1.0, 2.0 if self.whole else 1.0)
+            velocity = c[:gdim] * u / self.dt - (c[:gdim] - 1.0) * velocity
+            turn = Turn.none(gdim).turned(theta).angle if self.held[-1] else theta
+            own = turn if gdim == 2 else last.Q.T @ turn
+            spin = c[gdim:] * own / self.dt - (c[gdim:] - 1.0) * spin
+        return State(last.place + u, last.turn.turned(theta), velocity, spin, *push)
+
+    def given(
+        self, last: State, push: tuple[NDArray[np.float64], NDArray[np.float64]]
+    ) -> NDArray[np.float64]:
+        """Return force and moment on it in a step, besides those of contact."""
+        force, moment = push
+        if self.whole:
+            force = 0.5 * (force + last.force)
+            moment = 0.5 * (moment + last.moment)
+        return np.concatenate([force + self._m * self._gravity, moment])
+
+    def inertial(self, last: State, state: State) -> NDArray[np.float64]:
+        """Return the forces of inertia over a step."""
+        if self.dt is None:
+            return np.zeros(len(self.held))
+        before, after = (self._J @ s.spin for s in (last, state))
+        if len(before) == 3:
+            before, after = last.Q @ before, state.Q @ after
+        linear = self._m * (state.velocity - last.velocity)
+        return np.concatenate([linear, after - before]) / self.dt
+
+    def slopes(self, last: State, state: State, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return their derivatives by the step.
+
+        Args:
+            last: Where it begins.
+            state: Where it ends.
+            theta: Cayley vector of the step.
+        """
+        gdim, nr = self._gdim, len(theta)
+        K = np.zeros((gdim + nr, gdim + nr))
+        if self.dt is None:
+            return K
+        c = 2.0 if self.whole else 1.0
+        K[:gdim, :gdim] = c * self._m / self.dt**2 * np.eye(gdim)
+        if nr == 1:
+            K[gdim:, gdim:] = c * self._J / self.dt**2
+            return K
+        Q, J = state.Q, self._J
+        K[gdim:, gdim:] = crossing(Q @ J @ state.spin) @ cayley_variation(theta) / self.dt
+        K[gdim:, gdim:] += c * Q @ J @ last.Q.T / self.dt**2
+        return K
+
+    def swing(self, last: State) -> float:
+        """Return the size of the forces of inertia that would stop it within a step."""
+        if self.dt is None:
+            return 0.0
+        return 2.0 / self.dt * self._m * float(np.linalg.norm(last.velocity))
+
+
+def names_of(gdim: int) -> list[str]:
+    """Return the names of what a rigid body can do; all of its rotations have one."""
+    return [*NAMES[:gdim], TURNS]
+
+
+def held_of(fixed: Any, gdim: int, axisymmetric: bool) -> NDArray[np.bool_]:
+    """Return which of the unknowns of a rigid body follow a path.
+
+    Raises:
+        MPMError: Names that are none.
+    """
+    names = names_of(gdim)
+    try:
+        given = [fixed] if isinstance(fixed, str) else list(fixed)
+    except TypeError:
+        given = [fixed]
+    for name in given:
+        if name not in names:
+            raise MPMError(
+                f"fixed= of a RigidBody has names among {', '.join(map(repr, names))}, not "
+                f"{name!r}."
+            )
+    if axisymmetric:
+        given += [NAMES[0], TURNS]
+    held = [name in given for name in names[:-1]]
+    return np.array(held + [TURNS in given] * (1 if gdim == 2 else 3))
+
+
+def as_rotation(value: Any, name: str, gdim: int) -> NDArray[np.float64]:
+    """Return a number ``(1,)``, or a vector in space; a zero is none of either.
+
+    Raises:
+        MPMError: It is something else.
+    """
+    count = 1 if gdim == 2 else 3
+    try:
+        found = np.atleast_1d(np.array(value, dtype=np.float64))
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    if count == 3 and found.shape == (1,) and found[0] == 0.0:
+        found = np.zeros(3)
+    if found.shape != (count,) or not np.isfinite(found).all():
+        raise MPMError(f"{name} of a RigidBody must be {_finite(count)}, not {_shown(value)}.")
+    return found
+
+
+def _finite(count: int) -> str:
+    """Return how many numbers are asked for, in words."""
+    return "a finite number" if count == 1 else f"{count} finite numbers"
+
+
+def _shown(value: Any) -> str:
+    """Return what was given, on one line."""
+    return " ".join(repr(value).split())
+
+
+def as_inertia(value: Any, gdim: int) -> NDArray[np.float64]:
+    """Return a moment of inertia ``(1, 1)``, or a tensor ``(3, 3)``.
+
+    Raises:
+        MPMError: It is none: not symmetric, or not positive.
+    """
+    try:
+        found = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    count = 1 if gdim == 2 else 3
+    if found.shape == ():
+        found = found * np.eye(count)
+    good = found.shape == (count, count) and bool(np.isfinite(found).all())
+    good = good and not isinstance(value, bool)
+    if not good or np.abs(found - found.T).max() > 1e-12 * np.abs(found).max():
+        raise MPMError(
+            f"inertia of a RigidBody must be a number{'' if gdim == 2 else ' or (3, 3) numbers'}, "
+            f"not {_shown(value)}."
+        )
+    if not np.linalg.eigvalsh(found).min() > 0.0:
+        raise MPMError(f"inertia of a RigidBody must be positive, not {_shown(value)}.")
+    return found
