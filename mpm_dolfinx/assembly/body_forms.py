@@ -149,6 +149,7 @@ class BodyForms:
         self.fused = [form for form, fuse in zip(compiled, together, strict=True) if fuse]
         self.stock = [form for form, fuse in zip(compiled, together, strict=True) if not fuse]
         self._stock_ufl = [form for form, fuse in zip(tangents, together, strict=True) if not fuse]
+        self._tangents = tangents
         source = low_rank if self._average is None else self._average
         self._source = source
         self._low_rank = None if source is None else LowRankTangent(particles, source)
@@ -266,6 +267,39 @@ class BodyForms:
         if self._fast and self._low_rank is not None:
             total.axpy(1.0, self.low_rank_force(w))
         return total
+
+    @cached_property
+    def _energy_inside(self) -> tuple[fem.Function, list[fem.Form]]:
+        """The energies of the tangents' integrals over cells, and the motion that has them."""
+        motion = fem.Function(self._particles.W)
+        inside = []
+        for form in self._tangents:
+            cells = [each for each in form.integrals() if each.integral_type() == "cell"]
+            swap = dict.fromkeys(form.arguments(), motion)
+            if cells:
+                inside.append(ufl.replace(ufl.Form(cells), swap))
+        return motion, self._compile(inside)
+
+    def energies_of_gradients(self) -> NDArray[np.float64]:
+        """Return this rank's energies ``g : C : g`` of uniform gradients with one entry 1.
+
+        They are those of what integrals over cells have of the forms' tangent (collective).
+
+        Returns:
+            For each entry the energy, shape ``(gdim, gdim)``.
+        """
+        motion, forms = self._energy_inside
+        W = self._particles.W
+        gdim = self._element.block_size
+        x = W.tabulate_dof_coordinates()[:, :gdim]
+        own = x[: W.dofmap.index_map.size_local].sum(axis=0)
+        middle = self._body.comm.allreduce(own) / W.dofmap.index_map.size_global
+        energies = np.zeros((gdim, gdim))
+        for i, j in np.ndindex(gdim, gdim):
+            motion.x.array[:] = 0.0
+            motion.x.array.reshape(-1, gdim)[:, i] = x[:, j] - middle[j]
+            energies[i, j] = sum(float(np.real(fem.assemble_scalar(form))) for form in forms)
+        return energies
 
     def _nodal(self, w: PETSc.Vec) -> NDArray[np.float64]:
         """Return a vector on W at the domains' nodes, shape ``(n, k, gdim)`` (collective)."""

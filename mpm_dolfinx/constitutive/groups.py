@@ -27,6 +27,9 @@ __all__ = ["Groups", "background_cells", "pairs", "patches", "singles"]
 
 #: Share of a background cell below which a patch joins a neighbour.
 LEAST_FILL = 0.4
+#: Shares of cells are counted in it, so that which of several are the least is no matter of
+#: round-off.
+FILL_UNIT = 2.0**-26
 #: Singular values, relative to the largest, that a fitted plane needs to have a slope.
 SLENDER = 0.1
 
@@ -362,7 +365,8 @@ def patches(particles: Particles, material: NDArray[np.int64]) -> Groups:
             np.stack([whole.key, whole.material]), axis=1, return_index=True, return_inverse=True
         )
         label = first[label.ravel()]
-    return _numbered(particles, whole, _joined(label, whole.volume / whole.cell_volume, links))
+    fill = np.round(whole.volume / whole.cell_volume / FILL_UNIT) * FILL_UNIT
+    return _numbered(particles, whole, _joined(label, fill, links))
 
 
 def _same(values: NDArray[Any], links: NDArray[np.int64]) -> NDArray[np.bool_]:

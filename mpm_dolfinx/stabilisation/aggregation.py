@@ -18,13 +18,11 @@ from ..background.pairs import CellPairs
 from ..background.polynomials import CellPolynomials
 from ..particles.particles import Particles
 from ..transfer.touched import TouchedNodes
-from .cell_fill import CellFill
+from .cell_fill import CellFill, poorly_filled
 from .cure import Cure
 
-__all__ = ["FILL", "Aggregation"]
+__all__ = ["Aggregation"]
 
-#: Fill of a cell below which its dofs count as badly supported.
-FILL = 0.5
 #: Layers of cells over which aggregation looks for a well filled one.
 LAYERS = 8
 
@@ -57,7 +55,7 @@ class Aggregation(Cure):
         """See :meth:`Cure.unknowns`: not those that follow a well filled cell."""
         cells, V = self._cells, self._V
         support = CellFill.of(self._bodies, cells)
-        good = support.active & (support.fill.sum(axis=1) >= FILL)
+        good = support.active & ~poorly_filled(support.fill)
         self._good = marked(V, cells.nodes[: cells.num_own][good])
         root = self._roots(good, support.active)
         lost = np.flatnonzero(support.active & ~good & (root.index >= 0))

@@ -18,7 +18,20 @@ from ..background.basis import PointBasis
 from ..background.pairs import CellPairs
 from ..particles.particles import Particles
 
-__all__ = ["CellFill"]
+__all__ = ["CellFill", "poorly_filled"]
+
+#: Fill of a cell below which its dofs count as badly supported, but for round-off: bodies whose
+#: domains are half as wide as a cell fill halves of cells.
+FILL, SAME = 0.5, 1e-7
+
+
+def poorly_filled(fill: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return whether cells are filled too little to support their dofs.
+
+    Args:
+        fill: Of each body, shape ``(c, bodies)``.
+    """
+    return np.asarray(fill.sum(axis=1) < FILL - SAME)
 
 
 class CellFill(NamedTuple):

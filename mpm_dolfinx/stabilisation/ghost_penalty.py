@@ -17,8 +17,7 @@ from ..background.pairs import CellPairs
 from ..background.polynomials import CellPolynomials
 from ..particles.particles import Particles
 from ..transfer.touched import TouchedNodes
-from .aggregation import FILL
-from .cell_fill import CellFill
+from .cell_fill import CellFill, poorly_filled
 from .cure import Cure
 
 __all__ = ["GhostPenalty"]
@@ -81,8 +80,8 @@ class GhostPenalty(Cure):
         support = CellFill.of(self._bodies, cells)
         fill, active = cells.with_others(support.fill), cells.with_others(support.active)
         a, b = cells.pairs.T
-        least = np.minimum(fill[a].sum(axis=1), fill[b].sum(axis=1))
-        chosen = cells.pairs[cells.mine & active[a] & active[b] & (least < FILL)]
+        poor = poorly_filled(fill)
+        chosen = cells.pairs[cells.mine & active[a] & active[b] & (poor[a] | poor[b])]
         self._chosen = chosen
         self._shares = fill[chosen].sum(axis=1)
         self._marked = marked(self._V, cells.nodes[chosen])

@@ -24,7 +24,17 @@ __all__ = ["BodyTerm", "PointHistory", "StepForce"]
 
 
 class PointHistory(PointMaterial, Protocol):
-    """A material at a body's points, with its history. What is here is not collective."""
+    """A material at a body's points, with its history. What is here is not collective.
+
+    Attributes:
+        tangent: Pointwise derivative of the stress by F, shape ``(n nq, dim, dim, dim, dim)``.
+    """
+
+    tangent: NDArray[np.float64]
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Undeformed volume of each point, shape ``(n, nq)``; 0 where deleted."""
 
     def update(self) -> None:
         """Update stress and tangent for the present displacement, or raise an MPMError."""
@@ -226,20 +236,22 @@ class BodyTerm(Term):
         """Return the stiffness of the body to simple shear: its mean at the present state.
 
         It is the smallest positive energy ``g : C : g`` over uniform gradients g with one entry,
-        for an isotropic elastic body its shear modulus, or the mean of it.
+        for an isotropic elastic body its shear modulus, or the mean of it. What acts on facets,
+        supports and follower loads, is no stiffness of the body, and where the origin of
+        coordinates is does not matter.
         """
-        particles, u = self.particles, self.particles.T.createVecRight()
-        gdim = particles.mesh.geometry.dim
-        x = particles.V.tabulate_dof_coordinates()[: u.getLocalSize() // gdim, :gdim]
-        volume = particles.mesh.comm.allreduce(float(particles.initial_volume.sum()))
-        motion = particles.T.createVecLeft()
-        energies = []
-        for i, j in np.ndindex(gdim, gdim):
-            u.set(0.0)
-            u.array_w.reshape(-1, gdim)[:, i] = x[:, j]
-            particles.T.mult(u, motion)
-            energies.append(self.forms.stiffness_force(motion).dot(motion) / volume)
-        return min((energy for energy in energies if energy > 0.0), default=0.0)
+        particles = self.particles
+        if self._material is None:
+            energy = self.forms.energies_of_gradients()
+        else:
+            # (not around an axis, where a shear strains hoops by what is far from the middle)
+            plane = (slice(particles.mesh.geometry.dim),) * 4
+            tangent = self._material.tangent[:, *plane]
+            energy = np.einsum("n,niJiJ->iJ", self._material.weights.ravel(), tangent)
+        own = [particles.initial_volume.sum(), *energy.ravel()]
+        volume, *energies = particles.mesh.comm.allreduce(np.array(own))
+        positive = [float(energy / volume) for energy in energies if energy > 0.0]
+        return self.forms.factor * min(positive, default=0.0)
 
     def commit(self) -> Callable[[], None] | None:
         """See :meth:`Term.commit`."""

@@ -59,6 +59,21 @@ def test_patches_fill_about_a_background_cell(cell, offset):
     assert len(size) <= 25
 
 
+@pytest.mark.parametrize("cell", scenes.PLANE, ids=label)
+def test_patches_do_not_depend_on_round_off(cell):
+    # Of nine domains across four and a half cells, many patches are equally full.
+    found = []
+    for size, origin in ((1.0, 0.0), (1e3, 0.0), (1.0, [1.1e4, -2.3e4, 0.0])):
+        V = vectors(box([0.0, 0.0], [2.0, 2.0], [8, 8], QUADRILATERAL))
+        body = box([0.1, 0.13], [1.1, 1.13], [9, 9], cell)
+        for domain in (V.mesh, body):
+            domain.geometry.x[:] = size * domain.geometry.x + origin
+        problem = mpm.QuasiStaticProblem(mpm.Particles(body, V), ELASTIC, f_bar="patch")
+        found.append(members(problem))
+    np.testing.assert_array_equal(found[1], found[0])
+    np.testing.assert_array_equal(found[2], found[0])
+
+
 def test_patches_keep_materials_apart():
     V = vectors(box([0.0, 0.0], [1.0, 1.0], [2, 2], QUADRILATERAL))
     body = box([0.0, 0.0], [1.0, 1.0], [4, 4], QUADRILATERAL)
