@@ -39,8 +39,9 @@ class Coulomb:
 
     Args:
         friction: Coefficient of friction.
-        cohesion: Shear traction that is borne without pressure, where bodies touch.
-        limit: Largest shear traction, such as the undrained strength of clay on a pile.
+        cohesion: Shear traction that is borne without pressure, where bodies touch, per area of
+            the facets as they were at the last converged step.
+        limit: Largest shear traction, such as the undrained strength of clay on a pile, as well.
 
     Raises:
         MPMError: A negative or no number.
@@ -63,11 +64,24 @@ class Coulomb:
         """Whether there is no friction at all."""
         return self.limit == 0.0 or (self.friction == 0.0 and self.cohesion == 0.0)
 
-    def bound(self, p: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the largest shear traction at pressures, and its derivative, ``(n,)`` each."""
-        bound = self.friction * np.where(p.real > 0.0, p, 0.0) + self.cohesion
-        free = (bound.real < self.limit) & (p.real > 0.0)
-        return np.where(bound.real < self.limit, bound, self.limit), self.friction * free
+    @property
+    def by_area(self) -> bool:
+        """Whether a part of it does not grow with the pressure, but with the area."""
+        return self.cohesion > 0.0 or np.isfinite(self.limit)
+
+    def bound(
+        self, p: NDArray[Any], stretch: NDArray[np.float64]
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the largest shear traction at pressures, and its derivative, ``(n,)`` each.
+
+        Args:
+            p: Pressure per undeformed area.
+            stretch: Area over undeformed area.
+        """
+        bound = self.friction * np.where(p.real > 0.0, p, 0.0) + self.cohesion * stretch
+        limit = self.limit * stretch
+        free = (bound.real < limit) & (p.real > 0.0)
+        return np.where(bound.real < limit, bound, limit), self.friction * free
 
 
 def as_friction(value: Any) -> Coulomb:
@@ -88,6 +102,7 @@ class Points(NamedTuple):
         touched: Whether each was in contact, shape ``(n,)``.
         anchor: The anchor where it was, where it was not its place at that time, ``(n, gdim)``.
         gap: The gap at that time, shape ``(n,)``.
+        stretch: Area at that time over undeformed area, shape ``(n,)``.
     """
 
     stiffness: NDArray[np.float64]
@@ -95,6 +110,7 @@ class Points(NamedTuple):
     touched: NDArray[np.bool_]
     anchor: NDArray[np.float64]
     gap: NDArray[np.float64]
+    stretch: NDArray[np.float64]
 
     def of(self, which: Any) -> Points:
         """Return some of them."""
@@ -217,7 +233,7 @@ def traction(
         return Traction(p, np.zeros_like(n), inside, none)
     shear = np.where(inside[:, None], _trial(points, delta, gap, n, touch), 0.0)
     size = np.sqrt((shear * shear).sum(axis=1))
-    bound, _ = law.bound(p)
+    bound, _ = law.bound(p, points.stretch)
     slips = inside & (size.real > bound.real + points.tangential * touch)
     factor = np.where(slips, bound / np.where(slips, size, 1.0), 1.0)
     return Traction(p, factor[:, None] * shear, inside, slips)
@@ -284,7 +300,7 @@ def push_derivative(
     if acts.slips.any():
         s = acts.slips
         trial = _trial(points, delta, gap, n, touch)[s]
-        _, grows = law.bound(acts.pressure[s])
+        _, grows = law.bound(acts.pressure[s], points.stretch[s])
         tau = trial / np.linalg.norm(trial, axis=1)[:, None]
         found[s] += np.asarray(grows)[:, None] * tau
     return np.asarray(found * push.acts[:, None])
@@ -333,7 +349,7 @@ def shear_derivative(
         trial = _trial(points, delta, gap, n, touch)[s]
         size = np.linalg.norm(trial, axis=1)
         tau = trial / size[:, None]
-        bound, grows = law.bound(acts.pressure[s])
+        bound, grows = law.bound(acts.pressure[s], points.stretch[s])
         turned = (bound / size)[:, None, None] * (eye - tau[:, :, None] * tau[:, None, :])
         dt[s] = turned @ dt[s] + tau[:, :, None] * (np.asarray(grows)[:, None] * dp[s])[:, None, :]
     return np.asarray(dt)

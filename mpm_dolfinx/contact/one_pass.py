@@ -326,6 +326,7 @@ class Pass:
             memory.touched[which] | lost,
             np.zeros((len(which), 0)),
             np.where(lost, 0.0, memory.gap[which]),
+            self.source.stretch(self.law.by_area).ravel()[which],
         )
         self._facet, self._anchor = facet, anchor
         start = None

@@ -422,6 +422,7 @@ class Rigid(Contact):
             memory.touched.ravel(),
             memory.anchor.reshape(-1, gdim),
             memory.gap.ravel(),
+            self._surface.stretch(self.friction.by_area, which).ravel(),
         )
 
     def _evaluated(self, whole: bool = False) -> Memory:

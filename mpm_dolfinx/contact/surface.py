@@ -232,6 +232,26 @@ class Surface:
         """Area in the present mesh over that of the undeformed body, shape ``(m, nq)``."""
         return np.asarray(self._in_mesh / self._plain)
 
+    def stretch(
+        self, counts: bool = True, which: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return area at the last converged step over undeformed area, shape ``(m, nq)``.
+
+        Args:
+            counts: Whether it counts; otherwise 1 is told.
+            which: Numbers of facets; ``None``: all.
+        """
+        some = slice(None) if which is None else which
+        if not counts:
+            return np.ones_like(self._plain[some])
+        x = self.own_nodes(converged=True)[self._of_facets[some]]
+        now = normals(np.einsum("jqk,mki->mqij", self.slopes, x))
+        mesh_size = np.linalg.norm(normals(self._edges[some]), axis=2)
+        ratio = np.linalg.norm(now, axis=2) / mesh_size * self.mesh_area_ratio[some]
+        if self.axisymmetric:
+            ratio = ratio * (2.0 * np.pi) * (self.shapes @ x)[:, :, 0] / self._around[some]
+        return np.asarray(ratio)
+
     def mesh_normals(self) -> NDArray[np.float64]:
         """Return outward unit normals in the present mesh, shape ``(m, nq, gdim)``."""
         n = self.outward[:, None, None] * normals(self._edges)

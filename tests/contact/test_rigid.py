@@ -100,6 +100,39 @@ def test_a_cylinder_between_plates(f_bar):
     assert scenes.largest(particles.stress[:, 1, 1] + p) < 1e-7 * p
 
 
+@pytest.mark.parametrize("axisymmetric", [False, True])
+def test_a_limit_of_friction_is_per_area_of_the_stretched_facets(axisymmetric):
+    limit, wider, higher, rise = 0.7, 0.502, 0.2, 0.1
+    V = scenes.vectors(scenes.box([0.0, -0.3], [2.1, 1.8], [7, 7], QUADRILATERAL))
+    particles = mpm.Particles(scenes.box([0.5, 0.0], [1.0, 1.0], [3, 5], QUADRILATERAL), V)
+    wall = contact.Rigid(
+        particles,
+        contact.cavity(contact.box((-1.5, -9.0), (1.5, 9.0), 0.1)),
+        contact.Coulomb(0.4, limit=limit),
+        axisymmetric=axisymmetric,
+    )
+    value = fem.Function(V)
+    everywhere = fem.dirichletbc(value, np.arange(len(value.x.array) // 2, dtype=np.int32))
+    problem = mpm.QuasiStaticProblem(
+        particles,
+        Hencky(YOUNG, POISSON),
+        bcs=[everywhere],
+        axisymmetric=axisymmetric,
+        terms=[wall],
+    )
+
+    def path(t):  # first wider and higher, until it is pressed against the wall, then upwards
+        grows = min(2.0 * t, 1.0)
+        value.interpolate(
+            lambda x: (grows * wider * x[0], grows * higher * x[1] + rise * max(2.0 * t - 1.0, 0.0))
+        )
+
+    problem.solve(2, update=path)  # (values are of places, so each in one step)
+    around = 2.0 * np.pi * (1.0 + wider) if axisymmetric else 1.0
+    assert np.all(0.4 * wall.pressure[wall.touches] > 3.0 * limit) and problem.history.cutbacks == 0
+    assert problem.reaction(wall)[1] == pytest.approx(-limit * around * (1.0 + higher), rel=1e-9)
+
+
 def test_pressure_under_a_disc_is_that_of_hertz():
     problem, die, half, most = hertz(8, 1.0, 8)
     assert half == pytest.approx(0.2, rel=0.1)
@@ -120,7 +153,7 @@ def test_pressure_under_a_disc_is_that_of_hertz():
 @pytest.mark.parametrize("cell", PLANE, ids=scenes.name)
 def test_a_dragged_disc_is_the_same_on_any_number_of_ranks(cell):
     problem, die, path = dragged(cell)
-    problem.solve(10, update=path)
+    problem.solve(2, update=path)  # (values are of places, so each in one step)
     other, alone, path = dragged(cell, comm=scenes.MPI.COMM_SELF)
     other.solve(10, update=path)
     assert (
@@ -144,7 +177,7 @@ def test_a_dragged_disc_is_the_same_on_any_number_of_ranks(cell):
 
 def test_moment_is_that_of_the_reactions():
     problem, die, path = dragged()
-    problem.solve(10, update=path)
+    problem.solve(2, update=path)  # (values are of places, so each in one step)
     field = problem.reduced.fields[0]
     x = field.V.tabulate_dof_coordinates()[: len(field.force.array_r) // 2, :2]
     # forces of supports on all dofs of V; the contact's among them are at nodes of V, which carry
@@ -228,7 +261,7 @@ def test_contact_follows_other_meshes_of_the_body(what):
 @pytest.mark.parametrize("method", ["cpdi2", "cpdi", "gimp", "mpm"])
 def test_all_methods_feel_an_obstacle(method):
     problem, die, path = dragged(method=method, friction=0.2)
-    problem.solve(10, update=path)
+    problem.solve(2, update=path)  # (values are of places, so each in one step)
     other, alone, path = dragged(n=12, friction=0.2)
     other.solve(10, update=path)
     base = problem.reaction(problem.bcs[0])
@@ -239,7 +272,7 @@ def test_all_methods_feel_an_obstacle(method):
 
 def test_domains_of_degree_two_are_curved():
     problem, die, path = dragged(degree=2, n=4)
-    problem.solve(10, update=path)
+    problem.solve(2, update=path)  # (values are of places, so each in one step)
     other, alone, path = dragged(n=12)
     other.solve(10, update=path)
     assert die.reaction == pytest.approx(alone.reaction, rel=0.12)
