@@ -43,6 +43,7 @@ __all__ = [
     "cell_tree",
     "cell_vertices",
     "compiled_integrals",
+    "coordinate_element",
     "create_vector",
     "disconnected_mesh",
     "entity_nodes",
@@ -94,6 +95,12 @@ def geometry_degree(domain: mesh.Mesh) -> int:
     """Return the degree of the coordinate element (``.cmap`` before 0.11)."""
     geometry = domain.geometry
     return int((geometry.cmaps[0] if hasattr(geometry, "cmaps") else geometry.cmap).degree)
+
+
+def coordinate_element(domain: mesh.Mesh) -> Any:
+    """Return the coordinate element of a mesh, which the mesh of UFL knows (untyped there)."""
+    ufl_domain: Any = domain.ufl_domain()
+    return ufl_domain.ufl_coordinate_element()
 
 
 def input_cell_index(domain: mesh.Mesh) -> NDArray[np.int64]:
@@ -158,7 +165,7 @@ def tags_from_nodes(
 def mesh_on_ranks(
     comm: MPI.Comm,
     cells: NDArray[np.int64],
-    like: mesh.Mesh,
+    element: Any,
     x: NDArray[np.float64],
     ranks: list[list[int]],
 ) -> mesh.Mesh:
@@ -167,7 +174,7 @@ def mesh_on_ranks(
     Args:
         comm: Communicator (collective).
         cells: Nodes of this rank's part of the input, shape ``(n, k)``.
-        like: A mesh with the coordinate element that is wanted.
+        element: The coordinate element.
         x: This rank's part of the points, shape ``(m, gdim)``.
         ranks: For each of the cells its rank, then those where it is a ghost.
     """
@@ -178,8 +185,6 @@ def mesh_on_ranks(
     def partitioner(*_: Any) -> Any:
         return dolfinx.cpp.graph.AdjacencyList_int32(flat, offsets)
 
-    domain: Any = like.ufl_domain()
-    element = domain.ufl_coordinate_element()
     create: Any = mesh.create_mesh
     middle = (x, element) if _VERSION < (0, 10) else (element, x)
     whole: mesh.Mesh = create(comm, cells, *middle, partitioner)

@@ -179,7 +179,8 @@ def _moved(source: mesh.Mesh, ranks: NDArray[np.int64]) -> tuple[mesh.Mesh, NDAr
     where = exchange(np.column_stack([ranks, neighbour_ranks(source, ranks)]))
     targets = [[row[0], *sorted({*row[1:]} - {row[0], -1})] for row in where.tolist()]
     x = source.geometry.x[: numbering.size_local, :gdim].copy()
-    return _compat.mesh_on_ranks(comm, corners, source, x, targets), numbers
+    element = _compat.coordinate_element(source)
+    return _compat.mesh_on_ranks(comm, corners, element, x, targets), numbers
 
 
 def _moved_apart(

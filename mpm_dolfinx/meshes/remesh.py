@@ -17,8 +17,8 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-import basix
-from dolfinx import mesh
+import basix.ufl
+from dolfinx import fem, mesh
 
 from .. import _compat
 from ..parallel.exchange import RowExchange
@@ -87,6 +87,48 @@ def diagonals(
     return second.astype(np.int64), np.where(second, areas[:, 1], areas[:, 0])
 
 
+class _Nodes(NamedTuple):
+    """What the cells of a mesh are made of.
+
+    Attributes:
+        of_cells: Local nodes of each local cell, shape ``(n, k)``.
+        x: Positions of the local nodes, shape ``(m, gdim)``.
+        numbering: Index map of the nodes.
+        element: Coordinate element that they are for.
+        of_geometry_nodes: The node in the place of each local node of the mesh; where there is
+            none, any one.
+    """
+
+    of_cells: NDArray[np.int32]
+    x: NDArray[np.float64]
+    numbering: Any
+    element: Any
+    of_geometry_nodes: NDArray[np.int64]
+
+    @classmethod
+    def of_geometry(cls, source: mesh.Mesh) -> _Nodes:
+        """Return the nodes of a mesh."""
+        geometry = source.geometry
+        x = geometry.x[:, : geometry.dim].copy()
+        same = np.arange(len(x), dtype=np.int64)
+        element = _compat.coordinate_element(source)
+        return cls(_compat.geometry_dofmap(source), x, geometry.index_map(), element, same)
+
+    @classmethod
+    def of_space(cls, space: fem.FunctionSpace) -> _Nodes:
+        """Return the nodes of a Lagrange space, in which a mesh of its degree is interpolated."""
+        source, dofmap = space.mesh, space.dofmap
+        gdim, degree = source.geometry.dim, space.ufl_element().degree
+        x = space.tabulate_dof_coordinates()[:, :gdim].copy()
+        element = basix.ufl.element("Lagrange", source.basix_cell().name, degree, shape=(gdim,))
+        known = _compat.geometry_dofmap(source)
+        corners = len(basix.topology(source.basix_cell())[0])
+        alike = known.shape[1] if known.shape[1] == dofmap.list.shape[1] else corners
+        places = np.zeros(len(source.geometry.x), dtype=np.int64)
+        places[known[:, :alike]] = dofmap.list[:, :alike]
+        return cls(dofmap.list, x, dofmap.index_map, element, places)
+
+
 class Remesh(Carrier):
     """A mesh on the same ranks with some quadrilaterals cut in two, or with moved nodes.
 
@@ -96,8 +138,10 @@ class Remesh(Carrier):
     Args:
         source: The mesh before (collective).
         cuts: Quadrilaterals of degree 1 to be cut.
-        positions: Where the owned cells' nodes are to be, shape ``(n, k, gdim)``; ``None`` leaves
-            them.
+        positions: Where the nodes of the owned cells are to be, shape ``(n, k, gdim)``; ``None``
+            leaves them. They are those of a Lagrange space on the mesh, whose degree the map of the
+            new cells has.
+        space: That space; only with positions.
 
     Attributes:
         source: The mesh before.
@@ -106,7 +150,11 @@ class Remesh(Carrier):
     """
 
     def __init__(
-        self, source: mesh.Mesh, cuts: Cuts, positions: NDArray[np.float64] | None = None
+        self,
+        source: mesh.Mesh,
+        cuts: Cuts,
+        positions: NDArray[np.float64] | None = None,
+        space: fem.FunctionSpace | None = None,
     ) -> None:
         comm = source.comm
         index = _compat.input_cell_index(source)
@@ -125,7 +173,8 @@ class Remesh(Carrier):
         self.index = np.concatenate(
             [index[whole], index[cut], count + np.flatnonzero(here).astype(np.int64)]
         )
-        nodes = _compat.geometry_dofmap(source)[: len(index)]
+        places = _Nodes.of_geometry(source) if space is None else _Nodes.of_space(space)
+        nodes = places.of_cells[: len(index)]
         own, both = np.arange(nodes.shape[1]), (0, 1) if len(cut) else ()
         corners = np.broadcast_to(own, (len(index), len(own)))[whole]
         self._corners = np.concatenate([corners, *(HALVES[diagonal, half] for half in both)])
@@ -133,10 +182,9 @@ class Remesh(Carrier):
             [np.ones(corners.shape), *(HALVES_OF_MASS[[half] * len(cut)] for half in both)]
         )
 
-        x = source.geometry.x[:, : source.geometry.dim].copy()
+        x, numbering = places.x, places.numbering
         if positions is not None:
             x[nodes] = positions
-        numbering = source.geometry.index_map()
         added = np.cumsum([0, *comm.allgather(2 * len(cut))])
         firsts = np.array(comm.allgather(numbering.local_range[0]))
         old = numbering.local_to_global(np.arange(len(x), dtype=np.int32))
@@ -157,11 +205,12 @@ class Remesh(Carrier):
         first, last = (total * r // comm.size for r in (comm.rank, comm.rank + 1))
         exchange = RowExchange(comm, self.index, np.arange(first, last))
         targets = [[row[0], *sorted({*row[1:]} - {row[0], -1})] for row in exchange(seen).tolist()]
-        after = _compat.mesh_on_ranks(comm, exchange(cells), source, points, targets)
+        element = places.element
+        after = _compat.mesh_on_ranks(comm, exchange(cells), element, points, targets)
         origin = _compat.input_cell_index(after).copy()
         second = origin >= count
         origin[second] = cuts[origin[second] - count, 0]
-        super().__init__(source, after, origin, numbers)
+        super().__init__(source, after, origin, numbers[places.of_geometry_nodes])
 
     @property
     def halves(self) -> NDArray[np.bool_]:
@@ -177,7 +226,7 @@ class Remesh(Carrier):
             nodal: Whether halves have a part of the nodes only.
         """
         taken: NDArray[Any] = values[self._parents]
-        if not nodal:
+        if not nodal or len(self._cut) == 0:
             return taken
         corners = self._corners.reshape(*self._corners.shape, *[1] * (values.ndim - 2))
         return np.asarray(np.take_along_axis(taken, corners, axis=1))
@@ -215,4 +264,5 @@ class Remesh(Carrier):
         """
         want = _compat.input_cell_index(self.mesh)
         exchange = RowExchange(self.mesh.comm, self.index, want)
-        return np.asarray(exchange(self.rows(nodal, nodal=True) * self._parts))
+        shares = self.rows(nodal, nodal=True)
+        return np.asarray(exchange(shares * self._parts if len(self._cut) else shares))

@@ -130,7 +130,8 @@ class Domains:
         Args:
             moved: Whether its nodes are elsewhere.
         """
-        space = fem.functionspace(self.mesh, ("Discontinuous Lagrange", 1))
+        degree = self.W.ufl_element().degree
+        space = fem.functionspace(self.mesh, ("Discontinuous Lagrange", degree))
         self.mass_share = fem.Function(space, name="mass_share")
         self.mass_share.x.array[:] = 1.0
         if moved:

@@ -16,6 +16,7 @@ from dolfinx import fem, mesh
 
 from ..background.basis import BackgroundBasis, PointBasis
 from ..errors import MPMError, ParticleOutsideError, agree
+from ..meshes.quadrature import DomainQuadrature
 from ..parallel.given import require_same
 from ..transfer.matrix import transfer_matrix
 from ..transfer.transfer import Transfer
@@ -48,6 +49,10 @@ class Body(Protocol):
     @property
     def deletion(self) -> object | None:
         """Which domains are deleted, if any may be."""
+
+    @property
+    def quadrature(self) -> DomainQuadrature:
+        """The rule that carries the history, on each owned domain."""
 
     @property
     def dx(self) -> ufl.Measure:
@@ -265,9 +270,7 @@ class CarriedField:
         count = self.W.dofmap.index_map.size_local
         if self.field.at == "nodes":
             return np.ones(count)
-        test = ufl.TestFunction(self.field.particles.quadrature_function("one").function_space)
-        volumes = fem.assemble_vector(fem.form(test * self.field.particles.dx)).array
-        return np.asarray(volumes[:count])
+        return np.asarray(self.field.particles.quadrature.weights.ravel())
 
     def inverted(self) -> NDArray[np.int64]:
         """Return no particles: values cannot turn a domain inside out."""

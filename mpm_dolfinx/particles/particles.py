@@ -264,9 +264,10 @@ class Particles(MaterialDomains):
 
         Args:
             cuts: Which are cut, the same on all ranks.
-            positions: Where the domains' corners are to be, shape ``(n, k, gdim)``, if elsewhere.
+            positions: Where the domains' nodes are to be, shape ``(n, k, gdim)``, if elsewhere.
         """
-        move = Remesh(self.mesh, cuts, positions)
+        own = self.W if positions is not None and self.W.ufl_element().degree > 1 else None
+        move = Remesh(self.mesh, cuts, positions, own)
         self._take(move, positions is not None or self.origin is not None, cuts, positions)
         return move
 

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -188,6 +188,7 @@ class QuasiStaticProblem(ParticleProblem):
             _for_each(cell_tags, count),
             _for_each(facet_tags, count),
             [tuple(s for s in supports if s.particles is body) for body in bodies],
+            [self._more_of(body) for body in bodies],
             strict=True,
         )
         stresses = _for_each(initial_stress, count)
@@ -239,6 +240,10 @@ class QuasiStaticProblem(ParticleProblem):
         super()._build()
         for body, stress in zip(self.bodies, self._stresses, strict=True):
             body.attach(stress)
+
+    def _more_of(self, body: Particles) -> Mapping[str, Any]:
+        """Return what else a user has given for a body, by name, which may lie on its mesh."""
+        return {}
 
     def _made_of(self) -> list[str]:
         """See :meth:`ParticleProblem._made_of`."""
@@ -429,6 +434,7 @@ class QuasiStaticProblem(ParticleProblem):
             cell_tags,
             facet_tags,
             tuple(as_supports(supports, [particles])),
+            self._more_of(particles),
         )
         if particles.on_distortion == "split":
             replace(self.setup, bodies=(*self.setup.bodies, given)).require_divisible()
@@ -685,7 +691,9 @@ class QuasiStaticProblem(ParticleProblem):
     def nodal_masses(self, number: int) -> NDArray[np.float64]:
         """Return ``int density Q_c dX`` of each owned domain of a body, ``(n, k)`` (collective)."""
         body, (work, density) = self.bodies[number], self._density[number]
-        space = fem.functionspace(body.mesh, ("Discontinuous Lagrange", 1))
+        space = fem.functionspace(
+            body.mesh, ("Discontinuous Lagrange", body.W.ufl_element().degree)
+        )
         test: Any = ufl.TestFunction(space)
         if body.mass_share is not None:
             test = body.mass_share * test
@@ -695,7 +703,9 @@ class QuasiStaticProblem(ParticleProblem):
     def mass_matrices(self, number: int) -> NDArray[np.float64]:
         """Return ``int density Q_c Q_d dX`` of each owned domain, ``(n, k, k)`` (collective)."""
         body, (work, density) = self.bodies[number], self._density[number]
-        space = fem.functionspace(body.mesh, ("Discontinuous Lagrange", 1))
+        space = fem.functionspace(
+            body.mesh, ("Discontinuous Lagrange", body.W.ufl_element().degree)
+        )
         product = ufl.TrialFunction(space) * ufl.TestFunction(space)
         matrix = fem.assemble_matrix(fem.form(work.mass(density.value, product)))
         n, k = body.num_local, space.dofmap.list.shape[1]

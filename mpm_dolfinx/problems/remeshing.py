@@ -191,7 +191,8 @@ class Remeshing:
                 "the mesh of before cannot be restored; restore it without them."
             )
         problem.setup.require_movable("this checkpoint cannot be restored")
-        self._remesh(missing)
+        if any(map(len, missing)):
+            self._remesh(missing)
         if any(moved):
             comm = problem.bodies[0].V.mesh.comm
             positions = [
@@ -268,12 +269,15 @@ class Remeshing:
             given.require_movable_nodes(consequence)
         for term in setup.terms:
             term.require_remeshable(consequence)
-        if setup.f_bar != "none" or setup.axisymmetric or setup.mixed is not None:
-            raise MPMError(f"With f_bar, mixed or axisymmetric=True {consequence}.")
+        if setup.f_bar != "none" or setup.axisymmetric:
+            raise MPMError(f"With f_bar or axisymmetric=True {consequence}.")
         for body in problem.bodies:
-            linear = body.W.ufl_element().degree == _compat.geometry_degree(body.mesh) == 1
-            if not body.shares_nodes or not linear:
-                raise MPMError("Only a body of degree 1 that moves by 'cpdi2' can be rebased.")
+            degree, cells = body.W.ufl_element().degree, _compat.geometry_degree(body.mesh)
+            if not body.shares_nodes or cells not in (1, degree):
+                raise MPMError(
+                    "Only a body that moves by 'cpdi2', with straight cells or such of its own "
+                    "degree, can be rebased."
+                )
             with agree(body.mesh.comm):
                 if (bad := body.global_index[~body.proper() | body.deleted]).size:
                     raise MPMError(
@@ -304,7 +308,6 @@ class Remeshing:
         ]
 
         def change() -> None:
-            problem.keep_identity()
             for body, some, x in zip(problem.bodies, cuts, places, strict=True):
                 moves.append(body.rebase(some, x))
 
@@ -325,6 +328,7 @@ class Remeshing:
             snapshot.numbers["cuts"] = [body.cuts.tolist() for body in problem.bodies]
             return Snapshot(snapshot.numbers, [*tables, *snapshot.tables[len(tables) :]])
 
+        problem.keep_identity()
         problem.renew(change, carry)
         return moves
 

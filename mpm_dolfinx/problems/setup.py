@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 from mpi4py import MPI
@@ -133,7 +134,11 @@ class Numerics:
 
 @dataclass(frozen=True)
 class BodySetup:
-    """What a body is made of, and what acts on it; see :class:`QuasiStaticProblem` for each."""
+    """What a body is made of, and what acts on it; see :class:`QuasiStaticProblem` for each.
+
+    Attributes:
+        more: What else is given for the body, by name.
+    """
 
     particles: Particles
     material: Any
@@ -144,6 +149,7 @@ class BodySetup:
     cell_tags: Any
     facet_tags: Any
     supports: tuple[Support, ...]
+    more: Mapping[str, Any] = MappingProxyType({})
 
     def in_words(self) -> str:
         """Return the laws, and what loads and holds the body."""
@@ -186,6 +192,11 @@ class BodySetup:
                     f"{name} is written on the present body mesh, so {consequence}; give a "
                     "function that makes it from a mesh, e.g. "
                     "lambda mesh: ufl.SpatialCoordinate(mesh)[1]."
+                )
+        for name, value in self.more.items():
+            if holds(value, ufl.core.expr.Expr):
+                raise MPMError(
+                    f"{name} is written on the present body mesh, so {consequence}; give numbers."
                 )
         if self.supports:
             raise MPMError(f"supports= lie on the present body mesh, so {consequence}.")
@@ -291,7 +302,10 @@ class Setup:
         """
         self.require_movable("domains cannot be split")
         if self.mixed is not None:
-            raise MPMError("Domains cannot be split or rebased with mixed='pressure'.")
+            raise MPMError(
+                "Domains cannot be split with mixed='pressure': those of degree 1 have no pressure "
+                "of their own."
+            )
         for term in self.terms:
             term.require_remeshable("domains cannot be split")
         if self.f_bar != "none":

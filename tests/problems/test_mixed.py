@@ -379,7 +379,6 @@ def test_what_does_not_go_together_is_refused():
     clay = ModifiedCamClay(0.1, 0.02, 1.0, 100.0, 5.0, 3.0)
     raises(lambda: beam(clay), mpm.MPMError, "ModifiedCamClay may soften under a given")
     raises(lambda: turning("midpoint", soil), mpm.MPMError, "use scheme='euler'")
-    raises(lambda: beam().rebase(), mpm.MPMError, "With f_bar, mixed or")
 
 
 # -- Soils -------------------------------------------------------------------------------

@@ -479,3 +479,75 @@ def test_what_does_not_go_together_is_refused():
     raises(lambda: problem.remove([0]), mpm.MPMError, "cannot be taken from a body with water")
     problem, _, _ = column()
     raises(lambda: problem.solve(0.0, 0.1), mpm.MPMError, "give a later time")
+
+
+def soaked(comm=WORLD, **options):
+    """Return a block that settles and is sheared while water goes in and out; one of four kinds."""
+    background = scenes.box([0.0, 0.0], [3.0, 2.0], [6, 4], QUADRILATERAL, comm)
+    shape = scenes.bend(scenes.box([0.0, 0.0], [1.0, 1.0], [3, 3], QUADRILATERAL, comm), 0.03)
+    V = scenes.vectors(background, 2)
+    body = mpm.Particles(shape, V, degree=2)
+    defaults = {
+        "permeability": lambda J: 0.02 * J**3,
+        "storage": 0.01,
+        "fluid_density": 0.5,
+        "body_force": (0.2, -1.0),
+        "bcs": [scenes.fix(V, scenes.at(1, 0.0))],
+        "facet_tags": scenes.facet_tags(shape, scenes.at(0, 1.0), scenes.at(1, 1.0)),
+        "drained": [(0.1, 1)],
+        "inflow": [(0.05, 2)],
+        "tractions": [((1.0, -0.5), 2)],
+        "petsc_options": {"snes_rtol": 1e-11},
+    } | options
+    return mpm.PorousProblem(body, defaults.pop("material", Hencky(10.0, 0.3)), **defaults)
+
+
+@pytest.mark.parametrize(
+    "law",
+    [Hencky(10.0, 0.3), pytest.param(LinearElastic(30.0, 0.3), marks=pytest.mark.slow)],
+    ids=["finite", "small"],
+)
+def test_a_rebased_body_goes_on_as_one_that_is_not(law):
+    results = []
+    for changes in (False, True):
+        problem = soaked(material=law)
+        problem.solve(0.2, 0.1)
+        if changes:
+            problem.rebase()
+            assert scenes.largest(problem.particles.displacement.x.array) == 0.0
+        problem.solve(0.3, 0.1)
+        if changes:
+            problem.repartition(0.0)
+            problem.rebase()
+        problem.solve(0.4, 0.1)
+        (p,) = problem.pore_pressure
+        where = problem.particles.converged_nodes(p.W)
+        own = p.W.dofmap.list[: problem.particles.num_local]
+        values = {
+            "pressure": scenes.in_order(problem.particles, p.x.array[own]),
+            "places": scenes.in_order(problem.particles, where[own]),
+        }
+        results.append(outcome(problem) | values)
+        assert problem.history.iterations == results[0].setdefault("", problem.history.iterations)
+    assert np.abs(results[0]["deformation_gradient 0"] - np.eye(3)).max() > 0.05
+    del results[0][""]
+    same_run(results[1], results[0], 1e-9)
+
+
+@pytest.mark.parametrize("name", ["permeability", "storage", "drained", "inflow"])
+def test_what_lies_on_the_mesh_of_before_is_refused(name):
+    body = soaked().particles
+    x = ufl.SpatialCoordinate(body.mesh)[0]
+    tags = scenes.facet_tags(body.mesh, scenes.at(0, 1.0), scenes.at(1, 1.0))
+    value = 0.1 * (1.0 + x)
+    given = {"permeability": 0.02} | {
+        name: [(value, 1)] if name in ("drained", "inflow") else value
+    }
+    held = [scenes.fix(body.V, scenes.at(1, 0.0))]
+    again = mpm.Particles(body.mesh, body.V, degree=2)
+    law = Hencky(10.0, 0.3)
+    problem = mpm.PorousProblem(again, law, facet_tags=tags, bcs=held, **given)
+    before = scenes.state(problem)
+    for change in (problem.rebase, lambda: problem.repartition(0.0)):
+        raises(change, mpm.MPMError, f"{name} is written on the present body mesh")
+    scenes.assert_same_state(before, scenes.state(problem))

@@ -61,7 +61,8 @@ def sums(problem):
     """Return what a split must leave as it is: sums over the body, and at background nodes."""
     p = problem.particles
     volume, masses = p.initial_volume, problem.nodal_masses(0)
-    at_nodes = fem.Function(fem.functionspace(p.mesh, ("Lagrange", 1)))
+    degree = p.W.ufl_element().degree
+    at_nodes = fem.Function(fem.functionspace(p.mesh, ("Lagrange", degree)))
     np.add.at(at_nodes.x.array, at_nodes.function_space.dofmap.list[: p.num_local], masses)
     at_nodes.x.scatter_reverse(la.InsertMode.add)
     work = p.T.createVecLeft()
@@ -69,7 +70,7 @@ def sums(problem):
     forms = problem.body_terms[0].forms
     forms.assemble_external()
     (stress,) = problem._stresses
-    strain = stress.variable("elastic_b_minus_identity")[:, 0]
+    strain = stress.strain.average(stress.variable("elastic_b_minus_identity"))
     return {
         "volume": scenes.total(p, volume),
         "present volume": scenes.total(p, p.volume),
@@ -302,18 +303,18 @@ def test_checkpoint_after_a_split(tmp_path):
     other.restore(path)
 
 
-def block_of(cell, **options):
+def block_of(cell, degree=1, **options):
     """Return a bent block of plastic material on a roller, pulled at its side and pushed on top."""
     dim = 2 if cell in PLANE else 3
     grid = QUADRILATERAL if dim == 2 else HEXAHEDRON
-    V = scenes.vectors(scenes.box([0.0] * dim, [2.0] * dim, [4] * dim, grid))
-    body = scenes.bend(
-        scenes.box([0.0] * dim, [1.0] * dim, [2 if cell == TETRAHEDRON else 4] * dim, cell), 0.03
-    )
+    n = 4 if degree == 1 else 6 - dim - degree // 2
+    V = scenes.vectors(scenes.box([0.0] * dim, [2.0] * dim, [n] * dim, grid), degree)
+    count = 2 if cell == TETRAHEDRON and degree == 1 else n
+    body = scenes.bend(scenes.box([0.0] * dim, [1.0] * dim, [count] * dim, cell), 0.03)
     force, pull = np.zeros(dim), np.zeros(dim)
     force[:2], pull[0] = (2.0, -10.0), 4.0
     return mpm.QuasiStaticProblem(
-        mpm.Particles(body, V),
+        mpm.Particles(body, V, degree=degree),
         VonMises(1e3, 0.3, yield_stress=12.0, hardening=200.0),
         density=2.0,
         body_force=tuple(force),
@@ -325,9 +326,22 @@ def block_of(cell, **options):
     )
 
 
-@pytest.mark.parametrize("cell", ALL, ids=scenes.name)
-def test_rebase_keeps_everything_and_changes_no_step(cell):
-    problem, plain = block_of(cell), block_of(cell)
+#: Cells of straight bodies that are rebased, their degree, and what pressure they have.
+REBASED = [
+    *(pytest.param(cell, 1, None, id=scenes.name(cell)) for cell in ALL),
+    pytest.param(QUADRILATERAL, 2, "pressure", id="degree 2 with a pressure"),
+    pytest.param(
+        QUADRILATERAL, 2, "discontinuous pressure", id="discontinuous", marks=pytest.mark.slow
+    ),
+    pytest.param(TRIANGLE, 3, "pressure", id="degree 3 with a pressure"),
+    pytest.param(TETRAHEDRON, 2, "pressure", id="tetrahedra of degree 2", marks=pytest.mark.slow),
+    pytest.param(HEXAHEDRON, 2, None, id="hexahedra of degree 2", marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("cell", "degree", "mixed"), REBASED)
+def test_rebase_keeps_everything_and_changes_no_step(cell, degree, mixed):
+    problem, plain = (block_of(cell, degree, mixed=mixed) for _ in range(2))
     for each in (problem, plain):
         half_way(each, 4)
     p, dim = problem.particles, plain.particles.mesh.geometry.dim
@@ -381,6 +395,37 @@ def test_rebased_and_split_state_is_restored(tmp_path):
         rebased.restore(path)
 
 
+def test_rebased_body_with_a_pressure_is_restored_and_moves_to_other_ranks(tmp_path):
+    def block():
+        return block_of(QUADRILATERAL, 2, mixed="pressure")
+
+    path = WORLD.bcast(tmp_path) / "state"
+    whole = half_way(block(), 4)
+    whole.rebase()
+    whole.repartition(0.0)
+    whole.particles.load.value = 0.75
+    whole.step()
+    whole.rebase()
+    whole.save(path)
+    other = block()
+    other.restore(path)
+    same_run(outcome(other), outcome(whole), 1e-13)
+    for one, two in zip(whole.pressure, other.pressure, strict=True):
+        ours, theirs = (
+            scenes.in_order(p, f.x.array[: p.num_local * p.num_points].reshape(p.num_local, -1))
+            for p, f in ((whole.particles, one), (other.particles, two))
+        )
+        assert np.array_equal(ours, theirs) and np.abs(ours).max() > 1.0
+    straight = half_way(block(), 4)
+    straight.particles.load.value = 0.75
+    straight.step()
+    for each in (whole, other, straight):
+        each.particles.load.value = 1.0
+        each.step()
+    same_run(outcome(other), outcome(whole), 1e-9)
+    same_run(outcome(straight), outcome(whole), 1e-9)
+
+
 def test_rebase_refused():
     concave = dented("error")
     concave.solve(10)
@@ -425,6 +470,31 @@ def test_one_of_two_bodies():
     # The supports carry the weight of both, and the force to the side.
     forces = sum(problem.reaction(bc) for bc in problem.bcs)
     np.testing.assert_allclose(forces, [-3 * 2.5, 9 * 2.5], rtol=1e-7)
+
+
+def test_split_beside_a_body_of_degree_2():
+    spaces = [
+        scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL), degree)
+        for degree in (1, 2)
+    ]
+    shape = scenes.bend(scenes.box([0.0, 0.0], [1.0, 1.0], [4, 4], QUADRILATERAL), 0.03)
+    bodies = [mpm.Particles(shape, V, degree=degree) for degree, V in enumerate(spaces, start=1)]
+    bcs = [scenes.fix(V, scenes.at(i, 0.0), component=i) for V in spaces for i in range(2)]
+    problem = mpm.QuasiStaticProblem(bodies, Hencky(1e3, 0.3), 2.0, body_force=(3, -9), bcs=bcs)
+    half_way(problem, 4)
+    other = bodies[1]
+    before = [scenes.in_order(other, a) for a in (other.centroid, other.stress, other.domains)]
+    problem.split([2, 5], body=0)
+    after = [scenes.in_order(other, a) for a in (other.centroid, other.stress, other.domains)]
+    assert all(map(np.array_equal, before, after))
+    assert (bodies[0].num_global, other.num_global) == (18, 16)
+    for body in bodies:
+        body.load.value = 1.0
+    problem.step()
+    forces = np.array([problem.reaction(bc) for bc in bcs])
+    area = WORLD.allreduce(fem.assemble_scalar(fem.form(1.0 * ufl.dx(shape))))
+    for part in (forces[:2], forces[2:]):  # each carries its own weight
+        np.testing.assert_allclose(part.sum(axis=0), [-6.0 * area, 18.0 * area], rtol=1e-6)
 
 
 def test_refused():
