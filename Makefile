@@ -13,6 +13,11 @@ ARGS ?=
 export PYTHON VENV NP
 export OMP_NUM_THREADS := 1
 
+# Where compiled forms are kept, if not at home.
+ifneq ($(shell d="$${XDG_CACHE_HOME:-$$HOME/.cache}"; mkdir -p "$$d" 2>/dev/null && test -w "$$d" && echo yes),yes)
+export XDG_CACHE_HOME := $(CURDIR)/build/cache
+endif
+
 BIN := $(VENV)/bin
 SETUP := sh scripts/setup_env.sh
 

@@ -10,9 +10,9 @@
 # limit of each run in seconds; $MPIRUN another launcher. The run of everything on one rank is shared
 # out among two processes, where pytest-xdist is installed.
 #
-# Without --all, tests marked slow are left out, and several ranks run the folders where they have
-# something to do with each other: of whole runs those that are compared with one rank, and on more
-# ranks than two the least. Arguments, such as a folder, are run on all ranks.
+# Without --all, tests marked slow are left out, and several ranks run where they have something to do
+# with each other (between_ranks in tests/marks.py says which tests that are), more than two in the
+# rooms with the most of it. Arguments, such as a folder, are run in full on all ranks.
 set -uo pipefail
 
 cd "$(dirname "$0")/.." || exit 1
@@ -20,29 +20,23 @@ venv=${VENV:-.venv}
 limit=${TEST_TIMEOUT:-1800}
 export OMP_NUM_THREADS=1
 
-# Which tests, besides those that are named; on more ranks than two; and not on several ranks:
-# there no rank hears of another, or programs run that the first run has had.
-which=() few=() alone=()
+# Which tests, besides those that are named; on several ranks; and on more ranks than two.
+which=() several=() few=()
 default="2 3"
 if [[ ${1:-} == --all ]]; then
     shift
     which=(-m "")
     default="2 3 4"
+    if (($# == 0)); then # no rank hears of another there, or programs run that the first run has had
+        several=(--ignore=tests/materials --ignore=tests/benchmarks --ignore=tests/demos)
+    fi
 elif (($# == 0)); then
+    several=(--between-ranks)
     few=(parallel particles transfer physics/test_parallel.py problems/test_fields.py
         system/test_coupling.py system/test_fields.py)
     few=("${few[@]/#/tests/}")
     echo "The quick tests. Those of one folder or file take seconds: make test ARGS=tests/materials," \
         "NP=1 for one rank alone; make test-all runs all, also on four ranks."
-fi
-if (($# == 0)); then
-    alone=(--ignore=tests/materials --ignore=tests/benchmarks --ignore=tests/demos)
-    if ((${#which[@]} == 0)); then
-        for file in tests/physics/test_*.py; do
-            [[ $file == */test_parallel.py || $file == */test_combinations.py ]] ||
-                alone+=("--ignore=$file")
-        done
-    fi
 fi
 
 read -ra numbers <<<"${NP:-$default}"
@@ -107,5 +101,5 @@ for ranks in "${numbers[@]}"; do
     fi
     ((ranks == 2)) || chosen=("${few[@]}")
     MPM_DOLFINX_RANKS=$ranks run "${waiting[@]}" "${launcher[@]}" -n "$ranks" \
-        "$venv/bin/python" -m pytest -p no:cacheprovider "${which[@]}" "${alone[@]}" "${chosen[@]}" "$@"
+        "$venv/bin/python" -m pytest -p no:cacheprovider "${which[@]}" "${several[@]}" "${chosen[@]}" "$@"
 done

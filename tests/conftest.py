@@ -9,6 +9,7 @@ communicator of their own, so that they cannot be mistaken for a test's.
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import io
 import os
@@ -24,8 +25,8 @@ from petsc4py import PETSc
 
 import numpy as np
 import pytest
-
-from dolfinx import jit
+from marks import between_ranks
+from programs import patient_compilers
 
 comm = MPI.COMM_WORLD.Dup()
 
@@ -68,14 +69,28 @@ def pytest_configure(config: pytest.Config) -> None:
             "the launcher does not belong to the MPI library of mpi4py",
             returncode=4,
         )
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        # Two processes may want one form: the second waits until the first has compiled it.
-        _, what = jit.DOLFINX_DEFAULT_JIT_OPTIONS["timeout"]
-        jit.DOLFINX_DEFAULT_JIT_OPTIONS["timeout"] = (300, what)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(patient_compilers())
+        config.add_cleanup(stack.pop_all().close)
     if comm.rank > 0:
         config.pluginmanager.unregister(name="terminalreporter")
         reporter = pytest.TerminalReporter(config, State.quiet)
         config.pluginmanager.register(reporter, "terminalreporter")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--between-ranks",
+        action="store_true",
+        help="leave out what ranks have nothing to do with each other in (marks.between_ranks)",
+    )
+
+
+@pytest.hookimpl(trylast=True)  # of those that are not slow
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("between_ranks"):
+        items[:], others = between_ranks(items)
+        config.hook.pytest_deselected(items=others)
 
 
 def pytest_report_header() -> str:

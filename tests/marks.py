@@ -1,8 +1,28 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Which tests of a family ``make test`` runs, and which are left to ``make test-all``."""
+"""Which tests ``make test`` runs, and which are left to ``make test-all``."""
+
+import re
 
 import pytest
+
+#: Of a family on several ranks: prime to the sizes of most products of parameters.
+EVERY = 7
+#: Whole runs, whose answers one rank has looked at, and how many of them several ranks do again.
+WHOLE_RUNS = re.compile(
+    r"tests/(contact|plot|solvers|stepping)/|/test_(averaging|mixed|porous|stages|supports)\.py"
+)
+SOME = 3
+#: What ranks do together in them: tests that say so stay.
+TOGETHER = re.compile(
+    "checkpoint|combination|ends_on|fail|feature|interrupt|mesh|no_sense|refuse|repartition|"
+    "restart|restore|signal|split"
+)
+#: Physics, texts that are read, arrays that each rank has for itself.
+ALONE = re.compile(
+    r"tests/(benchmarks|demos|docs|materials|physics)/|"
+    r"/test_(house|public_api|law|shapes|whole_step|jacobian_bound)\.py"
+)
 
 
 def slow(*values):
@@ -25,3 +45,36 @@ def thinned(every, cases):
 def all_but(quick, values):
     """Return values of a test's parameter of which only the quick ones are in ``make test``."""
     return [v if v in quick else pytest.param(v, marks=pytest.mark.slow) for v in values]
+
+
+def between_ranks(items):
+    """Part a run on several ranks into what ``make test`` does, and what it leaves to one rank.
+
+    One rank has run everything. Several ranks run
+
+    - in full what has ranks as its subject: files called ``parallel``, functions with ``rank`` in
+      their name, tests marked ``mpi``,
+    - of each other function one in ``EVERY`` of its sets of parameters: a ghost, a boundary between
+      parts or a collective call does not know Poisson's ratio,
+    - in rooms of whole runs only one function in ``SOME``, and each that is about what ranks do
+      together, such as errors, files or other meshes: what runs are made of has its own tests,
+    - of physics, and of what a rank does for itself, only what is about ranks or such things.
+
+    Returns:
+        The tests to run, and the others.
+    """
+    chosen, others, functions, sets = [], [], {}, {}
+    for item in items:
+        path, name = item.nodeid.split("::")[0], getattr(item, "originalname", item.name)
+        if "parallel" in path or "rank" in name or item.get_closest_marker("mpi"):
+            chosen.append(item)
+            continue
+        place = sets[path, name] = sets.get((path, name), -1) + 1
+        left_out = place % EVERY
+        if not TOGETHER.search(name):
+            left_out = left_out or ALONE.search(path)
+            if WHOLE_RUNS.search(path):
+                names = functions.setdefault(path, {})
+                left_out = left_out or names.setdefault(name, len(names)) % SOME
+        (others if left_out else chosen).append(item)
+    return chosen, others

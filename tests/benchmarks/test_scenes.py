@@ -3,11 +3,10 @@
 """Scenes that are measured: particles and stock finite elements on one mesh converge alike."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
+import programs
 import pytest
 from marks import all_but
 
@@ -44,8 +43,7 @@ print(json.dumps(rows))
 def rows(cases, parts=()):
     """Run scenes in a process of their own: benchmarks have modules with names of tests."""
     sizes = {case: SIZES[case] for case in cases}
-    command = [sys.executable, "-c", RUNS, json.dumps(sizes), json.dumps(parts)]
-    done = subprocess.run(command, cwd=BENCHMARKS, capture_output=True, text=True, timeout=300)
+    done = programs.run("-c", RUNS, json.dumps(sizes), json.dumps(parts), cwd=BENCHMARKS)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 

@@ -3,7 +3,6 @@
 """The demos: each is a lecture note that runs by itself, and ends with a check and a picture."""
 
 import ast
-import os
 import re
 import shutil
 import statistics
@@ -11,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import programs
 import pytest
 from marks import all_but
 
@@ -27,7 +27,7 @@ NUMBER = re.compile(r"-?\d+(?:\.\d*)?(?:e[+-]?\d+)?")
 @pytest.mark.skip_in_parallel
 @pytest.mark.parametrize("name", NAMES)
 def test_text_is_a_lecture_note(name):
-    text = (DEMOS / f"{name}.py").read_text()
+    text = (DEMOS / f"{name}.py").read_text("utf-8")
     assert re.search(r"^# Level: [123]\.\d+$", text, re.MULTILINE)
     assert "# It illustrates how to:\n" in text
     assert "\nassert " in text and "\n# ## Exercises\n" in text
@@ -44,9 +44,9 @@ def test_code_fits_into_the_80_columns_of_a_page(name):
         pytest.skip("ruff formats what pages show")
     done = subprocess.run(
         [ruff, "format", "--isolated", "--line-length=80", "-"],
-        input=(DEMOS / f"{name}.py").read_text(),
+        input=(DEMOS / f"{name}.py").read_text("utf-8"),
         capture_output=True,
-        text=True,
+        encoding="utf-8",
         check=True,
     )
     lines = [line for line in done.stdout.splitlines() if not line.startswith("#")]
@@ -55,7 +55,7 @@ def test_code_fits_into_the_80_columns_of_a_page(name):
 
 @pytest.mark.skip_in_parallel
 def test_demos_are_short():
-    lines = [len((DEMOS / f"{name}.py").read_text().splitlines()) for name in NAMES]
+    lines = [len((DEMOS / f"{name}.py").read_text("utf-8").splitlines()) for name in NAMES]
     assert statistics.median(lines) < 120
 
 
@@ -71,7 +71,7 @@ def agrees(found, kept):
 @pytest.mark.skip_in_parallel
 @pytest.mark.parametrize("name", NAMES)
 def test_stands_alone(name):
-    tree = ast.parse((DEMOS / f"{name}.py").read_text())
+    tree = ast.parse((DEMOS / f"{name}.py").read_text("utf-8"))
     imported = {
         module
         for node in ast.walk(tree)
@@ -90,18 +90,7 @@ def test_runs_and_meets_its_own_assertions(name, tmp_path):
     # In a process of its own, from a directory of its own, where it leaves its picture.
     if name == "demo_gmsh_body":
         pytest.importorskip("gmsh", exc_type=(ImportError, OSError))
-    done = subprocess.run(
-        [sys.executable, str(DEMOS / f"{name}.py")],
-        capture_output=True,
-        text=True,
-        timeout=400,
-        cwd=tmp_path,
-        env={
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
-            "MPLBACKEND": "agg",
-        },
-    )
+    done = programs.run(DEMOS / f"{name}.py", cwd=tmp_path, MPLBACKEND="agg")
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() and "Exception ignored" not in done.stderr
     picture = (tmp_path / f"{name.removeprefix('demo_')}.png").read_bytes()

@@ -2,10 +2,9 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Numbers in README.md are those that were measured last."""
 
-import subprocess
-import sys
 from pathlib import Path
 
+import programs
 import pytest
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "readme_numbers.py"
@@ -13,9 +12,7 @@ SCRIPT = Path(__file__).parents[2] / "scripts" / "readme_numbers.py"
 
 @pytest.mark.skip_in_parallel
 def test_the_table_of_the_readme_follows():
-    done = subprocess.run(
-        [sys.executable, str(SCRIPT), "--check"], capture_output=True, text=True, timeout=60
-    )
+    done = programs.run(SCRIPT, "--check")
     assert done.returncode == 0, done.stderr
 
 
@@ -23,9 +20,8 @@ def test_the_table_of_the_readme_follows():
 def test_tables_of_the_documentation_come_from_somewhere():
     """Whether they are new is what ``make studies ARGS=--check`` tells."""
     make = Path(__file__).parents[2] / "docs" / "studies" / "make.py"
-    done = subprocess.run(
-        [sys.executable, str(make), "--still"], capture_output=True, text=True, timeout=120
-    )
+    done = programs.run(make, "--still")
+    assert done.stdout, done.stderr
     *told, total = done.stdout.splitlines()
     assert int(total.split()[0]) > 80
     late = (

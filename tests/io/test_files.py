@@ -5,10 +5,9 @@
 import os
 import socket
 import stat
-import subprocess
-import sys
 from pathlib import Path
 
+import programs
 import pytest
 import scenes
 from marks import slow
@@ -54,15 +53,7 @@ print("and then", sorted(p.name for p in path.parent.iterdir()))
 def test_a_file_that_a_limit_cuts_is_an_error(method, name, limit, tmp_path):
     path = tmp_path / name
     script = LIMITED.format(tests=TESTS, path=str(path), method=method, limit=limit)
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", script],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env=environment,
-        check=False,
-    )
+    done = programs.run("-W", "ignore", "-c", script, OMP_NUM_THREADS="1")
     assert done.returncode == 0, done.stderr
     told, same, left, then = done.stdout.splitlines()
     assert "cannot be written" in told and str(tmp_path) in told

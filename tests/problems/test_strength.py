@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from marks import slow
 from scenes import QUADRILATERAL, at, box, fix, in_order, vectors
 
 from dolfinx import mesh
@@ -102,7 +103,7 @@ def test_strength_is_divided(law):
 
 
 @pytest.mark.filterwarnings("ignore:The domains have 4")
-@pytest.mark.parametrize("mixed", ["pressure", "discontinuous pressure"])
+@pytest.mark.parametrize("mixed", ["pressure", *slow("discontinuous pressure")])
 def test_slope_with_a_pressure_of_its_own(mixed):
     """Cells of H/4 do, by both routes; the strength that was given comes back."""
     ends = []

@@ -12,7 +12,7 @@ from stress import build, checks, generator, worker
 from stress import run as suite
 
 #: How many of each class, and classes whose scenes take long.
-EACH = 3
+EACH = 2
 LONG = ("many_particles", "flow_f_bar", "flow_high_order")
 
 

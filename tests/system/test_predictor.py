@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from laws import Sulky
+from marks import slow
 from scenes import HEXAHEDRON, PLANE, QUADRILATERAL, TRIANGLE, WORLD, A, B
 
 from dolfinx import fem
@@ -126,7 +127,7 @@ def test_fewer_solves_for_the_same_answer(case, ne):
     np.testing.assert_allclose(with_it, without, rtol=0.0, atol=1e-8 * np.abs(without).max())
 
 
-@pytest.mark.parametrize("g0", [20e3, 80e3])
+@pytest.mark.parametrize("g0", [20e3, *slow(80e3)])
 def test_flow_takes_no_more_solves(g0):
     positions, histories = [], []
     for predictor in (False, True):
