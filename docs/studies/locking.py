@@ -36,6 +36,15 @@ BEAM = {
     'degree 2, `"domain"`': "--degree 2 --f-bar domain",
 }
 MIXED = [(0.5, 0.0), (0.5, 0.1), (0.5, 0.37), (0.5, 2e-9), (0.25, 0.0), (0.25, 0.37)]
+TUBE = {
+    '`mixed="pressure"`': "",
+    "shifted by 0.37 cells": "--offset 0.37",
+    "cells of half the wall, shifted": "--offset 0.37 --cells 2",
+    '`"discontinuous pressure"`, shifted': "--offset 0.37 --mixed discontinuous",
+    "displacements alone": "--mixed none",
+    "displacements alone, shifted": "--mixed none --offset 0.37",
+    'degree 1, `"patch"`, shifted': "--mixed none --degree 1 --f-bar patch --offset 0.37",
+}
 COLUMNS = {
     'quadrilaterals, `"domain"`': "--f-bar domain",
     'quadrilaterals, `"patch"`': "--f-bar patch",
@@ -81,6 +90,13 @@ def mixed(cell: float, offset: float) -> list[Any]:
     options = ["--poisson", 0.4999, "--degree", 2, "--mixed", "pressure"]
     r = run("cantilever", *options, "--cell", cell, "--offset", offset * cell)
     return [share(r, scientific(r["error"])), r["iterations"], r["cutbacks"]]
+
+
+def tube(options: str) -> list[Any]:
+    asked = [f"{word} pressure" if word == "discontinuous" else word for word in options.split()]
+    r = run("expansion", *asked)
+    errors = [scientific(r[key]) for key in ("error_early", "error")]
+    return [*errors, r["iterations"], r["cutbacks"]]
 
 
 def columns(options: str) -> list[str]:
@@ -131,6 +147,13 @@ def tables() -> dict[str, Table]:
             },
             quick=["0.5 m; 0 cells"],
             cases=["cantilever"],
+        ),
+        "locking/expansion": Table(
+            "locking",
+            ["", "radius 1.02", "1.5 to 8.5, largest", "linear solves", "cutbacks"],
+            {name: partial(tube, options) for name, options in TUBE.items()},
+            quick=list(TUBE)[:1],
+            cases=["expansion"],
         ),
         "locking/columns": Table(
             "locking",

@@ -21,7 +21,7 @@ LONG = {
     *("vortex", "disc", "discs", "discs-contact", "column"),
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
     *("slope", "vertical-cut", "footing-friction"),
-    *("stiff-footing", "hertz", "hertz-penalty"),
+    *("stiff-footing", "hertz", "hertz-penalty", "expansion-whole"),
     *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
 }
 COMMON = {"completed", "load", "iterations", "cutbacks", "failure"}
@@ -100,6 +100,12 @@ RUNS = {
         "--elements 8",
         {"error_axisymmetric": 1e-3, "error_plane": 1e-3},
     ),
+    "expansion": (
+        "expansion",
+        "--cells 4 --steps 20 --widest 4 --offset 0.37",
+        {"error_early": 1e-4, "error": 1e-4, "iterations": 250, "cutbacks": 0},
+    ),
+    "expansion-whole": ("expansion", "", {"error_early": 1e-5, "error": 1e-5, "iterations": 800}),
     "crossing": ("cell_crossing", "--steps 20", {"scatter_cpdi2": 0.02, "scatter_gimp": 0.025}),
     "block-hex": ("block3d", "--elements 2 --steps 20", {"volume_error": 0.05}),
     "block-tet": (
@@ -222,6 +228,7 @@ KEYS = {
         for method in ("mpm", "gimp", "cpdi", "cpdi2")
     },
     "cylinder": {"error_axisymmetric", "error_plane", "rate"},
+    "expansion": {"radius", "error_early", "error", "particles"},
     "cell_crossing": {f"scatter_{method}" for method in ("mpm", "gimp", "cpdi", "cpdi2")},
     "block3d": {"height", "barrel", "volume_error", "reaction"},
     "gmsh_body": {"error_reaction", "error_area"},
@@ -268,7 +275,7 @@ def test_numbers(case, capfd):
     assert COMMON | KEYS[name] <= numbers.keys()
     assert not any("time" in key or "seconds" in key for key in numbers)
     assert numbers["completed"] == 1 and numbers["failure"] is None
-    assert numbers["load"] == 1.0 or name in {"snap_through", *IN_TIME}
+    assert numbers["load"] == 1.0 or name in {"snap_through", "expansion", *IN_TIME}
     assert (numbers["iterations"] > 0) == (name != "domain_distortion")  # there all is prescribed
     for key, bound in bounds.items():
         assert numbers[key] <= bound, key
