@@ -400,6 +400,7 @@ def test_case_is_a_program(name, tmp_path):
         "collapse": "--cell 2 --particles-per-cell 1 --f-bar domain --steps 4",
         "footing": "--cell 0.5 --steps 4",
         "consolidation": "--cells 4 --steps 2",
+        "expansion": "--cells 2 --steps 4 --widest 2",
         "strength": "--cell 0.5",
         "gmsh_body": "--size 0.3 --body-size 0.3 --steps 2",
         "snap_through": "--cell 1 --steps 4",
