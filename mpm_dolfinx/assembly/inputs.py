@@ -18,6 +18,7 @@ from ..materials.base import Material
 from ..meshes.quadrature import quadrature_rule
 from ..parallel.given import require_same
 from ..particles.particles import Particles
+from ..reals import as_reals, holds_ufl
 
 __all__ = ["Density", "as_expression", "facet_measure", "functions_of", "is_tag", "known_tags"]
 
@@ -47,9 +48,15 @@ def _expression(value: Any, particles: Particles, name: str, shape: tuple[int, .
             value = value(particles.mesh)
         except Exception as error:
             raise as_ours(error, f"The function that makes {name}") from error
+    if isinstance(value, list | tuple) and holds_ufl(value):
+        # (with its Constants, whose values may change, and not what they are now)
+        try:
+            value = ufl.as_tensor(value)
+        except Exception as error:
+            raise as_ours(error, f"{name} must be numbers or UFL") from error
     if not isinstance(value, ufl.core.expr.Expr):
         try:
-            array = np.asarray(value, dtype=np.float64)
+            array = as_reals(value)
         except (TypeError, ValueError):
             raise MPMError(f"{name} must be numbers or a UFL expression, not {value!r}.") from None
         if not np.all(np.isfinite(array)):

@@ -20,6 +20,7 @@ from ..io.snapshot import Taken
 from ..meshes.remesh import Column
 from ..parallel.given import require_same
 from ..particles.particles import Particles
+from ..reals import as_reals, is_one_of
 from ..system.term import PointMaterial
 from .behind import Behind, ThroughGroups
 from .contact import Contact, Outcome, stiffness
@@ -135,7 +136,7 @@ class Rigid(Contact):
         if shape.dim != gdim:
             raise MPMError(f"The shape is one in {shape.dim} dimensions, the body in {gdim}.")
         rubs = as_friction(friction)
-        if law not in LAWS:
+        if not is_one_of(law, LAWS):
             raise MPMError(f"law must be one of {', '.join(map(repr, LAWS))}, not {law!r}.")
         require_same(
             particles.mesh.comm,
@@ -184,8 +185,8 @@ class Rigid(Contact):
         gdim = len(self._pose.offset)
         count = len(self._pose.angle)
         try:
-            to = np.array(offset, dtype=np.float64)
-            turn = np.atleast_1d(np.array(angle, dtype=np.float64))
+            to = as_reals(offset)
+            turn = np.atleast_1d(as_reals(angle))
         except (TypeError, ValueError):
             to = turn = np.zeros(0)
         if count == 3 and turn.shape == (1,) and turn[0] == 0.0:

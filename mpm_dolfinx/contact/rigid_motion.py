@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
+from ..reals import as_reals
 from .rotation import Pose, Turn, cayley_variation, crossing
 
 __all__ = ["RigidMotion", "State", "as_inertia", "as_rotation", "held_of", "names_of"]
@@ -249,7 +250,7 @@ def as_rotation(value: Any, name: str, gdim: int) -> NDArray[np.float64]:
     """
     count = 1 if gdim == 2 else 3
     try:
-        found = np.atleast_1d(np.array(value, dtype=np.float64))
+        found = np.atleast_1d(as_reals(value))
     except (TypeError, ValueError):
         found = np.zeros(0)
     if count == 3 and found.shape == (1,) and found[0] == 0.0:
@@ -276,7 +277,7 @@ def as_inertia(value: Any, gdim: int) -> NDArray[np.float64]:
         MPMError: It is none: not symmetric, or not positive.
     """
     try:
-        found = np.array(value, dtype=np.float64)
+        found = as_reals(value)
     except (TypeError, ValueError):
         found = np.zeros(0)
     count = 1 if gdim == 2 else 3

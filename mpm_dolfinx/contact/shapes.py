@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError, as_ours
+from ..reals import as_reals
 
 __all__ = [
     "Shape",
@@ -259,7 +260,7 @@ class _Given(Shape):
 
     def _values(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         try:
-            phi = np.asarray(self._function(y), dtype=np.float64)
+            phi = as_reals(self._function(y))
         except Exception as error:
             raise as_ours(error, "The signed distance of a shape") from error
         if phi.shape != (len(y),) or not np.isfinite(phi).all():
@@ -381,7 +382,7 @@ def polygon(corners: Any, radius: float = 0.0) -> Shape:
         MPMError: No polygon, or one that is too small for the radius.
     """
     try:
-        given = np.asarray(corners, dtype=np.float64)
+        given = as_reals(corners)
     except (TypeError, ValueError):
         given = np.zeros(0)
     if given.ndim != 2 or given.shape[1] != 2 or len(given) < 3 or not np.isfinite(given).all():
@@ -451,7 +452,7 @@ def as_point(value: Any, name: str, dim: int | None = None) -> NDArray[np.float6
         MPMError: They are none.
     """
     try:
-        vector = np.asarray(value, dtype=np.float64)
+        vector = as_reals(value)
     except (TypeError, ValueError):
         vector = np.zeros(0)
     dims = (2, 3) if dim is None else (dim,)

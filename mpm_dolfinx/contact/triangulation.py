@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ..errors import MPMError, agree, as_ours
 from ..plot.outlines import surface_algorithm
+from ..reals import as_reals
 from .nearest import FacetTree
 from .shapes import Shape, as_direction, as_point, as_positive, as_radius
 
@@ -281,7 +282,7 @@ def terrain(x: Any, y: Any, heights: Any, *, radius: float = 0.0, pivot: Any = N
         MPMError: No grid of heights, or a radius that is too large.
     """
     try:
-        first, second, z = (np.asarray(v, dtype=np.float64) for v in (x, y, heights))
+        first, second, z = (as_reals(v) for v in (x, y, heights))
     except (TypeError, ValueError):
         first = second = z = np.zeros(0)
     good = first.ndim == second.ndim == 1 and min(len(first), len(second)) > 1

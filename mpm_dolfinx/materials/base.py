@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError, agree
+from ..reals import as_reals
 from .given_pressure import AtPressure, at_pressure
 from .kinematics import KINEMATICS, Kinematics
 from .mandel import norm, num_components, to_tensor, to_vector
@@ -459,7 +460,7 @@ def check_parameter(
     held = isinstance(getattr(value, "value", None), np.ndarray)  # a Constant
     given: Any = value.x.array if hasattr(value, "x") else getattr(value, "value", value)
     try:
-        values = np.array(given, dtype=np.float64)
+        values = as_reals(given)
     except (TypeError, ValueError):
         raise MPMError(f"{name} must be a number or one number per point, not {value!r}") from None
     if held and values.ndim > 0:

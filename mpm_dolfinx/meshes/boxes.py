@@ -17,6 +17,7 @@ from dolfinx import mesh
 from .. import _compat
 from ..errors import MPMError, agree
 from ..parallel.exchange import swap
+from ..reals import as_reals
 
 __all__ = ["BOX_CELLS", "mesh_of_boxes"]
 
@@ -39,13 +40,13 @@ def mesh_of_boxes(comm: MPI.Comm, points: Any, lengths: Any, gdim: int) -> mesh.
     """
     with agree(comm):
         try:
-            centres = np.asarray(points, dtype=np.float64)
+            centres = as_reals(points)
         except (TypeError, ValueError):
             centres = np.array(np.nan)
         if centres.ndim != 2 or centres.shape[1] != gdim or not np.isfinite(centres).all():
             raise MPMError(f"points must be finite and of shape (n, {gdim}).")
         try:
-            sides = np.broadcast_to(np.asarray(lengths, np.float64), centres.shape)
+            sides = np.broadcast_to(as_reals(lengths), centres.shape)
         except (TypeError, ValueError):
             raise MPMError(
                 f"lengths must be a number or of shape {centres.shape}, not {np.shape(lengths)}."

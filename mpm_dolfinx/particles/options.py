@@ -22,6 +22,7 @@ from ..meshes.boxes import BOX_CELLS
 from ..meshes.jacobian_bound import JacobianBound
 from ..meshes.quadrature import default_degree
 from ..parallel.exchange import swap
+from ..reals import is_one_of
 from ..transfer.methods import METHODS
 
 __all__ = [
@@ -159,7 +160,7 @@ def validate_options(
 ) -> None:
     """Raise an error unless method, degrees and policies go together."""
     element = V.ufl_element()
-    if method not in METHODS:
+    if not is_one_of(method, METHODS):
         raise MPMError(f"Unknown method {method!r}; choose one of {', '.join(map(repr, METHODS))}.")
     _validate_degrees(body, element.degree, degree)
     if METHODS[method].one_point and (element.degree, degree, quadrature_degree or 1) != (1, 1, 1):
@@ -179,9 +180,9 @@ def validate_options(
             f"{degree}; use quadrature_degree={default_degree(body.basix_cell().name, degree)} "
             "or more."
         )
-    if outside not in ("error", "stop", "delete"):
+    if not is_one_of(outside, ("error", "stop", "delete")):
         raise MPMError(f"Unknown policy outside={outside!r}; choose 'error', 'stop' or 'delete'.")
-    if domain_update not in ("stretch", "fixed"):
+    if not is_one_of(domain_update, ("stretch", "fixed")):
         raise MPMError(f"Unknown domain_update={domain_update!r}; choose 'stretch' or 'fixed'.")
 
 
@@ -189,7 +190,7 @@ def validate_distortion(
     body: mesh.Mesh, method: str, degree: int, quadrature_degree: int | None, policy: str
 ) -> None:
     """Raise an error unless the policy for distorted domains is one for these domains."""
-    if policy not in ("error", "split"):
+    if not is_one_of(policy, ("error", "split")):
         raise MPMError(f"Unknown policy on_distortion={policy!r}; choose 'error' or 'split'.")
     plain = (body.basix_cell(), _compat.geometry_degree(body)) == (BOX_CELLS[0], 1)
     one_point = plain and (method, degree) == ("cpdi2", 1) and quadrature_degree in (None, 0, 1)

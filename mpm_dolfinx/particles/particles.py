@@ -23,6 +23,7 @@ from ..meshes.redistribution import Carrier, Redistribution, cell_centres
 from ..meshes.remesh import Column, Cuts, Remesh
 from ..meshes.trail import Trail
 from ..parallel.given import require_same
+from ..reals import is_one_of
 from ..transfer.method import CornerBasis, DomainState, ParticleState
 from ..transfer.methods import METHODS
 from ..transfer.transfer import Transfer
@@ -138,7 +139,7 @@ class Particles(MaterialDomains):
         )
         validate_options(body, V, method, degree, quadrature_degree, outside, domain_update)
         validate_distortion(body, method, degree, quadrature_degree, on_distortion)
-        if partition not in ("given", "background"):
+        if not is_one_of(partition, ("given", "background")):
             raise MPMError(f"Unknown partition={partition!r}; choose 'given' or 'background'.")
         validate_cells(body, "body")
         validate_cells(V.mesh, "background")

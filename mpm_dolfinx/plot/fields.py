@@ -16,6 +16,7 @@ from dolfinx import fem
 
 from ..errors import MPMError, agree
 from ..particles.particles import Particles
+from ..reals import as_reals
 
 __all__ = ["LABELS", "bodies_of", "values_of"]
 
@@ -78,7 +79,7 @@ def _given(body: Particles, values: Any) -> NDArray[np.float64]:
         if values.function_space.mesh is not body.mesh:
             raise MPMError(f"The Function {values.name!r} is not on the mesh of its body.")
         return _of_function(body, values)
-    array = np.asarray(values, dtype=np.float64)
+    array = as_reals(values)
     if array.shape != (body.num_local,):
         raise MPMError(
             f"values must have the shape ({body.num_local},), one value for each particle "

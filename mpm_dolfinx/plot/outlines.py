@@ -19,6 +19,7 @@ from dolfinx import fem, mesh
 from .. import _compat
 from ..errors import MPMError, agree
 from ..particles.particles import Particles
+from ..reals import as_reals
 
 __all__ = ["background", "domains", "edges", "grid", "imported", "outlines", "surface_algorithm"]
 
@@ -70,7 +71,7 @@ def domains(
     """
     comm: MPI.Comm = particles.mesh.comm
     _require_plane(particles.mesh)
-    shown = None if values is None else np.asarray(values, dtype=np.float64)
+    shown = None if values is None else as_reals(values)
     with agree(comm):
         if shown is not None and shown.shape != (particles.num_local,):
             raise MPMError(

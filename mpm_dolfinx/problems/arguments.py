@@ -29,6 +29,7 @@ __all__ = [
     "as_bodies",
     "as_conditions",
     "as_fields",
+    "as_loads",
     "as_supports",
     "as_terms",
     "by_space",
@@ -76,6 +77,26 @@ def as_bodies(particles: Particles | Sequence[Particles]) -> list[Particles]:
             "ranks."
         )
     return list(bodies)
+
+
+def as_loads(name: str, loads: Any) -> Sequence[Any]:
+    """Return loads on facets, or a list of them for each body, as they are given.
+
+    Args:
+        name: What they are called in a message.
+        loads: What is given; ``None``: none.
+
+    Raises:
+        MPMError: No list, such as a ``zip`` that is empty after it was looked at once.
+    """
+    if loads is None:
+        return ()
+    if not isinstance(loads, list | tuple):
+        raise MPMError(
+            f"{name} must be a list of pairs of a value and a tag, such as [(1.0, 1)], not "
+            f"{type(loads).__name__}."
+        )
+    return loads
 
 
 def as_fields(fields: Any, bodies: Sequence[Particles]) -> list[ParticleField]:

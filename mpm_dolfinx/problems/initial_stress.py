@@ -18,6 +18,7 @@ from ..assembly.inputs import as_expression
 from ..errors import MPMError, agree, as_ours
 from ..meshes.quadrature import quadrature_rule
 from ..particles.particles import Particles
+from ..reals import as_reals
 
 __all__ = ["geostatic", "initial_stress_at_points", "of_all_ranks"]
 
@@ -102,11 +103,11 @@ def geostatic(
     """
     try:
         g = np.zeros(3)
-        g[: len(gravity)] = np.asarray(gravity, dtype=np.float64)
+        g[: len(gravity)] = as_reals(gravity)
         layers = [(np.inf, float(density))] if np.ndim(density) == 0 else list(density)  # type: ignore[arg-type]
-        thickness, densities = np.array(layers, dtype=np.float64).T
-        ratios = np.broadcast_to(np.asarray(K0, dtype=np.float64), len(layers))
-        numbers = np.array([surface, surcharge], dtype=np.float64)
+        thickness, densities = as_reals(layers).T
+        ratios = np.broadcast_to(as_reals(K0), len(layers))
+        numbers = as_reals([surface, surcharge])
     except (TypeError, ValueError):
         raise MPMError(
             "geostatic needs a level, a density or layers (pairs of a thickness and a density), "
@@ -177,7 +178,7 @@ def _at_points(value: Any, particles: Particles) -> Array:
         points = particles.initial_points
         x[: points.shape[-1]] = points.reshape(n * nq, -1).T
         try:
-            found = np.asarray(value(x), dtype=np.float64)
+            found = as_reals(value(x))
         except MPMError:
             raise
         except Exception as error:
@@ -189,7 +190,7 @@ def _at_points(value: Any, particles: Particles) -> Array:
             )
         return np.moveaxis(found, -1, 0).reshape(n, nq, 3, 3)
     try:
-        array = np.asarray(value, dtype=np.float64)
+        array = as_reals(value)
     except (TypeError, ValueError):
         array = np.zeros(0)
     if array.shape not in ((3, 3), (n, 3, 3), (n, nq, 3, 3)):

@@ -28,6 +28,7 @@ from ..errors import MPMError, agree, as_ours
 from ..history import Energy
 from ..parallel.garbage import weakly
 from ..particles.particles import Particles
+from ..reals import as_reals
 from ..system.inertia import Followed, Inertia
 from ..system.term import PointMaterial
 from .arguments import as_bodies
@@ -223,7 +224,7 @@ def rayleigh_of(values: Any) -> tuple[float, float]:
         MPMError: They are not two numbers, or negative.
     """
     try:
-        alpha, beta = map(float, values)
+        alpha, beta = as_reals(values).tolist()
     except (TypeError, ValueError):
         raise MPMError(f"rayleigh must be (alpha, beta), two numbers, not {values!r}.") from None
     if not (0.0 <= alpha < math.inf and 0.0 <= beta < math.inf):

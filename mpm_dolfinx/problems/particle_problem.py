@@ -990,7 +990,9 @@ def _on_backgrounds(
     """
     own: list[list[Any]] = [[] for _ in groups]
     for form in _as_list(background):
-        arguments = form.arguments() if isinstance(form, ufl.Form) else ()
+        if not isinstance(form, ufl.Form):
+            raise MPMError(f"background must be UFL forms, not {type(form).__name__}.")
+        arguments = form.arguments()
         spaces = [argument.ufl_function_space() for argument in arguments]
         number = next((n for n, group in enumerate(groups) if group[0].V in spaces), 0)
         require_background_fields(form, groups[number])

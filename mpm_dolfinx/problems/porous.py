@@ -34,6 +34,7 @@ from ..materials.base import Material
 from ..parallel.given import require_same
 from ..particles.field import ParticleField
 from ..particles.particles import Particles
+from ..reals import as_reals
 from ..system.term import PointMaterial
 from .arguments import as_bodies
 from .particle_problem import Contribution, Law
@@ -660,7 +661,7 @@ def _begin_with(field: ParticleField, value: Any) -> None:
         elif callable(value):
             x = field.W.tabulate_dof_coordinates().T
             try:
-                values = np.asarray(value(x), dtype=np.float64)
+                values = as_reals(value(x))
             except Exception as error:
                 raise as_ours(error, "The function that gives pore_pressure") from error
             if values.shape != x.shape[1:]:

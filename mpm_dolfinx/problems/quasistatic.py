@@ -32,7 +32,7 @@ from ..system.body import StepForce
 from ..system.pressure import PressureTerm
 from ..system.term import Term
 from ..system.values import FieldTerm
-from .arguments import as_bodies, as_supports, as_terms
+from .arguments import as_bodies, as_loads, as_supports, as_terms
 from .initial_stress import initial_stress_at_points, of_all_ranks
 from .particle_problem import Contribution, Law, ParticleProblem
 from .remeshing import Remeshing, as_indices
@@ -143,6 +143,7 @@ class QuasiStaticProblem(ParticleProblem):
         mixed: str | None = None,
     ) -> None:
         bodies = as_bodies(particles)
+        tractions, pressures = as_loads("tractions", tractions), as_loads("pressures", pressures)
         require_same(
             bodies[0].V.mesh.comm,
             particles=particles,
@@ -321,7 +322,8 @@ class QuasiStaticProblem(ParticleProblem):
             ("facet_tags", facet_tags, False),
         ):
             if value is not ...:
-                for own, part in zip(changes, _for_each(value, count, pairs), strict=True):
+                wanted = as_loads(key, value) if pairs else value
+                for own, part in zip(changes, _for_each(wanted, count, pairs), strict=True):
                     own[key] = part
         if supports is not ...:
             every = as_supports(supports, bodies)
@@ -429,8 +431,8 @@ class QuasiStaticProblem(ParticleProblem):
             material,
             density,
             body_force,
-            tractions,
-            pressures,
+            as_loads("tractions", tractions),
+            as_loads("pressures", pressures),
             cell_tags,
             facet_tags,
             tuple(as_supports(supports, [particles])),

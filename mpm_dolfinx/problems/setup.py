@@ -18,6 +18,7 @@ from mpi4py import MPI
 import numpy as np
 
 import ufl
+from dolfinx import mesh
 
 from ..assembly.fused import is_fast
 from ..boundary.supports import Support
@@ -25,6 +26,7 @@ from ..constitutive.averaging import F_BARS
 from ..errors import MPMError
 from ..parallel.given import require_same
 from ..particles.particles import Particles
+from ..reals import is_one_of
 from ..solvers.linear import LINEAR_SOLVERS
 from ..system.term import Term
 from .arguments import carried, holds
@@ -74,7 +76,8 @@ class Numerics:
             MPMError: They differ between ranks, or there is no such thing.
         """
         require_same(comm, petsc_options=petsc_options, **options)
-        return cls(petsc_options=petsc_options or {}, **options)
+        given = {} if petsc_options is None else petsc_options
+        return cls(petsc_options=given, **options)
 
     def __post_init__(self) -> None:
         """Say so where something is unknown."""
@@ -92,11 +95,11 @@ class Numerics:
             ):
                 continue
             raise MPMError(f"{name} must be a dictionary of options by their names, not {given!r}.")
-        if self.dependent_dofs not in ("shift", "remove"):
+        if not is_one_of(self.dependent_dofs, ("shift", "remove")):
             raise MPMError(
                 f"Unknown dependent_dofs={self.dependent_dofs!r}; choose 'shift' or 'remove'."
             )
-        if self.linear_solver not in LINEAR_SOLVERS:
+        if not is_one_of(self.linear_solver, LINEAR_SOLVERS):
             raise MPMError(
                 f"Unknown linear_solver={self.linear_solver!r}; choose one of "
                 f"{', '.join(map(repr, LINEAR_SOLVERS))}."
@@ -150,6 +153,13 @@ class BodySetup:
     facet_tags: Any
     supports: tuple[Support, ...]
     more: Mapping[str, Any] = MappingProxyType({})
+
+    def __post_init__(self) -> None:
+        """Say so where something is no tags."""
+        for name in ("cell_tags", "facet_tags"):
+            tags = getattr(self, name)
+            if tags is not None and not isinstance(tags, mesh.MeshTags):
+                raise MPMError(f"{name} must be dolfinx MeshTags, not {type(tags).__name__}.")
 
     def in_words(self) -> str:
         """Return the laws, and what loads and holds the body."""
@@ -241,7 +251,9 @@ class Setup:
 
     def __post_init__(self) -> None:
         """Say so where something is unknown."""
-        if self.f_bar not in F_BARS:
+        if not isinstance(self.axisymmetric, bool | np.bool_):
+            raise MPMError(f"axisymmetric must be True or False, not {self.axisymmetric!r}.")
+        if not is_one_of(self.f_bar, F_BARS):
             raise MPMError(
                 f"Unknown f_bar={self.f_bar!r}; choose one of {', '.join(map(repr, F_BARS))}."
             )
@@ -256,7 +268,7 @@ class Setup:
 
     def _require_mixed(self) -> None:
         """Raise an error unless a pressure can be an unknown of all bodies."""
-        if not isinstance(self.mixed, str) or self.mixed not in MIXED:
+        if not is_one_of(self.mixed, MIXED):
             known = ", ".join(map(repr, MIXED))
             raise MPMError(f"Unknown mixed={self.mixed!r}; choose {known} or None.")
         if self.f_bar != "none":

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from ..errors import MPMError
 from ..particles.particles import Particles
+from ..reals import is_one_of
 from .aggregation import Aggregation
 from .cure import Cure
 from .dependent_dofs import DependentDofs
@@ -42,7 +43,7 @@ def stabilisation_of(
         MPMError: Something else, a method whose particles are not moved at their nodes, or two
             cures.
     """
-    if kind is not None and kind not in KINDS:
+    if kind is not None and not is_one_of(kind, KINDS):
         raise MPMError(
             f"Unknown stabilisation={kind!r}; choose {', '.join(map(repr, KINDS))} or None."
         )

@@ -22,6 +22,7 @@ from ..errors import MPMError, agree
 from ..parallel.given import require_same
 from ..particles.geometry import RING
 from ..particles.particles import Particles
+from ..reals import as_reals
 from ..system.reduced import ReducedSystem
 
 __all__ = ["ControlledSystem", "DisplacementControl"]
@@ -428,7 +429,7 @@ def _is_number(value: Any) -> bool:
 def _vector(value: Any, particles: Particles, name: str) -> NDArray[np.float64]:
     gdim = particles.mesh.geometry.dim
     try:
-        array = np.asarray(value, dtype=np.float64)
+        array = as_reals(value)
     except (TypeError, ValueError):
         array = np.zeros(0)
     if array.shape != (gdim,) or not np.isfinite(array).all():

@@ -40,6 +40,7 @@ from ..history import Energy
 from ..io.snapshot import Kept, Taken, fill, of_cells, spaces_of
 from ..meshes.remesh import Column
 from ..particles.particles import Particles
+from ..reals import is_one_of
 from .term import Motion, Term, Transfer
 
 __all__ = ["OUT_OF_RANGE", "SCHEMES", "Inertia"]
@@ -141,9 +142,9 @@ class Inertia(Term):
         energies: list[Energy],
         static: Sequence[Particles] = (),
     ) -> None:
-        if scheme not in SCHEMES:
+        if not is_one_of(scheme, SCHEMES):
             raise MPMError(f"Unknown scheme={scheme!r}; choose one of {', '.join(SCHEMES)}.")
-        if out_of_range not in OUT_OF_RANGE:
+        if not is_one_of(out_of_range, OUT_OF_RANGE):
             raise MPMError(
                 f"Unknown out_of_range={out_of_range!r}; choose one of {', '.join(OUT_OF_RANGE)}."
             )

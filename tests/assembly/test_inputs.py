@@ -9,6 +9,8 @@ from bad_input import held, particles, problem, tags_of_facets, with_one_value
 from compare import raises
 from scenes import QUADRILATERAL, TRIANGLE
 
+from dolfinx import fem
+
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import Hencky
 
@@ -80,3 +82,38 @@ def test_tag_that_is_on_facets_inside_too(what):
         return
     value = 1.0 if what == "pressures" else (1.0, 0.0)
     raises(problem(facet_tags=tags, **{what: [(value, 1)]}), mpm.MPMError, sentence)
+
+
+def test_a_constant_among_numbers_is_followed():
+    p, other = (particles() for _ in range(2))
+    gravity = fem.Constant(p.mesh, -1.0)
+    options = {"density": 2.0, "stabilisation": None}
+    bcs = [[scenes.fix(q.V, scenes.at(1, -1.0))] for q in (p, other)]
+    tags = tags_of_facets(p)
+    held = [mpm.boundary.fixed(q, tags_of_facets(q), 1) for q in (p, other)]
+    problem = mpm.QuasiStaticProblem(
+        p,
+        Hencky(1e3, 0.3),
+        body_force=(0.0, gravity),
+        tractions=[((gravity, 0.0), 1)],
+        facet_tags=tags,
+        bcs=bcs[0],
+        supports=held[:1],
+        **options,
+    )
+    problem.solve(2, update=lambda t: np.copyto(gravity.value, -5.0 * t))
+    expected = mpm.QuasiStaticProblem(
+        other,
+        Hencky(1e3, 0.3),
+        body_force=(0.0, -5.0),
+        tractions=[((-5.0, 0.0), 1)],
+        facet_tags=tags_of_facets(other),
+        bcs=bcs[1],
+        supports=held[1:],
+        **options,
+    )
+    expected.solve(2)
+    gap = scenes.in_order(p, p.centroid) - scenes.in_order(other, other.centroid)
+    assert np.abs(scenes.own(other.displacement)).max(initial=0.0) < 1.0
+    assert np.abs(gap).max() < 1e-9
+    assert scenes.largest(other.displacement.x.array) > 1e-4

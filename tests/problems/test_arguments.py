@@ -360,6 +360,23 @@ PROBLEMS = {
         held("plane", point="origin", normal=(0.0, 1.0)),
         r"point must be numbers",
     ),
+    "complex force": (problem(body_force=(0.0, 1j)), r"body_force must be numbers or"),
+    "force of UFL of several shapes": (
+        problem(body_force=lambda p: (0.0, fem.Constant(p.mesh, np.ones(2)))),
+        r"body_force must be numbers or UFL",
+    ),
+    "tractions in a zip": (
+        problem(tractions=zip([(1.0, 0.0)], [1], strict=True), facet_tags=tags_of_facets),
+        r"tractions must be a list of pairs.*not zip",
+    ),
+    "pressures of a generator": (
+        problem(pressures=(load for load in [(1.0, 1)]), facet_tags=tags_of_facets),
+        r"pressures must be a list of pairs.*not generator",
+    ),
+    "tags in words": (problem(cell_tags="sand"), r"cell_tags must be dolfinx MeshTags, not str"),
+    "an axis in words": (problem(axisymmetric="no"), r"axisymmetric must be True or False"),
+    "averages in an array": (problem(f_bar=np.zeros(2)), r"Unknown f_bar=array"),
+    "background in words": (problem(background="soft"), r"background must be UFL forms, not str"),
     "traction is no pair": (
         problem(tractions=[(1.0, 0.0, 1)], facet_tags=tags_of_facets),
         r"traction",

@@ -1,0 +1,52 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What a user has given, taken for real numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ufl
+from dolfinx import fem
+
+__all__ = ["as_reals", "holds_ufl", "is_one_of"]
+
+
+def as_reals(value: Any) -> NDArray[np.float64]:
+    """Return numbers as a new array.
+
+    Raises:
+        TypeError: Complex numbers, whose imaginary part would be dropped, or UFL that has no value
+            (NumPy goes through the components of a scalar without end).
+        ValueError: Something else that is none.
+    """
+    if holds_ufl(value, fem.Constant):
+        raise TypeError("UFL is no number")
+    array = np.asarray(value)
+    if np.iscomplexobj(array):
+        raise TypeError("complex numbers")
+    try:
+        return np.array(array, dtype=np.float64)
+    except OverflowError as error:
+        raise ValueError("too large a number") from error
+
+
+def holds_ufl(value: Any, *besides: type) -> bool:
+    """Return whether a value is UFL, or a list that holds some.
+
+    Args:
+        value: Anything.
+        *besides: Kinds of UFL that do not count.
+    """
+    if isinstance(value, list | tuple):
+        return any(holds_ufl(part, *besides) for part in value)
+    return isinstance(value, ufl.core.expr.Expr) and not isinstance(value, besides)
+
+
+def is_one_of(value: Any, names: Collection[str]) -> bool:
+    """Return whether a value is one of some names."""
+    return isinstance(value, str) and value in names
