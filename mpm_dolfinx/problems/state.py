@@ -102,7 +102,6 @@ class ProblemState:
         self.kept: list[tuple[Term | None, Kept]] = []
         self._stages: list[str] = []
         self._identity: dict[str, Any] | None = None
-        self._remeshed = False
 
     @property
     def _problem(self) -> Stateful:
@@ -189,7 +188,6 @@ class ProblemState:
     def before_remeshing(self) -> None:
         """Note what the problem is known by, before its body meshes change (collective)."""
         self._identity = self.identity()
-        self._remeshed = True
 
     def after_stage(self, name: str, first: dict[str, Any]) -> None:
         """Note that the problem is another one now.
@@ -212,7 +210,7 @@ class ProblemState:
         Raises:
             MPMError: Functions that cannot be kept, or that are missing.
         """
-        if functions and self._remeshed:
+        if functions and any(len(body.cuts) or body.rebases for body in self._problem.bodies):
             raise MPMError(
                 "Domains were split or the body rebased, so functions= on its new mesh could not "
                 "be restored; save the state without them."
