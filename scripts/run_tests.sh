@@ -32,8 +32,7 @@ if [[ ${1:-} == --all ]]; then
     fi
 elif (($# == 0)); then
     several=(--between-ranks)
-    few=(parallel particles transfer physics/test_parallel.py problems/test_fields.py
-        system/test_coupling.py system/test_fields.py)
+    few=(parallel particles transfer physics/test_parallel.py problems/test_fields.py)
     few=("${few[@]/#/tests/}")
     echo "The quick tests. Those of one folder or file take seconds: make test ARGS=tests/materials," \
         "NP=1 for one rank alone; make test-all runs all, also on four ranks."
