@@ -19,7 +19,7 @@ from .. import _compat
 from .contact import Outcome
 from .facets import Closest, NearFacets
 from .law import Coulomb, Points
-from .stencil import Start, Stencil, acting, derivatives, projected
+from .stencil import Foot, Start, Stencil, acting, derivatives, projected
 from .surface import Blocks, Surface, global_dofs, normals
 
 __all__ = ["Memory", "Pass"]
@@ -30,6 +30,8 @@ REACH = 2.0
 FREEZE = 12
 #: How far a point may slide off a facet's edge within a step, over the facet's size.
 LINGER = 0.1
+#: Cosine of the angle of two facets' normals below which there is a corner between them.
+CORNER = 0.7
 #: Penetration, over the thickness of the domain behind, of bodies as they are given.
 OVERLAP = 0.1
 
@@ -215,6 +217,11 @@ class Pass:
             # would come and go from one iterate to the next.
             stays = self._paired.near & (found.facet >= 0) & (found.beside < LINGER)
             found = found._replace(near=found.near | stays)
+        # One that was behind the end of a facet and touched nothing goes on to, until it is behind
+        # the facet itself.
+        assert self.memory is not None
+        out = ~self.memory.within & (self.memory.gap < -self.touch)
+        found = found._replace(near=found.near & ~(out & (found.beside >= LINGER)))
         if self.count > FREEZE and self._paired is not None:
             found = self._frozen(found, x, nodes)
         self._paired = found
@@ -275,25 +282,69 @@ class Pass:
             foot = projected(table, x[lost], nodes[at], near.outward[at])
             facet[lost], gap[lost] = at, foot.gap
             found = found._replace(facet=facet, place=place, gap=gap)
-        sideways = within & ~memory.within & (memory.gap < -self.touch)
-        offset = np.where(memory.within, np.clip(found.gap, memory.offset, 0.0), 0.0)
+        self._from, begins = self._before_step(found)
+        sideways = within & ~memory.within & (self._from < -self.touch)
+        offset = np.where(memory.within, np.clip(found.gap, begins, 0.0), 0.0)
         self._offset = np.where(within, np.where(sideways, found.gap, offset), 0.0)
-        inside = within & ~sideways & (found.gap - memory.offset <= self.touch)
+        self._begins = begins
+        inside = within & ~sideways & (found.gap - begins <= self.touch)
         out = (found.facet >= 0) & (found.near | (found.gap > self.touch))
         return found, inside, inside | (memory.within & out)
+
+    def _before_step(self, found: Closest) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return gaps at the beginning of a step, and those at which points begin to be pressed.
+
+        What a point has gone through is told by the facet that it comes to: measured from one on
+        the other side of a corner, its gap would jump, and the force with it. A point that was
+        pressed there, and is deeper behind this facet, begins to be pressed from there on, so that
+        it keeps its energy. On a surface without corners the gap is that of its facet of then.
+        """
+        near, memory = self._near, self.memory
+        assert near is not None and memory is not None
+        gap, offset = memory.gap.copy(), memory.offset.copy()
+        last = near.find(memory.closest)
+        new = np.flatnonzero((found.facet >= 0) & (found.facet != last))
+        if len(new) == 0:
+            return gap, offset
+        foot = self._foot_before(new, found.facet[new], found.place[new])
+        pressed = memory.within[new] & (last[new] >= 0)
+        was = self._foot_before(new, np.where(pressed, last[new], found.facet[new]), None)
+        bent = (foot.n * was.n).sum(axis=1) < CORNER
+        other = ~pressed | bent
+        depth = (gap - offset)[new]
+        gap[new[other]] = foot.gap[other]
+        turned = pressed & bent
+        offset[new[turned]] = np.minimum(foot.gap - depth, 0.0)[turned]
+        return gap, offset
+
+    def _foot_before(
+        self, which: NDArray[np.int64], facet: NDArray[np.int64], place: NDArray[np.float64] | None
+    ) -> Foot:
+        """Return projections of some points on facets at the beginning of the step."""
+        near, memory = self._near, self.memory
+        assert near is not None and memory is not None
+        x, X = memory.points[which], self._before[facet]
+        s = self._near_place(x, X) if place is None else near.project(x, X, place)
+        return projected(near.tabulate(s), x, X, near.outward[facet])
 
     def _frozen(
         self, found: Closest, x: NDArray[np.float64], nodes: NDArray[np.float64]
     ) -> Closest:
-        """Return the pairing of before, with projections as they are now."""
+        """Return the pairing of before, with projections as they are now.
+
+        A point beside the end of its facet is not held there: it would be pressed by the plane of
+        the facet, which goes on where there is none.
+        """
         assert self._near is not None and self._paired is not None
         before = self._paired
         keep = np.flatnonzero(before.near)
+        s = self._near.project(x[keep], nodes[before.facet[keep]], before.place[keep])
+        beside = np.abs(s - self._near.clamped(s)).max(axis=1, initial=0.0)
+        keep, s = keep[beside < LINGER], s[beside < LINGER]
         facet, place = found.facet.copy(), found.place.copy()
         gap, near = found.gap.copy(), found.near.copy()
         facet[keep] = before.facet[keep]
         X = nodes[facet[keep]]
-        s = self._near.project(x[keep], X, before.place[keep])
         N, dN, _ = self._near.tabulate(s)
         n = normals(np.einsum("nek,nki->nie", dN, X))
         n = n * (self._near.outward[facet[keep]] / np.linalg.norm(n, axis=1))[:, None]
@@ -335,7 +386,7 @@ class Pass:
             middle = 0.5 * (before + np.concatenate(parts[:2], axis=1))
             place = near.project(middle[:, 0], middle[:, 1:], found.place[which])
             table = near.tabulate(place)
-            start = Start(before, table, memory.gap[which], memory.offset[which])
+            start = Start(before, table, self._from[which], self._begins[which])
         return Stencil(
             which,
             found.place[which],

@@ -34,7 +34,7 @@ class Start(NamedTuple):
         x: Positions of points and nodes of their facets, shape ``(n, 1 + k, gdim)``.
         table: Shape functions with derivatives where the points are projected in the middle of the
             step: see :meth:`NearFacets.tabulate`.
-        gap: The gap, infinite where nothing was near, shape ``(n,)``.
+        gap: The gap, shape ``(n,)``.
         offset: As that of :class:`_Memory`.
     """
 
@@ -155,12 +155,9 @@ def acting(law: Coulomb, stencil: Stencil, z: NDArray[Any], touch: float, extent
         gap, middle, change = foot.gap, 0.5 * (start.x + both), both - start.x
         foot = projected(start.table, middle[:, 0], middle[:, 1:], stencil.outward)
         gradient = _gradient(foot)
-        linear = gap - (gradient * change).sum(axis=(1, 2))
-        linear = np.where(linear.real > 0.0, linear, 0.0)
-        before = np.where(np.isfinite(start.gap), start.gap, linear)
         v = deformation(middle, change)
-        gradient, _ = corrected(gradient, change, v, gap - before, extent)
-        gap, before = gap - start.offset, before - start.offset
+        gradient, _ = corrected(gradient, change, v, gap - start.gap, extent)
+        gap, before = gap - start.offset, start.gap - start.offset
         p = mean_pressure(stencil.points.stiffness, before, gap, touch)
         acts = traction(law, stencil.points, delta, gap, foot.n, touch, p)
     pushes = acts.pressure[:, None, None] * gradient

@@ -255,7 +255,8 @@ class Remesh(Carrier):
         taken = np.take_along_axis(taken, facet.reshape(*facet.shape, *more), axis=1)
         if taken.ndim > 2:
             taken = np.where(turned.reshape(*turned.shape, *more), taken[:, :, ::-1], taken)
-        return Column(np.where(there.reshape(*there.shape, *more), taken, 0), column.at)
+        nothing = np.zeros((), taken.dtype)  # a truth stays one
+        return Column(np.where(there.reshape(*there.shape, *more), taken, nothing), column.at)
 
     def masses(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the shares in masses at nodes ``(n, k)`` of each cell of the new mesh, ``(n, k)``.

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import error_of_a_term, outcome, same_run
+from marks import thinned
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD, box
 
 from dolfinx import fem
@@ -103,24 +104,30 @@ def test_friction_takes_energy_and_says_how_much():
     assert account(history) < 1e-10
 
 
-@pytest.mark.parametrize("scheme", ["midpoint", "conserving"])
-def test_a_block_falls_on_a_mat_without_inertia(scheme):
-    # What the block loses of its momentum, the mat's floor has; both halves of the contact count.
+def on_a_mat(speed, friction=0.0, cell=TRIANGLE, static=True, **options):
+    """Return a block that falls on a softer mat, with or without inertia, and the contact."""
     spaces = [scenes.vectors(box([-0.6, 0.0], [1.6, 2.0], [8, 8], QUADRILATERAL)) for _ in range(2)]
-    block = mpm.Particles(box([0.1, 0.55], [0.9, 1.2], [5, 4], TRIANGLE), spaces[0])
+    block = mpm.Particles(box([0.1, 0.55], [0.9, 1.2], [5, 4], cell), spaces[0])
     mat = mpm.Particles(box([-0.3, 0.0], [1.3, 0.5], [13, 4], QUADRILATERAL), spaces[1])
-    floor = scenes.fix(spaces[1], scenes.at(1, 0.0))
+    touch = contact.Pair(block, mat, friction)
     problem = mpm.DynamicProblem(
         [block, mat],
         [Hencky(100.0, 0.3), Hencky(30.0, 0.3)],
         1.0,
-        velocity=[(0.0, -0.3), None],
-        scheme=scheme,
-        bcs=[floor],
-        terms=[contact.Pair(block, mat)],
-        quasi_static=[mat],
-        **TIGHT,
+        velocity=[(0.0, -speed), None if static else (0.0, 0.0)],
+        bcs=[scenes.fix(spaces[1], scenes.at(1, 0.0))],
+        terms=[touch],
+        quasi_static=[mat] if static else [],
+        **{**TIGHT, **options},
     )
+    return problem, touch
+
+
+@pytest.mark.parametrize("scheme", ["midpoint", "conserving"])
+def test_a_block_falls_on_a_mat_without_inertia(scheme):
+    # What the block loses of its momentum, the mat's floor has; both halves of the contact count.
+    problem, _ = on_a_mat(0.3, scheme=scheme)
+    mat, floor = problem.bodies[1], problem.bcs[0]
     before, pushed, lowest = problem.momentum, 0, 0.0
     for step in problem.steps(0.8, 0.02):
         force = problem.reaction(floor)
@@ -132,6 +139,32 @@ def test_a_block_falls_on_a_mat_without_inertia(scheme):
     assert pushed > 3 and problem.momentum[1] > 0.0 and history.cutbacks == 0
     assert WORLD.allreduce(lowest) < -0.01
     assert account(history) < 1e-10
+
+
+@pytest.mark.parametrize(
+    ("static", "friction", "split"),
+    thinned(4, [(True, 0.5, True), (True, 0.0, False), (False, 0.5, True), (False, 0.5, False)]),
+)
+def test_corners_are_pressed_into_a_mat(static, friction, split):
+    # Points come round corners, from one facet to another: the difference of their gaps from both
+    # is no motion.
+    problem, touch = on_a_mat(1.0, friction, QUADRILATERAL, static, scheme="conserving")
+    before, pushed = problem.momentum, 0
+    for number, _ in enumerate(problem.steps(0.5, 0.02)):
+        force = problem.reaction(problem.bcs[0])
+        if static:  # (else the floor's nodes have a mass of their own)
+            np.testing.assert_allclose((problem.momentum - before)[1], 0.02 * force[1], atol=1e-10)
+        before, pushed = problem.momentum, pushed + bool(force[1] > 0.0)
+        if split and number == 10:
+            sticks, force = touch.sticks, problem.reaction(touch)
+            problem.split(np.arange(problem.bodies[0].num_global))
+            assert touch.sticks.dtype == bool  # numbers would choose points one and none
+            assert WORLD.allreduce(touch.sticks.sum()) == WORLD.allreduce(sticks.sum()) > 0
+            assert np.abs(problem.reaction(touch) - force).max() < 1e-12 * np.abs(force).max()
+    history = problem.history
+    assert pushed > 10 and problem.momentum[1] > 0.0
+    assert history.cutbacks <= (0 if static else 1) and max(history.iterations) <= 6
+    assert energies(history).max() < 1.0 + 1e-9 and account(history) < 1e-10
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])
