@@ -32,6 +32,10 @@ parser.add_argument("--dilation-angle", type=float, default=0.0, help="degrees")
 parser.add_argument("--cohesion", type=float, default=0.0, help="Pa")
 parser.add_argument("--young", type=kit.positive, default=1e6, help="Pa")
 parser.add_argument("--no-volume-correction", action="store_true", help="what opens stays open")
+parser.add_argument("--rayleigh", type=float, default=0.0, help="damping by stiffness, beta in s")
+parser.add_argument(
+    "--outside", choices=("error", "delete"), default="error", help="if grains leave the background"
+)
 parser.add_argument("--dt", type=kit.positive, default=0.01, help="time step, s")
 parser.add_argument("--time", type=kit.positive, help="until when, s; by default until it rests")
 parser.add_argument("--steps", type=kit.whole, help="time steps; by time and dt")
@@ -75,7 +79,7 @@ bcs = [
 ]
 n = args.particles_per_cell * args.cells
 body = kit.box([width, height], [n, max(1, round(n * a))], kit.DOMAINS[args.domain])
-particles = mpm.Particles(body, V)
+particles = mpm.Particles(body, V, outside=args.outside)
 
 correction = not args.no_volume_correction
 strength = (args.cohesion, args.friction_angle, args.dilation_angle)
@@ -93,6 +97,7 @@ problem = mpm.DynamicProblem(
     body_force=(0.0, -gravity),
     bcs=bcs,
     scheme="euler",
+    rayleigh=(0.0, args.rayleigh),
     initial_stress=mpm.geostatic(height, density, 0.5, (0.0, -gravity)),
 )
 end = args.time or 3.5 * sqrt(height / gravity) + sqrt(known * width / gravity)
@@ -141,6 +146,7 @@ numbers = {
     "kinetic_left": kinetic[-1] / max(kinetic),
     "iterations_per_step": float(np.mean(history.iterations)),
     "particles": particles.num_global,
+    "lost_particles": history.statistics["lost_particles"],
 }
 rows = [
     ("column", f"aspect {a:g}, {args.cells} cells wide, {particles.num_global} {args.domain}"),

@@ -506,4 +506,23 @@ NB_MODULE(_loops, m)
         "gradient"_a, "old_gradient"_a, "P"_a, "old_P"_a, "A"_a, "energy"_a, "old_energy"_a,
         "kind"_a, "small"_a, "factor"_a, "stress"_a.noconvert(), "tangent"_a.noconvert(),
         "Set stress and tangent of a whole step; return the points whose F is singular.");
+
+  m.def("damping",
+        [](Reals gradient, Reals old_gradient, Reals stiffness, Array<const bool> small,
+           double factor, RealsOut stress, RealsOut tangent) {
+    require(gradient.ndim() == 3 && old_gradient.size() == gradient.size()
+                && stress.size() == gradient.size(),
+            "gradients and stresses (n, dim, dim)");
+    const auto dim = static_cast<int>(gradient.shape(2));
+    require(dim == 2 || dim == 3, "two or three dimensions");
+    const std::size_t count = gradient.shape(0), square = static_cast<std::size_t>(dim * dim);
+    require(stiffness.size() == count * square * square && tangent.size() == stiffness.size(),
+            "stiffnesses and tangents (n, dim, dim, dim, dim)");
+    require(small.size() == count, "one kind for each point");
+    const Damping given{count,        gradient.data(), old_gradient.data(), stiffness.data(),
+                        small.data(), factor};
+    damping(given, dim, stress.data(), tangent.data());
+  },
+        "gradient"_a, "old_gradient"_a, "stiffness"_a, "small"_a, "factor"_a,
+        "stress"_a.noconvert(), "tangent"_a.noconvert(), "Set stress and tangent of damping.");
 }

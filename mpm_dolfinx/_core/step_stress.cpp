@@ -1,7 +1,7 @@
 // Copyright (C) 2026 the mpm-dolfinx authors
 // SPDX-License-Identifier: LGPL-3.0-or-later
 //
-// Stress of a whole step in time, point by point.
+// Stress of a whole step in time and of damping, point by point.
 
 #include "step_stress.h"
 #include "hot_loop.h"
@@ -11,6 +11,7 @@
 
 namespace
 {
+using core::Damping;
 using core::inverse;
 using core::Matrix;
 using core::Step;
@@ -217,6 +218,74 @@ std::vector<std::int64_t> step_stress_of(const StepEnds& ends, double* stress, d
   }
   return singular;
 }
+
+template <int dim>
+void damping_of(const Damping& damping, double* stress, double* tangent)
+{
+  constexpr int square = dim * dim, fourth = square * square;
+  for (std::size_t p = 0; p < damping.count; ++p)
+  {
+    const Matrix<dim> H = read<dim>(damping.gradient + p * square);
+    const Matrix<dim> old_H = read<dim>(damping.old_gradient + p * square);
+    const double* C = damping.stiffness + p * fourth;
+    const bool large = !damping.small[p];
+    double *own = stress + p * square, *slope = tangent + p * fourth;
+    Matrix<dim> F{}, mean{}, E, S;
+    for (int i = 0; i < dim; ++i)
+    {
+      F[i][i] = mean[i][i] = 1.0;
+      for (int j = 0; large && j < dim; ++j)
+      {
+        F[i][j] += H[i][j];
+        mean[i][j] += 0.5 * (H[i][j] + old_H[i][j]);
+      }
+    }
+    for (int I = 0; I < dim; ++I)
+      for (int J = 0; J < dim; ++J)
+      {
+        E[I][J] = 0.0;
+        for (int k = 0; k < dim; ++k)
+          E[I][J] += 0.5
+                     * (mean[k][I] * (H[k][J] - old_H[k][J]) + mean[k][J] * (H[k][I] - old_H[k][I]));
+      }
+    // dS_IJkL = C_IJMN dE_MN/dF_kL
+    double dS[fourth];
+    for (int a = 0; a < square; ++a)
+    {
+      const double* row = C + a * square;
+      double sum = 0.0;
+      for (int K = 0; K < dim; ++K)
+        for (int L = 0; L < dim; ++L)
+          sum += row[K * dim + L] * E[K][L];
+      S[a / dim][a % dim] = damping.factor * sum;
+      for (int k = 0; k < dim; ++k)
+        for (int L = 0; L < dim; ++L)
+        {
+          double entry = 0.0;
+          for (int M = 0; M < dim; ++M)
+            entry += F[k][M] * (row[M * dim + L] + row[L * dim + M]);
+          dS[a * square + k * dim + L] = 0.5 * damping.factor * entry;
+        }
+    }
+    const Matrix<dim> total = product<dim>(mean, S);
+    constexpr int rest = dim * square;
+    for (int i = 0; i < dim; ++i)
+    {
+      for (int J = 0; J < dim; ++J)
+        own[i * dim + J] = total[i][J];
+      for (int e = 0; e < rest; ++e)
+      {
+        double sum = 0.0;
+        for (int I = 0; I < dim; ++I)
+          sum += mean[i][I] * dS[I * rest + e];
+        slope[i * rest + e] = sum;
+      }
+      for (int J = 0; large && J < dim; ++J)
+        for (int L = 0; L < dim; ++L)
+          slope[i * rest + (J * dim + i) * dim + L] += 0.5 * S[L][J];
+    }
+  }
+}
 } // namespace
 
 HOT_LOOP std::vector<std::int64_t> core::step_stress(const StepEnds& ends, int dim, double* stress,
@@ -224,4 +293,12 @@ HOT_LOOP std::vector<std::int64_t> core::step_stress(const StepEnds& ends, int d
 {
   return dim == 2 ? step_stress_of<2>(ends, stress, tangent)
                   : step_stress_of<3>(ends, stress, tangent);
+}
+
+HOT_LOOP void core::damping(const Damping& damping, int dim, double* stress, double* tangent)
+{
+  if (dim == 2)
+    damping_of<2>(damping, stress, tangent);
+  else
+    damping_of<3>(damping, stress, tangent);
 }

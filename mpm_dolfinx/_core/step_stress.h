@@ -34,4 +34,17 @@ struct StepEnds
 // points whose F is singular. See mpm_dolfinx.constitutive.step_stress, which is the oracle.
 std::vector<std::int64_t> step_stress(const StepEnds& ends, int dim, double* stress,
                                       double* tangent);
+
+// Displacement gradients at both ends of a step, (count, dim, dim), and the stiffness of the
+// undeformed body, (count, dim, dim, dim, dim), by which a rate of strain is resisted.
+struct Damping
+{
+  std::size_t count;
+  const double *gradient, *old_gradient, *stiffness;
+  const bool* small; // (count,), whether a law is of small strains
+  double factor;     // of stress and tangent
+};
+
+// Set the stress of damping (count, dim, dim) and its derivative (count, dim, dim, dim, dim) by F.
+void damping(const Damping& damping, int dim, double* stress, double* tangent);
 } // namespace core

@@ -438,6 +438,11 @@ class StepStress:
         assert self._undeformed is not None
         H, small = self._tried - self._H, self._small
         factor = self._viscosity / self._dt
+        if self._points.compiled and loops is not None:
+            P, A = np.empty(H.shape), np.empty(self._undeformed.shape)
+            ends = (np.ascontiguousarray(self._tried), np.ascontiguousarray(self._H))
+            loops.damping(*ends, self._undeformed, small, factor, P, A)
+            return P, A
         C = factor * self._undeformed
         change, slope = _strain(self._tried, self._H)
         change[small] = 0.5 * (H + H.swapaxes(1, 2))[small]

@@ -18,6 +18,7 @@ CASES = Path(__file__).parents[2] / "benchmarks" / "cases"
 #: Programs that ``make test`` runs, and numbers that it leaves to ``make test-all``.
 SHORT = ("compaction", "column_free", "snap_through")
 LONG = {
+    *("sand-damped", "sand-dilates"),
     *("vortex", "disc", "discs", "discs-contact", "column"),
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
     *("slope", "vertical-cut", "footing-friction"),
@@ -204,6 +205,16 @@ RUNS = {
         "sand_column",
         "--aspect 0.5 --cells 6",
         {"ratio": 1.15, "kinetic_left": 0.05},
+    ),
+    "sand-damped": (
+        "sand_column",
+        "--aspect 2 --cells 10 --rayleigh 1e-5",
+        {"ratio": 1.3, "kinetic_left": 1e-4, "cutbacks": 70},
+    ),
+    "sand-dilates": (
+        "sand_column",
+        "--aspect 2 --cells 10 --rayleigh 1e-5 --cohesion 1e3 --dilation-angle 10",
+        {"ratio": 1.3, "kinetic_left": 1e-3, "cutbacks": 35},
     ),
     "column": ("column_dynamic", "--time 0.4", {"cutbacks": 0, "balance_error": 1e-12}),
 }
