@@ -233,11 +233,12 @@ class NearFacets:
         n_of = n_of / np.linalg.norm(n_of, axis=1)[:, None]
         g = ((points[who] - np.einsum("nk,nki->ni", N, X)) * n_of).sum(axis=1)
         gap[who] = g
-        # A point behind the end of an open surface, or beside an edge, touches nothing.
+        # A point behind the end of an open surface, or beside an edge, touches nothing; nor does
+        # one beside the edge of a thin body that faces its far side.
         size = np.linalg.norm(np.einsum("nek,nki->nei", dN, X), axis=2).max(axis=1)
         over = np.abs(s[first] - inner[first]).max(axis=1) * size
-        off = (g < 0.0) & (over > np.maximum(1e-9 * size, 0.2 * np.abs(g)))
-        off &= far[first] > 2.0 * np.abs(g) + 1e-12 * size
+        off = (g < 0.0) & (over > np.maximum(1e-9 * size, 0.2 * np.minimum(np.abs(g), 0.1 * size)))
+        off &= (far[first] > 2.0 * np.abs(g) + 1e-12 * size) | (g < -0.5 * size)
         near[who] = ~off
         beside[who] = over / size
         return Closest(facet, place, gap, near, beside)

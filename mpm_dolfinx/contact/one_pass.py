@@ -516,9 +516,9 @@ class Pass:
         assert near is not None and memory is not None and found is not None
         x = self._flat(self.outcome.positions)
         at = near.find(memory.facet)
-        was = np.flatnonzero(
-            (at >= 0) & np.isfinite(memory.gap) & (self.source.weights.ravel() > 0)
-        )
+        # (one beside a thin body may have been behind its far side already)
+        before = np.isfinite(memory.gap) & (memory.gap > -0.25 * self.reach)
+        was = np.flatnonzero((at >= 0) & before & (self.source.weights.ravel() > 0))
         if len(was) == 0:
             return False
         X = self._nodes[at[was]]

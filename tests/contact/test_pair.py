@@ -406,6 +406,27 @@ def test_bodies_that_overlap_at_the_beginning_are_refused():
         mpm.QuasiStaticProblem([a, b], Hencky(1e3, 0.3), terms=[contact.Pair(a, b)])
 
 
+@pytest.mark.parametrize("cell", [QUADRILATERAL, HEXAHEDRON], ids=scenes.name)
+def test_narrow_blocks_of_one_width_stand_on_each_other(cell):
+    # Points on a block's side, near its top, face the far side of the block above.
+    dim = 2 if cell == QUADRILATERAL else 3
+    Va, Vb = spaces([-0.3] * dim, [0.9] * dim, [4] * dim)
+    size, up, n = np.full(dim, 0.3), np.eye(dim)[-1], [2] * (dim - 1) + [1]
+    lower = mpm.Particles(scenes.box([0.0] * dim, size, n, cell), Va, quadrature_degree=2)
+    body = scenes.box(0.3 * up, size + 0.3 * up, n, cell)
+    upper = mpm.Particles(body, Vb, quadrature_degree=2)
+    ground = contact.Rigid(lower, contact.plane([0.0] * dim, up), 0.4)
+    touch = contact.Pair(upper, lower, 0.4)
+    problem = mpm.QuasiStaticProblem(
+        [upper, lower], Hencky(1e4, 0.3), 1.0, body_force=-100.0 * up, terms=[ground, touch]
+    )
+    problem.solve(3)
+    weight = 100.0 * np.prod(size)
+    assert problem.reaction(touch) == pytest.approx(weight * up, abs=1e-6 * weight)
+    assert problem.reaction(ground) == pytest.approx(2.0 * weight * up, abs=1e-6 * weight)
+    assert problem.history.cutbacks == 0
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
