@@ -22,7 +22,7 @@ from dolfinx import fem, la
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.io import Kept
-from mpm_dolfinx.materials import DruckerPrager, Hencky, MohrCoulomb, VonMises
+from mpm_dolfinx.materials import DruckerPrager, Hencky, ModifiedCamClay, MohrCoulomb, VonMises
 from mpm_dolfinx.solvers import linear
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "combinations.md"
@@ -54,6 +54,7 @@ FEATURES = {
     "VonMises": {"law": VonMises(YOUNG, POISSON, rho_y=6.0)},
     "MohrCoulomb": {"law": MohrCoulomb(YOUNG, POISSON, 4.0, 30.0)},
     "DruckerPrager": {"law": DruckerPrager(YOUNG, POISSON, 4.0, 30.0)},
+    "ModifiedCamClay": {"law": ModifiedCamClay(0.02, 0.004, 2.5, 400.0, 5.0, 1.0)},
     "ghost": {"stabilisation": "ghost"},
     "aggregate": {"stabilisation": "aggregate"},
     "remove": {"dependent_dofs": "remove"},
