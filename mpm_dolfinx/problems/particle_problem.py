@@ -36,6 +36,7 @@ from ..parallel.garbage import Cleaner
 from ..parallel.given import require_same
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
+from ..solvers.linear import chosen
 from ..solvers.newton import NewtonSolver
 from ..stabilisation.choice import stabilisation_of
 from ..stepping.automatic import ErrorControl
@@ -366,6 +367,7 @@ class ParticleProblem:
             statistics,
             Predictor(numerics.predictor),
         )
+        degree = max(body.V.ufl_element().degree for body in self.bodies)
         newton = NewtonSolver(
             self._comm,
             numerics.petsc_options_prefix,
@@ -376,7 +378,7 @@ class ParticleProblem:
             numerics.line_search,
             statistics,
             self.bodies[0].V.mesh.geometry.dim,
-            numerics.linear_solver,
+            chosen(numerics.linear_solver, degree),
         )
         self._stepper.follow(reduced, newton, clean_up)
         forms = [f for given in contributions for f in (given.residual, given.tangent) if f]

@@ -19,7 +19,7 @@ from ..parallel.magnitudes import unit_sized
 from .multigrid import SHIFT, Multigrid
 from .saddle import Fields, SaddleMultigrid
 
-__all__ = ["LINEAR_SOLVERS", "Indefinite", "Levels", "ShiftedFactor"]
+__all__ = ["LINEAR_SOLVERS", "Indefinite", "Levels", "ShiftedFactor", "chosen"]
 
 #: Values of ``linear_solver``.
 LINEAR_SOLVERS = ("auto", "direct", "multigrid")
@@ -29,6 +29,9 @@ COARSEST = 600
 CROSSOVER = {2: 40000, 3: 3000}
 #: The same in a motion, where the mass takes it three times the iterations.
 CROSSOVER_IN_MOTION = {2: 40000, 3: 5000}
+
+#: Degree of the background up to which it may be chosen.
+HIGHEST = 2
 
 #: Values of MUMPS's INFOG(1) that more workspace cures.
 OUT_OF_WORKSPACE = (-8, -9)
@@ -46,6 +49,10 @@ PORD, PORD_FROM = {"mat_mumps_icntl_7": 4}, 10000
 #: which on they are used; and the relative residual to which such a factor is iterated with.
 LOW_RANK, LOW_RANK_FROM = {"mat_mumps_icntl_35": 1, "mat_mumps_cntl_7": 1e-4}, 20000
 COMPRESSED = 1e-10
+#: Iterations for a decade of the residual above which ``"auto"`` factorises from then on: with n
+#: unknowns ``n / 450`` in space, where operations of a factor grow as n², ``n^0.5 / 30`` in the
+#: plane; and how many times as many a solve may have.
+BEARABLE, MOST_BEARABLE = {2: (0.5, 30.0), 3: (1.0, 450.0)}, 2.0
 #: Unknowns up to which a factorisation takes over where multigrid comes to nothing, and steps in
 #: a row in which it may before no step begins with multigrid.
 TAKEN_OVER, ENDURED = {2: 500000, 3: 50000}, 3
@@ -72,6 +79,15 @@ SINGULAR = (
 #: PETSc's error numbers for what an option asks for: not supported, out of range, an unknown
 #: type, and a package that is missing.
 REFUSALS = (56, 63, 86, 92)
+
+
+def chosen(linear_solver: str, degree: int) -> str:
+    """Return the linear solver of backgrounds of a degree.
+
+    From degree 3 on rows have so many entries that a factorisation is cheaper up to ten thousand
+    unknowns and more, and ``"auto"`` means that.
+    """
+    return "direct" if linear_solver == "auto" and degree > HIGHEST else linear_solver
 
 
 class Indefinite(Exception):
@@ -125,6 +141,10 @@ class ShiftedFactor:
         self.iterates = False
         self._own_rtol = self._own_type = False
         self._failures = 0  # steps in a row
+        self._longest = ITERATIONS
+        self._dear = False  # what multigrid takes, beside a factorisation
+        self._left: float | None = None  # of the residual, by the linear model
+        self._bent, self._curved = 1.0, 1.0  # what that lacked in the first solve of a step
         self._shifts = False  # what multigrid sweeps over
         self._multigrid: Multigrid | SaddleMultigrid | None = None
         self._constrained = False
@@ -189,7 +209,7 @@ class ShiftedFactor:
                 constraints.
             in_motion: Whether the tangent has masses.
         """
-        self.D = None
+        self.D = self._left = None
         self._constrained = constrained
         iterates = self._prefers_multigrid(size, in_motion)
         if iterates != self.iterates:
@@ -218,13 +238,20 @@ class ShiftedFactor:
     def _prefers_multigrid(self, size: int, in_motion: bool) -> bool:
         if size <= COARSEST:
             return False  # a factor is all that its levels would be
-        if self._own_type or self._failures >= ENDURED:
+        if self._own_type or self._failures >= ENDURED or self._dear:
             return False
         if self._linear_solver != "auto":
             return self._linear_solver == "multigrid"
         crossover = CROSSOVER_IN_MOTION if in_motion else CROSSOVER
         plain = self._symmetric and not self._constrained
         return plain and size >= crossover.get(self._dim, np.inf)
+
+    def _bearable(self, size: int) -> float:
+        """Return the iterations for a decade of the residual that cost as much as a factor."""
+        if self._linear_solver != "auto" or self._dim not in BEARABLE:
+            return np.inf
+        power, share = BEARABLE[self._dim]
+        return float(size**power / share)
 
     def _choose(self, iterates: bool) -> None:
         """Set up the KSP for multigrid or for a factorisation (collective)."""
@@ -241,6 +268,7 @@ class ShiftedFactor:
             pc.setType("mg")
             with _options_refused(), self._own_options():
                 ksp.setFromOptions()
+            self._longest = ksp.getTolerances()[3]
             return
         kind, factor, package = self._direct
         ksp.setType(kind)
@@ -264,6 +292,9 @@ class ShiftedFactor:
             Whether K and P are other objects than at the last call.
         """
         self._levels = levels
+        if self.iterates and self._dear:
+            self._choose(False)
+            self._iterate_with_factor(K.getSize()[0])
         if self.shift > 0.0 and self.D is None:
             self.D = self.shift * levels.diagonal(K)
             negative = int(np.count_nonzero(self.D.array_r < 0.0))
@@ -369,8 +400,10 @@ class ShiftedFactor:
     def aim(self, norms: Sequence[float], tolerance: float) -> None:
         """Say how exactly the next of Newton's steps is needed, where multigrid finds it.
 
-        That is Eisenstat & Walker's (1996) second choice: what the last iteration has made of the
-        residual, to the power of the golden ratio; no more than its tolerance asks for.
+        That is the finer of Eisenstat & Walker's (1996) two choices: by how much the linear model
+        has missed the residual, and what the last iteration has made of that, to the power of the
+        golden ratio; no more than its tolerance asks for. A step begins with what the model
+        lacked at the beginning of the last one.
 
         Args:
             norms: Norms of the residuals so far.
@@ -378,16 +411,26 @@ class ShiftedFactor:
         """
         if not self.iterates or self._own_rtol:
             return
-        rtol: float = FIRST
+        rtol = min(FIRST, self._bent)
         if len(norms) > 1 and norms[-2] > 0.0:
             rtol = min(float((norms[-1] / norms[-2]) ** GOLDEN), ROUGHEST)
+            if self._left is not None:
+                missed = abs(norms[-1] - self._left) / norms[-2]
+                rtol = min(rtol, missed)
+                if len(norms) == 2:
+                    self._curved = missed
         if norms and norms[-1] > 0.0:
             rtol = max(rtol, min(FINAL * tolerance / norms[-1], ROUGHEST))
-        self._ksp.setTolerances(rtol=rtol)
+        rtol = max(rtol, COMPRESSED)
+        assert self.K is not None
+        bearable = -math.log10(min(rtol, ROUGHEST)) * self._bearable(self.K.getSize()[0])
+        most = min(MOST_BEARABLE * bearable, self._longest)
+        self._ksp.setTolerances(rtol=rtol, max_it=math.ceil(most))
 
     def end(self) -> None:
         """End a step that has converged."""
         self._indefinite = 0
+        self._bent = self._curved
         if self.iterates:
             self._failures = 0
 
@@ -395,9 +438,9 @@ class ShiftedFactor:
         """Look at what SNES has solved; return whether it is a solution (collective).
 
         Where the method of conjugate gradients has found the tangent indefinite, that of
-        generalised minimal residuals solves, if no smaller step is to be tried. Where multigrid
-        comes to nothing a factor takes over for the rest of the step, and after three steps in a
-        row for good, unless there are so many unknowns that it would take far longer.
+        generalised minimal residuals solves. Where multigrid comes to nothing a factor takes over
+        for the rest of the step, and after three steps in a row for good, unless there are so many
+        unknowns that it would take far longer.
 
         Args:
             b: The right-hand side.
@@ -419,24 +462,45 @@ class ShiftedFactor:
             self._statistics["krylov_iterations"] += self._ksp.getIterationNumber()
         reason = self._ksp.getConvergedReason()
         if reason >= 0 or self._does(b):
+            self._assess(self._ksp, b)
             return True
         if reason in INDEFINITE:
             self._negative = True
-            matrix = reason == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
-            if matrix and shorten and self._indefinite < PATIENCE:
-                self._indefinite += 1
-                raise Indefinite
             if self._solve_indefinite(b, x, self._ksp.getTolerances()[0]):
+                self._assess(self._flexible, b)
                 return True
+            self.give_up(shorten)
         if K.getSize()[0] > TAKEN_OVER.get(self._dim, 0):
             return False
         self._failures += 1
+        self._dear = self._linear_solver == "auto"
         self._choose(False)
         self._iterate_with_factor(K.getSize()[0])
         self._factorise(K, levels)
         self._statistics.count("multigrid_failures")
         self._ksp.solve(b, x)
         return True
+
+    def give_up(self, shorten: bool) -> None:
+        """Give a step up whose tangent is indefinite, a few times, where multigrid solves.
+
+        Args:
+            shorten: Whether a step that fails is tried again with less load.
+
+        Raises:
+            Indefinite: The step is given up.
+        """
+        if self.iterates and shorten and self._indefinite < PATIENCE:
+            self._indefinite += 1
+            raise Indefinite
+
+    def _assess(self, ksp: PETSc.KSP, b: PETSc.Vec) -> None:
+        """Note what a solve has left, and whether a factor would have cost less (collective)."""
+        size, left = b.norm(), ksp.getResidualNorm()
+        self._left = left
+        if 0.0 < left < size:
+            decades = max(math.log10(size / left), 1.0)
+            self._dear = ksp.getIterationNumber() > decades * self._bearable(b.getSize())
 
     def _does(self, b: PETSc.Vec) -> bool:
         """Return whether a solve that round-off has ended leaves a residual that does for Newton.
@@ -489,6 +553,7 @@ class ShiftedFactor:
                 self._ksp.solve(b, x)
                 return
             before = self._ksp.getTolerances()[0]
+            self._ksp.setTolerances(max_it=self._longest)
             if not self._own_rtol:
                 self._ksp.setTolerances(rtol=ACCURATE)
             if self._negative or not self._solved(b, x):

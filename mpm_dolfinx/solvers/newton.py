@@ -575,19 +575,13 @@ class NewtonSolver:
         self._origin = x
         self._failure = self._finished(y)
         if self._failure is not None:
-            self._trial.waxpy(-1.0, y, x)
-            self._R.set(np.nan)
-            self._known = True
-            return False
+            return self._fail(x, y)
         refined = self._refines
         if refined:
             self._solve(self._R, y)
         self._negative = self._problem.constrain(y, x, self._solve)
         if self.iterations == 1 and self._is_loose(y, norm(self._R)):
-            self._trial.waxpy(-1.0, y, x)
-            self._R.set(np.nan)
-            self._known = True
-            return False
+            return self._fail(x, y)
         if self._refines and not refined:
             self._solve(self._R, y)
             self._negative = self._problem.constrain(y, x, self._solve)
@@ -597,7 +591,11 @@ class NewtonSolver:
             self._search.withdraw(x, y, self._R, self._trial)
             changed = True
         elif self._search is not None and not self._is_settled(y, x):
-            changed = self._search(x, y, self._R, self._trial)
+            try:
+                changed = self._search(x, y, self._R, self._trial)
+            except Indefinite:
+                self._failure = self._not_definite()
+                return self._fail(x, y)
         else:
             changed = False
             self._trial.waxpy(-1.0, y, x)
@@ -607,15 +605,30 @@ class NewtonSolver:
         self._known = True
         return changed or self._refines
 
+    def _fail(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Let SNES end, as the step to ``x - y`` cannot be taken; return that y is as it was."""
+        self._trial.waxpy(-1.0, y, x)
+        self._R.set(np.nan)
+        self._known = True
+        return False
+
+    def _not_definite(self) -> ConvergenceError:
+        return ConvergenceError(
+            f"The tangent was not positive definite after {self.iterations} linear solves"
+        )
+
+    @property
+    def _shortens(self) -> bool:
+        """Whether a smaller step is the best cure of a tangent that is not positive definite."""
+        return self._shorten and not self._problem.softens
+
     def _finished(self, y: PETSc.Vec) -> MPMError | None:
         """Finish a linear solve of SNES; return why that cannot be."""
         try:
-            if self._factor.finish(self._R, y, self._shorten and not self._problem.softens):
+            if self._factor.finish(self._R, y, self._shortens):
                 return None
         except Indefinite:
-            return ConvergenceError(
-                f"The tangent was not positive definite after {self.iterations} linear solves"
-            )
+            return self._not_definite()
         return ConvergenceError(
             f"Multigrid did not solve for a Newton step after {self.iterations} linear solves; "
             "use linear_solver='direct'"
@@ -653,8 +666,12 @@ class NewtonSolver:
         Args:
             F: The residual.
             y: The step; replaced.
+
+        Raises:
+            Indefinite: A smaller load step is to be tried instead.
         """
         assert self.K is not None
+        self._factor.give_up(self._shortens)
         for damping in DAMPINGS:
             self._set_tangent(self.K, damping)
             self._factor.solve(F, y)
