@@ -2,9 +2,12 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Multigrid on boxes of the background, compared with factorisations."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 import scenes
+from compare import outcome, same_run
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE
 
 import mpm_dolfinx as mpm
@@ -16,16 +19,25 @@ TIGHT = {"snes_rtol": 1e-12}
 PLASTIC = VonMises(1e6, 0.3, rho_y=20e3)
 
 
-def heavy(n, cell=QUADRILATERAL, degree=1, material=PLASTIC, weight=8e3, bent=0.0, **options):
+def heavy(
+    n,
+    cell=QUADRILATERAL,
+    degree=1,
+    material=PLASTIC,
+    weight=8e3,
+    bent=0.0,
+    comm=scenes.WORLD,
+    **options,
+):
     """Return a column, half as large as its background, with n background cells over its width."""
     dim = 3 if cell in (TETRAHEDRON, HEXAHEDRON) else 2
-    grid = scenes.box([0.0] * dim, [1.0] * dim, [2 * n] * dim, cell)
+    grid = scenes.box([0.0] * dim, [1.0] * dim, [2 * n] * dim, cell, comm)
     grid = scenes.bend(grid, bent)
     grid.geometry.x[:, :dim] *= 8.0
     V = scenes.vectors(grid, degree)
     finer = 2 if degree == 1 else 1
     domains = cell if degree == 1 else TRIANGLE
-    body = scenes.box([0.0] * dim, [4.0] * dim, [finer * n] * dim, domains)
+    body = scenes.box([0.0] * dim, [4.0] * dim, [finer * n] * dim, domains, comm)
     bcs = [scenes.fix(V, scenes.at(axis, 0.0), component=axis) for axis in range(dim)]
     options.setdefault("petsc_options", TIGHT)
     return mpm.QuasiStaticProblem(
@@ -71,6 +83,31 @@ def test_displacements_are_those_of_a_factorisation(n, options):
     for run in runs:
         run.solve(steps=2)
     assert_same(*runs)
+
+
+@pytest.mark.skipif(scenes.WORLD.size == 1, reason="compares several ranks with one")
+@pytest.mark.parametrize(
+    ("n", "options"),
+    [
+        pytest.param(24, {}, marks=pytest.mark.slow),
+        pytest.param(24, {"cell": TRIANGLE, "stabilisation": "ghost"}, marks=pytest.mark.slow),
+        pytest.param(11, {"degree": 2}, marks=pytest.mark.slow),
+        pytest.param(6, {"cell": HEXAHEDRON, "stabilisation": "ghost"}, marks=pytest.mark.slow),
+        (24, {"material": MohrCoulomb(1e6, 0.3, 2e4, 0.5, 0.1), "weight": 4e3}),
+    ],
+)
+def test_several_ranks_take_the_same_way(n, options):
+    runs = []
+    for comm in (scenes.WORLD, MPI.COMM_SELF):
+        run = heavy(n, linear_solver="multigrid", comm=comm, **options)
+        run.solve(steps=2)
+        statistics = run.history.statistics
+        assert statistics["multigrid_failures"] == 0
+        runs.append((run, statistics["krylov_iterations"] / statistics["factorisations"]))
+    (several, its), (one, alone) = runs
+    assert abs(its - alone) <= 2.0
+    assert abs(several.history.total_iterations - one.history.total_iterations) <= 2
+    same_run(outcome(several), outcome(one), 1e-9)
 
 
 def test_factors_of_low_rank_give_the_same(monkeypatch):
