@@ -64,7 +64,8 @@ class BackgroundBasis:
         """Evaluate the basis at points (collective).
 
         A point on a facet belongs to that of its cells that comes first in the mesh's input,
-        on any number of ranks. A point at most 1e-10 of a cell outside the mesh counts as on it.
+        on any number of ranks. A point at most 1e-10 of a cell outside the mesh, or the round-off
+        of its coordinates, counts as on it.
 
         Args:
             points: This rank's points, shape ``(n, gdim)``; they may lie in cells of any rank.
@@ -89,7 +90,7 @@ class BackgroundBasis:
         for start in range(0, n, BLOCK):  # what is on the way is large
             part = slice(start, start + BLOCK)
             cell, reference, violation = cells.locate(points[part])
-            reference = cells.clip(reference)
+            reference = cells.clip(cell, reference)
             table = _compat.tabulated(self._basis, int(gradients), reference)
             found[part] = violation <= TOLERANCE
             inside = found[part, None]

@@ -18,12 +18,14 @@ from dolfinx import fem, mesh
 
 from .. import _compat
 
-__all__ = ["DROP", "TOLERANCE", "CellTable", "Cells", "cell_volumes"]
+__all__ = ["COORDINATES", "DROP", "TOLERANCE", "CellTable", "Cells", "cell_volumes"]
 
 #: Reference distance within which a point outside a cell counts as on its boundary.
 TOLERANCE = 1e-10
 #: Reference distance within which a point is on a facet; the cell first in the input takes it.
 FACET = 1e-12
+#: Error of coordinates, relative to them: some units in the last place.
+COORDINATES = 4.0 * np.finfo(float).eps
 #: Points looked for at once, so that what is known of them stays in the cache.
 BLOCK = 1 << 14
 #: Basis values below this are no weight.
@@ -94,9 +96,13 @@ class Cells:
         # Of coordinates: no small part of a cell that is tiny or far from the origin.
         self.roundoff = 8.0 * np.finfo(float).eps * np.abs(self.vertices).max(initial=0.0)
         self.affine = self._is_affine()
+        every = np.arange(count)
+        slopes = np.linalg.inv(self.jacobians(every, np.tile(self.middle, (count, 1))))
+        error = COORDINATES * np.abs(self.vertices).max(axis=(1, 2), initial=0.0)
+        #: Reference distance that is round-off of coordinates, which is much far from the origin.
+        self.slack = error * np.abs(slopes).sum(axis=2).max(axis=1, initial=0.0)
         if self.affine:
-            every = np.arange(count)
-            self._slopes = np.linalg.inv(self.jacobians(every, np.tile(self.middle, (count, 1))))
+            self._slopes = slopes
             self._centres = np.einsum(
                 "k,nki->ni", self.map.tabulate(0, self.middle[None])[0, 0, :, 0], self.vertices
             )
@@ -113,7 +119,7 @@ class Cells:
                 MPI.COMM_SELF, self.vertices, self._name, degree=degree
             )
         cells = np.arange(len(self.vertices), dtype=np.int32)
-        return _compat.cell_tree(domain, cells, 1e2 * TOLERANCE * size)
+        return _compat.cell_tree(domain, cells, max(1e2 * TOLERANCE * size, self.roundoff))
 
     def _is_affine(self) -> bool:
         if len(self.vertices) == 0 or (self.simplex and self.map.degree == 1):
@@ -170,19 +176,28 @@ class Cells:
         reference[active[size[~lost & (size > max(1e-14, floor))] > 1e-12]] = np.nan
         return reference
 
-    def violation(self, reference: NDArray[np.float64]) -> NDArray[np.float64]:
+    def violation(
+        self, cells: NDArray[np.int64], reference: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Return how far reference coordinates lie outside the cell (0 inside, inf for NaN)."""
         low = -reference.min(axis=1, initial=0.0)
         high = reference.sum(axis=1) - 1 if self.simplex else reference.max(axis=1) - 1
         worst = np.maximum(low, high)
-        return np.where(np.isnan(worst), np.inf, np.where(worst <= FACET, 0.0, worst))
+        near = np.maximum(FACET, self.slack[cells])
+        return np.where(np.isnan(worst), np.inf, np.where(worst <= near, 0.0, worst))
 
-    def clip(self, reference: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return reference coordinates moved onto the cell."""
+    def clip(self, cells: NDArray[np.int64], reference: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return reference coordinates moved onto the cell, and onto its facets where near.
+
+        Else nodes off a facet that a point lies on would have the round-off of its coordinates
+        for a weight.
+        """
+        slack = self.slack[cells, None]
+        inside = np.where(reference <= slack, 0.0, reference)
         if not self.simplex:
-            return np.clip(reference, 0.0, 1.0)
-        inside = np.maximum(reference, 0.0)
-        return np.asarray(inside / np.maximum(1.0, inside.sum(axis=1))[:, None])
+            return np.where(inside >= 1.0 - slack, 1.0, inside)
+        total = inside.sum(axis=1)[:, None]
+        return np.asarray(np.where(total >= 1.0 - slack, inside / total, inside))
 
     def locate(
         self, points: NDArray[np.float64]
@@ -200,7 +215,7 @@ class Cells:
                 known = block[inside]
                 cell[known] = found
                 reference[known] = self.pull_back(found, points[known])
-                violation[known] = self.violation(reference[known])
+                violation[known] = self.violation(found, reference[known])
                 block = block[violation[block] > TOLERANCE]
             if len(block) == 0:
                 continue
@@ -222,7 +237,7 @@ class Cells:
             return hit, hit, points[hit], np.zeros(0)
         cells: NDArray[np.int64] = candidates.astype(np.int64)
         reference = self.pull_back(cells, np.repeat(points, counts, axis=0))
-        outside = self.violation(reference)
+        outside = self.violation(cells, reference)
         starts, counts = offsets[hit], counts[hit]
         least = np.repeat(np.minimum.reduceat(outside, starts), counts)
         rank = np.where(outside == least, self.index[cells], np.iinfo(np.int64).max)
@@ -252,12 +267,13 @@ class RegularGrid:
         lines, places = [], []
         for x in np.moveaxis(vertices, 2, 0):
             line = np.unique(x)
-            line = line[np.diff(line, prepend=-np.inf) > 1e-9 * (line[-1] - line[0])]
+            error = 2.0 * COORDINATES * np.abs(line).max()
+            line = line[np.diff(line, prepend=-np.inf) > max(1e-9 * (line[-1] - line[0]), error)]
             middles = 0.5 * (x.min(axis=1) + x.max(axis=1))
             place = np.searchsorted(line, middles) - 1
             ends = line[np.clip([place, place + 1], 0, len(line) - 1)]
             near = np.minimum(np.abs(x - ends[0][:, None]), np.abs(x - ends[1][:, None]))
-            if near.max() > 1e-9 * np.diff(line).min():
+            if near.max() > max(1e-9 * np.diff(line).min(), error):
                 return None
             lines.append(line)
             places.append(place)
@@ -292,7 +308,9 @@ class RegularGrid:
         low, high = [], []
         for line, size, x in zip(self._lines, self._sizes, points.T, strict=True):
             place = self._place(line, size, x)
-            reach = FACET * (line[place + 1] - line[place])
+            ends = line[place], line[place + 1]
+            error = COORDINATES * np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+            reach = np.maximum(FACET * (ends[1] - ends[0]), error)
             low.append(np.where(x - line[place] <= reach, np.maximum(place - 1, 0), place))
             beyond = np.minimum(place + 1, len(line) - 2)
             high.append(np.where(line[place + 1] - x <= reach, beyond, place))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..parallel.exchange import swap
-from .cells import TOLERANCE, CellTable
+from .cells import COORDINATES, TOLERANCE, CellTable
 
 __all__ = ["Tiles"]
 
@@ -43,7 +43,8 @@ class Tiles:
         edge = (size.prod() * TILE / count) ** (1.0 / gdim)
         self._shape = np.maximum(size / edge, 1.0).astype(np.int64)
         self._edges = size / self._shape
-        pad = 1e2 * TOLERANCE * size.max()
+        error = 2.0 * COORDINATES * (np.abs(self._low) + size).max()
+        pad = max(1e2 * TOLERANCE * size.max(), error)
         self._ranks = self._place(boxes + np.array([[-pad], [pad]]))
         self._ranges = self._place(low - pad), self._place(high + pad)
         self._known = np.zeros(self._shape.prod(), dtype=bool)

@@ -261,7 +261,11 @@ def polyline(points: Any, *, outside: Any = None, radius: float = 0.0, pivot: An
     Raises:
         MPMError: What makes no line; see :func:`triangulated`.
     """
-    count = np.arange(len(points) if hasattr(points, "__len__") else 0)
+    try:
+        number = len(points)
+    except (TypeError, NotImplementedError):  # one number, or UFL that is one
+        number = 0
+    count = np.arange(number)
     x, facets = _as_arrays(points, np.column_stack([count[:-1], count[1:]]), 2, "polyline")
     return _surface(x, facets, outside, radius, pivot)
 
@@ -376,7 +380,7 @@ def _as_arrays(
     points: Any, facets: Any, dim: int, what: str
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     try:
-        x, corners = np.array(points, dtype=np.float64), np.array(facets)
+        x, corners = as_reals(points), np.array(facets)
     except (TypeError, ValueError):
         x, corners = np.zeros(0), np.zeros(0)
     if x.ndim != 2 or x.shape[1] != dim or not np.isfinite(x).all():

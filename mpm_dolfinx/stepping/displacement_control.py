@@ -17,7 +17,7 @@ from dolfinx import fem, la
 
 from ..assembly.rules import depends_on, split_by_rule
 from ..background.basis import BackgroundBasis
-from ..background.cells import TOLERANCE
+from ..background.cells import COORDINATES, TOLERANCE
 from ..errors import MPMError, agree
 from ..parallel.given import require_same
 from ..particles.geometry import RING
@@ -172,7 +172,8 @@ class DisplacementControl:
         start, sides = x[nodes[:, 0]], x[nodes[:, 1:]] - x[nodes[:, :1]]
         along = np.linalg.solve(sides.transpose(0, 2, 1), (self._point - start)[:, :, None])
         weights = np.column_stack([1.0 - along.sum(axis=1), along[:, :, 0]])
-        inside = weights.min(axis=1)
+        error = COORDINATES * np.abs(self._point).max() * np.abs(np.linalg.inv(sides)).sum((1, 2))
+        inside = weights.min(axis=1) + error
         best = np.argsort(-inside)[:1]
         numbers = particles.W.dofmap.index_map.local_to_global(nodes[best].ravel())
         mine = inside[best].max(initial=-np.inf), numbers, weights[best].ravel()

@@ -13,7 +13,7 @@ from dolfinx import fem, mesh
 
 from .. import _compat
 from ..background.basis import BackgroundBasis, PointBasis
-from ..background.cells import TOLERANCE
+from ..background.cells import COORDINATES, TOLERANCE
 from ..errors import MPMError, agree
 from ..meshes.boxes import BOX_CELLS
 from .method import CornerBasis, DomainState, Method, affine
@@ -122,7 +122,12 @@ class BoxGrid:
                 )
         self.lower = np.array([line[0] for line in self._lines])
         self.upper = np.array([line[-1] for line in self._lines])
-        self.reach = np.array([TOLERANCE * np.diff(line).min() for line in self._lines])
+        self.reach = np.array(
+            [
+                max(TOLERANCE * np.diff(line).min(), COORDINATES * np.abs(line).max())
+                for line in self._lines
+            ]
+        )
 
     def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which points ``(n, gdim)`` are inside the background, or on its boundary."""

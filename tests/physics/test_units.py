@@ -73,3 +73,54 @@ def test_units(name):
         for one, two, factor in zip(expected, answer, factors, strict=True):
             size = max(scenes.largest(one), 1e-12)
             np.testing.assert_allclose(two * factor, one, rtol=0, atol=1e-8 * size, err_msg=unit)
+
+
+#: Origins of coordinates, the last two those of a map.
+ORIGINS = ((0.0, 0.0), (1.1e4, -2.3e4), (5.3e5, 4.1e6), (5.3e5 + 0.1, 4.1e6 + 0.3))
+
+
+def near(V, component, places):
+    """Return a condition on lines of a background of unit cells, or of a tenth of that."""
+    return scenes.fix(
+        V,
+        lambda x: np.any(np.abs(x[component][:, None] - places) < 1e-3, axis=1),
+        component=component,
+    )
+
+
+@pytest.mark.parametrize("cell", scenes.PLANE, ids=scenes.name)
+@pytest.mark.parametrize("ground", scenes.PLANE, ids=scenes.name)
+def test_a_body_on_lines_of_its_background_wherever_the_origin_is(cell, ground):
+    # Nodes on facets and on the border have coordinates of a round-off that is not that of cells.
+    found = []
+    h = 0.1
+    for origin in ORIGINS:
+        low = np.array(origin)
+        V = scenes.vectors(scenes.box(low, low + 7 * h, [7, 7], ground))
+        body = scenes.box(low, low + np.array([7 * h, 3 * h]), [14, 6], cell)
+        bcs = [near(V, 0, [low[0], low[0] + 7 * h]), near(V, 1, low[1:])]
+        particles = mpm.Particles(body, V)
+        problem = mpm.QuasiStaticProblem(
+            particles, Hencky(1e4, 0.3), body_force=(0.0, -100.0), bcs=bcs
+        )
+        problem.solve(steps=2)
+        force = problem.reaction(bcs[1])
+        found.append((scenes.in_order(particles, particles.volume), force))
+        assert abs(force[1] - 100.0 * 21 * h**2) < 1e-6
+    for volume, force in found[1:]:
+        assert np.abs(volume / found[0][0] - 1.0).max() < 1e-7
+        assert np.abs(force - found[0][1]).max() < 1e-6
+
+
+def test_a_controlled_point_in_coordinates_of_a_map():
+    low = np.array(ORIGINS[-1])
+    V = scenes.vectors(scenes.box(low, low + 7.0, [7, 7], QUADRILATERAL))
+    particles = mpm.Particles(
+        scenes.box(low, low + np.array([7.0, 3.0]), [14, 6], scenes.TRIANGLE), V
+    )
+    bcs = [near(V, 1, low[1:]), near(V, 0, [low[0], low[0] + 7.0])]
+    problem = mpm.QuasiStaticProblem(particles, Hencky(1e4, 0.3), body_force=(0.0, -10.0), bcs=bcs)
+    top = low + np.array([7.0, 3.0])
+    control = mpm.DisplacementControl(particles, 0.01, point=top, direction=(0.0, -1.0))
+    problem.solve(2, control=control)
+    assert np.isclose(control.present(), 0.01)
