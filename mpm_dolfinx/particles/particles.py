@@ -425,9 +425,16 @@ class Particles(MaterialDomains):
         return ParticleField(self, V, at, kind, name)
 
     def converged_points(self) -> NDArray[np.float64]:
-        """Return positions of all history's points, last converged, ``(n, nq, gdim)``."""
+        """Return positions of all history's points, last converged, ``(n, nq, gdim)``.
+
+        The point of a triangle that was cut from a quadrilateral is its centroid.
+        """
         corners = self._converged_corners()
-        return np.asarray(np.einsum("qk,nki->nqi", self.quadrature.shapes, corners))
+        points = np.asarray(np.einsum("qk,nki->nqi", self.quadrature.shapes, corners))
+        cut = self.triangular
+        if cut.any():
+            points[cut] = np.einsum("nk,nki->ni", self.mesh_averages[cut], corners[cut])[:, None]
+        return points
 
     def converged_nodes(self, W: fem.FunctionSpace) -> NDArray[np.float64]:
         """Return positions of the nodes of a Lagrange space on the body mesh, last converged.

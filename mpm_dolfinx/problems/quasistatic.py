@@ -30,6 +30,7 @@ from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
 from ..system.body import StepForce
 from ..system.pressure import PressureTerm
+from ..system.smoothing import PressureSmoothing
 from ..system.term import Term
 from ..system.values import FieldTerm
 from .arguments import as_bodies, as_loads, as_supports, as_terms
@@ -102,6 +103,9 @@ class QuasiStaticProblem(ParticleProblem):
             von Mises, Mohr-Coulomb, Drucker-Prager, your own), backgrounds and particles of degree
             2 or 3, instead of ``f_bar``. ``"discontinuous pressure"``: a polynomial of that degree
             in each quadrilateral or hexahedron of the background, so that it may jump.
+            ``"stabilised pressure"``: displacement and pressure are both of degree 1, and what the
+            pressure deviates by from its mean in each cell counts as compliance (Bochev, Dohrmann &
+            Gunzburger 2006).
 
     Attributes:
         pressure: With ``mixed``, the pressure of each body: a :class:`mpm_dolfinx.ParticleField` at
@@ -490,8 +494,9 @@ class QuasiStaticProblem(ParticleProblem):
                 return known
         V = next((V for its, V in self._spaces_of_pressure if its is body), None)
         if V is None:
-            family = "Lagrange" if self.setup.mixed == "pressure" else "DPC"
-            V = fem.functionspace(body.V.mesh, (family, body.V.ufl_element().degree - 1))
+            family = "DPC" if self.setup.mixed == "discontinuous pressure" else "Lagrange"
+            degree = max(body.V.ufl_element().degree - 1, 1)
+            V = fem.functionspace(body.V.mesh, (family, degree))
             self._spaces_of_pressure.append((body, V))
         return body.field(V, at="points", name="pressure")
 
@@ -582,10 +587,15 @@ class QuasiStaticProblem(ParticleProblem):
         """See :meth:`ParticleProblem._couplings`."""
         if self.setup.mixed is None:
             return super()._couplings(contributions)
-        return [
-            PressureTerm(body, CarriedField(field), acting, self._compiled)
-            for body, field, acting in zip(self.bodies, self.pressure, self._acting, strict=True)
-        ]
+        found: list[FieldTerm] = []
+        for body, field, acting, points in zip(
+            self.bodies, self.pressure, self._acting, self._stresses, strict=True
+        ):
+            carried = CarriedField(field)
+            found.append(PressureTerm(body, carried, acting, self._compiled))
+            if self.setup.mixed == "stabilised pressure":
+                found.append(PressureSmoothing(carried, points))
+        return found
 
     def begin_step(self) -> None:
         """See :meth:`ParticleProblem.begin_step`; parameters of materials have new values then."""

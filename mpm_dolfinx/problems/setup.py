@@ -35,7 +35,7 @@ from .summary import counted
 __all__ = ["MIXED", "BodySetup", "Numerics", "Setup"]
 
 #: What may be an unknown beside displacements.
-MIXED = ("pressure", "discontinuous pressure")
+MIXED = ("pressure", "discontinuous pressure", "stabilised pressure")
 #: Cells of the background in which a pressure may be linear by itself.
 WHOLE = ("quadrilateral", "hexahedron")
 
@@ -275,16 +275,23 @@ class Setup:
             raise MPMError(f"mixed={self.mixed!r} takes the place of f_bar; leave f_bar='none'.")
         for body in (given.particles for given in self.bodies):
             degrees = [space.ufl_element().degree for space in (body.V, body.W)]
-            if min(degrees) < 2:
+            if self.mixed == "stabilised pressure":
+                if degrees != [1, 1]:
+                    raise MPMError(
+                        "mixed='stabilised pressure' is for a background and particles of degree "
+                        f"1, not {degrees[0]} and {degrees[1]}; use mixed='pressure' there."
+                    )
+            elif min(degrees) < 2:
                 raise MPMError(
-                    "mixed='pressure' needs a background and particles of degree 2 or 3 "
+                    f"mixed={self.mixed!r} needs a background and particles of degree 2 or 3 "
                     f"(degree=2), not {degrees[0]} and {degrees[1]}: with displacements of degree "
-                    "1 the pressure would oscillate; use f_bar='patch' there."
+                    "1 the pressure would oscillate; use mixed='stabilised pressure' or "
+                    "f_bar='patch' there."
                 )
             if self.mixed != "pressure" and body.V.mesh.topology.cell_name() not in WHOLE:
                 raise MPMError(
-                    "mixed='discontinuous pressure' needs a background of quadrilaterals or "
-                    "hexahedra: linear in each triangle or tetrahedron it would oscillate; use "
+                    f"mixed={self.mixed!r} needs a background of quadrilaterals or hexahedra: on "
+                    "triangles or tetrahedra it would oscillate, or nearly so; use degree 2 with "
                     "mixed='pressure' there."
                 )
 
@@ -313,11 +320,6 @@ class Setup:
             MPMError: They may not.
         """
         self.require_movable("domains cannot be split")
-        if self.mixed is not None:
-            raise MPMError(
-                "Domains cannot be split with mixed='pressure': those of degree 1 have no pressure "
-                "of their own."
-            )
         for term in self.terms:
             term.require_remeshable("domains cannot be split")
         if self.f_bar != "none":

@@ -70,6 +70,7 @@ FEATURES = {
     "multigrid": {"linear_solver": "multigrid"},
     "contact": {"contact": "penalty"},
     "contact, Nitsche": {"contact": "nitsche"},
+    "stabilised pressure": {"mixed": "stabilised pressure"},
 }
 
 
