@@ -50,7 +50,7 @@ def ring(h):
     return mesh.create_mesh(comm, cells.astype(np.int64), element, points)
 
 
-# The exact traction acts on the straight sides of the ring, so that they are no error.
+# The exact traction acts on the straight sides, so that they are no error.
 def run(degree, n, steps, draws):
     """Return times, errors and sizes of the displacement."""
     corners, body = [[-1.5, -1.5], [1.5, 1.5]], ring(1.0 / n)

@@ -17,6 +17,7 @@ import threading
 import urllib.parse
 from pathlib import Path
 
+import programs
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,14 +35,8 @@ def site(tmp_path_factory):
     for name in NEEDED:
         pytest.importorskip(name, reason="the documentation needs pip install '.[docs]'")
     folder = tmp_path_factory.mktemp("site")
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(folder)],
-        cwd=ROOT,
-        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
+    build = ("-m", "mkdocs", "build", "--strict", "--quiet", "-d", folder)
+    done = programs.run(*build, cwd=ROOT, NO_MKDOCS_2_WARNING="1")
     assert done.returncode == 0, done.stderr[-4000:]
     return folder
 
@@ -152,7 +147,7 @@ def test_a_notebook_runs(site, tmp_path):
     os.environ["PYTHONPATH"] = paths
     try:
         client = nbclient.NotebookClient(
-            book, timeout=300, resources={"metadata": {"path": tmp_path}}
+            book, timeout=int(programs.PATIENCE), resources={"metadata": {"path": tmp_path}}
         )
         client.execute()
     finally:
@@ -275,10 +270,10 @@ def seen(site, tmp_path_factory):
         stderr=subprocess.DEVNULL,
     )
     try:
-        assert server.done.wait(400.0), "the browser has not looked at all pages in 400 s"
+        assert server.done.wait(programs.PATIENCE), "the browser has not looked at all pages"
     finally:
-        browser.terminate()
-        browser.wait(30.0)
+        browser.kill()
+        browser.wait()
         server.shutdown()
     return server.report
 
