@@ -470,8 +470,10 @@ class MaterialPoints:
         self.mean_stress.follow(points, material, bulk, soft)
         return _Group(material, points, law)
 
-    def _resolve(self, material: Material, points: NDArray[np.int64]) -> Material:
-        """Return the material with its parameters at the points."""
+    def _resolve(
+        self, material: Material, points: NDArray[np.int64], weakened: bool = True
+    ) -> Material:
+        """Return the material with its parameters at the points, weakened or as given."""
         law = type(material).__name__
         if not isinstance(getattr(material, "symmetric", None), bool | np.bool_):
             raise MPMError(
@@ -488,7 +490,7 @@ class MaterialPoints:
             replaced[name] = _read_only(np.repeat(values, self._particles.num_points))
         if replaced:
             material = material.with_parameters(**replaced).at(points)
-        if self._weakening != 1.0:
+        if weakened and self._weakening != 1.0:
             material = material.weakened(self._weakening)
         if not self.compiled and isinstance(material, CompiledMaterial):
             material = material.with_parameters()
@@ -883,15 +885,21 @@ class MaterialPoints:
         self._last = last
 
     def laws(self) -> list[tuple[str, dict[str, Any]]]:
-        """Return name and parameters of each material; arrays with the indices of their points."""
+        """Return name and parameters of each material; arrays with the indices of their points.
+
+        They are those of the material as it was given, whatever its strength is divided by.
+        """
         nq = self._particles.num_points
         index = self._particles.global_index[:, None] * nq + np.arange(nq)
         laws = []
-        for group in self._groups:
+        for given, group in zip(self._given, self._groups, strict=True):
             where = index.ravel()[group.points]
+            material = group.material
+            if self._weakening != 1.0:
+                material = self._resolve(given.material, group.points, weakened=False)
             parameters: dict[str, Any] = {
                 name: (where, value) if isinstance(value, np.ndarray) else value
-                for name, value in group.material.parameters.items()
+                for name, value in material.parameters.items()
             }
             parameters["points"] = (where, np.ones(len(where)))
             if self.mean_stress is not None:

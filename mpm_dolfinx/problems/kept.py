@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
+from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, ParticleOutsideError
 from ..history import Attempt, History, Loss, Stage, Statistics, Step
 from ..io.snapshot import Kept, Taken, fill, of_cells
@@ -66,6 +67,7 @@ class Material(Kept):
         get: Returns it at the last converged step.
         put: Takes it again.
         at: Where arrays live that do not say it; ``None``: they must.
+        points: The materials at the points of each body, which may be weakened.
     """
 
     key = "history"
@@ -75,8 +77,14 @@ class Material(Kept):
         get: Callable[[], list[dict[str, Any]]],
         put: Callable[[list[dict[str, NDArray[Any]]]], None],
         at: Any,
+        points: Sequence[MaterialPoints] = (),
     ) -> None:
-        self._get, self._put, self._at = get, put, at
+        self._get, self._put, self._at, self._points = get, put, at, points
+
+    def numbers(self) -> dict[str, Any]:
+        """See :class:`Kept`."""
+        factors = [points.weakening for points in self._points]
+        return {"weakening": factors} if factors else {}
 
     def columns(self, body: int | None) -> dict[str, Column]:
         """See :class:`Kept`."""
@@ -105,7 +113,10 @@ class Material(Kept):
                 )
 
     def restore(self, taken: Taken) -> None:
-        """See :class:`Kept`."""
+        """See :class:`Kept`; a state that says nothing of strength leaves it as it is."""
+        for points, factor in zip(self._points, taken.numbers.get("weakening", ()), strict=False):
+            if factor != points.weakening:
+                points.weaken(factor)
         self._put(taken.columns[:-1])
 
 

@@ -25,6 +25,7 @@ from ..assembly.fused import is_fast
 from ..assembly.rules import data_at_points
 from ..boundary.supports import Support
 from ..constitutive.averaging import Linearised
+from ..constitutive.points import MaterialPoints
 from ..contact.contact import Contact
 from ..contact.rigid_body import RigidBody
 from ..errors import MPMError, agree, warn
@@ -940,6 +941,10 @@ class ParticleProblem:
 
     def roll_back(self) -> None:
         """Return to the last converged evaluation."""
+
+    def material_points(self) -> list[MaterialPoints]:
+        """Return the materials at the points of each body; none where the residual is all."""
+        return []
 
     #: Where arrays of :meth:`converged_state` live that do not say it; ``None``: they must.
     _history_at: str | None = "cells"

@@ -729,6 +729,10 @@ class QuasiStaticProblem(ParticleProblem):
 
     _history_at = None
 
+    def material_points(self) -> list[MaterialPoints]:
+        """See :meth:`ParticleProblem.material_points`."""
+        return self._stresses
+
     def converged_state(self) -> list[dict[str, Any]]:
         """See :meth:`ParticleProblem.converged_state`."""
         return [dict(stress.converged_state()) for stress in self._stresses]

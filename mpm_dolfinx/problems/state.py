@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
+from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree
 from ..history import History
 from ..io import checkpoint, identity
@@ -55,6 +56,9 @@ class Stateful(Protocol):
 
     def laws(self) -> list[list[tuple[str, dict[str, Any]]]]:
         """Return name and parameters of each body's materials."""
+
+    def material_points(self) -> list[MaterialPoints]:
+        """Return the materials at the points of each body."""
 
     def converged_state(self) -> list[dict[str, Any]]:
         """Return the history at the points of each body."""
@@ -169,7 +173,12 @@ class ProblemState:
         needed = problem.data_at_points() if whole else set()
         things = [
             kept.Bodies(problem.bodies),
-            kept.Material(problem.converged_state, problem.set_converged_state, self._history_at),
+            kept.Material(
+                problem.converged_state,
+                problem.set_converged_state,
+                self._history_at,
+                problem.material_points(),
+            ),
             kept.Functions(functions, problem.bodies, needed),
             kept.Values(carried, problem.reduced),
             kept.Increments(problem.reduced, problem.bodies, carried),

@@ -2,10 +2,12 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Factors of safety by one call, against a published slope and a bound of limit analysis."""
 
+from mpi4py.MPI import MAX
+
 import numpy as np
 import pytest
 from marks import slow
-from scenes import QUADRILATERAL, at, box, fix, in_order, vectors
+from scenes import QUADRILATERAL, WORLD, at, box, fix, in_order, vectors
 
 from dolfinx import mesh
 
@@ -118,16 +120,63 @@ def test_slope_with_a_pressure_of_its_own(mixed):
     np.testing.assert_allclose(ends[0].displacements, ends[1].displacements, rtol=1e-5)
 
 
-def test_stops_where_the_body_moves_too_far():
-    """A block that stands on its base yields, and stays in the state before it went too far."""
+def block(law=None):
+    """Return a block that stands on its base."""
     V = vectors(box([0, 0], [3, 3], [3, 3], QUADRILATERAL))
-    problem = mpm.QuasiStaticProblem(
+    return mpm.QuasiStaticProblem(
         mpm.Particles(box([0, 0], [2, 2], [4, 4], QUADRILATERAL), V),
-        materials.Tresca(1e3, 0.3, cohesion=6.0),
+        law or materials.Tresca(1e3, 0.3, cohesion=6.0),
         density=1.0,
         body_force=(0.0, -4.0),
         bcs=[fix(V, at(0, 0), component=0), fix(V, at(1, 0), component=1)],
     )
+
+
+CHANGES = {
+    "split": lambda problem: problem.split([0]),
+    "rebase": lambda problem: problem.rebase(),
+    "repartition": lambda problem: problem.repartition(0.0),
+    "stage": lambda problem: problem.stage(body_force=(0.0, -4.0)),
+    "remove": lambda problem: problem.remove(lambda x: (x[0] > 1.5) & (x[1] > 1.5)),
+    "state": lambda problem: problem.return_to(problem.capture()),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_is_weak_stays_weak(change, mpi_tmp_path):
+    problem = block()
+    problem.solve(2)
+    problem.points[0].weaken(2.2)
+    CHANGES[change](problem)
+    assert problem.points[0].weakening == 2.2
+    problem.solve() if change in ("stage", "remove") else problem.step()
+
+    def most(problem):
+        """Return the largest maximum shear stress of Kirchhoff's, on any rank."""
+        J = np.linalg.det(problem.particles.deformation_gradient)[:, None, None]
+        s = np.linalg.eigvalsh(J * problem.particles.stress.reshape(-1, 3, 3))
+        return WORLD.allreduce(0.5 * (s[:, 2] - s[:, 0]).max(initial=0.0), MAX)
+
+    assert most(problem) == pytest.approx(6.0 / 2.2, rel=1e-9)
+    if change != "state":
+        return
+    problem.save(mpi_tmp_path / "weak")
+    again = block()
+    again.restore(mpi_tmp_path / "weak")
+    assert again.points[0].weakening == 2.2
+    for one in (problem, again):
+        one.particles.load.value = 1.02
+        one.step()
+    assert most(again) == pytest.approx(6.0 / 2.2, rel=1e-9)
+    ends = (in_order(one.particles, one.particles.centroid) for one in (problem, again))
+    np.testing.assert_allclose(*ends, atol=1e-12)
+    with pytest.raises(mpm.MPMError, match="the material is not the same"):
+        block(materials.Tresca(1e3, 0.3, cohesion=6.0 / 2.2)).restore(mpi_tmp_path / "weak")
+
+
+def test_stops_where_the_body_moves_too_far():
+    """A block that stands on its base yields, and stays in the state before it went too far."""
+    problem = block()
     with pytest.raises(mpm.MPMError, match="whole load"):
         mpm.strength_reduction(problem)
     problem.solve(2)
