@@ -26,13 +26,15 @@ from dolfinx import fem
 from ufl.algorithms.analysis import extract_coefficients, extract_constants
 
 from ..assembly.inputs import as_expression, is_tag, known_tags
-from ..errors import MPMError, agree
+from ..errors import MPMError, agree, warn
 from ..particles.particles import Particles
 
 __all__ = ["Dashpot", "Plane", "Support", "dashpot", "fixed", "plane", "roller"]
 
 #: Stiffness of a support in units of the modulus over the thickness of a domain.
 PENALTY = 1e3
+#: Ratio of moduli from which a support is too soft for a material that came later.
+STIFFER = 10.0
 #: Gap, relative to the body's coordinates, at which a plane is touched: their round-off.
 TOUCH = 1e-14
 
@@ -89,6 +91,7 @@ class Support:
         )
         self._penalty = float(penalty)
         self._modulus = modulus is not None
+        self._found: NDArray[np.float64] | None = None
         if modulus is not None:
             self.scale(as_expression(modulus, particles, "modulus", ()))
         self._traction = -self._stiffness * gap
@@ -154,13 +157,38 @@ class Support:
         """
         self._whole_step = self._has_whole_step(share)
         self._power = None
-        if not self._modulus:
+        if not self._modulus or self._found is not None:
             each = fem.Function(self._stiffness.function_space)
             cells = each.function_space.dofmap.list[: self.particles.num_local, 0]
             each.x.array[cells] = moduli()
-            self.scale(each)
+            if self._modulus:
+                self._compare(np.asarray(each.x.array, dtype=np.float64))
+            else:
+                self.scale(each)
+                self._found = np.array(each.x.array, dtype=np.float64)
         self.revolve(turn)
         return self.residual
+
+    def _compare(self, moduli: NDArray[np.float64]) -> None:
+        """Warn where the body is much stiffer than the stiffness was chosen for (collective)."""
+        assert self._found is not None
+        behind = self._stiffness.x.array > 0.0
+        mine = float((moduli[behind] / self._found[behind]).max(initial=0.0))
+        comm: MPI.Comm = self.particles.mesh.comm
+        stiffer = comm.allreduce(mine, MPI.MAX)
+        if stiffer > STIFFER:
+            warn(
+                comm,
+                f"A support has the stiffness that the first material gave it, and the present one "
+                f"is {stiffer:.3g} times as stiff, so that the support gives way as much more of "
+                "its strain; give the support modulus=, that of the stiffest material.",
+                stacklevel=6,
+            )
+
+    def forget_modulus(self) -> None:
+        """Take that of another problem's material, unless one was given."""
+        if self._found is not None:
+            self._modulus, self._found = False, None
 
     @property
     def residual(self) -> ufl.Form:

@@ -400,4 +400,6 @@ def as_supports(supports: Any, bodies: Sequence[Particles]) -> list[Support]:
         raise MPMError("supports must be a list of supports made by mpm.boundary.")
     if any(all(s.particles is not body for body in bodies) for s in supports):
         raise MPMError("A support was made with other particles than those of this problem.")
+    if len({id(support) for support in supports}) < len(supports):
+        raise MPMError("A support stands twice in supports, and would hold twice; give it once.")
     return list(supports)

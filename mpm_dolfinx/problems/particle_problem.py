@@ -524,7 +524,11 @@ class ParticleProblem:
             MPMError: What is to be changed does not go together.
         """
         self._require_governing()
-        self._staging.begin(name, change, sudden)
+        if not isinstance(name, str):
+            raise MPMError(f"The name of a stage must be a string, not {name!r}.")
+        if not isinstance(sudden, bool | np.bool_):
+            raise MPMError(f"sudden must be True or False, not {sudden!r}.")
+        self._staging.begin(name, change, bool(sudden))
 
     @property
     def held_back(self) -> float:

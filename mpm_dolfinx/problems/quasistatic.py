@@ -182,6 +182,11 @@ class QuasiStaticProblem(ParticleProblem):
             linear_solver=linear_solver,
         )
         supports = as_supports(supports, bodies)
+        for body in bodies:
+            moved = bodies[0].V.mesh.comm.allreduce(int(np.any(body.converged_displacement)))
+            for support in supports:
+                if support.particles is body and not moved:
+                    support.forget_modulus()
         count = len(bodies) if isinstance(particles, list | tuple) else 0
         given = zip(
             bodies,

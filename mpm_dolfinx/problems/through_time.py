@@ -118,6 +118,8 @@ class TimeProblem(ParticleProblem):
             output_at=output_at,
             repartition=repartition,
         )
+        if update is not None and not callable(update):
+            raise MPMError(f"update= is a function of t, not {update!r}.")
         now = self.history.time
         for name, value in (("time", time), ("dt", dt)):
             known = isinstance(value, float | int | np.number) and not isinstance(value, bool)

@@ -216,6 +216,8 @@ class Stepper:
         else:
             raise MPMError(f"steps must be a whole number from 1 on or 'auto', not {steps!r}.")
         if update is not None:
+            if not callable(update):
+                raise MPMError(f"update= is a function of t, not {update!r}.")
             update = on_all_ranks(self._comm, update)
         if control is not None and not isinstance(control, DisplacementControl):
             raise MPMError(f"control= is a DisplacementControl, not {control!r}.")

@@ -257,3 +257,38 @@ def test_a_body_of_revolution_stands_on_its_roller():
     )
     problem.solve(steps=2)
     np.testing.assert_allclose(problem.reaction(base)[1], 20.0 * np.pi, rtol=1e-8)
+
+
+def standing(first, *laws):
+    """Return a column on a roller of its own, of each of some materials one after the other."""
+    V = scenes.vectors(scenes.box([-0.5, -0.3], [1.5, 1.2], [8, 6], QUADRILATERAL))
+    body = scenes.box([0.0, 0.07], [1.0, 1.07], [4, 4], QUADRILATERAL)
+    p = mpm.Particles(body, V)
+    base = fixed(p, scenes.facet_tags(body, scenes.at(1, 0.07)), 1)
+    problems = [
+        mpm.QuasiStaticProblem(p, law, body_force=(0.0, -10.0), supports=[base])
+        for law in (first, *laws)
+    ]
+    return p, base, problems[-1]
+
+
+def test_a_support_is_as_stiff_as_the_material_of_the_last_problem():
+    # (a cell of a notebook that is run again with another material)
+    p, _, problem = standing(Hencky(1e3, 0.3), Hencky(1e6, 0.3))
+    problem.solve(steps=2)
+    fresh, _, expected = standing(Hencky(1e6, 0.3))
+    expected.solve(steps=2)
+    exact = scenes.in_order(fresh, fresh.volume)
+    assert np.abs(scenes.in_order(p, p.volume) - exact).max() < 1e-9
+    gap = scenes.in_order(p, p.centroid) - scenes.in_order(fresh, fresh.centroid)
+    assert np.abs(gap).max() < 1e-9
+
+
+def test_a_stage_with_a_material_too_stiff_for_its_support():
+    _, base, problem = standing(Hencky(1e3, 0.3))
+    problem.solve(steps=1)
+    problem.stage(material=Hencky(5e3, 0.3))
+    with pytest.warns(UserWarning, match=r"1e\+03 times as stiff.*give the support modulus="):
+        problem.stage(material=Hencky(1e6, 0.3))
+    problem.solve(steps=1)
+    np.testing.assert_allclose(problem.reaction(base), [0.0, 10.0], atol=1e-6)

@@ -337,6 +337,10 @@ PROBLEMS = {
         problem(supports=lambda p: mpm.boundary.fixed(p, tags_of_facets(p), 1)),
         r"supports must be a list",
     ),
+    "support twice": (
+        problem(supports=lambda p: [mpm.boundary.fixed(p, tags_of_facets(p), 1)] * 2),
+        r"stands twice in supports",
+    ),
     "support of another body": (foreign_support, r"made with other particles"),
     "support of no body": (lambda: mpm.boundary.fixed("body", None, 1), r"mpm\.Particles, not str"),
     "roller of no body": (lambda: mpm.boundary.roller(1, None, 1, (0, 1)), r"Particles, not int"),
@@ -491,3 +495,11 @@ def test_density_that_becomes_negative(kind):
     become(1.0)
     problem.step()
     np.testing.assert_allclose(problem.reaction(bcs[0])[1], weight / 2.0, rtol=1e-9)
+
+
+def test_a_path_or_a_stage_of_another_kind():
+    made = held("fixed")()
+    raises(lambda: made.solve(2, update=5), mpm.MPMError, r"update= is a function of t, not 5")
+    raises(lambda: made.stage(sudden="no"), mpm.MPMError, r"sudden must be True or False")
+    raises(lambda: made.stage(name=5), mpm.MPMError, r"name of a stage must be a string")
+    assert not made.history.stages
