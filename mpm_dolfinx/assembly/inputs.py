@@ -161,10 +161,11 @@ def known_tags(
             that is used is on facets inside the body.
     """
     body = particles.mesh
+    needs = f"{what} {'needs' if what.startswith('A ') else 'need'}"
     if not isinstance(facet_tags, mesh.MeshTags) or facet_tags.dim != body.topology.dim - 1:
-        raise MPMError(f"{what} need facet_tags=, tags of the body's facets.")
+        raise MPMError(f"{needs} facet_tags=, tags of the body's facets.")
     if not _compat.are_tags_of(facet_tags, body):
-        raise MPMError(f"{what} need facet_tags= of the body's mesh, not of another one.")
+        raise MPMError(f"{needs} facet_tags= of the body's mesh, not of another one.")
     with agree(body.comm):
         pairs, times = np.unique(
             np.column_stack([facet_tags.indices, facet_tags.values]), axis=0, return_counts=True

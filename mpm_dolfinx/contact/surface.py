@@ -24,6 +24,9 @@ from ..particles.particles import Particles
 
 __all__ = ["Blocks", "Facets", "PointMatrix", "Surface", "global_dofs", "nodal_vector", "normals"]
 
+#: Highest degree of a rule on a facet: 51 points each way.
+MOST = 100
+
 #: Position, relative to the coordinates of a body, at which a point touches: their round-off.
 TOUCH = 1e-12
 
@@ -136,9 +139,11 @@ class Surface:
     ) -> None:
         if degree is None:
             degree = 2 * int(particles.W.ufl_element().degree) + 1
-        if not isinstance(degree, int | np.integer) or degree < 0:
+        whole = isinstance(degree, int | np.integer) and not isinstance(degree, bool)
+        if not whole or not 0 <= degree <= MOST:
             raise MPMError(
-                f"quadrature_degree of {what} must be a whole number from 0 on, not {degree!r}."
+                f"quadrature_degree of {what} must be a whole number from 0 to {MOST}, not "
+                f"{degree!r}."
             )
         self.particles = particles
         self.axisymmetric = axisymmetric

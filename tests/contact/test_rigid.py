@@ -481,8 +481,10 @@ def test_a_body_that_nothing_holds_yet_is_no_false_verdict():
         ({"penalty": 0.0}, "penalty must be a positive number"),
         ({"modulus": -1.0}, "modulus must be a positive number"),
         ({"tangential_penalty": "1"}, "tangential_penalty must be a positive number"),
-        ({"quadrature_degree": -1}, "whole number from 0"),
-        ({"tag": 3}, "need facet_tags="),
+        ({"quadrature_degree": -1}, "whole number from 0 to 100, not -1"),
+        ({"quadrature_degree": True}, "whole number from 0 to 100, not True"),
+        ({"quadrature_degree": 1000}, "whole number from 0 to 100, not 1000"),
+        ({"tag": 3}, "A Rigid needs facet_tags="),
     ],
 )
 def test_what_makes_no_sense_is_refused(options, sentence):
