@@ -22,7 +22,7 @@ BIN := $(VENV)/bin
 SETUP := sh scripts/setup_env.sh
 
 # Benchmarks that print a JSON object; work_precision.py writes its results and pictures itself.
-BENCHMARKS := $(wildcard $(patsubst %,benchmarks/%.py,assembly step skip solvers multigrid choice scaling ranks cantilever_reference))
+BENCHMARKS := $(wildcard $(patsubst %,benchmarks/%.py,assembly step contact skip solvers multigrid choice scaling ranks cantilever_reference))
 
 .DEFAULT_GOAL := help
 .PHONY: help demo demos test test-all test-debian stress bench bench-smoke studies lint docs serve dist

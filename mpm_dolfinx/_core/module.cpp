@@ -15,6 +15,7 @@
 #include <nanobind/stl/vector.h>
 
 #include "arrays.h"
+#include "contact.h"
 #include "domains.h"
 #include "material.h"
 #include "mean_stress.h"
@@ -53,6 +54,44 @@ Numbered numbered(const std::vector<Part>& parts, int dim, const Indices& number
     result.parts.push_back({offsets.data(), nodes.data(), columns, their_numbers.data()});
   }
   return result;
+}
+
+// Points that meet facets: places, tables of the facets, and what is known of the points.
+Meeting meeting_of(const Reals& x, const std::vector<Reals>& tables,
+                   const std::vector<Reals>& points, const Array<const std::uint8_t>& touched,
+                   const std::vector<double>& law, bool smooth)
+{
+  require(x.ndim() == 3 && (x.shape(2) == 2 || x.shape(2) == 3), "places (n, count, 2 or 3)");
+  require(tables.size() == 4 && points.size() == 5 && law.size() == 4, "tables, points and law");
+  const std::size_t n = x.shape(0), sides = x.shape(2) - 1;
+  require(tables[0].ndim() == 2, "shape functions (n, nodes)");
+  const std::size_t nodes = tables[0].shape(1);
+  require(tables[0].shape(0) == n && tables[1].size() == n * sides * nodes
+              && tables[2].size() == n * sides * sides * nodes && tables[3].size() == n * nodes,
+          "shape functions with first and second derivatives, and those of anchors");
+  require(x.shape(1) == 1 + (smooth ? nodes : 2 * nodes), "places of a point, nodes and anchors");
+  for (const Reals& values : points)
+    require(values.size() == n, "values (n,)");
+  require(touched.size() == n, "touched (n,)");
+  return {n,
+          static_cast<int>(x.shape(1)),
+          static_cast<int>(nodes),
+          x.data(),
+          tables[0].data(),
+          tables[1].data(),
+          tables[2].data(),
+          tables[3].data(),
+          points[0].data(),
+          points[1].data(),
+          points[2].data(),
+          touched.data(),
+          points[3].data(),
+          points[4].data(),
+          law[0],
+          law[1],
+          law[2],
+          law[3],
+          smooth};
 }
 
 Dofmap dofmap_of(const Indices& dofmap)
@@ -525,4 +564,94 @@ NB_MODULE(_loops, m)
   },
         "gradient"_a, "old_gradient"_a, "stiffness"_a, "small"_a, "factor"_a,
         "stress"_a.noconvert(), "tangent"_a.noconvert(), "Set stress and tangent of damping.");
+
+  m.def("act",
+        [](Reals x, const std::vector<Reals>& tables, const std::vector<Reals>& points,
+           Array<const std::uint8_t> touched, const std::vector<double>& law, bool smooth,
+           RealsOut pushes, RealsOut rubs, RealsOut pressure, RealsOut shear,
+           Array<std::uint8_t> inside, Array<std::uint8_t> slips) {
+    const Meeting meeting = meeting_of(x, tables, points, touched, law, smooth);
+    const std::size_t n = meeting.points, dim = x.shape(2);
+    require(pushes.size() == n * (1 + meeting.nodes) * dim && rubs.size() == pushes.size()
+                && pressure.size() == n && shear.size() == n * dim && inside.size() == n
+                && slips.size() == n,
+            "forces (n, 1 + nodes, dim), values (n,)");
+    act(meeting, static_cast<int>(dim),
+        {pushes.data(), rubs.data(), pressure.data(), shear.data(), inside.data(), slips.data()});
+  },
+        "x"_a, "tables"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a, "pushes"_a.noconvert(),
+        "rubs"_a.noconvert(), "pressure"_a.noconvert(), "shear"_a.noconvert(),
+        "inside"_a.noconvert(), "slips"_a.noconvert(),
+        "Set what acts between points and facets.");
+
+  m.def("differentiate",
+        [](Reals x, const std::vector<Reals>& tables, const std::vector<Reals>& points,
+           Array<const std::uint8_t> touched, const std::vector<double>& law, bool smooth,
+           RealsOut derivatives) {
+    const Meeting meeting = meeting_of(x, tables, points, touched, law, smooth);
+    const std::size_t n = meeting.points, dim = x.shape(2);
+    require(derivatives.size() == n * (1 + meeting.nodes) * dim * meeting.count * dim,
+            "derivatives (n, 1 + nodes, dim, count, dim)");
+    differentiate(meeting, static_cast<int>(dim), derivatives.data());
+  },
+        "x"_a, "tables"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a,
+        "derivatives"_a.noconvert(), "Set the derivatives of what acts between points and facets.");
+
+  m.def("add_blocks",
+        [](Reals derivatives, Reals weights, Offsets number, int first_row, Reals row_shapes,
+           int first_column, Reals column_shapes, RealsOut blocks) {
+    require(derivatives.ndim() == 5, "derivatives (n, places, dim, count, dim)");
+    const std::size_t n = derivatives.shape(0), dim = derivatives.shape(2);
+    const auto places = static_cast<int>(derivatives.shape(1));
+    const auto count = static_cast<int>(derivatives.shape(3));
+    require((dim == 2 || dim == 3) && derivatives.shape(4) == dim, "two or three dimensions");
+    require(weights.size() == n && number.size() == n, "weights and numbers (n,)");
+    require(blocks.ndim() == 3 && blocks.shape(1) % dim == 0 && blocks.shape(2) % dim == 0,
+            "blocks (m, rows, columns)");
+    const auto side = [&](int first, const Reals& shapes, std::size_t size, int most) {
+      const auto nodes = static_cast<int>(size / dim);
+      const bool own = shapes.size() > 0;
+      require(!own || shapes.size() == n * nodes, "shape functions (n, nodes)");
+      require(first >= 0 && first + (own ? 1 : nodes) <= most, "places of a stencil");
+      return Side{first, nodes, own ? shapes.data() : nullptr};
+    };
+    const Side rows = side(first_row, row_shapes, blocks.shape(1), places);
+    const Side columns = side(first_column, column_shapes, blocks.shape(2), count);
+    for (std::size_t p = 0; p < n; ++p)
+      require(number.data()[p] >= 0
+                  && number.data()[p] < static_cast<std::int64_t>(blocks.shape(0)),
+              "numbers of blocks");
+    add_blocks(n, static_cast<int>(dim), places, count, derivatives.data(), weights.data(),
+               number.data(), rows, columns, blocks.data());
+  },
+        "derivatives"_a, "weights"_a, "number"_a, "first_row"_a, "row_shapes"_a, "first_column"_a,
+        "column_shapes"_a, "blocks"_a.noconvert(), "Add derivatives at points to blocks.");
+
+  m.def("find_closest",
+        [](Reals x, Reals normal, Reals corners, Reals outward, Array<const std::uint8_t> present,
+           const std::vector<double>& bounds, int most, OffsetsOut found, RealsOut place,
+           RealsOut gap, Array<std::uint8_t> near, RealsOut beside) {
+    require(corners.ndim() == 3 && (corners.shape(2) == 2 || corners.shape(2) == 3),
+            "corners (facets, nodes, 2 or 3)");
+    const std::size_t dim = corners.shape(2), nodes = corners.shape(1), n = found.size();
+    const std::size_t facets = corners.shape(0);
+    require(nodes == dim || (dim == 3 && nodes == 4), "lines, triangles or quadrilaterals");
+    require(x.size() == n * dim && (normal.size() == 0 || normal.size() == n * dim)
+                && outward.size() == facets && present.size() == facets,
+            "points and normals (n, dim), signs of facets");
+    require(place.size() == n * (dim - 1) && gap.size() == n && near.size() == n
+                && beside.size() == n,
+            "results (n,)");
+    require(bounds.size() == 5, "reach, three cosines, and the last step");
+    return find_closest({n, facets, static_cast<int>(nodes), x.data(),
+                         normal.size() == 0 ? nullptr : normal.data(), corners.data(),
+                         outward.data(), present.data(), bounds[0], bounds[1], bounds[2], bounds[3],
+                         bounds[4], most},
+                        static_cast<int>(dim),
+                        {found.data(), place.data(), gap.data(), near.data(), beside.data()});
+  },
+        "x"_a, "normal"_a, "corners"_a, "outward"_a, "present"_a, "bounds"_a, "most"_a,
+        "found"_a.noconvert(), "place"_a.noconvert(), "gap"_a.noconvert(), "near"_a.noconvert(),
+        "beside"_a.noconvert(),
+        "Find the closest facets of points; return whether all that were tried have an area.");
 }

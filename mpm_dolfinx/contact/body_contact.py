@@ -126,8 +126,10 @@ class BodyContact(Rigid):
 
     def _positions(self, which: NDArray[np.int64] | None) -> NDArray[np.float64]:
         """See :class:`Rigid`."""
-        seen = None if which is None else self._seen
-        return super()._positions(which) if seen is None else seen[1]
+        near, seen = self._near, self._seen
+        if seen is None or near is None or which is not near.which:
+            return super()._positions(which)
+        return seen[1]
 
     def put(self, pose: Pose, whole: bool = False) -> None:
         """Evaluate what acts with the shape in some place.

@@ -18,15 +18,17 @@ from numpy.typing import NDArray
 
 import basix
 
+from .._core import loops
 from ..parallel.exchange import swap
 from .surface import Surface, global_dofs, normals
 
 __all__ = ["Closest", "NearFacets", "solved"]
 
-#: Cosine of the angle of two normals below which surfaces face each other.
-FACING = -0.1
-#: Most Newton steps of a projection, and the step that ends them.
-PROJECTIONS, CLOSE = 20, 1e-14
+#: Cosine of the angle of two normals below which surfaces face each other; and in the middle of a
+#: facet, below which they may do so somewhere, and below which they do so for sure.
+FACING, MAY_FACE, SURELY_FACING = -0.1, 0.5, -0.4
+#: Most Newton steps of a projection, and the step that ends them: the next one is its square.
+PROJECTIONS, CLOSE = 20, 1e-10
 
 
 class Closest(NamedTuple):
@@ -126,6 +128,8 @@ class NearFacets:
         k = self.element.dim
         if n == 0:
             return np.zeros((0, k)), np.zeros((0, e, k)), np.zeros((0, e, e, k))
+        if self.element.degree == 1:
+            return self._of_degree_1(place)
         table = self.element.tabulate(2, place)[:, :, :, 0]
         first = [1 + i for i in range(e)]
         if e == 1:
@@ -136,6 +140,27 @@ class NearFacets:
                 [basix.index(1, 1), basix.index(0, 2)],
             ]
         return table[0], table[first].swapaxes(0, 1), np.moveaxis(table[np.array(second)], 2, 0)
+
+    def _of_degree_1(
+        self, place: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return :meth:`tabulate` of lines, triangles and quadrilaterals of degree 1."""
+        n, e = place.shape
+        k = self.element.dim
+        N, dN, ddN = np.empty((n, k)), np.empty((n, e, k)), np.zeros((n, e, e, k))
+        if k < 4:
+            N[:, 0], N[:, 1:] = 1.0 - place.sum(axis=1), place
+            dN[:] = np.vstack([-np.ones(e), np.eye(e)]).T
+            return N, dN, ddN
+        ends = np.stack([1.0 - place, place], axis=1)
+        slopes = np.array([-1.0, 1.0])
+        for node in range(4):
+            i, j = node % 2, node // 2
+            N[:, node] = ends[:, i, 0] * ends[:, j, 1]
+            dN[:, 0, node] = slopes[i] * ends[:, j, 1]
+            dN[:, 1, node] = slopes[j] * ends[:, i, 0]
+            ddN[:, 0, 1, node] = ddN[:, 1, 0, node] = slopes[i] * slopes[j]
+        return N, dN, ddN
 
     def project(
         self, points: NDArray[np.float64], nodes: NDArray[np.float64], place: NDArray[np.float64]
@@ -155,21 +180,22 @@ class NearFacets:
             return np.asarray(np.clip(place + step, -3.0, 4.0))
         place = place.copy()
         left = np.arange(len(points))
+        x, X = points, nodes
         for _ in range(PROJECTIONS):
             N, dN, ddN = self.tabulate(place[left])
-            x, X = points[left], nodes[left]
             r = x - np.einsum("nk,nki->ni", N, X)
-            A = np.einsum("nek,nki->nei", dN, X)
-            B = np.einsum("nefk,nki,ni->nef", ddN, X, r)
+            A = dN @ X
             G = A @ A.swapaxes(1, 2)
             # where a curved facet bends towards the point too much, its plane has to do
-            bent = G - B
-            good = np.linalg.det(bent) > 0.1 * np.linalg.det(G)
+            bent = G - np.einsum("nefk,nk->nef", ddN, np.einsum("nki,ni->nk", X, r))
+            good = _determinant(bent) > 0.1 * _determinant(G)
             G = np.where(good[:, None, None], bent, G)
-            step = np.linalg.solve(G, np.einsum("nei,ni->ne", A, r)[:, :, None])[:, :, 0]
-            step = np.clip(step, -1.0, 1.0)
+            if not (_determinant(G) > 0.0).all():
+                raise np.linalg.LinAlgError("A facet has no area.")
+            step = np.clip(solved(G, np.einsum("nei,ni->ne", A, r)), -1.0, 1.0)
             place[left] = np.clip(place[left] + step, -3.0, 4.0)
-            left = left[np.abs(step).max(axis=1, initial=0.0) > CLOSE]
+            going = np.abs(step).max(axis=1, initial=0.0) > CLOSE
+            left, x, X = left[going], x[going], X[going]
             if len(left) == 0:
                 break
         return place
@@ -191,6 +217,7 @@ class NearFacets:
         outward: NDArray[np.float64] | None,
         nodes: NDArray[np.float64],
         reach: float,
+        compiled: bool = True,
     ) -> Closest:
         """Return the closest facet of each point.
 
@@ -200,16 +227,39 @@ class NearFacets:
                 takes facets as they come.
             nodes: Nodes of the facets, of :meth:`positions`.
             reach: How near a facet must be.
+            compiled: Whether compiled loops may be used.
+
+        Raises:
+            numpy.linalg.LinAlgError: A facet has no area.
         """
         n, e = len(points), self.gdim - 1
         facet = np.full(n, -1, dtype=np.int64)
         place, gap = np.zeros((n, e)), np.full(n, np.inf)
         near, beside = np.zeros(n, dtype=bool), np.zeros(n)
+        found = Closest(facet, place, gap, near, beside)
+        if compiled and loops is not None and self.element.degree == 1:
+            good = loops.find_closest(
+                np.ascontiguousarray(points),
+                np.zeros((0, 1)) if outward is None else np.ascontiguousarray(outward),
+                np.ascontiguousarray(nodes),
+                np.ascontiguousarray(self.outward),
+                self.present.view(np.uint8),
+                [reach, FACING, SURELY_FACING, MAY_FACE, CLOSE],
+                PROJECTIONS,
+                facet,
+                place,
+                gap,
+                near.view(np.uint8),
+                beside,
+            )
+            if not good:
+                raise np.linalg.LinAlgError("A facet has no area.")
+            return found
         which, facets = self._candidates(points, nodes, reach)
-        which, facets = self._facing(points, outward, nodes, which, facets, reach)
-        which, facets = self._nearest(points, nodes, which, facets)
+        which, facets, faces = self._facing(points, outward, nodes, which, facets, reach)
+        which, facets = self._nearest(points, nodes, which, facets, faces)
         if len(which) == 0:
-            return Closest(facet, place, gap, near, beside)
+            return found
         x, X = points[which], nodes[facets]
         s = self.project(x, X, self._start(len(which)))
         inner = self.clamped(s)
@@ -241,7 +291,7 @@ class NearFacets:
         off &= (far[first] > 2.0 * np.abs(g) + 1e-12 * size) | (g < -0.5 * size)
         near[who] = ~off
         beside[who] = over / size
-        return Closest(facet, place, gap, near, beside)
+        return found
 
     def _nearest(
         self,
@@ -249,16 +299,42 @@ class NearFacets:
         nodes: NDArray[np.float64],
         which: NDArray[np.int64],
         facets: NDArray[np.int64],
+        faces: NDArray[np.bool_],
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the pairs in which a facet may be the closest, by balls around flat facets."""
-        if not self._flat or len(which) == 0:
+        """Return the pairs in which a facet may be the closest.
+
+        No facet is nearer than its box, nor farther than the place on it where its plane in the
+        middle has the point.
+
+        Args:
+            points: Shape ``(n, gdim)``.
+            nodes: Nodes of the facets.
+            which: Points of some pairs.
+            facets: Their facets.
+            faces: Whether the facet of each faces its point for sure.
+        """
+        if len(which) == 0:
             return which, facets
-        middle = nodes.mean(axis=1)
-        size = np.linalg.norm(nodes - middle[:, None], axis=2).max(axis=1)
-        far = np.linalg.norm(points[which] - middle[facets], axis=1)
+        N, dN, _ = self.tabulate(self._start(1))
+        middle, A = N[0] @ nodes, dN[0] @ nodes
+        G = A @ A.swapaxes(1, 2)
+        x, X = points[which], nodes[facets]
+        along = np.einsum("nei,ni->ne", A[facets], x - middle[facets])
+        good = _determinant(G)[facets] > 0.0
+        place = self._start(len(which))
+        place[good] += solved(G[facets][good], along[good])
+        at, _, _ = self.tabulate(self.clamped(place))
+        far = np.linalg.norm(x - np.einsum("nk,nki->ni", at, X), axis=1)
         most = np.full(len(points), np.inf)
-        np.minimum.at(most, which, far)
-        good = far - size[facets] <= most[which] * (1.0 + 1e-9)
+        np.minimum.at(most, which[faces], far[faces])
+        low, high = nodes.min(axis=1), nodes.max(axis=1)
+        if self.element.degree > 1:  # which goes beyond its nodes
+            more = 0.5 * (high - low)
+            low, high = low - more, high + more
+        out = np.maximum(np.maximum(low[facets] - x, x - high[facets]), 0.0)
+        # (within round-off, as where surfaces touch all of these are nothing)
+        slack = 1e-9 * (high - low).max(axis=1, initial=0.0)[facets]
+        good = np.linalg.norm(out, axis=1) <= most[which] * (1.0 + 1e-9) + slack
         return which[good], facets[good]
 
     def _facing(
@@ -269,10 +345,14 @@ class NearFacets:
         which: NDArray[np.int64],
         facets: NDArray[np.int64],
         reach: float,
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the pairs of points and facets that may be near, by the planes of the facets."""
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the pairs of points and facets that may be near, by the planes of the facets.
+
+        And which of the facets face their points for sure.
+        """
+        faces = np.ones(len(which), dtype=bool)
         if len(which) == 0:
-            return which, facets
+            return which, facets, faces
         _, dN, _ = self.tabulate(self._start(1))
         n = self.outward[:, None] * normals(np.einsum("ek,fki->fie", dN[0], nodes))
         n = n / np.maximum(np.linalg.norm(n, axis=1), 1e-300)[:, None]
@@ -284,8 +364,9 @@ class NearFacets:
         good &= np.linalg.norm(points[which] - middle[facets], axis=1) <= reach + size[facets]
         if outward is not None:
             facing = (outward[which] * n[facets]).sum(axis=1)
-            good &= facing < (0.5 if curved else FACING)
-        return which[good], facets[good]
+            good &= facing < MAY_FACE
+            faces = facing < SURELY_FACING
+        return which[good], facets[good], faces[good]
 
     def _candidates(
         self, points: NDArray[np.float64], nodes: NDArray[np.float64], reach: float
@@ -333,6 +414,13 @@ class NearFacets:
         x = points[which]
         good = ((x >= low[facet]) & (x <= high[facet])).all(axis=1)
         return which[good], facet[good]
+
+
+def _determinant(G: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return determinants of matrices ``(n, e, e)`` of one or two rows."""
+    if G.shape[1] == 1:
+        return G[:, 0, 0]
+    return np.asarray(G[:, 0, 0] * G[:, 1, 1] - G[:, 0, 1] * G[:, 1, 0])
 
 
 def solved(G: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:

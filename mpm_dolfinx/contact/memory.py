@@ -127,7 +127,7 @@ class Near(NamedTuple):
         which: Their numbers.
         memory: What is known of them.
         nodes: Where the nodes of all facets begin.
-        radius: Largest distance of these from where the shape has its pivot.
+        radius: How much gaps change at most, by the angle that the shape turns by.
         margin: How far points may come nearer until others could touch.
     """
 

@@ -19,7 +19,7 @@ from .. import _compat
 from .contact import Outcome
 from .facets import Closest, NearFacets
 from .law import Coulomb, Points
-from .stencil import Foot, Start, Stencil, acting, derivatives, projected
+from .stencil import Foot, Start, Stencil, acting_now, added_blocks, derivatives, projected
 from .surface import Blocks, Surface, global_dofs, normals
 
 __all__ = ["Memory", "Pass"]
@@ -211,7 +211,7 @@ class Pass:
         assert self._near is not None
         near, x, nodes = self._near, self._x, self._nodes
         self.count += 1
-        found = near.closest(x, self._normals(), nodes, self.reach)
+        found = near.closest(x, self._normals_near(x, nodes), nodes, self.reach)
         if self._paired is not None:
             # A point that slides off an edge goes on to touch until the step's end, or the force
             # would come and go from one iterate to the next.
@@ -238,9 +238,7 @@ class Pass:
         shape = (len(self.source.cells), self.source.nq)
         force = np.zeros_like(x)
         pressure, slips = np.zeros(len(x)), np.zeros(len(x), dtype=bool)
-        pushes, rubs, acts = acting(
-            self.law, self.stencil, self.stencil.x, self.touch, self.target.extent
-        )
+        pushes, rubs, acts = acting_now(self.law, self.stencil, self.touch, self.target.extent)
         both = pushes + rubs
         force[which], pressure[which], slips[which] = both[:, 0], acts.pressure, acts.slips
         self.reaction = both[:, 1:]
@@ -258,6 +256,18 @@ class Pass:
             inside.reshape(shape),
             slips.reshape(shape),
         )
+
+    def _normals_near(
+        self, x: NDArray[np.float64], nodes: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return normals at the points; zero on facets that are far from all others."""
+        m, nq, gdim = len(self.source.cells), self.source.nq, self.source.gdim
+        low, high = nodes.min(axis=(0, 1), initial=np.inf), nodes.max(axis=(0, 1), initial=-np.inf)
+        within = ((x >= low - self.reach) & (x <= high + self.reach)).all(axis=1)
+        which = np.flatnonzero(within.reshape(m, nq).any(axis=1))
+        found = np.zeros((m, nq, gdim))
+        found[which] = self.source.normals(which=which)
+        return self._flat(found)
 
     def _over_step(
         self,
@@ -424,32 +434,24 @@ class Pass:
         facet_of, point = which // source.nq, which % source.nq
         w = -factor * source.weights.ravel()[which]
         D = derivatives(self.law, self.stencil, self.touch, self.target.extent)
-        D *= w[:, None, None, None, None]
-        N = source.shapes[point]
+        N, none = source.shapes[point], np.zeros((0, k))
         own = global_dofs(source.particles.W, source.nodes[facet_of])
-        columns: list[tuple[int, NDArray[np.int64], NDArray[np.int64], slice]] = [
-            (0, facet_of, own, slice(0, 1)),
-            (1, near.number[self._facet], near.dofs[self._facet], slice(1, 1 + k)),
+        columns = [
+            (0, 0, facet_of, own, N),
+            (1, 1, near.number[self._facet], near.dofs[self._facet], none),
         ]
         if not self.law.smooth:
-            columns.append(
-                (1, near.number[self._anchor], near.dofs[self._anchor], slice(1 + k, 1 + 2 * k))
-            )
-        rows = columns[:2]
+            anchors = near.number[self._anchor], near.dofs[self._anchor]
+            columns.append((1, 1 + k, *anchors, none))
         found: dict[tuple[int, int], list[Blocks]] = {}
-        for row, row_key, row_dofs, row_part in rows:
-            for column, column_key, column_dofs, column_part in columns:
-                block = D[:, row_part, :, column_part, :]
-                if row == 0:
-                    block = N[:, :, None, None, None] * block
-                if column == 0:
-                    block = block * N[:, None, None, :, None]
-                n, a, i, b, j = block.shape
-                values = block.reshape(n, a * i, b * j)
-                keys = np.column_stack([row_key, column_key])
-                found.setdefault((row, column), []).append(
-                    Blocks(keys, row_dofs, column_dofs, values)
-                )
+        for row, first_row, row_key, row_dofs, row_shapes in columns[:2]:
+            for column, first_column, column_key, column_dofs, column_shapes in columns:
+                keys, one, number = _grouped(row_key, column_key)
+                shape = (len(keys), row_dofs.shape[1], column_dofs.shape[1])
+                rows, cols = (first_row, row_shapes), (first_column, column_shapes)
+                values = added_blocks(D, w, number, rows, cols, shape)
+                blocks = Blocks(keys, row_dofs[one], column_dofs[one], values)
+                found.setdefault((row, column), []).append(blocks)
         return found
 
     # -- The next step --------------------------------------------------------------------------
@@ -569,3 +571,15 @@ def _numbers(near: NearFacets, facet: NDArray[np.int64]) -> NDArray[np.int64]:
     numbers = np.full(len(facet), -1, dtype=np.int64)
     numbers[facet >= 0] = near.number[facet[facet >= 0]]
     return numbers
+
+
+def _grouped(
+    a: NDArray[np.int64], b: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return different pairs of numbers ``(m, 2)``, one place of each, and which each place has."""
+    order = np.lexsort((b, a))
+    keys = np.column_stack([a, b])[order]
+    new = np.append(True, (np.diff(keys, axis=0) != 0).any(axis=1))[: len(keys)]
+    number = np.zeros(len(a), dtype=np.int64)
+    number[order] = np.cumsum(new) - 1
+    return keys[new], order[new], number

@@ -164,6 +164,7 @@ class Rigid(Contact):
         self._memory: Memory | None = None
         self._trial: Memory | None = None
         self._near: Near | None = None
+        self._wider: Near | None = None
 
     # -- The path -------------------------------------------------------------------------------
 
@@ -443,31 +444,44 @@ class Rigid(Contact):
 
     def _look_near(self) -> None:
         """Note which facets may touch in a step, and what others may move until they could."""
-        self._near = None
+        self._near, self._wider = self._nearer_than(0.0), None
+
+    def _nearer_than(self, distance: float) -> Near | None:
+        """Return the facets that are within a distance, or some domains; ``None``: nearly all."""
         memory, surface = self._memory, self._surface
         assert memory is not None
         if self._nitsche or not self.shape.measures or memory.gap.size == 0:
-            return
+            return None
         least = memory.gap.min(axis=1)
-        near = least <= NEAR * surface.thickness
+        near = least <= np.maximum(NEAR * surface.thickness, distance)
         if near.mean() > MOST_NEAR:
-            return
+            return None
         which = np.flatnonzero(near)
         nodes = surface.own_nodes(converged=True)
         arms = nodes - self.shape.pivot - memory.pose.offset
         radius = float(np.linalg.norm(arms, axis=1).max())
+        if (arm := self.shape.arm) is not None:
+            radius = min(radius, arm)
         margin = float(least[~near].min()) - surface.touch
-        self._near = Near(which, memory.of(which), nodes, radius, margin)
+        return Near(which, memory.of(which), nodes, radius, margin)
 
     def _within_reach(self) -> Near | None:
         """Return what may touch at the present positions; ``None``: all."""
-        near, memory, pose = self._near, self._memory, self._pose
-        if near is None or memory is None:
-            return None
+        near = self._near
+        if near is None or (moved := self._approach(near)) < near.margin:
+            return near
+        if self._wider is None or moved >= self._wider.margin:
+            self._wider = self._nearer_than(2.0 * moved)
+        wider = self._wider
+        return wider if wider is not None and moved < wider.margin else None
+
+    def _approach(self, near: Near) -> float:
+        """Return by how much points have come nearer to the obstacle in the step at most."""
+        memory, pose = self._memory, self._pose
+        assert memory is not None
         shifted = float(np.linalg.norm(pose.offset - memory.pose.offset))
         turned = float(np.linalg.norm(pose.Q - memory.pose.Q, 2)) * near.radius
-        moved = self._surface.spread * (self._largest_change(near) + turned) + shifted
-        return near if moved < near.margin else None
+        return self._surface.spread * (self._largest_change(near) + turned) + shifted
 
     def _largest_change(self, near: Near) -> float:
         """Return how far a node of the facets has moved in the step at most."""

@@ -67,6 +67,16 @@ class Shape:
         return None
 
     @property
+    def arm(self) -> float | None:
+        """How much its distances change at most, by the angle it turns by; ``None``: not known.
+
+        No more than its own points move: by their distance from the pivot.
+        """
+        if self.bounds is None:
+            return None
+        return float(np.linalg.norm(np.abs(self.bounds - self.pivot).max(axis=0)))
+
+    @property
     def outline(self) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
         """Points ``(n, dim)`` and facets ``(m, dim)`` of its surface, where it is made of such."""
         return None
@@ -117,6 +127,10 @@ class _Round(Shape):
         if np.linalg.matrix_rank(self._across) < self.dim:
             return None
         return np.array([self.pivot - self._radius, self.pivot + self._radius])
+
+    @property
+    def arm(self) -> float | None:
+        return None if self.bounds is None else 0.0  # a ball turns in itself
 
     def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         arm = (y - self.pivot) @ self._across

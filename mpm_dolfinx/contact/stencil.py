@@ -4,7 +4,8 @@
 
 A point is projected on the facet; the gap gives the pressure, the way from the anchor the shear.
 What acts on the point acts the other way on the facet's nodes, as if the point were fixed to the
-facet by a rigid arm along its normal. Derivatives are those of a complex step, exact to round-off.
+facet by a rigid arm along its normal. Compiled loops do so point by point and carry derivatives
+along; what they are, and whole steps of a motion, are told here by complex steps.
 """
 
 from __future__ import annotations
@@ -14,12 +15,25 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .._core import loops
 from .facets import solved
 from .law import Coulomb, Points, Traction, traction
 from .surface import normals
 from .whole_step import corrected, deformation, mean_pressure
 
-__all__ = ["Acting", "Foot", "Start", "Stencil", "Table", "acting", "derivatives", "projected"]
+__all__ = [
+    "Acting",
+    "Foot",
+    "Start",
+    "Stencil",
+    "Table",
+    "acting",
+    "acting_now",
+    "added_blocks",
+    "by_complex_step",
+    "derivatives",
+    "projected",
+]
 
 #: Step of the complex derivative.
 STEP = 1e-40
@@ -169,6 +183,46 @@ def acting(law: Coulomb, stencil: Stencil, z: NDArray[Any], touch: float, extent
     return Acting(pushes, np.concatenate([acts.shear[:, None], rubs], axis=1), acts)
 
 
+def _compiled_arguments(law: Coulomb, stencil: Stencil, touch: float) -> tuple[Any, ...]:
+    """Return what the compiled loops take."""
+    points = stencil.points
+    arrays = [points.stiffness, points.tangential, points.gap, points.stretch]
+    return (
+        np.ascontiguousarray(stencil.x),
+        [np.ascontiguousarray(part) for part in (*stencil.table, stencil.anchored)],
+        [np.ascontiguousarray(part) for part in (stencil.outward, *arrays)],
+        points.touched.view(np.uint8),
+        [law.friction, law.cohesion, law.limit, touch],
+        law.smooth,
+    )
+
+
+def acting_now(law: Coulomb, stencil: Stencil, touch: float, extent: float) -> Acting:
+    """Return what acts at the stencil's own positions: :func:`acting`, compiled where it can be.
+
+    Args:
+        law: As for :func:`acting`, as all that is not said here.
+        stencil: As there.
+        touch: As there.
+        extent: As there.
+    """
+    if loops is None or stencil.start is not None:
+        return acting(law, stencil, stencil.x, touch, extent)
+    n, _, gdim = stencil.x.shape
+    pushes, rubs = (np.zeros((n, 1 + stencil.anchored.shape[1], gdim)) for _ in range(2))
+    acts = Traction(np.zeros(n), np.zeros((n, gdim)), np.zeros(n, bool), np.zeros(n, bool))
+    loops.act(
+        *_compiled_arguments(law, stencil, touch),
+        pushes,
+        rubs,
+        acts.pressure,
+        acts.shear,
+        acts.inside.view(np.uint8),
+        acts.slips.view(np.uint8),
+    )
+    return Acting(pushes, rubs, acts)
+
+
 def derivatives(law: Coulomb, stencil: Stencil, touch: float, extent: float) -> NDArray[np.float64]:
     """Return the derivative of all forces at the points' stencils, ``(n, 1 + k, i, z, j)``.
 
@@ -178,11 +232,23 @@ def derivatives(law: Coulomb, stencil: Stencil, touch: float, extent: float) -> 
         touch: As there.
         extent: As there.
     """
-    z = stencil.x.astype(np.complex128)
-    n, count, gdim = z.shape
+    n, count, gdim = stencil.x.shape
     D = np.zeros((n, 1 + stencil.anchored.shape[1], gdim, count, gdim))
     if n == 0:
         return D
+    if loops is not None and stencil.start is None:
+        loops.differentiate(*_compiled_arguments(law, stencil, touch), D)
+        return D
+    return by_complex_step(law, stencil, touch, extent)
+
+
+def by_complex_step(
+    law: Coulomb, stencil: Stencil, touch: float, extent: float
+) -> NDArray[np.float64]:
+    """Return :func:`derivatives` by complex steps, which do without compiled loops."""
+    z = stencil.x.astype(np.complex128)
+    n, count, gdim = z.shape
+    D = np.zeros((n, 1 + stencil.anchored.shape[1], gdim, count, gdim))
     # (nothing acts where all are shifted, so that the points' derivatives follow)
     for node in range(1, count):
         for j in range(gdim):
@@ -193,3 +259,37 @@ def derivatives(law: Coulomb, stencil: Stencil, touch: float, extent: float) -> 
             D[:, :, :, node, j] = (pushes + rubs).imag / STEP
     D[:, :, :, 0] = -D[:, :, :, 1:].sum(axis=3)
     return D
+
+
+def added_blocks(
+    D: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    number: NDArray[np.int64],
+    rows: tuple[int, NDArray[np.float64]],
+    columns: tuple[int, NDArray[np.float64]],
+    shape: tuple[int, int, int],
+) -> NDArray[np.float64]:
+    """Return blocks of a matrix by derivatives at points.
+
+    Args:
+        D: The derivatives, shape ``(n, 1 + k, i, z, j)``.
+        weights: Of the points, shape ``(n,)``.
+        number: Number of the block that each adds to.
+        rows: First place of a stencil that is meant, and shape functions ``(n, a)`` by which it is
+            spread over nodes, where it is the point itself; ``(0, k)`` is none.
+        columns: The same of columns.
+        shape: Of the blocks.
+    """
+    blocks = np.zeros(shape)
+    if loops is not None:
+        loops.add_blocks(D, weights, number, *rows, *columns, blocks)
+        return blocks
+    parts = []
+    for (first, N), size in zip((rows, columns), shape[1:], strict=True):
+        places = slice(first, first + (1 if len(N) else size // D.shape[2]))
+        parts.append((places, N[:, :, None] if len(N) else np.ones((1, 1, 1))))
+    (row, left), (column, right) = parts
+    block = (weights[:, None, None] * left)[..., None, None] * D[:, row, :, column]
+    block = block * right[:, None, None]
+    np.add.at(blocks, number, block.reshape(-1, *shape[1:]))
+    return blocks

@@ -166,7 +166,7 @@ class Surface:
         kind = basix.cell.subentity_types(cell)[dim][0]
         points, weights = map(np.asarray, basix.make_quadrature(kind, self._degree))
         self.nq = len(weights)
-        x = W.tabulate_dof_coordinates()[:, : self.gdim]
+        x = self._mesh_nodes = W.tabulate_dof_coordinates()[:, : self.gdim].copy()
         self.element: Any = basix.create_element(
             basix.ElementFamily.P, kind, element.degree, element.lagrange_variant
         )
@@ -223,9 +223,7 @@ class Surface:
 
     def undeformed(self) -> NDArray[np.float64]:
         """Return the points in the mesh, shape ``(m, nq, gdim)``."""
-        assert self._space is not None
-        x = self._space.tabulate_dof_coordinates()[:, : self.gdim]
-        return np.asarray(self.shapes @ x[self.nodes])
+        return np.asarray(self.shapes @ self._mesh_nodes[self.nodes])
 
     @property
     def reference_points(self) -> list[NDArray[np.float64]]:
@@ -266,9 +264,8 @@ class Surface:
         """Return positions of this rank's nodes of W, shape ``(N, gdim)``."""
         if converged:
             return self.particles.node_positions
-        assert self._space is not None
         d = self.particles.displacement.x.array.reshape(-1, self.gdim)
-        return np.asarray(self._space.tabulate_dof_coordinates()[:, : self.gdim] + d)
+        return np.asarray(self._mesh_nodes + d)
 
     def positions(
         self, converged: bool = False, which: NDArray[np.int64] | None = None
@@ -294,11 +291,14 @@ class Surface:
         """Size of each undeformed facet, shape ``(m,)``."""
         return np.asarray(self._plain.sum(axis=1) ** (1.0 / (self.gdim - 1)))
 
-    def normals(self, converged: bool = False) -> NDArray[np.float64]:
+    def normals(
+        self, converged: bool = False, which: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float64]:
         """Return outward unit normals at the points, as the body is displaced, as positions."""
-        x = self.node_positions(converged)[self.nodes]
-        edges = np.einsum("jqk,mki->mqij", self.slopes, x)
-        n = self.outward[:, None, None] * normals(edges)
+        chosen: Any = slice(None) if which is None else which
+        x = self.own_nodes(converged)[self._of_facets[chosen]]
+        edges = np.moveaxis(self.slopes[:, None] @ x, 0, -1)
+        n = self.outward[chosen, None, None] * normals(edges)
         return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
 
     def force(self, tractions: NDArray[np.float64], sign: float = 1.0) -> PETSc.Vec:
@@ -409,6 +409,7 @@ class PointMatrix:
         )
         self._matrix: PETSc.Mat | None = None
         self._places: dict[tuple[int, ...], int] = {}
+        self._last: dict[int, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
         self._size = 0
         self._i: list[NDArray[np.int64]] = []
         self._j: list[NDArray[np.int64]] = []
@@ -425,6 +426,10 @@ class PointMatrix:
         before = self._size
         begins = []
         for number, part in enumerate(parts):
+            known = self._last.get(number)
+            if known is not None and np.array_equal(known[0], part.keys):
+                begins.append(known[1])
+                continue
             size = part.rows.shape[1] * part.columns.shape[1]
             begin = np.zeros(len(part.keys), dtype=np.int64)
             for block, key in enumerate(part.keys.tolist()):
@@ -437,6 +442,7 @@ class PointMatrix:
                     self._j.append(np.tile(part.columns[block], part.rows.shape[1]))
                 begin[block] = place
             begins.append(begin)
+            self._last[number] = part.keys, begin
         if self._comm.allreduce(self._size > before, MPI.LOR):
             self._matrix = self._make()
         if self._matrix is None:
@@ -444,7 +450,11 @@ class PointMatrix:
         values = np.zeros(self._size)
         for part, begin in zip(parts, begins, strict=True):
             flat = part.values.reshape(len(begin), part.rows.shape[1] * part.columns.shape[1])
-            np.add.at(values, begin[:, None] + np.arange(flat.shape[1]), flat)
+            places = begin[:, None] + np.arange(flat.shape[1])
+            if len(np.unique(begin)) == len(begin):
+                values[places] += flat
+            else:
+                np.add.at(values, places, flat)
         _compat.set_entries(self._matrix, values)
         return self._matrix
 
