@@ -95,10 +95,12 @@ class PressureSmoothing(FieldTerm):
         sums = PETSc.Mat().createAIJ(sizes, csr=(rows, columns, volumes), comm=comm)
         ones, volume = sums.createVecLeft(), sums.createVecRight()
         ones.set(1.0)
-        sums.multTranspose(ones, volume)
+        # rows of cells: the product by columns would add in the order in which ranks answer
+        of_cells = sums.transpose(PETSc.Mat())
+        of_cells.mult(ones, volume)
         weight, stiffness = volume.duplicate(), ones.duplicate()
         stiffness.array_w[:] = shear
-        sums.multTranspose(stiffness, weight)
+        of_cells.mult(stiffness, weight)
         # volume / weight is one over the mean shear modulus of a cell
         filled = weight.array_r > 0.0
         share = np.zeros(len(filled))

@@ -475,7 +475,7 @@ def test_a_stabilised_pressure_goes_on_from_a_file_and_on_other_meshes(mpi_tmp_p
     other = simple(law)
     other.restore(mpi_tmp_path / "state")
     other.solve(4)
-    same_run(outcome(other), outcome(whole), 0.0)
+    same_run(outcome(other), outcome(whole), EXACT)
     moved = simple(law)
     run = moved.steps(4)
     next(run)
