@@ -197,7 +197,7 @@ class Cells:
         if not self.simplex:
             return np.where(inside >= 1.0 - slack, 1.0, inside)
         total = inside.sum(axis=1)[:, None]
-        return np.asarray(np.where(total >= 1.0 - slack, inside / total, inside))
+        return np.asarray(inside / np.where(total >= 1.0 - slack, total, 1.0))
 
     def locate(
         self, points: NDArray[np.float64]

@@ -86,13 +86,16 @@ class Behind:
         for side, places in enumerate(surface.reference_points):
             here = surface.facets == side
             taken[here] = extrapolation(cell, rule, places, degree)
-        normals = surface.mesh_normals()
-        self._weights = taken[:, :, :, None] * normals[:, :, None, :]
-        if particles.rebased:
-            G = np.eye(gdim) + particles.reference.gradient[self._cells]
-            turned = np.einsum("mpJK,mqpK->mqpJ", G.swapaxes(2, 3), self._weights)
-            self._weights = turned / np.linalg.det(G)[:, None, :, None]
-            self._weights *= surface.mesh_area_ratio[:, :, None, None]
+        self._weights = taken[:, :, :, None] * surface.undeformed_normals()[:, :, None, :]
+        # What was cut has a gradient of its own, not that of its corners; it is the same everywhere
+        # in the cell, so that the traction may be taken from the mesh.
+        cut = np.flatnonzero(particles.triangular[self._cells])
+        if len(cut) and particles.rebased:
+            G = np.eye(gdim) + particles.reference.gradient[self._cells[cut]]
+            normals = surface.mesh_normals()[cut]
+            turned = np.einsum("mpJK,mqK->mqpJ", G.swapaxes(2, 3), normals)
+            turned *= (taken[cut] / np.linalg.det(G)[:, None])[:, :, :, None]
+            self._weights[cut] = turned * surface.mesh_area_ratio[cut, :, None, None]
 
     def tractions(self, stress: PointMaterial) -> Array:
         """Return the tractions, shape ``(m, nq, gdim)``."""

@@ -260,6 +260,15 @@ class Surface:
         n = self.outward[:, None, None] * normals(self._edges)
         return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
 
+    def undeformed_normals(self) -> NDArray[np.float64]:
+        """Return outward unit normals of the undeformed body, as those in the present mesh."""
+        origin = self.particles.origin
+        if origin is None:
+            return self.mesh_normals()
+        x = origin.x.array.reshape(-1, self.gdim)[self.nodes]
+        n = self.outward[:, None, None] * normals(np.einsum("jqk,mki->mqij", self.slopes, x))
+        return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
+
     def node_positions(self, converged: bool = False) -> NDArray[np.float64]:
         """Return positions of this rank's nodes of W, shape ``(N, gdim)``."""
         if converged:

@@ -173,6 +173,17 @@ def test_points_that_are_not_numbers_are_outside():
 
 
 @pytest.mark.parametrize("cell", ALL, ids=scenes.name)
+def test_points_at_vertices_divide_by_nothing(cell):
+    domain = scenes.unit(2, cell)
+    V = scenes.vectors(domain)
+    with np.errstate(all="raise"):
+        rows = BackgroundBasis(V).at(domain.geometry.x[:, : domain.geometry.dim])
+    assert rows.found.all()
+    np.testing.assert_allclose(rows.values.max(axis=1), 1.0, atol=1e-14)
+    np.testing.assert_allclose(np.abs(rows.values).sum(axis=1), 1.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("cell", ALL, ids=scenes.name)
 def test_ranks_without_points_or_cells(cell):
     V = scenes.vectors(scenes.unit(1, cell))
     dim = V.mesh.geometry.dim
