@@ -16,7 +16,7 @@ from ..assembly.inputs import Density
 from ..boundary.supports import Support, is_one_sided
 from ..constitutive.points import MaterialPoints
 from ..constitutive.step_stress import StepStress
-from ..errors import MPMError
+from ..errors import MPMError, warn
 from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..system.body import StepForce
@@ -103,6 +103,13 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         )
         alpha, self._viscosity = rayleigh_of(rayleigh)
         require_motion("DynamicProblem", options)
+        kept = out_of_range == "reflect" and scheme != "euler"
+        if kept and options.get("mixed") == "stabilised pressure":
+            warn(
+                bodies[0].V.mesh.comm,
+                "With mixed='stabilised pressure' a motion with out_of_range='reflect' may win "
+                "energy, as points come into other cells; use out_of_range='project'.",
+            )
         start = initial_velocities(velocity, particles)
         self._energies = []
         for body, its in zip(bodies, start, strict=True):

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Motion: momentum, energy and order, against exact solutions; splits, ranks and restarts."""
 
+import warnings
 from itertools import product
 
 from mpi4py import MPI
@@ -203,6 +204,42 @@ def test_with_f_bar_an_elastic_body_keeps_its_energy(cell, f_bar, assembly):
     assert history.energies[-1].strain > 0.01 * whole[0]
     assert change_of_balance(history) < 1e-12
     assert np.mean(history.iterations) <= 5.0 and history.cutbacks == 0
+
+
+@pytest.mark.parametrize(
+    ("scheme", "time"),
+    [
+        ("conserving", 0.6),
+        pytest.param("conserving", 4.0, marks=pytest.mark.slow),
+        pytest.param("midpoint", 4.0, marks=pytest.mark.slow),
+    ],
+)
+def test_with_a_stabilised_pressure_no_energy_is_won(scheme, time):
+    # What keeps the pressure from oscillating is of the cells, and stores other energies in others.
+    def problem(out):
+        return spinning(
+            material=Hencky(100.0, 0.4999),
+            velocity=lambda x: spin(x) + 0.3 * np.sin(4.0 * x[:2]),
+            scheme=scheme,
+            out_of_range=out,
+            mixed="stabilised pressure",
+        )
+
+    with warnings.catch_warnings(record=True) as told:  # on the first rank
+        warnings.simplefilter("always")
+        problem("reflect")
+    sentences = [str(each.message) for each in told if "may win energy" in str(each.message)]
+    assert len(sentences) == (WORLD.rank == 0)
+    assert all("use out_of_range='project'" in one for one in sentences)
+    moving = problem("project")
+    momentum, turning = moving.momentum, moving.angular_momentum
+    history = moving.solve(time, 0.05)
+    np.testing.assert_allclose(moving.momentum, momentum, atol=1e-11)
+    if scheme == "conserving":
+        np.testing.assert_allclose(moving.angular_momentum, turning, rtol=1e-11)
+    whole = np.array([energy.kinetic + energy.strain for energy in history.energies])
+    assert whole.max() == whole[0] and whole[-1] > 0.8 * whole[0]
+    assert change_of_balance(history) < 1e-12
 
 
 @pytest.mark.parametrize("cell", [TRIANGLE, QUADRILATERAL])
