@@ -153,7 +153,7 @@ def test_pressure_under_a_disc_is_that_of_hertz():
 @pytest.mark.parametrize("cell", PLANE, ids=scenes.name)
 def test_a_dragged_disc_is_the_same_on_any_number_of_ranks(cell):
     problem, die, path = dragged(cell)
-    problem.solve(2, update=path)  # (values are of places, so each in one step)
+    problem.solve(10, update=path)
     other, alone, path = dragged(cell, comm=scenes.MPI.COMM_SELF)
     other.solve(10, update=path)
     assert (
@@ -177,7 +177,7 @@ def test_a_dragged_disc_is_the_same_on_any_number_of_ranks(cell):
 
 def test_moment_is_that_of_the_reactions():
     problem, die, path = dragged()
-    problem.solve(2, update=path)  # (values are of places, so each in one step)
+    problem.solve(10, update=path)
     field = problem.reduced.fields[0]
     x = field.V.tabulate_dof_coordinates()[: len(field.force.array_r) // 2, :2]
     # forces of supports on all dofs of V; the contact's among them are at nodes of V, which carry
@@ -261,7 +261,7 @@ def test_contact_follows_other_meshes_of_the_body(what):
 @pytest.mark.parametrize("method", ["cpdi2", "cpdi", "gimp", "mpm"])
 def test_all_methods_feel_an_obstacle(method):
     problem, die, path = dragged(method=method, friction=0.2)
-    problem.solve(2, update=path)  # (values are of places, so each in one step)
+    problem.solve(10, update=path)
     other, alone, path = dragged(n=12, friction=0.2)
     other.solve(10, update=path)
     base = problem.reaction(problem.bcs[0])
@@ -272,7 +272,7 @@ def test_all_methods_feel_an_obstacle(method):
 
 def test_domains_of_degree_two_are_curved():
     problem, die, path = dragged(degree=2, n=4)
-    problem.solve(2, update=path)  # (values are of places, so each in one step)
+    problem.solve(10, update=path)
     other, alone, path = dragged(n=12)
     other.solve(10, update=path)
     assert die.reaction == pytest.approx(alone.reaction, rel=0.12)
