@@ -281,6 +281,8 @@ def added_blocks(
         shape: Of the blocks.
     """
     blocks = np.zeros(shape)
+    if len(D) == 0:
+        return blocks
     if loops is not None:
         loops.add_blocks(D, weights, number, *rows, *columns, blocks)
         return blocks

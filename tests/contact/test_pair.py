@@ -327,6 +327,27 @@ def test_contact_follows_other_meshes_of_the_bodies(what):
     assert np.abs(problem.reaction(touch) - end).max() < bound * np.abs(end).max()
 
 
+def test_bodies_of_different_degrees_come_to_touch():
+    Va, Vb = spaces([-0.5] * 3, [1.5, 1.5, 2.5], [2, 2, 3])
+    a = mpm.Particles(scenes.box([0.0, 0.0, 1.01], [1.0, 1.0, 2.0], [1] * 3, TETRAHEDRON), Va)
+    b = mpm.Particles(scenes.box([0.0] * 3, [1.0] * 3, [1] * 3, TETRAHEDRON), Vb, degree=2)
+    touch = contact.Pair(b, a, 0.3)
+    top, base = (
+        fem.locate_dofs_geometrical(V, where)
+        for V, where in ((Va, lambda x: x[2] > 1.4), (Vb, lambda x: x[2] < 0.1))
+    )
+    motion = fem.Constant(Va.mesh, np.zeros(3))
+    bcs = [fem.dirichletbc(motion, top, Va), fem.dirichletbc(np.zeros(3), base, Vb)]
+    problem = mpm.QuasiStaticProblem([b, a], Hencky(YOUNG, POISSON), bcs=bcs, terms=[touch])
+    steps = problem.steps(2, update=lambda t: np.put(motion.value, 2, -0.018 * t))
+    next(steps)
+    assert not problem.reaction(touch).any()
+    next(steps)
+    force = problem.reaction(touch)
+    assert force[2] < 0.0
+    assert np.abs(problem.reaction(problem.bcs[1]) + force).max() < 1e-6 * abs(force[2])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("cell", [TETRAHEDRON, HEXAHEDRON], ids=scenes.name)
 def test_a_cube_is_dragged_on_another(cell):

@@ -100,3 +100,14 @@ def test_compiled_blocks_are_those_of_numpy(monkeypatch, spread):
     known = stencil.added_blocks(D, weights, number, rows, columns, size)
     np.testing.assert_allclose(found, known, atol=1e-13)
     assert np.abs(known).max() > 0.1
+
+
+def test_blocks_of_no_points_are_none_whatever_the_degrees_of_both_bodies():
+    k, shapes, none = 3, np.zeros((0, 6)), np.zeros((0, 3))
+    D, nothing, number = np.zeros((0, 1 + k, 3, 1 + 2 * k, 3)), np.zeros(0), np.zeros(0, np.int64)
+    for rows, columns, size in (
+        ((0, shapes), (0, shapes), (0, 18, 18)),
+        ((1, none), (0, shapes), (0, 9, 18)),
+    ):
+        found = stencil.added_blocks(D, nothing, number, rows, columns, size)
+        assert found.shape == size
