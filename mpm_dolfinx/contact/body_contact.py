@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -149,14 +150,24 @@ class BodyContact(Rigid):
         """Largest coordinate of the undeformed body."""
         return self._surface.extent
 
+    def span(self) -> float:
+        """Return the largest length of the undeformed body along an axis (collective)."""
+        x = self.bodies[0].initial_domains.reshape(-1, self._surface.gdim)
+        comm = self.bodies[0].mesh.comm
+        low = comm.allreduce(x.min(axis=0, initial=np.inf), MPI.MIN)
+        high = comm.allreduce(x.max(axis=0, initial=-np.inf), MPI.MAX)
+        return float((high - low).max())
+
     def total(self, centres: tuple[NDArray[np.float64], ...]) -> NDArray[np.float64]:
-        """Return this rank's force and moment on the other body, and the size of both.
+        """Return this rank's force and moment on the other body, their size, and their round-off.
+
+        Gaps have the round-off of the body's coordinates.
 
         Args:
             centres: Centre of the rigid body at the step's beginning and end.
 
         Returns:
-            Force, moment about the centre, size of the force: shape ``(gdim + nr + 1,)``.
+            Force, moment about the centre, size and round-off of the force, ``(gdim + nr + 2,)``.
         """
         assert self._trial is not None
         outcome = self._trial.outcome
@@ -165,7 +176,10 @@ class BodyContact(Rigid):
         arm = self._arms(which, centres)
         moments = np.einsum("mqij,mqi->j", crossing(arm), f)
         size = np.linalg.norm(f, axis=2).sum()
-        return np.concatenate([f.sum(axis=(0, 1)), moments, [size]])
+        k = (self._penalty + self._tangential) * self._stiffness[which]
+        stiffness = float((self._surface.weights[which] * k).sum())
+        round_off = np.finfo(np.float64).eps * self._surface.extent * stiffness
+        return np.concatenate([f.sum(axis=(0, 1)), moments, [size, round_off]])
 
     def _arms(
         self, which: NDArray[np.int64], centres: tuple[NDArray[np.float64], ...]

@@ -19,7 +19,7 @@ rest, which is of the rank of their number, and dense in the unknowns near the c
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -49,10 +49,28 @@ BALANCED, AT_ROUND_OFF = 1e-14, 1e-9
 MOST_ITERATIONS, MOST_HALVINGS = 60, 12
 #: Stiffness, relative to the largest, below which nothing holds a body.
 LOOSE = 1e-11
-#: Gap, over twice the largest coordinate, to which a body without a hold falls.
-NEAR = 1e-7
+#: Gap, over twice the length of what it falls on, to which a body without a hold falls; at least
+#: this much times the round-off of coordinates.
+NEAR, LEAST = 1e-7, 8.0
 #: Most that a body turns in one iteration.
 MOST_TURN = 0.5
+
+
+class Balance(NamedTuple):
+    """Forces on a rigid body that is put somewhere.
+
+    Attributes:
+        residual: Forces and moments that are left, shape ``(gdim + nr,)``.
+        size: Size of all forces.
+        enough: Size of a residual that is good enough where it falls no further: by round-off of
+            the forces and of the coordinates that they depend on.
+        state: Where the body is.
+    """
+
+    residual: NDArray[np.float64]
+    size: float
+    enough: float
+    state: State
 
 
 class RigidBody(Term):
@@ -153,7 +171,7 @@ class RigidBody(Term):
         )
         self._memory = self._trial = still
         self._found = np.zeros(gdim + nr)
-        self._lever = 1.0
+        self._lever = self._span = 1.0
         self._aim = Pose(np.zeros(gdim), np.zeros(nr))
         self._push = still.force, still.moment
         self._share = 1.0
@@ -271,8 +289,8 @@ class RigidBody(Term):
     def _centres(self, state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return self._motion.centre(self._memory), self._motion.centre(state)
 
-    def _put(self, s: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, State]:
-        """Put the body somewhere; return its residual, the size of its forces, and its state.
+    def _put(self, s: NDArray[np.float64]) -> Balance:
+        """Put the body somewhere; return the forces on it there.
 
         Raises:
             MPMError: A contact cannot be evaluated there, on any rank (collective).
@@ -287,11 +305,12 @@ class RigidBody(Term):
         last = self._memory
         given = self._motion.given(last, self._push)
         inertial = self._motion.inertial(last, state)
-        size = float(total[-1]) + sum(
+        size = float(total[-2]) + sum(
             float(np.linalg.norm(self._levelled(part))) for part in (given, inertial)
         )
         size += self._motion.swing(last)
-        return inertial + total[:-1] - given, size, state
+        enough = AT_ROUND_OFF * size + float(total[-1])
+        return Balance(inertial + total[:-2] - given, size, enough, state)
 
     def _levelled(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return forces, and moments over the length that they are compared by."""
@@ -349,41 +368,41 @@ class RigidBody(Term):
     def _find(self, s: NDArray[np.float64]) -> None:
         """Solve for the balance of the body from some step of it (collective)."""
         gdim = self.shape.dim
-        R, size, state = self._put(s)
-        norm = self._size_of(R)
+        now = self._put(s)
+        norm = self._size_of(now.residual)
         for _ in range(MOST_ITERATIONS):
-            if norm <= BALANCED * size:
+            if norm <= BALANCED * now.size:
                 break
-            K, _ = self._slopes(state, s[gdim:], False)
+            R = now.residual
+            K, _ = self._slopes(now.state, s[gdim:], False)
             inverse, onto = self._inverse(K)
             left = self._size_of(R - onto @ R)
-            if left > AT_ROUND_OFF * size:
-                s = self._fallen(s, onto @ R - R, left / size)
-                R, size, state = self._put(s)
-                norm = self._size_of(R)
+            if left > now.enough:
+                s = self._fallen(s, onto @ R - R, left / now.size)
+                now = self._put(s)
+                norm = self._size_of(now.residual)
                 continue
             step = inverse @ R
             turn = float(np.linalg.norm(step[gdim:]))
             step *= min(1.0, MOST_TURN / turn) if turn > 0.0 else 1.0
-            floor = norm <= AT_ROUND_OFF * size
+            floor = norm <= now.enough
             for _ in range(1 if floor else MOST_HALVINGS):
                 tried = self._put(s - step)
-                if (found := self._size_of(tried[0])) < norm:
+                if (found := self._size_of(tried.residual)) < norm:
                     break
                 step *= 0.5
             else:
-                R, size, state = self._put(s)
+                now = self._put(s)
                 break
             slow = floor and found > 0.5 * norm
-            s, norm = s - step, found
-            R, size, state = tried
+            s, norm, now = s - step, found, tried
             if slow:
                 break
-        if not norm <= AT_ROUND_OFF * size:
+        if not norm <= now.enough:
             raise ConvergenceError(
-                f"The forces on a RigidBody do not balance: {norm / size:.1e} of them are left"
+                f"The forces on a RigidBody do not balance: {norm / now.size:.1e} of them are left"
             )
-        self._found, self._trial = s, state
+        self._found, self._trial = s, now.state
 
     def _fallen(
         self, s: NDArray[np.float64], force: NDArray[np.float64], share: float
@@ -398,14 +417,16 @@ class RigidBody(Term):
         way = np.where(self._held, 0.0, force)
         way[self.shape.dim :] = 0.0
         size = float(np.linalg.norm(way))
-        far = 2.0 * max(contact.extent for contact in self.contacts)
+        extent = max(contact.extent for contact in self.contacts)
+        close = max(2.0 * NEAR * self._span, LEAST * float(np.finfo(np.float64).eps) * extent)
         gap, gone = self._least_gap(s), 0.0
+        far = 2.0 * (self._span + gap)
         while size > 0.0 and 0.0 < gap and gone < far:
             gone += gap
             s = s + gap / size * way
             before, gap = gap, self._least_gap(s)
-            if gap < NEAR * far:
-                return np.asarray(s + (max(gap, 0.0) + NEAR * far) / size * way)
+            if gap < close:
+                return np.asarray(s + (max(gap, 0.0) + close) / size * way)
             if gap > before:
                 break
         raise ConvergenceError(
@@ -439,7 +460,7 @@ class RigidBody(Term):
         self._motion.dt, self._motion.whole = None, False
         for contact in self.contacts:
             contact.take_part(number, bodies, materials)
-        self._lever = max(contact.extent for contact in self.contacts)
+        self._lever = self._span = max([contact.span() for contact in self.contacts])
         gyration = self._motion.gyration
         if gyration is not None:
             self._lever = gyration
