@@ -155,7 +155,7 @@ class Domains:
             self.origin.x.scatter_forward()
 
     def mass_shares(self) -> NDArray[np.float64]:
-        """Return the factors of the density at the corners of the owned domains, ``(n, k)``."""
+        """Return the factors of the density at the nodes of the owned domains, ``(n, k)``."""
         assert self.mass_share is not None
         dofs = self.mass_share.function_space.dofmap.list[: self.num_local]
         return np.array(self.mass_share.x.array[dofs], dtype=np.float64)
@@ -170,7 +170,7 @@ class Domains:
         return ufl.sqrt(ufl.inner(area, area))
 
     def set_mass_shares(self, shares: NDArray[np.float64]) -> None:
-        """Set the factors of the density at the corners of the owned domains, shape ``(n, k)``."""
+        """Set the factors of the density at the nodes of the owned domains, shape ``(n, k)``."""
         assert self.mass_share is not None
         dofs = self.mass_share.function_space.dofmap.list[: self.num_local]
         self.mass_share.x.array[dofs] = shares

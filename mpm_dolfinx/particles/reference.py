@@ -22,7 +22,7 @@ class Reference(NamedTuple):
             ``(n, nq, gdim, gdim)``.
         volume: Undeformed volume of each domain, shape ``(n,)``.
         averages: Averages of the shape functions over the undeformed domains, shape ``(n, k)``.
-        domains: Undeformed corners of each domain, shape ``(n, k, gdim)``.
+        domains: Undeformed nodes of each domain, shape ``(n, k, gdim)``.
     """
 
     gradient: NDArray[np.float64]

@@ -182,11 +182,6 @@ class QuasiStaticProblem(ParticleProblem):
             linear_solver=linear_solver,
         )
         supports = as_supports(supports, bodies)
-        for body in bodies:
-            moved = bodies[0].V.mesh.comm.allreduce(int(np.any(body.converged_displacement)))
-            for support in supports:
-                if support.particles is body and not moved:
-                    support.forget_modulus()
         count = len(bodies) if isinstance(particles, list | tuple) else 0
         given = zip(
             bodies,
@@ -211,6 +206,11 @@ class QuasiStaticProblem(ParticleProblem):
         )
         if any(body.on_distortion == "split" for body in bodies):
             setup.require_divisible()
+        for body in bodies:
+            moved = bodies[0].V.mesh.comm.allreduce(int(np.any(body.converged_displacement)))
+            for support in supports:
+                if support.particles is body and not moved:
+                    support.forget_modulus()
         self.setup = setup
         self._parameters = self._functions()
         self._spaces_of_pressure: list[tuple[Particles, fem.FunctionSpace]] = []

@@ -296,7 +296,7 @@ class Remeshing:
 
         Args:
             cuts: For each body.
-            positions: For each body, of its domains' corners; displacements are zero then.
+            positions: For each body, of its domains' nodes; displacements are zero then.
         """
         problem = self._problem
         places = [None] * len(cuts) if positions is None else list(positions)
@@ -368,7 +368,7 @@ def _earlier(gradient: NDArray[np.float64], h: NDArray[np.float64]) -> NDArray[n
 
 
 def _shares(matrices: NDArray[np.float64], masses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the factors of the density at the corners that make given masses there, ``(n, k)``.
+    """Return the factors of the density at the nodes that make given masses there, ``(n, k)``.
 
     Args:
         matrices: ``int density Q_c Q_d dX``, shape ``(n, k, k)``.

@@ -286,6 +286,20 @@ def test_a_support_is_as_stiff_as_the_material_of_the_last_problem():
     assert np.abs(gap).max() < 1e-9
 
 
+def test_a_problem_that_cannot_be_made_leaves_a_support_as_it_was():
+    found = []
+    for fails in (False, True):
+        p, base, problem = standing(Hencky(1e3, 0.3))
+        if fails:
+            with pytest.raises(mpm.MPMError, match="needs a background and particles of degree 2"):
+                mpm.QuasiStaticProblem(p, Hencky(1e6, 0.3), supports=[base], mixed="pressure")
+        problem.solve(steps=1)
+        problem.stage(material=Hencky(5e3, 0.3))
+        problem.solve(steps=1)
+        found.append(scenes.in_order(p, p.centroid))
+    assert np.array_equal(*found) if WORLD.size == 1 else np.allclose(*found, rtol=0.0, atol=1e-12)
+
+
 def test_a_stage_with_a_material_too_stiff_for_its_support():
     _, base, problem = standing(Hencky(1e3, 0.3))
     problem.solve(steps=1)
