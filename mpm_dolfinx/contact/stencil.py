@@ -35,8 +35,8 @@ __all__ = [
     "projected",
 ]
 
-#: Step of the complex derivative.
-STEP = 1e-40
+#: Step of the complex derivative, and most points of which it is taken at once.
+STEP, AT_ONCE = 1e-40, 4096
 
 type Table = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
@@ -250,15 +250,30 @@ def by_complex_step(
     n, count, gdim = z.shape
     D = np.zeros((n, 1 + stencil.anchored.shape[1], gdim, count, gdim))
     # (nothing acts where all are shifted, so that the points' derivatives follow)
-    for node in range(1, count):
-        for j in range(gdim):
-            kept = z[:, node, j].copy()
-            z[:, node, j] += 1j * STEP
-            pushes, rubs, _ = acting(law, stencil, z, touch, extent)
-            z[:, node, j] = kept
-            D[:, :, :, node, j] = (pushes + rubs).imag / STEP
+    ways = [(node, j) for node in range(1, count) for j in range(gdim)]
+    many = max(1, AT_ONCE // max(n, 1))
+    for first in range(0, len(ways), many):
+        some = ways[first : first + many]
+        copies = np.repeat(z[None], len(some), axis=0)
+        for copy, (node, j) in zip(copies, some, strict=True):
+            copy[:, node, j] += 1j * STEP
+        whole = _repeated(stencil, len(some))
+        pushes, rubs, _ = acting(law, whole, copies.reshape(-1, count, gdim), touch, extent)
+        slopes = ((pushes + rubs).imag / STEP).reshape(len(some), n, -1, gdim)
+        for slope, (node, j) in zip(slopes, some, strict=True):
+            D[:, :, :, node, j] = slope
     D[:, :, :, 0] = -D[:, :, :, 1:].sum(axis=3)
     return D
+
+
+def _repeated(values: Any, times: int) -> Any:
+    """Return arrays, or tuples of such, in which all points come several times in turn."""
+    if isinstance(values, np.ndarray):
+        return np.tile(values, (times, *(1 for _ in values.shape[1:])))
+    if values is None:
+        return None
+    parts = [_repeated(part, times) for part in values]
+    return type(values)(*parts) if hasattr(values, "_fields") else tuple(parts)
 
 
 def added_blocks(

@@ -85,6 +85,24 @@ def test_compiled_loops_do_what_numpy_and_the_complex_step_do(side, friction):
     np.testing.assert_allclose(D, by_steps, atol=1e-13 * np.abs(by_steps).max())
 
 
+@pytest.mark.parametrize("side", SIDES)
+def test_directions_of_complex_steps_are_the_same_one_by_one(monkeypatch, side):
+    law = FRICTION["rough"]
+    points = meeting(side, law)
+    shape = np.array(points.x[:, : 1 + points.anchored.shape[1]])
+    before = shape + 0.01 * np.random.default_rng(3).normal(size=shape.shape)
+    gap, offset = points.points.gap, np.minimum(0.1 * points.points.gap, 0.0)
+    whole = points._replace(start=stencil.Start(before, points.table, gap, offset))
+    for case in (points, whole):
+        found = stencil.by_complex_step(law, case, TOUCH, EXTENT)
+        with monkeypatch.context() as one_by_one:
+            one_by_one.setattr(stencil, "AT_ONCE", 1)
+            known = stencil.by_complex_step(law, case, TOUCH, EXTENT)
+        scale = np.abs(known).max()
+        assert scale > 0.1
+        np.testing.assert_allclose(found, known, atol=1e-13 * scale)
+
+
 @pytest.mark.parametrize("spread", ["rows", "columns", "both"])
 def test_compiled_blocks_are_those_of_numpy(monkeypatch, spread):
     some = np.random.default_rng(2)
