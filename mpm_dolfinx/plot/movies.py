@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..errors import MPMError, agree
 from .fields import LABELS, Field, bodies_of
 from .outlines import imported
-from .scenes import Look, Shot, draw, new_figure, take
+from .scenes import Look, Shot, corners, draw, framed, new_figure, take
 
 __all__ = ["movie"]
 
@@ -40,12 +40,13 @@ def movie(
     cmap: Any = "viridis",
     limits: tuple[float | None, float | None] | None = None,
     camera: Any = None,
+    box: Any = None,
 ) -> None:
     """Run a problem and make a movie of it: ``movie(problem, problem.steps(40), "run.gif")``.
 
     A frame is drawn as :func:`scene` draws it, of the beginning and after each step (collective).
-    All frames have the same colours and show the same part of the space. The movie is written at
-    the end of the run, also of one that ends in an error.
+    All frames have the same colours and show the same part of the space: where bodies are in any of
+    them. The movie is written at the end of the run, also of one that ends in an error.
 
     Args:
         problem: The problem.
@@ -62,10 +63,11 @@ def movie(
         cmap: As in :func:`scene`.
         limits: First and last value of the colours; by default the extremes of the whole run.
         camera: As in :func:`scene`.
+        box: As in :func:`scene`.
 
     Raises:
-        MPMError: Another kind of file, there is no such field, or matplotlib is missing; or what
-            the run raises.
+        MPMError: Another kind of file, ``box`` is none, there is no such field, or matplotlib is
+            missing; or what the run raises.
     """
     bodies = bodies_of(problem)
     comm: MPI.Comm = bodies[0].mesh.comm
@@ -74,11 +76,12 @@ def movie(
             raise MPMError(f"A movie is a file that ends in .gif or .webp, not {str(path)!r}.")
         if every < 1 or fps <= 0:
             raise MPMError("every must be at least 1, and fps positive.")
+        shown = corners(box, bodies[0].mesh.geometry.dim)
     figures = imported("matplotlib.figure", comm)
     imported("PIL.Image", comm)
     name = field if isinstance(field, str) else ""
     look = Look(LABELS.get(name, name.replace("_", " ")) if label is None else label)
-    look = replace(look, cmap=cmap, limits=limits, camera=camera)
+    look = replace(look, cmap=cmap, limits=limits, camera=camera, box=shown)
 
     def shot() -> tuple[float, Shot | None]:
         now = field() if callable(field) else field
@@ -111,13 +114,15 @@ def _write(
 ) -> None:
     """Draw all frames and write them to a file, on rank 0."""
     shots = [frame for _, frame in frames]
-    low = np.min([frame.extent[0] for frame in shots], axis=0)
-    high = np.max([frame.extent[1] for frame in shots], axis=0)
+    if look.box is None:
+        low = np.min([frame.extent[0] for frame in shots], axis=0)
+        high = np.max([frame.extent[1] for frame in shots], axis=0)
+        look = replace(look, box=framed(np.array([low, high]), shots[0].around))
     least, most = (f([frame.range[i] for frame in shots]) for i, f in enumerate((min, max)))
     given = (None, None) if look.limits is None else look.limits
     first, last = given
     limits = (least if first is None else first, most if last is None else last)
-    look = replace(look, limits=limits, box=np.array([low, high]))
+    look = replace(look, limits=limits)
     image = import_module("PIL.Image")
     pictures = _frames(figures, frames, look, dpi)
     # One palette for all frames: what does not move does not flicker.
@@ -134,8 +139,7 @@ def _frames(
     figures: Any, frames: list[tuple[float, Shot]], look: Look, dpi: float
 ) -> list[NDArray[np.uint8]]:
     """Return the pixels of all frames, drawn on one figure."""
-    assert look.box is not None
-    figure = new_figure(figures, replace(frames[0][1], extent=look.box))
+    figure = new_figure(figures, frames[0][1], look)
     figure.set_dpi(dpi)
     canvas = import_module("matplotlib.backends.backend_agg").FigureCanvasAgg(figure)
     ax = figure.add_subplot()

@@ -21,10 +21,12 @@ from ..particles.particles import Particles
 from .fields import LABELS, Field, bodies_of, values_of
 from .outlines import edges, grid, imported, outlines, surface_algorithm
 
-__all__ = ["Look", "Shot", "draw", "scene", "take"]
+__all__ = ["Look", "Shot", "corners", "draw", "framed", "new_figure", "scene", "take"]
 
-#: Room around the bodies, relative to their extent, and pixels of a picture in space.
-MARGIN, PIXELS = 0.04, (1500, 1200)
+#: Room around the bodies, relative to their extent, and pixels of the longer side in space.
+MARGIN, PIXELS = 0.04, 1500
+#: Size of a background in space over that of what is shown, up to which its box is drawn.
+ROOMY = 2.0
 #: Height over width of what is shown, below which the colour bar lies beneath it.
 FLAT = 0.4
 #: Radius of the marks of contact points in points.
@@ -32,7 +34,7 @@ MARK = 3.0
 #: Colour of obstacles; in the plane and in space, how far they are shown around the bodies, over
 #: the extent of these, and samples of their distance along the longest side.
 OBSTACLE = "#b9b2a6"
-NEAR, SAMPLES = {2: 0.3, 3: 1.0}, {2: 300, 3: 60}
+NEAR, SAMPLES = {2: 0.3, 3: 0.2}, {2: 300, 3: 60}
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class Look:
 
     Attributes:
         limits: First and last value of the colours.
-        box: Corners of what is shown, shape ``(2, gdim)``; ``None``: the bodies.
+        box: Corners of what is shown, shape ``(2, gdim)``; ``None``: the bodies, and some room.
     """
 
     label: str
@@ -97,13 +99,15 @@ def scene(
     lines: bool | None = None,
     camera: Any = None,
     title: str | None = None,
+    box: Any = None,
 ) -> Any:
     """Draw all bodies of a problem as they are now, coloured by a field (collective).
 
-    Rigid obstacles are drawn in grey, as far as they are near the bodies.
+    The picture is as large as the bodies, with some room for rigid obstacles beside them, which are
+    drawn in grey and cut off there.
 
-    In the plane the picture is matplotlib's, in space it is rendered by pyvista, off the screen;
-    the colour bar stands beside it.
+    In the plane the picture is matplotlib's, in space it is rendered by pyvista, off the screen,
+    without perspective; the colour bar stands beside it.
 
     Args:
         problem: A problem, particles, or a list of particles.
@@ -116,37 +120,72 @@ def scene(
         path: Where to save it, e.g. ``"scene.png"``.
         ax: Axes of matplotlib to draw on; only those of rank 0 count. A figure is made without.
         warp: Factor on the displacement.
-        background: Whether the background is drawn: its cells in the plane, its box in space.
+        background: Whether the background is drawn: its cells in the plane; in space its box, if
+            that is not much larger than the bodies, or lies in ``box``.
         label: What the colour bar says; the field's name without.
         cmap: Colour map.
         limits: First and last value of the colours; ``None`` in a place is the smallest or
             largest value.
         lines: Whether edges of domains are drawn; by default where there are not too many.
-        camera: In space, where it is seen from: anything that pyvista takes as
+        camera: In space, from which side it is seen: anything that pyvista takes as
             ``camera_position``, such as ``"xz"`` or a vector towards the eye.
         title: A line above it.
+        box: What is shown instead of all bodies: the lower and the upper corner of a box, shape
+            ``(2, gdim)``.
 
     Returns:
         The figure of matplotlib on rank 0, ``None`` elsewhere.
 
     Raises:
-        MPMError: There is no such field, or a package for pictures is missing.
+        MPMError: There is no such field, ``box`` is none, or a package for pictures is missing.
     """
     bodies = bodies_of(problem)
     comm: MPI.Comm = bodies[0].mesh.comm
+    with agree(comm):
+        shown = corners(box, bodies[0].mesh.geometry.dim)
     figures = imported("matplotlib.figure", comm)
     name = field if isinstance(field, str) else ""
     look = Look(LABELS.get(name, name.replace("_", " ")) if label is None else label)
     look = replace(look, cmap=cmap, limits=limits, lines=lines, camera=camera, title=title)
+    look = replace(look, box=shown)
     shot = take(problem, bodies, field, warp, background)
     with agree(comm):
         if shot is None:
             return None
-        figure = ax.figure if ax is not None else new_figure(figures, shot)
+        figure = ax.figure if ax is not None else new_figure(figures, shot, look)
         draw(shot, look, figure.add_subplot() if ax is None else ax)
         if path is not None:
             figure.savefig(path, dpi=160, bbox_inches="tight")
         return figure
+
+
+def corners(box: Any, gdim: int) -> NDArray[np.float64] | None:
+    """Return the corners of a box that a user gives, shape ``(2, gdim)``.
+
+    Raises:
+        MPMError: It is none.
+    """
+    if box is None:
+        return None
+    try:
+        given = np.array(box, dtype=np.float64)
+    except (TypeError, ValueError):
+        given = np.zeros(0)
+    if given.shape != (2, gdim) or not np.isfinite(given).all() or (given[0] >= given[1]).any():
+        raise MPMError(
+            f"box must be the lower and the upper corner of what is shown, {gdim} coordinates "
+            f"each, not {box!r}."
+        )
+    return given
+
+
+def framed(extent: NDArray[np.float64], around: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """Return a box with some room around the bodies, and in space around a background near them."""
+    if around is not None and extent.shape[1] == 3:
+        if np.ptp(around, axis=0).max() <= ROOMY * np.ptp(extent, axis=0).max():
+            extent = np.array([np.minimum(extent[0], around[0]), np.maximum(extent[1], around[1])])
+    room = MARGIN * float((extent[1] - extent[0]).max())
+    return np.array([extent[0] - room, extent[1] + room])
 
 
 def take(
@@ -212,8 +251,17 @@ def _with_obstacles(extent: NDArray[np.float64], obstacles: Sequence[Any]) -> ND
     room = NEAR[extent.shape[1]] * float((extent[1] - extent[0]).max())
     low, high = extent[0] - room, extent[1] + room
     for obstacle in obstacles:
-        if obstacle.bounds is not None:
-            first, last = np.clip(obstacle.bounds, low, high)
+        bounds = obstacle.bounds
+        if bounds is None and len(low) == 3:
+            axes, phi = _sampled(obstacle, low, high)
+            there = np.argwhere(np.abs(phi) <= axes[0][1] - axes[0][0])
+            if len(there):
+                bounds = [
+                    [axis[i] for axis, i in zip(axes, end, strict=True)]
+                    for end in (there.min(axis=0), there.max(axis=0))
+                ]
+        if bounds is not None:
+            first, last = np.clip(bounds, low, high)
             if (first < last).all():
                 extent = np.array([np.minimum(extent[0], first), np.maximum(extent[1], last)])
     return extent
@@ -252,17 +300,32 @@ def _marks(problem: Any, comm: MPI.Comm) -> tuple[NDArray[Any], NDArray[Any]]:
     return where[touching], what[touching]
 
 
-def new_figure(figures: Any, shot: Shot) -> Any:
+def new_figure(figures: Any, shot: Shot, look: Look) -> Any:
     """Return an empty figure whose shape suits what is shown."""
-    if shot.extent.shape[1] == 3:
-        size = (8.0, 6.0)
+    box = framed(shot.extent, shot.around) if look.box is None else look.box
+    if len(box[0]) == 3:
+        right, up, _ = _axes(look)
+        wide, high = np.abs(right) @ (box[1] - box[0]), np.abs(up) @ (box[1] - box[0])
     else:
-        wide, high = np.maximum(shot.extent[1] - shot.extent[0], 1e-12)
-        size = (
-            8.0,
-            float(np.clip(8.0 * high / wide + (1.6 if high < FLAT * wide else 0.4), 2.4, 8.6)),
-        )
-    return figures.Figure(figsize=size, layout="compressed")
+        wide, high = np.maximum(box[1] - box[0], 1e-12)
+    height = np.clip(8.0 * high / wide + (1.6 if high < FLAT * wide else 0.4), 2.4, 8.6)
+    return figures.Figure(figsize=(8.0, float(height)), layout="compressed")
+
+
+def _axes(look: Look) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return unit vectors to the right and upwards in a picture in space, and into it."""
+    pyvista = import_module("pyvista")
+    with _quiet():
+        plotter = pyvista.Plotter(off_screen=True)
+        if look.camera is None:
+            plotter.view_vector((1.0, -1.6, 0.8), viewup=(0.0, 0.0, 1.0))
+        else:
+            plotter.camera_position = look.camera
+        into, up = np.array(plotter.camera.direction), np.array(plotter.camera.up)
+        plotter.close()
+    right = np.cross(into, up)
+    right /= np.linalg.norm(right)
+    return right, np.cross(right, into), into
 
 
 def draw(shot: Shot, look: Look, ax: Any, bar: bool = True) -> Any:
@@ -276,7 +339,7 @@ def draw(shot: Shot, look: Look, ax: Any, bar: bool = True) -> Any:
     if look.title is not None:
         ax.set_title(look.title)
     if coloured and bar:
-        flat = shot.extent.shape[1] == 2 and np.ptp(ax.get_ylim()) < FLAT * np.ptp(ax.get_xlim())
+        flat = np.ptp(ax.get_ylim()) < FLAT * np.ptp(ax.get_xlim())
         place = {"orientation": "horizontal", "shrink": 0.6} if flat else {"shrink": 0.8}
         colorbar = ax.figure.colorbar(artist, ax=ax, label=look.label, aspect=28, **place)
         colorbar.outline.set_linewidth(0.4)
@@ -315,9 +378,7 @@ def _draw_plane(shot: Shot, look: Look, limits: tuple[float, float], ax: Any) ->
     if shot.marks is not None:
         points, pressures = shot.marks
         ax.scatter(*points.T, s=MARK**2, c=colours.to_rgba(pressures), zorder=3)
-    low, high = shot.extent if look.box is None else look.box
-    room = MARGIN * max(high - low)
-    low, high = low - room, high + room
+    low, high = framed(shot.extent, shot.around) if look.box is None else look.box
     for obstacle in shot.obstacles:
         (x, y), phi = _sampled(obstacle, low, high)
         if phi.min() < 0.0 < phi.max():
@@ -367,8 +428,13 @@ def _rendered(shot: Shot, look: Look, limits: tuple[float, float]) -> NDArray[np
     pyvista = import_module("pyvista")
     count = sum(grid.n_cells for grid in shot.bodies)
     lines = count < 60000 if look.lines is None else look.lines
+    box = framed(shot.extent, shot.around) if look.box is None else look.box
+    right, up, into = _axes(look)
+    size, middle = box[1] - box[0], box.mean(axis=0)
+    wide, high = np.abs(right) @ size, np.abs(up) @ size
+    pixels = [max(1, round(PIXELS * side / max(wide, high))) for side in (wide, high)]
     with _quiet():
-        plotter = pyvista.Plotter(off_screen=True, window_size=PIXELS, lighting="three lights")
+        plotter = pyvista.Plotter(off_screen=True, window_size=pixels, lighting="three lights")
         for number, body in enumerate(shot.bodies):
             body = body.copy()
             colour: dict[str, Any] = {"color": "lightgrey"}
@@ -407,23 +473,26 @@ def _rendered(shot: Shot, look: Look, limits: tuple[float, float]) -> NDArray[np
                 show_scalar_bar=False,
             )
         for obstacle in shot.obstacles:
-            near = shot.extent if shot.around is None else shot.around
-            solid = _solid(pyvista, obstacle, _with_obstacles(near, shot.obstacles))
+            solid = _solid(pyvista, obstacle, box)
             if solid is not None and solid.n_cells:
                 look_of = {"smooth_shading": True, "split_sharp_edges": True}
                 plotter.add_mesh(solid, color=OBSTACLE, ambient=0.35, diffuse=0.65, **look_of)
-        if shot.around is not None:
-            box = pyvista.Box(shot.around.T.ravel())
-            plotter.add_mesh(box, style="wireframe", color="#999999", line_width=1.0)
+        if (
+            shot.around is not None
+            and (box[0] <= shot.around[0]).all()
+            and (shot.around[1] <= box[1]).all()
+        ):
+            cells = pyvista.Box(shot.around.T.ravel())
+            plotter.add_mesh(cells, style="wireframe", color="#999999", line_width=1.0)
         plotter.enable_parallel_projection()
-        if look.camera is None:
-            plotter.view_vector((1.0, -1.6, 0.8), viewup=(0.0, 0.0, 1.0))
-        else:
-            plotter.camera_position = look.camera
+        away = 2.0 * float(np.linalg.norm(size))
+        plotter.camera_position = [middle - away * into, middle, up]
+        plotter.camera.parallel_scale = high / 2.0
+        plotter.reset_camera_clipping_range()
         plotter.enable_anti_aliasing("msaa")
         image = np.asarray(plotter.screenshot(return_img=True))
         plotter.close()
-    if look.box is not None:  # frames of a movie have one size
+    if look.box is not None:  # shown as it is, so that frames of a movie have one size
         return image
     drawn = np.argwhere((image < 250).any(axis=2))
     if not len(drawn):

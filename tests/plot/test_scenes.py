@@ -86,6 +86,10 @@ def test_what_is_not_there_is_refused_in_one_sentence(solved):
         mpm.plot.scene(solved, np.zeros(solved.particles.num_local + 1))
     with pytest.raises(mpm.MPMError, match="a problem, of particles"):
         mpm.plot.scene("slope")
+    with pytest.raises(mpm.MPMError, match=r"lower and the upper corner .* 2 coordinates"):
+        mpm.plot.scene(solved, box=[(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)])
+    with pytest.raises(mpm.MPMError, match="lower and the upper corner"):
+        mpm.plot.movie(solved, [], "run.gif", box=[(1.0, 1.0), (0.0, 2.0)])
     with pytest.raises(mpm.MPMError, match=r"ends in \.gif or \.webp"):
         mpm.plot.movie(solved, [], "run.avi")
     with pytest.raises(mpm.MPMError, match="no step yet"):
@@ -199,3 +203,58 @@ def test_obstacles_in_space_are_rendered(kind):
         pixels = np.asarray(figure.axes[0].images[0].get_array())[..., :3].astype(float)
         brownish = (pixels[..., 0] - pixels[..., 2] > 10).mean()
         assert brownish < 1e-3 if kind == "nowhere" else brownish > 0.03
+
+
+def coloured(pixels):
+    """Return first and last row and column of what has the colours of a field."""
+    places = np.argwhere(np.ptp(np.asarray(pixels)[..., :3].astype(int), axis=2) > 60)
+    return places.min(axis=0), places.max(axis=0) + 1
+
+
+@pytest.mark.parametrize("wide", [1.0, 100.0])
+def test_bodies_in_space_fill_the_picture_whatever_is_around_them(wide):
+    pytest.importorskip("pyvista")
+    V = vectors(box([-wide] * 3, [1.0 + wide] * 3, [8] * 3, HEXAHEDRON))
+    particles = mpm.Particles(scenes.unit(2, HEXAHEDRON), V)
+    hills = mpm.contact.terrain([-wide, wide], [-wide, wide], np.full((2, 2), -0.05))
+    problem = mpm.QuasiStaticProblem(
+        particles, mpm.materials.Hencky(1e3, 0.3), terms=[mpm.contact.Rigid(particles, hills)]
+    )
+    height = particles.centroid[:, 2]
+    figure = mpm.plot.scene(problem, height, cmap="autumn", camera="xz", lines=False)
+    if WORLD.rank > 0:
+        return
+    pixels = figure.axes[0].images[0].get_array()
+    first, last = coloured(pixels)
+    # the cube of size 1, a floor 0.05 below it, and room of 0.2 beside and above
+    share = (last - first) / np.array(pixels.shape[:2])
+    assert (share > 0.6).all()
+    # seen from the front without perspective it is as wide as it is high
+    assert abs((last - first)[0] / (last - first)[1] - 1.0) < 0.01
+
+
+def test_a_box_is_what_is_shown(solved):
+    shown = np.array([[0.2, 0.1], [0.7, 0.4]])
+    figure = mpm.plot.scene(solved, box=shown)
+    if WORLD.rank == 0:
+        ax = figure.axes[0]
+        np.testing.assert_array_equal(np.transpose([ax.get_xlim(), ax.get_ylim()]), shown)
+        require_apart(figure)
+
+
+def test_a_box_in_space_is_what_is_shown():
+    pytest.importorskip("pyvista")
+    problem, _ = pressed(mpm.contact.sphere((50.0, 50.0, 50.0), 0.3), 3)
+    values = problem.particles.centroid[:, 2]
+    # of four boxes' width the cube has the second; of two boxes' height the upper
+    shown = [(-1.0, -9.0, -1.0), (3.0, 9.0, 1.0)]
+    figure = mpm.plot.scene(
+        problem, values, cmap="autumn", camera="xz", background=False, box=shown, lines=False
+    )
+    if WORLD.rank == 0:
+        pixels = np.asarray(figure.axes[0].images[0].get_array())
+        high, wide = pixels.shape[:2]
+        assert abs(wide / high - 2.0) < 0.01
+        first, last = coloured(pixels)
+        np.testing.assert_allclose(first, (0, wide / 4), atol=3)
+        np.testing.assert_allclose(last, (high / 2, wide / 2), atol=3)
