@@ -165,6 +165,7 @@ class Rigid(Contact):
         self._trial: Memory | None = None
         self._near: Near | None = None
         self._wider: Near | None = None
+        self._stretch: NDArray[np.float64] | None = None
 
     # -- The path -------------------------------------------------------------------------------
 
@@ -331,7 +332,7 @@ class Rigid(Contact):
 
     def _begin_anew(self, pose: Pose) -> None:
         """Take the converged positions for those of points that nothing has touched yet."""
-        self._near = None
+        self._near = self._stretch = None
         x = self._surface.positions(converged=True)
         m, nq, gdim = x.shape
         with agree(self._comm):
@@ -424,8 +425,14 @@ class Rigid(Contact):
             memory.touched.ravel(),
             memory.anchor.reshape(-1, gdim),
             memory.gap.ravel(),
-            self._surface.stretch(self.friction.by_area, which).ravel(),
+            self._stretch_of(which).ravel(),
         )
+
+    def _stretch_of(self, which: NDArray[np.int64] | None) -> NDArray[np.float64]:
+        """Return the stretch of facets that counts for friction: that at the step's beginning."""
+        if self._stretch is None:
+            return self._surface.stretch(self.friction.by_area, which)
+        return self._stretch if which is None else self._stretch[which]
 
     def _evaluated(self, whole: bool = False) -> Memory:
         """Return what acts at the present positions.
@@ -443,7 +450,13 @@ class Rigid(Contact):
         return self._evaluated_on(near.memory, near.which).among(near.which, memory)
 
     def _look_near(self) -> None:
-        """Note which facets may touch in a step, and what others may move until they could."""
+        """Note which facets may touch in a step, and what others may move until they could.
+
+        And their stretch, once in a step: where it is committed bodies are at its end already, and
+        a motion begins its terms anew.
+        """
+        if self._stretch is None:
+            self._stretch = self._surface.stretch(self.friction.by_area)
         self._near, self._wider = self._nearer_than(0.0), None
 
     def _nearer_than(self, distance: float) -> Near | None:
@@ -832,7 +845,7 @@ class Rigid(Contact):
         if (failure := agreed(self._comm, failure)) is not None:
             raise failure
         self._memory = replace(trial, step=None)
-        self._near = None
+        self._near = self._stretch = None
 
         def undo() -> None:
             self._memory = before
@@ -863,7 +876,7 @@ class Rigid(Contact):
         assert self._memory is not None
         self._trial = self._memory
         self._pose = self._memory.pose
-        self._near = None
+        self._near = self._stretch = None
 
     def _outcome(self) -> tuple[Surface, Outcome]:
         if self._memory is None:
@@ -923,8 +936,11 @@ class Rigid(Contact):
 
     @property
     def _tells_more(self) -> bool:
-        """Whether tractions were other ones than positions tell: by stress, or of whole steps."""
-        return self._nitsche or self._of_step
+        """Whether tractions were other ones than positions tell.
+
+        So they are by stress, of whole steps, and by areas of the end of the step before.
+        """
+        return self._nitsche or self._of_step or self.friction.by_area
 
     def _evaluated_at_converged(self) -> Memory:
         body = self.bodies[0]

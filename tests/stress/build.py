@@ -34,6 +34,7 @@ class Run(NamedTuple):
         second: What sets the loads at t in a second stage, or None.
         contact: The contact, or None.
         time: End and step of a motion, or None.
+        rigid: What drives a rigid body and what it is, or None.
     """
 
     problem: Any
@@ -49,6 +50,12 @@ class Run(NamedTuple):
     second: Any = None
     contact: Any = None
     time: Any = None
+    rigid: Any = None
+
+    @property
+    def touch(self):
+        """What tells of the points in contact: of a rigid body its contact, or None."""
+        return self.contact if self.rigid is None else self.contact.contacts[0]
 
 
 def grid(comm, lower, upper, n, cell, diagonal):
@@ -255,6 +262,14 @@ def shape_of(data):
         return mpm.contact.polygon(corners, radius)
     if name == "cavity":
         return mpm.contact.cavity(mpm.contact.disc(c, size))
+    if name == "polyline":
+        corners = c + size * np.array([[-0.8, -1.0], [0.8, -1.0], [0.6, 0.9], [-0.7, 0.6]])
+        return mpm.contact.polyline(corners[[0, 1, 2, 3, 0]], radius=radius, pivot=c)
+    if name == "triangles":
+        corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+        halves = [(q[0], *q[k : k + 2]) for q in sides for k in (1, 2)]
+        return mpm.contact.triangulated(c + size * corners, halves, radius=radius, pivot=c)
     assert name == "ellipse"
 
     def capsule(y):
@@ -270,8 +285,23 @@ def make_contact(scene, bodies):
     data = scene["contact"]
     law = mpm.contact.Coulomb(data["friction"], cohesion=data["cohesion"])
     if "obstacle" in data:
-        shape = shape_of(data["obstacle"])
-        return mpm.contact.Rigid(bodies[0], shape, law, penalty=data["penalty"])
+        shape, penalty = shape_of(data["obstacle"]), data["penalty"]
+        if "rigid" in data:
+            about = data["rigid"]
+            given = {k: about[k] for k in ("mass", "inertia", "gravity", "fixed")}
+            moves = about["velocity"] is not None
+            if moves:
+                turns = about["spin"] if shape.dim == 2 else (0.0, 0.0, about["spin"])
+                given |= {"velocity": about["velocity"], "spin": turns}
+            if not any(about["gravity"]):
+                given["gravity"] = None
+            centre = data["obstacle"].get("centre", data["obstacle"].get("point"))
+            return mpm.contact.RigidBody(
+                bodies[0], shape, friction=law, centre=centre, penalty=penalty, **given
+            )
+        return mpm.contact.Rigid(
+            bodies[0], shape, law, penalty=penalty, law=data.get("law", "penalty")
+        )
     passes, penalty = data["passes"], data["penalty"]
     return mpm.contact.Pair(bodies[1], bodies[0], law, passes=passes, penalty=penalty)
 
@@ -311,7 +341,11 @@ def make(scene, comm) -> Run:
     pair = "passes" in scene.get("contact", {})
     spaces = [V for _ in meshes]
     if pair:
-        spaces[1] = fem.functionspace(background, ("Lagrange", scene.get("degree", 1), (dim,)))
+        other = background
+        if "second_background" in scene:
+            data = {**scene["second_background"], "unit": length}
+            other = make_background(comm, data, low, high, ())[0]
+        spaces[1] = fem.functionspace(other, ("Lagrange", scene.get("degree", 1), (dim,)))
     bodies = [mpm.Particles(body, W, **options) for body, W in zip(meshes, spaces, strict=True)]
     if support == "press":
         held = [
@@ -336,7 +370,11 @@ def make(scene, comm) -> Run:
     def update(t):
         for body in bodies:
             body.load.value = factor(t)
-        if touch is not None and "obstacle" in scene["contact"]:
+        if touch is not None and "rigid" in scene["contact"]:
+            about = scene["contact"]["rigid"]
+            moment = t * about["moment"]
+            touch.push(t * np.array(about["force"]), moment if dim == 2 else (0.0, 0.0, moment))
+        elif touch is not None and "obstacle" in scene["contact"]:
             touch.move(t * np.array(scene["contact"]["way"]), t * scene["contact"]["turn"])
         elif support == "press":
             held[-1][1].value[:] = t * np.array(scene["contact"]["way"])
@@ -363,7 +401,10 @@ def make(scene, comm) -> Run:
         more = {"terms": [touch]}
     if "motion_of" in scene:
         about, kind = scene["motion_of"], mpm.DynamicProblem
-        speeds = [(0.0, about["speed"])] + [(0.1 * about["speed"], 0.0)] * (len(bodies) - 1)
+        up, along = np.eye(dim)[1], np.eye(dim)[0]
+        speeds = [tuple(about["speed"] * up)] + [tuple(0.1 * about["speed"] * along)] * (
+            len(bodies) - 1
+        )
         more |= {
             "velocity": speeds if len(bodies) > 1 else speeds[0],
             **{k: about[k] for k in ("scheme", "out_of_range")},
@@ -393,4 +434,5 @@ def make(scene, comm) -> Run:
         second if "second_weight" in scene else None,
         touch,
         time,
+        scene.get("contact", {}).get("rigid"),
     )

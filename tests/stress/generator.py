@@ -717,14 +717,20 @@ def rubbing(rng: Random) -> Scene:
 ROUND = ("plane", "disc", "box", "polygon", "cavity", "ellipse")
 
 
+#: Gaps between bodies at the beginning, of which some are refused.
+GAPS = (0.0, 0.0, 1e-13, 0.01, 0.1, -0.01, -0.3)
+#: Others, of which fewer are.
+MILD = (0.0, 0.0, 0.0, 0.0, 1e-13, 0.01, 0.01, 0.05, -1e-3, -0.1)
+
+
 @scene_class(40)
-def obstacles(rng: Random, index: int) -> Scene:
+def obstacles(rng: Random, index: int, gaps: tuple[float, ...] = GAPS) -> Scene:
     """Obstacles of every shape, far into bodies or through them, at a gap or in overlap."""
     dim = 3 if index % 5 == 4 else 2
     name = ROUND[index % 6] if dim == 2 else ("plane", "disc", "cylinder", "box")[index // 5 % 4]
     height = 0.6
     size = [1.0, height, 0.5][:dim]
-    gap = float(pick(rng, 0.0, 0.0, 1e-13, 0.01, 0.1, -0.01, -0.3))
+    gap = float(pick(rng, *gaps))
     plastic = bool(rng.integers(2))
     return assembled(
         rng,
@@ -823,4 +829,106 @@ def soils(rng: Random, index: int) -> Scene:
         },
         weight=down(float(rng.uniform(1.2, 1.8)) * limit / height),
         support=pick(rng, "stand", "roll"),
+    )
+
+
+@scene_class(20)
+def nitsche(rng: Random, index: int) -> Scene:
+    """Obstacles at which the pressure is that of the stress behind the facet, as in motion."""
+    made = bouncing(rng, 6 * (index // 5)) if index % 5 == 3 else obstacles(rng, index, MILD)
+    made["contact"] |= {"law": "nitsche", "penalty": float(pick(rng, 0.5, 1.0, 1.0, 4.0))}
+    if "motion_of" in made:
+        # (whole steps have no stress at their end alone: all but "euler" is refused)
+        made["motion_of"]["scheme"] = "midpoint" if index == 18 else "euler"
+    return made
+
+
+@scene_class(14)
+def paired(rng: Random, index: int) -> Scene:
+    """Two bodies on backgrounds of their own, at rest and in motion, in the plane and in space."""
+    dim = 3 if index % 5 == 4 else 2
+    moves = index % 2 == 1
+    speed = between(rng, 1e-3, 0.3)
+    ends = min(20.0, 0.6 / speed)
+    # (what moves meets in the first third)
+    gap = 0.3 * speed * ends * float(rng.uniform()) if moves else float(pick(rng, *MILD))
+    shape = pick(rng, "block", "jitter", *(() if dim == 3 else ("disc", "trapezium")))
+    upper = [0.5, 0.4, 0.3][:dim]
+    start = [float(rng.uniform(0.1, 0.4)), 0.5 + gap, 0.1][:dim]
+    room = 1.2 if moves else 1.0
+    plastic = bool(rng.integers(2))
+    about = {**rubbing(rng), **press(rng, dim), "passes": int(pick(rng, 1, 2, 2))}
+    about |= {"friction": float(rng.uniform(0.0, 2.0)), "turn": 0.0}
+    motion = {
+        "scheme": ("conserving", "midpoint", "euler")[index // 2 % 3],
+        "out_of_range": pick(rng, "project", "reflect"),
+        "speed": speed,
+        "time": ends,
+    }
+    return assembled(
+        rng,
+        dim,
+        body=body(rng, dim, shape=pick(rng, "block", "jitter"), size=[1.0, 0.5, 0.5][:dim]),
+        second=body(rng, dim, shape=shape, size=upper, origin=start),
+        background=background(rng, dim, room=room),
+        second_background=background(rng, dim, room=room, h=float(pick(rng, 0.2, 0.35))),
+        material=von_mises(rng, between(rng, 3e-3, 3e-2)) if plastic else hencky(rng),
+        contact=about,
+        **({"motion_of": motion} if moves else {}),
+        weight=down(0.0 if moves else float(pick(rng, 0.0, 1e-3)), dim),
+        support="none" if moves else "press",
+        path="contact",
+        steps=12 if moves else int(pick(rng, 3, 8)),
+        limit=180.0,
+    )
+
+
+@scene_class(7)
+def driven(rng: Random, index: int) -> Scene:
+    """Rigid bodies of every shape that forces drive, at rest and in motion."""
+    dim = 3 if index % 4 > 1 else 2
+    moves = index % 2 == 1
+    names = {
+        2: ("disc", "box", "polygon", "ellipse", "polyline", "cavity", "plane"),
+        3: ("disc", "cylinder", "box", "triangles", "plane"),
+    }[dim]
+    name = names[index // 4 % len(names)]
+    load, speed = between(rng, 1e-4, 3e-2), between(rng, 1e-3, 0.3)
+    ends = min(20.0, 0.4 / speed)
+    gap = 0.3 * speed * ends * float(rng.uniform()) if moves else float(pick(rng, *MILD))
+    about = {**rubbing(rng), "obstacle": obstacle(rng, dim, name, [0.5, 0.6, 0.25][:dim], gap)}
+    if name == "plane":
+        about["obstacle"] |= {"normal": [0.0, -1.0, 0.0][:dim]}
+    mass = load * between(rng, 0.1, 1.0) if not moves else between(rng, 1e-2, 10.0)
+    fixed = pick(rng, (), (), (), ("rotation",), ("x",), ("x", "rotation"))
+    about["rigid"] = {
+        "mass": mass,
+        "inertia": 0.4 * mass * about["obstacle"]["size"] ** 2 * float(rng.uniform(0.5, 1.0)),
+        "gravity": down(float(pick(rng, 0.0, 1.0)) if not moves else 0.0, dim),
+        "force": [0.0 if moves else v for v in down(load, dim, float(rng.uniform(-0.3, 0.3)))],
+        "moment": 0.0 if moves else float(pick(rng, 0.0, rng.uniform(-0.05, 0.05))) * load,
+        "velocity": [0.3 * speed, -speed, 0.0][:dim] if moves else None,
+        "spin": float(pick(rng, 0.0, speed)) if moves else None,
+        "fixed": () if moves else fixed,
+        "way": [0.0] * dim,
+    }
+    motion = {
+        "scheme": ("conserving", "midpoint", "euler")[index // 2 % 3],
+        "out_of_range": pick(rng, "project", "reflect"),
+        "speed": 0.0,
+        "time": ends,
+    }
+    plastic = bool(rng.integers(2))
+    return assembled(
+        rng,
+        dim,
+        body=body(rng, dim, shape=pick(rng, "block", "jitter"), size=[1.0, 0.6, 0.5][:dim]),
+        background=background(rng, dim, room=1.2 if moves else 0.75),
+        material=von_mises(rng, between(rng, 3e-3, 3e-2)) if plastic else hencky(rng),
+        contact=about,
+        **({"motion_of": motion} if moves else {}),
+        support="none" if moves else pick(rng, "stand", "roll"),
+        path="contact",
+        steps=12 if moves else int(pick(rng, 2, 6)),
+        limit=180.0,
     )
