@@ -153,10 +153,10 @@ class BodyContact(Rigid):
     def span(self) -> float:
         """Return the largest length of the undeformed body along an axis (collective)."""
         x = self.bodies[0].initial_domains.reshape(-1, self._surface.gdim)
-        comm = self.bodies[0].mesh.comm
-        low = comm.allreduce(x.min(axis=0, initial=np.inf), MPI.MIN)
-        high = comm.allreduce(x.max(axis=0, initial=-np.inf), MPI.MAX)
-        return float((high - low).max())
+        ends = np.concatenate([x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)])
+        self.bodies[0].mesh.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MAX)
+        above, below = np.split(ends, 2)
+        return float((above + below).max())
 
     def total(self, centres: tuple[NDArray[np.float64], ...]) -> NDArray[np.float64]:
         """Return this rank's force and moment on the other body, their size, and their round-off.
