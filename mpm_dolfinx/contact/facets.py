@@ -22,13 +22,17 @@ from .._core import loops
 from ..parallel.exchange import swap
 from .surface import Surface, global_dofs, normals
 
-__all__ = ["Closest", "NearFacets", "solved"]
+__all__ = ["Closest", "NearFacets", "Table", "separated", "solved"]
 
 #: Cosine of the angle of two normals below which surfaces face each other; and in the middle of a
 #: facet, below which they may do so somewhere, and below which they do so for sure.
 FACING, MAY_FACE, SURELY_FACING = -0.1, 0.5, -0.4
 #: Most Newton steps of a projection, and the step that ends them: the next one is its square.
 PROJECTIONS, CLOSE = 20, 1e-10
+
+
+#: Shape functions of a facet at points, ``(n, k)``, with their first and second derivatives.
+type Table = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
 class Closest(NamedTuple):
@@ -263,11 +267,8 @@ class NearFacets:
         x, X = points[which], nodes[facets]
         s = self.project(x, X, self._start(len(which)))
         inner = self.clamped(s)
-        N, dN, _ = self.tabulate(inner)
-        r = x - np.einsum("nk,nki->ni", N, X)
+        r, n_of = separated(self.tabulate(inner), x, X, self.outward[facets])
         far = np.linalg.norm(r, axis=1)
-        n_of = self.outward[facets][:, None] * normals(np.einsum("nek,nki->nie", dN, X))
-        n_of = n_of / np.linalg.norm(n_of, axis=1)[:, None]
         ok = far <= reach
         if outward is not None:
             ok &= (outward[which] * n_of).sum(axis=1) < FACING
@@ -277,15 +278,12 @@ class NearFacets:
         first = order[np.diff(which[order], prepend=-1) != 0]
         who = which[first]
         facet[who], place[who] = facets[first], s[first]
-        N, dN, _ = self.tabulate(s[first])
-        X = nodes[facets[first]]
-        n_of = self.outward[facets[first]][:, None] * normals(np.einsum("nek,nki->nie", dN, X))
-        n_of = n_of / np.linalg.norm(n_of, axis=1)[:, None]
-        g = ((points[who] - np.einsum("nk,nki->ni", N, X)) * n_of).sum(axis=1)
-        gap[who] = g
+        table, X = self.tabulate(s[first]), nodes[facets[first]]
+        r, n_of = separated(table, points[who], X, self.outward[facets[first]])
+        gap[who] = g = (r * n_of).sum(axis=1)
         # A point behind the end of an open surface, or beside an edge, touches nothing; nor does
         # one beside the edge of a thin body that faces its far side.
-        size = np.linalg.norm(np.einsum("nek,nki->nei", dN, X), axis=2).max(axis=1)
+        size = np.linalg.norm(np.einsum("nek,nki->nei", table[1], X), axis=2).max(axis=1)
         over = np.abs(s[first] - inner[first]).max(axis=1) * size
         off = (g < 0.0) & (over > np.maximum(1e-9 * size, 0.2 * np.minimum(np.abs(g), 0.1 * size)))
         off &= (far[first] > 2.0 * np.abs(g) + 1e-12 * size) | (g < -0.5 * size)
@@ -421,6 +419,22 @@ def _determinant(G: NDArray[np.float64]) -> NDArray[np.float64]:
     if G.shape[1] == 1:
         return G[:, 0, 0]
     return np.asarray(G[:, 0, 0] * G[:, 1, 1] - G[:, 0, 1] * G[:, 1, 0])
+
+
+def separated(
+    table: Table, x: NDArray[np.float64], X: NDArray[np.float64], outward: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the ways from places on facets to points, and outward unit normals there.
+
+    Args:
+        table: Shape functions with derivatives at the places.
+        x: The points, shape ``(n, gdim)``.
+        X: Nodes of the facets, shape ``(n, k, gdim)``.
+        outward: As that of :class:`Surface`.
+    """
+    N, dN, _ = table
+    n = outward[:, None] * normals(np.einsum("nek,nki->nie", dN, X))
+    return x - np.einsum("nk,nki->ni", N, X), n / np.linalg.norm(n, axis=1)[:, None]
 
 
 def solved(G: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:

@@ -17,10 +17,10 @@ import basix
 
 from .. import _compat
 from .contact import Outcome
-from .facets import Closest, NearFacets
+from .facets import Closest, NearFacets, separated
 from .law import Coulomb, Points
 from .stencil import Foot, Start, Stencil, acting_now, added_blocks, derivatives, projected
-from .surface import Blocks, Surface, global_dofs, normals
+from .surface import Blocks, Surface, global_dofs
 
 __all__ = ["Memory", "Pass"]
 
@@ -132,14 +132,20 @@ class Pass:
 
     def begin(self, converged: bool = True) -> None:
         """Learn of the facets near the points as they are (collective)."""
-        x = self._flat(self.source.positions(converged))
-        nodes = self.target.node_positions(converged)
-        self._near = NearFacets(self.target, self._number, x, 3.0 * self.reach, nodes)
-        self._before = self._near.positions(self.target.node_positions(converged=True))
-        self._start = x, nodes
+        self._learn(
+            self._flat(self.source.positions(converged)), self.target.node_positions(converged)
+        )
         self._paired: Closest | None = None
         self.stencil = None
         self.count = 0
+
+    def _learn(self, x: NDArray[np.float64], nodes: NDArray[np.float64]) -> NearFacets:
+        """Learn of the facets near points, for bodies at some positions (collective)."""
+        near = NearFacets(self.target, self._number, x, 3.0 * self.reach, nodes)
+        self._before = near.positions(self.target.node_positions(converged=True))
+        self._start = x, nodes
+        self._near = near
+        return near
 
     def _follow(self, x: NDArray[np.float64], nodes: NDArray[np.float64]) -> None:
         """Learn of other facets where bodies have gone far since (collective)."""
@@ -149,13 +155,11 @@ class Pass:
         ]
         if self._comm.allreduce(sum(moved), MPI.MAX) <= self.reach:
             return
-        paired, near = self._paired, self._near
-        assert near is not None
-        self._near = NearFacets(self.target, self._number, x, 3.0 * self.reach, nodes)
-        self._before = self._near.positions(self.target.node_positions(converged=True))
-        self._start = x, nodes
+        paired, before = self._paired, self._near
+        assert before is not None
+        near = self._learn(x, nodes)
         if paired is not None:
-            place = np.where(paired.facet >= 0, self._near.find(_numbers(near, paired.facet)), -1)
+            place = np.where(paired.facet >= 0, near.find(_numbers(before, paired.facet)), -1)
             self._paired = paired._replace(facet=place, near=paired.near & (place >= 0))
 
     def begin_anew(self) -> None:
@@ -354,12 +358,10 @@ class Pass:
         facet, place = found.facet.copy(), found.place.copy()
         gap, near = found.gap.copy(), found.near.copy()
         facet[keep] = before.facet[keep]
-        X = nodes[facet[keep]]
-        N, dN, _ = self._near.tabulate(s)
-        n = normals(np.einsum("nek,nki->nie", dN, X))
-        n = n * (self._near.outward[facet[keep]] / np.linalg.norm(n, axis=1))[:, None]
+        at = facet[keep]
+        r, n = separated(self._near.tabulate(s), x[keep], nodes[at], self._near.outward[at])
         place[keep], near[keep] = s, True
-        gap[keep] = ((x[keep] - np.einsum("nk,nki->ni", N, X)) * n).sum(axis=1)
+        gap[keep] = (r * n).sum(axis=1)
         return Closest(facet, place, gap, near, found.beside)
 
     def _stencil(
@@ -526,10 +528,7 @@ class Pass:
         X = self._nodes[at[was]]
         s = self._near_place(x[was], X)
         inner = near.clamped(s)
-        N, dN, _ = near.tabulate(inner)
-        r = x[was] - np.einsum("nk,nki->ni", N, X)
-        n = normals(np.einsum("nek,nki->nie", dN, X))
-        n = n * (near.outward[at[was]] / np.linalg.norm(n, axis=1))[:, None]
+        r, n = separated(near.tabulate(inner), x[was], X, near.outward[at[was]])
         deep = (r * n).sum(axis=1) < -0.75 * self.reach
         beside = np.linalg.norm(s - inner, axis=1) > 0.5
         return bool(np.any(deep & ~beside & ~found.near[was]))

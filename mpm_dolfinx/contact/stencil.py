@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._core import loops
-from .facets import solved
+from .facets import Table, solved
 from .law import Coulomb, Points, Traction, traction
 from .surface import normals
 from .whole_step import corrected, deformation, mean_pressure
@@ -37,8 +37,6 @@ __all__ = [
 
 #: Step of the complex derivative, and most points of which it is taken at once.
 STEP, AT_ONCE = 1e-40, 4096
-
-type Table = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
 class Start(NamedTuple):

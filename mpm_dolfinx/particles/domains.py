@@ -19,7 +19,7 @@ from .deletion import Deletion
 from .geometry import Geometry
 from .reference import Reference
 
-__all__ = ["Domains"]
+__all__ = ["Domains", "separate_nodes"]
 
 #: How far a node may be behind the axis of a body of revolution, over its domain's width: what
 #: soft supports there, and round-off, may leave.
@@ -130,9 +130,7 @@ class Domains:
         Args:
             moved: Whether its nodes are elsewhere.
         """
-        degree = self.W.ufl_element().degree
-        space = fem.functionspace(self.mesh, ("Discontinuous Lagrange", degree))
-        self.mass_share = fem.Function(space, name="mass_share")
+        self.mass_share = fem.Function(separate_nodes(self.W), name="mass_share")
         self.mass_share.x.array[:] = 1.0
         if moved:
             self.origin = fem.Function(self.W, name="origin")
@@ -432,3 +430,8 @@ class Domains:
             Shape ``(n, corners)``.
         """
         return self._geometry.corner_jacobians(self._corners())
+
+
+def separate_nodes(W: fem.FunctionSpace) -> fem.FunctionSpace:
+    """Return numbers at the nodes of W, those of each cell by themselves (collective)."""
+    return fem.functionspace(W.mesh, ("Discontinuous Lagrange", W.ufl_element().degree))

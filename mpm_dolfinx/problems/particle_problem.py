@@ -63,6 +63,7 @@ from .arguments import (
     require_background_fields,
     require_entity_maps,
     require_own_fields,
+    require_truth,
     residuals_of,
 )
 from .setup import Numerics
@@ -526,8 +527,7 @@ class ParticleProblem:
         self._require_governing()
         if not isinstance(name, str):
             raise MPMError(f"The name of a stage must be a string, not {name!r}.")
-        if not isinstance(sudden, bool | np.bool_):
-            raise MPMError(f"sudden must be True or False, not {sudden!r}.")
+        require_truth("sudden", sudden)
         self._staging.begin(name, change, bool(sudden))
 
     @property

@@ -26,6 +26,7 @@ from ..constitutive.strain import Strain, strain_of
 from ..errors import DomainDistortionError, MPMError, agree, agreed, warn
 from ..io.checkpoint import Snapshot
 from ..parallel.given import require_same
+from ..particles.domains import separate_nodes
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
 from ..system.body import StepForce
@@ -708,9 +709,7 @@ class QuasiStaticProblem(ParticleProblem):
     def nodal_masses(self, number: int) -> NDArray[np.float64]:
         """Return ``int density Q_c dX`` of each owned domain of a body, ``(n, k)`` (collective)."""
         body, (work, density) = self.bodies[number], self._density[number]
-        space = fem.functionspace(
-            body.mesh, ("Discontinuous Lagrange", body.W.ufl_element().degree)
-        )
+        space = separate_nodes(body.W)
         test: Any = ufl.TestFunction(space)
         if body.mass_share is not None:
             test = body.mass_share * test
@@ -720,9 +719,7 @@ class QuasiStaticProblem(ParticleProblem):
     def mass_matrices(self, number: int) -> NDArray[np.float64]:
         """Return ``int density Q_c Q_d dX`` of each owned domain, ``(n, k, k)`` (collective)."""
         body, (work, density) = self.bodies[number], self._density[number]
-        space = fem.functionspace(
-            body.mesh, ("Discontinuous Lagrange", body.W.ufl_element().degree)
-        )
+        space = separate_nodes(body.W)
         product = ufl.TrialFunction(space) * ufl.TestFunction(space)
         matrix = fem.assemble_matrix(fem.form(work.mass(density.value, product)))
         n, k = body.num_local, space.dofmap.list.shape[1]

@@ -29,7 +29,7 @@ from ..particles.particles import Particles
 from ..reals import is_one_of
 from ..solvers.linear import LINEAR_SOLVERS
 from ..system.term import Term
-from .arguments import carried, holds
+from .arguments import carried, holds, require_truth
 from .summary import counted
 
 __all__ = ["MIXED", "BodySetup", "Numerics", "Setup"]
@@ -82,8 +82,7 @@ class Numerics:
     def __post_init__(self) -> None:
         """Say so where something is unknown."""
         for name in ("line_search", "predictor"):
-            if not isinstance(getattr(self, name), bool | np.bool_):
-                raise MPMError(f"{name} must be True or False, not {getattr(self, name)!r}.")
+            require_truth(name, getattr(self, name))
         if not isinstance(self.petsc_options_prefix, str):
             raise MPMError(
                 f"petsc_options_prefix must be a string, not {self.petsc_options_prefix!r}."
@@ -251,8 +250,7 @@ class Setup:
 
     def __post_init__(self) -> None:
         """Say so where something is unknown."""
-        if not isinstance(self.axisymmetric, bool | np.bool_):
-            raise MPMError(f"axisymmetric must be True or False, not {self.axisymmetric!r}.")
+        require_truth("axisymmetric", self.axisymmetric)
         if not is_one_of(self.f_bar, F_BARS):
             raise MPMError(
                 f"Unknown f_bar={self.f_bar!r}; choose one of {', '.join(map(repr, F_BARS))}."
