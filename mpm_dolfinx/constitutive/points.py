@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
 from typing import Any, NamedTuple
 
@@ -546,15 +546,31 @@ class MaterialPoints:
             know it.
         """
         result = np.full(self._points, np.nan)
-        for group, state in zip(
-            self._groups, self._trial if trial else self._last.states, strict=True
-        ):
+        for group, state in self._states(trial):
             energy = group.material.strain_energy(state)
             if energy is not None:
                 self._require(group, "strain energy", energy, (len(group.points),))
                 result[group.points] = energy
         if self.averaging is not None:
             result += self.averaging.energy().ravel() if trial else self._last.resisted
+        return result
+
+    def _states(self, trial: bool) -> Iterator[tuple[_Group, State]]:
+        """Return the groups with their states in the last update, or at the converged step."""
+        return zip(self._groups, self._trial if trial else self._last.states, strict=True)
+
+    def potential(self, trial: bool = False) -> NDArray[np.float64]:
+        """Return the elastic energy and, where a law knows it, the plastic work, ``(n nq,)``.
+
+        Args:
+            trial: As for :meth:`strain_energy`.
+        """
+        result = self.strain_energy(trial)
+        for group, state in self._states(trial):
+            work = group.material.plastic_work(state)
+            if work is not None:
+                self._require(group, "plastic work", work, (len(group.points),))
+                result[group.points] += work
         return result
 
     @property
@@ -568,14 +584,17 @@ class MaterialPoints:
         return self._where(lambda law: not vars(type(law)).get("linear_in_volume", False))
 
     @property
-    def is_hyperelastic(self) -> NDArray[np.bool_]:
-        """Which points have a stress that derives from an energy, ``(n nq,)``.
+    def has_potential(self) -> NDArray[np.bool_]:
+        """Which points have a stress that derives from :meth:`potential` over a step, ``(n nq,)``.
 
         That is one of F there; with F-bar, of F at the points of a group, which has one material.
         With a pressure of its own that is the stress without it.
         """
-        elastic = self._where(lambda law: not getattr(law, "inelastic", True))
-        return elastic & np.isfinite(self.strain_energy())
+        found = self._where(lambda law: not getattr(law, "inelastic", True))
+        for group, state in self._states(False):
+            if group.material.plastic_work(state) is not None:
+                found[group.points] = True
+        return found & np.isfinite(self.strain_energy())
 
     def _where(self, holds: Callable[[Material], bool]) -> NDArray[np.bool_]:
         result = np.zeros(self._points, dtype=bool)

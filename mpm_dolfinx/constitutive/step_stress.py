@@ -12,9 +12,12 @@ c = 0 (Simo & Tarnow 1992), or, where the stress derives from an energy W of the
     c = (W_1 - W_n - (S_n + S_1)/2 : (E_1 - E_n)) / |E_1 - E_n|^2
 
 (Gonzalez 2000), so that the work P* : (F_1 - F_n) is W_1 - W_n. As S* is symmetric, angular
-momentum is kept. Where a law whose pressure may vanish by yielding (sand) knows its elastic energy
-W, c is that of Gonzalez if it is positive, and 0 otherwise: the mean of two stresses that yield is
-not one that does, and could give back more work than there was energy, as where a body falls apart.
+momentum is kept. Metals have such an energy over each step as well: elastic energy and plastic work
+together, of which the stress of a radial return is the derivative (Ortiz & Stainier 1999).
+
+Where a law whose pressure may vanish by yielding (sand) knows its elastic energy W, c is that of
+Gonzalez if it is positive, and 0 otherwise: the mean of two stresses that yield is not one that
+does, and could give back more work than there was energy, as where a body falls apart.
 So P* : (F_1 - F_n) >= W_1 - W_n at each of its points. (The tangent takes the stress for the
 derivative of W there, which is exact where the point has become free of stress.) With F-bar, W is
 the energy of a group of domains and depends on F at all of its points, with the effective stress P
@@ -105,7 +108,7 @@ class StepStress:
             )
         self._undeformed: Array | None = None
         self._small = points.has_small_strain
-        self._exact = points.is_hyperelastic & ~self._small
+        self._exact = points.has_potential & ~self._small
         bounded = points.may_part & ~np.isnan(points.strain_energy())
         self._kind = np.where(bounded, 3, 1).astype(np.uint8)
         self._kind[self._exact], self._kind[self._small] = 2, 0
@@ -181,12 +184,12 @@ class StepStress:
         self._reference = self._present_reference()
         self._H = self._gradient()
         self._P = points.first_piola.copy()
-        self._energy = self._elastic = points.strain_energy()
+        self._energy, self._potential = points.strain_energy(), points.potential()
         if self._splits:
             found, p = points.volume_strain, points.converged_pressure
             self._volume, self._slope = found.volume, found.slope
             self._of_pressure = found.slope / self._share
-            self._elastic = self._energy - 0.5 * found.compliance * p**2
+            self._potential -= 0.5 * found.compliance * p**2
             self._P -= p[:, None, None] * found.slope
             self._own = self._P
         if self._viscosity > 0.0:
@@ -258,11 +261,11 @@ class StepStress:
         """Return P* and its derivative by F at the step's end, over the share."""
         energies = None
         if (self._kind >= 2).any():
-            energy = self._points.strain_energy(trial=True)
+            potential = self._points.potential(trial=True)
             if self._splits:
                 p, found = self._present_pressure()[0], self._points.volume_strain
-                energy = energy - 0.5 * found.compliance * p**2
-            energies = energy, self._elastic
+                potential -= 0.5 * found.compliance * p**2
+            energies = potential, self._potential
         ends = _Ends(self._stress, self._P, self.tangent, energies, self._kind)
         stress, tangent = self._mean(ends)
         if self._splits:
@@ -478,7 +481,7 @@ class StepStress:
             A function that takes it back.
         """
         points = self._points
-        settled = ["_H", "_P", "_energy", "_elastic", "_work"]
+        settled = ["_H", "_P", "_energy", "_potential", "_work"]
         if self._splits:
             settled += ["_volume", "_slope", "_of_pressure", "_own"]
         before = {name: getattr(self, name) for name in settled}

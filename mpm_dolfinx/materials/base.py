@@ -206,6 +206,23 @@ class Material(ABC):
         """
         return None
 
+    def plastic_work(self, state: State) -> NDArray[np.float64] | None:
+        """Return what yielding has taken up, per undeformed volume of points, shape ``(n,)``.
+
+        It is for laws whose stress after an update is the derivative of it and of the strain energy
+        together, the history being as it was: those of associated flow and isotropic hardening,
+        integrated by backward Euler (Ortiz & Stainier 1999, Comput. Methods Appl. Mech. Engrg 171,
+        section 2). In a motion with ``scheme="conserving"`` they lose what yielding takes up and
+        nothing else.
+
+        Args:
+            state: Their state.
+
+        Returns:
+            The work; ``None``, as here, where the law is no such one.
+        """
+        return None
+
     def stressed_state(self, cauchy_stress: NDArray[np.float64], dim: int) -> State:
         """Return the state of points that carry a stress where their body is undeformed.
 

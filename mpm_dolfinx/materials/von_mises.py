@@ -104,6 +104,12 @@ class VonMises(IsotropicElastic):
         """Return f, shape ``(n,)``, of a state's stress ``(n, m)`` and plastic strain ``(n,)``."""
         return np.asarray(norm(deviator(stress)) / self.strength(plastic_strain) - 1.0)
 
+    def plastic_work(self, state: State) -> NDArray[np.float64]:
+        """See :meth:`Material.plastic_work`: the uniaxial stress, along the plastic strain."""
+        kappa = state["plastic_strain"]
+        yields = np.sqrt(1.5) * self.rho_y + 0.5 * self.parameters["hardening"] * kappa
+        return np.asarray(yields * kappa)
+
     def integrate(
         self, trial_strain: NDArray[np.float64], variables: State, tangent: bool
     ) -> Integration:

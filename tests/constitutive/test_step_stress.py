@@ -136,9 +136,10 @@ def test_a_singular_gradient_is_an_error_of_the_step():
 
 
 @pytest.mark.parametrize("cell", [TRIANGLE, QUADRILATERAL, HEXAHEDRON])
-@pytest.mark.parametrize("law", ["Hencky", "linear"])
+@pytest.mark.parametrize("law", ["Hencky", "linear", "strong"])
 def test_the_work_of_an_elastic_body_is_its_energy(cell, law):
-    _, _, stress, put = stepped(cell, LAWS[law])
+    # (the strong one is of a law that yields, and does not)
+    _, _, stress, put = stepped(cell, {**LAWS, "strong": VonMises(10.0, 0.3, rho_y=99.0)}[law])
     before = stress.strain_energy()
     put(0.6, 3.0)
     stress.update()
@@ -146,6 +147,28 @@ def test_the_work_of_an_elastic_body_is_its_energy(cell, law):
     stress.commit()
     assert stress.stress_work == pytest.approx(stress.strain_energy() - before, rel=1e-9)
     assert symmetric.shape == stress.first_piola.shape
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("cell", [TRIANGLE, HEXAHEDRON])
+def test_the_work_of_metal_is_its_energy_and_what_yielding_takes(cell, compiled):
+    rho_y, hardening = 0.4, 2.0
+    law = VonMises(10.0, 0.3, rho_y=rho_y, hardening=hardening)
+    _, points, stress, put = stepped(cell, law, compiled=compiled)
+    first, all_taken = WORLD.allreduce(stress.strain_energy()), 0.0
+    for amount in (0.3, 0.6, 0.5, -0.1):
+        kappa, energy = points.plastic_strain().ravel(), WORLD.allreduce(stress.strain_energy())
+        put(amount, 3.0)
+        stress.update()
+        stress.commit()
+        change = points.plastic_strain().ravel() - kappa
+        middle = rho_y + np.sqrt(2.0 / 3.0) * hardening * (kappa + 0.5 * change)
+        taken = WORLD.allreduce(float(points.weights.ravel() @ (np.sqrt(1.5) * middle * change)))
+        found = WORLD.allreduce(stress.stress_work)
+        energy = WORLD.allreduce(stress.strain_energy()) - energy
+        assert found == pytest.approx(energy + taken, rel=1e-9)
+        all_taken += taken
+    assert all_taken > first
 
 
 GROUPED = [

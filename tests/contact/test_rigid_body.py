@@ -21,7 +21,7 @@ YOUNG, POISSON = 100.0, 0.3
 CONFINED = YOUNG * (1 - POISSON) / (1 + POISSON) / (1 - 2 * POISSON)
 
 
-def thrown(shape="disc", friction=0.0, comm=WORLD, origin=0.0, **options):
+def thrown(shape="disc", friction=0.0, comm=WORLD, origin=0.0, law=None, **options):
     """Return a block that floats, and a body of mass, which spins, thrown at it."""
 
     def at(*x):
@@ -45,7 +45,7 @@ def thrown(shape="disc", friction=0.0, comm=WORLD, origin=0.0, **options):
     )
     problem = mpm.DynamicProblem(
         particles,
-        Hencky(YOUNG, POISSON),
+        Hencky(YOUNG, POISSON) if law is None else law,
         1.0,
         terms=[ball],
         **{"scheme": "conserving", "out_of_range": "reflect", **TIGHT, **options},
@@ -86,6 +86,22 @@ def test_an_impact_keeps_energy_momentum_and_angular_momentum(shape, friction):
     account = problem.history.energies
     assert np.ptp([e.balance for e in account]) < 1e-12
     assert account[-1].damping > 1e-2 * whole if friction else account[-1].damping == 0.0
+    assert np.mean(problem.history.iterations) < 5.0 and problem.history.cutbacks == 0
+
+
+@pytest.mark.parametrize("strength", [5.0, 50.0])
+def test_an_impact_on_metal_takes_what_yielding_takes(strength):
+    # The work of a radial return, found from the plastic strains: nothing is won or lost besides,
+    # neither where metal yields nor where it is struck too softly for that.
+    law = VonMises(YOUNG, POISSON, yield_stress=strength, hardening=10.0)
+    problem, ball = thrown("box", law=law)
+    volumes, whole, taken = problem.points[0].weights.ravel(), ball.kinetic_energy, 0.0
+    for _ in problem.steps(0.24, 0.02):
+        kappa = problem.points[0].plastic_strain().ravel()
+        taken = WORLD.allreduce(float(volumes @ ((strength + 5.0 * kappa) * kappa)))
+        assert energy(problem, ball) + taken == pytest.approx(whole, rel=1e-10)
+    assert taken > 0.05 * whole if strength < 10.0 else taken == 0.0
+    assert problem.history.energies[-1].dissipated == pytest.approx(taken, abs=1e-10 * whole)
     assert np.mean(problem.history.iterations) < 5.0 and problem.history.cutbacks == 0
 
 
