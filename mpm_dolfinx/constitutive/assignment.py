@@ -1,0 +1,243 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Which material governs which points of a body, with which parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem, mesh
+
+from .. import _compat
+from ..errors import MPMError, agree
+from ..materials.base import Material, Refused, check_parameter
+from ..materials.compiled import CompiledMaterial
+from ..particles.particles import Particles
+from .governed import Governed
+from .pressure import MeanStress, is_split, without_bulk
+
+__all__ = ["Assignment", "Materials"]
+
+type Materials = Material | Mapping[int, Material]
+
+
+class _Given(NamedTuple):
+    """A material as the user gave it, and what its parameters were then."""
+
+    material: Material
+    parameters: dict[str, Any]
+
+    def live(self) -> list[tuple[str, Any]]:
+        """Return the parameters whose values are followed."""
+        kinds = fem.Function | fem.Constant
+        return [(n, v) for n, v in self.parameters.items() if isinstance(v, kinds)]
+
+    def require_same(self) -> None:
+        """Raise an error where the parameters are other objects now."""
+        now = self.material.parameters
+        if now.keys() != self.parameters.keys() or any(
+            now[name] is not value for name, value in self.parameters.items()
+        ):
+            raise MPMError(
+                f"Parameters of a {type(self.material).__name__} were replaced after the problem "
+                "was made, which does not follow that; give DG0 Functions or Constants, whose "
+                "values it follows, or make a new problem."
+            )
+
+
+class Assignment:
+    """The materials of a body, each at the points that it governs (collective).
+
+    Args:
+        particles: The body.
+        dim: Dimension of stress and strain.
+        materials: One material, or one for each tag of ``cell_tags``.
+        cell_tags: Tags of the body's cells.
+        compiled: Whether materials may use their compiled updates.
+        mean_stress: The pressure in place of the mean stress, if there is one.
+
+    Attributes:
+        governed: The materials at their points.
+        weakening: What the strength of all of them is divided by.
+
+    Raises:
+        MPMError: Materials, tags or parameters that do not go together.
+    """
+
+    def __init__(
+        self,
+        particles: Particles,
+        dim: int,
+        materials: Materials,
+        cell_tags: mesh.MeshTags | None,
+        compiled: bool,
+        mean_stress: MeanStress | None,
+    ) -> None:
+        self._particles = particles
+        self._dim = dim
+        self._compiled = compiled
+        self._mean_stress = mean_stress
+        self.weakening = 1.0
+        with agree(particles.mesh.comm):
+            chosen = self._chosen(materials, cell_tags)
+            self._given = [_Given(material, dict(material.parameters)) for material, _ in chosen]
+            self.governed = [self._governing(material, points) for material, points in chosen]
+
+    @property
+    def given(self) -> list[Material]:
+        """The materials as they were given."""
+        return [given.material for given in self._given]
+
+    def as_strong_as_given(self) -> list[Material]:
+        """Return the materials at their points, whatever their strength is divided by."""
+        if self.weakening == 1.0:
+            return [part.material for part in self.governed]
+        return [
+            self._resolved(material, part.points, weakened=False)
+            for material, part in zip(self.given, self.governed, strict=True)
+        ]
+
+    def follow_parameters(self) -> bool:
+        """Take over the present values of parameters that are Functions or Constants (collective).
+
+        Returns:
+            Whether some have changed on this rank.
+
+        Raises:
+            MPMError: They are not allowed, or the parameters of a material are other objects than
+                when this was made.
+        """
+        with agree(self._particles.mesh.comm):
+            for given in self._given:
+                given.require_same()
+        for given in self._given:
+            limits = given.material.limits
+            for name, value in given.live():
+                check_parameter(name, value, **limits.get(name, {}))
+        changed = False
+        for number, (given, part) in enumerate(zip(self._given, self.governed, strict=True)):
+            if not given.live():
+                continue
+            present = self._resolved(given.material, part.points)
+            if any(
+                not np.array_equal(present.parameters[name], part.material.parameters[name])
+                for name, _ in given.live()
+            ):
+                self.governed[number] = self._taken(present, part.points)
+                changed = True
+        return changed
+
+    def weaken(self, factor: float) -> None:
+        """Divide the strength of all materials by a factor from now on, 1 at first (collective).
+
+        Raises:
+            MPMError: A material does not say what its strength is.
+        """
+        self.weakening = factor
+        with agree(self._particles.mesh.comm):
+            self.governed = [
+                self._governing(material, part.points)
+                for material, part in zip(self.given, self.governed, strict=True)
+            ]
+
+    def _chosen(
+        self, materials: Materials, cell_tags: mesh.MeshTags | None
+    ) -> list[tuple[Material, NDArray[np.int64]]]:
+        """Return each material with the points it is for."""
+        nq, count = self._particles.num_points, self._particles.num_local
+        if isinstance(materials, Material):
+            return [(materials, np.arange(count * nq))]
+        if not isinstance(materials, Mapping) or not all(
+            isinstance(m, Material) for m in materials.values()
+        ):
+            raise MPMError(
+                "material must be a material of mpm.materials or a dictionary "
+                f"{{cell tag: material}}, not {type(materials).__name__}."
+            )
+        body = self._particles.mesh
+        if cell_tags is None or cell_tags.dim != body.topology.dim:
+            raise MPMError("A dictionary of materials needs cell_tags=, tags of the body's cells.")
+        if not _compat.are_tags_of(cell_tags, body):
+            raise MPMError("cell_tags are those of another mesh than the body's.")
+        tags = np.full(count, -1, dtype=np.int64)
+        own = cell_tags.indices < count
+        tags[cell_tags.indices[own]] = cell_tags.values[own]
+        known = np.isin(tags, list(materials))
+        without = self._particles.global_index[~known]
+        if len(without):
+            missing = ", ".join(str(tag) if tag >= 0 else "none" for tag in np.unique(tags[~known]))
+            raise MPMError(
+                f"The cell tags of {{particles}} ({missing}) have no material, as there are "
+                f"materials for {', '.join(map(str, materials))} alone; give one for each tag.",
+                without,
+            )
+        tags = np.repeat(tags, nq)
+        return [(material, np.flatnonzero(tags == tag)) for tag, material in materials.items()]
+
+    def _governing(self, material: Material, points: NDArray[np.int64]) -> Governed:
+        """Return a material as it was given at points."""
+        return self._taken(self._resolved(material, points), points)
+
+    def _taken(self, material: Material, points: NDArray[np.int64]) -> Governed:
+        """Return a material at its points, without its mean stress where a pressure is that."""
+        whole = Governed(self._particles, self._dim, material, points, material)
+        if self._mean_stress is None:
+            return whole
+        if not is_split(material):
+            shear = whole.undeformed_tangent()[:, 0, 1, 0, 1]
+            self._mean_stress.shear[points] = shear
+            return replace(whole, at_pressure=True)
+        law, bulk, soft = without_bulk(material)
+        self._mean_stress.follow(points, material, bulk, soft)
+        return replace(whole, law=law)
+
+    def _resolved(
+        self, material: Material, points: NDArray[np.int64], weakened: bool = True
+    ) -> Material:
+        """Return a material with its parameters at points, weakened or as given."""
+        law = type(material).__name__
+        if not isinstance(getattr(material, "symmetric", None), bool | np.bool_):
+            raise MPMError(
+                f"{law} does not say whether its tangent is symmetric; write symmetric = True (or "
+                "False) into the class."
+            )
+        replaced: dict[str, float | NDArray[np.float64]] = {}
+        for name, value in material.parameters.items():
+            if isinstance(value, fem.Constant):
+                replaced[name] = float(value.value)
+            if not isinstance(value, fem.Function | np.ndarray):
+                continue
+            values = np.repeat(self._per_cell(name, value), self._particles.num_points)
+            values.flags.writeable = False
+            replaced[name] = values
+        if replaced:
+            material = material.with_parameters(**replaced).at(points)
+        if weakened and self.weakening != 1.0:
+            material = material.weakened(self.weakening)
+        if not self._compiled and isinstance(material, CompiledMaterial):
+            material = material.with_parameters()
+            material.compiled = False
+        return material
+
+    def _per_cell(self, name: str, value: Any) -> NDArray[np.float64]:
+        """Return a parameter's values in the owned cells."""
+        n = self._particles.num_local
+        if isinstance(value, Refused):
+            raise MPMError(value.message)
+        if isinstance(value, np.ndarray):
+            if value.shape != (n,):
+                raise MPMError(
+                    f"The parameter {name} has {len(value)} values for {n} particles; give a "
+                    "number, a DG0 Function on the body, or one value for each owned particle."
+                )
+            return value
+        space = value.function_space
+        element = space.ufl_element()
+        if space.mesh is not self._particles.mesh or element.degree != 0 or space.value_size != 1:
+            raise MPMError(f"The parameter {name} must be a scalar DG0 Function on the body mesh.")
+        return np.asarray(value.x.array[space.dofmap.list[:n, 0]])
