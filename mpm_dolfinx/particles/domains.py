@@ -159,6 +159,20 @@ class Domains:
         return np.array(self.mass_share.x.array[dofs], dtype=np.float64)
 
     @property
+    def volume_ratio(self) -> Any:
+        """UFL: undeformed volume of the body mesh over its own."""
+        return 1.0 if self.origin is None else ufl.det(ufl.grad(self.origin))
+
+    @property
+    def mass_ratio(self) -> Any:
+        """UFL: mass per volume of the body mesh over the density that was given for it.
+
+        Of a body that was rebased it is the ratio of volumes, so that masses of domains stay what
+        they are; shares are beside that of what was cut.
+        """
+        return 1.0 if self.mass_share is None else self.mass_share * self.volume_ratio
+
+    @property
     def area_ratio(self) -> Any:
         """UFL: undeformed area of the body mesh's facets over their own, by Nanson's formula."""
         if self.origin is None:
@@ -173,6 +187,20 @@ class Domains:
         dofs = self.mass_share.function_space.dofmap.list[: self.num_local]
         self.mass_share.x.array[dofs] = shares
         self.mass_share.x.scatter_forward()
+
+    def refer_mass_shares(self) -> None:
+        """Take the mass shares for such per volume of the mesh, which older files have.
+
+        They become those per undeformed volume with the same masses at the nodes.
+        """
+        assert self.origin is not None
+        exact = self._geometry.exact_rule()
+        N, own = exact.shapes, exact.weights
+        moved = self.origin.x.array.reshape(-1, self._geometry.gdim) - self._geometry.nodes
+        before = own * volume_ratio(exact.displacement_gradient(moved[self.domain_nodes]))
+        masses = np.einsum("nq,qc,qd,nd->nc", own, N, N, self.mass_shares(), optimize=True)
+        matrices = np.einsum("nq,qc,qd->ncd", before, N, N, optimize=True)
+        self.set_mass_shares(np.linalg.solve(matrices, masses[:, :, None])[:, :, 0])
 
     @property
     def rebased(self) -> bool:

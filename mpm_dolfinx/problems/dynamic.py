@@ -101,7 +101,8 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
             quasi_static=[number for number, body in enumerate(bodies) if body in static],
             terms=terms,
         )
-        alpha, self._viscosity = rayleigh_of(rayleigh)
+        damping = rayleigh_of(rayleigh)
+        self._viscosity = damping[1]
         require_motion("DynamicProblem", options)
         kept = out_of_range == "reflect" and scheme != "euler"
         if kept and options.get("mixed") == "stabilised pressure":
@@ -115,7 +116,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         for body, its in zip(bodies, start, strict=True):
             if body in static:
                 its.x.array[:] = 0.0
-        self.inertia = Inertia(bodies, start, scheme, out_of_range, alpha, self._energies, static)
+        self.inertia = Inertia(bodies, start, scheme, out_of_range, damping, self._energies, static)
         given = as_terms(terms, bodies)
         governed = [body.governed_by for body in bodies]
         try:
@@ -275,7 +276,7 @@ class DynamicParticleProblem(MovingProblem):
             damping=damping,
             supports=supports,
         )
-        alpha, _ = rayleigh_of((damping, 0.0))
+        rayleigh = rayleigh_of((damping, 0.0))
         require_motion("DynamicParticleProblem", options)
         if scheme == "conserving":
             raise MPMError(
@@ -295,7 +296,7 @@ class DynamicParticleProblem(MovingProblem):
             raise MPMError(f"There are {len(bodies)} bodies, but a list of {len(given)} densities.")
         self._densities = [Density(rho, body) for rho, body in zip(given, bodies, strict=True)]
         self._energies = []
-        self.inertia = Inertia(bodies, start, scheme, out_of_range, alpha, self._energies)
+        self.inertia = Inertia(bodies, start, scheme, out_of_range, rayleigh, self._energies)
         every = [self.inertia, *as_terms(terms, bodies)]
         super().__init__(R, particles, J, predictor=False, terms=every, **options)
         self.history.energies = self._energies

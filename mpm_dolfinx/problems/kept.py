@@ -37,8 +37,9 @@ class Bodies(Kept):
         self._bodies = bodies
 
     def numbers(self) -> dict[str, Any]:
-        """Return how quadrilaterals were cut."""
-        return {"cuts": [body.cuts.tolist() for body in self._bodies]}
+        """Return how quadrilaterals were cut, and which volume shares of masses are per."""
+        cuts = [body.cuts.tolist() for body in self._bodies]
+        return {"cuts": cuts, "mass share per": "undeformed volume"}
 
     def columns(self, body: int | None) -> dict[str, Column]:
         """See :class:`Kept`."""
@@ -58,6 +59,8 @@ class Bodies(Kept):
         """See :class:`Kept`."""
         for body, columns in zip(self._bodies, taken.columns, strict=False):
             body.set_converged_state(columns)
+            if "mass share per" not in taken.numbers and body.origin is not None:
+                body.refer_mass_shares()
 
 
 class Material(Kept):

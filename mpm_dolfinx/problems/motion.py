@@ -113,7 +113,7 @@ class MovingProblem(TimeProblem):
         space = fem.functionspace(body.mesh, broken)
         product = ufl.inner(ufl.TrialFunction(space), ufl.TestFunction(space))
         if body.mass_share is not None:
-            product = body.mass_share * product
+            product = body.mass_ratio * product
         form = self._mass_form(number, product)
         if body.deletion is not None:
             form = body.deletion.present_only(form)

@@ -400,7 +400,7 @@ class _Undeformed:
         self._strain, self._body = strain, strain.particles
         origin = self._body.origin
         self._to_mesh = None if origin is None else ufl.inv(ufl.grad(origin))
-        self.volume_ratio = 1.0 if origin is None else ufl.det(ufl.grad(origin))
+        self.volume_ratio = self._body.volume_ratio
 
     def grad(self, w: Any) -> Any:
         """Return the gradient of a field on the mesh."""

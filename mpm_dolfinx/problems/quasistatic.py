@@ -527,7 +527,7 @@ class QuasiStaticProblem(ParticleProblem):
         self._density.append((work, density))
         mass = density.value
         if body.mass_share is not None:
-            mass = mass * body.mass_share
+            mass = mass * body.mass_ratio
         acting, of_step = self._in_time(history, given.supports)
         self._acting.append(acting)
         symmetric = acting.symmetric and not given.pressures
@@ -712,15 +712,20 @@ class QuasiStaticProblem(ParticleProblem):
         space = separate_nodes(body.W)
         test: Any = ufl.TestFunction(space)
         if body.mass_share is not None:
-            test = body.mass_share * test
+            test = body.mass_ratio * test
         vector = fem.assemble_vector(fem.form(work.mass(density.value, test)))
         return np.asarray(vector.array[space.dofmap.list[: body.num_local]])
 
     def mass_matrices(self, number: int) -> NDArray[np.float64]:
-        """Return ``int density Q_c Q_d dX`` of each owned domain, ``(n, k, k)`` (collective)."""
+        """Return ``int density Q_c Q_d dX`` of each owned domain, ``(n, k, k)`` (collective).
+
+        Shares that masses have where domains were cut are left out.
+        """
         body, (work, density) = self.bodies[number], self._density[number]
         space = separate_nodes(body.W)
         product = ufl.TrialFunction(space) * ufl.TestFunction(space)
+        if body.origin is not None:
+            product = body.volume_ratio * product
         matrix = fem.assemble_matrix(fem.form(work.mass(density.value, product)))
         n, k = body.num_local, space.dofmap.list.shape[1]
         return matrix.data[: n * k * k].reshape(n, k, k)

@@ -279,7 +279,8 @@ class Remeshing:
                     "degree, can be rebased."
                 )
             with agree(body.mesh.comm):
-                if (bad := body.global_index[~body.proper() | body.deleted]).size:
+                bad = np.union1d(body.folded(), body.global_index[body.deleted])
+                if len(bad):
                     raise MPMError(
                         "{particles} are concave or deleted, so the body cannot be rebased; split "
                         "concave quadrilaterals first.",

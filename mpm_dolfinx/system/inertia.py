@@ -118,7 +118,8 @@ class Inertia(Term):
         velocities: At the beginning, on W of each body.
         scheme: One of :data:`SCHEMES`.
         out_of_range: ``"project"`` or ``"reflect"``; of no meaning to ``"euler"``.
-        damping: Damping in proportion to the mass, one over a time.
+        rayleigh: Damping in proportion to mass, one over a time, and to stiffness, a time, of which
+            the second is in the stress of bodies.
         energies: Where the account is kept, one entry for each step.
         static: Bodies among these that have no inertia: they are in equilibrium at each step's end,
             and their velocity is the mean of the step.
@@ -138,7 +139,7 @@ class Inertia(Term):
         velocities: Sequence[fem.Function],
         scheme: str,
         out_of_range: str,
-        damping: float,
+        rayleigh: tuple[float, float],
         energies: list[Energy],
         static: Sequence[Particles] = (),
     ) -> None:
@@ -150,7 +151,8 @@ class Inertia(Term):
             )
         super().__init__(bodies)
         self.scheme, self.out_of_range = scheme, out_of_range
-        self._damping = damping
+        self._rayleigh = rayleigh
+        self._damping = rayleigh[0]
         self.static = tuple(static)
         self.velocities = list(velocities)
         self.dt, self.time = 1.0, 0.0
@@ -679,9 +681,10 @@ class Inertia(Term):
         """Raise nothing: velocities are those of the same nodes."""
 
     def numbers(self) -> dict[str, Any]:
-        """Return scheme, time and account, for a checkpoint."""
+        """Return scheme, damping, time and account, for a checkpoint."""
         return {
             "scheme": [self.scheme, self.out_of_range],
+            "rayleigh": list(self._rayleigh),
             "static": [number for number, body in enumerate(self.bodies) if self.is_static(body)],
             "time": self.time,
             "energies": [list(vars(energy).values()) for energy in self._energies],
@@ -762,13 +765,20 @@ class _Velocities(Kept):
         """See :class:`Kept`."""
         if "scheme" not in taken.numbers:
             raise MPMError(f"{source} holds no velocities; it is not that of a DynamicProblem.")
-        mine, its = self._inertia.numbers()["scheme"], taken.numbers["scheme"]
+        present = self._inertia.numbers()
+        mine, its = present["scheme"], taken.numbers["scheme"]
         if list(its) != mine:
             raise MPMError(
                 f"{source} was made with scheme={its[0]!r}, out_of_range={its[1]!r}, and this "
                 f"problem with {mine[0]!r}, {mine[1]!r}."
             )
-        if taken.numbers.get("static", []) != self._inertia.numbers()["static"]:
+        damping = taken.numbers.get("rayleigh")  # which older files do not tell
+        if damping is not None and damping != present["rayleigh"]:
+            raise MPMError(
+                f"{source} was made with rayleigh={tuple(damping)}, and this problem with "
+                f"{tuple(present['rayleigh'])}."
+            )
+        if taken.numbers.get("static", []) != present["static"]:
             raise MPMError(f"{source} has other bodies without inertia than quasi_static= says.")
         super().require(source, taken)
 

@@ -814,6 +814,11 @@ def test_a_run_that_is_restored_goes_on_bit_for_bit(tmp_path, out, scheme):
         mpm.MPMError,
         f"was made with scheme={scheme!r}",
     )
+    raises(
+        lambda: thrown(out=out, scheme=scheme, rayleigh=(0.0, 1e-3)).restore(path),
+        mpm.MPMError,
+        r"was made with rayleigh=\(0.0, 0.0\), and this problem with \(0.0, 0.001\)",
+    )
     static = mpm.QuasiStaticProblem(square(), VonMises(100.0, 0.3, rho_y=3.0))
     static.save(path)
     raises(lambda: thrown(out=out).restore(path), mpm.MPMError, "holds no velocities")
@@ -858,6 +863,26 @@ def test_split_and_rebase_keep_momentum(out, scheme):
         centre = np.trapezoid([1.73, 1.73], dx=0.2)
         np.testing.assert_allclose(turned, -2.0 * centre, atol=1e-10)
     assert change_of_balance(history) < 1e-9
+
+
+@pytest.mark.parametrize(("cell", "degree"), [(TRIANGLE, 3), (QUADRILATERAL, 2)])
+def test_a_rebase_keeps_kinetic_energy(cell, degree):
+    # A body that shears by as much as its size: cells with curved sides, far from what they were.
+    def torn(x):
+        return np.stack([2.0 * np.sin(3.0 * x[1]), 1.5 * np.cos(4.0 * x[0])])
+
+    body = box([1.23, 1.51], [2.23, 2.51], [2, 2], cell)
+    particles = mpm.Particles(body, plate(degree=degree), degree=degree)
+    problem = spinning(particles, velocity=torn)
+    problem.solve(0.2, 0.05)
+    strain = np.abs(particles.deformation_gradient - np.eye(3)).max(initial=0.0)
+    assert WORLD.allreduce(strain, MPI.MAX) > 0.3
+    before = problem.kinetic_energy, *problem.momentum
+    problem.rebase()
+    after = problem.kinetic_energy, *problem.momentum
+    np.testing.assert_allclose(after, before, rtol=0, atol=1e-13 * before[0])
+    problem.solve(0.3, 0.05)
+    assert change_of_balance(problem.history) < 1e-9
 
 
 @pytest.mark.parametrize("scheme", ["midpoint", "conserving", "euler"])

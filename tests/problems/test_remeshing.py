@@ -426,6 +426,20 @@ def test_rebased_body_with_a_pressure_is_restored_and_moves_to_other_ranks(tmp_p
     same_run(outcome(straight), outcome(whole), 1e-9)
 
 
+@pytest.mark.parametrize(
+    ("cell", "degree"),
+    [(TRIANGLE, 3), (QUADRILATERAL, 2), pytest.param(HEXAHEDRON, 2, marks=pytest.mark.slow)],
+)
+def test_rebase_keeps_the_mass_matrices(cell, degree):
+    problem = half_way(block_of(cell, degree), 4)
+    before = scenes.in_order(problem.particles, problem.mass_matrices(0))
+    problem.rebase()
+    after = scenes.in_order(problem.particles, problem.mass_matrices(0))
+    np.testing.assert_allclose(after, before, rtol=0, atol=1e-13 * np.abs(before).max())
+    shares = problem.particles.mass_shares()
+    np.testing.assert_allclose(shares, 1.0, rtol=0, atol=1e-10)
+
+
 def test_rebase_refused():
     concave = dented("error")
     concave.solve(10)
@@ -433,6 +447,11 @@ def test_rebase_refused():
         concave.rebase()
     concave.split([0])
     concave.rebase()
+    mild = dented("error")  # at the corner alone, not where mass is integrated
+    next(step for step in mild.steps(10) if step.load > 0.75)
+    assert (mild.particles.corner_jacobians() > -0.3).all()
+    with pytest.raises(mpm.MPMError, match="particle 0 are concave or deleted"):
+        mild.rebase()
     with pytest.raises(mpm.MPMError, match="density is a function of the mesh"):
         column().rebase()
     tall = scenes.column(scenes.A, 2, QUADRILATERAL, LinearElastic(1.0, 0.0), method="cpdi")
