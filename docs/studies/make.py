@@ -6,7 +6,7 @@
     python docs/studies/make.py               all but those of run times
     python docs/studies/make.py --check       what does not follow: runs the quick rows
     python docs/studies/make.py --still       the same without any run
-    python docs/studies/make.py --stamp NAME  scripts have changed in what does not matter to it
+    python docs/studies/make.py --stamp TABLE scripts have changed in what does not matter to it
 
 NAME is a table, as ``locking/cantilever``, or the beginning of several, as ``locking``. A comment
 above each table of measured numbers tells where it comes from:
@@ -17,8 +17,9 @@ above each table of measured numbers tells where it comes from:
 
 The first number is a hash of the scripts that made the table, the second one of its rows. A table
 does not follow where the scripts have changed since, where it was edited by hand, or where its
-quick rows come out otherwise. ``--stamp`` takes the name of a page too, and writes both numbers
-anew: for tables copied by hand from what another program has printed.
+quick rows come out otherwise. ``--stamp`` writes both numbers of one table anew, for one copied by
+hand from what another program has printed: TABLE is its name, or its page and line, as complaints
+tell them, ``docs/dynamics.md:169``.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class Found(NamedTuple):
     @property
     def name(self) -> str:
         """What a complaint calls it."""
-        return f"docs/{self.page}.md, line {self.start + 1}"
+        return f"docs/{self.page}.md:{self.start + 1}"
 
 
 def digest(*parts: bytes) -> str:
@@ -133,6 +134,18 @@ def put(found: Found, rows: list[str]) -> None:
     lines[found.start : found.stop] = rows
     lines[found.at] = marked(found.source, rows)
     path.write_text("\n".join(lines) + "\n", "utf-8")
+
+
+def stamp(name: str) -> None:
+    """Write the hashes of the one table that has this name, or stands at this line of a page."""
+    every = [f for f in all_found() if f.source not in ("", "once")]
+    chosen = [f for f in every if name in (f.name, f.source)]
+    if len(chosen) != 1:
+        page = name.partition(":")[0].removeprefix("docs/").removesuffix(".md")
+        there = [f for f in chosen or every if chosen or f.page == page]
+        places = "".join(f"\n  {f.name}  {f.source}" for f in there)
+        raise SystemExit(f"{name!r} names {len(chosen)} tables where one is stamped.{places}")
+    put(chosen[0], chosen[0].rows)
 
 
 def make(name: str) -> bool:
@@ -204,15 +217,11 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help="a table, or its beginning")
     parser.add_argument("--check", action="store_true", help="change nothing, run the quick rows")
     parser.add_argument("--still", action="store_true", help="change nothing, run nothing")
-    parser.add_argument("--stamp", metavar="NAME", help="write the hashes of a table or page")
+    parser.add_argument("--stamp", metavar="TABLE", help="write the hashes of one table")
     parser.add_argument("--times", action="store_true", help="also tables of run times")
     args = parser.parse_args()
     if args.stamp:
-        chosen = [f for f in all_found() if f.source not in ("", "once")]
-        for found in chosen:
-            mine = found.source == args.stamp
-            if mine or (found.page == args.stamp and found.source.startswith("by ")):
-                put(found, found.rows)
+        stamp(args.stamp)
         return
     unknown = [n for n in args.names if not any(t.startswith(n) for t in TABLES)]
     if unknown:
