@@ -164,7 +164,7 @@ def agree(item: pytest.Item, report: pytest.TestReport) -> None:
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_runtest_teardown() -> Generator[None]:
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None]:
     """Destroy what a test left, on all ranks together: destructors may be collective."""
     try:
         return (yield)
@@ -174,6 +174,8 @@ def pytest_runtest_teardown() -> Generator[None]:
             sys.__dict__.pop(name, None)
         if not State.out_of_step:
             gc.collect()
+            if nextitem is None or nextitem.path != item.path:
+                gc.freeze()  # modules and forms that it loaded, as after the collection of tests
             PETSc.garbage_cleanup()
             MPI.COMM_WORLD.Barrier()
 
