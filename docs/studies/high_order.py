@@ -18,6 +18,7 @@ from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.particles import options as validation
+from mpm_dolfinx.stabilisation import ghost_penalty
 
 CELLS = {"quadrilaterals": mesh.CellType.quadrilateral, "triangles": mesh.CellType.triangle}
 PAIRS = [(k, m) for k in (1, 2, 3) for m in (1, 2, 3)]
@@ -116,6 +117,53 @@ def flow(weight: int, h: float, domain: str, kind: str) -> list[Any]:
     return [r["cutbacks"], r["iterations"], f"{r['toe']:.2f}{reached}", f"{r['y_mean']:.4f}"]
 
 
+def condition(degree: int, stabilisation: str | None, offset: float) -> float:
+    """Condition number of a held block's reduced tangent, scaled to unit diagonal."""
+    h, side = 0.5, 1.0
+    background = rectangle([1.5, 3.0], [3, 6], mesh.CellType.quadrilateral)
+    V = fem.functionspace(background, ("Lagrange", degree, (2,)))
+    cells = 2 * round(side / h)
+    body = rectangle([side, side], [cells, cells], mesh.CellType.quadrilateral)
+    body.geometry.x[:, 1] += side - offset
+    facets = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[0], 0.0))
+    dofs = fem.locate_dofs_topological(V, 1, facets)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(body, V, degree=degree),
+        mpm.materials.Hencky(YOUNG, 0.2),
+        body_force=(0.0, -1.0),
+        bcs=[fem.dirichletbc(np.zeros(2), dofs, V)],
+        stabilisation=stabilisation,
+    )
+    problem.solve(steps=1)
+    K = problem.A.convert("dense").getDenseArray()
+    scale = 1.0 / np.sqrt(np.diag(K))
+    values = np.linalg.eigvalsh(K * np.outer(scale, scale))
+    return float(values[-1] / values[0]) if values[0] > 1e-14 * values[-1] else np.inf
+
+
+def conditions(degree: int, stabilisation: str | None, gamma: float) -> list[str]:
+    """The smallest and the largest of a block that is moved through a cell, and their ratio."""
+    usual, ghost_penalty.PENALTY = ghost_penalty.PENALTY, gamma
+    offsets = [1e-9, 1e-6, *np.linspace(0.0, 0.5, 200)]
+    found = [condition(degree, stabilisation, offset) for offset in offsets]
+    ghost_penalty.PENALTY = usual
+    smallest, largest = min(found), max(found)
+    if np.isinf(largest):
+        return [scientific(smallest), "singular", ""]
+    ratio = largest / smallest
+    written = f"{ratio:.2g}" if ratio < 100.0 else scientific(ratio)
+    return [scientific(smallest), scientific(largest), written]
+
+
+CONDITIONS: dict[str, tuple[int, str | None, float]] = {
+    "degree 1, none": (1, None, 0.0),
+    "degree 2, none": (2, None, 0.0),
+    "ghost penalty, $\\gamma = 10^{-6}$": (2, "ghost", 1e-6),
+    "ghost penalty, $\\gamma = 10^{-5}$": (2, "ghost", 1e-5),
+    "**ghost penalty, $\\gamma = 10^{-4}$**": (2, "ghost", 1e-4),
+    "aggregation": (2, "aggregate", 0.0),
+    "degree 3, ghost penalty, $\\gamma = 10^{-4}$": (3, "ghost", 1e-4),
+}
 FRONTS: dict[str, tuple[Any, ...]] = {
     "degree 1": ("--degree", 1),
     "degree 1, 4 x 4 domains in a cell": ("--degree", 1, "--particles-per-cell", 4),
@@ -145,6 +193,11 @@ def tables() -> dict[str, Table]:
         )
         for name, kind in CELLS.items()
     }
+    found["high-order/condition"] = Table(
+        "high-order",
+        ["degree 2 where no other is named", "smallest", "largest", "ratio"],
+        {name: partial(conditions, *options) for name, options in CONDITIONS.items()},
+    )
     found["high-order/beam"] = Table(
         "high-order",
         ["degree, cells", "0", "0.1 h", "0.37 h", "1e-9", "solves, at most"],

@@ -40,10 +40,11 @@ import soils
 import solver
 import splitting
 import step_size
+import supports
 from case_runs import ROOT, Table, head, row
 
 DOCS = ROOT / "docs"
-SCRIPTS = (step_size, load_steps, locking, splitting, soils, methods, high_order, solver)
+SCRIPTS = (step_size, load_steps, locking, splitting, soils, methods, high_order, solver, supports)
 TABLES: dict[str, tuple[Table, Path]] = {
     name: (table, Path(str(script.__file__)))
     for script in SCRIPTS

@@ -1,13 +1,19 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The table of docs/splitting.md."""
+"""The tables of docs/splitting.md."""
 
 from __future__ import annotations
 
-from functools import partial
+import sys
+from collections.abc import Mapping, Sequence
+from functools import cache, partial
 from typing import Any
 
-from case_runs import Table, run
+import numpy as np
+from case_runs import ROOT, Table, run, scientific
+
+sys.path.append(str(ROOT / "tests"))
+from problems import test_remeshing as bodies
 
 SCENES = [
     (0.5, 1, 20),
@@ -35,9 +41,51 @@ def cells(cell: float, each: int, weight: int) -> list[str]:
     return found
 
 
+#: What a split and a rebase leave as it is, by what the tests call it.
+SUMS = {
+    "volume, undeformed and present": ("volume", "present volume"),
+    "mass, and its moment": ("mass", "moment of mass"),
+    "mass at each node of the background": ("mass at nodes of the background",),
+    "external forces, sum of all forces, at each node": ("external forces", "forces"),
+    "elastic strain, plastic strain": ("elastic strain", "plastic strain"),
+    "sums of stress and deformation gradient": ("stress", "F"),
+}
+
+
+@cache
+def before_and_after() -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:
+    """Sums of a split column, and of rebased blocks in the plane and in space."""
+    found = []
+    split = bodies.half_way(bodies.column())
+    quadrilaterals = bodies.half_way(bodies.block_of(bodies.QUADRILATERAL), 4)
+    hexahedra = bodies.half_way(bodies.block_of(bodies.HEXAHEDRON), 4)
+    for problem in (split, quadrilaterals, hexahedra):
+        before = bodies.sums(problem)
+        if problem is split:
+            problem.split(bodies.some(problem.particles))
+        else:
+            problem.rebase()
+        found.append((before, bodies.sums(problem)))
+    return found
+
+
+def differences(names: Sequence[str]) -> list[str]:
+    """The largest differences of some sums, relative to the largest number of each."""
+    row = []
+    for before, after in before_and_after():
+        gaps = [np.abs(after[n] - before[n]).max() / np.abs(before[n]).max() for n in names]
+        row.append(scientific(float(max(gaps)), 0))
+    return row
+
+
 def tables() -> dict[str, Table]:
     labels = [f"{h:g} m, {each}, {g} kN/m³" for h, each, g in SCENES]
     return {
+        "splitting/sums": Table(
+            "splitting",
+            ["", "split", "rebase, quadrilaterals", "rebase, hexahedra"],
+            {label: partial(differences, names) for label, names in SUMS.items()},
+        ),
         "splitting/column": Table(
             "splitting",
             [
@@ -49,5 +97,5 @@ def tables() -> dict[str, Table]:
             {label: partial(cells, *s) for label, s in zip(labels, SCENES, strict=True)},
             quick=labels[:1],
             cases=["column_free"],
-        )
+        ),
     }
