@@ -3,9 +3,10 @@
 """What ``linear_solver="auto"`` chooses, and how long the other choice takes.
 
 Scenes of all kinds, in space with few unknowns more than those from which on multigrid is chosen,
-where it gains least: bodies that weigh on rollers, slump, touch and move. Each runs with MUMPS,
-with what is chosen and with multigrid; its are those of conjugate gradients, or of FGMRES, over all
-linear solves. Seconds are this process's CPU time.
+where it gains least: bodies that weigh on rollers, slump, touch and move. Kinds of which it takes
+many iterations, and for which it is chosen later, are there below that, and some above it. Each
+runs with MUMPS, with what is chosen and with multigrid; its are those of conjugate gradients, or of
+FGMRES, over all linear solves. Seconds are this process's CPU time.
 """
 
 from __future__ import annotations
@@ -243,6 +244,7 @@ NEARLY = mpm.materials.VonMises(1e6, 0.49, rho_y=20e3)
 SMALL = mpm.materials.LinearElastic(1e6, 0.3)
 SAND = mpm.materials.MohrCoulomb(1e6, 0.3, 2e4, 0.5, 0.1)
 GMSH = {"background": partial(unstructured, 8.0, 0.4), "body": TETRAHEDRON}
+GMSH_FINE = {"background": partial(unstructured, 8.0, 0.28), "body": TETRAHEDRON}
 GMSH_2 = {"background": partial(unstructured, 8.0, 0.8), "body": TETRAHEDRON, "degree": 2}
 SCENES = [
     Scene("hexahedra", heavy, 9),
@@ -255,10 +257,12 @@ SCENES = [
     Scene("GIMP", partial(heavy, method="gimp"), 9),
     Scene("graded grid", partial(heavy, change=graded), 9),
     Scene("bent hexahedra", partial(heavy, change=bent), 9),
+    Scene("bent hexahedra, finer", partial(heavy, change=bent), 13),
     Scene("rollers on the body", held, 9),
     Scene("tetrahedra", partial(heavy, **TET), 9),
     Scene("tetrahedra on hexahedra", partial(heavy, body=TETRAHEDRON), 9),
     Scene("tetrahedra by gmsh", partial(heavy, **GMSH), 9),
+    Scene("tetrahedra by gmsh, finer", partial(heavy, **GMSH_FINE), 13),
     Scene("degree 2", partial(heavy, degree=2), 5, 2),
     Scene("degree 2, ghost penalty", partial(heavy, degree=2, stabilisation="ghost"), 5, 2),
     Scene("degree 2, Poisson's ratio 0.49", partial(heavy, degree=2, law=NEARLY), 5, 2),
@@ -268,6 +272,7 @@ SCENES = [
     Scene("rigid sphere", partial(pressed, friction=0.0), 15, 6),
     Scene("rigid sphere, friction 0.3", partial(pressed, friction=0.3), 15, 6),
     Scene("two bodies", partial(stacked, friction=0.0), 12, 4),
+    Scene("two bodies, finer", partial(stacked, friction=0.0), 18, 4),
     Scene("two bodies, friction 0.3", partial(stacked, friction=0.3), 12, 4),
     Scene("sand, not associated", partial(heavy, law=SAND, weight=4e3), 9),
     Scene("pressure that follows", squeezed, 15, 6),

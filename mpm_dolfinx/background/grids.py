@@ -17,7 +17,7 @@ from dolfinx import fem
 
 from .. import _compat
 
-__all__ = ["box_weights", "cell_lines", "coarser"]
+__all__ = ["box_weights", "cell_lines", "coarser", "grid_lines"]
 
 #: Grid points for each vertex of a background up to which its vertices are taken for a grid's.
 GRID = 4.0
@@ -39,23 +39,42 @@ def cell_lines(V: fem.FunctionSpace) -> list[NDArray[np.float64]]:
     Returns:
         For each direction the coordinates of the lines, rising, the same on all ranks.
     """
-    background = V.mesh
-    comm: MPI.Comm = background.comm
-    gdim = background.geometry.dim
-    count = background.topology.index_map(background.topology.dim).size_local
-    corners = len(basix.geometry(background.basix_cell()))  # they come first
-    x = background.geometry.x[_compat.geometry_dofmap(background)[:count, :corners]][:, :, :gdim]
-    vertices = background.topology.index_map(0).size_global
+    if (lines := grid_lines(V)) is not None:
+        return lines
+    x = _vertices(V)
+    low, high = x.min(axis=1, initial=np.inf), x.max(axis=1, initial=-np.inf)
+    comm: MPI.Comm = V.mesh.comm
+    return [_by_size(comm, low[:, a], high[:, a]) for a in range(V.mesh.geometry.dim)]
+
+
+def grid_lines(V: fem.FunctionSpace) -> list[NDArray[np.float64]] | None:
+    """Return the lines of the rectilinear grid that the vertices of the background lie on.
+
+    Args:
+        V: Background space (collective).
+
+    Returns:
+        As :func:`cell_lines`; ``None`` where they lie on no grid.
+    """
+    x = _vertices(V)
+    comm: MPI.Comm = V.mesh.comm
+    most = GRID * V.mesh.topology.index_map(0).size_global
     lines = []
-    for axis in range(gdim):
+    for axis in range(V.mesh.geometry.dim):
         parts = comm.allgather(_distinct(x[:, :, axis].ravel()))
         lines.append(_distinct(np.concatenate(parts)))
-        if len(lines[-1]) > GRID * vertices:
-            break
-    if np.prod([len(line) for line in lines], dtype=float) <= GRID * vertices:
-        return lines
-    low, high = x.min(axis=1, initial=np.inf), x.max(axis=1, initial=-np.inf)
-    return [_by_size(comm, low[:, axis], high[:, axis]) for axis in range(gdim)]
+        if len(lines[-1]) > most:
+            return None
+    return lines if np.prod([len(line) for line in lines], dtype=float) <= most else None
+
+
+def _vertices(V: fem.FunctionSpace) -> NDArray[np.float64]:
+    """Return the vertices of this rank's own cells, shape ``(n, corners, gdim)``."""
+    background = V.mesh
+    count = background.topology.index_map(background.topology.dim).size_local
+    corners = len(basix.geometry(background.basix_cell()))  # they come first
+    nodes = _compat.geometry_dofmap(background)[:count, :corners]
+    return np.asarray(background.geometry.x[nodes][:, :, : background.geometry.dim])
 
 
 def _distinct(values: NDArray[np.float64]) -> NDArray[np.float64]:

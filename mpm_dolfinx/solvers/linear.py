@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from enum import IntEnum
 from typing import Any, Protocol
 
 from petsc4py import PETSc
@@ -19,14 +20,27 @@ from ..parallel.magnitudes import unit_sized
 from .multigrid import SHIFT, Multigrid
 from .saddle import Fields, SaddleMultigrid
 
-__all__ = ["LINEAR_SOLVERS", "Indefinite", "Levels", "ShiftedFactor", "chosen"]
+__all__ = ["LINEAR_SOLVERS", "Coarsening", "Indefinite", "Levels", "ShiftedFactor", "chosen"]
 
 #: Values of ``linear_solver``.
 LINEAR_SOLVERS = ("auto", "direct", "multigrid")
 #: Most unknowns of the coarsest level of multigrid, which is factorised.
 COARSEST = 600
+
+
+class Coarsening(IntEnum):
+    """How well the boxes of multigrid follow a tangent."""
+
+    GOOD = 0  # backgrounds are grids, of degree 1 or of boxes
+    FAIR = 1  # of degree 1 and no grid, or a term couples two backgrounds
+    POOR = 2  # of a higher degree, of simplices or no grid
+
+
 #: Unknowns from which on multigrid takes less time than a factorisation, by dimension of space.
-CROSSOVER = {2: 40000, 3: 3000}
+CROSSOVER = {
+    2: dict.fromkeys(Coarsening, 40000),
+    3: {Coarsening.GOOD: 3000, Coarsening.FAIR: 8000, Coarsening.POOR: 20000},
+}
 #: The same in a motion, where the mass takes it three times the iterations.
 CROSSOVER_IN_MOTION = {2: 40000, 3: 5000}
 
@@ -96,6 +110,14 @@ class Indefinite(Exception):
 
 class Levels(Fields, Protocol):
     """What a linear solver must know of the unknowns. All calls are collective."""
+
+    @property
+    def constrained(self) -> bool:
+        """Whether there are unknowns besides displacements."""
+
+    @property
+    def coarsening(self) -> Coarsening:
+        """How well multigrid's boxes follow the tangent."""
 
     def rigid_motions(self) -> PETSc.NullSpace:
         """Return the rigid motions in the unknowns."""
@@ -200,18 +222,17 @@ class ShiftedFactor:
             for key in options:
                 database.delValue(key)
 
-    def begin(self, size: int, constrained: bool = False, in_motion: bool = False) -> None:
+    def begin(self, size: int, levels: Levels, in_motion: bool = False) -> None:
         """Begin a step (collective).
 
         Args:
             size: Number of all unknowns.
-            constrained: Whether there are others than displacements, as such that enforce
-                constraints.
+            levels: What multigrid must know of the unknowns.
             in_motion: Whether the tangent has masses.
         """
         self.D = self._left = None
-        self._constrained = constrained
-        iterates = self._prefers_multigrid(size, in_motion)
+        self._constrained = levels.constrained
+        iterates = self._prefers_multigrid(size, levels, in_motion)
         if iterates != self.iterates:
             self._choose(iterates)
         if not iterates:
@@ -235,16 +256,18 @@ class ShiftedFactor:
             self._ksp.setType(self._direct[0])
             self._ksp.setNormType(PETSc.KSP.NormType.NORM_DEFAULT)
 
-    def _prefers_multigrid(self, size: int, in_motion: bool) -> bool:
+    def _prefers_multigrid(self, size: int, levels: Levels, in_motion: bool) -> bool:
         if size <= COARSEST:
             return False  # a factor is all that its levels would be
         if self._own_type or self._failures >= ENDURED or self._dear:
             return False
         if self._linear_solver != "auto":
             return self._linear_solver == "multigrid"
-        crossover = CROSSOVER_IN_MOTION if in_motion else CROSSOVER
-        plain = self._symmetric and not self._constrained
-        return plain and size >= crossover.get(self._dim, np.inf)
+        least = CROSSOVER.get(self._dim, {})
+        if not self._symmetric or self._constrained or size < min(least.values(), default=np.inf):
+            return False
+        moving = CROSSOVER_IN_MOTION[self._dim] if in_motion else 0
+        return size >= max(least[levels.coarsening], moving)
 
     def _bearable(self, size: int) -> float:
         """Return the iterations for a decade of the residual that cost as much as a factor."""

@@ -51,10 +51,6 @@ class ReducedProblem(Levels, Resisting, Protocol):
     def softens(self) -> bool:
         """Whether tangents may be indefinite where ``constrain`` permits no such direction."""
 
-    @property
-    def constrained(self) -> bool:
-        """Whether there are unknowns besides displacements."""
-
     def residual(self, x: PETSc.Vec, F: PETSc.Vec) -> MPMError | None:
         """Evaluate the residual at x, or say why that cannot be."""
 
@@ -228,7 +224,7 @@ class NewtonSolver:
             potential = self._symmetric and problem.has_potential()
             self._hurries = self.gives_up_early and shorten and not potential
             self._search.begin(potential, self._hurries)
-        self._factor.begin(sizes[1], problem.constrained, self.lets_go)
+        self._factor.begin(sizes[1], problem, self.lets_go)
         # What an iterative solve that fails means is for _pre_check to say.
         self.snes.setMaxLinearSolveFailures(1000 if self._factor.iterates else 1)
         self._tolerance = 0.0

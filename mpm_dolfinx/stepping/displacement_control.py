@@ -23,6 +23,7 @@ from ..parallel.given import require_same
 from ..particles.geometry import RING
 from ..particles.particles import Particles
 from ..reals import as_reals
+from ..solvers.linear import Coarsening
 from ..system.reduced import ReducedSystem
 
 __all__ = ["ControlledSystem", "DisplacementControl"]
@@ -277,6 +278,11 @@ class ControlledSystem:
     def constrained(self) -> bool:
         """Whether there are unknowns besides displacements."""
         return self._reduced.constrained
+
+    @property
+    def coarsening(self) -> Coarsening:
+        """How well multigrid's boxes follow the tangent (collective)."""
+        return self._reduced.coarsening
 
     @property
     def load(self) -> float:

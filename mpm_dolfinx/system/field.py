@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from itertools import combinations
 
 from mpi4py import MPI
@@ -18,10 +19,12 @@ from dolfinx import fem
 from .. import _compat
 from ..assembly.background_forms import BackgroundForms
 from ..assembly.fused import Restriction
-from ..background.grids import cell_lines, coarser
+from ..background.grids import cell_lines, coarser, grid_lines
+from ..meshes.boxes import BOX_CELLS
 from ..parallel.magnitudes import joint_norm, norm
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
+from ..solvers.linear import Coarsening
 from ..stabilisation.cure import Cure
 from ..transfer.touched import TouchedNodes, TransferRows
 from .hierarchy import FieldDofs
@@ -276,6 +279,14 @@ class Field:
         points = self.free.collect(self.V.tabulate_dof_coordinates()[nodes, :gdim])
         numbers = np.arange(self._part_of_x.start, self._part_of_x.stop)
         return FieldDofs(numbers, points, self.free.collect(components), self._lines, self._bs)
+
+    @cached_property
+    def coarsening(self) -> Coarsening:
+        """How well multigrid's boxes follow the background (collective)."""
+        if grid_lines(self.V) is None:
+            return Coarsening.FAIR if self.V.ufl_element().degree == 1 else Coarsening.POOR
+        nested = self.V.ufl_element().degree == 1 or self.V.mesh.basix_cell() in BOX_CELLS
+        return Coarsening.GOOD if nested else Coarsening.POOR
 
     # -- Vectors --------------------------------------------------------------------------
 

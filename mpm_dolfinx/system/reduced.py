@@ -23,6 +23,7 @@ from ..parallel.interruption import Interrupted, note, noted
 from ..parallel.magnitudes import joint_norm, norm
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
+from ..solvers.linear import Coarsening
 from ..transfer.touched import TransferRows
 from .field import Field, Motion, ValueField
 from .hierarchy import interpolations
@@ -141,6 +142,18 @@ class ReducedSystem:
     def constrained(self) -> bool:
         """Whether there are unknowns besides displacements."""
         return bool(self._value_fields)
+
+    @property
+    def coarsening(self) -> Coarsening:
+        """How well multigrid's boxes follow the tangent (collective)."""
+        found = [field.coarsening for field in self.fields]
+        if any(self._couples(term) for term in self._terms):
+            found.append(Coarsening.FAIR)  # each field has boxes of its own
+        return max(found)
+
+    def _couples(self, term: Term) -> bool:
+        """Return whether a term acts on bodies of several fields."""
+        return len({id(self._place(body)[0]) for body in term.bodies}) > 1
 
     @property
     def sizes(self) -> tuple[int, int]:

@@ -200,29 +200,32 @@ def test_iterations_do_not_grow_with_the_number_of_unknowns():
     assert counts[2] <= 1.3 * counts[0] + 1.0
 
 
+def tied(linear_solver):
+    """Return a block that is tied to another one, each on a background of its own."""
+    bodies, bcs = [], []
+    for low, n in ((0.0, 37), (2.0, 34)):
+        V = scenes.vectors(scenes.box([0.0, 0.0], [4.0, 6.0], [n, n], QUADRILATERAL))
+        body = scenes.box([0.0, low], [2.0, low + 2.0], [n] * 2, QUADRILATERAL)
+        bodies.append(mpm.Particles(body, V))
+        bcs.append(scenes.fix(V, scenes.at(0, 0.0), component=0))
+    bcs.append(scenes.fix(bodies[0].V, scenes.at(1, 0.0), component=1))
+    tags = scenes.facet_tags(bodies[1].mesh, scenes.at(1, 2.0))
+    return mpm.QuasiStaticProblem(
+        bodies,
+        Hencky(1e5, 0.3),
+        density=1.0,
+        body_force=(0.0, -5e3),
+        bcs=bcs,
+        terms=[mpm.Tie(bodies[1], bodies[0], tags, 1, 1e7)],
+        linear_solver=linear_solver,
+        petsc_options=TIGHT,
+    )
+
+
 def test_bodies_on_backgrounds_of_their_own():
-    moved = []
-    for name in ("direct", "multigrid"):
-        bodies, bcs = [], []
-        for low, n in ((0.0, 37), (2.0, 34)):
-            V = scenes.vectors(scenes.box([0.0, 0.0], [4.0, 6.0], [n, n], QUADRILATERAL))
-            body = scenes.box([0.0, low], [2.0, low + 2.0], [n] * 2, QUADRILATERAL)
-            bodies.append(mpm.Particles(body, V))
-            bcs.append(scenes.fix(V, scenes.at(0, 0.0), component=0))
-        bcs.append(scenes.fix(bodies[0].V, scenes.at(1, 0.0), component=1))
-        tags = scenes.facet_tags(bodies[1].mesh, scenes.at(1, 2.0))
-        run = mpm.QuasiStaticProblem(
-            bodies,
-            Hencky(1e5, 0.3),
-            density=1.0,
-            body_force=(0.0, -5e3),
-            bcs=bcs,
-            terms=[mpm.Tie(bodies[1], bodies[0], tags, 1, 1e7)],
-            linear_solver=name,
-            petsc_options=TIGHT,
-        )
+    moved = [tied("direct"), tied("multigrid")]
+    for run in moved:
         run.solve(steps=1)
-        moved.append(run)
     a, b = ([scenes.own(body.displacement) for body in run.bodies] for run in moved)
     assert max(scenes.largest(x - y) for x, y in zip(a, b, strict=True)) < 1e-9
     assert moved[1].history.statistics["krylov_iterations"] > 0
@@ -238,8 +241,14 @@ def test_a_factorisation_takes_over_where_multigrid_comes_to_nothing():
     assert_same(*runs, failures=linear.ENDURED)
 
 
+def from_on(*unknowns):
+    """Return the unknowns from which on multigrid is chosen, the same or by kind of coarsening."""
+    kinds = linear.Coarsening
+    return {2: dict(zip(kinds, unknowns * (len(kinds) // len(unknowns)), strict=True))}
+
+
 def test_many_unknowns_are_for_multigrid(monkeypatch):
-    monkeypatch.setattr(linear, "CROSSOVER", {2: 700})
+    monkeypatch.setattr(linear, "CROSSOVER", from_on(700))
     for n, used in ((12, False), (20, True)):
         run = heavy(n, linear_solver="auto")
         run.solve(steps=1)
@@ -257,8 +266,37 @@ def test_many_unknowns_are_for_multigrid(monkeypatch):
         assert (motion.history.statistics["krylov_iterations"] > 0) == used
 
 
+@pytest.mark.parametrize(
+    ("n", "options", "least"),
+    [
+        (20, {}, 700),
+        (20, {"bent": 0.01}, 2000),
+        (20, {"cell": TRIANGLE}, 700),
+        (10, {"degree": 2}, 700),
+        (10, {"degree": 2, "bent": 0.01}, 3000),
+        (10, {"degree": 2, "cell": TRIANGLE}, 3000),
+    ],
+)
+def test_what_coarsens_badly_is_for_multigrid_later(monkeypatch, n, options, least):
+    monkeypatch.setattr(linear, "CROSSOVER", from_on(700, 2000, 3000))
+    run = heavy(n, linear_solver="auto", **options)
+    run.solve(steps=1)
+    assert 700 < run.history.statistics["free_dofs"] < 2000
+    assert (run.history.statistics["krylov_iterations"] > 0) == (least == 700)
+    assert run.reduced.coarsening == [700, 2000, 3000].index(least)
+
+
+def test_backgrounds_that_a_tie_couples_are_for_multigrid_later(monkeypatch):
+    monkeypatch.setattr(linear, "CROSSOVER", from_on(700, 10**6, 10**6))
+    run = tied("auto")
+    run.solve(steps=1)
+    assert run.history.statistics["free_dofs"] > 700
+    assert run.history.statistics["krylov_iterations"] == 0
+    assert run.reduced.coarsening is linear.Coarsening.FAIR
+
+
 def test_a_factorisation_goes_on_where_multigrid_takes_longer(monkeypatch):
-    monkeypatch.setattr(linear, "CROSSOVER", {2: 700})
+    monkeypatch.setattr(linear, "CROSSOVER", from_on(700))
     counts = []
     for bearable in (1e9, 0.6):
         monkeypatch.setattr(linear, "BEARABLE", {2: (0.0, 1.0 / bearable)})
@@ -272,7 +310,7 @@ def test_a_factorisation_goes_on_where_multigrid_takes_longer(monkeypatch):
 
 
 def test_a_background_of_degree_3_is_factorised(monkeypatch):
-    monkeypatch.setattr(linear, "CROSSOVER", {2: 100})
+    monkeypatch.setattr(linear, "CROSSOVER", from_on(100))
     for degree, used in ((2, True), (3, False)):
         run = heavy(24 // degree, degree=degree, linear_solver="auto")
         run.solve(steps=1)
