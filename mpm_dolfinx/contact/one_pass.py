@@ -464,6 +464,9 @@ class Pass:
         assert near is not None and memory is not None and found is not None
         assert self.stencil is not None
         x = self._flat(self.outcome.positions)
+        offset = self._offset
+        if self.of_step:
+            found, offset = self._returned(found, x)
         place, numbers = found.place.copy(), _numbers(near, found.facet)
         which = self.stencil.which
         if not self.law.smooth and len(which):
@@ -496,10 +499,38 @@ class Pass:
             closest,
             found.gap,
             self._within,
-            self._offset,
+            offset,
             x,
             anchors,
         )
+
+    def _returned(
+        self, found: Closest, x: NDArray[np.float64]
+    ) -> tuple[Closest, NDArray[np.float64]]:
+        """Return the pairing at a step's end and where points begin to be pressed from then on.
+
+        A point that has stayed with its facet beyond the facet's end goes to the one that it is on:
+        if it did in the next step, its gap would change by as much however short that is, and the
+        force without bound. It keeps its energy.
+        """
+        near = self._near
+        assert near is not None
+        which = np.flatnonzero(self._within)
+        off = np.abs(found.place[which] - near.clamped(found.place[which])).max(axis=1, initial=0.0)
+        which = which[(off > 0.0) | (self.count > FREEZE)]
+        there = near.closest(
+            x[which], self._normals_near(x, self._nodes)[which], self._nodes, self.reach
+        )
+        moves = there.near & (there.facet >= 0) & (there.facet != found.facet[which])
+        which = which[moves]
+        facet, place, gap = found.facet.copy(), found.place.copy(), found.gap.copy()
+        depth = gap[which] - self._offset[which]
+        facet[which], place[which], gap[which] = (
+            part[moves] for part in (there.facet, there.place, there.gap)
+        )
+        offset = self._offset.copy()
+        offset[which] = np.minimum(gap[which] - depth, 0.0)
+        return found._replace(facet=facet, place=place, gap=gap), offset
 
     def located(
         self,
