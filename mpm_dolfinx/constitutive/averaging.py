@@ -168,13 +168,16 @@ class VolumeAveraging:
         self._particles = strain.particles
         self._strain, self._dim = strain, strain.dim
         self._symmetric = symmetric
-        self._weights = strain.volumes()
-        self._volume = self._weights.sum(axis=1)
         self.modulus = modulus
         self.groups = self._grouped(kind, material)
         self.kind = kind
         self._grouped_tangent: GroupedTangent | None = None
         self._low_rank: LowRankTerm | None = None
+
+    @property
+    def _weights(self) -> Array:
+        """Undeformed volume of each point, shape ``(n, nq)``."""
+        return self._strain.volumes()
 
     def _grouped(self, kind: str, material: NDArray[np.int64]) -> Groups:
         body = self._particles
@@ -202,17 +205,18 @@ class VolumeAveraging:
         """
         a = 1.0 / self._dim
         excess = _determinant_minus_one(gradient)
-        of_domain = (self._weights * excess).sum(axis=1)
+        weights = self._weights
+        volume, of_domain = weights.sum(axis=1), (weights * excess).sum(axis=1)
         present = ~self._particles.deleted
-        sizes = np.stack([self._volume, of_domain], axis=1)
+        sizes = np.stack([volume, of_domain], axis=1)
         sums = self.groups.sum(np.where(present[:, None], sizes, 0.0))
-        group_volume = np.where(present, sums[:, 0], self._volume)
+        group_volume = np.where(present, sums[:, 0], volume)
         of_group = np.where(present, sums[:, 1], of_domain)
         ln_group = np.log1p(of_group / group_volume)[:, None]
         self._deviation = np.log1p(excess) - ln_group
         change = -a * self._deviation
         self._group_size = group_volume + of_group
-        self._counted = self._weights * present[:, None]
+        self._counted = weights * present[:, None]
         self._J = 1.0 + excess
         self._F = np.eye(self._dim) + gradient
         self._Z = np.linalg.inv(self._F).swapaxes(2, 3)
@@ -222,7 +226,7 @@ class VolumeAveraging:
 
     def abandon(self) -> None:
         """Take part in the sums of an evaluation that failed on this rank (collective)."""
-        self.groups.sum(np.zeros((len(self._volume), 2)))
+        self.groups.sum(np.zeros((self._particles.num_local, 2)))
 
     def effective(self, P: Array, A: Array) -> tuple[Array, Array]:
         """Return the first Piola stress that does work on F, and its pointwise tangent.
@@ -332,7 +336,10 @@ class VolumeAveraging:
         parts += [normal[:, 2]] if self._dim == 2 else []
         own = np.stack(parts, axis=1)
         present = ~self._particles.deleted
-        weighted = np.column_stack([x, own, np.ones(len(x))]) * (self._volume * present)[:, None]
+        weighted = (
+            np.column_stack([x, own, np.ones(len(x))])
+            * (self._weights.sum(axis=1) * present)[:, None]
+        )
         totals = self.groups.totals(weighted)
         means = totals[:, :-1] / np.where(totals[:, -1:] > 0.0, totals[:, -1:], 1.0)
         centre, mean = means[:, :gdim], means[:, gdim:]

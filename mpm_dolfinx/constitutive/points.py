@@ -469,7 +469,8 @@ class MaterialPoints:
         if not self._particles.rebased:
             return stress, tangent
         gdim = self._particles.mesh.geometry.dim
-        G = (np.eye(gdim) + self._particles.reference.gradient).reshape(-1, gdim, gdim)
+        G = np.tile(np.eye(self.dim), (len(stress), 1, 1))
+        G[:, :gdim, :gdim] += self._particles.reference.gradient.reshape(-1, gdim, gdim)
         volume = np.linalg.det(G)[:, None, None]
         stress = np.einsum("niJ,nMJ->niM", stress, G) / volume
         tangent = np.einsum("niJkL,nMJ,nNL->niMkN", tangent, G, G, optimize=True)

@@ -94,7 +94,11 @@ class Strain:
 
     def ufl_gradient(self, w: Any) -> Any:
         """Return the gradient of a displacement, shape ``(dim, dim)``."""
-        return ufl.grad(w)
+        return self.with_turn(ufl.grad(w), w)
+
+    def with_turn(self, gradient: Any, w: Any) -> Any:
+        """Return a gradient of a displacement w in the body's dimensions in those of the strain."""
+        return gradient
 
 
 class Revolution(Strain):
@@ -108,7 +112,8 @@ class Revolution(Strain):
         super().__init__(particles)
         particles.require_radius()
         self.dim = 3
-        self._radius = ufl.SpatialCoordinate(particles.mesh)[0]
+        self._mesh_radius = ufl.SpatialCoordinate(particles.mesh)[0]
+        self._radius = self._mesh_radius if particles.origin is None else particles.origin[0]
 
     @property
     def hoop(self) -> Array | None:
@@ -136,11 +141,11 @@ class Revolution(Strain):
     @property
     def present_turn(self) -> Any:
         """See :class:`Strain`."""
-        return 2.0 * np.pi * (self._radius + self.particles.displacement[0])
+        return 2.0 * np.pi * (self._mesh_radius + self.particles.displacement[0])
 
-    def ufl_gradient(self, w: Any) -> Any:
-        """See :meth:`Strain.ufl_gradient`."""
-        g = ufl.grad(w)
+    def with_turn(self, gradient: Any, w: Any) -> Any:
+        """See :meth:`Strain.with_turn`."""
+        g = gradient
         hoop = w[0] / self._radius
         return ufl.as_tensor([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, hoop]])
 

@@ -202,7 +202,9 @@ class Surface:
         self.extent = float(body.comm.allreduce(extent, MPI.MAX))
         self._around = np.ones_like(area)
         if self.axisymmetric:
-            self._around = 2.0 * np.pi * self.undeformed()[:, :, 0]
+            origin = self.particles.origin
+            X = x if origin is None else origin.x.array.reshape(-1, self.gdim)
+            self._around = 2.0 * np.pi * (self.shapes @ X[self.nodes])[:, :, 0]
         self.look_at_deleted()
         return True
 

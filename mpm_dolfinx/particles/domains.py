@@ -274,7 +274,10 @@ class Domains:
         gradient = self._present_gradient()
         if not axisymmetric:
             return gradient
-        return with_hoop(gradient, self.hoop, self._nodal())
+        moved = self._nodal()
+        if self._reference is not None:
+            moved = self._corners() - self._reference.domains
+        return with_hoop(gradient, self.hoop, moved)
 
     def _present_gradient(self) -> NDArray[np.float64]:
         """Return ``grad d`` at the history's points, of the same displacement only once."""
@@ -292,7 +295,7 @@ class Domains:
     @property
     def radii(self) -> NDArray[np.float64]:
         """Undeformed radius of the history's points, shape ``(n, nq)``."""
-        radii = self._geometry.corners[:, :, 0]
+        radii = self.initial_domains[:, :, 0]
         return np.asarray(np.einsum("qk,nk->nq", self.quadrature.shapes, radii))
 
     @property
@@ -314,7 +317,7 @@ class Domains:
         with agree(self.mesh.comm):
             if self._geometry.gdim != 2:
                 raise MPMError("An axisymmetric body is a mesh in the (r, z) plane.")
-            left = self._geometry.corners[:, :, 0].min(axis=1) < -1e-12
+            left = self.initial_domains[:, :, 0].min(axis=1) < -1e-12
             if left.any():
                 raise MPMError(
                     "The domains of {particles} have a negative radius; an axisymmetric body "

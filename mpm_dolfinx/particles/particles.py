@@ -280,10 +280,17 @@ class Particles(MaterialDomains):
         positions: NDArray[np.float64] | None = None,
     ) -> None:
         """Live on another mesh (collective)."""
+        before: Reference | None = None
+        if positions is not None:
+            before = self.present_reference()
+        elif cuts is None and self.rebased:
+            before = self.reference
         self._trail.append(move, cuts, positions is not None)
         self._settle(move.mesh)
         if moved or len(self.cuts):
             self.expect_reference(moved)
+        if before is not None:  # at once, for what is made of the undeformed body
+            self.refer(Reference(*(move.of_cells(values) for values in before)))
 
     def require_meshes_as_they_were(self) -> None:
         """Raise an error where coordinates of body or background have changed on this rank.
@@ -462,6 +469,10 @@ class Particles(MaterialDomains):
                 raise MPMError("DOLFINx numbers nodes of scalars and vectors differently here.")
             self._vectors = W, space
         return self._vectors[1]
+
+    def present_reference(self) -> Reference:
+        """Return the undeformed body as a mesh shows it that has the last converged positions."""
+        return self.reference._replace(gradient=self.converged_gradient())
 
     def converged_gradient(self) -> NDArray[np.float64]:
         """Return ``F - I`` at the history's points, last converged, ``(n, nq, gdim, gdim)``."""

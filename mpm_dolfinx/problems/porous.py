@@ -398,7 +398,7 @@ class _Undeformed:
 
     def __init__(self, strain: Strain) -> None:
         self._strain, self._body = strain, strain.particles
-        origin = self._body.origin
+        origin = self._origin = self._body.origin
         self._to_mesh = None if origin is None else ufl.inv(ufl.grad(origin))
         self.volume_ratio = self._body.volume_ratio
 
@@ -408,15 +408,13 @@ class _Undeformed:
 
     def strained(self, w: Any) -> Any:
         """Return what :meth:`Strain.ufl_gradient` does."""
-        # a body of revolution, which has one more direction, is never rebased
-        return self._strain.ufl_gradient(w) if self._to_mesh is None else self.grad(w)
+        return self._strain.with_turn(self.grad(w), w)
 
     def displacement_gradient(self, d: Any) -> Any:
         """Return ``F - I`` for a displacement of the mesh, shape ``(dim, dim)``."""
-        found = self.strained(d)
-        if self._to_mesh is None:
-            return found
-        return found + self._to_mesh - ufl.Identity(self._strain.dim)
+        if self._origin is None:
+            return self.strained(d)
+        return self.strained(d + ufl.SpatialCoordinate(self._body.mesh) - self._origin)
 
     def normal(self) -> Any:
         """Return the outward unit normal of the undeformed body."""
@@ -464,7 +462,10 @@ class _Flow:
             1.0 + ufl.tr(g) if small else ufl.det(unit + g) for g in (self._gradient, before)
         )
         dim = body.mesh.geometry.dim
-        plane = self._gradient if dim == strain.dim else ufl.grad(d)
+        g = self._gradient
+        plane = (
+            g if dim == strain.dim else ufl.as_tensor([[g[i, j] for j in (0, 1)] for i in (0, 1)])
+        )
         self._F = ufl.Identity(dim) + plane
 
     def work_of_pressure(self) -> ufl.Form:

@@ -251,15 +251,13 @@ class Remeshing:
         """
         problem = self._problem
         self._require_movable_nodes()
-        gradients = [body.converged_gradient() for body in problem.bodies]
         masses = [problem.nodal_masses(number) for number in range(len(problem.bodies))]
         none = np.zeros((0, 2), dtype=np.int64)
         positions = [body.converged_domains for body in problem.bodies]
         moves = self._remesh([none] * len(positions), positions)
-        for number, (body, move, gradient, mass) in enumerate(
-            zip(problem.bodies, moves, gradients, masses, strict=True)
+        for number, (body, move, mass) in enumerate(
+            zip(problem.bodies, moves, masses, strict=True)
         ):
-            body.refer(body.reference._replace(gradient=move.of_cells(gradient)))
             body.set_mass_shares(_shares(problem.mass_matrices(number), move.masses(mass)))
 
     def _require_movable_nodes(self) -> None:
@@ -269,8 +267,6 @@ class Remeshing:
             given.require_movable_nodes(consequence)
         for term in setup.terms:
             term.require_remeshable(consequence)
-        if setup.f_bar != "none" or setup.axisymmetric:
-            raise MPMError(f"With f_bar or axisymmetric=True {consequence}.")
         for body in problem.bodies:
             degree, cells = body.W.ufl_element().degree, _compat.geometry_degree(body.mesh)
             if not body.shares_nodes or cells not in (1, degree):
@@ -302,7 +298,10 @@ class Remeshing:
         problem = self._problem
         places = [None] * len(cuts) if positions is None else list(positions)
         moves: list[Remesh] = []
-        references = [body.reference for body in problem.bodies]
+        references = [
+            body.reference if x is None else body.present_reference()
+            for body, x in zip(problem.bodies, places, strict=True)
+        ]
         shares = [
             np.ones(body.domain_nodes.shape) if body.mass_share is None else body.mass_shares()
             for body in problem.bodies

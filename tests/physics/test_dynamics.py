@@ -885,6 +885,25 @@ def test_a_rebase_keeps_kinetic_energy(cell, degree):
     assert change_of_balance(problem.history) < 1e-9
 
 
+@pytest.mark.parametrize("options", [{"f_bar": "patch"}, {"axisymmetric": True}], ids=str)
+def test_a_motion_goes_on_as_it_was_after_a_rebase(options):
+    # A tube or a block that widens, pulled back by its stiffness.
+    runs = []
+    for rebased in (False, True):
+        problem = spinning(velocity=lambda x: 0.3 * x[:2], scheme="conserving", **options)
+        problem.solve(0.2, 0.05)
+        if rebased:
+            problem.rebase()
+        problem.solve(0.4, 0.05)
+        assert change_of_balance(problem.history) < 1e-9
+        runs.append(problem)
+    one, two = runs
+    assert one.history.iterations == two.history.iterations
+    places = [in_order(run.particles, run.particles.domains) for run in runs]
+    np.testing.assert_allclose(places[1], places[0], rtol=0, atol=1e-9)
+    assert np.abs(one.particles.deformation_gradient - np.eye(3)).max(initial=0.0) > 0.01
+
+
 @pytest.mark.parametrize("scheme", ["midpoint", "conserving", "euler"])
 def test_a_split_between_two_steps_keeps_momentum(scheme):
     # The forces at the beginning of the next step are those of before.

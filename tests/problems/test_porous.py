@@ -499,18 +499,24 @@ def soaked(comm=WORLD, **options):
         "tractions": [((1.0, -0.5), 2)],
         "petsc_options": {"snes_rtol": 1e-11},
     } | options
+    if options.get("axisymmetric"):
+        defaults["bcs"].append(scenes.fix(V, scenes.at(0, 0.0), component=0))
     return mpm.PorousProblem(body, defaults.pop("material", Hencky(10.0, 0.3)), **defaults)
 
 
 @pytest.mark.parametrize(
-    "law",
-    [Hencky(10.0, 0.3), pytest.param(LinearElastic(30.0, 0.3), marks=pytest.mark.slow)],
-    ids=["finite", "small"],
+    "options",
+    [
+        {},
+        pytest.param({"material": LinearElastic(30.0, 0.3)}, marks=pytest.mark.slow),
+        pytest.param({"axisymmetric": True}, marks=pytest.mark.slow),
+    ],
+    ids=["finite", "small", "around an axis"],
 )
-def test_a_rebased_body_goes_on_as_one_that_is_not(law):
+def test_a_rebased_body_goes_on_as_one_that_is_not(options):
     results = []
     for changes in (False, True):
-        problem = soaked(material=law)
+        problem = soaked(**options)
         problem.solve(0.2, 0.1)
         if changes:
             problem.rebase()

@@ -326,22 +326,48 @@ def block_of(cell, degree=1, **options):
     )
 
 
-#: Cells of straight bodies that are rebased, their degree, and what pressure they have.
+#: Cells of straight bodies that are rebased, their degree, and options.
 REBASED = [
-    *(pytest.param(cell, 1, None, id=scenes.name(cell)) for cell in ALL),
-    pytest.param(QUADRILATERAL, 2, "pressure", id="degree 2 with a pressure"),
+    *(pytest.param(cell, 1, {}, id=scenes.name(cell)) for cell in ALL),
+    pytest.param(QUADRILATERAL, 2, {"mixed": "pressure"}, id="degree 2 with a pressure"),
     pytest.param(
-        QUADRILATERAL, 2, "discontinuous pressure", id="discontinuous", marks=pytest.mark.slow
+        QUADRILATERAL,
+        2,
+        {"mixed": "discontinuous pressure"},
+        id="discontinuous",
+        marks=pytest.mark.slow,
     ),
-    pytest.param(TRIANGLE, 3, "pressure", id="degree 3 with a pressure"),
-    pytest.param(TETRAHEDRON, 2, "pressure", id="tetrahedra of degree 2", marks=pytest.mark.slow),
-    pytest.param(HEXAHEDRON, 2, None, id="hexahedra of degree 2", marks=pytest.mark.slow),
+    pytest.param(TRIANGLE, 3, {"mixed": "pressure"}, id="degree 3 with a pressure"),
+    pytest.param(
+        TETRAHEDRON, 2, {"mixed": "pressure"}, id="tetrahedra of degree 2", marks=pytest.mark.slow
+    ),
+    pytest.param(HEXAHEDRON, 2, {}, id="hexahedra of degree 2", marks=pytest.mark.slow),
+    pytest.param(QUADRILATERAL, 1, {"f_bar": "patch"}, id="patches"),
+    pytest.param(TRIANGLE, 1, {"f_bar": "pair"}, id="pairs"),
+    pytest.param(QUADRILATERAL, 2, {"f_bar": "domain"}, id="F-bar over the domain"),
+    pytest.param(QUADRILATERAL, 2, {"axisymmetric": True}, id="around an axis"),
+    pytest.param(
+        QUADRILATERAL,
+        2,
+        {"axisymmetric": True, "mixed": "pressure"},
+        id="with a pressure around it",
+    ),
+    pytest.param(
+        TRIANGLE, 1, {"axisymmetric": True, "f_bar": "patch"}, id="patches around an axis"
+    ),
+    pytest.param(
+        QUADRILATERAL,
+        2,
+        {"axisymmetric": True, "f_bar": "domain", "assembly": "reference"},
+        id="the reference route around an axis",
+        marks=pytest.mark.slow,
+    ),
 ]
 
 
-@pytest.mark.parametrize(("cell", "degree", "mixed"), REBASED)
-def test_rebase_keeps_everything_and_changes_no_step(cell, degree, mixed):
-    problem, plain = (block_of(cell, degree, mixed=mixed) for _ in range(2))
+@pytest.mark.parametrize(("cell", "degree", "options"), REBASED)
+def test_rebase_keeps_everything_and_changes_no_step(cell, degree, options):
+    problem, plain = (block_of(cell, degree, **options) for _ in range(2))
     for each in (problem, plain):
         half_way(each, 4)
     p, dim = problem.particles, plain.particles.mesh.geometry.dim
@@ -395,9 +421,14 @@ def test_rebased_and_split_state_is_restored(tmp_path):
         rebased.restore(path)
 
 
-def test_rebased_body_with_a_pressure_is_restored_and_moves_to_other_ranks(tmp_path):
+@pytest.mark.parametrize(
+    ("degree", "options"),
+    [(2, {"mixed": "pressure"}), (1, {"f_bar": "patch", "axisymmetric": True})],
+    ids=["pressure", "patches around an axis"],
+)
+def test_rebased_body_is_restored_and_moves_to_other_ranks(tmp_path, degree, options):
     def block():
-        return block_of(QUADRILATERAL, 2, mixed="pressure")
+        return block_of(QUADRILATERAL, degree, **options)
 
     path = WORLD.bcast(tmp_path) / "state"
     whole = half_way(block(), 4)
@@ -457,8 +488,6 @@ def test_rebase_refused():
     tall = scenes.column(scenes.A, 2, QUADRILATERAL, LinearElastic(1.0, 0.0), method="cpdi")
     with pytest.raises(mpm.MPMError, match="that moves by 'cpdi2'"):
         tall.rebase()
-    with pytest.raises(mpm.MPMError, match="With f_bar"):
-        block_of(TRIANGLE, f_bar="patch").rebase()
 
 
 def test_one_of_two_bodies():
