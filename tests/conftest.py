@@ -26,7 +26,7 @@ from petsc4py import PETSc
 import numpy as np
 import pytest
 from marks import between_ranks
-from programs import patient_compilers
+from programs import patient_compilers, remembered_forms
 
 comm = MPI.COMM_WORLD.Dup()
 
@@ -71,6 +71,7 @@ def pytest_configure(config: pytest.Config) -> None:
         )
     with contextlib.ExitStack() as stack:
         stack.enter_context(patient_compilers())
+        stack.enter_context(remembered_forms())
         config.add_cleanup(stack.pop_all().close)
     if comm.rank > 0:
         config.pluginmanager.unregister(name="terminalreporter")

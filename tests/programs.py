@@ -11,6 +11,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from ffcx.codegeneration import jit
+
 #: How long what hangs is waited for. Compiling many forms on a busy machine takes minutes.
 PATIENCE = 500.0
 
@@ -53,3 +55,24 @@ def patient_compilers() -> Iterator[None]:
             os.environ.pop("XDG_CONFIG_HOME")
             if before is not None:
                 os.environ["XDG_CONFIG_HOME"] = before
+
+
+@contextlib.contextmanager
+def remembered_forms() -> Iterator[None]:
+    """Have FFCx look for a form once: for each that is made again it lists its whole cache."""
+    look, found = jit.get_cached_module, {}
+
+    def remember(module_name, object_names, cache_dir, timeout):
+        key = module_name, tuple(object_names), str(cache_dir)
+        if key not in found:
+            objects, module = look(module_name, object_names, cache_dir, timeout)
+            if module is None:  # which the caller compiles now
+                return None, None
+            found[key] = objects, module
+        return found[key]
+
+    jit.get_cached_module = remember
+    try:
+        yield
+    finally:
+        jit.get_cached_module = look
