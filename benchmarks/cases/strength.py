@@ -25,6 +25,9 @@ parser.add_argument(
 )
 parser.add_argument("--friction-angle", type=float, default=20.0, help="of slope and footing")
 parser.add_argument("--tolerance", type=kit.positive, default=0.01, help="of the factor of safety")
+parser.add_argument(
+    "--limit", type=kit.positive, default=2.0, help="displacement that stands, weight height^2/E"
+)
 parser.add_argument("--steps", type=kit.whole, default=20, help="steps of the footing")
 parser.add_argument("--degree", type=int, choices=(1, 2), default=1, help="of the footing's basis")
 parser.add_argument("--rough", action="store_true", help="a rough strip, not a smooth one")
@@ -188,7 +191,8 @@ try:
         factor = path[-1][1]
     else:
         problem.solve(2)
-        found = mpm.strength_reduction(problem, tolerance=args.tolerance)
+        limit = args.limit * weight * height**2 / young
+        found = mpm.strength_reduction(problem, tolerance=args.tolerance, displacement=limit)
         scale = weight * height if args.case == "vertical_cut" else 1.0
         factor = scale * found.factor
         path = [(d, scale * f) for d, f in zip(found.displacements, found.factors, strict=True)]

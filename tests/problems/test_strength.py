@@ -69,6 +69,21 @@ def test_slope_of_griffiths_and_lane():
     problem.step()  # with the strength that was given: nothing moves on
 
 
+@pytest.mark.parametrize("step", [0.1, *slow(0.02, 0.05)])
+def test_slope_as_it_stands(step):
+    """What Newton's method misses in a long step is tried again in shorter ones, up to the limit.
+
+    In steps of 0.1 it fails at 1.35, which the slope bears.
+    """
+    problem = slope()
+    problem.solve(2)
+    limit = 2 * 20.0 * H**2 / 1e5
+    found = mpm.strength_reduction(problem, step=step, displacement=limit)
+    assert found.factor == pytest.approx(1.40, abs=0.04) and found.factor > 1.38
+    assert 0 < found.above - found.factor <= 0.01
+    assert found.displacements[-1] <= limit < 4 * found.displacements[-1]
+
+
 @pytest.mark.slow
 def test_vertical_cut():
     problem = cut()
