@@ -37,6 +37,8 @@ __all__ = [
 ]
 
 ROUTES = ("auto", "fast", "reference")
+#: Most room for the entries of a matrix, in what they need.
+ROOM = 1.1
 
 
 def is_fast(route: str) -> bool:
@@ -70,10 +72,12 @@ class Support:
     Attributes:
         offsets: Where the nodes of each domain begin, shape ``(n + 1,)``.
         nodes: Numbers of these among the touched nodes.
+        changes: How often they have become others.
     """
 
     def __init__(self, dofmap: NDArray[np.int32]) -> None:
         self._dofmap = dofmap
+        self.changes = 0
         self.offsets: NDArray[np.int64] = np.zeros(1, dtype=np.int64)
         self.nodes: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
 
@@ -83,6 +87,7 @@ class Support:
         same = np.array_equal(offsets, self.offsets) and np.array_equal(nodes, self.nodes)
         if not same:
             self.offsets, self.nodes = offsets, nodes
+            self.changes += 1
         return same
 
     def transfers(self, rows: TransferRows) -> NDArray[np.float64]:
@@ -268,6 +273,7 @@ class FusedTangent:
         ]
         self._statistics = statistics
         self._A: PETSc.Mat | None = None
+        self._room = [no_values, no_values]  # for entries in columns of this rank, and in others
 
     def restrict(self, fields: Sequence[Restriction], sizes: tuple[int, int]) -> None:
         """Take over the present transfer and unknowns (collective).
@@ -302,7 +308,7 @@ class FusedTangent:
         inside = [own for own, _ in found]
         outside = [others for _, others in found]
         csr = [_stacked(parts, entries, sizes[0]) for entries in (inside, outside)]
-        values = [np.zeros(len(columns)) for _, columns in csr]
+        values = [self._entries(side, len(columns)) for side, (_, columns) in enumerate(csr)]
         ends = [0, 0]
         for block, entries in zip(self._blocks, zip(inside, outside, strict=True), strict=True):
             mine = []
@@ -316,6 +322,17 @@ class FusedTangent:
             matrices[0] if self._comm.size == 1 else tuple(matrices),
             comm=self._comm,
         )
+
+    def _entries(self, side: int, count: int) -> NDArray[np.float64]:
+        """Return room for entries, that of the matrix before where it is large enough.
+
+        Memory that is new has to be cleared by the system, page by page.
+        """
+        if not count <= len(self._room[side]) <= ROOM * count:
+            self._room[side] = np.empty(int((0.5 + 0.5 * ROOM) * count))
+        room = self._room[side][:count]
+        room[:] = 0.0
+        return room
 
     def weigh(self, masses: Masses) -> PETSc.Mat:
         """Return ``T^T M T``, and keep it for :meth:`assemble` in this step (collective).
@@ -376,7 +393,7 @@ def _stacked(
     for part, (starts, _) in zip(parts, entries, strict=True):
         counts[part.start + 1 : part.stop + 1] = np.diff(starts)
     columns = np.concatenate([columns for _, columns in entries])
-    return np.cumsum(counts, dtype=PETSc.IntType), columns.astype(PETSc.IntType)
+    return np.cumsum(counts, dtype=PETSc.IntType), columns.astype(PETSc.IntType, copy=False)
 
 
 class _Pattern:
@@ -393,6 +410,7 @@ class _Pattern:
     def __init__(self, rows: _Block, columns: _Block) -> None:
         self._references = weakref.ref(rows), weakref.ref(columns)
         self._pairs: list[tuple[Support, Support]] = []
+        self._made_of: tuple[Any, ...] = ()
         self.values: NDArray[np.float64] = no_values
 
     @property
@@ -414,10 +432,18 @@ class _Pattern:
         return len(self._pairs) - 1
 
     def make(self) -> None:
-        """Find the blocks, and the place of each pair of nodes of a domain among them."""
+        """Find the blocks, and the place of each pair of nodes of a domain among them.
+
+        They are those of before where domains see the same nodes as then.
+        """
+        seen = [(one.changes, other.changes) for one, other in self._pairs]
+        made_of = self._rows.num_touched, self.columns.num_touched, *seen
+        if made_of == self._made_of:
+            return
+        self._made_of = made_of
         rows, columns = (_joined([pair[side] for pair in self._pairs]) for side in range(2))
-        sizes = self._rows.num_touched, self.columns.num_touched
-        self.offsets, self.nodes, positions = loops.pattern(*rows, sizes[0], *columns, sizes[1])
+        found = loops.pattern(*rows, self._rows.num_touched, *columns, self.columns.num_touched)
+        self.offsets, self.nodes, positions = found
         counts = [
             int((np.diff(one.offsets) * np.diff(other.offsets)).sum()) for one, other in self._pairs
         ]
