@@ -24,6 +24,8 @@ __all__ = ["ErrorControl", "StepError", "control_of", "error_of_step"]
 #: The largest first step: one that walks from the elastic range into flow leaves an error that
 #: nothing repairs.
 FIRST = 0.05
+#: Share of the first step down to which it is taken back where something touches in it.
+EARLIEST = 0.25
 #: Factor to the next step, at least and at most, and share of the one that would just do.
 LEAST, MOST, SAFETY = 0.2, 2.0, 0.9
 #: Exponents of a step's error and of that of the step before, in a PI controller of order two.
@@ -48,11 +50,13 @@ class StepError:
         error: Its error, the root mean square over the nodes of all bodies.
         motion: Motion of the run up to its end, likewise.
         smooth: Whether no history has changed in it, nor contact.
+        touches: Whether one has, where bodies may touch and let go.
     """
 
     error: float
     motion: float
     smooth: bool
+    touches: bool = False
 
 
 def error_of_step(reduced: ReducedSystem, size: float, comm: MPI.Comm) -> StepError:
@@ -83,7 +87,8 @@ def error_of_step(reduced: ReducedSystem, size: float, comm: MPI.Comm) -> StepEr
     gdim = reduced.bodies[bodies[0]].W.mesh.geometry.dim
     nodes = comm.allreduce(sum(len(u) for u in increments)) / gdim
     rms = [joint_norm(np.concatenate(values), comm) / math.sqrt(nodes) for values in (error, moved)]
-    return StepError(rms[0], rms[1], reduced.smooth())
+    smooth = reduced.smooth()
+    return StepError(rms[0], rms[1], smooth, not smooth and reduced.one_sided())
 
 
 class ErrorControl:
@@ -92,7 +97,8 @@ class ErrorControl:
     With ``q = w e / ((8 tolerance)^2 |d|)`` of a step's error e and the motion |d| of the run so
     far, or ``w e / ((5 tolerance)^2 length)``, the next step is larger by
     ``0.9 q^-0.35 q_before^0.2`` (a PI controller: Gustafsson 1991), and one with q > 4 is taken
-    back; w is 1, or 0.02 where nothing yields. The error of the run is then in proportion to the
+    back; w is 1, or 0.02 where nothing yields. A first step in which something touches is taken
+    back down to a quarter. The error of the run is then in proportion to the
     tolerance.
 
     Args:
@@ -140,7 +146,7 @@ class ErrorControl:
         self._size = self._first
         self._before: float | None = None
         self._ratio = 0.0
-        self._holds = False
+        self._holds = self._touches = False
         self._unkept = 0
 
     @property
@@ -203,6 +209,7 @@ class ErrorControl:
             allowed = (OF_MOTION * self._tolerance) ** 2 * found.motion
         else:
             allowed = (OF_LENGTH * self._tolerance) ** 2 * self._length
+        self._touches = found.touches
         error = found.error * (ELASTIC if found.smooth else 1.0)
         self._ratio = error / allowed if error > 0.0 else 0.0
         return self._ratio
@@ -210,11 +217,13 @@ class ErrorControl:
     def reject(self) -> bool:
         """Make the step smaller that was judged last, if its error is too large; tell whether.
 
-        The first one is not, nor the smallest, which are counted.
+        The smallest is not, and counted. Nor is the first one, as half of it counts as its error,
+        however small it is; but what contact moves wrongly at first stays, so that with it the
+        first step is made small.
         """
         tried = self.target - self._now
-        first = self._before is None
-        if self._ratio <= REJECTED or first:
+        small = not self._touches or tried <= EARLIEST * self._first
+        if self._ratio <= REJECTED or (self._before is None and small):
             return False
         if self._smallest:
             self._unkept += 1

@@ -73,6 +73,19 @@ def test_a_step_with_too_large_an_error_is_taken_back():
     assert ends[0] == 0.05
 
 
+def test_a_first_step_is_taken_back_where_something_touches():
+    # Half of its motion counts as its error, whatever its size: that alone must not reject it.
+    control = ErrorControl(0.01)
+    control.judge(StepError(0.5, 1.0, False))
+    assert not control.reject()
+    control.judge(StepError(0.5, 1.0, False, True))
+    assert control.reject() and control.target == pytest.approx(0.01)
+    control.judge(StepError(0.5, 1.0, False, True))
+    assert not control.reject()
+    control.accept(5)
+    assert control.share == pytest.approx(0.01)
+
+
 def test_a_step_that_failed_is_halved_and_does_not_grow_at_once():
     control = ErrorControl(0.01)
     assert control.cut_back() and control.target == 0.025
@@ -185,6 +198,43 @@ def test_output_and_what_was_taken_back():
         start = attempt.load - attempt.size
         k = int(np.argmin(np.abs(np.array(history.load) - start)))
         assert history.load[k] == pytest.approx(start) and history.load[k + 1] < attempt.load
+
+
+def pressed():
+    """Return a block and a rigid disc on it that moves down by 0.1, and the path."""
+    V = scenes.vectors(scenes.box([0.0, 0.0], [4.0, 3.0], [8, 6], QUADRILATERAL))
+    body = scenes.box([0.0, 0.0], [4.0, 2.0], [16, 8], QUADRILATERAL)
+    particles = mpm.Particles(body, V)
+    disc = mpm.contact.Rigid(
+        particles,
+        mpm.contact.disc((2.0, 3.0), 1.0),
+        facet_tags=scenes.facet_tags(body, scenes.at(1, 2.0)),
+        tag=1,
+    )
+    problem = mpm.QuasiStaticProblem(
+        particles,
+        mpm.materials.VonMises(500.0, 0.3, rho_y=1.0),
+        bcs=[
+            scenes.fix(V, scenes.at(axis, place), component=axis)
+            for axis, place in ((0, 0.0), (0, 4.0), (1, 0.0))
+        ],
+        terms=[disc],
+    )
+    return problem, lambda t: disc.move((0.0, -0.1 * t))
+
+
+def test_errors_of_contact_from_the_first_step_on_fall_with_the_tolerance():
+    problem, path = pressed()
+    problem.solve(100, update=path)
+    exact, errors = nodal(problem), []
+    for tolerance in (0.04, 0.01):
+        problem, path = pressed()
+        history = problem.solve("auto", tolerance=tolerance, update=path)
+        assert history.taken_back[0].size == 0.05
+        assert "times the allowed" in history.taken_back[0].reason
+        assert history.steps[0].load < 0.05
+        errors.append(distance(nodal(problem), exact))
+    assert errors[1] < 0.6 * errors[0]
 
 
 def test_a_rejected_step_leaves_no_trace():
