@@ -58,6 +58,20 @@ def raises(build, error, sentence):
     return caught
 
 
+def breaks(term, step):
+    """Take a step in which the update of a term fails after its work, and mend the term."""
+    update = term.update
+
+    def broken():
+        update()
+        raise RuntimeError("broken")
+
+    term.update = broken
+    with pytest.raises(Exception, match="broken"):
+        step()
+    term.update = update
+
+
 def error_of_blocks(problem, step=1e-5, size=1e-3):
     """Return the largest relative error of any block of a tangent, against differences.
 
