@@ -100,7 +100,8 @@ def _first(ax: Any, run: History, curve: Mapping[str, Sequence[float]] | None) -
 
 def _solves(ax: Any, run: History) -> None:
     numbers = np.arange(1, len(run.steps) + 1)
-    ax.bar(numbers, run.iterations, width=0.8, color="C0")
+    apart = len(numbers) <= 60  # gaps of less than a pixel are drawn as stripes
+    ax.bar(numbers, run.iterations, width=0.8 if apart else 1.0, antialiased=apart, color="C0")
     failed = f", and {run.failed_iterations} in steps that failed" if run.failed_iterations else ""
     ax.set(xlabel="step", ylabel="linear solves")
     ax.set_title(f"{sum(run.iterations)} linear solves{failed}", fontsize="medium")
