@@ -203,13 +203,13 @@ RUNS = {
     "vortex": ("vortex", "", {"displacement_error": 4.6e-2, "velocity_error": 1.26e-1}),
     "sand": (
         "sand_column",
-        "--aspect 0.5 --cells 6",
+        "--aspect 0.5 --cells 6 --rayleigh 0",
         {"ratio": 1.15, "kinetic_left": 0.05},
     ),
     "sand-damped": (
         "sand_column",
-        "--aspect 2 --cells 10 --rayleigh 1e-5",
-        {"ratio": 1.3, "kinetic_left": 1e-4, "cutbacks": 70},
+        "--aspect 2 --cells 10 --rayleigh 1.6e-5",
+        {"ratio": 1.15, "kinetic_left": 1e-4, "cutbacks": 35},
     ),
     "sand-dilates": (
         "sand_column",
