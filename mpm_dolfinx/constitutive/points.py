@@ -302,6 +302,14 @@ class MaterialPoints:
         return not any(part.at_pressure for part in self._governed)
 
     @property
+    def at_pressure(self) -> NDArray[np.bool_]:
+        """Whether the law of each point is evaluated at its pressure, shape ``(n nq,)``."""
+        result = np.zeros(self._points, dtype=bool)
+        for part in self._governed:
+            result[part.points] = part.at_pressure
+        return result
+
+    @property
     def grouped(self) -> VolumeAveraging | None:
         """What knows what the tangent has from other points of a group; ``None`` without F-bar."""
         return self.averaging

@@ -26,7 +26,14 @@ from ..errors import MPMError
 from ..materials.base import Material, StrainMaterial, Update
 from ..particles.field import ParticleField
 
-__all__ = ["MeanStress", "VolumeStrain", "is_split", "with_pressure", "without_bulk"]
+__all__ = [
+    "MeanStress",
+    "VolumeStrain",
+    "is_split",
+    "slope_of_volume",
+    "with_pressure",
+    "without_bulk",
+]
 
 
 class VolumeStrain(NamedTuple):
@@ -225,7 +232,7 @@ def with_pressure(
         return found
     mean = stress[:, :3].sum(axis=1) / 3.0
     change = pressure - mean
-    slope = _slope(gradient, small)
+    slope = slope_of_volume(gradient, small)
     turning = np.where(small, 0.0, change)[:, None, None, None, None]
     product = slope[:, :, :, None, None] * slope[:, None, None, :, :]
     whole = tangent - bulk[:, None, None, None, None] * product
@@ -235,8 +242,13 @@ def with_pressure(
     return Pressed(first_piola + change[:, None, None] * slope, whole, own, mean / bulk, slope)
 
 
-def _slope(gradient: NDArray[np.float64], small: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the derivative of the volume strain by F."""
+def slope_of_volume(gradient: NDArray[np.float64], small: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the derivative of the volume strain by F, shape ``(n, dim, dim)``.
+
+    Args:
+        gradient: ``F - I``, shape ``(n, dim, dim)``.
+        small: Whether the strain is small, shape ``(n,)``.
+    """
     eye = np.eye(gradient.shape[-1])
     slope = np.linalg.inv(gradient + eye).swapaxes(1, 2)
     slope[small] = eye

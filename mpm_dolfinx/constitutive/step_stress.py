@@ -22,8 +22,10 @@ So P* : (F_1 - F_n) >= W_1 - W_n at each of its points. (The tangent takes the s
 derivative of W there, which is exact where the point has become free of stress.) With F-bar, W is
 the energy of a group of domains and depends on F at all of its points, with the effective stress P
 as its derivative; numerator and denominator of c are integrals over the group then, and so is what
-is said of W. A law of small strains takes the mean of its stresses, which has the same two merits
-as far as they go there. Damping in proportion to the stiffness C of the undeformed body is
+is said of W. Where a law is evaluated at a pressure of its own, which acts through the whole step,
+c is 0 for the rest of its stress. A law of small strains takes the mean of its stresses, which has
+the same two merits as far as they go there. Damping in proportion to the stiffness C of the
+undeformed body is
 ``P_v = F_m (beta C : (E_1 - E_n) / dt)``: it resists no rotation and never gives energy.
 """
 
@@ -36,12 +38,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._core import loops
-from ..errors import ConvergenceError, MPMError
+from ..errors import ConvergenceError
+from ..meshes.quadrature import volume_ratio
 from ..particles.reference import Reference
 from .averaging import Linearised, LowRankTerm, VolumeAveraging
 from .groups import Groups
 from .points import MaterialPoints
-from .pressure import MeanStress, VolumeStrain
+from .pressure import MeanStress, VolumeStrain, slope_of_volume
 
 __all__ = ["StepStress"]
 
@@ -100,20 +103,17 @@ class StepStress:
         self._muted = False
         self._work = (0.0, 0.0, 0.0)
         self._splits = points.mean_stress is not None and share < 1.0
-        if self._splits and not points.comes_apart:
-            raise MPMError(
-                "mixed='pressure' in a motion with the scheme 'midpoint' or 'conserving' is for "
-                "laws whose mean stress is the bulk modulus times the volume strain, such as "
-                "Hencky or VonMises; use scheme='euler', or f_bar='patch'."
-            )
+        # points whose law is evaluated at the pressure, and knows no volume strain of its own
+        self._pressed = points.at_pressure & self._splits
         self._undeformed: Array | None = None
         self._small = points.has_small_strain
         self._exact = points.has_potential & ~self._small
-        bounded = points.may_part & ~np.isnan(points.strain_energy())
+        bounded = points.may_part & ~np.isnan(points.strain_energy()) & ~self._pressed
         self._kind = np.where(bounded, 3, 1).astype(np.uint8)
         self._kind[self._exact], self._kind[self._small] = 2, 0
         plain = not conserving and viscosity == 0.0 and not self._splits
-        self.symmetric: bool = points.symmetric and (plain or bool(self._small.all()))
+        plain = plain or (bool(self._small.all()) and not self._pressed.any())
+        self.symmetric: bool = points.symmetric and plain
         self.settle()
         self._tried: Array = self._H
         self._stress = points.first_piola
@@ -186,11 +186,12 @@ class StepStress:
         self._P = points.first_piola.copy()
         self._energy, self._potential = points.strain_energy(), points.potential()
         if self._splits:
-            found, p = points.volume_strain, points.converged_pressure
-            self._volume, self._slope = found.volume, found.slope
-            self._of_pressure = found.slope / self._share
-            self._potential -= 0.5 * found.compliance * p**2
-            self._P -= p[:, None, None] * found.slope
+            p = np.where(self._pressed, self._pressure.values, points.converged_pressure)
+            self._volume, self._slope = self._volumes(self._H)
+            self._now = self._volume, self._slope
+            self._of_pressure = self._mean_slope = self._slope / self._share
+            self._potential -= 0.5 * points.volume_strain.compliance * p**2
+            self._P -= p[:, None, None] * self._slope
             self._own = self._P
         if self._viscosity > 0.0:
             self._undeformed = points.undeformed_tangent()
@@ -222,6 +223,7 @@ class StepStress:
             return
         self._tried = self._gradient()
         if self._splits:
+            self._now = self._volumes(self._tried)
             self._take_pressure_out()
         if self._conserving:
             self._stress, self.tangent = self._whole_step()
@@ -242,15 +244,31 @@ class StepStress:
 
     def _take_pressure_out(self) -> None:
         """Leave in stress and tangent what is not of the pressure."""
-        p, slope = self._present_pressure()
+        p, (_, slope) = self._pressure.values, self._now
         self._stress = self._own = self._stress - p[:, None, None] * slope
         self.tangent = self.tangent - p[:, None, None, None, None] * self._turning(slope)
 
-    def _present_pressure(self) -> tuple[Array, Array]:
-        """Return the pressure, and the slope of the volume strain, in the last update."""
+    @property
+    def _pressure(self) -> MeanStress:
+        """The pressure of its own."""
         pressure = self._points.mean_stress
         assert pressure is not None
-        return pressure.values, pressure.strain.slope
+        return pressure
+
+    def _volumes(self, H: Array) -> tuple[Array, Array]:
+        """Return the volume strain in the last update, at ``F - I``, and its derivative by F.
+
+        Laws that are evaluated at the pressure count that of the whole strain.
+        """
+        found, pressed = self._points.volume_strain, self._pressed
+        if not pressed.any():
+            return found.volume, found.slope
+        volume, slope = found.volume.copy(), found.slope.copy()
+        small = self._small[pressed]
+        excess = volume_ratio(H[pressed])
+        volume[pressed] = np.where(small, np.einsum("nii->n", H[pressed]), np.log(excess))
+        slope[pressed] = slope_of_volume(H[pressed], small)
+        return volume, slope
 
     def _turning(self, slope: Array) -> Array:
         """Return the derivative of the volume strain's slope by F."""
@@ -263,7 +281,7 @@ class StepStress:
         if (self._kind >= 2).any():
             potential = self._points.potential(trial=True)
             if self._splits:
-                p, found = self._present_pressure()[0], self._points.volume_strain
+                p, found = self._pressure.values, self._points.volume_strain
                 potential -= 0.5 * found.compliance * p**2
             energies = potential, self._potential
         ends = _Ends(self._stress, self._P, self.tangent, energies, self._kind)
@@ -275,16 +293,28 @@ class StepStress:
 
     def _of_volume(self) -> tuple[Array, Array]:
         """Return the stress of the pressure of the whole step, and its derivative, as above."""
-        p, slope = self._present_pressure()
+        p, (volume, slope) = self._pressure.values, self._now
         turning, before = self._turning(slope), self._slope
         if self._conserving:
-            volumes = self._points.volume_strain.volume, self._volume
+            volumes = volume, self._volume
             kind = np.where(self._small, 0, 2).astype(np.uint8)
             mean, tangent = self._mean(_Ends(slope, before, turning, volumes, kind))
         else:
             mean, tangent = 0.5 * (slope + before) / self._share, 0.5 * turning / self._share
-        self._of_pressure = mean
+        self._mean_slope, self._of_pressure = mean, mean + self._own_by_pressure(slope)
         return p[:, None, None] * mean, p[:, None, None, None, None] * tangent
+
+    def _own_by_pressure(self, slope: Array) -> Array:
+        """Return the derivative by the pressure of the stress that is not of it, over the share."""
+        if not self._pressed.any():
+            return np.zeros_like(slope)
+        own = np.where(self._pressed[:, None, None], self._points.by_pressure - slope, 0.0)
+        if not self._conserving:
+            return own
+        unit = np.eye(self._points.dim)
+        turned = np.linalg.solve(unit + self._tried, own)
+        turned = (unit + 0.5 * (self._tried + self._H)) @ turned
+        return np.where(self._small[:, None, None], own, turned) * (0.5 / self._share)
 
     def _mean(self, ends: _Ends) -> tuple[Array, Array]:
         """Return what acts over a step, and its derivative by F at the end, over the share."""
@@ -483,7 +513,7 @@ class StepStress:
         points = self._points
         settled = ["_H", "_P", "_energy", "_potential", "_work"]
         if self._splits:
-            settled += ["_volume", "_slope", "_of_pressure", "_own"]
+            settled += ["_volume", "_slope", "_now", "_of_pressure", "_mean_slope", "_own"]
         before = {name: getattr(self, name) for name in settled}
         H = self._gradient() - self._H
         viscous = 0.0 if self._viscous is None else self._viscous
@@ -491,8 +521,8 @@ class StepStress:
         if self._conserving:
             stress = whole = self._share * self._stress - viscous
         elif self._splits:
-            p, _ = self._present_pressure()
-            whole = self._share * p[:, None, None] * self._of_pressure
+            p = self._pressure.values
+            whole = self._share * p[:, None, None] * self._mean_slope
             stress = 0.5 * (self._P + self._own) + whole
         elif self._share < 1.0:
             stress = 0.5 * (self._P + points.first_piola)
