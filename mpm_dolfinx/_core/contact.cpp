@@ -5,6 +5,7 @@
 //
 // Derivatives are carried along in the few vectors that all depends on: the way from the facet's
 // place to the point, first and second derivatives of the facet there, and the way from the anchor.
+// What acts on the nodes of a facet is made of as few vectors, by the same factors.
 
 #include "contact.h"
 #include "hot_loop.h"
@@ -106,14 +107,21 @@ T dot(const std::array<T, dim>& a, const std::array<T, dim>& b)
   return sum;
 }
 
-// Of symmetric second derivatives.
-constexpr int pair_of(int e, int f) { return e + f; }
+// Which of so many second derivatives is that by two directions, -1: it is zero. A line or a triangle
+// of degree 1 has none, a quadrilateral the mixed one.
+template <int dim, int bends>
+constexpr int bend_of(int e, int f)
+{
+  if (bends == dim * (dim - 1) / 2)
+    return e + f;
+  return bends == 1 && e != f ? 0 : -1;
+}
 
 // What all depends on: r, slopes A, bends B, and the way from the anchor.
-template <typename T, int dim>
+template <typename T, int dim, int bends>
 struct Ways
 {
-  static constexpr int sides = dim - 1, bends = sides * (sides + 1) / 2;
+  static constexpr int sides = dim - 1;
   using Vector = std::array<T, dim>;
   Vector r, delta;
   std::array<Vector, sides> A;
@@ -135,18 +143,18 @@ std::array<T, sides> solved(const std::array<std::array<G, sides>, sides>& matri
                             const std::array<T, sides>& b)
 {
   if constexpr (sides == 1)
-    return {b[0] * T(inverse(matrix[0][0]))};
+    return {inverse(matrix[0][0]) * b[0]};
   else
   {
     const G det = matrix[0][0] * matrix[1][1] - matrix[0][1] * matrix[1][0];
-    const T factor(inverse(det));
-    return {(T(matrix[1][1]) * b[0] - T(matrix[0][1]) * b[1]) * factor,
-            (T(matrix[0][0]) * b[1] - T(matrix[1][0]) * b[0]) * factor};
+    const G factor = inverse(det);
+    return {factor * (matrix[1][1] * b[0] - matrix[0][1] * b[1]),
+            factor * (matrix[0][0] * b[1] - matrix[1][0] * b[0])};
   }
 }
 
-template <typename T, int dim>
-Foot<T, dim> foot_of(const Ways<T, dim>& ways, const core::Meeting& m, std::size_t p)
+template <typename T, int dim, int bends>
+Foot<T, dim> foot_of(const Ways<T, dim, bends>& ways, const core::Meeting& m, std::size_t p)
 {
   constexpr int sides = dim - 1;
   Foot<T, dim> foot{};
@@ -160,8 +168,12 @@ Foot<T, dim> foot_of(const Ways<T, dim>& ways, const core::Meeting& m, std::size
     {
       double sum = 0.0;
       for (int i = 0; i < dim; ++i)
-        sum += value_of(ways.A[e][i]) * value_of(ways.A[f][i])
-               - value_of(ways.B[pair_of(e, f)][i]) * value_of(ways.r[i]);
+      {
+        sum += value_of(ways.A[e][i]) * value_of(ways.A[f][i]);
+        if constexpr (bends > 0)
+          if (const int b = bend_of<dim, bends>(e, f); b >= 0)
+            sum -= value_of(ways.B[b][i]) * value_of(ways.r[i]);
+      }
       G[e][f] = sum;
     }
   }
@@ -172,8 +184,10 @@ Foot<T, dim> foot_of(const Ways<T, dim>& ways, const core::Meeting& m, std::size
     for (int e = 0; e < sides; ++e)
     {
       r[i] = r[i] - ways.A[e][i] * foot.moved[e];
-      for (int f = 0; f < sides; ++f)
-        A[e][i] = A[e][i] + ways.B[pair_of(e, f)][i] * foot.moved[f];
+      if constexpr (bends > 0)
+        for (int f = 0; f < sides; ++f)
+          if (const int b = bend_of<dim, bends>(e, f); b >= 0)
+            A[e][i] = A[e][i] + ways.B[b][i] * foot.moved[f];
     }
   std::array<T, dim> n;
   if constexpr (dim == 2)
@@ -223,36 +237,35 @@ Foot<T, dim> foot_of(const Ways<T, dim>& ways, const core::Meeting& m, std::size
 }
 
 // What acts on a node of the facet: by pressure, and by friction, whose arm turns with the facet.
-template <typename T, int dim>
-void on_node(const Foot<T, dim>& foot, const core::Meeting& m, std::size_t p, int node,
-             std::array<T, dim>& push, std::array<T, dim>& rub)
+template <int dim>
+void on_node(const Foot<double, dim>& foot, const core::Meeting& m, std::size_t p, int node,
+             double* push, double* rub)
 {
   constexpr int sides = dim - 1;
   const double* slope = m.slope + p * sides * m.nodes;
   const double* bend = m.bend + p * sides * sides * m.nodes;
-  T N(m.shape[p * m.nodes + node]), turn(0.0);
+  double N = m.shape[p * m.nodes + node], turn = 0.0;
   for (int e = 0; e < sides; ++e)
   {
-    N = N + slope[e * m.nodes + node] * foot.moved[e];
-    T by(slope[e * m.nodes + node]);
+    N += slope[e * m.nodes + node] * foot.moved[e];
+    double by = slope[e * m.nodes + node];
     for (int f = 0; f < sides; ++f)
-      by = by + bend[(e * sides + f) * m.nodes + node] * foot.moved[f];
-    turn = turn + by * foot.lag[e];
+      by += bend[(e * sides + f) * m.nodes + node] * foot.moved[f];
+    turn += by * foot.lag[e];
   }
-  const T arm = foot.gap * turn, pressed = N * foot.pressure;
+  const double arm = foot.gap * turn, pressed = N * foot.pressure;
   for (int i = 0; i < dim; ++i)
   {
-    push[i] = T(-1.0) * pressed * foot.n[i];
+    push[i] = -pressed * foot.n[i];
     rub[i] = arm * foot.n[i] - N * foot.shear[i];
   }
 }
 
-template <typename T, int dim>
-Ways<T, dim> ways_of(const core::Meeting& m, std::size_t p)
+template <typename T, int dim, int bends>
+Ways<T, dim, bends> ways_of(const core::Meeting& m, std::size_t p)
 {
-  using W = Ways<T, dim>;
-  constexpr int sides = W::sides;
-  W ways{};
+  constexpr int sides = dim - 1;
+  Ways<T, dim, bends> ways{};
   const double* x = m.x + p * m.count * dim;
   const double* slope = m.slope + p * sides * m.nodes;
   const double* bend = m.bend + p * sides * sides * m.nodes;
@@ -260,7 +273,7 @@ Ways<T, dim> ways_of(const core::Meeting& m, std::size_t p)
   {
     double r = x[i], delta = x[i];
     std::array<double, sides> A{};
-    std::array<double, W::bends> B{};
+    std::array<double, bends> B{};
     for (int k = 0; k < m.nodes; ++k)
     {
       const double X = x[(1 + k) * dim + i];
@@ -268,8 +281,10 @@ Ways<T, dim> ways_of(const core::Meeting& m, std::size_t p)
       for (int e = 0; e < sides; ++e)
       {
         A[e] += slope[e * m.nodes + k] * X;
-        for (int f = e; f < sides; ++f)
-          B[pair_of(e, f)] += bend[(e * sides + f) * m.nodes + k] * X;
+        if constexpr (bends > 0)
+          for (int f = e; f < sides; ++f)
+            if (const int b = bend_of<dim, bends>(e, f); b >= 0)
+              B[b] += bend[(e * sides + f) * m.nodes + k] * X;
       }
       if (!m.smooth)
         delta -= m.anchored[p * m.nodes + k] * x[(1 + m.nodes + k) * dim + i];
@@ -278,18 +293,18 @@ Ways<T, dim> ways_of(const core::Meeting& m, std::size_t p)
     ways.delta[i] = m.smooth ? T(0.0) : T(delta);
     for (int e = 0; e < sides; ++e)
       ways.A[e][i] = T(A[e]);
-    for (int b = 0; b < W::bends; ++b)
+    for (int b = 0; b < bends; ++b)
       ways.B[b][i] = T(B[b]);
   }
   return ways;
 }
 
-template <int dim>
+template <int dim, int bends>
 void act_in(const core::Meeting& m, const core::Met& result)
 {
   for (std::size_t p = 0; p < m.points; ++p)
   {
-    const auto foot = foot_of(ways_of<double, dim>(m, p), m, p);
+    const auto foot = foot_of(ways_of<double, dim, bends>(m, p), m, p);
     double* push = result.pushes + p * (1 + m.nodes) * dim;
     double* rub = result.rubs + p * (1 + m.nodes) * dim;
     for (int i = 0; i < dim; ++i)
@@ -300,116 +315,146 @@ void act_in(const core::Meeting& m, const core::Met& result)
     result.pressure[p] = foot.pressure;
     result.inside[p] = foot.inside;
     result.slips[p] = foot.slips;
-    for (int k = 0; k < m.nodes; ++k)
-    {
-      std::array<double, dim> pushes, rubs;
-      on_node<double, dim>(foot, m, p, k, pushes, rubs);
-      for (int i = 0; i < dim; ++i)
-      {
-        push[(1 + k) * dim + i] = pushes[i];
-        rub[(1 + k) * dim + i] = rubs[i];
-      }
-    }
+    for (int k = 1; k <= m.nodes; ++k)
+      on_node<dim>(foot, m, p, k - 1, push + k * dim, rub + k * dim);
   }
 }
 
-template <int dim>
-void differentiate_in(const core::Meeting& m, double* derivatives)
+// Set the derivative of all forces at a point by the places of its stencil, (1 + nodes, dim, count,
+// dim), by way of that of the vectors that they are made of.
+template <int dim, int bends, bool rubs>
+void differentiate_at(const core::Meeting& m, std::size_t p, double* D, std::vector<double>& work)
 {
-  constexpr int sides = dim - 1, bends = sides * (sides + 1) / 2;
-  // vectors: r, A, B, delta
-  constexpr int vectors = 2 + sides + bends, lanes = dim * vectors;
+  constexpr int sides = dim - 1, vectors = 1 + sides + bends, lanes = dim * (vectors + rubs);
   using T = Dual<lanes>;
-  std::vector<double> factors(static_cast<std::size_t>(m.count * vectors));
-  for (std::size_t p = 0; p < m.points; ++p)
+  auto ways = ways_of<T, dim, bends>(m, p);
+  for (int i = 0; i < dim; ++i)
   {
-    auto ways = ways_of<T, dim>(m, p);
+    ways.r[i].by[i] = 1.0;
+    for (int e = 0; e < sides; ++e)
+      ways.A[e][i].by[(1 + e) * dim + i] = 1.0;
+    for (int b = 0; b < bends; ++b)
+      ways.B[b][i].by[(1 + sides + b) * dim + i] = 1.0;
+    if constexpr (rubs)
+      ways.delta[i].by[vectors * dim + i] = 1.0;
+  }
+  const auto foot = foot_of(ways, m, p);
+  // What acts on a node is a sum of vectors: that on the point, and by each slope and bend.
+  constexpr int parts = rubs ? vectors : 1 + sides;
+  std::array<std::array<T, dim>, parts> made;
+  for (int i = 0; i < dim; ++i)
+  {
+    const T force = foot.pressure * foot.n[i] + foot.shear[i];
+    made[0][i] = force;
+    if constexpr (rubs)
+    {
+      const T arm = foot.gap * foot.n[i];
+      for (int e = 0; e < sides; ++e)
+        made[1 + e][i] = foot.moved[e] * force - foot.lag[e] * arm;
+      for (int b = 0; b < bends; ++b)
+        made[1 + sides + b][i] = T(0.0);
+      for (int e = 0; e < sides; ++e)
+        for (int f = 0; f < sides; ++f)
+          if (const int b = bend_of<dim, bends>(e, f); b >= 0)
+            made[1 + sides + b][i] = made[1 + sides + b][i] + foot.lag[e] * foot.moved[f] * arm;
+    }
+    else
+      for (int e = 0; e < sides; ++e)
+        made[1 + e][i] = foot.moved[e] * force;
+  }
+  // How the vectors go with each node.
+  const double* slope = m.slope + p * sides * m.nodes;
+  const double* bend = m.bend + p * sides * sides * m.nodes;
+  const int width = m.count * dim;
+  double* factors = work.data();
+  double* half = factors + m.nodes * vectors;
+  for (int k = 0; k < m.nodes; ++k)
+  {
+    double* mine = factors + k * vectors;
+    mine[0] = -m.shape[p * m.nodes + k];
+    for (int e = 0; e < sides; ++e)
+    {
+      mine[1 + e] = slope[e * m.nodes + k];
+      for (int f = e; f < sides; ++f)
+        if (const int b = bend_of<dim, bends>(e, f); b >= 0)
+          mine[1 + sides + b] = bend[(e * sides + f) * m.nodes + k];
+    }
+  }
+  for (int part = 0; part < parts; ++part)
     for (int i = 0; i < dim; ++i)
     {
-      ways.r[i].by[i] = 1.0;
-      for (int e = 0; e < sides; ++e)
-        ways.A[e][i].by[(1 + e) * dim + i] = 1.0;
-      for (int b = 0; b < bends; ++b)
-        ways.B[b][i].by[(1 + sides + b) * dim + i] = 1.0;
-      if (!m.smooth)
-        ways.delta[i].by[(1 + sides + bends) * dim + i] = 1.0;
-    }
-    // how the vectors go with each place of the stencil
-    const double* slope = m.slope + p * sides * m.nodes;
-    const double* bend = m.bend + p * sides * sides * m.nodes;
-    std::fill(factors.begin(), factors.end(), 0.0);
-    factors[0] = 1.0;
-    factors[vectors - 1] = 1.0;
-    for (int k = 0; k < m.nodes; ++k)
-    {
-      double* mine = factors.data() + (1 + k) * vectors;
-      mine[0] = -m.shape[p * m.nodes + k];
-      for (int e = 0; e < sides; ++e)
-      {
-        mine[1 + e] = slope[e * m.nodes + k];
-        for (int f = e; f < sides; ++f)
-          mine[1 + sides + pair_of(e, f)] = bend[(e * sides + f) * m.nodes + k];
-      }
-      if (!m.smooth)
-        factors[(1 + m.nodes + k) * vectors + vectors - 1] = -m.anchored[p * m.nodes + k];
-    }
-    const auto foot = foot_of(ways, m, p);
-    double* D = derivatives + p * (1 + m.nodes) * dim * m.count * dim;
-    for (int k = -1; k < m.nodes; ++k)
-    {
-      std::array<T, dim> push, rub;
-      if (k < 0)
-        for (int i = 0; i < dim; ++i)
+      const double* by = made[part][i].by.data();
+      double* row = half + (part * dim + i) * width;
+      for (int j = 0; j < dim; ++j)
+        row[j] = rubs ? by[j] + by[vectors * dim + j] : by[j];
+      for (int k = 0; k < m.nodes; ++k)
+        for (int j = 0; j < dim; ++j)
         {
-          push[i] = foot.pressure * foot.n[i];
-          rub[i] = foot.shear[i];
+          double sum = 0.0;
+          for (int v = 0; v < vectors; ++v)
+            sum += factors[k * vectors + v] * by[v * dim + j];
+          row[(1 + k) * dim + j] = sum;
+          if constexpr (rubs)
+            row[(1 + m.nodes + k) * dim + j]
+                = -m.anchored[p * m.nodes + k] * by[vectors * dim + j];
         }
-      else
-        on_node<T, dim>(foot, m, p, k, push, rub);
-      for (int i = 0; i < dim; ++i, D += m.count * dim)
-      {
-        const T whole = push[i] + rub[i];
-        for (int c = 0; c < m.count; ++c)
-        {
-          const double* mine = factors.data() + c * vectors;
-          for (int j = 0; j < dim; ++j)
-          {
-            double sum = 0.0;
-            for (int v = 0; v < vectors; ++v)
-              sum += mine[v] * whole.by[v * dim + j];
-            D[c * dim + j] = sum;
-          }
-        }
-      }
+    }
+  std::copy_n(half, dim * width, D);
+  for (int k = 0; k < m.nodes; ++k)
+  {
+    double* rows = D + (1 + k) * dim * width;
+    for (int c = 0; c < dim * width; ++c)
+      rows[c] = factors[k * vectors] * half[c];
+    for (int part = 1; part < parts; ++part)
+    {
+      // (by slopes the other way, as these go with what is taken from the shape functions)
+      const double factor = (part <= sides ? -1.0 : 1.0) * factors[k * vectors + part];
+      const double* from = half + part * dim * width;
+      for (int c = 0; c < dim * width; ++c)
+        rows[c] += factor * from[c];
     }
   }
 }
 
+// Add the derivative at a point to blocks between nodes.
 template <int dim>
-void add_blocks_in(std::size_t points, int places, int count, const double* derivatives,
-                   const double* weights, const std::int64_t* number, const core::Side& rows,
-                   const core::Side& columns, double* blocks)
+void add_at(const core::Sums& sums, std::size_t p, int nodes, int count, const double* D)
 {
-  const int width = columns.nodes * dim, size = rows.nodes * dim * width;
-  for (std::size_t p = 0; p < points; ++p)
-    for (int a = 0; a < rows.nodes; ++a)
+  const int rows = sums.sources + nodes, columns = sums.sources + count - 1;
+  const std::int32_t* positions = sums.positions + sums.group[p] * rows * columns;
+  const double* shapes = sums.shapes + p * sums.sources;
+  const auto spread = [&](int node) { return node < sums.sources ? shapes[node] : 1.0; };
+  const auto place = [&](int node) { return std::max(node - sums.sources + 1, 0); };
+  for (int a = 0; a < rows; ++a)
+  {
+    const double left = sums.weights[p] * spread(a);
+    const double* row = D + place(a) * dim * count * dim;
+    for (int b = 0; b < columns; ++b)
     {
-      const int place = rows.shapes ? rows.first : rows.first + a;
-      const double left = weights[p] * (rows.shapes ? rows.shapes[p * rows.nodes + a] : 1.0);
+      const double factor = left * spread(b);
+      const double* from = row + place(b) * dim;
+      double* block = sums.values + static_cast<std::size_t>(positions[a * columns + b]) * dim * dim;
       for (int i = 0; i < dim; ++i)
-      {
-        const double* D = derivatives + ((p * places + place) * dim + i) * count * dim;
-        double* row = blocks + number[p] * size + (a * dim + i) * width;
-        for (int b = 0; b < columns.nodes; ++b)
-        {
-          const double* here = D + (columns.shapes ? columns.first : columns.first + b) * dim;
-          const double factor
-              = left * (columns.shapes ? columns.shapes[p * columns.nodes + b] : 1.0);
-          for (int j = 0; j < dim; ++j)
-            row[b * dim + j] += factor * here[j];
-        }
-      }
+        for (int j = 0; j < dim; ++j)
+          block[i * dim + j] += factor * from[i * count * dim + j];
     }
+  }
+}
+
+template <int dim, int bends>
+void add_tangents_in(const core::Meeting& m, const core::Sums& sums)
+{
+  constexpr int vectors = dim + bends;
+  std::vector<double> D((1 + m.nodes) * dim * m.count * dim);
+  std::vector<double> work(m.nodes * vectors + vectors * dim * m.count * dim);
+  for (std::size_t p = 0; p < m.points; ++p)
+  {
+    if (m.smooth)
+      differentiate_at<dim, bends, false>(m, p, D.data(), work);
+    else
+      differentiate_at<dim, bends, true>(m, p, D.data(), work);
+    add_at<dim>(sums, p, m.nodes, m.count, D.data());
+  }
 }
 
 // A facet of degree 1 at a place: the point there, its slopes, and its one mixed second derivative.
@@ -442,8 +487,8 @@ struct Place
     }
   }
 
-  // The unit normal, outwards.
-  std::array<double, dim> normal(double outward) const
+  // The normal of the size of the area element, outwards.
+  std::array<double, dim> area(double outward) const
   {
     std::array<double, dim> n;
     if constexpr (dim == 2)
@@ -451,7 +496,16 @@ struct Place
     else
       for (int i = 0; i < 3; ++i)
         n[i] = A[0][(i + 1) % 3] * A[1][(i + 2) % 3] - A[0][(i + 2) % 3] * A[1][(i + 1) % 3];
-    const double factor = outward / std::sqrt(dot(n, n));
+    for (double& part : n)
+      part *= outward;
+    return n;
+  }
+
+  // The unit normal, outwards.
+  std::array<double, dim> normal(double outward) const
+  {
+    auto n = area(outward);
+    const double factor = 1.0 / std::sqrt(dot(n, n));
     for (double& part : n)
       part *= factor;
     return n;
@@ -521,11 +575,11 @@ public:
   using Vector = std::array<double, dim>;
 
   explicit Tiles(const core::Search& search)
-      : low_(search.facets), high_(search.facets), normal_(search.facets)
+      : low_(search.facets), high_(search.facets), normal_(search.facets),
+        at_corners_(search.facets)
   {
     base_.fill(INFINITY);
     top_.fill(-INFINITY);
-    double width = 0.0;
     std::vector<std::int64_t> there;
     for (std::size_t facet = 0; facet < search.facets; ++facet)
     {
@@ -549,16 +603,36 @@ public:
       std::array<double, dim - 1> middle;
       middle.fill(search.nodes == 3 ? 1.0 / 3.0 : 0.5);
       normal_[facet] = Place<dim>(corners, search.nodes, middle).normal(search.outward[facet]);
+      at_corners_[facet].fill(normal_[facet]);
+      if constexpr (dim == 3)
+        if (search.nodes == 4)
+        {
+          double least = INFINITY;
+          for (int k = 0; k < 4; ++k)
+          {
+            const Place<dim> at(corners, 4, {static_cast<double>(k % 2), static_cast<double>(k / 2)});
+            at_corners_[facet][k] = at.area(search.outward[facet]);
+            least = std::min(least, dot(at_corners_[facet][k], normal_[facet]));
+          }
+          // (a facet that bends so much may face anything)
+          const double factor = least > 0.0 ? 1.0 / least : NAN;
+          for (Vector& corner : at_corners_[facet])
+            for (double& part : corner)
+              part *= factor;
+        }
+      double size = 0.0;
       for (int i = 0; i < dim; ++i)
       {
-        base_[i] = std::min(base_[i], low[i] - search.reach);
-        top_[i] = std::max(top_[i], high[i] + search.reach);
-        width += (high[i] - low[i] + 2.0 * search.reach) / dim;
+        base_[i] = std::min(base_[i], low[i]);
+        top_[i] = std::max(top_[i], high[i]);
+        size = std::max(size, high[i] - low[i]);
       }
+      width_ += size;
     }
     if (there.empty())
       return;
-    width /= static_cast<double>(there.size());
+    width_ /= static_cast<double>(there.size());
+    double width = width_;
     for (double all = INFINITY; all > 1000.0 + 8.0 * static_cast<double>(there.size());)
     {
       all = 1.0;
@@ -578,30 +652,12 @@ public:
     {
       for (const std::int64_t facet : there)
       {
-        std::array<std::int64_t, dim> first, last;
-        Vector from = low_[facet], to = high_[facet];
-        for (int i = 0; i < dim; ++i)
-        {
-          from[i] -= search.reach;
-          to[i] += search.reach;
-        }
-        first = tile(from.data());
-        last = tile(to.data());
-        auto at = first;
-        for (bool more = true; more;)
-        {
-          const std::size_t number = number_of(at);
+        for_each({tile(low_[facet].data()), tile(high_[facet].data())}, [&](std::size_t number) {
           if (round == 0)
             ++begin_[number + 1];
           else
             facets_[next_[number]++] = facet;
-          more = false;
-          for (int i = 0; i < dim && !more; ++i)
-          {
-            more = at[i] < last[i];
-            at[i] = more ? at[i] + 1 : first[i];
-          }
-        }
+        });
       }
       if (round == 0)
       {
@@ -613,15 +669,42 @@ public:
     }
   }
 
-  // The facets that may be within reach of a point.
-  std::pair<const std::int64_t*, const std::int64_t*> at(const double* x) const
+  using Tile = std::array<std::int64_t, dim>;
+  using Range = std::pair<Tile, Tile>; // the first and the last, both within
+
+  // The tiles within some distance of a point.
+  Range around(const double* x, double distance) const
   {
+    Vector low, high;
     for (int i = 0; i < dim; ++i)
-      if (begin_.empty() || !(x[i] >= base_[i] && x[i] <= top_[i]))
-        return {nullptr, nullptr};
-    const std::size_t number = number_of(tile(x));
-    return {facets_.data() + begin_[number], facets_.data() + begin_[number + 1]};
+    {
+      low[i] = x[i] - distance;
+      high[i] = x[i] + distance;
+    }
+    return {tile(low.data()), tile(high.data())};
   }
+
+  // Whether a facet may be within some distance of a point.
+  bool reaches(const double* x, double distance) const
+  {
+    bool within = !begin_.empty();
+    for (int i = 0; i < dim; ++i)
+      within = within && x[i] >= base_[i] - distance && x[i] <= top_[i] + distance;
+    return within;
+  }
+
+  // Call f(facet) for the facets of some tiles, for those in several of them several times.
+  template <typename F>
+  void facets(const Range& range, F&& f) const
+  {
+    for_each(range, [&](std::size_t number) {
+      for (std::size_t k = begin_[number]; k < begin_[number + 1]; ++k)
+        f(facets_[k]);
+    });
+  }
+
+  // The mean size of a facet.
+  double size() const { return width_; }
 
   // How far a point is from the box of a facet.
   double away(const double* x, std::int64_t facet) const
@@ -635,23 +718,56 @@ public:
     return std::sqrt(sum);
   }
 
+  // Whether the cosine of a normal and that of a facet is above a negative bound anywhere on it, for
+  // sure: a facet's normal is a mean of those at its corners, and no shorter than the least of their
+  // parts along the one in the middle.
+  bool turned_away(std::int64_t facet, const double* n, double bound) const
+  {
+    for (const Vector& corner : at_corners_[facet])
+    {
+      double sum = 0.0;
+      for (int i = 0; i < dim; ++i)
+        sum += corner[i] * n[i];
+      if (!(sum > bound + 1e-9))
+        return false;
+    }
+    return true;
+  }
+
   // The normal in the middle of a facet.
   const Vector& normal(std::int64_t facet) const { return normal_[facet]; }
 
 private:
-  std::array<std::int64_t, dim> tile(const double* x) const
+  template <typename F>
+  void for_each(const Range& range, F&& f) const
   {
-    std::array<std::int64_t, dim> at;
+    Tile at = range.first;
+    for (bool more = true; more;)
+    {
+      f(number_of(at));
+      more = false;
+      for (int i = 0; i < dim && !more; ++i)
+      {
+        more = at[i] < range.second[i];
+        at[i] = more ? at[i] + 1 : range.first[i];
+      }
+    }
+  }
+
+  Tile tile(const double* x) const
+  {
+    Tile at;
     for (int i = 0; i < dim; ++i)
     {
       const double share = (x[i] - base_[i]) / std::max(top_[i] - base_[i], 1e-300);
-      const auto place = static_cast<std::int64_t>(share * static_cast<double>(count_[i]));
-      at[i] = std::min(std::max(place, std::int64_t{0}), count_[i] - 1);
+      const auto count = static_cast<double>(count_[i]);
+      const double place = std::min(std::max(share * count, 0.0), count - 1.0);
+      at[i] = static_cast<std::int64_t>(place);
     }
     return at;
   }
 
-  std::size_t number_of(const std::array<std::int64_t, dim>& at) const
+  std::size_t number_of(const Tile& at) const
   {
     std::size_t number = 0;
     for (int i = 0; i < dim; ++i)
@@ -660,7 +776,9 @@ private:
   }
 
   std::vector<Vector> low_, high_, normal_;
+  std::vector<std::array<Vector, dim == 2 ? 1 : 4>> at_corners_; // see turned_away
   Vector base_, top_;
+  double width_ = 0.0;
   std::array<std::int64_t, dim> count_{};
   std::vector<std::size_t> begin_, next_;
   std::vector<std::int64_t> facets_;
@@ -687,13 +805,8 @@ bool find_closest_in(const core::Search& search, const core::Found& found)
   const Tiles<dim> tiles(search);
   std::vector<std::pair<double, std::int64_t>> some;
   bool good = true;
-  for (std::size_t p = 0; p < search.points; ++p)
-  {
-    found.facet[p] = -1;
-    found.gap[p] = INFINITY;
-    found.near[p] = 0;
-    found.beside[p] = 0.0;
-    std::fill_n(found.place + p * sides, sides, 0.0);
+  const auto look = [&](std::size_t p, const typename Tiles<dim>::Range& range, double& least,
+                        double& nearest) {
     const double* x = search.x + p * dim;
     const auto cosine = [&](const std::array<double, dim>& n) {
       double sum = 0.0;
@@ -702,21 +815,21 @@ bool find_closest_in(const core::Search& search, const core::Found& found)
       return sum;
     };
     // No facet is nearer than its box; one that faces the point is not farther than its nodes.
-    const auto [first, last] = tiles.at(x);
     some.clear();
     double most = INFINITY;
-    for (const std::int64_t* facet = first; facet != last; ++facet)
-    {
-      const double away = tiles.away(x, *facet);
-      if (!(away <= search.reach && away <= most))
-        continue;
-      const double turned = search.normal ? cosine(tiles.normal(*facet)) : -1.0;
+    tiles.facets(range, [&](std::int64_t facet) {
+      const double turned = search.normal ? cosine(tiles.normal(facet)) : -1.0;
       if (!(turned < search.may))
-        continue;
-      some.emplace_back(away, *facet);
+        return;
+      const double away = tiles.away(x, facet);
+      if (!(away <= search.reach && away <= most))
+        return;
+      if (search.normal && tiles.turned_away(facet, search.normal + p * dim, search.facing))
+        return;
+      some.emplace_back(away, facet);
       if (turned < search.sure)
       {
-        const double* corners = search.corners + *facet * search.nodes * dim;
+        const double* corners = search.corners + facet * search.nodes * dim;
         for (int k = 0; k < search.nodes; ++k)
         {
           double sum = 0.0;
@@ -725,13 +838,17 @@ bool find_closest_in(const core::Search& search, const core::Found& found)
           most = std::min(most, std::sqrt(sum) * (1.0 + 1e-9));
         }
       }
-    }
+    });
     std::sort(some.begin(), some.end());
-    double least = INFINITY, nearest = INFINITY;
+    std::int64_t before = -1;
     for (const auto& [away, facet] : some)
     {
       if (away > std::min(most, nearest + 1e-9 * search.reach))
         break;
+      // (one that is in several tiles comes up several times)
+      if (facet == found.facet[p] || facet == before)
+        continue;
+      before = facet;
       const double* corners = search.corners + facet * search.nodes * dim;
       std::array<double, sides> s;
       good = project<dim>(search, x, corners, s) && good;
@@ -769,6 +886,37 @@ bool find_closest_in(const core::Search& search, const core::Found& found)
       found.near[p] = !off;
       found.beside[p] = over / size;
     }
+  };
+  for (std::size_t p = 0; p < search.points; ++p)
+  {
+    found.facet[p] = -1;
+    found.gap[p] = INFINITY;
+    found.near[p] = 0;
+    found.beside[p] = 0.0;
+    std::fill_n(found.place + p * sides, sides, 0.0);
+    const double* x = search.x + p * dim;
+    if (!tiles.reaches(x, search.reach))
+      continue;
+    double least = INFINITY, nearest = INFINITY;
+    auto range = tiles.around(x, 0.0);
+    for (double within = 0.0;;)
+    {
+      look(p, range, least, nearest);
+      // farther, as far as one may be that is nearer than what has been found
+      typename Tiles<dim>::Range wider = range;
+      bool found_all = false;
+      while (!found_all && wider == range)
+      {
+        const bool seen = nearest < INFINITY;
+        const double needed = seen ? nearest + 1e-9 * search.reach : 2.0 * within + tiles.size();
+        found_all = within >= std::min(seen ? needed : INFINITY, search.reach);
+        within = std::min(needed, search.reach);
+        wider = tiles.around(x, within);
+      }
+      if (found_all)
+        break;
+      range = wider;
+    }
   }
   return good;
 }
@@ -781,27 +929,39 @@ HOT_LOOP bool core::find_closest(const Search& search, int dim, const Found& fou
 
 HOT_LOOP void core::act(const Meeting& meeting, int dim, const Met& result)
 {
-  if (dim == 2)
-    act_in<2>(meeting, result);
+  if (dim == 2 && meeting.nodes == 2)
+    act_in<2, 0>(meeting, result);
+  else if (dim == 2)
+    act_in<2, 1>(meeting, result);
+  else if (meeting.nodes == 3)
+    act_in<3, 0>(meeting, result);
+  else if (meeting.nodes == 4)
+    act_in<3, 1>(meeting, result);
   else
-    act_in<3>(meeting, result);
+    act_in<3, 3>(meeting, result);
 }
 
-HOT_LOOP void core::differentiate(const Meeting& meeting, int dim, double* derivatives)
+HOT_LOOP void core::add_tangents(const Meeting& meeting, int dim, const Sums& sums)
 {
-  if (dim == 2)
-    differentiate_in<2>(meeting, derivatives);
+  if (dim == 2 && meeting.nodes == 2)
+    add_tangents_in<2, 0>(meeting, sums);
+  else if (dim == 2)
+    add_tangents_in<2, 1>(meeting, sums);
+  else if (meeting.nodes == 3)
+    add_tangents_in<3, 0>(meeting, sums);
+  else if (meeting.nodes == 4)
+    add_tangents_in<3, 1>(meeting, sums);
   else
-    differentiate_in<3>(meeting, derivatives);
+    add_tangents_in<3, 3>(meeting, sums);
 }
 
-HOT_LOOP void core::add_blocks(std::size_t points, int dim, int places, int count,
-                               const double* derivatives, const double* weights,
-                               const std::int64_t* number, const Side& rows, const Side& columns,
-                               double* blocks)
+HOT_LOOP void core::add_derivatives(std::size_t points, int dim, int nodes, int count,
+                                    const double* derivatives, const Sums& sums)
 {
-  if (dim == 2)
-    add_blocks_in<2>(points, places, count, derivatives, weights, number, rows, columns, blocks);
-  else
-    add_blocks_in<3>(points, places, count, derivatives, weights, number, rows, columns, blocks);
+  const std::size_t size = static_cast<std::size_t>((1 + nodes) * dim * count * dim);
+  for (std::size_t p = 0; p < points; ++p)
+    if (dim == 2)
+      add_at<2>(sums, p, nodes, count, derivatives + p * size);
+    else
+      add_at<3>(sums, p, nodes, count, derivatives + p * size);
 }

@@ -35,21 +35,23 @@ struct Met
 // Set what acts on points and nodes. The oracle is mpm_dolfinx.contact.stencil.acting.
 void act(const Meeting& meeting, int dim, const Met& result);
 
-// Set its derivatives, (points, 1 + nodes, dim, count, dim).
-void differentiate(const Meeting& meeting, int dim, double* derivatives);
-
-// A side of blocks: places of a stencil, from `first` on, or the point itself, which is spread over
-// `nodes` of its facet by shape functions (points, nodes).
-struct Side
+// Where derivatives at points add up: in blocks between nodes, those of the point's own facet, over
+// which it is spread, then those of its stencil.
+struct Sums
 {
-  int first, nodes;
-  const double* shapes; // or null
+  int sources;                     // nodes of a point's own facet
+  const double *weights, *shapes;  // (points,), (points, sources)
+  const std::int64_t* group;       // (points,), which has the positions
+  const std::int32_t* positions;   // (groups, sources + nodes, sources + count - 1)
+  double* values;                  // (blocks, dim, dim)
 };
 
-// Add derivatives (points, places, dim, count, dim), times weights, to blocks by their numbers.
-void add_blocks(std::size_t points, int dim, int places, int count, const double* derivatives,
-                const double* weights, const std::int64_t* number, const Side& rows,
-                const Side& columns, double* blocks);
+// Add the derivatives of what acts. The oracle is mpm_dolfinx.contact.stencil.by_complex_step.
+void add_tangents(const Meeting& meeting, int dim, const Sums& sums);
+
+// Add derivatives (points, 1 + nodes, dim, count, dim).
+void add_derivatives(std::size_t points, int dim, int nodes, int count, const double* derivatives,
+                     const Sums& sums);
 
 // Points and flat or bilinear facets, lines, triangles or quadrilaterals by the number of nodes.
 struct Search

@@ -94,6 +94,31 @@ Meeting meeting_of(const Reals& x, const std::vector<Reals>& tables,
           smooth};
 }
 
+// Where derivatives at points add up.
+Sums sums_of(std::size_t points, int dim, int nodes, int count, const Reals& weights,
+             const Reals& shapes, const Offsets& group, const Indices& positions,
+             const RealsOut& values)
+{
+  require(weights.size() == points && group.size() == points && shapes.ndim() == 2
+              && shapes.shape(0) == points,
+          "weights, shape functions and groups of points");
+  const auto sources = static_cast<int>(shapes.shape(1));
+  require(positions.ndim() == 3
+              && positions.shape(1) == static_cast<std::size_t>(sources + nodes)
+              && positions.shape(2) == static_cast<std::size_t>(sources + count - 1),
+          "positions (groups, rows, columns)");
+  for (std::size_t p = 0; p < points; ++p)
+    require(group.data()[p] >= 0
+                && group.data()[p] < static_cast<std::int64_t>(positions.shape(0)),
+            "numbers of groups");
+  const std::size_t blocks = values.size() / static_cast<std::size_t>(dim * dim);
+  for (std::size_t k = 0; k < positions.size(); ++k)
+    require(positions.data()[k] >= 0
+                && static_cast<std::size_t>(positions.data()[k]) < blocks,
+            "positions of blocks");
+  return {sources, weights.data(), shapes.data(), group.data(), positions.data(), values.data()};
+}
+
 Dofmap dofmap_of(const Indices& dofmap)
 {
   require(dofmap.ndim() == 2, "dofmap (n, k)");
@@ -584,48 +609,36 @@ NB_MODULE(_loops, m)
         "inside"_a.noconvert(), "slips"_a.noconvert(),
         "Set what acts between points and facets.");
 
-  m.def("differentiate",
+  m.def("add_tangents",
         [](Reals x, const std::vector<Reals>& tables, const std::vector<Reals>& points,
            Array<const std::uint8_t> touched, const std::vector<double>& law, bool smooth,
-           RealsOut derivatives) {
+           Reals weights, Reals shapes, Offsets group, Indices positions, RealsOut values) {
     const Meeting meeting = meeting_of(x, tables, points, touched, law, smooth);
-    const std::size_t n = meeting.points, dim = x.shape(2);
-    require(derivatives.size() == n * (1 + meeting.nodes) * dim * meeting.count * dim,
-            "derivatives (n, 1 + nodes, dim, count, dim)");
-    differentiate(meeting, static_cast<int>(dim), derivatives.data());
+    const auto dim = static_cast<int>(x.shape(2));
+    add_tangents(meeting, dim,
+                 sums_of(meeting.points, dim, meeting.nodes, meeting.count, weights, shapes, group,
+                         positions, values));
   },
-        "x"_a, "tables"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a,
-        "derivatives"_a.noconvert(), "Set the derivatives of what acts between points and facets.");
+        "x"_a, "tables"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a, "weights"_a, "shapes"_a,
+        "group"_a, "positions"_a, "values"_a.noconvert(),
+        "Add the derivatives of what acts between points and facets to blocks between nodes.");
 
-  m.def("add_blocks",
-        [](Reals derivatives, Reals weights, Offsets number, int first_row, Reals row_shapes,
-           int first_column, Reals column_shapes, RealsOut blocks) {
-    require(derivatives.ndim() == 5, "derivatives (n, places, dim, count, dim)");
-    const std::size_t n = derivatives.shape(0), dim = derivatives.shape(2);
-    const auto places = static_cast<int>(derivatives.shape(1));
+  m.def("add_derivatives",
+        [](Reals derivatives, Reals weights, Reals shapes, Offsets group, Indices positions,
+           RealsOut values) {
+    require(derivatives.ndim() == 5, "derivatives (n, 1 + nodes, dim, count, dim)");
+    const auto dim = static_cast<int>(derivatives.shape(2));
+    require((dim == 2 || dim == 3) && derivatives.shape(4) == derivatives.shape(2),
+            "two or three dimensions");
+    const std::size_t n = derivatives.shape(0);
+    const auto nodes = static_cast<int>(derivatives.shape(1)) - 1;
     const auto count = static_cast<int>(derivatives.shape(3));
-    require((dim == 2 || dim == 3) && derivatives.shape(4) == dim, "two or three dimensions");
-    require(weights.size() == n && number.size() == n, "weights and numbers (n,)");
-    require(blocks.ndim() == 3 && blocks.shape(1) % dim == 0 && blocks.shape(2) % dim == 0,
-            "blocks (m, rows, columns)");
-    const auto side = [&](int first, const Reals& shapes, std::size_t size, int most) {
-      const auto nodes = static_cast<int>(size / dim);
-      const bool own = shapes.size() > 0;
-      require(!own || shapes.size() == n * nodes, "shape functions (n, nodes)");
-      require(first >= 0 && first + (own ? 1 : nodes) <= most, "places of a stencil");
-      return Side{first, nodes, own ? shapes.data() : nullptr};
-    };
-    const Side rows = side(first_row, row_shapes, blocks.shape(1), places);
-    const Side columns = side(first_column, column_shapes, blocks.shape(2), count);
-    for (std::size_t p = 0; p < n; ++p)
-      require(number.data()[p] >= 0
-                  && number.data()[p] < static_cast<std::int64_t>(blocks.shape(0)),
-              "numbers of blocks");
-    add_blocks(n, static_cast<int>(dim), places, count, derivatives.data(), weights.data(),
-               number.data(), rows, columns, blocks.data());
+    add_derivatives(
+        n, dim, nodes, count, derivatives.data(),
+        sums_of(n, dim, nodes, count, weights, shapes, group, positions, values));
   },
-        "derivatives"_a, "weights"_a, "number"_a, "first_row"_a, "row_shapes"_a, "first_column"_a,
-        "column_shapes"_a, "blocks"_a.noconvert(), "Add derivatives at points to blocks.");
+        "derivatives"_a, "weights"_a, "shapes"_a, "group"_a, "positions"_a,
+        "values"_a.noconvert(), "Add derivatives at points to blocks between nodes.");
 
   m.def("find_closest",
         [](Reals x, Reals normal, Reals corners, Reals outward, Array<const std::uint8_t> present,

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..errors import MPMError
 from ..particles.particles import Particles
 from .law import Coulomb
+from .memory import Near
 from .rigid import Rigid
 from .rotation import Pose, cayley_variation, crossing
 from .shapes import Shape
@@ -90,7 +91,8 @@ class BodyContact(Rigid):
                 "by which its forces balance."
             )
         self._place = place
-        self._seen: tuple[float, NDArray[np.float64]] | None = None
+        self._change: float | None = None
+        self._seen: list[tuple[NDArray[np.int64], NDArray[np.float64]]] | None = None
 
     @property
     def _key(self) -> str:
@@ -111,39 +113,40 @@ class BodyContact(Rigid):
         self._surface.look_at_deleted()
         self._new_pattern()
         self._look_near()
-        self._seen = None
+        self._change = self._seen = None
         return ()
 
     def look(self) -> None:
         """Look where the body is now, for all places in which the shape is tried."""
-        self._seen = None
+        self._change, self._seen = None, []
         if self._near is not None:
-            near = self._near
-            self._seen = super()._largest_change(near), self._surface.positions(which=near.which)
+            self._change = super()._largest_change(self._near)
 
-    def _largest_change(self, near: Any) -> float:
+    def _largest_change(self, near: Near) -> float:
         """See :class:`Rigid`."""
-        return super()._largest_change(near) if self._seen is None else self._seen[0]
+        return super()._largest_change(near) if self._change is None else self._change
 
     def _positions(self, which: NDArray[np.int64] | None) -> NDArray[np.float64]:
         """See :class:`Rigid`."""
-        near, seen = self._near, self._seen
-        if seen is None or near is None or which is not near.which:
+        if which is None or self._seen is None:
             return super()._positions(which)
-        return seen[1]
+        for known, positions in self._seen:
+            if known is which:
+                return positions
+        self._seen.append((which, super()._positions(which)))
+        return self._seen[-1][1]
 
-    def put(self, pose: Pose, whole: bool = False) -> None:
+    def put(self, pose: Pose) -> None:
         """Evaluate what acts with the shape in some place.
 
         Args:
             pose: The place.
-            whole: Whether gaps are asked for that are too wide to matter.
 
         Raises:
             MPMError: That cannot be.
         """
         self._pose = self._aim = pose
-        self._trial = self._evaluated(whole)
+        self._trial = self._evaluated()
 
     @property
     def extent(self) -> float:
@@ -170,10 +173,11 @@ class BodyContact(Rigid):
             Force, moment about the centre, size and round-off of the force, ``(gdim + nr + 2,)``.
         """
         assert self._trial is not None
-        outcome = self._trial.outcome
-        which = np.flatnonzero(outcome.traction.any(axis=(1, 2)))
-        f = self._surface.weights[which, :, None] * outcome.traction[which]
-        arm = self._arms(which, centres)
+        trial, traction = self._trial, self._trial.outcome.traction
+        here = np.flatnonzero(traction.any(axis=(1, 2)))
+        which = trial.numbers(here)
+        f = self._surface.weights[which, :, None] * traction[here]
+        arm = self._arms(here, centres)
         moments = np.einsum("mqij,mqi->j", crossing(arm), f)
         size = np.linalg.norm(f, axis=2).sum()
         k = (self._penalty + self._tangential) * self._stiffness[which]
@@ -182,14 +186,19 @@ class BodyContact(Rigid):
         return np.concatenate([f.sum(axis=(0, 1)), moments, [size, round_off]])
 
     def _arms(
-        self, which: NDArray[np.int64], centres: tuple[NDArray[np.float64], ...]
+        self, here: NDArray[np.int64], centres: tuple[NDArray[np.float64], ...]
     ) -> NDArray[np.float64]:
-        """Return arms from the centre, those of the middle where forces are of whole steps."""
-        assert self._memory is not None and self._trial is not None
-        after = self._trial.outcome.positions[which]
+        """Return arms from the centre, those of the middle where forces are of whole steps.
+
+        Args:
+            here: Places of facets among those that were looked at.
+            centres: As for :meth:`total`.
+        """
+        assert self._trial is not None
+        after = self._trial.outcome.positions[here]
         if not self._of_step:
             return after - centres[1]
-        before = self._memory.outcome.positions[which]
+        before = self._known(self._trial).outcome.positions[here]
         return np.asarray(0.5 * (before - centres[0] + after - centres[1]))
 
     def works(self, motion: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Any:
@@ -198,25 +207,27 @@ class BodyContact(Rigid):
         Args:
             motion: Returns the motions of the rigid body at arms of the middle.
         """
-        assert self._trial is not None and self._memory is not None
-        surface, trial = self._surface, self._trial
+        assert self._trial is not None
+        trial = self._trial
         if trial.step is None:
             return np.zeros(2)
-        f = surface.weights[:, :, None] * trial.outcome.traction
-        change = trial.outcome.positions - self._memory.outcome.positions
-        Q = self._rotation(trial, self._memory)
+        memory, w = self._known(trial), self._weights(trial)[:, :, None]
+        f = w * trial.outcome.traction
+        change = trial.outcome.positions - memory.outcome.positions
+        Q = self._rotation(trial, memory)
         step = trial.step
         normal = (step.pressure[:, None] * step.gradient) @ Q.T
         shear = trial.outcome.traction - normal.reshape(f.shape)
-        slid = change - motion(0.5 * change + self._memory.outcome.positions)
-        taken = -float((surface.weights[:, :, None] * shear * slid).sum())
+        slid = change - motion(0.5 * change + memory.outcome.positions)
+        taken = -float((w * shear * slid).sum())
         return np.array([-float((f * change).sum()) - taken, taken])
 
-    def least(self) -> float:
-        """Return the least gap of this rank's points, as they were evaluated last."""
-        assert self._trial is not None
-        trial = self._exact(self._trial) if self.shape.costly else self._trial
-        return float(trial.gap[self._surface.weights > 0.0].min(initial=np.inf))
+    def least(self, pose: Pose) -> float:
+        """Return the least gap of this rank's points with the shape in some place."""
+        surface = self._surface
+        borne = np.flatnonzero((surface.weights > 0.0).any(axis=1))
+        x = surface.positions(which=borne)[surface.weights[borne] > 0.0]
+        return float(self._measured(self._framed(x, pose))[0].min(initial=np.inf))
 
     def energy(self) -> float:
         """Return this rank's energy of penetration at the last converged step."""
@@ -228,20 +239,22 @@ class BodyContact(Rigid):
 
     def acting(self) -> ActingPoints:
         """Return what there is at the points that touch."""
-        trial, memory, surface = self._trial, self._memory, self._surface
-        assert trial is not None and memory is not None
-        which, inside, flat = self._acting(trial, memory)
+        assert self._trial is not None
+        trial, surface = self._trial, self._surface
+        memory = self._known(trial)
+        here, inside, flat = self._acting(trial, memory)
+        which = trial.numbers(here)
         slopes = np.zeros((len(which), surface.nq, surface.gdim, surface.gdim))
         if len(flat):
             slopes[inside] = self._derivative_within(trial, memory, flat)
-        force = trial.outcome.traction[which]
+        force = trial.outcome.traction[here]
         return ActingPoints(
             which,
             global_dofs(self.bodies[0].W, surface.nodes[which]),
             surface.shapes,
             surface.weights[which],
-            memory.outcome.positions[which],
-            trial.outcome.positions[which],
+            memory.outcome.positions[here],
+            trial.outcome.positions[here],
             force,
             np.linalg.solve(self._rotation(trial, memory), force[..., None])[..., 0],
             slopes,

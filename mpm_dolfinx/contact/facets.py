@@ -61,7 +61,7 @@ class NearFacets:
         number: A number of each facet that this rank owns, the same on any ranks, shape ``(m,)``.
         points: This rank's points as they are, shape ``(n, gdim)``.
         around: How near a facet must be.
-        nodes: Positions of this rank's nodes of the surface's W as they are, shape ``(N, gdim)``.
+        nodes: Positions of the surface's own nodes as they are, shape ``(N, gdim)``.
 
     Attributes:
         number: Numbers of the facets that this rank knows, sorted.
@@ -86,7 +86,7 @@ class NearFacets:
         low = np.append(points, empty, axis=0).min(axis=0) - around
         high = np.append(points, -empty, axis=0).max(axis=0) + around
         boxes = np.array(self._comm.allgather([low, high]))
-        x = nodes[surface.nodes]
+        x = nodes[surface.own]
         lower, upper = x.min(axis=1, initial=np.inf), x.max(axis=1, initial=-np.inf)
         self._given = [
             np.flatnonzero((upper >= box[0]).all(axis=1) & (lower <= box[1]).all(axis=1))
@@ -107,9 +107,9 @@ class NearFacets:
         """Return the nodes of the facets, shape ``(f, k, gdim)`` (collective).
 
         Args:
-            x: Positions of this rank's nodes of the surface's W, shape ``(N, gdim)``.
+            x: Positions of the surface's own nodes, shape ``(N, gdim)``.
         """
-        mine = x[self._surface.nodes]
+        mine = x[self._surface.own]
         parts = swap(self._comm, [mine[which] for which in self._given])
         return np.concatenate(parts)[self._order]
 

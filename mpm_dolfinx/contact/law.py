@@ -231,12 +231,16 @@ def traction(
     none = np.zeros(len(p), dtype=bool)
     if law.smooth:
         return Traction(p, np.zeros_like(n), inside, none)
-    shear = np.where(inside[:, None], _trial(points, delta, gap, n, touch), 0.0)
-    size = np.sqrt((shear * shear).sum(axis=1))
-    bound, _ = law.bound(p, points.stretch)
-    slips = inside & (size.real > bound.real + points.tangential * touch)
-    factor = np.where(slips, bound / np.where(slips, size, 1.0), 1.0)
-    return Traction(p, factor[:, None] * shear, inside, slips)
+    which = np.flatnonzero(inside)
+    some = points.of(which)
+    tried = _trial(some, delta[which], gap[which], n[which], touch)
+    size = np.sqrt((tried * tried).sum(axis=1))
+    bound, _ = law.bound(p[which], some.stretch)
+    slipping = size.real > bound.real + some.tangential * touch
+    factor = np.where(slipping, bound / np.where(slipping, size, 1.0), 1.0)
+    shear, slips = np.zeros(n.shape, dtype=np.result_type(tried, factor)), none
+    shear[which], slips[which] = factor[:, None] * tried, slipping
+    return Traction(p, shear, inside, slips)
 
 
 def derivative(

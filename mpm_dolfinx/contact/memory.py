@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,7 @@ class Memory:
         step: The step of a motion, at all points, by whose middle the forces are.
         behind: Tractions by the stress behind the facets, where these count, ``(m, nq, gdim)``.
         pressed: Which points that stress presses, or is about to, where it counts, ``(m, nq)``.
-        whole: Whether all facets were looked at, not those alone that may touch.
+        facets: Numbers of the facets that were looked at, as nothing acts on others; ``None``: all.
         exact: Whether all gaps are known, and not only what some are at least.
     """
 
@@ -67,8 +67,12 @@ class Memory:
     step: Step | None = None
     behind: NDArray[np.float64] | None = None
     pressed: NDArray[np.bool_] | None = None
-    whole: bool = True
+    facets: NDArray[np.int64] | None = None
     exact: bool = True
+
+    def numbers(self, here: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the numbers of facets by their places among those that were looked at."""
+        return here if self.facets is None else self.facets[here]
 
     def of(self, which: NDArray[np.int64]) -> Memory:
         """Return what is known of some facets."""
@@ -80,43 +84,7 @@ class Memory:
             self.gap[which],
             self.normal[which],
             outcome,
-        )
-
-    def among(self, which: NDArray[np.int64], last: Memory) -> Memory:
-        """Return it as what acts on some facets, with nothing that acts on the others.
-
-        Args:
-            which: Their numbers.
-            last: What is known of all of them.
-        """
-        m, nq = last.gap.shape
-
-        def spread(values: Any, base: Any) -> Any:
-            """Return values in their places, and others elsewhere."""
-            found = np.zeros((m, *values.shape[1:]), values.dtype) if base is None else base.copy()
-            found[which] = values
-            return found
-
-        mine, its = self.outcome, last.outcome
-        outcome = Outcome(
-            spread(mine.positions, its.positions),
-            spread(mine.gap, last.gap),
-            *(spread(v, None) for v in (mine.pressure, mine.traction, mine.inside, mine.slips)),
-        )
-        step = self.step
-        if step is not None:
-            parts = (part.reshape(len(which), nq, *part.shape[1:]) for part in step)
-            step = Step(*(spread(p, None).reshape(m * nq, *p.shape[2:]) for p in parts))
-        return Memory(
-            self.pose,
-            outcome.inside,
-            spread(self.anchor, last.anchor),
-            outcome.gap,
-            spread(self.normal, last.normal),
-            outcome,
-            self.works,
-            step,
-            whole=False,
+            facets=which,
         )
 
 
@@ -124,14 +92,12 @@ class Near(NamedTuple):
     """Facets that may touch in a step.
 
     Attributes:
-        which: Their numbers.
         memory: What is known of them.
         nodes: Where the nodes of all facets begin.
         radius: How much gaps change at most, by the angle that the shape turns by.
         margin: How far points may come nearer until others could touch.
     """
 
-    which: NDArray[np.int64]
     memory: Memory
     nodes: NDArray[np.float64]
     radius: float

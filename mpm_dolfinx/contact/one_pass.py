@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import fields, replace
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -19,8 +19,9 @@ from .. import _compat
 from .contact import Outcome
 from .facets import Closest, NearFacets, separated
 from .law import Coulomb, Points
-from .stencil import Foot, Start, Stencil, acting_now, added_blocks, derivatives, projected
-from .surface import Blocks, Surface, global_dofs
+from .pair_matrices import Met
+from .stencil import Foot, Start, Stencil, Sums, acting_now, add_tangents, projected
+from .surface import Surface, global_nodes
 
 __all__ = ["Memory", "Pass"]
 
@@ -63,9 +64,16 @@ class Memory(NamedTuple):
     points: NDArray[np.float64]
     anchors: NDArray[np.float64]
 
+    def of(self, points: NDArray[np.int64]) -> Memory:
+        """Return what is known of some points."""
+        parts: list[Any] = [part[points] for part in self]
+        return Memory(*parts)
+
 
 class Pass:
     """Points of one body against facets of another.
+
+    In a step it looks at those points alone that may come near to a facet.
 
     Args:
         source: The points.
@@ -76,6 +84,9 @@ class Pass:
     Attributes:
         share: Share of what both passes bear.
         of_step: Whether forces are those of whole steps of a motion.
+        memory: What is known of all points.
+        outcome: What acted on all points at the last converged step.
+        learned: How often it has learned of other facets.
         works: This rank's work against pressure and against friction in such a step.
     """
 
@@ -94,7 +105,9 @@ class Pass:
         self.stencil: Stencil | None = None
         self.of_step = False
         self.works = (0.0, 0.0)
+        self.learned = 0
         self._near: NearFacets | None = None
+        self._known: tuple[Memory, Memory] | None = None
 
     def settle(
         self, source: NDArray[np.float64], target: NDArray[np.float64], share: float
@@ -111,7 +124,7 @@ class Pass:
         self.law = replace(law, cohesion=share * law.cohesion, limit=share * law.limit)
         facing = float(np.median(np.concatenate(self._comm.allgather(target))))
         k = share / (1.0 / source + 1.0 / facing) if len(source) else source
-        self._stiffness = np.repeat(k, self.source.nq)
+        self._stiffness = k
         self.reach = REACH * max(
             float(np.median(np.concatenate(self._comm.allgather(surface.sizes))))
             for surface in (self.source, self.target)
@@ -130,67 +143,119 @@ class Pass:
 
     # -- A step ---------------------------------------------------------------------------------
 
-    def begin(self, converged: bool = True) -> None:
+    def begin(self) -> None:
         """Learn of the facets near the points as they are (collective)."""
-        self._learn(
-            self._flat(self.source.positions(converged)), self.target.node_positions(converged)
-        )
+        self._learn(self.source.own_nodes(converged=True), self.target.own_nodes(converged=True))
         self._paired: Closest | None = None
         self.stencil = None
         self.count = 0
 
-    def _learn(self, x: NDArray[np.float64], nodes: NDArray[np.float64]) -> NearFacets:
-        """Learn of the facets near points, for bodies at some positions (collective)."""
-        near = NearFacets(self.target, self._number, x, 3.0 * self.reach, nodes)
-        self._before = near.positions(self.target.node_positions(converged=True))
-        self._start = x, nodes
-        self._near = near
+    def _learn(self, mine: NDArray[np.float64], nodes: NDArray[np.float64]) -> NearFacets:
+        """Learn of the facets near points, and of the points near these (collective).
+
+        Args:
+            mine: Positions of the own nodes of the points' surface.
+            nodes: Those of the facets'.
+        """
+        source = self.source
+        x = source.shapes @ mine[source.own]
+        near = NearFacets(self.target, self._number, self._flat(x), 3.0 * self.reach, nodes)
+        corners = near.positions(nodes)
+        self._before = near.positions(self.target.own_nodes(converged=True))
+        # (until it learns anew, no point gets nearer to a facet by more than the reach)
+        low = corners.min(axis=(0, 1), initial=np.inf) - 2.0 * self.reach
+        high = corners.max(axis=(0, 1), initial=-np.inf) + 2.0 * self.reach
+        within = ((x >= low) & (x <= high)).all(axis=2).any(axis=1)
+        if self.memory is not None:
+            within |= (self.memory.facet >= 0).reshape(within.shape[0], -1).any(axis=1)
+        self._facets = np.flatnonzero(within)
+        points = self._facets[:, None] * source.nq + np.arange(source.nq)
+        self._which, self._known = points.ravel(), None
+        self._stretch: NDArray[np.float64] | None = None
+        self._weights = source.weights[self._facets].ravel()
+        self._start, self._near = (mine, nodes), near
+        self.learned += 1
         return near
 
-    def _follow(self, x: NDArray[np.float64], nodes: NDArray[np.float64]) -> None:
+    def _follow(self, mine: NDArray[np.float64], nodes: NDArray[np.float64]) -> None:
         """Learn of other facets where bodies have gone far since (collective)."""
         moved = [
-            np.linalg.norm(a - b, axis=1).max(initial=0.0)
-            for a, b in zip((x, nodes), self._start, strict=True)
+            surface.spread * np.sqrt(((a - b) ** 2).sum(axis=1).max(initial=0.0))
+            for surface, a, b in zip(
+                (self.source, self.target), (mine, nodes), self._start, strict=True
+            )
         ]
-        if self._comm.allreduce(sum(moved), MPI.MAX) <= self.reach:
+        if self._comm.allreduce(float(sum(moved)), MPI.MAX) <= self.reach:
             return
-        paired, before = self._paired, self._near
+        paired, before, which = self._paired, self._near, self._which
         assert before is not None
-        near = self._learn(x, nodes)
+        near = self._learn(mine, nodes)
         if paired is not None:
-            place = np.where(paired.facet >= 0, near.find(_numbers(before, paired.facet)), -1)
-            self._paired = paired._replace(facet=place, near=paired.near & (place >= 0))
+            facet = near.find(_numbers(before, paired.facet))
+            paired = paired._replace(facet=facet, near=paired.near & (facet >= 0))
+            whole = _nothing(self._count, self.source.gdim - 1)
+            self._paired = Closest(
+                *(
+                    _spread(part, which, base)[self._which]
+                    for part, base in zip(paired, whole, strict=True)
+                )
+            )
+
+    @property
+    def _count(self) -> int:
+        """Number of all points."""
+        return len(self.source.cells) * self.source.nq
+
+    @property
+    def _last(self) -> Memory:
+        """What is known of the points that it looks at."""
+        assert self.memory is not None
+        if self._known is None or self._known[0] is not self.memory:
+            self._known = self.memory, self.memory.of(self._which)
+        return self._known[1]
 
     def begin_anew(self) -> None:
         """Take the converged positions for those of points that nothing has touched yet."""
+        self.memory = None
         self.begin()
         x = self._flat(self.source.positions(converged=True))
-        assert self._near is not None
-        nodes = self._near.positions(self.target.node_positions(converged=True))
-        found = self._near.closest(x, self._normals(True), nodes, self.reach)
-        self.memory = Memory(
-            np.zeros(len(x), dtype=bool),
-            _numbers(self._near, found.facet),
-            found.place,
-            _numbers(self._near, found.facet),
-            found.gap,
-            found.near & (found.gap <= self.touch),
-            np.zeros(len(x)),
+        near, which = self._near, self._which
+        assert near is not None
+        nodes = near.positions(self.target.own_nodes(converged=True))
+        normals = self._flat(self.source.normals(converged=True, which=self._facets))
+        found = near.closest(x[which], normals, nodes, self.reach)
+        self.memory = self._remembered(
             x,
-            x,
+            Memory(
+                np.zeros(len(which), dtype=bool),
+                _numbers(near, found.facet),
+                found.place,
+                _numbers(near, found.facet),
+                found.gap,
+                found.near & (found.gap <= self.touch),
+                np.zeros(len(which)),
+                x[which],
+                x[which],
+            ),
         )
-        self.outcome = self._nothing(x, np.where(found.near, found.gap, np.inf))
+        m, nq = len(self.source.cells), self.source.nq
+        gap = _spread(np.where(found.near, found.gap, np.inf), which, np.full(len(x), np.inf))
+        place, none, zero = x.reshape(m, nq, -1), np.zeros((m, nq), dtype=bool), np.zeros((m, nq))
+        self.outcome = Outcome(place, gap.reshape(m, nq), zero, np.zeros_like(place), none, none)
 
-    def _normals(self, converged: bool = False) -> NDArray[np.float64]:
-        return self._flat(self.source.normals(converged))
+    def _remembered(self, x: NDArray[np.float64], known: Memory) -> Memory:
+        """Return what is to be remembered of all points.
 
-    def _nothing(self, x: NDArray[np.float64], gap: NDArray[np.float64]) -> Outcome:
-        m, nq, gdim = len(self.source.cells), self.source.nq, self.source.gdim
-        none = np.zeros((m, nq), dtype=bool)
-        place = x.reshape(m, nq, gdim)
-        zero = np.zeros((m, nq))
-        return Outcome(place, gap.reshape(m, nq), zero, np.zeros_like(place), none, none)
+        Args:
+            x: Their positions.
+            known: What there is of those that it looks at.
+        """
+        n = len(x)
+        facet, place, gap, near, beside = _nothing(n, self.source.gdim - 1)
+        whole = Memory(near, facet, place, facet, gap, near, beside, x, x)
+        return Memory(
+            *(_spread(part, self._which, base) for part, base in zip(known, whole, strict=True))
+        )
 
     def overlap(self) -> tuple[NDArray[np.int64], float] | None:
         """Return particles that are deep in the other body at the beginning, and how deep."""
@@ -204,18 +269,20 @@ class Pass:
 
     def look(self) -> None:
         """Learn where facets are now (collective)."""
-        x = self._flat(self.source.positions())
-        node_positions = self.target.node_positions()
-        self._follow(x, node_positions)
+        source, nodes = self.source, self.target.own_nodes()
+        mine = source.own_nodes()
+        self._follow(mine, nodes)
         assert self._near is not None
-        self._x, self._nodes = x, self._near.positions(node_positions)
+        self._x = self._flat(source.shapes @ mine[source.own[self._facets]])
+        self._nodes = self._near.positions(nodes)
 
     def evaluate(self) -> None:
         """Find what acts there."""
         assert self._near is not None
-        near, x, nodes = self._near, self._x, self._nodes
+        near, x, nodes, last = self._near, self._x, self._nodes, self._last
         self.count += 1
-        found = near.closest(x, self._normals_near(x, nodes), nodes, self.reach)
+        normals = self._flat(self.source.normals(which=self._facets))
+        found = near.closest(x, normals, nodes, self.reach)
         if self._paired is not None:
             # A point that slides off an edge goes on to touch until the step's end, or the force
             # would come and go from one iterate to the next.
@@ -223,14 +290,13 @@ class Pass:
             found = found._replace(near=found.near | stays)
         # One that was behind the end of a facet and touched nothing goes on to, until it is behind
         # the facet itself.
-        assert self.memory is not None
-        out = ~self.memory.within & (self.memory.gap < -self.touch)
+        out = ~last.within & (last.gap < -self.touch)
         found = found._replace(near=found.near & ~(out & (found.beside >= LINGER)))
         if self.count > FREEZE and self._paired is not None:
             found = self._frozen(found, x, nodes)
         self._paired = found
         gap = np.where(found.near, found.gap, np.inf)
-        borne = self.source.weights.ravel() > 0.0
+        borne = self._weights > 0.0
         within = found.near & (gap <= self.touch) & borne
         inside = pressed = within
         self._within, self._offset = within, np.zeros(len(x))
@@ -239,7 +305,7 @@ class Pass:
             pressed &= borne
         which = np.flatnonzero(pressed)
         self.stencil = self._stencil(which, found, x, nodes)
-        shape = (len(self.source.cells), self.source.nq)
+        shape = (len(self._facets), self.source.nq)
         force = np.zeros_like(x)
         pressure, slips = np.zeros(len(x)), np.zeros(len(x), dtype=bool)
         pushes, rubs, acts = acting_now(self.law, self.stencil, self.touch, self.target.extent)
@@ -249,10 +315,10 @@ class Pass:
         self.shear = acts.shear
         if self.stencil.start is not None:
             change = self.stencil.x[:, : both.shape[1]] - self.stencil.start.x
-            w = self.source.weights.ravel()[which]
+            w = self._weights[which]
             done = [-float(w @ (part * change).sum(axis=(1, 2))) for part in (pushes, rubs)]
             self.works = done[0], done[1]
-        self.outcome = Outcome(
+        self._trial = Outcome(
             x.reshape(*shape, -1),
             gap.reshape(shape),
             pressure.reshape(shape),
@@ -261,17 +327,10 @@ class Pass:
             slips.reshape(shape),
         )
 
-    def _normals_near(
-        self, x: NDArray[np.float64], nodes: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return normals at the points; zero on facets that are far from all others."""
-        m, nq, gdim = len(self.source.cells), self.source.nq, self.source.gdim
-        low, high = nodes.min(axis=(0, 1), initial=np.inf), nodes.max(axis=(0, 1), initial=-np.inf)
-        within = ((x >= low - self.reach) & (x <= high + self.reach)).all(axis=1)
-        which = np.flatnonzero(within.reshape(m, nq).any(axis=1))
-        found = np.zeros((m, nq, gdim))
-        found[which] = self.source.normals(which=which)
-        return self._flat(found)
+    def touches(self) -> bool:
+        """Return whether any point of this rank touches, or has."""
+        inside = self.stencil is not None and self._trial.inside.any()
+        return bool(inside or (self.memory is not None and self.memory.touched.any()))
 
     def _over_step(
         self,
@@ -284,8 +343,8 @@ class Pass:
 
         Points that leave through their facets give back their energy.
         """
-        near, memory = self._near, self.memory
-        assert near is not None and memory is not None
+        near, memory = self._near, self._last
+        assert near is not None
         lost = np.flatnonzero(memory.within & (found.facet < 0))
         at = near.find(memory.closest[lost])
         lost, at = lost[at >= 0], at[at >= 0]
@@ -313,8 +372,8 @@ class Pass:
         pressed there, and is deeper behind this facet, begins to be pressed from there on, so that
         it keeps its energy. On a surface without corners the gap is that of its facet of then.
         """
-        near, memory = self._near, self.memory
-        assert near is not None and memory is not None
+        near, memory = self._near, self._last
+        assert near is not None
         gap, offset = memory.gap.copy(), memory.offset.copy()
         last = near.find(memory.closest)
         new = np.flatnonzero((found.facet >= 0) & (found.facet != last))
@@ -335,8 +394,8 @@ class Pass:
         self, which: NDArray[np.int64], facet: NDArray[np.int64], place: NDArray[np.float64] | None
     ) -> Foot:
         """Return projections of some points on facets at the beginning of the step."""
-        near, memory = self._near, self.memory
-        assert near is not None and memory is not None
+        near, memory = self._near, self._last
+        assert near is not None
         x, X = memory.points[which], self._before[facet]
         s = self._near_place(x, X) if place is None else near.project(x, X, place)
         return projected(near.tabulate(s), x, X, near.outward[facet])
@@ -371,8 +430,8 @@ class Pass:
         x: NDArray[np.float64],
         nodes: NDArray[np.float64],
     ) -> Stencil:
-        near, memory = self._near, self.memory
-        assert near is not None and memory is not None
+        near, memory = self._near, self._last
+        assert near is not None
         facet = found.facet[which]
         anchor = near.find(memory.facet[which])
         lost = anchor < 0
@@ -382,14 +441,16 @@ class Pass:
         parts = [x[which][:, None], nodes[facet]]
         if not self.law.smooth:
             parts.append(nodes[anchor])
-        k = self._stiffness[which]
+        if self._stretch is None:
+            self._stretch = self.source.stretch(self.law.by_area, self._facets).ravel()
+        k = self._stiffness[self._facets[which // self.source.nq]]
         points = Points(
             self._penalties[0] * k,
             np.where(lost, 0.0, self._penalties[1] * k),
             memory.touched[which] | lost,
             np.zeros((len(which), 0)),
             np.where(lost, 0.0, memory.gap[which]),
-            self.source.stretch(self.law.by_area).ravel()[which],
+            self._stretch[which],
         )
         self._facet, self._anchor = facet, anchor
         start = None
@@ -413,96 +474,97 @@ class Pass:
     def forces(self) -> tuple[PETSc.Vec, PETSc.Vec]:
         """Return the forces on the nodes of both bodies (collective)."""
         assert self._near is not None and self.stencil is not None
-        source = self.source
-        first = source.force(self.outcome.traction)
+        first = self.source.force(self._trial.traction, which=self._facets)
         second = _compat.create_vector(self.target.particles.W)
-        w = source.weights.ravel()[self.stencil.which]
-        values = w[:, None, None] * self.reaction
+        values = self._weights[self.stencil.which][:, None, None] * self.reaction
         dofs = self._near.dofs[self._facet].astype(PETSc.IntType)
         second.setValues(dofs.ravel(), values.ravel(), addv=PETSc.InsertMode.ADD_VALUES)
         second.assemble()
         return first, second
 
-    def blocks(self, factor: float) -> dict[tuple[int, int], list[Blocks]]:
-        """Return what the forces' derivatives add to matrices, by (source 0, target 1).
+    def met(self) -> Met:
+        """Return the facets that meet at the points where something acts."""
+        near, source = self._near, self.source
+        assert near is not None and self.stencil is not None
+        own = self._facets[self.stencil.which // source.nq]
+        bs = source.particles.W.dofmap.index_map_bs
+        others = [self._facet] if self.law.smooth else [self._facet, self._anchor]
+        nodes = [near.dofs[facet][:, ::bs] // bs for facet in others]
+        mine = global_nodes(source.particles.W, source.nodes[own])
+        return Met(np.stack([own, *others], axis=1), (mine, *nodes))
+
+    def add_tangents(
+        self,
+        factor: float,
+        group: NDArray[np.int64],
+        positions: NDArray[np.int32],
+        values: NDArray[np.float64],
+    ) -> None:
+        """Add the forces' derivatives to blocks.
 
         Args:
             factor: What they are multiplied by.
+            group: See :class:`Sums`.
+            positions: As there.
+            values: As there.
         """
-        near, source = self._near, self.source
-        assert near is not None and self.stencil is not None
-        k = near.element.dim
-        which = self.stencil.which
-        facet_of, point = which // source.nq, which % source.nq
-        w = -factor * source.weights.ravel()[which]
-        D = derivatives(self.law, self.stencil, self.touch, self.target.extent)
-        N, none = source.shapes[point], np.zeros((0, k))
-        own = global_dofs(source.particles.W, source.nodes[facet_of])
-        columns = [
-            (0, 0, facet_of, own, N),
-            (1, 1, near.number[self._facet], near.dofs[self._facet], none),
-        ]
-        if not self.law.smooth:
-            anchors = near.number[self._anchor], near.dofs[self._anchor]
-            columns.append((1, 1 + k, *anchors, none))
-        found: dict[tuple[int, int], list[Blocks]] = {}
-        for row, first_row, row_key, row_dofs, row_shapes in columns[:2]:
-            for column, first_column, column_key, column_dofs, column_shapes in columns:
-                keys, one, number = _grouped(row_key, column_key)
-                shape = (len(keys), row_dofs.shape[1], column_dofs.shape[1])
-                rows, cols = (first_row, row_shapes), (first_column, column_shapes)
-                values = added_blocks(D, w, number, rows, cols, shape)
-                blocks = Blocks(keys, row_dofs[one], column_dofs[one], values)
-                found.setdefault((row, column), []).append(blocks)
-        return found
+        assert self.stencil is not None
+        which, source = self.stencil.which, self.source
+        sums = Sums(
+            -factor * self._weights[which],
+            source.shapes[which % source.nq],
+            group,
+            positions,
+            values,
+        )
+        add_tangents(self.law, self.stencil, self.touch, self.target.extent, sums)
 
     # -- The next step --------------------------------------------------------------------------
 
-    def after(self) -> Memory:
+    def after(self) -> tuple[Memory, Outcome]:
         """Return what is to be remembered of the last evaluation, if it is that of a step."""
-        near, memory, found = self._near, self.memory, self._paired
-        assert near is not None and memory is not None and found is not None
-        assert self.stencil is not None
-        x = self._flat(self.outcome.positions)
-        offset = self._offset
+        near, last, found = self._near, self._last, self._paired
+        assert near is not None and found is not None and self.stencil is not None
+        trial, x, offset = self._trial, self._x, self._offset
         if self.of_step:
             found, offset = self._returned(found, x)
+        inside = trial.inside.ravel()
         place, numbers = found.place.copy(), _numbers(near, found.facet)
         which = self.stencil.which
         if not self.law.smooth and len(which):
-            inside = self.outcome.inside.ravel()[which]
-            slips = self.outcome.slips.ravel()[which]
+            slips = trial.slips.ravel()[which]
             k = self.stencil.points.tangential
-            stays = inside & ~slips & self.stencil.points.touched
-            stays &= near.find(memory.facet[which]) >= 0
-            moves = inside & ~stays
+            stays = inside[which] & ~slips & self.stencil.points.touched
+            stays &= near.find(last.facet[which]) >= 0
+            moves = inside[which] & ~stays
             # anchors that moved are beside the foot, and belong to the facet that is there
             X = self._nodes[self._facet[moves]]
             N, _, _ = near.tabulate(self.stencil.place[moves])
             lag = self.shear[moves] / np.where(k[moves] > 0.0, k[moves], 1.0)[:, None]
             foot = np.einsum("nk,nki->ni", N, X) + lag
             at, s = self.located(foot, self._nodes, self._facet[moves])
-            numbers[which[stays]] = memory.facet[which[stays]]
-            place[which[stays]] = memory.place[which[stays]]
+            numbers[which[stays]] = last.facet[which[stays]]
+            place[which[stays]] = last.place[which[stays]]
             numbers[which[moves]] = near.number[at]
             place[which[moves]] = s
         anchors = x.copy()
         at = near.find(numbers)
         N, _, _ = near.tabulate(place[at >= 0])
         anchors[at >= 0] = np.einsum("nk,nki->ni", N, self._nodes[at[at >= 0]])
-        inside = self.outcome.inside.ravel().copy()
         closest = _numbers(near, found.facet)
-        return Memory(
-            inside,
-            numbers,
-            place,
-            closest,
-            found.gap,
-            self._within,
-            offset,
-            x,
-            anchors,
+        own = Memory(inside, numbers, place, closest, found.gap, self._within, offset, x, anchors)
+        memory = self._remembered(self._flat(self.source.positions()), own)
+        m, nq = len(self.source.cells), self.source.nq
+        place = memory.points.reshape(m, nq, -1)
+        none, zero = np.zeros((m, nq), dtype=bool), np.zeros((m, nq))
+        nothing = Outcome(place, np.full((m, nq), np.inf), zero, np.zeros_like(place), none, none)
+        outcome = Outcome(
+            *(
+                _spread(getattr(trial, field.name), self._facets, getattr(nothing, field.name))
+                for field in fields(Outcome)
+            )
         )
+        return memory, outcome
 
     def _returned(
         self, found: Closest, x: NDArray[np.float64]
@@ -518,9 +580,8 @@ class Pass:
         which = np.flatnonzero(self._within)
         off = np.abs(found.place[which] - near.clamped(found.place[which])).max(axis=1, initial=0.0)
         which = which[(off > 0.0) | (self.count > FREEZE)]
-        there = near.closest(
-            x[which], self._normals_near(x, self._nodes)[which], self._nodes, self.reach
-        )
+        normals = self._flat(self.source.normals(which=self._facets))[which]
+        there = near.closest(x[which], normals, self._nodes, self.reach)
         moves = there.near & (there.facet >= 0) & (there.facet != found.facet[which])
         which = which[moves]
         facet, place, gap = found.facet.copy(), found.place.copy(), found.gap.copy()
@@ -547,13 +608,12 @@ class Pass:
 
     def leaks(self) -> bool:
         """Return whether a point has gone through the other body since the last step."""
-        near, memory, found = self._near, self.memory, self._paired
-        assert near is not None and memory is not None and found is not None
-        x = self._flat(self.outcome.positions)
+        near, memory, found, x = self._near, self._last, self._paired, self._x
+        assert near is not None and found is not None
         at = near.find(memory.facet)
         # (one beside a thin body may have been behind its far side already)
         before = np.isfinite(memory.gap) & (memory.gap > -0.25 * self.reach)
-        was = np.flatnonzero((at >= 0) & before & (self.source.weights.ravel() > 0))
+        was = np.flatnonzero((at >= 0) & before & (self._weights > 0.0))
         if len(was) == 0:
             return False
         X = self._nodes[at[was]]
@@ -579,7 +639,7 @@ class Pass:
         self.begin_anew()
         near, memory = self._near, self.memory
         assert near is not None and memory is not None
-        nodes = near.positions(self.target.node_positions(converged=True))
+        nodes = near.positions(self.target.own_nodes(converged=True))
         which = np.flatnonzero(touched.ravel())
         numbers, place = memory.facet.copy(), memory.place.copy()
         found = near.closest(self._flat(anchors)[which], None, nodes, self.reach)
@@ -603,13 +663,14 @@ def _numbers(near: NearFacets, facet: NDArray[np.int64]) -> NDArray[np.int64]:
     return numbers
 
 
-def _grouped(
-    a: NDArray[np.int64], b: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return different pairs of numbers ``(m, 2)``, one place of each, and which each place has."""
-    order = np.lexsort((b, a))
-    keys = np.column_stack([a, b])[order]
-    new = np.append(True, (np.diff(keys, axis=0) != 0).any(axis=1))[: len(keys)]
-    number = np.zeros(len(a), dtype=np.int64)
-    number[order] = np.cumsum(new) - 1
-    return keys[new], order[new], number
+def _nothing(n: int, e: int) -> Closest:
+    """Return what there is of n points to which no facet is near."""
+    facet, gap, place = np.full(n, -1, dtype=np.int64), np.full(n, np.inf), np.zeros((n, e))
+    return Closest(facet, place, gap, np.zeros(n, dtype=bool), np.zeros(n))
+
+
+def _spread(part: NDArray[Any], which: NDArray[np.int64], base: NDArray[Any]) -> NDArray[Any]:
+    """Return an array with others in some places."""
+    whole = base.copy()
+    whole[which] = part
+    return whole

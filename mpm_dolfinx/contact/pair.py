@@ -30,8 +30,9 @@ from ..system.term import PointMaterial
 from .contact import Contact, Outcome, stiffness
 from .law import Coulomb, as_friction
 from .one_pass import Pass
+from .pair_matrices import PairMatrices
 from .shapes import as_positive
-from .surface import Blocks, PointMatrix, Surface
+from .surface import Surface
 
 __all__ = ["Pair"]
 
@@ -132,7 +133,6 @@ class Pair(Contact):
             Pass(self._surfaces[i], self._surfaces[1 - i], law, penalties) for i in range(passes)
         ]
         self._made, self._begins = False, True
-        self._last: list[Outcome] | None = None
 
     # -- The term -------------------------------------------------------------------------------
 
@@ -164,7 +164,7 @@ class Pair(Contact):
         for i, each in enumerate(self._passes):
             each.settle(k[i], k[1 - i], shares[i])
             each.begin_anew()
-        self._made, self._last = True, None
+        self._made = True
         self._new_pattern()
 
     def _shares(self) -> list[float]:
@@ -185,8 +185,8 @@ class Pair(Contact):
         return [first, 1.0 - first]
 
     def _new_pattern(self) -> None:
-        spaces = [body.W for body in self.bodies]
-        self._matrices = {(i, j): PointMatrix(spaces[i], spaces[j]) for i in (0, 1) for j in (0, 1)}
+        self._matrices = PairMatrices([body.W for body in self.bodies])
+        self._learned = [each.learned for each in self._passes]
 
     def _require_apart(self) -> None:
         for each in self._passes:
@@ -233,10 +233,7 @@ class Pair(Contact):
 
     def smooth(self) -> bool:
         """See :meth:`Term.smooth`: contact is not."""
-        return not any(
-            each.outcome.inside.any() or (each.memory is not None and each.memory.touched.any())
-            for each in self._passes
-        )
+        return not any(each.touches() for each in self._passes)
 
     def residuals(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.residuals`."""
@@ -260,12 +257,12 @@ class Pair(Contact):
 
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
         """See :meth:`Term.tangents`."""
-        parts: dict[tuple[int, int], list[Blocks]] = {pair: [] for pair in self._matrices}
-        for number, each in enumerate(self._passes):
-            for (i, j), blocks in each.blocks(1.0 / self._share).items():
-                parts[abs(i - number), abs(j - number)] += blocks
-        found = {pair: self._matrices[pair].of(blocks) for pair, blocks in parts.items()}
-        return {pair: K for pair, K in found.items() if K is not None}
+        if self._learned != [each.learned for each in self._passes]:
+            self._new_pattern()
+        groups = self._matrices.groups([each.met() for each in self._passes])
+        for each, (group, positions) in zip(self._passes, groups, strict=True):
+            each.add_tangents(1.0 / self._share, group, positions, self._matrices.values)
+        return self._matrices.assembled()
 
     # -- What it remembers ----------------------------------------------------------------------
 
@@ -282,34 +279,21 @@ class Pair(Contact):
             )
         if (failure := agreed(self._comm, failure)) is not None:
             raise failure
-        before = [each.memory for each in self._passes]
-        told = self._last
+        before = [(each.memory, each.outcome) for each in self._passes]
         for each in self._passes:
-            each.memory = each.after()
-        self._last = [each.outcome for each in self._passes]
+            each.memory, each.outcome = each.after()
 
         def undo() -> None:
-            for each, memory in zip(self._passes, before, strict=True):
-                each.memory = memory
-            self._last = told
+            for each, (memory, outcome) in zip(self._passes, before, strict=True):
+                each.memory, each.outcome = memory, outcome
 
         return undo
-
-    def _told(self) -> list[Outcome]:
-        if self._last is None:
-            return [each.outcome for each in self._passes]
-        return self._last
-
-    def roll_back(self) -> None:
-        """See :meth:`Term.roll_back`."""
-        for each, outcome in zip(self._passes, self._told(), strict=True):
-            each.outcome = outcome
 
     def _outcome(self) -> tuple[Surface, Outcome]:
         """Return what the points of a tell: with two passes they bear their share alone."""
         if not self._made:
             raise MPMError("A contact belongs to no problem yet; give it as terms=[contact].")
-        told, share = self._told()[0], self._passes[0].share
+        told, share = self._passes[0].outcome, self._passes[0].share
         return self._surfaces[0], replace(
             told, pressure=told.pressure / share, traction=told.traction / share
         )
@@ -319,8 +303,8 @@ class Pair(Contact):
         if not self._made:
             raise MPMError("A contact belongs to no problem yet; give it as terms=[contact].")
         found = []
-        for number, outcome in enumerate(self._told()):
-            surface, sign = self._surfaces[number], 1.0 - 2.0 * number
+        for number, each in enumerate(self._passes):
+            outcome, surface, sign = each.outcome, each.source, 1.0 - 2.0 * number
             force = sign * surface.weights[:, :, None] * outcome.traction
             gdim = surface.gdim
             found.append((outcome.positions.reshape(-1, gdim), force.reshape(-1, gdim)))
@@ -345,7 +329,7 @@ class Pair(Contact):
         surface = self._surfaces[number]
         columns = surface.columns()
         if number < len(self._passes):
-            memory, outcome = self._passes[number].memory, self._told()[number]
+            memory, outcome = self._passes[number].memory, self._passes[number].outcome
             assert memory is not None
             shape = outcome.inside.shape
             columns["anchor"] = surface.column(memory.anchors.reshape(*shape, surface.gdim))
@@ -371,13 +355,11 @@ class Pair(Contact):
                 surface.of_column(columns["offset"]),
             )
         self.update()
-        self._last = [
-            replace(
-                each.outcome,
+        for each, surface, columns in zip(self._passes, self._surfaces, every, strict=False):
+            each.outcome = replace(
+                each.after()[1],
                 inside=surface.of_column(columns["touches"]),
                 slips=surface.of_column(columns["slips"]),
                 pressure=surface.of_column(columns["pressure"]),
                 traction=surface.of_column(columns["traction"]),
             )
-            for each, surface, columns in zip(self._passes, self._surfaces, every, strict=False)
-        ]

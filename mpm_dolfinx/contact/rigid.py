@@ -54,6 +54,8 @@ OVERLAP = 0.1
 #: Gap, over the thickness of the domain behind, up to which a facet may touch in a step; and share
 #: of facets that do so up to which others are left out.
 NEAR, MOST_NEAR = 2.0, 0.7
+#: How much farther facets are looked for than they have come nearer, where that was too far.
+FARTHER = 1.4
 #: Most points of each rank at which the shapes of ranks are compared.
 LOOKED_AT = 16
 
@@ -415,8 +417,9 @@ class Rigid(Contact):
             return error
         return None
 
-    def _points(self, memory: Memory, which: NDArray[np.int64] | None = None) -> Points:
-        """Return the points of some facets, of which something is known; ``None``: of all."""
+    def _points(self, memory: Memory) -> Points:
+        """Return the points of facets of which something is known."""
+        which = memory.facets
         k = (self._stiffness if which is None else self._stiffness[which]).ravel()
         gdim = memory.anchor.shape[2]
         return Points(
@@ -446,8 +449,8 @@ class Rigid(Contact):
         if near is None:
             if not (whole or memory.exact):
                 self._memory = memory = self._exact(memory)
-            return self._evaluated_on(memory, None)
-        return self._evaluated_on(near.memory, near.which).among(near.which, memory)
+            return self._evaluated_on(memory)
+        return self._evaluated_on(near.memory)
 
     def _look_near(self) -> None:
         """Note which facets may touch in a step, and what others may move until they could.
@@ -476,7 +479,7 @@ class Rigid(Contact):
         if (arm := self.shape.arm) is not None:
             radius = min(radius, arm)
         margin = float(least[~near].min()) - surface.touch
-        return Near(which, memory.of(which), nodes, radius, margin)
+        return Near(memory.of(which), nodes, radius, margin)
 
     def _within_reach(self) -> Near | None:
         """Return what may touch at the present positions; ``None``: all."""
@@ -484,7 +487,7 @@ class Rigid(Contact):
         if near is None or (moved := self._approach(near)) < near.margin:
             return near
         if self._wider is None or moved >= self._wider.margin:
-            self._wider = self._nearer_than(2.0 * moved)
+            self._wider = self._nearer_than(FARTHER * moved)
         wider = self._wider
         return wider if wider is not None and moved < wider.margin else None
 
@@ -505,18 +508,13 @@ class Rigid(Contact):
         """Return where points of some facets are, ``None``: of all."""
         return self._surface.positions(which=which)
 
-    def _evaluated_on(self, memory: Memory, which: NDArray[np.int64] | None) -> Memory:
-        """Return what acts on some facets, or on all.
-
-        Args:
-            memory: What is known of these.
-            which: Their numbers; ``None``: all.
-        """
-        pose = self._pose
+    def _evaluated_on(self, memory: Memory) -> Memory:
+        """Return what acts on facets of which something is known."""
+        pose, which = self._pose, memory.facets
         x = self._positions(which)
         m, nq, gdim = x.shape
         y = self._framed(x, pose).reshape(-1, gdim)
-        points = self._points(memory, which)
+        points = self._points(memory)
         touch = self._surface.touch
         behind, reach = None, np.full(len(y), touch)
         if self._nitsche:
@@ -548,8 +546,7 @@ class Rigid(Contact):
         force = normal + shear
         works = (0.0, 0.0)
         if step is not None:
-            weights = self._surface.weights if which is None else self._surface.weights[which]
-            moves = weights[:, :, None] * (x - memory.outcome.positions)
+            moves = self._weights(memory)[:, :, None] * (x - memory.outcome.positions)
             works = -float((normal * moves).sum()), -float((shear * moves).sum())
         outcome = Outcome(
             x,
@@ -562,7 +559,10 @@ class Rigid(Contact):
         return Memory(
             pose,
             outcome.inside,
-            self._anchors(points, y, phi, n, acts.shear, outcome).reshape(x.shape),
+            # (not asked for until all facets are looked at)
+            memory.anchor
+            if which is not None
+            else self._anchors(points, y, phi, n, acts.shear, outcome).reshape(x.shape),
             outcome.gap,
             n.reshape(x.shape),
             outcome,
@@ -570,7 +570,23 @@ class Rigid(Contact):
             step,
             behind,
             pressed,
+            which,
         )
+
+    def _known(self, trial: Memory) -> Memory:
+        """Return what was known of the facets that were looked at."""
+        assert self._memory is not None
+        if trial.facets is None:
+            return self._memory
+        for near in (self._near, self._wider):
+            if near is not None and near.memory.facets is trial.facets:
+                return near.memory
+        return self._memory.of(trial.facets)
+
+    def _weights(self, memory: Memory) -> NDArray[np.float64]:
+        """Return the undeformed areas of the points of facets of which something is known."""
+        weights = self._surface.weights
+        return weights if memory.facets is None else np.asarray(weights[memory.facets])
 
     def _stress_behind(self) -> Behind:
         """Return what takes the stress at the points of domains to their facets."""
@@ -594,13 +610,17 @@ class Rigid(Contact):
             before = self._framed(memory.outcome.positions, memory.pose).reshape(y.shape)
             phi = memory.gap.ravel() - np.linalg.norm(y - before, axis=1)
             near = ~(phi > reach)
+        phi[near], n[near] = self._measured(y[near])
+        return phi, n
+
+    def _measured(self, y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return gaps and normals of points in the frame of the shape."""
         try:
-            phi[near], n[near] = self.shape.distance(y[near])
+            return self.shape.distance(y)
         except MPMError:
             raise
         except Exception as error:
             raise as_ours(error, "The shape of a Rigid") from error
-        return phi, n
 
     def _step(
         self,
@@ -651,13 +671,16 @@ class Rigid(Contact):
     def residuals(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.residuals`."""
         assert self._trial is not None
-        return [self._surface.force(self._trial.outcome.traction, -1.0 / self._share)]
+        trial = self._trial
+        return [self._surface.force(trial.outcome.traction, -1.0 / self._share, trial.facets)]
 
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
         """See :meth:`Term.tangents`."""
-        assert self._trial is not None and self._memory is not None
-        trial, memory, surface = self._trial, self._memory, self._surface
-        which, inside, flat = self._acting(trial, memory)
+        assert self._trial is not None
+        trial, surface = self._trial, self._surface
+        memory = self._known(trial)
+        here, inside, flat = self._acting(trial, memory)
+        which = trial.numbers(here)
         D = np.zeros((len(which), surface.nq, surface.gdim, surface.gdim))
         if len(flat):
             D[inside] = self._derivative(trial, memory, flat) / self._share
@@ -665,7 +688,7 @@ class Rigid(Contact):
         k = N.shape[1] * surface.gdim
         blocks = np.einsum("mq,qa,qb,mqij->maibj", -w, N, N, D, optimize=True)
         dofs = global_dofs(self.bodies[0].W, surface.nodes[which])
-        parts = [Blocks(which[:, None], dofs, dofs, blocks.reshape(-1, k, k))]
+        parts = [Blocks(which, dofs, dofs, blocks.reshape(-1, k, k))]
         if trial.behind is None:
             K = self._matrix.of(parts)
             return {} if K is None else {(0, 0): K}
@@ -707,7 +730,7 @@ class Rigid(Contact):
         blocks = np.einsum("qa,mqi,mqbj->maibj", N, force[which], slopes, optimize=True)
         columns = global_dofs(self.bodies[0].W, behind.nodes[which])
         shape = (len(which), rows.shape[1], columns.shape[1])
-        return Blocks(which[:, None], rows, columns, blocks.reshape(shape))
+        return Blocks(which, rows, columns, blocks.reshape(shape))
 
     def _push(
         self, trial: Memory, memory: Memory, flat: NDArray[np.int64], bent: bool = False
@@ -759,18 +782,22 @@ class Rigid(Contact):
     def _acting(
         self, trial: Memory, memory: Memory
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.int64]]:
-        """Return facets that touch, which of their points do, and the numbers of these points."""
+        """Return facets that touch, which of their points do, and the numbers of these points.
+
+        As places among the facets that were looked at, and among their points.
+        """
         surface, acting = self._surface, trial.touched
         if self._of_step:
             acting = acting | (memory.gap <= surface.touch)
         if trial.behind is not None:
             assert trial.pressed is not None
             acting = acting | trial.pressed
-        which = np.flatnonzero(
-            acting.any(axis=1) & (surface.weights.max(axis=1, initial=0.0) > 0.0)
+        here = np.flatnonzero(
+            acting.any(axis=1) & (self._weights(trial).max(axis=1, initial=0.0) > 0.0)
         )
-        inside = acting[which]
-        return which, inside, (which[:, None] * surface.nq + np.arange(surface.nq))[inside]
+        inside = acting[here]
+        flat = (here[:, None] * surface.nq + np.arange(surface.nq))[inside]
+        return here, inside, flat
 
     def _derivative(
         self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
@@ -828,7 +855,7 @@ class Rigid(Contact):
         assert before is not None and trial is not None
         failure: MPMError | None = None
         try:
-            if not trial.whole:
+            if trial.facets is not None:
                 trial = self._evaluated(whole=True)
             if self.shape.costly:
                 least = trial.gap.min(axis=1, initial=np.inf)

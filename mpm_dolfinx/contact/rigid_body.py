@@ -47,6 +47,8 @@ __all__ = ["RigidBody"]
 BALANCED, AT_ROUND_OFF = 1e-14, 1e-9
 #: Most iterations, and most halvings of one of them.
 MOST_ITERATIONS, MOST_HALVINGS = 60, 12
+#: Tries in which the residual is not halved, after which another place to begin at is looked at.
+PATIENCE = 10
 #: Stiffness, relative to the largest, below which nothing holds a body.
 LOOSE = 1e-11
 #: Gap, over twice the length of what it falls on, to which a body without a hold falls; at least
@@ -356,23 +358,35 @@ class RigidBody(Term):
             assert self._condensed is not None
             starts = [*self._condensed.followed(), self._found, *starts]
         failure: MPMError | None = None
-        for s in starts:
-            try:
-                self._find(s)
-                self._begins = False
-                return None
-            except MPMError as error:
-                failure = error
+        for patience in (PATIENCE, MOST_ITERATIONS * MOST_HALVINGS):
+            for s in starts:
+                try:
+                    self._find(s, patience)
+                    self._begins = False
+                    return None
+                except MPMError as error:
+                    failure = error
         return failure
 
-    def _find(self, s: NDArray[np.float64]) -> None:
-        """Solve for the balance of the body from some step of it (collective)."""
+    def _find(self, s: NDArray[np.float64], patience: int) -> None:
+        """Solve for the balance of the body from some step of it (collective).
+
+        Args:
+            s: The step.
+            patience: Tries in which the residual has to be halved.
+
+        Raises:
+            MPMError: It was not found.
+        """
         gdim = self.shape.dim
         now = self._put(s)
         norm = self._size_of(now.residual)
+        halved, tries = norm, 0
         for _ in range(MOST_ITERATIONS):
-            if norm <= BALANCED * now.size:
+            if norm <= BALANCED * now.size or (norm > now.enough and tries > patience):
                 break
+            tries = 0 if norm < 0.5 * halved else tries
+            halved = norm if tries == 0 else halved
             R = now.residual
             K, _ = self._slopes(now.state, s[gdim:], False)
             inverse, onto = self._inverse(K)
@@ -380,7 +394,7 @@ class RigidBody(Term):
             if left > now.enough:
                 s = self._fallen(s, onto @ R - R, left / now.size)
                 now = self._put(s)
-                norm = self._size_of(now.residual)
+                norm = halved = self._size_of(now.residual)
                 continue
             step = inverse @ R
             turn = float(np.linalg.norm(step[gdim:]))
@@ -388,6 +402,7 @@ class RigidBody(Term):
             floor = norm <= now.enough
             for _ in range(1 if floor else MOST_HALVINGS):
                 tried = self._put(s - step)
+                tries += 1
                 if (found := self._size_of(tried.residual)) < norm:
                     break
                 step *= 0.5
@@ -438,10 +453,8 @@ class RigidBody(Term):
         """Return the least gap of all points after some step (collective)."""
         pose = self._pose(self._stepped(s))
         with agree(self._comm):
-            for contact in self.contacts:
-                contact.put(pose, whole=True)
-        gaps = [contact.least() for contact in self.contacts]
-        return float(self._comm.allreduce(min(gaps), MPI.MIN))
+            least = min(contact.least(pose) for contact in self.contacts)
+        return float(self._comm.allreduce(least, MPI.MIN))
 
     def _size_of(self, R: NDArray[np.float64]) -> float:
         """Return the size of a residual in what is free."""

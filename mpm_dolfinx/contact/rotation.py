@@ -11,6 +11,8 @@ stable algorithms for rigid body dynamics", Int. J. Numer. Meth. Engng 31, 1991)
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,7 +60,8 @@ def cayley_variation(theta: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(factor * (np.eye(3) - 0.5 * crossing(theta)))
 
 
-class Pose(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Pose:
     """Where a shape is: ``x = pivot + offset + Q (y - pivot)``.
 
     Attributes:
@@ -69,7 +72,7 @@ class Pose(NamedTuple):
     offset: NDArray[np.float64]
     angle: NDArray[np.float64]
 
-    @property
+    @cached_property
     def Q(self) -> NDArray[np.float64]:
         """The rotation."""
         return rotation(self.angle)

@@ -26,12 +26,12 @@ __all__ = [
     "Foot",
     "Start",
     "Stencil",
+    "Sums",
     "Table",
     "acting",
     "acting_now",
-    "added_blocks",
+    "add_tangents",
     "by_complex_step",
-    "derivatives",
     "projected",
 ]
 
@@ -78,6 +78,26 @@ class Stencil(NamedTuple):
     points: Points
     outward: NDArray[np.float64]
     start: Start | None
+
+
+class Sums(NamedTuple):
+    """Where derivatives at points add up: in blocks between nodes.
+
+    Attributes:
+        weights: Of the points, shape ``(n,)``.
+        shapes: Shape functions by which a point is spread over the a nodes of its own facet,
+            ``(n, a)``.
+        group: Group of each point, shape ``(n,)``.
+        positions: Blocks of each group, by forces on nodes of a point's facet and of the one that
+            it meets, and places of these nodes and of those of the anchor's, ``(g, r, c)``.
+        values: The blocks, shape ``(b, gdim, gdim)``.
+    """
+
+    weights: NDArray[np.float64]
+    shapes: NDArray[np.float64]
+    group: NDArray[np.int64]
+    positions: NDArray[np.int32]
+    values: NDArray[np.float64]
 
 
 class Foot(NamedTuple):
@@ -221,29 +241,50 @@ def acting_now(law: Coulomb, stencil: Stencil, touch: float, extent: float) -> A
     return Acting(pushes, rubs, acts)
 
 
-def derivatives(law: Coulomb, stencil: Stencil, touch: float, extent: float) -> NDArray[np.float64]:
-    """Return the derivative of all forces at the points' stencils, ``(n, 1 + k, i, z, j)``.
+def add_tangents(law: Coulomb, stencil: Stencil, touch: float, extent: float, sums: Sums) -> None:
+    """Add the derivatives of all forces at the points' stencils to blocks.
 
     Args:
         law: As for :func:`acting`, as all that is not said here.
         stencil: As there.
         touch: As there.
         extent: As there.
+        sums: Where they add up.
     """
-    n, count, gdim = stencil.x.shape
-    D = np.zeros((n, 1 + stencil.anchored.shape[1], gdim, count, gdim))
-    if n == 0:
-        return D
+    if len(stencil.x) == 0:
+        return
+    where = [np.ascontiguousarray(part) for part in sums[:4]]
     if loops is not None and stencil.start is None:
-        loops.differentiate(*_compiled_arguments(law, stencil, touch), D)
-        return D
-    return by_complex_step(law, stencil, touch, extent)
+        arguments = _compiled_arguments(law, stencil, touch)
+        loops.add_tangents(*arguments, *where, sums.values)
+        return
+    D = by_complex_step(law, stencil, touch, extent)
+    if loops is not None:
+        loops.add_derivatives(D, *where, sums.values)
+        return
+    N = sums.shapes[:, :, None, None, None]
+    rows = (
+        np.concatenate([N * D[:, :1], D[:, 1:]], axis=1) * sums.weights[:, None, None, None, None]
+    )
+    own = rows[:, :, :, :1] * sums.shapes[:, None, None, :, None]
+    whole = np.concatenate([own, rows[:, :, :, 1:]], axis=3)
+    np.add.at(sums.values, sums.positions[sums.group], whole.swapaxes(2, 3))
 
 
 def by_complex_step(
     law: Coulomb, stencil: Stencil, touch: float, extent: float
 ) -> NDArray[np.float64]:
-    """Return :func:`derivatives` by complex steps, which do without compiled loops."""
+    """Return the derivatives of all forces at the points' stencils, by complex steps.
+
+    Args:
+        law: As for :func:`acting`.
+        stencil: As there.
+        touch: As there.
+        extent: As there.
+
+    Returns:
+        Shape ``(n, 1 + k, i, z, j)``.
+    """
     z = stencil.x.astype(np.complex128)
     n, count, gdim = z.shape
     D = np.zeros((n, 1 + stencil.anchored.shape[1], gdim, count, gdim))
@@ -272,39 +313,3 @@ def _repeated(values: Any, times: int) -> Any:
         return None
     parts = [_repeated(part, times) for part in values]
     return type(values)(*parts) if hasattr(values, "_fields") else tuple(parts)
-
-
-def added_blocks(
-    D: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    number: NDArray[np.int64],
-    rows: tuple[int, NDArray[np.float64]],
-    columns: tuple[int, NDArray[np.float64]],
-    shape: tuple[int, int, int],
-) -> NDArray[np.float64]:
-    """Return blocks of a matrix by derivatives at points.
-
-    Args:
-        D: The derivatives, shape ``(n, 1 + k, i, z, j)``.
-        weights: Of the points, shape ``(n,)``.
-        number: Number of the block that each adds to.
-        rows: First place of a stencil that is meant, and shape functions ``(n, a)`` by which it is
-            spread over nodes, where it is the point itself; ``(0, k)`` is none.
-        columns: The same of columns.
-        shape: Of the blocks.
-    """
-    blocks = np.zeros(shape)
-    if len(D) == 0:
-        return blocks
-    if loops is not None:
-        loops.add_blocks(D, weights, number, *rows, *columns, blocks)
-        return blocks
-    parts = []
-    for (first, N), size in zip((rows, columns), shape[1:], strict=True):
-        places = slice(first, first + (1 if len(N) else size // D.shape[2]))
-        parts.append((places, N[:, :, None] if len(N) else np.ones((1, 1, 1))))
-    (row, left), (column, right) = parts
-    block = (weights[:, None, None] * left)[..., None, None] * D[:, row, :, column]
-    block = block * right[:, None, None]
-    np.add.at(blocks, number, block.reshape(-1, *shape[1:]))
-    return blocks

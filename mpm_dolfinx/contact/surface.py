@@ -22,7 +22,17 @@ from ..errors import MPMError
 from ..meshes.remesh import Column
 from ..particles.particles import Particles
 
-__all__ = ["Blocks", "Facets", "PointMatrix", "Surface", "global_dofs", "nodal_vector", "normals"]
+__all__ = [
+    "Blocks",
+    "Facets",
+    "PointMatrix",
+    "Surface",
+    "global_dofs",
+    "global_nodes",
+    "nodal_vector",
+    "normals",
+    "sizes_of",
+]
 
 #: Highest degree of a rule on a facet: 51 points each way.
 MOST = 100
@@ -117,6 +127,7 @@ class Surface:
         cells: Owned cell of each facet, shape ``(m,)``.
         facets: Its local number in the cell, shape ``(m,)``.
         nodes: Local nodes of W of each facet, shape ``(m, k)``.
+        own: Their places among :meth:`own_nodes`.
         element: The basix element of a facet.
         shapes: Its shape functions at the points, shape ``(nq, k)``.
         slopes: Their derivatives, shape ``(gdim - 1, nq, k)``.
@@ -184,7 +195,7 @@ class Surface:
             own = np.linalg.norm(places[:, None] - element.points, axis=2).argmin(axis=1)
             self.nodes[here] = W.dofmap.list[self.cells[here]][:, own]
         self._own, places = np.unique(self.nodes, return_inverse=True)
-        self._of_facets = places.reshape(self.nodes.shape)
+        self.own = places.reshape(self.nodes.shape)
         self._own_mesh = x[self._own]
         edges = np.einsum("jqk,mki->mqij", self.slopes, x[self.nodes])
         area = np.sqrt(np.linalg.det(edges.swapaxes(2, 3) @ edges)) * weights
@@ -249,7 +260,7 @@ class Surface:
         some = slice(None) if which is None else which
         if not counts:
             return np.ones_like(self._plain[some])
-        x = self.own_nodes(converged=True)[self._of_facets[some]]
+        x = self.own_nodes(converged=True)[self.own[some]]
         now = normals(np.einsum("jqk,mki->mqij", self.slopes, x))
         mesh_size = np.linalg.norm(normals(self._edges[some]), axis=2)
         ratio = np.linalg.norm(now, axis=2) / mesh_size * self.mesh_area_ratio[some]
@@ -271,13 +282,6 @@ class Surface:
         n = self.outward[:, None, None] * normals(np.einsum("jqk,mki->mqij", self.slopes, x))
         return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
 
-    def node_positions(self, converged: bool = False) -> NDArray[np.float64]:
-        """Return positions of this rank's nodes of W, shape ``(N, gdim)``."""
-        if converged:
-            return self.particles.node_positions
-        d = self.particles.displacement.x.array.reshape(-1, self.gdim)
-        return np.asarray(self._mesh_nodes + d)
-
     def positions(
         self, converged: bool = False, which: NDArray[np.int64] | None = None
     ) -> NDArray[np.float64]:
@@ -287,15 +291,14 @@ class Surface:
             converged: Whether those at the last converged step are meant.
             which: Numbers of facets; ``None``: all.
         """
-        places = self._of_facets if which is None else self._of_facets[which]
+        places = self.own if which is None else self.own[which]
         return np.asarray(self.shapes @ self.own_nodes(converged)[places])
 
     def own_nodes(self, converged: bool = False) -> NDArray[np.float64]:
         """Return positions of the nodes of all facets, each once, shape ``(n, gdim)``."""
-        if converged:
-            return self.particles.node_positions[self._own]
-        d = self.particles.displacement.x.array.reshape(-1, self.gdim)
-        return np.asarray(self._own_mesh + d[self._own])
+        body = self.particles
+        d = body.converged_displacement if converged else body.displacement.x.array
+        return np.asarray(self._own_mesh + d.reshape(-1, self.gdim)[self._own])
 
     @property
     def sizes(self) -> NDArray[np.float64]:
@@ -307,20 +310,27 @@ class Surface:
     ) -> NDArray[np.float64]:
         """Return outward unit normals at the points, as the body is displaced, as positions."""
         chosen: Any = slice(None) if which is None else which
-        x = self.own_nodes(converged)[self._of_facets[chosen]]
+        x = self.own_nodes(converged)[self.own[chosen]]
         edges = np.moveaxis(self.slopes[:, None] @ x, 0, -1)
         n = self.outward[chosen, None, None] * normals(edges)
         return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
 
-    def force(self, tractions: NDArray[np.float64], sign: float = 1.0) -> PETSc.Vec:
+    def force(
+        self,
+        tractions: NDArray[np.float64],
+        sign: float = 1.0,
+        which: NDArray[np.int64] | None = None,
+    ) -> PETSc.Vec:
         """Return what tractions at the points do to the nodes of W (collective).
 
         Args:
             tractions: Per undeformed area, shape ``(m, nq, gdim)``.
             sign: What they are multiplied by.
+            which: Numbers of their facets; ``None``: all.
         """
-        acting = np.flatnonzero(tractions.any(axis=(1, 2)))
-        forces = self.shapes.T @ (sign * self.weights[acting, :, None] * tractions[acting])
+        here = np.flatnonzero(tractions.any(axis=(1, 2)))
+        acting = here if which is None else which[here]
+        forces = self.shapes.T @ (sign * self.weights[acting, :, None] * tractions[here])
         return nodal_vector(self.particles.W, self.nodes[acting], forces)
 
     # -- What is kept ---------------------------------------------------------------------------
@@ -377,10 +387,9 @@ def nodal_vector(
     vector = _compat.create_vector(W)
     gdim = forces.shape[-1]
     with vector.localForm() as whole:
-        size = whole.getSize() // gdim
-        flat, part = nodes.ravel(), forces.reshape(-1, gdim)
-        sums = [np.bincount(flat, weights=part[:, i], minlength=size) for i in range(gdim)]
-        whole.array_w[:] = np.stack(sums, axis=1).ravel()
+        whole.set(0.0)
+        dofs = nodes[..., None] * gdim + np.arange(gdim)
+        np.add.at(whole.array_w, dofs.ravel(), forces.ravel())
     vector.ghostUpdate(PETSc.InsertMode.ADD_VALUES, PETSc.ScatterMode.REVERSE)
     return vector
 
@@ -389,11 +398,11 @@ class Blocks(NamedTuple):
     """Dense blocks of a matrix.
 
     Attributes:
-        keys: What each block is known by, shape ``(n, ...)``: those of one key have the same rows
-            and columns.
+        keys: What each block is known by, shape ``(n,)``, each another: those of one key have the
+            same rows and columns.
         rows: Global dofs of their rows, shape ``(n, r)``.
         columns: Global dofs of their columns, shape ``(n, c)``.
-        values: Shape ``(n, r, c)``; those of one key add up.
+        values: Shape ``(n, r, c)``.
     """
 
     keys: NDArray[np.int64]
@@ -415,12 +424,11 @@ class PointMatrix:
         self._sizes = tuple(
             (space if self._comm.rank == 0 else 0, space)
             if isinstance(space, int)
-            else _sizes_of(space)
+            else sizes_of(space)
             for space in (rows, columns)
         )
         self._matrix: PETSc.Mat | None = None
-        self._places: dict[tuple[int, ...], int] = {}
-        self._last: dict[int, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
+        self._places: dict[int, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
         self._size = 0
         self._i: list[NDArray[np.int64]] = []
         self._j: list[NDArray[np.int64]] = []
@@ -435,25 +443,7 @@ class PointMatrix:
             ``None`` where no rank has had any.
         """
         before = self._size
-        begins = []
-        for number, part in enumerate(parts):
-            known = self._last.get(number)
-            if known is not None and np.array_equal(known[0], part.keys):
-                begins.append(known[1])
-                continue
-            size = part.rows.shape[1] * part.columns.shape[1]
-            begin = np.zeros(len(part.keys), dtype=np.int64)
-            for block, key in enumerate(part.keys.tolist()):
-                name = (number, *key)
-                place = self._places.get(name)
-                if place is None:
-                    place = self._places[name] = self._size
-                    self._size += size
-                    self._i.append(np.repeat(part.rows[block], part.columns.shape[1]))
-                    self._j.append(np.tile(part.columns[block], part.rows.shape[1]))
-                begin[block] = place
-            begins.append(begin)
-            self._last[number] = part.keys, begin
+        begins = [self._begin(number, part) for number, part in enumerate(parts)]
         if self._comm.allreduce(self._size > before, MPI.LOR):
             self._matrix = self._make()
         if self._matrix is None:
@@ -461,13 +451,26 @@ class PointMatrix:
         values = np.zeros(self._size)
         for part, begin in zip(parts, begins, strict=True):
             flat = part.values.reshape(len(begin), part.rows.shape[1] * part.columns.shape[1])
-            places = begin[:, None] + np.arange(flat.shape[1])
-            if len(np.unique(begin)) == len(begin):
-                values[places] += flat
-            else:
-                np.add.at(values, places, flat)
+            values[begin[:, None] + np.arange(flat.shape[1])] = flat
         _compat.set_entries(self._matrix, values)
         return self._matrix
+
+    def _begin(self, number: int, part: Blocks) -> NDArray[np.int64]:
+        """Return where the entries of each block begin, at the end those of new ones."""
+        none = np.zeros(0, dtype=np.int64)
+        keys, begins = self._places.get(number, (none, none))
+        new = np.flatnonzero(~np.isin(part.keys, keys))
+        if len(new):
+            rows, columns = part.rows[new], part.columns[new]
+            size = rows.shape[1] * columns.shape[1]
+            self._i.append(np.repeat(rows, columns.shape[1], axis=1).ravel())
+            self._j.append(np.tile(columns, (1, rows.shape[1])).ravel())
+            keys = np.concatenate([keys, part.keys[new]])
+            begins = np.concatenate([begins, self._size + size * np.arange(len(new))])
+            self._size += size * len(new)
+            order = np.argsort(keys)
+            keys, begins = self._places[number] = keys[order], begins[order]
+        return begins[np.searchsorted(keys, part.keys)]
 
     def _make(self) -> PETSc.Mat:
         matrix = PETSc.Mat().create(self._comm)
@@ -480,7 +483,7 @@ class PointMatrix:
         return matrix
 
 
-def _sizes_of(W: fem.FunctionSpace) -> tuple[int, int]:
+def sizes_of(W: fem.FunctionSpace) -> tuple[int, int]:
     """Return the number of dofs of this rank and of all ranks."""
     index, bs = W.dofmap.index_map, W.dofmap.index_map_bs
     return index.size_local * bs, index.size_global * bs
@@ -488,7 +491,12 @@ def _sizes_of(W: fem.FunctionSpace) -> tuple[int, int]:
 
 def global_dofs(W: fem.FunctionSpace, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the global dofs of local nodes ``(n, k)`` of W, shape ``(n, k gdim)``."""
-    index, bs = W.dofmap.index_map, W.dofmap.index_map_bs
-    whole = np.asarray(index.local_to_global(nodes.ravel().astype(np.int32)), dtype=np.int64)
-    dofs = whole.reshape(nodes.shape)[:, :, None] * bs + np.arange(bs)
+    bs = W.dofmap.index_map_bs
+    dofs = global_nodes(W, nodes)[:, :, None] * bs + np.arange(bs)
     return np.asarray(dofs.reshape(len(nodes), nodes.shape[1] * bs))
+
+
+def global_nodes(W: fem.FunctionSpace, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the global numbers of local nodes of W, of any shape."""
+    whole = W.dofmap.index_map.local_to_global(nodes.ravel().astype(np.int32))
+    return np.asarray(whole, dtype=np.int64).reshape(nodes.shape)

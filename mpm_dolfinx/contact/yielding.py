@@ -50,7 +50,7 @@ class Yielding:
         rows = np.arange(len(inverse))
         self._factors = [[], []]
         for place, (acting, blocks) in enumerate(parts):
-            keys = acting.facets[:, None]
+            keys = acting.facets
             here = np.broadcast_to(rows, (len(keys), len(rows)))
             left = blocks.of_nodes.swapaxes(1, 2) / share
             for side, matrix, values in (

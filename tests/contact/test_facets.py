@@ -24,10 +24,10 @@ def near_a_body(kind, degree=1):
     body = mpm.Particles(mesh, V, degree=degree)
     surface = Surface(body, None, None, 3, False, "A test")
     surface.settle()
-    nodes = surface.node_positions()
+    nodes = surface.own_nodes()
     nodes = nodes + 0.03 * np.sin(5.0 * nodes[:, ::-1])
     rng = np.random.default_rng(1)
-    x = nodes[surface.nodes].mean(axis=1)[rng.integers(0, len(surface.cells), 300)]
+    x = nodes[surface.own].mean(axis=1)[rng.integers(0, len(surface.cells), 300)]
     x = x + rng.uniform(-0.15, 0.15, x.shape)
     inner = -rng.normal(size=x.shape)
     inner /= np.linalg.norm(inner, axis=1)[:, None]

@@ -80,9 +80,39 @@ def test_compiled_loops_do_what_numpy_and_the_complex_step_do(side, friction):
         (*told[:2], *told.acts[:2]), (*known[:2], *known.acts[:2]), strict=True
     ):
         np.testing.assert_allclose(found, value, atol=1e-14)
-    D = stencil.derivatives(law, points, TOUCH, EXTENT)
-    by_steps = stencil.by_complex_step(law, points, TOUCH, EXTENT)
-    np.testing.assert_allclose(D, by_steps, atol=1e-13 * np.abs(by_steps).max())
+
+
+def sums(points, groups=7, blocks=50):
+    """Return blocks to add to, in which points of some groups meet, and meet themselves."""
+    some = np.random.default_rng(2)
+    (n, count, dim), k, own = points.x.shape, points.anchored.shape[1], 6
+    return stencil.Sums(
+        some.uniform(size=n),
+        some.normal(size=(n, own)),
+        some.integers(0, groups, n),
+        some.integers(0, blocks, (groups, own + k, own + count - 1)).astype(np.int32),
+        np.zeros((blocks, dim, dim)),
+    )
+
+
+@pytest.mark.skipif(loops is None, reason="needs the compiled loops")
+@pytest.mark.parametrize("friction", FRICTION)
+@pytest.mark.parametrize("side", SIDES)
+def test_compiled_tangents_are_the_complex_steps_summed_up(monkeypatch, side, friction):
+    law = FRICTION[friction]
+    points = meeting(side, law)
+    found, known = sums(points), sums(points)
+    stencil.add_tangents(law, points, TOUCH, EXTENT, found)
+    with monkeypatch.context() as without:
+        without.setattr(stencil, "loops", None)
+        stencil.add_tangents(law, points, TOUCH, EXTENT, known)
+    scale = np.abs(known.values).max()
+    assert scale > 1.0
+    np.testing.assert_allclose(found.values, known.values, atol=1e-14 * scale)
+    again = sums(points)
+    D = stencil.by_complex_step(law, points, TOUCH, EXTENT)
+    loops.add_derivatives(D, *again[:4], again.values)
+    np.testing.assert_allclose(again.values, known.values, atol=1e-14 * scale)
 
 
 @pytest.mark.parametrize("side", SIDES)
@@ -103,29 +133,23 @@ def test_directions_of_complex_steps_are_the_same_one_by_one(monkeypatch, side):
         np.testing.assert_allclose(found, known, atol=1e-13 * scale)
 
 
-@pytest.mark.parametrize("spread", ["rows", "columns", "both"])
-def test_compiled_blocks_are_those_of_numpy(monkeypatch, spread):
-    some = np.random.default_rng(2)
-    n, dim, k = 20, 3, 4
-    D = some.normal(size=(n, 1 + k, dim, 1 + 2 * k, dim))
-    shapes, none = some.normal(size=(n, 6)), np.zeros((0, k))
-    rows = (0, shapes) if spread != "columns" else (1, none)
-    columns = (0, shapes) if spread != "rows" else (1 + k, none)
-    size = (5, dim * (6 if rows[0] == 0 else k), dim * (6 if columns[0] == 0 else k))
-    number, weights = some.integers(0, 5, n), some.uniform(size=n)
-    found = stencil.added_blocks(D, weights, number, rows, columns, size)
-    monkeypatch.setattr(stencil, "loops", None)
-    known = stencil.added_blocks(D, weights, number, rows, columns, size)
-    np.testing.assert_allclose(found, known, atol=1e-13)
-    assert np.abs(known).max() > 0.1
+def test_no_points_add_nothing():
+    law = FRICTION["rough"]
+    points = meeting("triangle", law, count=0)
+    where = sums(points)
+    stencil.add_tangents(law, points, TOUCH, EXTENT, where)
+    assert not where.values.any()
 
 
-def test_blocks_of_no_points_are_none_whatever_the_degrees_of_both_bodies():
-    k, shapes, none = 3, np.zeros((0, 6)), np.zeros((0, 3))
-    D, nothing, number = np.zeros((0, 1 + k, 3, 1 + 2 * k, 3)), np.zeros(0), np.zeros(0, np.int64)
-    for rows, columns, size in (
-        ((0, shapes), (0, shapes), (0, 18, 18)),
-        ((1, none), (0, shapes), (0, 9, 18)),
+@pytest.mark.skipif(loops is None, reason="needs the compiled loops")
+def test_blocks_that_are_not_there_are_refused():
+    law = FRICTION["rough"]
+    points = meeting("quadrilateral", law)
+    where = sums(points)
+    for wrong in (
+        where._replace(values=where.values[:-1]),
+        where._replace(group=where.group + 1),
+        where._replace(positions=where.positions[:, :-1]),
     ):
-        found = stencil.added_blocks(D, nothing, number, rows, columns, size)
-        assert found.shape == size
+        with pytest.raises(ValueError, match="shapes do not go together"):
+            stencil.add_tangents(law, points, TOUCH, EXTENT, wrong)
