@@ -31,6 +31,9 @@ parser.add_argument(
     default="body",
     help="what the strip holds: facets of the soil, or nodes of the background",
 )
+parser.add_argument(
+    "--finer", type=kit.count, default=0, help="how often cells are halved towards the strip's edge"
+)
 parser.add_argument("--small-strain", action="store_true", help="material of small strain")
 parser.add_argument("--steps", type=kit.whole, default=40, help="steps")
 args = parser.parse()
@@ -45,32 +48,9 @@ h = half_width / max(1, round(half_width / args.cell))
 # and from there on each a fifth longer than the one before. (The cell is rounded so that the strip
 # ends at a line.)
 
-
-def lines(fine: float) -> np.ndarray:
-    """Grid lines from 0 to `size`, at first `h` apart."""
-    cells = np.full(round(fine / h), h)
-    longer = h * 1.2 ** np.arange(1, 100)
-    longer = longer[: 1 + np.argmax(np.cumsum(longer) >= size - cells.sum())]
-    longer *= (size - cells.sum()) / longer.sum()
-    return np.concatenate([[0.0], np.cumsum(cells), cells.sum() + np.cumsum(longer)])
-
-
-def divided(along: np.ndarray, parts: int) -> np.ndarray:
-    """Lines that divide each interval of others into equal parts."""
-    places = np.arange((len(along) - 1) * parts + 1) / parts
-    return np.interp(places, np.arange(len(along)), along)
-
-
-def grid(x: np.ndarray, y: np.ndarray, kind: mesh.CellType) -> mesh.Mesh:
-    """A mesh with given grid lines: that of a rectangle with its vertices moved."""
-    domain = kit.box([len(x) - 1.0, len(y) - 1.0], [len(x) - 1, len(y) - 1], kind)
-    for axis, along in enumerate((x, y)):
-        place = domain.geometry.x[:, axis]
-        place[:] = np.interp(place, np.arange(len(along)), along)
-    return domain
-
-
-across, up = lines(1.75), size - lines(1.0)[::-1]
+across, up = kit.lines(h, 1.75, size), size - kit.lines(h, 1.0, size)[::-1]
+across, up = kit.finer_at(half_width, across, args.finer), kit.finer_at(size, up, args.finer)
+edge = h / 2**args.finer  # the cells at the strip's edge
 
 # The background has the same lines but for two shifts, and two more rows of cells above the ground
 # as room for the heave. The strip's edge is a singular point, and two things about it are decided
@@ -83,13 +63,13 @@ across, up = lines(1.75), size - lines(1.0)[::-1]
 # lines at its edge and at the ground.
 
 on_body = args.strip == "body"
-beyond, over = (0.04 * h, 1e-4) if on_body else (0.0, 0.0)  # m
+beyond, over = (0.04 * edge, 1e-4) if on_body else (0.0, 0.0)  # m
 taper = np.clip((size - across) / 2.0, 0.0, 1.0) * (across > 0.0)
 heights = np.append(up - over * np.clip(up, 0.0, 1.0), size - over + h * np.arange(1, 3))
-background = grid(across + beyond * taper, heights, mesh.CellType.quadrilateral)
+background = kit.grid([across + beyond * taper, heights], mesh.CellType.quadrilateral)
 V = fem.functionspace(background, ("Lagrange", args.degree, (2,)))
 each = args.particles_per_cell
-body = grid(divided(across, each), divided(up, each), kit.DOMAINS[args.domain])
+body = kit.grid([kit.divided(across, each), kit.divided(up, each)], kit.DOMAINS[args.domain])
 
 # Quadrilaterals of degree 1 have 2 by 2 points here.
 

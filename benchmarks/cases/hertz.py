@@ -38,30 +38,17 @@ def lines(fine: float) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum([*cells[: round(fine / h)], *tail])])
 
 
-def grid(places: list[np.ndarray], kind: mesh.CellType) -> mesh.Mesh:
-    """A mesh with given lines."""
-    counts = [len(along) - 1 for along in places]
-    domain = kit.box([float(count) for count in counts], counts, kind)
-    for axis, along in enumerate(places):
-        at = domain.geometry.x[:, axis]
-        at[:] = np.interp(at, np.arange(len(along)), along)
-    return domain
-
-
-def halved(along: np.ndarray) -> np.ndarray:
-    """Lines that divide each interval of others in two."""
-    return np.interp(np.arange(2 * len(along) - 1) / 2, np.arange(len(along)), along)
-
-
 # The background has the body's lines, but for one more above, 0.4 cells over the ground, and the
 # outermost, which are a little farther away, as the body is pressed outwards.
 
 across, up = lines(4.0 * a / 3.0), -lines(a)[::-1]
 border = end + 0.05 * a
 beside, over = np.append(across[:-1], border), np.concatenate([[-border], up[1:], [0.4 * h]])
-V = fem.functionspace(grid([beside, beside, over], mesh.CellType.hexahedron), ("Lagrange", 1, (3,)))
+V = fem.functionspace(
+    kit.grid([beside, beside, over], mesh.CellType.hexahedron), ("Lagrange", 1, (3,))
+)
 block = mpm.Particles(
-    grid([halved(across), halved(across), halved(up)], kit.DOMAINS[args.domain]), V
+    kit.grid([kit.divided(along, 2) for along in (across, across, up)], kit.DOMAINS[args.domain]), V
 )
 ground = mesh.locate_entities_boundary(block.mesh, 2, lambda x: np.isclose(x[2], 0.0))
 tags = mesh.meshtags(block.mesh, 2, np.sort(ground), np.full(len(ground), 1, np.int32))

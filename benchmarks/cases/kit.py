@@ -71,6 +71,10 @@ class Parser(argparse.ArgumentParser):
             self.add_argument(
                 "--quadrature-degree", type=whole, help="of the domains' rule; by their degree"
             )
+        self.add_stabilisation()
+
+    def add_stabilisation(self) -> None:
+        """Add the cures of badly supported dofs."""
         self.add_argument(
             "--stabilisation",
             choices=("auto", "ghost", "aggregate", "none"),
@@ -101,6 +105,11 @@ def whole(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a whole number from 1 on")
     return value
+
+
+def count(text: str) -> int:
+    """A whole number from 0 on."""
+    return whole(text) if text.strip() != "0" else 0
 
 
 def positive(text: str) -> float:
@@ -137,6 +146,39 @@ DOMAINS = {
 }
 F_BARS = ("none", "domain", "pair", "patch")
 METHODS = ("cpdi2", "cpdi", "gimp", "mpm")
+
+
+def lines(h: float, fine: float, whole: float) -> np.ndarray:
+    """Grid lines `h` apart up to `fine`, and from there to `whole` each cell a fifth longer."""
+    cells = np.full(round(fine / h), h)
+    longer = h * 1.2 ** np.arange(1, 100)
+    longer = longer[: 1 + np.argmax(np.cumsum(longer) >= whole - cells.sum())]
+    longer *= (whole - cells.sum()) / longer.sum()
+    return np.concatenate([[0.0], np.cumsum(cells), cells.sum() + np.cumsum(longer)])
+
+
+def divided(along: np.ndarray, parts: int) -> np.ndarray:
+    """Lines that divide each interval of others into equal parts."""
+    places = np.arange((len(along) - 1) * parts + 1) / parts
+    return np.interp(places, np.arange(len(along)), along)
+
+
+def finer_at(place: float, along: np.ndarray, times: int) -> np.ndarray:
+    """Lines of which the intervals next to one at `place` are halved towards it."""
+    middle = int(np.argmin(np.abs(along - place)))
+    lengths = [along[i] - along[middle] for i in (middle - 1, middle + 1) if 0 <= i < len(along)]
+    more = [along[middle] + length / 2.0**k for length in lengths for k in range(1, times + 1)]
+    return np.sort(np.append(along, more))
+
+
+def grid(places: Sequence[np.ndarray], kind: mesh.CellType) -> mesh.Mesh:
+    """A mesh with given grid lines along each axis: that of a box with its vertices moved."""
+    counts = [len(along) - 1 for along in places]
+    domain = box([float(count) for count in counts], counts, kind)
+    for axis, along in enumerate(places):
+        place = domain.geometry.x[:, axis]
+        place[:] = np.interp(place, np.arange(len(along)), along)
+    return domain
 
 
 def box(upper: Sequence[float], cells: Sequence[int], kind: mesh.CellType) -> mesh.Mesh:

@@ -28,6 +28,12 @@ parser.add_argument(
 )
 parser.add_argument("--steps", type=kit.whole, help="a hundredth of a width each by default")
 parser.add_f_bar("patch")
+parser.add_mixed()
+parser.add_argument("--degree", type=int, choices=(1, 2), default=1, help="of the basis")
+parser.add_argument("--domains-per-cell", type=kit.whole, default=2, help="each way")
+parser.add_argument(
+    "--finer", type=kit.count, default=0, help="how often cells are halved towards the edge at 0.5"
+)
 args = parser.parse()
 
 # The right half of a soil 8 m wide and 2.5 m deep; obstacles are 1 m wide but for the wedge.
@@ -48,26 +54,24 @@ def lines(end: float, fine: float) -> np.ndarray:
     return np.concatenate([h * np.arange(round(fine / h) + 1), fine + np.cumsum(tail)])
 
 
-def divided(along: np.ndarray) -> np.ndarray:
-    """Lines that divide each interval of others in two."""
-    return np.interp(np.arange(2 * len(along) - 1) / 2, np.arange(len(along)), along)
-
-
-def grid(x: np.ndarray, y: np.ndarray, kind: mesh.CellType) -> mesh.Mesh:
-    """A mesh with given lines."""
-    domain = kit.box([len(x) - 1.0, len(y) - 1.0], [len(x) - 1, len(y) - 1], kind)
-    for axis, along in enumerate((x, y)):
-        place = domain.geometry.x[:, axis]
-        place[:] = np.interp(place, np.arange(len(along)), along)
-    return domain
-
-
 across, up = lines(wide, 1.5), -lines(deep, 1.0)[::-1]
-room = np.append(up, h * np.arange(1, round(1.0 / h) + 1))
-V = fem.functionspace(grid(across, room, mesh.CellType.quadrilateral), ("Lagrange", 1, (2,)))
-rule = 2 if args.domain == "quad" and args.quadrature_degree is None else args.quadrature_degree
+across, up = kit.finer_at(0.5, across, args.finer), kit.finer_at(0.0, up, args.finer)
+above = kit.finer_at(0.0, h * np.arange(round(1.0 / h) + 1), args.finer)
+room = np.append(up, above[1:])
+V = fem.functionspace(
+    kit.grid([across, room], mesh.CellType.quadrilateral), ("Lagrange", args.degree, (2,))
+)
+rule = args.quadrature_degree
+if rule is None and args.domain == "quad" and args.degree == 1:
+    rule = 2
 soil = mpm.Particles(
-    grid(divided(across), divided(up), kit.DOMAINS[args.domain]), V, quadrature_degree=rule
+    kit.grid(
+        [kit.divided(along, args.domains_per_cell) for along in (across, up)],
+        kit.DOMAINS[args.domain],
+    ),
+    V,
+    degree=args.degree,
+    quadrature_degree=rule,
 )
 
 
@@ -110,7 +114,8 @@ problem = mpm.QuasiStaticProblem(
         held(0, lambda x: np.isclose(x[1], -deep)),
         held(1, lambda x: np.isclose(x[1], -deep)),
     ],
-    f_bar=args.f_bar,
+    f_bar=args.f_bar if args.mixed == "none" else "none",
+    mixed=None if args.mixed == "none" else args.mixed,
     terms=[obstacle],
 )
 

@@ -33,6 +33,10 @@ parser.add_argument("--degree", type=int, choices=(1, 2), default=1, help="of th
 parser.add_argument("--rough", action="store_true", help="a rough strip, not a smooth one")
 parser.add_f_bar("patch")
 parser.add_mixed()
+parser.add_argument(
+    "--domains-per-cell", type=kit.whole, default=2, help="under the footing, each way"
+)
+parser.add_stabilisation()
 parser.add_argument("--dilation-angle", type=float, help="of the footing's soil, else associated")
 args = parser.parse()
 
@@ -49,29 +53,6 @@ def space(width: float, depth: float) -> fem.FunctionSpace:
         comm, [[0.0, 0.0], [h * c for c in cells]], cells, mesh.CellType.quadrilateral
     )
     return fem.functionspace(grid, ("Lagrange", 1, (2,)))
-
-
-def lines(fine: float, whole: float) -> np.ndarray:
-    """Grid lines `h` apart up to `fine`, and from there on each cell a fifth longer."""
-    cells = np.full(round(fine / h), h)
-    longer = h * 1.2 ** np.arange(1, 100)
-    longer = longer[: 1 + np.argmax(np.cumsum(longer) >= whole - cells.sum())]
-    longer *= (whole - cells.sum()) / longer.sum()
-    return np.concatenate([[0.0], np.cumsum(cells), cells.sum() + np.cumsum(longer)])
-
-
-def halved(along: np.ndarray) -> np.ndarray:
-    """Lines and the middles between them."""
-    return np.interp(np.arange(2 * len(along) - 1) / 2, np.arange(len(along)), along)
-
-
-def graded(x: np.ndarray, y: np.ndarray, cell: mesh.CellType) -> mesh.Mesh:
-    """A mesh with given grid lines."""
-    grid = kit.box([len(x) - 1.0, len(y) - 1.0], [len(x) - 1, len(y) - 1], cell)
-    for axis, along in enumerate((x, y)):
-        place = grid.geometry.x[:, axis]
-        place[:] = np.interp(place, np.arange(len(along)), along)
-    return grid
 
 
 def held(V: fem.FunctionSpace, component: int, *places: float) -> fem.DirichletBC:
@@ -122,16 +103,15 @@ else:
     # As in footing.py a line of the background is a little beyond the strip's edge, and one a
     # little below the ground.
     young, size = 1e6, 3.0
-    across, up = lines(1.5, size), size - lines(1.0, size)[::-1]
+    across, up = kit.lines(h, 1.5, size), size - kit.lines(h, 1.0, size)[::-1]
     taper = np.clip((size - across) / 1.5, 0.0, 1.0) * (across > 0.0)
     over = 0.002 * h
     heights = np.append(up - over * np.clip(up, 0.0, 1.0), size - over + h * np.arange(1, 3))
-    grid = graded(across + 0.04 * h * taper, heights, mesh.CellType.quadrilateral)
+    grid = kit.grid([across + 0.04 * h * taper, heights], mesh.CellType.quadrilateral)
     V = fem.functionspace(grid, ("Lagrange", args.degree, (2,)))
-    body = graded(halved(across), halved(up), kind)
+    body = kit.grid([kit.divided(along, args.domains_per_cell) for along in (across, up)], kind)
     cohesion = 1.0 if args.case == "footing" else 0.0
     dilation = args.friction_angle if args.dilation_angle is None else args.dilation_angle
-    law = mpm.materials.MohrCoulomb(young, 0.3, cohesion, args.friction_angle, dilation)
     bcs = [held(V, 0, 0.0, size), held(V, 1, 0.0)]
     tangent = np.tan(np.radians(args.friction_angle))
     N_q = np.exp(np.pi * tangent) * np.tan(np.radians(45.0 + args.friction_angle / 2.0)) ** 2
@@ -146,7 +126,9 @@ else:
             (30.0, True): 14.754,
         }
         exact = known.get((args.friction_angle, args.rough), np.nan)
-        settlement = 1e-5 * height * np.nan_to_num(exact, nan=10.0)
+        # So stiff that the heave beside the strip adds nothing.
+        young, settlement = 1e7, 1e-6 * height * np.nan_to_num(exact, nan=10.0)
+    law = mpm.materials.MohrCoulomb(young, 0.3, cohesion, args.friction_angle, dilation)
 
 particles = mpm.Particles(
     body,
@@ -175,6 +157,7 @@ problem = mpm.QuasiStaticProblem(
     supports=supports,
     f_bar=args.f_bar if args.mixed == "none" else "none",
     mixed=None if args.mixed == "none" else args.mixed,
+    stabilisation=kit.stabilisation(args),
     petsc_options_prefix="strength_",
     initial_stress=mpm.geostatic(size, weight, 0.5, (0.0, -1.0)) if has_strip and weight else None,
 )

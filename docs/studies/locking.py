@@ -30,6 +30,13 @@ STRIPS = {
     "nodes of the background": "--strip background",
     "nodes, small strain": "--strip background --small-strain",
 }
+ONE = "--particles-per-cell 1 --stabilisation none"
+EDGES = {
+    "one domain, `None`": (ONE, (0, 0)),
+    "one domain, `None`, finer": (ONE, (2, 1)),
+    "one domain, ghost penalty, finer": ("--particles-per-cell 1", (2, 1)),
+    "2 by 2, ghost penalty, finer": ("", (2, 1)),
+}
 BEAM = {
     'one point, `"patch"`': "--quadrature-degree 1 --f-bar patch",
     '2 by 2 points, `"patch"`': "--quadrature-degree 2 --f-bar patch",
@@ -77,10 +84,10 @@ def footing(options: str) -> list[Any]:
     return found
 
 
-def strip(options: str) -> list[Any]:
+def strip(options: str, finer: tuple[int, int] = (0, 0)) -> list[Any]:
     found: list[Any] = []
-    for cell in (0.25, 0.125):
-        asked = ["--mixed", "pressure", "--degree", 2, *options.split()]
+    for cell, times in zip((0.25, 0.125), finer, strict=True):
+        asked = ["--mixed", "pressure", "--degree", 2, "--finer", times, *options.split()]
         r = run("footing", "--cell", cell, *asked)
         found.append(share(r, f"{r['peak']:.4f}, {r['ratio']:.4f} ({100 * r['drop']:.2f} %)"))
         found.append(f"{r['iterations']} ({r['most_solves']})")
@@ -137,6 +144,12 @@ def tables() -> dict[str, Table]:
             "locking",
             ["the strip holds", *beside],
             {name: partial(strip, options) for name, options in STRIPS.items()},
+            cases=["footing"],
+        ),
+        "locking/edge": Table(
+            "locking",
+            ["domains in a cell, `stabilisation`", *beside],
+            {name: partial(strip, *asked) for name, asked in EDGES.items()},
             cases=["footing"],
         ),
         "locking/cantilever": Table(

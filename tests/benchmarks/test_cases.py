@@ -21,7 +21,8 @@ LONG = {
     *("sand-damped", "sand-dilates"),
     *("vortex", "disc", "discs", "discs-contact", "column"),
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
-    *("slope", "vertical-cut", "footing-friction"),
+    *("slope", "vertical-cut", "footing-friction", "footing-weight-rough", "footing-edge"),
+    *("finer-footing", "mixed-footing"),
     *("stiff-footing", "hertz", "hertz-penalty", "expansion-whole"),
     *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
 }
@@ -130,13 +131,36 @@ RUNS = {
     ),
     "footing-weight": (
         "strength",
-        "--case footing_weight --cell 0.25 --friction-angle 30 --degree 2 --steps 12",
-        {"ratio": 1.35, "cutbacks": 0},
+        "--case footing_weight --cell 0.25 --friction-angle 30 --degree 2 --steps 12 --f-bar none "
+        "--domains-per-cell 1 --quadrature-degree 3 --stabilisation none",
+        {"ratio": 1.025, "cutbacks": 2},
+    ),
+    "footing-weight-rough": (
+        "strength",
+        "--case footing_weight --cell 0.25 --friction-angle 30 --degree 2 --steps 12 --f-bar none "
+        "--domains-per-cell 1 --quadrature-degree 3 --stabilisation none --rough",
+        {"ratio": 1.012, "cutbacks": 3},
+    ),
+    "footing-edge": (
+        "footing",
+        "--cell 0.25 --finer 2 --degree 2 --mixed pressure --particles-per-cell 1 "
+        "--stabilisation none",
+        {"ratio": 1.012, "peak": 1.018, "drop": 2e-3, "most_solves": 8, "cutbacks": 0},
     ),
     "rounded-footing": (
         "penetration",
         "--obstacle footing --cell 0.25 --steps 10",
         {"ratio": 1.17, "cutbacks": 0, "iterations": 50, "penetration": 0.01},
+    ),
+    "finer-footing": (
+        "penetration",
+        "--obstacle footing --finer 2 --law nitsche",
+        {"ratio": 1.04, "cutbacks": 0, "iterations": 180},
+    ),
+    "mixed-footing": (
+        "penetration",
+        "--obstacle footing --degree 2 --domains-per-cell 1 --mixed pressure",
+        {"ratio": 1.015, "cutbacks": 0, "iterations": 150},
     ),
     "stiff-footing": (
         "penetration",
@@ -294,7 +318,7 @@ def test_numbers(case, capfd):
         assert numbers["error"] > 6e-2 and numbers["iterations"] <= 170
     if name == "block3d":
         assert abs(numbers["height"] - 1.2) < 1e-3
-    if name == "strength":
+    if name in ("strength", "footing", "penetration") and numbers.get("ratio"):
         assert numbers["ratio"] > 0.9
     if name == "sand_column":
         assert numbers["ratio"] > 0.85
