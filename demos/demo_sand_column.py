@@ -42,8 +42,7 @@ density, gravity = 2000.0, (0.0, -10.0)  # kg/m3, m/s2
 end, dt = 1.45, 0.01  # s
 run_out = 1.2 * a
 
-# The floor is a row of cells that are held as a whole: sand that falls onto it between two steps
-# stays where it is.
+# The floor is a row of cells held as a whole: sand that falls onto it in a step stays there.
 
 corners, quadrilateral = [[0.0, -h], [28 * h, 11 * h]], mesh.CellType.quadrilateral
 background = mesh.create_rectangle(comm, corners, [28, 12], quadrilateral)
@@ -76,9 +75,8 @@ problem = mpm.DynamicProblem(
 
 X = particles.W.tabulate_dof_coordinates()[:, 0]
 times, fronts, pictures = [0.0], [0.0], {}
-figure, axes = plt.subplot_mosaic(
-    [["0.3", "0.6"], ["end", "front"]], figsize=(13, 6.5), layout="constrained"
-)
+rows = [["0.3", "0.6"], ["end", "front"]]
+figure, axes = plt.subplot_mosaic(rows, figsize=(13, 6.5), layout="constrained")
 for step in problem.steps(end, dt, output_at=[0.3, 0.6]):
     times.append(step.time)
     x = X + particles.displacement.x.array[::2]
@@ -115,9 +113,7 @@ assert abs(fronts[-1] / run_out - 1.0) < 0.15 and left < 0.02
 
 # ## Exercises
 #
-# 1. Leave out `volume_correction`. How much larger is the heap (`particles.volume`), and where does
-#    its front come to?
-# 2. Take `a = 3`, with five times the viscosity. The background must be higher and longer; what of
-#    (1) is left?
+# 1. Leave out `volume_correction`. How much larger is the heap (`particles.volume`)?
+# 2. Take `a = 3`, five times the viscosity and a larger background. What of (1) is left?
 # 3. Take 25° and 35°. The experiment hardly depends on the angle; does the law?
 # 4. Leave out `rayleigh`. How many more linear solves are there, and where does the front lie?
