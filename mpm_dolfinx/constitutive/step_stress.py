@@ -265,8 +265,8 @@ class StepStress:
             return found.volume, found.slope
         volume, slope = found.volume.copy(), found.slope.copy()
         small = self._small[pressed]
-        excess = volume_ratio(H[pressed])
-        volume[pressed] = np.where(small, np.einsum("nii->n", H[pressed]), np.log(excess))
+        logarithmic = np.log(volume_ratio(H[pressed]))
+        volume[pressed] = np.where(small, np.einsum("nii->n", H[pressed]), logarithmic)
         slope[pressed] = slope_of_volume(H[pressed], small)
         return volume, slope
 

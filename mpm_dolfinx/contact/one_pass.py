@@ -148,7 +148,7 @@ class Pass:
         self._learn(self.source.own_nodes(converged=True), self.target.own_nodes(converged=True))
         self._paired: Closest | None = None
         self.stencil = None
-        self.count = 0
+        self._evaluations = 0
 
     def _learn(self, mine: NDArray[np.float64], nodes: NDArray[np.float64]) -> NearFacets:
         """Learn of the facets near points, and of the points near these (collective).
@@ -193,7 +193,7 @@ class Pass:
         if paired is not None:
             facet = near.find(_numbers(before, paired.facet))
             paired = paired._replace(facet=facet, near=paired.near & (facet >= 0))
-            whole = _nothing(self._count, self.source.gdim - 1)
+            whole = _nothing(self._num_points, self.source.gdim - 1)
             self._paired = Closest(
                 *(
                     _spread(part, which, base)[self._which]
@@ -202,7 +202,7 @@ class Pass:
             )
 
     @property
-    def _count(self) -> int:
+    def _num_points(self) -> int:
         """Number of all points."""
         return len(self.source.cells) * self.source.nq
 
@@ -238,10 +238,15 @@ class Pass:
                 x[which],
             ),
         )
-        m, nq = len(self.source.cells), self.source.nq
-        gap = _spread(np.where(found.near, found.gap, np.inf), which, np.full(len(x), np.inf))
-        place, none, zero = x.reshape(m, nq, -1), np.zeros((m, nq), dtype=bool), np.zeros((m, nq))
-        self.outcome = Outcome(place, gap.reshape(m, nq), zero, np.zeros_like(place), none, none)
+        untouched = self._untouched(x)
+        gap = np.where(found.near, found.gap, np.inf).reshape(-1, self.source.nq)
+        self.outcome = replace(untouched, gap=_spread(gap, self._facets, untouched.gap))
+
+    def _untouched(self, x: NDArray[np.float64]) -> Outcome:
+        """Return what there is of all points, at x, to which nothing is near."""
+        shape = len(self.source.cells), self.source.nq
+        place, zero, none = x.reshape(*shape, -1), np.zeros(shape), np.zeros(shape, dtype=bool)
+        return Outcome(place, np.full(shape, np.inf), zero, np.zeros_like(place), none, none)
 
     def _remembered(self, x: NDArray[np.float64], known: Memory) -> Memory:
         """Return what is to be remembered of all points.
@@ -280,7 +285,7 @@ class Pass:
         """Find what acts there."""
         assert self._near is not None
         near, x, nodes, last = self._near, self._x, self._nodes, self._last
-        self.count += 1
+        self._evaluations += 1
         normals = self._flat(self.source.normals(which=self._facets))
         found = near.closest(x, normals, nodes, self.reach)
         if self._paired is not None:
@@ -292,7 +297,7 @@ class Pass:
         # the facet itself.
         out = ~last.within & (last.gap < -self.touch)
         found = found._replace(near=found.near & ~(out & (found.beside >= LINGER)))
-        if self.count > FREEZE and self._paired is not None:
+        if self._evaluations > FREEZE and self._paired is not None:
             found = self._frozen(found, x, nodes)
         self._paired = found
         gap = np.where(found.near, found.gap, np.inf)
@@ -554,13 +559,10 @@ class Pass:
         closest = _numbers(near, found.facet)
         own = Memory(inside, numbers, place, closest, found.gap, self._within, offset, x, anchors)
         memory = self._remembered(self._flat(self.source.positions()), own)
-        m, nq = len(self.source.cells), self.source.nq
-        place = memory.points.reshape(m, nq, -1)
-        none, zero = np.zeros((m, nq), dtype=bool), np.zeros((m, nq))
-        nothing = Outcome(place, np.full((m, nq), np.inf), zero, np.zeros_like(place), none, none)
+        untouched = self._untouched(memory.points)
         outcome = Outcome(
             *(
-                _spread(getattr(trial, field.name), self._facets, getattr(nothing, field.name))
+                _spread(getattr(trial, field.name), self._facets, getattr(untouched, field.name))
                 for field in fields(Outcome)
             )
         )
@@ -579,7 +581,7 @@ class Pass:
         assert near is not None
         which = np.flatnonzero(self._within)
         off = np.abs(found.place[which] - near.clamped(found.place[which])).max(axis=1, initial=0.0)
-        which = which[(off > 0.0) | (self.count > FREEZE)]
+        which = which[(off > 0.0) | (self._evaluations > FREEZE)]
         normals = self._flat(self.source.normals(which=self._facets))[which]
         there = near.closest(x[which], normals, self._nodes, self.reach)
         moves = there.near & (there.facet >= 0) & (there.facet != found.facet[which])

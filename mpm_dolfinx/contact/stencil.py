@@ -27,7 +27,6 @@ __all__ = [
     "Start",
     "Stencil",
     "Sums",
-    "Table",
     "acting",
     "acting_now",
     "add_tangents",

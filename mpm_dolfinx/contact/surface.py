@@ -177,7 +177,7 @@ class Surface:
         kind = basix.cell.subentity_types(cell)[dim][0]
         points, weights = map(np.asarray, basix.make_quadrature(kind, self._degree))
         self.nq = len(weights)
-        x = self._mesh_nodes = W.tabulate_dof_coordinates()[:, : self.gdim].copy()
+        x = W.tabulate_dof_coordinates()[:, : self.gdim].copy()
         self.element: Any = basix.create_element(
             basix.ElementFamily.P, kind, element.degree, element.lagrange_variant
         )
@@ -194,9 +194,9 @@ class Surface:
             places = at[0] + self.element.points @ (at[1 : dim + 1] - at[0])
             own = np.linalg.norm(places[:, None] - element.points, axis=2).argmin(axis=1)
             self.nodes[here] = W.dofmap.list[self.cells[here]][:, own]
-        self._own, places = np.unique(self.nodes, return_inverse=True)
+        self._distinct, places = np.unique(self.nodes, return_inverse=True)
         self.own = places.reshape(self.nodes.shape)
-        self._own_mesh = x[self._own]
+        self._own_mesh = x[self._distinct]
         edges = np.einsum("jqk,mki->mqij", self.slopes, x[self.nodes])
         area = np.sqrt(np.linalg.det(edges.swapaxes(2, 3) @ edges)) * weights
         self._plain = self._in_mesh = area
@@ -233,10 +233,6 @@ class Surface:
     def touch(self) -> float:
         """Gap at which points touch."""
         return TOUCH * self.extent
-
-    def undeformed(self) -> NDArray[np.float64]:
-        """Return the points in the mesh, shape ``(m, nq, gdim)``."""
-        return np.asarray(self.shapes @ self._mesh_nodes[self.nodes])
 
     @property
     def reference_points(self) -> list[NDArray[np.float64]]:
@@ -298,7 +294,7 @@ class Surface:
         """Return positions of the nodes of all facets, each once, shape ``(n, gdim)``."""
         body = self.particles
         d = body.converged_displacement if converged else body.displacement.x.array
-        return np.asarray(self._own_mesh + d.reshape(-1, self.gdim)[self._own])
+        return np.asarray(self._own_mesh + d.reshape(-1, self.gdim)[self._distinct])
 
     @property
     def sizes(self) -> NDArray[np.float64]:
