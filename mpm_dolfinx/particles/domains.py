@@ -326,12 +326,6 @@ class Domains:
                 )
 
     @property
-    def present_weights(self) -> NDArray[np.float64]:
-        """Reference volumes of the history's points, shape ``(n, nq)``; 0 where deleted."""
-        weights = self.quadrature.weights
-        return np.where(self.deleted[:, None], 0.0, weights) if self.deletion else weights
-
-    @property
     def deleted(self) -> NDArray[np.bool_]:
         """Whether each particle this rank owns is deleted, shape ``(n,)``."""
         if self.deletion is None:
@@ -435,12 +429,6 @@ class Domains:
         sign = self._geometry.orientation
         folded = self._geometry.jacobian_bound.vanishes(now, sign) & ~self.triangular
         return np.asarray(self.global_index[folded])
-
-    def proper(self) -> NDArray[np.bool_]:
-        """Return whether det J is positive wherever mass is integrated, shape ``(n,)``."""
-        exact = self._geometry.exact_rule()
-        ratio = volume_ratio(exact.displacement_gradient(self._nodal()))
-        return np.asarray((ratio > 0.0).all(axis=1))
 
     def domain_distortion(self) -> NDArray[np.float64]:
         """Return the smallest det J of each domain over its mean, shape ``(n,)``.
