@@ -71,6 +71,7 @@ FEATURES = {
     "contact": {"contact": "penalty"},
     "contact, Nitsche": {"contact": "nitsche"},
     "stabilised pressure": {"mixed": "stabilised pressure"},
+    "RigidBody": {"contact": "rigid body"},
 }
 
 
@@ -127,12 +128,15 @@ class Scene:
     """
 
     kind = mpm.QuasiStaticProblem
+    speed = 0.0
 
     def __init__(self, wanted):
         self.wanted = wanted
         self.dim = wanted.get("dim", 2)
         self.degree = wanted.get("degree", 1)
         self.springs, self.goal = None, None
+        self.start = np.zeros(self.dim)
+        self.start[-1] = -self.speed
         self.supports = []
         n, h = (2, 1.0) if self.dim == 3 and "delete" not in wanted else (4, 0.5)
         if self.dim == 2 and self.degree > 1:
@@ -206,14 +210,7 @@ class Scene:
             terms.append(self.springs)
         self.contact = None
         if "contact" in wanted:
-            inward = np.eye(self.dim)[0]
-            self.contact = mpm.contact.Rigid(
-                first,
-                mpm.contact.plane(inward, -inward),
-                0.3,
-                axisymmetric="axisymmetric" in wanted,
-                law=wanted["contact"],
-            )
+            self.contact = self.touching(bodies)
             terms.append(self.contact)
         background = None
         if "background" in wanted:
@@ -240,6 +237,30 @@ class Scene:
             terms=terms,
             petsc_options={"snes_rtol": 1e-11},
             **{name: wanted[name] for name in names if name in wanted},
+        )
+
+    def touching(self, bodies):
+        """Return a wall at a side, or a rigid one whose weight presses it there, or on the top."""
+        first, axisymmetric = bodies[0], "axisymmetric" in self.wanted
+        out = np.eye(self.dim)[0]
+        if self.wanted["contact"] != "rigid body":
+            law = self.wanted["contact"]
+            wall = mpm.contact.plane(out, -out)
+            return mpm.contact.Rigid(first, wall, 0.3, axisymmetric=axisymmetric, law=law)
+        centre = np.full(self.dim, 0.6 if "delete" in self.wanted else 0.4)
+        centre[0] = 1.0
+        if axisymmetric:
+            first, out, centre = bodies[-1], np.eye(2)[1], np.array([0.0, float(len(bodies))])
+        return mpm.contact.RigidBody(
+            first,
+            mpm.contact.plane(centre, -out),
+            0.1,
+            inertia=None if axisymmetric else 0.02,
+            centre=centre,
+            friction=0.3,
+            gravity=-GRAVITY * out,
+            velocity=self.start,
+            axisymmetric=axisymmetric,
         )
 
     def change(self):
@@ -436,15 +457,26 @@ class Moving(Scene):
         scheme: Of the motion.
     """
 
+    speed = 0.1
+
     def __init__(self, wanted, scheme):
         self.scheme = scheme
         super().__init__(wanted)
 
     def kind(self, bodies, law, **options):
         """Return the problem."""
-        start = (*[0.0] * (self.dim - 1), -0.1)
+        start, still = tuple(self.start), []
+        if "quasi_static" in self.wanted:
+            start, still = [None, start], [bodies[0]]
         return mpm.DynamicProblem(
-            bodies, law, 1.0, velocity=start, scheme=self.scheme, rayleigh=(0.5, 1e-3), **options
+            bodies,
+            law,
+            1.0,
+            velocity=start,
+            scheme=self.scheme,
+            rayleigh=(0.5, 1e-3),
+            quasi_static=still,
+            **options,
         )
 
 
@@ -485,7 +517,7 @@ def rows_of(title, columns):
 
 def motions():
     """Return the rows of the page's table of motions."""
-    return rows_of("in motion", 4)
+    return rows_of("in motion", 5)
 
 
 def test_the_page_has_each_feature_in_motion():
@@ -501,15 +533,18 @@ def test_the_page_has_each_feature_in_motion():
 def test_a_feature_in_motion(feature, mpi_tmp_path, monkeypatch):
     monkeypatch.setattr(linear, "COARSEST", 12)
     sentences = page()[1]
-    for cell, scheme in zip(motions()[feature], ("midpoint", "conserving", "euler"), strict=True):
+    wanted = FEATURES[feature]
+    kinds = [(wanted, scheme) for scheme in ("midpoint", "conserving", "euler")]
+    kinds.append(({"bodies": "one V"} | wanted | {"quasi_static": True}, "midpoint"))
+    for cell, (options, scheme) in zip(motions()[feature], kinds, strict=True):
         try:
             if cell == "+":
-                move(FEATURES[feature], scheme, mpi_tmp_path)
+                move(options, scheme, mpi_tmp_path)
             else:
                 with pytest.raises(mpm.MPMError, match=re.escape(sentences[cell])):
-                    move(FEATURES[feature], scheme, mpi_tmp_path)
+                    move(options, scheme, mpi_tmp_path)
         except BaseException as error:
-            error.add_note(f"{feature} with scheme={scheme!r}: {cell}")
+            error.add_note(f"{feature} with scheme={scheme!r}, {list(options)}: {cell}")
             raise
 
 
