@@ -40,7 +40,7 @@ from .rotation import Pose
 from .shapes import Shape, as_positive
 from .surface import Blocks, PointMatrix, Surface, global_dofs
 from .ways import OPPOSITE, crosses, gets_deep
-from .whole_step import corrected, mean_pressure, pressure_slope
+from .whole_step import corrected, corrected_slope, mean_pressure, pressure_slope
 
 __all__ = ["Placed", "Rigid"]
 
@@ -828,13 +828,7 @@ class Rigid(Contact):
         step = Step(*(part[flat] for part in trial.step))
         H = 0.5 * self.shape.curvature(step.middle)
         slope = pressure_slope(points.stiffness, step.before, gap, touch)
-        size = (step.change**2).sum(axis=1)
-        moved = step.factor != 0.0
-        dfactor = n - step.normal - np.einsum("nij,nj->ni", H, step.change)
-        dfactor -= 2.0 * step.factor[:, None] * step.change
-        dfactor = np.where(moved[:, None], dfactor / np.where(moved, size, 1.0)[:, None], 0.0)
-        turn = H + step.factor[:, None, None] * np.eye(gdim)
-        turn = turn + step.change[:, :, None] * dfactor[:, None, :]
+        turn = corrected_slope(step.normal, H, step.change, step.factor, n)
         D = step.gradient[:, :, None] * (slope[:, None] * n)[:, None, :]
         D = D + step.pressure[:, None, None] * turn
         if not law.smooth:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["corrected", "deformation", "mean_pressure", "pressure_slope"]
+__all__ = ["corrected", "corrected_slope", "deformation", "mean_pressure", "pressure_slope"]
 
 #: Change of position, over a body's coordinates, below which a gradient is not corrected.
 STILL = 1e-8
@@ -89,6 +89,34 @@ def corrected(
     lacks = difference - (gradient * change).sum(axis=axes)
     factor = np.where(moved, lacks / np.where(moved, size, 1.0), 0.0)
     return gradient + factor.reshape(-1, *(1 for _ in axes)) * along, factor
+
+
+def corrected_slope(
+    gradient: NDArray[np.float64],
+    bend: NDArray[np.float64],
+    change: NDArray[np.float64],
+    factor: NDArray[np.float64],
+    slope: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the derivative of :func:`corrected` by a change along which it corrects.
+
+    Args:
+        gradient: What was corrected, shape ``(n, gdim)``.
+        bend: Its derivative by the change, shape ``(n, gdim, gdim)``.
+        change: dz, and v, shape ``(n, gdim)``.
+        factor: That of v, shape ``(n,)``.
+        slope: Derivative of the difference by the change, shape ``(n, gdim)``.
+
+    Returns:
+        Shape ``(n, gdim, gdim)``.
+    """
+    size = (change**2).sum(axis=1)
+    moved = factor != 0.0
+    dfactor = slope - gradient - np.einsum("nij,nj->ni", bend, change)
+    dfactor -= 2.0 * factor[:, None] * change
+    dfactor = np.where(moved[:, None], dfactor / np.where(moved, size, 1.0)[:, None], 0.0)
+    turn = bend + factor[:, None, None] * np.eye(change.shape[1])
+    return np.asarray(turn + change[:, :, None] * dfactor[:, None, :])
 
 
 def deformation(middle: NDArray[Any], change: NDArray[Any]) -> NDArray[Any]:

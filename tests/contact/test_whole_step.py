@@ -54,3 +54,30 @@ def test_a_corrected_gradient_has_no_sum_no_moment_and_the_difference_asked_for(
     assert np.abs(whole_step.deformation(middle, rigid)).max() < 1e-12
     same, factor = whole_step.corrected(middle, rigid, none, difference, 1.0)
     assert np.array_equal(same, middle) and not factor.any()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_slope_of_a_corrected_gradient_is_that_of_the_complex_step(dim):
+    # The gap of a sphere over a step, corrected along the step, as for what is rigid.
+    some = np.random.default_rng(5)
+    start = some.uniform(0.5, 1.0, size=(30, dim))
+    change = 0.2 * some.normal(size=start.shape)
+
+    def corrected(dz):
+        before, middle, end = (np.sqrt((x * x).sum(axis=1)) for x in places(dz))
+        n = places(dz)[1] / middle[:, None]
+        return whole_step.corrected(n, dz, dz, end - before, 1.0)
+
+    def places(dz):
+        return start, start + 0.5 * dz, start + dz
+
+    radii = [np.linalg.norm(x, axis=1)[:, None] for x in places(change)]
+    _, n, slope = (x / r for x, r in zip(places(change), radii, strict=True))
+    bend = 0.5 * (np.eye(dim) - n[:, :, None] * n[:, None, :]) / radii[1][:, :, None]
+    _, factor = corrected(change)
+    found = whole_step.corrected_slope(n, bend, change, factor, slope)
+    for j in range(dim):
+        step = 1e-30j * np.eye(dim)[j]
+        exact = corrected(change + step)[0].imag / 1e-30
+        np.testing.assert_allclose(found[:, :, j], exact, atol=1e-12 * np.abs(found).max())
+    assert np.abs(factor).min() > 0.0
