@@ -111,9 +111,7 @@ class MovingProblem(TimeProblem):
             "Lagrange", element.cell_type, element.degree, discontinuous=True
         )
         space = fem.functionspace(body.mesh, broken)
-        product = ufl.inner(ufl.TrialFunction(space), ufl.TestFunction(space))
-        if body.mass_share is not None:
-            product = body.mass_ratio * product
+        product = body.mass_ratio * ufl.inner(ufl.TrialFunction(space), ufl.TestFunction(space))
         form = self._mass_form(number, product)
         if body.deletion is not None:
             form = body.deletion.present_only(form)

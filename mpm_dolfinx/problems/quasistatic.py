@@ -525,9 +525,7 @@ class QuasiStaticProblem(ParticleProblem):
         density = Density(given.density, body)
         density.require()
         self._density.append((work, density))
-        mass = density.value
-        if body.mass_share is not None:
-            mass = mass * body.mass_ratio
+        mass = density.value * body.mass_ratio
         acting, of_step = self._in_time(history, given.supports)
         self._acting.append(acting)
         symmetric = acting.symmetric and not given.pressures
@@ -710,9 +708,7 @@ class QuasiStaticProblem(ParticleProblem):
         """Return ``int density Q_c dX`` of each owned domain of a body, ``(n, k)`` (collective)."""
         body, (work, density) = self.bodies[number], self._density[number]
         space = separate_nodes(body.W)
-        test: Any = ufl.TestFunction(space)
-        if body.mass_share is not None:
-            test = body.mass_ratio * test
+        test = body.mass_ratio * ufl.TestFunction(space)
         vector = fem.assemble_vector(fem.form(work.mass(density.value, test)))
         return np.asarray(vector.array[space.dofmap.list[: body.num_local]])
 
@@ -723,9 +719,7 @@ class QuasiStaticProblem(ParticleProblem):
         """
         body, (work, density) = self.bodies[number], self._density[number]
         space = separate_nodes(body.W)
-        product = ufl.TrialFunction(space) * ufl.TestFunction(space)
-        if body.origin is not None:
-            product = body.volume_ratio * product
+        product = body.volume_ratio * (ufl.TrialFunction(space) * ufl.TestFunction(space))
         matrix = fem.assemble_matrix(fem.form(work.mass(density.value, product)))
         n, k = body.num_local, space.dofmap.list.shape[1]
         return matrix.data[: n * k * k].reshape(n, k, k)
