@@ -189,9 +189,13 @@ class Governed:
     def plastic_work(self, state: State) -> NDArray[np.float64] | None:
         """Return the plastic work per undeformed volume, shape ``(n,)``, where it is known.
 
+        It is not where an heir of the law that tells it has changed the law.
+
         Raises:
             MPMError: The law gives something else.
         """
+        if not _is_as_inherited(type(self.material), "plastic_work"):
+            return None
         return self._known("plastic work", self.material.plastic_work(state))
 
     def _known(self, what: str, values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
@@ -261,6 +265,17 @@ class Governed:
         particles = np.unique(self.particles.global_index[domains])
         where = " (at {particles})" if len(particles) else ""
         return type(error)(error.message.rstrip(".") + where, particles)
+
+
+def _is_as_inherited(law: type, name: str) -> bool:
+    """Return whether heirs of the class that a function is of change nothing else of that class."""
+    heirs: list[type] = []
+    for its in law.__mro__:
+        if name in vars(its):
+            changed = {other for heir in heirs for other in vars(heir) if hasattr(its, other)}
+            return all(other.startswith("__") or other == "_abc_impl" for other in changed)
+        heirs.append(its)
+    raise AttributeError(name)
 
 
 def _read_only(values: NDArray[Any]) -> NDArray[Any]:

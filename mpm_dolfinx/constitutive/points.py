@@ -424,7 +424,7 @@ class MaterialPoints:
         """
         found = self._where(lambda law: not getattr(law, "inelastic", True))
         for part, state in self._states(False):
-            if part.material.plastic_work(state) is not None:
+            if part.plastic_work(state) is not None:
                 found[part.points] = True
         return found & np.isfinite(self.strain_energy())
 

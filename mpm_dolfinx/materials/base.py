@@ -213,7 +213,7 @@ class Material(ABC):
         together, the history being as it was: those of associated flow and isotropic hardening,
         integrated by backward Euler (Ortiz & Stainier 1999, Comput. Methods Appl. Mech. Engrg 171,
         section 2). In a motion with ``scheme="conserving"`` they lose what yielding takes up and
-        nothing else.
+        nothing else. An heir that changes something of such a law must tell its own.
 
         Args:
             state: Their state.

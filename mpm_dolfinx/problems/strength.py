@@ -15,6 +15,11 @@ from .through_time import TimeProblem
 
 __all__ = ["StrengthReduction", "strength_reduction"]
 
+#: Decimals of a factor: sums of steps are told as 1.2, not as 1.2000000000000002.
+DIGITS = 12
+#: Least step and tolerance of a factor.
+FINEST = 1e-9
+
 
 @dataclass(frozen=True)
 class StrengthReduction:
@@ -90,6 +95,8 @@ def strength_reduction(
         for n in numbers
     ):
         raise MPMError("step, tolerance, most and displacement must be positive numbers.")
+    if min(step, tolerance) < FINEST:
+        raise MPMError(f"step and tolerance must be at least {FINEST:g}.")
     if most <= 1.0:
         raise MPMError(f"most= is a factor at which to stop, above 1, not {most:g}.")
     if any(body.load.value < 1.0 for body in problem.bodies) or problem.held_back > 0.0:
@@ -124,6 +131,7 @@ def strength_reduction(
     try:
         while bad - good > tolerance and good < most:
             factor = min(good + size, 0.5 * (good + bad) if np.isfinite(bad) else np.inf, most)
+            factor = round(factor, DIGITS)
             if stands(factor):
                 good = factor
                 # (there is a limit to end it, so what failed in longer steps is tried again)

@@ -86,3 +86,62 @@ def test_how_much_of_an_answer_is_read_to_find_what_is_not_finite(law, monkeypat
     # A law of the package gives its arrays away: its history is not copied at each step.
     stress = problem._stresses[0]
     assert (stress._last.stress is stress.first_piola) == (law is VonMises)
+
+
+class Overstressed(VonMises):
+    """A law that returns half of the way, so that its stress is no derivative of an energy."""
+
+    def integrate(self, trial_strain, variables, tangent):
+        whole = super().integrate(trial_strain, variables, tangent)
+        elastic = 0.5 * (trial_strain + whole.elastic_strain)
+        flow = 0.5 * (variables["plastic_strain"] + whole.variables["plastic_strain"])
+        D = self.elastic_tangent(*trial_strain.shape) if tangent else None
+        return whole._replace(
+            stress=self.elastic_stress(elastic),
+            tangent=D if D is None else 0.5 * (D + whole.tangent),
+            elastic_strain=elastic,
+            variables={"plastic_strain": flow},
+        )
+
+
+class Silent(Overstressed):
+    """The same, which says that it knows no plastic work."""
+
+    def plastic_work(self, state):
+        return None
+
+
+class Told(Overstressed):
+    """The same, which says that its plastic work is 1."""
+
+    def plastic_work(self, state):
+        return np.ones(len(state["plastic_strain"]))
+
+
+def spun(law):
+    """Return a square that turns and stretches, yields and is as it is after some steps."""
+    V = scenes.vectors(scenes.box([-1.0, -1.0], [2.0, 2.0], [6, 6], QUADRILATERAL))
+    body = scenes.unit(4, QUADRILATERAL)
+    problem = mpm.DynamicProblem(
+        mpm.Particles(body, V),
+        law(100.0, 0.3, rho_y=1.5, hardening=30.0),
+        1.0,
+        velocity=lambda x: np.stack([2.0 * x[0] - 3.0 * x[1], 3.0 * x[0] - 2.0 * x[1]]),
+        scheme="conserving",
+    )
+    problem.solve(0.1, 0.02)
+    return problem
+
+
+def test_plastic_work_is_not_that_of_a_law_that_an_heir_has_changed():
+    ends, works = [], []
+    for law in (VonMises, Own, Overstressed, Silent, Told):
+        problem = spun(law)
+        assert scenes.largest(problem.particles.plastic_strain) > 0.01
+        points = problem._stresses[0]
+        ends.append(scenes.gather(problem.particles.domains))
+        works.append(scenes.largest(points.potential() - points.strain_energy()))
+    np.testing.assert_allclose(ends[1], ends[0], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(ends[2], ends[3], rtol=0, atol=1e-14)
+    assert works[0] == pytest.approx(works[1]) and works[0] > 0.01
+    assert works[2:] == [0.0, 0.0, pytest.approx(1.0)]

@@ -82,6 +82,7 @@ def test_slope_as_it_stands(step):
     assert found.factor == pytest.approx(1.40, abs=0.04) and found.factor > 1.38
     assert 0 < found.above - found.factor <= 0.01
     assert found.displacements[-1] <= limit < 4 * found.displacements[-1]
+    assert found.factors[:3] == [1.0, round(1.0 + step, 2), round(1.0 + 2.0 * step, 2)]
 
 
 @pytest.mark.slow
@@ -207,6 +208,8 @@ def test_stops_where_the_body_moves_too_far():
         mpm.strength_reduction(problem, step=0.0)
     with pytest.raises(mpm.MPMError, match="positive"):
         mpm.strength_reduction(problem, tolerance=np.inf)  # of which nothing would be found
+    with pytest.raises(mpm.MPMError, match="at least 1e-09"):
+        mpm.strength_reduction(problem, tolerance=1e-13)
     with pytest.raises(mpm.MPMError, match="above 1"):
         mpm.strength_reduction(problem, most=0.5)
     with pytest.raises(mpm.MPMError, match="QuasiStatic"):
