@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -147,6 +147,10 @@ class BodyContact(Rigid):
         """
         self._pose = self._aim = pose
         self._trial = self._evaluated()
+
+    def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
+        """See :meth:`Term.tangents`: derivatives, as the rigid body's own are."""
+        return self.derivatives()
 
     @property
     def extent(self) -> float:

@@ -28,6 +28,7 @@ __all__ = [
     "derivative",
     "nitsche",
     "push_derivative",
+    "secant_along",
     "shear_derivative",
     "traction",
 ]
@@ -357,3 +358,35 @@ def shear_derivative(
         turned = (bound / size)[:, None, None] * (eye - tau[:, :, None] * tau[:, None, :])
         dt[s] = turned @ dt[s] + tau[:, :, None] * (np.asarray(grows)[:, None] * dp[s])[:, None, :]
     return np.asarray(dt)
+
+
+def secant_along(
+    points: Points,
+    delta: NDArray[np.float64],
+    gap: NDArray[np.float64],
+    n: NDArray[np.float64],
+    touch: float,
+    acts: Traction,
+) -> NDArray[np.float64]:
+    """Return what the secant of friction has along the shear of points that slip.
+
+    That is the traction over the way from the anchor, of which :func:`shear_derivative` has what is
+    across the shear alone.
+
+    Args:
+        points: As for :func:`traction`, as all that is not said here.
+        delta: As there.
+        gap: As there.
+        n: As there.
+        touch: As there.
+        acts: What :func:`traction` returned.
+
+    Returns:
+        Shape ``(n, gdim, gdim)``, to be added to derivatives by positions.
+    """
+    share, _ = _since_touch(points, gap, touch)
+    size = np.linalg.norm(_trial(points, delta, gap, n, touch), axis=1)
+    bound = np.linalg.norm(acts.shear, axis=1)
+    tau = acts.shear / np.where(bound > 0.0, bound, 1.0)[:, None]
+    stiffness = points.tangential * share * bound / np.where(size > 0.0, size, 1.0)
+    return np.asarray(-stiffness[:, None, None] * tau[:, :, None] * tau[:, None, :])

@@ -28,16 +28,19 @@ from .law import (
     Coulomb,
     Points,
     Push,
+    Traction,
     as_friction,
     derivative,
     nitsche,
     push_derivative,
+    secant_along,
     shear_derivative,
     traction,
 )
 from .memory import Memory, Near, Step
 from .rotation import Pose
 from .shapes import Shape, as_positive
+from .slip_changes import SlipChanges
 from .surface import Blocks, PointMatrix, Surface, global_dofs
 from .ways import OPPOSITE, crosses, gets_deep
 from .whole_step import corrected, corrected_slope, mean_pressure, pressure_slope
@@ -167,6 +170,7 @@ class Rigid(Contact):
         self._trial: Memory | None = None
         self._near: Near | None = None
         self._wider: Near | None = None
+        self._slip_changes = SlipChanges()
         self._stretch: NDArray[np.float64] | None = None
 
     # -- The path -------------------------------------------------------------------------------
@@ -377,6 +381,7 @@ class Rigid(Contact):
         self._pose = self._aim
         require_same(self._comm, offset=self._pose.offset, angle=self._pose.angle)
         self._new_pattern()
+        self._slip_changes.begin()
         with agree(self._comm):
             x = memory.outcome.positions
             if self._passes(memory, x, self._pose):
@@ -675,7 +680,19 @@ class Rigid(Contact):
         return [self._surface.force(trial.outcome.traction, -1.0 / self._share, trial.facets)]
 
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        """See :meth:`Term.tangents`."""
+        """See :meth:`Term.tangents`; points that change their slip have secants."""
+        return self._tangents(not self.friction.smooth)
+
+    def derivatives(self) -> Mapping[tuple[int, int], PETSc.Mat]:
+        """See :meth:`Term.derivatives`."""
+        return self._tangents(False)
+
+    def _tangents(self, secants: bool) -> Mapping[tuple[int, int], PETSc.Mat]:
+        """Return the derivatives of the forces.
+
+        Args:
+            secants: Whether points that have changed their slip take secants instead.
+        """
         assert self._trial is not None
         trial, surface = self._trial, self._surface
         memory = self._known(trial)
@@ -684,6 +701,8 @@ class Rigid(Contact):
         D = np.zeros((len(which), surface.nq, surface.gdim, surface.gdim))
         if len(flat):
             D[inside] = self._derivative(trial, memory, flat) / self._share
+        if secants:  # (also where nothing touches on this rank: it notes that)
+            D[inside] += self._secants(trial, memory, flat) / self._share
         N, w = surface.shapes, surface.weights[which]
         k = N.shape[1] * surface.gdim
         blocks = np.einsum("mq,qa,qb,mqij->maibj", -w, N, N, D, optimize=True)
@@ -805,6 +824,33 @@ class Rigid(Contact):
         """Return the derivative of the traction by positions at some points that touch."""
         Q = self._rotation(trial, memory)
         return np.asarray(Q @ self._derivative_within(trial, memory, flat) @ trial.pose.Q.T)
+
+    def _secants(
+        self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return what tangents have besides where points have changed their slip."""
+        gdim, Q = self._surface.gdim, self._rotation(trial, memory)
+        slips = trial.outcome.slips.ravel()
+        normal = trial.normal if trial.step is None else trial.step.normal
+        n, pressure = normal.reshape(-1, gdim), trial.outcome.pressure.ravel()
+        force = np.linalg.solve(Q, trial.outcome.traction.reshape(-1, gdim).T).T
+        shear = force - n * (n * force).sum(axis=1)[:, None]
+        m, nq = self._surface.weights.shape
+        place = nq * trial.numbers(np.arange(len(trial.gap)))[:, None] + np.arange(nq)
+        slipping, along = np.zeros(m * nq, dtype=bool), np.zeros((m * nq, gdim))
+        slipping[place.ravel()], along[place.ravel()] = slips, shear
+        changed = self._slip_changes.note(slipping, along)[place.ravel()][flat]
+        found = np.zeros((len(flat), gdim, gdim))
+        if not changed.any():
+            return found
+        some = flat[changed]
+        points = self._points(memory).of(some)
+        y = self._framed(trial.outcome.positions.reshape(-1, gdim)[some], trial.pose)
+        acts = Traction(pressure[some], shear[some], slips[some], slips[some])
+        gap = trial.gap.ravel()[some]
+        secant = secant_along(points, y - points.anchor, gap, n[some], self._surface.touch, acts)
+        found[changed] = Q @ secant @ trial.pose.Q.T
+        return found
 
     def _rotation(self, trial: Memory, memory: Memory) -> NDArray[np.float64]:
         """Return what turns tractions out of the frame of the shape."""

@@ -236,6 +236,10 @@ class Term:
         """
         return ()
 
+    def derivatives(self) -> Mapping[tuple[int, int], PETSc.Mat]:
+        """Return the derivatives of the forces, where :meth:`tangents` are others to begin with."""
+        return self.tangents()
+
     def stiffness_force(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
         """Return the whole tangent times displacements on W of each body, or nothing.
 
@@ -243,7 +247,7 @@ class Term:
             motions: The displacements.
         """
         forces: dict[int, PETSc.Vec] = {}
-        for (a, b), K in self.tangents().items():
+        for (a, b), K in self.derivatives().items():
             if a not in forces:
                 forces[a] = K.createVecLeft()
                 forces[a].set(0.0)

@@ -23,7 +23,7 @@ LONG = {
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
     *("slope", "vertical-cut", "footing-friction", "footing-weight-rough", "footing-edge"),
     *("finer-footing", "mixed-footing"),
-    *("stiff-footing", "hertz", "hertz-penalty", "expansion-whole"),
+    *("stiff-footing", "hertz", "hertz-penalty", "expansion-whole", "pile-deep"),
     *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
 }
 COMMON = {"completed", "load", "iterations", "cutbacks", "failure"}
@@ -181,6 +181,16 @@ RUNS = {
         "hertz",
         "--cells 3 --law nitsche --penalty 0.5",
         {"error_force": 0.04, "error_radius": 0.01, "error_pressure": 0.08},
+    ),
+    "pile": (
+        "penetration",
+        "--obstacle pile --friction 0.5 --depth 0.05 --steps 5 --tangential-penalty 1",
+        {"cutbacks": 0, "iterations": 66},
+    ),
+    "pile-deep": (
+        "penetration",
+        "--obstacle pile --friction 0.5 --depth 1 --steps 100 --tangential-penalty 1",
+        {"cutbacks": 5, "iterations_per_step": 12.0},
     ),
     "disc": ("penetration", "", {"cutbacks": 0, "iterations": 520, "force": 7.0}),
     "snap-through": ("snap_through", "--steps 12", {"error": 5e-3, "cutbacks": 0}),

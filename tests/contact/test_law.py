@@ -7,6 +7,7 @@ import pytest
 
 from mpm_dolfinx import contact
 from mpm_dolfinx.contact import law as laws
+from mpm_dolfinx.contact.slip_changes import SlipChanges
 
 TOUCH = 1e-12
 
@@ -106,6 +107,39 @@ def test_shear_stays_within_coulombs_cone():
     assert np.all(size <= bound * (1 + 1e-9))
     assert np.allclose(size[acts.slips], bound[acts.slips], rtol=1e-14)
     assert (bound == 0.7 * stretch).any() and (bound < 0.7 * stretch).any()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_secant_takes_the_way_from_the_anchor_to_the_shear(dim):
+    # On a plane, without pressure in the bound: S delta = t, where the tangent gives nothing.
+    law, plane = contact.Coulomb(0.0, cohesion=0.3), contact.plane(np.zeros(dim), np.eye(dim)[-1])
+    some = np.random.default_rng(1)
+    _, points, y = scene(dim)
+    points = points._replace(touched=np.ones(len(y), dtype=bool))
+    y[:, -1] = -0.01 * some.uniform(size=len(y))
+    phi, n = plane.distance(y)
+    delta, H = y - points.anchor, np.zeros((len(y), dim, dim))
+    acts = laws.traction(law, points, delta, phi, n, TOUCH)
+    D = laws.derivative(law, points, delta, phi, n, H, TOUCH)
+    S = D + laws.secant_along(points, delta, phi, n, TOUCH, acts)
+    along = delta - n * (n * delta).sum(axis=1)[:, None]
+    slips = acts.slips
+    assert 50 < slips.sum() < len(y)
+    tangent, secant = (np.einsum("nij,nj->ni", M, along)[slips] for M in (D, S))
+    np.testing.assert_allclose(tangent, 0.0, atol=1e-12)
+    np.testing.assert_allclose(secant, acts.shear[slips], atol=1e-12)
+
+
+def test_points_that_change_their_slip_are_noted():
+    changes, right, left = SlipChanges(), np.array([[1.0, 0.0]] * 3), np.array([[-1.0, 0.1]] * 3)
+    slips = np.array([True, True, False])
+    assert changes.note(slips, right).tolist() == [True, True, False]  # an attempt begins
+    assert changes.note(slips, 2.0 * right).tolist() == [False, False, False]
+    assert changes.note(~slips, right).tolist() == [False, False, True]
+    assert changes.note(slips, right).tolist() == [True, True, False]
+    assert changes.note(slips, left).tolist() == [True, True, False]
+    changes.begin()
+    assert changes.note(slips, left).tolist() == [True, True, False]
 
 
 def test_nothing_acts_at_a_gap():
