@@ -39,6 +39,12 @@ class Met(NamedTuple):
     facets: NDArray[np.int64]
     nodes: tuple[NDArray[np.int64], ...]
 
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape of blocks: of each point by nodes that forces act on, and all nodes."""
+        widths = [nodes.shape[1] for nodes in self.nodes]
+        return len(self.facets), sum(widths[:2]), sum(widths)
+
 
 class PairMatrices:
     """Matrices on W of two bodies, whose patterns grow as facets come to meet others.
@@ -101,13 +107,7 @@ class PairMatrices:
                 seen[number if side == 0 else 1 - number].append(nodes.ravel())
         names = [np.unique(np.concatenate(parts)) for parts in seen]
         sides = [_sides(number, known, names) for number, known in enumerate(self._known)]
-        self._positions = [
-            np.zeros((len(known.facets), rows, columns), dtype=np.int32)
-            for known, rows, columns in (
-                (known, sum(x.shape[1] for x in known.nodes[:2]), sum(map(_width, known.nodes)))
-                for known in self._known
-            )
-        ]
+        self._positions = [np.zeros(known.shape, dtype=np.int32) for known in self._known]
         begin, new = 0, dict[tuple[int, int], tuple[NDArray[Any], NDArray[Any]]]()
         for i, j in self._counts:
             rows, columns = [one[0][i] for one in sides], [one[1][j] for one in sides]
@@ -154,10 +154,6 @@ class PairMatrices:
                 found[pair] = self._matrices[pair]
             begin += count
         return found
-
-
-def _width(nodes: NDArray[np.int64]) -> int:
-    return int(nodes.shape[1])
 
 
 def _keys(facets: NDArray[np.int64]) -> NDArray[np.int64]:
