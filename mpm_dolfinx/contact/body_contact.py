@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..errors import MPMError
 from ..particles.particles import Particles
 from .law import Coulomb
-from .memory import Near
+from .placed import distance_within, framed
 from .rigid import Rigid
 from .rotation import Pose, cayley_variation, crossing
 from .shapes import Shape
@@ -91,8 +91,6 @@ class BodyContact(Rigid):
                 "by which its forces balance."
             )
         self._place = place
-        self._change: float | None = None
-        self._seen: list[tuple[NDArray[np.int64], NDArray[np.float64]]] | None = None
 
     @property
     def _key(self) -> str:
@@ -113,28 +111,11 @@ class BodyContact(Rigid):
         self._surface.look_at_deleted()
         self._new_pattern()
         self._look_near()
-        self._change = self._seen = None
         return ()
 
     def look(self) -> None:
         """Look where the body is now, for all places in which the shape is tried."""
-        self._change, self._seen = None, []
-        if self._near is not None:
-            self._change = super()._largest_change(self._near)
-
-    def _largest_change(self, near: Near) -> float:
-        """See :class:`Rigid`."""
-        return super()._largest_change(near) if self._change is None else self._change
-
-    def _positions(self, which: NDArray[np.int64] | None) -> NDArray[np.float64]:
-        """See :class:`Rigid`."""
-        if which is None or self._seen is None:
-            return super()._positions(which)
-        for known, positions in self._seen:
-            if known is which:
-                return positions
-        self._seen.append((which, super()._positions(which)))
-        return self._seen[-1][1]
+        self._reach.hold()
 
     def put(self, pose: Pose) -> None:
         """Evaluate what acts with the shape in some place.
@@ -184,7 +165,7 @@ class BodyContact(Rigid):
         arm = self._arms(here, centres)
         moments = np.einsum("mqij,mqi->j", crossing(arm), f)
         size = np.linalg.norm(f, axis=2).sum()
-        k = (self._penalty + self._tangential) * self._stiffness[which]
+        k = sum(self._tractions.stiffnesses(which))
         stiffness = float((self._surface.weights[which] * k).sum())
         round_off = np.finfo(np.float64).eps * self._surface.extent * stiffness
         return np.concatenate([f.sum(axis=(0, 1)), moments, [size, round_off]])
@@ -215,10 +196,10 @@ class BodyContact(Rigid):
         trial = self._trial
         if trial.step is None:
             return np.zeros(2)
-        memory, w = self._known(trial), self._weights(trial)[:, :, None]
+        memory, w = self._known(trial), self._tractions.weights(trial)[:, :, None]
         f = w * trial.outcome.traction
         change = trial.outcome.positions - memory.outcome.positions
-        Q = self._rotation(trial, memory)
+        Q = self._tractions.rotation(trial, memory)
         step = trial.step
         normal = (step.pressure[:, None] * step.gradient) @ Q.T
         shear = trial.outcome.traction - normal.reshape(f.shape)
@@ -231,13 +212,15 @@ class BodyContact(Rigid):
         surface = self._surface
         borne = np.flatnonzero((surface.weights > 0.0).any(axis=1))
         x = surface.positions(which=borne)[surface.weights[borne] > 0.0]
-        return float(self._measured(self._framed(x, pose))[0].min(initial=np.inf))
+        return float(
+            distance_within(self.shape, framed(self.shape, pose, x))[0].min(initial=np.inf)
+        )
 
     def energy(self) -> float:
         """Return this rank's energy of penetration at the last converged step."""
         self._outcome()
         assert self._memory is not None
-        points, gap = self._points(self._memory), self._memory.gap.ravel()
+        points, gap = self._tractions.points(self._memory), self._memory.gap.ravel()
         pressed = np.where(gap <= self._surface.touch, gap, 0.0)
         return float(0.5 * self._surface.weights.ravel() @ (points.stiffness * pressed**2))
 
@@ -246,11 +229,11 @@ class BodyContact(Rigid):
         assert self._trial is not None
         trial, surface = self._trial, self._surface
         memory = self._known(trial)
-        here, inside, flat = self._acting(trial, memory)
+        here, inside, flat = self._tractions.acting(trial, memory)
         which = trial.numbers(here)
         slopes = np.zeros((len(which), surface.nq, surface.gdim, surface.gdim))
         if len(flat):
-            slopes[inside] = self._derivative_within(trial, memory, flat)
+            slopes[inside] = self._tractions.derivative_within(trial, memory, flat)
         force = trial.outcome.traction[here]
         return ActingPoints(
             which,
@@ -260,7 +243,7 @@ class BodyContact(Rigid):
             memory.outcome.positions[here],
             trial.outcome.positions[here],
             force,
-            np.linalg.solve(self._rotation(trial, memory), force[..., None])[..., 0],
+            np.linalg.solve(self._tractions.rotation(trial, memory), force[..., None])[..., 0],
             slopes,
         )
 
@@ -282,7 +265,7 @@ class BodyContact(Rigid):
         trial, memory = self._trial, self._memory
         assert trial is not None and memory is not None
         gdim, share = acting.force.shape[2], 0.5 if self._of_step else 1.0
-        Q, last = self._rotation(trial, memory), trial.pose.Q
+        Q, last = self._tractions.rotation(trial, memory), trial.pose.Q
         H = cayley_variation(theta)
         arm = acting.after - centres[1]
         middle = 0.5 * (acting.before - centres[0] + arm) if self._of_step else arm

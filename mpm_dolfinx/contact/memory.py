@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .contact import Outcome
 from .rotation import Pose
 
-__all__ = ["Memory", "Near", "Step"]
+__all__ = ["Memory", "Step"]
 
 
 class Step(NamedTuple):
@@ -86,19 +86,3 @@ class Memory:
             outcome,
             facets=which,
         )
-
-
-class Near(NamedTuple):
-    """Facets that may touch in a step.
-
-    Attributes:
-        memory: What is known of them.
-        nodes: Where the nodes of all facets begin.
-        radius: How much gaps change at most, by the angle that the shape turns by.
-        margin: How far points may come nearer until others could touch.
-    """
-
-    memory: Memory
-    nodes: NDArray[np.float64]
-    radius: float
-    margin: float

@@ -34,7 +34,7 @@ from ..particles.particles import Particles
 from ..system.term import PointMaterial, Term, Transfer
 from .body_contact import BodyContact
 from .law import Coulomb
-from .rigid import Placed
+from .placed import Placed
 from .rigid_motion import RigidMotion, State, as_inertia, as_rotation, held_of, names_of
 from .rotation import Pose, Turn, crossing
 from .shapes import Shape, as_point, as_positive

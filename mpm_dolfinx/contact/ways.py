@@ -7,6 +7,7 @@ behind it, or a point is out again on the side of a corner. What happens on the 
 questions, as neither has the other's answer: whether a point is ever deep in the shape
 (:func:`gets_deep`, which also tells of ways that end in it), and whether one goes in on one
 side and out on the opposite one, however thin the shape is between them (:func:`crosses`).
+:func:`passes` asks both of the points of a body's surface.
 """
 
 from __future__ import annotations
@@ -16,10 +17,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .memory import Memory
+from .placed import framed
+from .rotation import Pose
 from .shapes import Shape
+from .surface import Surface
 
-__all__ = ["crosses", "gets_deep"]
+__all__ = ["OPPOSITE", "crosses", "gets_deep", "passes"]
 
+#: Penetration, over the thickness of the domain behind, from which a body is in an obstacle
+#: rather than on it.
+DEEP = 1.0
 #: Most places on the way of a point that are looked at, of all points at once, and by steps of
 #: the distance.
 MOST_PLACES, MOST_AT_ONCE, MOST_STEPS = 1000, 100_000, 100
@@ -32,6 +40,32 @@ STEEP = 0.1
 #: Product of two normals below which they are those of opposite sides, for a point that touches
 #: one of them, and for one that touches neither before nor after.
 OPPOSITE, OPPOSITE_FREE = -0.5, -0.1
+
+
+def passes(
+    shape: Shape, surface: Surface, memory: Memory, x: NDArray[np.float64], pose: Pose
+) -> bool:
+    """Return whether points get deep into an obstacle, or through it, on a straight way.
+
+    Args:
+        shape: The obstacle.
+        surface: The points.
+        memory: Where they and the obstacle begin.
+        x: Where they end, shape ``(m, nq, gdim)``.
+        pose: Where the obstacle ends.
+    """
+    deep = DEEP * np.broadcast_to(surface.thickness[:, None], memory.gap.shape)
+    a = framed(shape, memory.pose, memory.outcome.positions)
+    b = framed(shape, pose, x)
+    way = np.linalg.norm(b - a, axis=2)
+    reached = memory.gap - way < -deep
+    if gets_deep(shape, a, b, memory.gap, deep, reached & (surface.weights > 0.0)):
+        return True
+    near = (memory.gap < way) & (way > 0.0) & (surface.weights > 0.0)
+    thickness, gap, normal = deep[near] / DEEP, memory.gap[near], memory.normal[near]
+    if len(gap) and not memory.exact:
+        gap, normal = shape.distance(a[near])
+    return crosses(shape, a[near], b[near], gap, normal, thickness)
 
 
 def gets_deep(

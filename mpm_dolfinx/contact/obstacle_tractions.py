@@ -1,0 +1,407 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Tractions of an obstacle at the points of a body's facets, and their derivatives.
+
+They are those of :mod:`.law` in the frame of the shape, where it is at the end of a step; or, in
+motion by the middle of a step, those of :mod:`.whole_step` turned by the mean of the rotations.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .contact import Outcome
+from .law import (
+    Coulomb,
+    Points,
+    Push,
+    Traction,
+    derivative,
+    nitsche,
+    push_derivative,
+    secant_along,
+    shear_derivative,
+    traction,
+)
+from .memory import Memory, Step
+from .nitsche import Nitsche
+from .placed import distance_within, framed
+from .rotation import Pose
+from .shapes import Shape
+from .slip_changes import SlipChanges
+from .surface import Surface
+from .whole_step import corrected, corrected_slope, mean_pressure, pressure_slope
+
+__all__ = ["Acting", "ObstacleTractions"]
+
+
+class Acting(NamedTuple):
+    """Points that touch.
+
+    Attributes:
+        here: Places of their facets among those that were looked at, shape ``(f,)``.
+        inside: Which points of these touch, shape ``(f, nq)``.
+        flat: Numbers of the points, shape ``(n,)``, among all of the facets that were looked at.
+    """
+
+    here: NDArray[np.int64]
+    inside: NDArray[np.bool_]
+    flat: NDArray[np.int64]
+
+
+class ObstacleTractions:
+    """Tractions of an obstacle at the points of a surface, and their derivatives.
+
+    Args:
+        surface: The points.
+        shape: The obstacle.
+        friction: The law of friction.
+        penalty: Stiffness in the normal direction, without unit.
+        tangential: Stiffness of points that stick, without unit.
+
+    Attributes:
+        of_step: Whether forces are those of whole steps of a motion.
+        nitsche: The stress behind the facets, where the pressure is that.
+        slip_changes: Which points have changed their slip.
+    """
+
+    def __init__(
+        self, surface: Surface, shape: Shape, friction: Coulomb, penalty: float, tangential: float
+    ) -> None:
+        self._surface, self._shape, self._friction = surface, shape, friction
+        self._penalty, self._tangential = penalty, tangential
+        self.of_step = False
+        self.nitsche: Nitsche | None = None
+        self.slip_changes = SlipChanges()
+        self._stretch: NDArray[np.float64] | None = None
+
+    # -- What points have -----------------------------------------------------------------------
+
+    def settle(self, stiffness: NDArray[np.float64]) -> None:
+        """Take the present facets of the surface.
+
+        Args:
+            stiffness: Modulus over thickness of each, shape ``(m,)``.
+        """
+        self._stiffness = np.repeat(stiffness[:, None], self._surface.nq, axis=1)
+
+    def hold_stretch(self) -> None:
+        """Note the stretch of facets that counts for friction, once in a step.
+
+        Where a step is committed bodies are at its end already, and a motion begins its terms anew.
+        """
+        if self._stretch is None:
+            self._stretch = self._surface.stretch(self._friction.by_area)
+
+    def forget_stretch(self) -> None:
+        """Forget the stretch of facets."""
+        self._stretch = None
+
+    def stiffnesses(
+        self, which: NDArray[np.int64] | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return those of points in the normal direction and along the surface, ``(m, nq)``.
+
+        Args:
+            which: Numbers of facets; ``None``: all.
+        """
+        k = self._stiffness if which is None else self._stiffness[which]
+        return self._penalty * k, self._tangential * k
+
+    def points(self, memory: Memory) -> Points:
+        """Return the points of facets of which something is known."""
+        which = memory.facets
+        normal, tangential = self.stiffnesses(which)
+        gdim = memory.anchor.shape[2]
+        return Points(
+            normal.ravel(),
+            tangential.ravel(),
+            memory.touched.ravel(),
+            memory.anchor.reshape(-1, gdim),
+            memory.gap.ravel(),
+            self._stretch_of(which).ravel(),
+        )
+
+    def _stretch_of(self, which: NDArray[np.int64] | None) -> NDArray[np.float64]:
+        """Return the stretch of facets that counts for friction: that at the step's beginning."""
+        if self._stretch is None:
+            return self._surface.stretch(self._friction.by_area, which)
+        return self._stretch if which is None else self._stretch[which]
+
+    def weights(self, memory: Memory) -> NDArray[np.float64]:
+        """Return the undeformed areas of the points of facets of which something is known."""
+        weights = self._surface.weights
+        return weights if memory.facets is None else np.asarray(weights[memory.facets])
+
+    # -- What acts on them ----------------------------------------------------------------------
+
+    def evaluated(self, memory: Memory, x: NDArray[np.float64], pose: Pose) -> Memory:
+        """Return what acts on facets of which something is known.
+
+        Args:
+            memory: What is known of the last converged step.
+            x: Where their points are, shape ``(m, nq, gdim)``.
+            pose: Where the shape is.
+        """
+        which = memory.facets
+        m, nq, gdim = x.shape
+        y = framed(self._shape, pose, x).reshape(-1, gdim)
+        points = self.points(memory)
+        touch = self._surface.touch
+        behind, reach = None, np.full(len(y), touch)
+        if self.nitsche is not None:
+            behind = self.nitsche.tractions()
+            reach = touch + np.linalg.norm(behind, axis=2).ravel() / points.stiffness
+        phi, n = self._distance(y, memory, reach)
+        pushes, step, Q = n, None, pose.Q
+        pressure, pressed = None, None
+        if behind is not None:
+            push = nitsche(points, (behind @ Q).reshape(-1, gdim), phi, n, touch)
+            pressure, pressed = push.pressure, push.acts.reshape(m, nq)
+        if self.of_step:
+            step = self._step(points, memory, y, phi)
+            pushes, Q = step.gradient, memory.pose.mean(pose)
+            pressure = step.pressure
+        acts = traction(
+            self._friction,
+            points,
+            y - points.anchor,
+            phi,
+            n if step is None else step.normal,
+            touch,
+            pressure,
+        )
+        shape = (m, nq)
+        normal, shear = (
+            (part @ Q.T).reshape(x.shape) for part in (acts.pressure[:, None] * pushes, acts.shear)
+        )
+        force = normal + shear
+        works = (0.0, 0.0)
+        if step is not None:
+            moves = self.weights(memory)[:, :, None] * (x - memory.outcome.positions)
+            works = -float((normal * moves).sum()), -float((shear * moves).sum())
+        outcome = Outcome(
+            x,
+            phi.reshape(shape),
+            acts.pressure.reshape(shape),
+            force,
+            (acts.inside if behind is not None else phi <= touch).reshape(shape),
+            acts.slips.reshape(shape),
+        )
+        return Memory(
+            pose,
+            outcome.inside,
+            # (not asked for until all facets are looked at)
+            memory.anchor
+            if which is not None
+            else _anchors(points, y, phi, n, acts.shear, outcome).reshape(x.shape),
+            outcome.gap,
+            n.reshape(x.shape),
+            outcome,
+            works,
+            step,
+            behind,
+            pressed,
+            which,
+        )
+
+    def _distance(
+        self, y: NDArray[np.float64], memory: Memory, reach: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return gaps and normals of points; of a costly shape what they are at least if far.
+
+        Args:
+            y: The points, in the frame of the shape.
+            memory: What is known of the last converged step.
+            reach: Gap within which a point may be pressed.
+        """
+        phi, n = np.zeros(len(y)), memory.normal.reshape(y.shape).copy()
+        near = np.ones(len(y), dtype=bool)
+        if self._shape.costly:
+            before = framed(self._shape, memory.pose, memory.outcome.positions).reshape(y.shape)
+            phi = memory.gap.ravel() - np.linalg.norm(y - before, axis=1)
+            near = ~(phi > reach)
+        phi[near], n[near] = distance_within(self._shape, y[near])
+        return phi, n
+
+    def _step(
+        self,
+        points: Points,
+        memory: Memory,
+        y: NDArray[np.float64],
+        gap: NDArray[np.float64],
+    ) -> Step:
+        """Return what there is of a step to positions and gaps at all points."""
+        before = memory.gap.ravel()
+        x = memory.outcome.positions
+        change = y - framed(self._shape, memory.pose, x).reshape(y.shape)
+        middle = y - 0.5 * change
+        surface = self._surface
+        n = memory.normal.reshape(y.shape).copy()
+        acts = (before <= surface.touch) | (gap <= surface.touch)
+        n[acts] = self._shape.distance(middle[acts])[1]
+        gradient, factor = corrected(n, change, change, gap - before, surface.extent)
+        pressure = mean_pressure(points.stiffness, before, gap, surface.touch)
+        return Step(change, middle, n, gradient, factor, before, pressure)
+
+    # -- Derivatives of what acts ---------------------------------------------------------------
+
+    def acting(self, trial: Memory, memory: Memory) -> Acting:
+        """Return the points that touch.
+
+        Args:
+            trial: What acts.
+            memory: What is known of its facets at the last converged step.
+        """
+        surface, acting = self._surface, trial.touched
+        if self.of_step:
+            acting = acting | (memory.gap <= surface.touch)
+        if trial.behind is not None:
+            assert trial.pressed is not None
+            acting = acting | trial.pressed
+        here = np.flatnonzero(
+            acting.any(axis=1) & (self.weights(trial).max(axis=1, initial=0.0) > 0.0)
+        )
+        inside = acting[here]
+        flat = (here[:, None] * surface.nq + np.arange(surface.nq))[inside]
+        return Acting(here, inside, flat)
+
+    def rotation(self, trial: Memory, memory: Memory) -> NDArray[np.float64]:
+        """Return what turns tractions out of the frame of the shape."""
+        return memory.pose.mean(trial.pose) if self.of_step else trial.pose.Q
+
+    def derivative(
+        self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return the derivative of the traction by positions, shape ``(n, gdim, gdim)``.
+
+        Args:
+            trial: As for :meth:`acting`.
+            memory: As there.
+            flat: Numbers of points that touch.
+        """
+        Q = self.rotation(trial, memory)
+        return np.asarray(Q @ self.derivative_within(trial, memory, flat) @ trial.pose.Q.T)
+
+    def derivative_within(
+        self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return :meth:`derivative` in the frame of the shape."""
+        surface, gdim = self._surface, self._surface.gdim
+        y = framed(self._shape, trial.pose, trial.outcome.positions.reshape(-1, gdim)[flat])
+        n, gap = trial.normal.reshape(-1, gdim)[flat], trial.gap.ravel()[flat]
+        points = self.points(memory).of(flat)
+        delta = y - points.anchor
+        touch, law = surface.touch, self._friction
+        if not self.of_step:
+            H = self._shape.curvature(y)
+            push = None if trial.behind is None else self._push(trial, memory, flat, bent=True)
+            return derivative(law, points, delta, gap, n, H, touch, push)
+        assert trial.step is not None
+        step = Step(*(part[flat] for part in trial.step))
+        H = 0.5 * self._shape.curvature(step.middle)
+        slope = pressure_slope(points.stiffness, step.before, gap, touch)
+        turn = corrected_slope(step.normal, H, step.change, step.factor, n)
+        D = step.gradient[:, :, None] * (slope[:, None] * n)[:, None, :]
+        D = D + step.pressure[:, None, None] * turn
+        if not law.smooth:
+            acts = traction(law, points, delta, gap, step.normal, touch, step.pressure)
+            dp = slope[:, None] * n
+            D = D + shear_derivative(law, points, delta, gap, step.normal, H, touch, acts, dp, n)
+        return np.asarray(D)
+
+    def secants(
+        self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return what tangents have besides :meth:`derivative` where points change their slip.
+
+        It notes how they slip, and is called on all ranks, also where nothing touches.
+        """
+        gdim, Q = self._surface.gdim, self.rotation(trial, memory)
+        slips = trial.outcome.slips.ravel()
+        normal = trial.normal if trial.step is None else trial.step.normal
+        n, pressure = normal.reshape(-1, gdim), trial.outcome.pressure.ravel()
+        force = np.linalg.solve(Q, trial.outcome.traction.reshape(-1, gdim).T).T
+        shear = force - n * (n * force).sum(axis=1)[:, None]
+        m, nq = self._surface.weights.shape
+        place = nq * trial.numbers(np.arange(len(trial.gap)))[:, None] + np.arange(nq)
+        slipping, along = np.zeros(m * nq, dtype=bool), np.zeros((m * nq, gdim))
+        slipping[place.ravel()], along[place.ravel()] = slips, shear
+        changed = self.slip_changes.note(slipping, along)[place.ravel()][flat]
+        found = np.zeros((len(flat), gdim, gdim))
+        if not changed.any():
+            return found
+        some = flat[changed]
+        points = self.points(memory).of(some)
+        y = framed(self._shape, trial.pose, trial.outcome.positions.reshape(-1, gdim)[some])
+        acts = Traction(pressure[some], shear[some], slips[some], slips[some])
+        gap = trial.gap.ravel()[some]
+        secant = secant_along(points, y - points.anchor, gap, n[some], self._surface.touch, acts)
+        found[changed] = Q @ secant @ trial.pose.Q.T
+        return found
+
+    def by_stress(
+        self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return the derivative of the traction by that of the stress behind.
+
+        Of the latter by its part along the normal, shape ``(n, gdim)``.
+        """
+        gdim, pose = self._surface.gdim, trial.pose
+        points = self.points(memory).of(flat)
+        y = framed(self._shape, pose, trial.outcome.positions.reshape(-1, gdim)[flat])
+        force = push_derivative(
+            self._friction,
+            points,
+            y - points.anchor,
+            trial.gap.ravel()[flat],
+            trial.normal.reshape(-1, gdim)[flat],
+            self._surface.touch,
+            self._push(trial, memory, flat),
+        )
+        return np.asarray(force @ pose.Q.T)
+
+    def _push(
+        self, trial: Memory, memory: Memory, flat: NDArray[np.int64], bent: bool = False
+    ) -> Push:
+        """Return the pressure of Nitsche's method at some points.
+
+        Args:
+            trial: What acts.
+            memory: What is known of the last converged step.
+            flat: Their numbers.
+            bent: Whether the derivative of the pressure is asked for.
+        """
+        gdim, pose = self._surface.gdim, trial.pose
+        assert trial.behind is not None
+        H = None
+        if bent:
+            x = trial.outcome.positions.reshape(-1, gdim)[flat]
+            H = self._shape.curvature(framed(self._shape, pose, x))
+        return nitsche(
+            self.points(memory).of(flat),
+            trial.behind.reshape(-1, gdim)[flat] @ pose.Q,
+            trial.gap.ravel()[flat],
+            trial.normal.reshape(-1, gdim)[flat],
+            self._surface.touch,
+            H,
+        )
+
+
+def _anchors(
+    points: Points,
+    y: NDArray[np.float64],
+    phi: NDArray[np.float64],
+    n: NDArray[np.float64],
+    shear: NDArray[np.float64],
+    outcome: Outcome,
+) -> NDArray[np.float64]:
+    """Return the anchors to be remembered, and where points were that touch nothing."""
+    inside, slips = outcome.inside.ravel(), outcome.slips.ravel()
+    foot = y - phi[:, None] * n + shear / points.tangential[:, None]
+    stays = inside & ~slips & points.touched
+    anchor = np.where(stays[:, None], points.anchor, foot)
+    return np.where(inside[:, None], anchor, y)

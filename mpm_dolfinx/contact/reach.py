@@ -1,0 +1,162 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Which facets may touch an obstacle in a step; what acts is not asked of others.
+
+At the beginning of a step facets within some domains of the obstacle are noted. Others cannot touch
+until points have come nearer by a margin, which is told by the motion of nodes and of the shape
+(distances change no faster than positions do). Where they have, facets are looked for anew, farther
+away, and where nearly all are near there is nothing to be left out.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .memory import Memory
+from .rotation import Pose
+from .shapes import Shape
+from .surface import Surface
+
+__all__ = ["Reach", "is_near"]
+
+#: Gap, over the thickness of the domain behind, up to which a facet may touch in a step; and share
+#: of facets that do so up to which others are left out.
+NEAR, MOST_NEAR = 2.0, 0.7
+#: How much farther facets are looked for than they have come nearer, where that was too far.
+FARTHER = 1.4
+
+
+class Near(NamedTuple):
+    """Facets that may touch in a step.
+
+    Attributes:
+        memory: What is known of them.
+        nodes: Where the nodes of all facets begin.
+        radius: How much gaps change at most, by the angle that the shape turns by.
+        margin: How far points may come nearer until others could touch.
+    """
+
+    memory: Memory
+    nodes: NDArray[np.float64]
+    radius: float
+    margin: float
+
+
+class Reach:
+    """What of a surface an obstacle may reach in a step.
+
+    Args:
+        surface: The surface.
+        shape: The obstacle.
+    """
+
+    def __init__(self, surface: Surface, shape: Shape) -> None:
+        self._surface, self._shape = surface, shape
+        self._near: Near | None = None
+        self._wider: Near | None = None
+        self._change: float | None = None
+        self._seen: list[tuple[NDArray[np.int64], NDArray[np.float64]]] | None = None
+
+    def forget(self) -> None:
+        """Take all facets for near, until they are looked for."""
+        self._near = self._wider = None
+
+    def look(self, memory: Memory) -> None:
+        """Note which facets may touch in a step, and what others may move until they could.
+
+        Args:
+            memory: What is known of the last converged step.
+        """
+        self._near, self._wider = self._within(memory, 0.0), None
+        self._change = self._seen = None
+
+    def hold(self) -> None:
+        """Look where the body is now, once for all places in which the shape is tried."""
+        self._change, self._seen = None, []
+        if self._near is not None:
+            self._change = self._largest_change(self._near)
+
+    def of(self, memory: Memory, pose: Pose) -> Memory | None:
+        """Return what is known of facets that may touch at the present positions; ``None``: all.
+
+        Args:
+            memory: What is known of the last converged step.
+            pose: Where the shape is.
+        """
+        near = self._near
+        if near is None:
+            return None
+        if (moved := self._approach(near, memory, pose)) < near.margin:
+            return near.memory
+        if self._wider is None or moved >= self._wider.margin:
+            self._wider = self._within(memory, FARTHER * moved)
+        wider = self._wider
+        return wider.memory if wider is not None and moved < wider.margin else None
+
+    def known(self, trial: Memory, memory: Memory) -> Memory:
+        """Return what was known of the facets that were looked at in a trial.
+
+        Args:
+            trial: The trial.
+            memory: What is known of all facets.
+        """
+        if trial.facets is None:
+            return memory
+        for near in (self._near, self._wider):
+            if near is not None and near.memory.facets is trial.facets:
+                return near.memory
+        return memory.of(trial.facets)
+
+    def positions(self, which: NDArray[np.int64] | None) -> NDArray[np.float64]:
+        """Return where points of some facets are, ``None``: of all."""
+        if which is None or self._seen is None:
+            return self._surface.positions(which=which)
+        for known, positions in self._seen:
+            if known is which:
+                return positions
+        self._seen.append((which, self._surface.positions(which=which)))
+        return self._seen[-1][1]
+
+    def _within(self, memory: Memory, distance: float) -> Near | None:
+        """Return the facets that are within a distance, or some domains; ``None``: nearly all."""
+        surface, shape = self._surface, self._shape
+        if not shape.measures or memory.gap.size == 0:
+            return None
+        near = is_near(memory, surface, distance)
+        if near.mean() > MOST_NEAR:
+            return None
+        which = np.flatnonzero(near)
+        nodes = surface.own_nodes(converged=True)
+        arms = nodes - shape.pivot - memory.pose.offset
+        radius = float(np.linalg.norm(arms, axis=1).max())
+        if (arm := shape.arm) is not None:
+            radius = min(radius, arm)
+        margin = float(memory.gap[~near].min()) - surface.touch
+        return Near(memory.of(which), nodes, radius, margin)
+
+    def _approach(self, near: Near, memory: Memory, pose: Pose) -> float:
+        """Return by how much points have come nearer to the obstacle in the step at most."""
+        shifted = float(np.linalg.norm(pose.offset - memory.pose.offset))
+        turned = float(np.linalg.norm(pose.Q - memory.pose.Q, 2)) * near.radius
+        change = self._largest_change(near) if self._change is None else self._change
+        return self._surface.spread * (change + turned) + shifted
+
+    def _largest_change(self, near: Near) -> float:
+        """Return how far a node of the facets has moved in the step at most."""
+        change = self._surface.own_nodes() - near.nodes
+        return float(np.sqrt((change * change).sum(axis=1).max(initial=0.0)))
+
+
+def is_near(memory: Memory, surface: Surface, distance: float = 0.0) -> NDArray[np.bool_]:
+    """Return which facets of a surface are near to an obstacle, shape ``(m,)``.
+
+    Args:
+        memory: What is known of them.
+        surface: The surface.
+        distance: Up to where they are near, if that is more than some domains.
+    """
+    least = memory.gap.min(axis=1, initial=np.inf)
+    return np.asarray(least <= np.maximum(NEAR * surface.thickness, distance))
