@@ -26,6 +26,8 @@ KINDS = ("rigid", "triangles", "rigid_body", "pair")
 YOUNG, POISSON, FRICTION = 1e3, 0.3, 0.3
 #: How far obstacles go into the block, 1 high, and along it.
 DEPTH, WAY = 0.02, 0.01
+#: Radius of obstacles.
+RADIUS = 0.4
 #: Calls of a term that a problem makes within steps.
 CALLS = (
     "begin",
@@ -88,15 +90,14 @@ def space(dim: int, cells: int) -> fem.FunctionSpace:
 
 
 def ball(dim: int, kind: str) -> mpm.contact.Shape:
-    """A ball of radius 0.4 on the middle of the block, or one of triangles or segments."""
-    radius = 0.4
-    centre = np.array([0.5] * (dim - 1) + [1.0 + radius])
+    """A ball on the middle of the block, or one of triangles or segments."""
+    centre = np.array([0.5] * (dim - 1) + [1.0 + RADIUS])
     if kind != "triangles":
-        return (mpm.contact.disc if dim == 2 else mpm.contact.sphere)(tuple(centre), radius)
+        return (mpm.contact.disc if dim == 2 else mpm.contact.sphere)(tuple(centre), RADIUS)
     if dim == 2:
         angle = np.linspace(0.0, 2.0 * np.pi, 721)
         return mpm.contact.polyline(
-            centre + radius * np.column_stack([np.cos(angle), np.sin(angle)])
+            centre + RADIUS * np.column_stack([np.cos(angle), np.sin(angle)])
         )
     turn, rise = np.meshgrid(
         np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False), np.linspace(0.0, np.pi, 61)[1:-1]
@@ -110,7 +111,7 @@ def ball(dim: int, kind: str) -> mpm.contact.Shape:
     top = np.stack([np.full(60, 3540), at[0], after[0]], -1)
     low = np.stack([np.full(60, 3541), after[-1], at[-1]], -1)
     triangles = np.concatenate([side.reshape(-1, 3) for side in [*sides, top, low]])
-    return mpm.contact.triangulated(centre + radius * points, triangles)
+    return mpm.contact.triangulated(centre + RADIUS * points, triangles)
 
 
 def held(V: fem.FunctionSpace, value: Any, where: Callable[..., Any]) -> fem.DirichletBC:
@@ -129,8 +130,10 @@ def obstacle(
     up = np.eye(dim)[-1]
     contact: Any
     if kind == "rigid_body":
+        # (a ball whose weight is in its middle is at rest wherever it rolls)
         force = 0.25 * YOUNG * DEPTH if dim == 2 else YOUNG * DEPTH**1.5
-        contact = mpm.contact.RigidBody(block, shape, friction=FRICTION)
+        low = shape.pivot - 0.5 * RADIUS * up
+        contact = mpm.contact.RigidBody(block, shape, friction=FRICTION, centre=low)
     else:
         contact = mpm.contact.Rigid(block, shape, FRICTION)
 
