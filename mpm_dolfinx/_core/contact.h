@@ -52,29 +52,4 @@ void add_tangents(const Meeting& meeting, int dim, const Sums& sums);
 // Add derivatives (points, 1 + nodes, dim, count, dim).
 void add_derivatives(std::size_t points, int dim, int nodes, int count, const double* derivatives,
                      const Sums& sums);
-
-// Points and flat or bilinear facets, lines, triangles or quadrilaterals by the number of nodes.
-struct Search
-{
-  std::size_t points, facets;
-  int nodes;
-  const double *x, *normal;       // (points, dim); no normals: or null
-  const double* corners;          // (facets, nodes, dim)
-  const double* outward;          // (facets,)
-  const std::uint8_t* present;    // (facets,)
-  double reach, facing, sure, may, close; // see mpm_dolfinx.contact.facets
-  int most;
-};
-
-struct Found
-{
-  std::int64_t* facet; // -1 where there is none, (points,)
-  double *place, *gap; // (points, dim - 1), (points,)
-  std::uint8_t* near;
-  double* beside;
-};
-
-// Find the closest facet of each point. The oracle is NearFacets.closest. Returns whether all facets
-// have an area.
-bool find_closest(const Search& search, int dim, const Found& found);
 } // namespace core

@@ -15,6 +15,7 @@
 #include <nanobind/stl/vector.h>
 
 #include "arrays.h"
+#include "closest.h"
 #include "contact.h"
 #include "domains.h"
 #include "material.h"

@@ -1,0 +1,118 @@
+// Copyright (C) 2026 the mpm-dolfinx authors
+// SPDX-License-Identifier: LGPL-3.0-or-later
+//
+// Numbers with their derivatives by a few others, and vectors of few of them.
+
+#pragma once
+
+#include <array>
+#include <cmath>
+#include <cstddef>
+
+namespace core
+{
+// A number with its derivatives by some others.
+template <int count>
+struct Dual
+{
+  double value = 0.0;
+  std::array<double, count> by{};
+
+  Dual() = default;
+  Dual(double number) : value(number) {}
+};
+
+template <int count>
+Dual<count> operator+(Dual<count> a, const Dual<count>& b)
+{
+  a.value += b.value;
+  for (int i = 0; i < count; ++i)
+    a.by[i] += b.by[i];
+  return a;
+}
+
+template <int count>
+Dual<count> operator-(Dual<count> a, const Dual<count>& b)
+{
+  a.value -= b.value;
+  for (int i = 0; i < count; ++i)
+    a.by[i] -= b.by[i];
+  return a;
+}
+
+template <int count>
+Dual<count> operator*(const Dual<count>& a, const Dual<count>& b)
+{
+  Dual<count> result(a.value * b.value);
+  for (int i = 0; i < count; ++i)
+    result.by[i] = a.value * b.by[i] + b.value * a.by[i];
+  return result;
+}
+
+template <int count>
+Dual<count> operator*(double a, Dual<count> b)
+{
+  b.value *= a;
+  for (int i = 0; i < count; ++i)
+    b.by[i] *= a;
+  return b;
+}
+
+// f(a), of a known derivative.
+template <int count>
+Dual<count> chain(const Dual<count>& a, double value, double slope)
+{
+  Dual<count> result(value);
+  for (int i = 0; i < count; ++i)
+    result.by[i] = slope * a.by[i];
+  return result;
+}
+
+inline double value_of(double a) { return a; }
+inline double inverse(double a) { return 1.0 / a; }
+inline double root(double a) { return std::sqrt(a); }
+
+template <int count>
+double value_of(const Dual<count>& a)
+{
+  return a.value;
+}
+
+template <int count>
+Dual<count> inverse(const Dual<count>& a)
+{
+  return chain(a, 1.0 / a.value, -1.0 / (a.value * a.value));
+}
+
+template <int count>
+Dual<count> root(const Dual<count>& a)
+{
+  const double size = std::sqrt(a.value);
+  return chain(a, size, 0.5 / size);
+}
+
+template <typename T, std::size_t dim>
+T dot(const std::array<T, dim>& a, const std::array<T, dim>& b)
+{
+  T sum = a[0] * b[0];
+  for (std::size_t i = 1; i < dim; ++i)
+    sum = sum + a[i] * b[i];
+  return sum;
+}
+
+// Solve for a matrix of one or two rows.
+template <typename T, typename G, std::size_t sides>
+std::array<T, sides> solved(const std::array<std::array<G, sides>, sides>& matrix,
+                            const std::array<T, sides>& b)
+{
+  if constexpr (sides == 1)
+    return {inverse(matrix[0][0]) * b[0]};
+  else
+  {
+    const G det = matrix[0][0] * matrix[1][1] - matrix[0][1] * matrix[1][0];
+    const G factor = inverse(det);
+    return {factor * (matrix[1][1] * b[0] - matrix[0][1] * b[1]),
+            factor * (matrix[0][0] * b[1] - matrix[1][0] * b[0])};
+  }
+}
+} // namespace core
