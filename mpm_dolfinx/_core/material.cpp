@@ -4,9 +4,9 @@
 // Hencky elasticity and laws of plasticity in logarithmic strain, point by point.
 //
 // The same algorithms as mpm_dolfinx.materials (kinematics, von_mises, mohr_coulomb,
-// drucker_prager, cam_clay), which are their oracles. All are isotropic, so stress and strain share
-// the axes of the trial elastic b, and tangents have 8 (plane) or 21 (space) entries other than
-// zero in that frame.
+// drucker_prager, mu_i, cam_clay), which are their oracles. All are isotropic, so stress and strain
+// share the axes of the trial elastic b, and tangents have 8 (plane) or 21 (space) entries other
+// than zero in that frame.
 
 #include "material.h"
 #include "hot_loop.h"
@@ -463,6 +463,55 @@ struct MohrCoulomb
   }
 };
 
+// A trial strain as laws of two invariants see it: tau = p 1 + sqrt(2) q n, with the unit deviator
+// n; q is the root of J2.
+struct Invariants
+{
+  double trace, size = 0.0;
+  std::array<double, 3> deviator;
+  explicit Invariants(const std::array<double, 3>& strain) : trace(strain[0] + strain[1] + strain[2])
+  {
+    for (int a = 0; a < 3; ++a)
+    {
+      deviator[a] = strain[a] - trace / 3.0;
+      size += deviator[a] * deviator[a];
+    }
+    size = std::sqrt(size);
+  }
+};
+
+// What such a law returns to: p, q, and their derivatives by the trace and the size of the deviator.
+struct Returned
+{
+  double p, q, p_trace = 0.0, p_size = 0.0, q_trace = 0.0, q_size = 0.0;
+};
+
+// Answer of such a law that yields, with the elastic strain of volume.
+void answer_returned(const std::array<double, 3>& strain, const Invariants& trial,
+                     const Returned& law, double shear, double volume, Response& r)
+{
+  const double root = root_two * shear * trial.size;
+  const double ratio = root > 0.0 ? law.q / root : 0.0, secant = 2.0 * shear * ratio;
+  const double along = root_two * law.q_size - secant;
+  std::array<double, 3> direction;
+  r.plastic = true;
+  for (int a = 0; a < 3; ++a)
+  {
+    direction[a] = trial.size > 0.0 ? trial.deviator[a] / trial.size : 0.0;
+    r.stress[a] = law.p + secant * trial.deviator[a];
+    r.elastic_strain[a] = ratio * trial.deviator[a] + volume / 3.0;
+  }
+  r.variables[0] += root_two_thirds * norm_of_difference(strain, r.elastic_strain);
+  for (int a = 0; a < 3; ++a)
+    for (int b = 0; b < 3; ++b)
+    {
+      r.shear[a][b] = secant;
+      r.normal[a][b] = secant * ((a == b ? 1.0 : 0.0) - 1.0 / 3.0)
+                       + along * direction[a] * direction[b] + law.p_trace
+                       + law.p_size * direction[b] + root_two * law.q_trace * direction[a];
+    }
+}
+
 // The cone, or the cap at the largest mean stress; see mpm_dolfinx.materials.drucker_prager.
 struct DruckerPrager
 {
@@ -476,16 +525,8 @@ struct DruckerPrager
 
   void operator()(const std::array<double, 3>& strain, double tolerance, Response& r) const
   {
-    const double trace = strain[0] + strain[1] + strain[2], mean = bulk * trace;
-    std::array<double, 3> deviator;
-    double size = 0.0;
-    for (int a = 0; a < 3; ++a)
-    {
-      deviator[a] = strain[a] - trace / 3.0;
-      size += deviator[a] * deviator[a];
-    }
-    size = std::sqrt(size);
-    const double root = root_two * shear * size;
+    const Invariants trial(strain);
+    const double mean = bulk * trial.trace, root = root_two * shear * trial.size;
     const double room = tolerance * (root + std::abs(mean) + strength);
     const double f = root + eta * mean - strength;
     if (!(f > room || mean - top > room))
@@ -495,43 +536,64 @@ struct DruckerPrager
     }
     const double stiffness = shear + bulk * eta * flow;
     const double multiplier = f > 0.0 ? f / stiffness : 0.0;
-    double p = mean - bulk * flow * multiplier, q = root - shear * multiplier;
-    // Derivatives of p and q by the trace and the size of the deviator.
-    double p_trace = 0.0, q_size = 0.0, p_size = 0.0, q_trace = 0.0;
-    const bool keeps_volume = corrects && p > top;
-    if (p > top)
+    Returned law{mean - bulk * flow * multiplier, root - shear * multiplier};
+    const bool keeps_volume = corrects && law.p > top;
+    if (law.p > top)
     {
       const double limit = std::max(strength - eta * top, 0.0);
-      p = top;
-      q_size = root < limit ? root_two * shear : 0.0;
-      q = std::min(root, limit);
+      law.p = top;
+      law.q_size = root < limit ? root_two * shear : 0.0;
+      law.q = std::min(root, limit);
     }
     else
     {
-      p_trace = bulk * (1.0 - bulk * eta * flow / stiffness);
-      q_size = root_two * shear * (1.0 - shear / stiffness);
-      p_size = -root_two * shear * bulk * flow / stiffness;
-      q_trace = -shear * bulk * eta / stiffness;
+      law.p_trace = bulk * (1.0 - bulk * eta * flow / stiffness);
+      law.q_size = root_two * shear * (1.0 - shear / stiffness);
+      law.p_size = -root_two * shear * bulk * flow / stiffness;
+      law.q_trace = -shear * bulk * eta / stiffness;
     }
-    const double ratio = root > 0.0 ? q / root : 0.0, secant = 2.0 * shear * ratio;
-    const double along = root_two * q_size - secant;
-    std::array<double, 3> direction;
-    r.plastic = true;
-    for (int a = 0; a < 3; ++a)
+    answer_returned(strain, trial, law, shear, keeps_volume ? trial.trace : law.p / bulk, r);
+  }
+};
+
+// Friction by the inertial number, without cohesion and dilation; see mpm_dolfinx.materials.mu_i.
+struct MuIRheology
+{
+  double bulk, shear, friction, range, lag, time;
+  explicit MuIRheology(const double* p)
+      : bulk(p[0]), shear(p[1]), friction(p[2]), range(p[3]), lag(p[4]), time(p[5])
+  {
+  }
+
+  void operator()(const std::array<double, 3>& strain, double tolerance, Response& r) const
+  {
+    const Invariants trial(strain);
+    const double pressure = -bulk * trial.trace, root = root_two * shear * trial.size;
+    const double f = root - friction * pressure, room = tolerance * (root + std::abs(pressure));
+    if (!(f > room || -pressure > room))
     {
-      direction[a] = size > 0.0 ? deviator[a] / size : 0.0;
-      r.stress[a] = p + secant * deviator[a];
-      r.elastic_strain[a] = ratio * deviator[a] + (keeps_volume ? trace : p / bulk) / 3.0;
+      answer_elastic(strain, bulk, shear, r);
+      return;
     }
-    r.variables[0] += root_two_thirds * norm_of_difference(strain, r.elastic_strain);
-    for (int a = 0; a < 3; ++a)
-      for (int b = 0; b < 3; ++b)
-      {
-        r.shear[a][b] = secant;
-        r.normal[a][b] = secant * ((a == b ? 1.0 : 0.0) - 1.0 / 3.0)
-                         + along * direction[a] * direction[b] + p_trace + p_size * direction[b]
-                         + root_two * q_trace * direction[a];
-      }
+    if (!(pressure > 0.0))
+    {
+      answer_returned(strain, trial, Returned{0.0, 0.0}, shear, trial.trace, r);
+      return;
+    }
+    // shear lag m^2 + b m = f wait for the plastic shear m
+    const double wait = time * std::sqrt(pressure), quick = shear * lag;
+    const double b = shear * wait + lag * (range * pressure - f);
+    const double slope = std::sqrt(b * b + 4.0 * quick * f * wait);
+    const double slip = b > 0.0 ? 2.0 * f * wait / (b + slope) : 0.5 * (slope - b) / quick;
+    const double q = std::max(root - shear * slip, friction * pressure);
+    Returned law{-pressure, std::min(q, (friction + range) * pressure)};
+    const double excess = law.q / pressure - friction;
+    law.p_trace = bulk;
+    law.q_size = root_two * shear * (1.0 - shear * (lag * slip + wait) / slope);
+    law.q_trace =
+        -bulk * shear
+        * (slip * lag * (friction + range) + wait * (friction - 0.5 * excess)) / slope;
+    answer_returned(strain, trial, law, shear, trial.trace, r);
   }
 };
 
@@ -998,6 +1060,8 @@ HOT_LOOP std::vector<std::int64_t> core::update_logarithmic(const Update& update
     return update_all<MohrCoulomb>(update, dim);
   case Law::drucker_prager:
     return update_all<DruckerPrager>(update, dim);
+  case Law::mu_i:
+    return update_all<MuIRheology>(update, dim);
   case Law::cam_clay:
     return update_all<CamClay>(update, dim);
   default:

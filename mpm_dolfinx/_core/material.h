@@ -22,6 +22,7 @@ enum class Law {
   von_mises,      // bulk, shear, rho_y, hardening
   mohr_coulomb,   // bulk, shear, sin(phi), sin(psi), 2 c cos(phi), cut-off, volume correction
   drucker_prager, // bulk, shear, eta, eta_psi, xi c, largest mean stress, volume correction
+  mu_i,           // bulk, shear, mu_s, mu_2 - mu_s, d sqrt(rho_s)/I_0, duration of the step
   cam_clay        // compression, swelling, M, shear, reference pressure
 };
 
@@ -37,6 +38,8 @@ constexpr std::size_t num_parameters(Law law)
     return 2;
   case Law::von_mises:
     return 4;
+  case Law::mu_i:
+    return 6;
   case Law::cam_clay:
     return 5;
   default:

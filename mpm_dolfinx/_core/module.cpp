@@ -189,6 +189,8 @@ Law law_of(const std::string& name)
     return Law::mohr_coulomb;
   if (name == "drucker_prager")
     return Law::drucker_prager;
+  if (name == "mu_i")
+    return Law::mu_i;
   throw std::invalid_argument("there is no compiled law " + name);
 }
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -64,6 +65,7 @@ class Assignment:
     Attributes:
         governed: The materials at their points.
         weakening: What the strength of all of them is divided by.
+        duration: Of the steps of which updates are; infinite where no time passes.
 
     Raises:
         MPMError: Materials, tags or parameters that do not go together.
@@ -83,6 +85,7 @@ class Assignment:
         self._compiled = compiled
         self._mean_stress = mean_stress
         self.weakening = 1.0
+        self.duration = math.inf
         with agree(particles.mesh.comm):
             chosen = self._chosen(materials, cell_tags)
             self._given = [_Given(material, dict(material.parameters)) for material, _ in chosen]
@@ -145,6 +148,16 @@ class Assignment:
                 for material, part in zip(self.given, self.governed, strict=True)
             ]
 
+    def pace(self, duration: float) -> None:
+        """Let updates be those of steps of a duration, infinite at first."""
+        if duration == self.duration:
+            return
+        self.duration = duration
+        for number, part in enumerate(self.governed):
+            law = part.law.in_time(duration)
+            if law is not part.law:
+                self.governed[number] = replace(part, law=law)
+
     def _chosen(
         self, materials: Materials, cell_tags: mesh.MeshTags | None
     ) -> list[tuple[Material, NDArray[np.int64]]]:
@@ -185,7 +198,8 @@ class Assignment:
 
     def _taken(self, material: Material, points: NDArray[np.int64]) -> Governed:
         """Return a material at its points, without its mean stress where a pressure is that."""
-        whole = Governed(self._particles, self._dim, material, points, material)
+        law = material.in_time(self.duration)
+        whole = Governed(self._particles, self._dim, material, points, law)
         if self._mean_stress is None:
             return whole
         if not is_split(material):

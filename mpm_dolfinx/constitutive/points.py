@@ -149,6 +149,10 @@ class MaterialPoints:
         """
         self._assignment.weaken(factor)
 
+    def pace(self, duration: float) -> None:
+        """Let updates be those of steps of a duration; without a call no time passes."""
+        self._assignment.pace(duration)
+
     # -- A stress that is there at first ---------------------------------------------------
 
     def begin_with_pressure(self) -> None:
@@ -254,10 +258,18 @@ class MaterialPoints:
         return state
 
     def _settle(self, states: list[State]) -> None:
-        """Take states for those of the last converged step, at the present displacement."""
+        """Take states for those of the last converged step, at the present displacement.
+
+        The update that asks for their stress takes no time: what flows goes on to.
+        """
         self._last = self._last._replace(states=states)
-        with agree(self._particles.mesh.comm) if self.averaging is None else nullcontext():
-            self.update()
+        duration = self._assignment.duration
+        self.pace(0.0)
+        try:
+            with agree(self._particles.mesh.comm) if self.averaging is None else nullcontext():
+                self.update()
+        finally:
+            self.pace(duration)
         self._trial = states
         self._make_last(states, self.first_piola.copy())
 

@@ -170,6 +170,7 @@ class StepStress:
     def pace(self, dt: float, share: float) -> None:
         """See :meth:`system.term.Term.pace`."""
         self._dt, self._share = dt, share
+        self._points.pace(dt)
         if self._present_reference() is not self._reference:
             self.settle()
 

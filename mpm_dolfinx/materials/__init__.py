@@ -18,6 +18,7 @@ from .check import check_tangent
 from .drucker_prager import DruckerPrager
 from .elastic import Hencky, IsotropicElastic, LinearElastic
 from .mohr_coulomb import FrictionalMaterial, MohrCoulomb, Tresca
+from .mu_i import MuIRheology
 from .return_mapping import ReturnMapping
 from .von_mises import SmallStrainVonMises, VonMises
 
@@ -31,6 +32,7 @@ __all__ = [
     "Material",
     "ModifiedCamClay",
     "MohrCoulomb",
+    "MuIRheology",
     "Parameter",
     "ReturnMapping",
     "SmallStrainVonMises",

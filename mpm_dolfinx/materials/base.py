@@ -258,6 +258,16 @@ class Material(ABC):
             f"The strength of a {type(self).__name__} cannot be reduced; give it a method weakened."
         )
 
+    def in_time(self, duration: float) -> Self:
+        """Return this material for updates over steps of a duration.
+
+        That is the material itself, unless a law whose stress depends on rates says otherwise.
+
+        Args:
+            duration: Not negative; infinite where no time passes, as in quasi-static problems.
+        """
+        return self
+
     def at(self, points: NDArray[np.integer[Any]]) -> Self:
         """Return this material restricted to points, given by their numbers.
 

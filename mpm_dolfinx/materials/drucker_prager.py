@@ -14,7 +14,7 @@ from .base import Field, Integration, Parameter, State
 from .mandel import deviator, deviatoric_projector, identity, norm, trace
 from .mohr_coulomb import FrictionalMaterial
 
-__all__ = ["DruckerPrager"]
+__all__ = ["DruckerPrager", "Returned", "returned_tangent"]
 
 Array = NDArray[np.float64]
 Match = Literal["outer", "inner", "plane_strain"]
@@ -173,7 +173,7 @@ def _give_back(
     constants: _Constants, strain: Array, tangent: bool
 ) -> tuple[Array, Array, Array | None]:
     """Return stress, elastic strain and tangent of trial strains ``(n, m)`` that yield."""
-    n, m = strain.shape
+    n = len(strain)
     bulk, shear, eta, flow, strength, top, corrects = constants
     mean, dev = bulk * trace(strain), deviator(strain)
     size = norm(dev)
@@ -197,17 +197,48 @@ def _give_back(
     stress[:, :3] += p[:, None]
     if not tangent:
         return stress, elastic, None
-    # Derivatives of p and q, the root of J2, by the trace and by the size of the deviator.
-    p_trace = np.where(cap, 0.0, bulk * (1.0 - bulk * eta * flow / stiffness))
-    q_size = np.sqrt(2.0) * shear * np.where(cap, held, 1.0 - shear / stiffness)
-    p_size = np.where(cap, 0.0, -np.sqrt(2.0) * shear * bulk * flow / stiffness)
-    q_trace = np.where(cap, 0.0, -shear * bulk * eta / stiffness)
-    one = identity(m)
-    direction = np.divide(dev, size[:, None], out=np.zeros_like(dev), where=size[:, None] > 0.0)
-    along = np.sqrt(2.0) * q_size - 2.0 * shear * ratio
+    answer = Returned(
+        p,
+        q,
+        p_trace=np.where(cap, 0.0, bulk * (1.0 - bulk * eta * flow / stiffness)),
+        p_size=np.where(cap, 0.0, -np.sqrt(2.0) * shear * bulk * flow / stiffness),
+        q_trace=np.where(cap, 0.0, -shear * bulk * eta / stiffness),
+        q_size=np.sqrt(2.0) * shear * np.where(cap, held, 1.0 - shear / stiffness),
+    )
+    return stress, elastic, returned_tangent(answer, strain, shear, ratio)
+
+
+class Returned(NamedTuple):
+    """What a law of p and q, the root of J2, returns to, with derivatives, shape ``(n,)`` each.
+
+    Derivatives are those by the trace and by the size of the deviator of the trial strain.
+    """
+
+    p: Array
+    q: Array
+    p_trace: Array
+    p_size: Array
+    q_trace: Array
+    q_size: Array
+
+
+def returned_tangent(law: Returned, strain: Array, shear: Array, ratio: Array) -> Array:
+    """Return the tangent of a law of two invariants, shape ``(n, m, m)``.
+
+    Args:
+        law: What it returns to.
+        strain: Trial strains, shape ``(n, m)``.
+        shear: Shear modulus, shape ``(n,)``.
+        ratio: q over that of the trial state, shape ``(n,)``.
+    """
+    m = strain.shape[1]
+    one, dev = identity(m), deviator(strain)
+    size = norm(dev)[:, None]
+    direction = np.divide(dev, size, out=np.zeros_like(dev), where=size > 0.0)
+    along = np.sqrt(2.0) * law.q_size - 2.0 * shear * ratio
     D = np.einsum("n,ij->nij", 2.0 * shear * ratio, deviatoric_projector(m))
     D += np.einsum("n,ni,nj->nij", along, direction, direction)
-    D += np.einsum("n,i,j->nij", p_trace, one, one)
-    D += np.einsum("n,i,nj->nij", p_size, one, direction)
-    D += np.einsum("n,ni,j->nij", np.sqrt(2.0) * q_trace, direction, one)
-    return stress, elastic, D
+    D += np.einsum("n,i,j->nij", law.p_trace, one, one)
+    D += np.einsum("n,i,nj->nij", law.p_size, one, direction)
+    D += np.einsum("n,ni,j->nij", np.sqrt(2.0) * law.q_trace, direction, one)
+    return np.asarray(D)

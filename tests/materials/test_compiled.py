@@ -14,6 +14,7 @@ from mpm_dolfinx.materials import (
     Hencky,
     ModifiedCamClay,
     MohrCoulomb,
+    MuIRheology,
     Tresca,
     VonMises,
 )
@@ -50,6 +51,11 @@ LAWS = {
         decay=20.0,
         volume_correction=True,
     ),
+    "mu(i)": MuIRheology(1e3, 0.3, 0.4, 0.7, 0.02, 3.0).in_time(0.01),
+    "mu(i) by point, without rates": MuIRheology(1e3, 0.3, 0.4, 0.7 * SPREAD, 0.02, 3.0),
+    "mu(i) by point": MuIRheology(
+        1e3 * SPREAD, 0.3, 0.4, 0.7 * SPREAD, 0.02 * SPREAD, 3.0 * SPREAD, 0.3 * SPREAD
+    ).in_time(1e-4),
     "drucker-prager": DruckerPrager(1e3, 0.3, 2.0, 30.0, 10.0, match="plane_strain"),
     "drucker-prager without cohesion": DruckerPrager(1e3, 0.3, 0.0, 30.0),
     "drucker-prager by point, cut off": DruckerPrager(

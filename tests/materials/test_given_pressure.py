@@ -64,7 +64,8 @@ def test_the_answer_is_that_to_another_volume(name, dim):
     at_rest = law.yield_function(
         answer.state["stress"], *(answer.state[v] for v in law.internal_variables)
     )
-    if law.kinematics == "logarithmic" and "decay" not in law.parameters:
+    has_rates = law.in_time(np.inf) is not law
+    if law.kinematics == "logarithmic" and "decay" not in law.parameters and not has_rates:
         scale = 1.0 if "cam" in name else size
         assert at_rest.max() <= 1e-9 * scale
         np.testing.assert_allclose(again.state["stress"], found, atol=1e-6 * size)

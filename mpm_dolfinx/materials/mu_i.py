@@ -1,0 +1,220 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Dense flow of grains: friction that rises with the rate of shear, returned in closed form."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import MPMError
+from .base import Field, Integration, Parameter, State, check_parameter
+from .drucker_prager import Returned, returned_tangent
+from .elastic import IsotropicElastic
+from .mandel import deviator, norm, trace
+
+__all__ = ["MuIRheology"]
+
+Array = NDArray[np.float64]
+
+
+class MuIRheology(IsotropicElastic):
+    """Elastoplasticity of dry grains in flow, with friction by the inertial number (mu(I)).
+
+    Hencky elasticity at finite strain. The root of J2 of the Kirchhoff stress is at most mu(I) P, P
+    the pressure, with (Jop, Forterre & Pouliquen 2006, Nature 441, eqs. 2 and 3)::
+
+        mu(I) = mu_s + (mu_2 - mu_s) I / (I_0 + I),    I = d gamma_dot / sqrt(P / rho_s)
+
+    d the diameter of the grains, rho_s their density and gamma_dot the rate of plastic shear,
+    sqrt(2 D : D) in simple shear. Flow keeps the volume. Grains that are pulled apart carry no
+    stress; what has opened closes again without resistance, and bears pressure then as before.
+
+    Backward Euler in closed form: P does not change in a return without dilation, so that the
+    plastic shear of a step solves a quadratic equation (Dunatunga & Kamrin 2015, J. Fluid Mech.
+    779, section 3). The work of a return is mu(I) P times that shear and never negative. Where no
+    time passes, as in a :class:`~mpm_dolfinx.QuasiStaticProblem`, friction is mu_s: the law is then
+    :class:`DruckerPrager` with ``match="plane_strain"``, the angle arcsin(mu_s) and
+    ``volume_correction=True``; in plane strain it flows under the stress of Mohr-Coulomb's.
+
+    Attributes:
+        duration: Of a step, from which strains make rates; infinite where no time passes.
+        yield_tolerance: Excess of the yield function over the stress that counts as round-off.
+    """
+
+    symmetric = False
+    kinematics: ClassVar[Literal["small", "logarithmic"]] = "logarithmic"
+    inelastic: ClassVar[bool] = True
+    internal_variables: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType(
+        {"plastic_strain": ()}
+    )
+    limits: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType(
+        {
+            **IsotropicElastic.limits,
+            "static_friction": {"above": 0.0},
+            "limit_friction": {"above": 0.0},
+            "grain_size": {"least": 0.0},
+            "grain_density": {"above": 0.0},
+            "inertial_number": {"above": 0.0},
+        }
+    )
+    yield_tolerance: ClassVar[float] = 1e-13
+    _loop: ClassVar[str] = "mu_i"
+
+    def __init__(
+        self,
+        young: ArrayLike | Field,
+        poisson: ArrayLike | Field,
+        static_friction: ArrayLike | Field,
+        limit_friction: ArrayLike | Field,
+        grain_size: ArrayLike | Field,
+        grain_density: ArrayLike | Field,
+        inertial_number: ArrayLike | Field = 0.279,
+    ) -> None:
+        """Set the parameters.
+
+        Args:
+            young: Young's modulus, in units of stress.
+            poisson: Poisson's ratio.
+            static_friction: mu_s, the coefficient of friction of slow flow; the sine of an angle of
+                Mohr-Coulomb's law.
+            limit_friction: mu_2, that of flow without end in rate; at least ``static_friction``.
+            grain_size: Diameter d of the grains, a length; 0: friction without rates.
+            grain_density: Density rho_s of what the grains are made of, without their pores.
+            inertial_number: I_0, at which friction is half way between the two; by default that
+                of glass beads.
+
+        Raises:
+            MPMError: A value is out of range, or the friction at the limit is the smaller one.
+        """
+        super().__init__(young, poisson)
+        given: dict[str, Any] = {
+            "static_friction": static_friction,
+            "limit_friction": limit_friction,
+            "grain_size": grain_size,
+            "grain_density": grain_density,
+            "inertial_number": inertial_number,
+        }
+        checked = {name: check_parameter(name, v, **self.limits[name]) for name, v in given.items()}
+        self.parameters = {**self.parameters, **checked}
+        self.duration = math.inf
+        _require_rising(self.parameters)
+
+    def in_time(self, duration: float) -> Self:
+        """See :meth:`Material.in_time`."""
+        if duration == self.duration:
+            return self
+        other = copy.copy(self)
+        other.duration = duration
+        return other
+
+    def weakened(self, factor: float) -> Self:
+        """See :meth:`Material.weakened`; both coefficients are divided."""
+        values = {n: self.parameters[n] / factor for n in ("static_friction", "limit_friction")}
+        known = {n: v if isinstance(v, np.ndarray) else float(v) for n, v in values.items()}
+        return self.with_parameters(**known)
+
+    def initial_state(self, n: int, dim: int) -> State:
+        """See :meth:`Material.initial_state`."""
+        _require_rising(self.parameters)
+        return super().initial_state(n, dim)
+
+    def yield_function(self, stress: Array, plastic_strain: Array) -> Array:
+        """Return the root of J2 less mu_s P, shape ``(n,)``; positive in flow that is fast."""
+        root = np.sqrt(0.5) * norm(deviator(stress))
+        return np.asarray(root + self.parameters["static_friction"] * trace(stress) / 3.0)
+
+    def _constants(self) -> tuple[Parameter, ...]:
+        """Return moduli, mu_s, mu_2 - mu_s, d sqrt(rho_s)/I_0 and the duration.
+
+        Where there are no rates the last two are 0 and 1.
+        """
+        values = self.parameters
+        friction = values["static_friction"]
+        span = values["limit_friction"] - friction
+        if math.isinf(self.duration):
+            return self.bulk, self.shear, friction, span, 0.0, 1.0
+        lag = values["grain_size"] * np.sqrt(values["grain_density"]) / values["inertial_number"]
+        time = np.where(np.equal(lag, 0.0), 1.0, self.duration)
+        return self.bulk, self.shear, friction, span, lag, time
+
+    def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
+        """See :meth:`StrainMaterial.integrate`."""
+        n, m = trial_strain.shape
+        stress = self.elastic_stress(trial_strain)
+        D = self.elastic_tangent(n, m) if tangent else None
+        constants = [np.broadcast_to(c, n) for c in self._constants()]
+        bulk, shear, friction = constants[:3]
+        pressure = -bulk * trace(trial_strain)
+        root = np.sqrt(2.0) * shear * norm(deviator(trial_strain))
+        room = self.yield_tolerance * (root + np.abs(pressure))
+        points = np.flatnonzero((root - friction * pressure > room) | (-pressure > room))
+        if len(points) == 0:
+            return Integration(stress, D, trial_strain, variables)
+        constants = [values[points] for values in constants]
+        strain, shear = trial_strain[points], shear[points]
+        answer = _give_back(constants, pressure[points], root[points])
+        ratio = np.divide(
+            answer.q, root[points], out=np.zeros(len(points)), where=root[points] > 0.0
+        )
+        part = ratio[:, None] * deviator(strain)
+        stress[points] = 2.0 * shear[:, None] * part
+        stress[points, :3] += answer.p[:, None]
+        elastic, kappa = trial_strain.copy(), variables["plastic_strain"].copy()
+        part[:, :3] += trace(strain)[:, None] / 3.0
+        elastic[points] = part
+        kappa[points] += np.sqrt(2.0 / 3.0) * norm(strain - part)
+        if D is not None:
+            D = D.copy()
+            D[points] = returned_tangent(answer, strain, shear, ratio)
+        return Integration(stress, D, elastic, {"plastic_strain": kappa})
+
+
+def _give_back(constants: list[Array], pressure: Array, root: Array) -> Returned:
+    """Return what trial states that yield return to.
+
+    The plastic shear of a step is the positive root of G k x^2 + b x = f w, with w = dt sqrt(P),
+    k = d sqrt(rho_s)/I_0, f the excess over mu_s P, and b = G w + k ((mu_2 - mu_s) P - f).
+
+    Args:
+        constants: As :meth:`MuIRheology._constants` gives them, shape ``(n,)`` each.
+        pressure: P of the trial state.
+        root: Its root of J2.
+    """
+    bulk, shear, friction, span, lag, time = constants
+    apart = ~(pressure > 0.0)
+    P = np.where(apart, 1.0, pressure)
+    f = np.where(apart, 1.0, root - friction * P)
+    wait = time * np.sqrt(P)
+    b = shear * wait + lag * (span * P - f)
+    slope = np.sqrt(b**2 + 4.0 * shear * lag * f * wait)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slip = np.where(b > 0.0, 2.0 * f * wait / (b + slope), 0.5 * (slope - b) / (shear * lag))
+    q = np.clip(root - shear * slip, friction * P, (friction + span) * P)
+    by_root = 1.0 - shear * (lag * slip + wait) / slope
+    by_pressure = slip * lag * (friction + span) + wait * (1.5 * friction - 0.5 * q / P)
+    return Returned(
+        p=np.where(apart, 0.0, -P),
+        q=np.where(apart, 0.0, q),
+        p_trace=np.where(apart, 0.0, bulk),
+        p_size=np.zeros_like(P),
+        q_trace=np.where(apart, 0.0, -bulk * shear * by_pressure / slope),
+        q_size=np.where(apart, 0.0, np.sqrt(2.0) * shear * by_root),
+    )
+
+
+def _require_rising(parameters: Mapping[str, Any]) -> None:
+    """Raise an error where values that are known have friction that falls with the rate."""
+    first, last = parameters["static_friction"], parameters["limit_friction"]
+    if not all(isinstance(value, float | np.ndarray) for value in (first, last)):
+        return
+    if np.shape(first) and np.shape(last) and np.shape(first) != np.shape(last):
+        return  # said where they are used
+    if np.any(np.asarray(last) < np.asarray(first)):
+        raise MPMError("limit_friction is less than static_friction; give at least that.")
