@@ -47,8 +47,6 @@ __all__ = ["RigidBody"]
 BALANCED, AT_ROUND_OFF = 1e-14, 1e-9
 #: Most iterations, and most halvings of one of them.
 MOST_ITERATIONS, MOST_HALVINGS = 60, 12
-#: Tries in which the residual is not halved, after which another place to begin at is looked at.
-PATIENCE = 10
 #: Stiffness, relative to the largest, below which nothing holds a body.
 LOOSE = 1e-11
 #: Gap, over twice the length of what it falls on, to which a body without a hold falls; at least
@@ -358,22 +356,23 @@ class RigidBody(Term):
             assert self._condensed is not None
             starts = [*self._condensed.followed(), self._found, *starts]
         failure: MPMError | None = None
-        for patience in (PATIENCE, MOST_ITERATIONS * MOST_HALVINGS):
-            for s in starts:
-                try:
-                    self._find(s, patience)
-                    self._begins = False
-                    return None
-                except MPMError as error:
-                    failure = error
+        for s in starts:
+            try:
+                self._find(s)
+                self._begins = False
+                return None
+            except MPMError as error:
+                failure = error
         return failure
 
-    def _find(self, s: NDArray[np.float64], patience: int) -> None:
+    def _find(self, s: NDArray[np.float64]) -> None:
         """Solve for the balance of the body from some step of it (collective).
+
+        With friction there may be several: starts are left for others only where they lead nowhere,
+        or it would leap from one to another as the other bodies move.
 
         Args:
             s: The step.
-            patience: Tries in which the residual has to be halved.
 
         Raises:
             MPMError: It was not found.
@@ -381,12 +380,9 @@ class RigidBody(Term):
         gdim = self.shape.dim
         now = self._put(s)
         norm = self._size_of(now.residual)
-        halved, tries = norm, 0
         for _ in range(MOST_ITERATIONS):
-            if norm <= BALANCED * now.size or (norm > now.enough and tries > patience):
+            if norm <= BALANCED * now.size:
                 break
-            tries = 0 if norm < 0.5 * halved else tries
-            halved = norm if tries == 0 else halved
             R = now.residual
             K, _ = self._slopes(now.state, s[gdim:], False)
             inverse, onto = self._inverse(K)
@@ -394,7 +390,7 @@ class RigidBody(Term):
             if left > now.enough:
                 s = self._fallen(s, onto @ R - R, left / now.size)
                 now = self._put(s)
-                norm = halved = self._size_of(now.residual)
+                norm = self._size_of(now.residual)
                 continue
             step = inverse @ R
             turn = float(np.linalg.norm(step[gdim:]))
@@ -402,7 +398,6 @@ class RigidBody(Term):
             floor = norm <= now.enough
             for _ in range(1 if floor else MOST_HALVINGS):
                 tried = self._put(s - step)
-                tries += 1
                 if (found := self._size_of(tried.residual)) < norm:
                     break
                 step *= 0.5
