@@ -4,12 +4,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..errors import ConvergenceError, DomainDistortionError, MPMError, ParticleOutsideError
 from ..parallel.given import require_same
+from ..parallel.interruption import held, interrupted, settle
 from .quasistatic import QuasiStaticProblem
 from .through_time import TimeProblem
 
@@ -30,12 +32,49 @@ class StrengthReduction:
         above: The least factor for which there was none; infinite where none was tried.
         factors: The factors with equilibrium, in order.
         displacements: Largest displacement of a node since the reduction began, for each.
+        limit: Largest displacement that counted as equilibrium.
     """
 
     factor: float
     above: float
     factors: list[float] = field(default_factory=list)
     displacements: list[float] = field(default_factory=list)
+    limit: float = np.inf
+
+
+class _Search:
+    """Which factor is tried next, by what came of those before.
+
+    A factor at which Newton's method fails is tried again whenever a nearer one has stood, one that
+    moves the body too far is not.
+
+    Args:
+        step: First increment.
+        most: Largest factor.
+
+    Attributes:
+        good: The last factor that stood.
+        bad: The least factor above it that did not, since then or for good.
+    """
+
+    def __init__(self, step: float, most: float) -> None:
+        self.good, self.bad = 1.0, np.inf
+        self._step, self._most, self._too_far = step, most, np.inf
+
+    def next(self) -> float:
+        """Return the factor to try."""
+        middle = 0.5 * (self.good + self.bad)
+        return round(min(self.good + self._step, middle, self._most), DIGITS)
+
+    def stood(self, factor: float) -> None:
+        """Go on from a factor, also to those at which Newton's method has failed."""
+        self.good, self.bad = factor, self._too_far
+
+    def fell(self, factor: float, too_far: bool) -> None:
+        """Go half as far from the last that stood."""
+        self.bad, self._step = factor, 0.5 * (factor - self.good)
+        if too_far:
+            self._too_far = factor
 
 
 def strength_reduction(
@@ -56,9 +95,12 @@ def strength_reduction(
     where its cells are coarse. The factor of safety of the body as it stands is found by a limit
     of the displacement: a few times what it would settle elastically, for a slope of height H
     about ``density gravity H^2 / young`` (Griffiths & Lane's diagrams have that unit). Newton's
-    method may also fail where there is equilibrium, most where soils do not dilate. With a limit
-    such a factor is tried again in smaller increments; without one the first factor that fails
-    bounds what is found from above.
+    method may also fail where there is equilibrium, most where soils do not dilate. So a factor
+    at which it has failed is tried again in smaller increments. One that moves the body too far is
+    not.
+
+    Where something else ends it, Ctrl-C or an error in a function of yours, the body is left in the
+    last state of equilibrium too, with the strength that it was given.
 
     Coarse cells may find too high a factor: a vertical cut 5 % with cells of a tenth of its height,
     3 % with half of that. Look at two grids.
@@ -69,14 +111,17 @@ def strength_reduction(
         tolerance: Width to which the factor is found.
         most: A factor at which to stop, should the body hold.
         displacement: Largest displacement, from the beginning of the reduction, that counts as
-            equilibrium; ``None``: any.
+            equilibrium; ``np.inf``: any. By default it is the strain of the body's stress at its
+            modulus of shear, in the mean (of squares) over the body, times its extent, the mean
+            (geometric) of the sides of a box around it: for a slope some ``2 density gravity
+            H^2 / young``.
 
     Returns:
         The factor of safety and how it was found.
 
     Raises:
         MPMError: The problem is not at its whole load, its steps have a duration (PorousProblem,
-            DynamicProblem), or a material has no strength.
+            DynamicProblem), a material has no strength, or domains may be split.
     """
     if not isinstance(problem, QuasiStaticProblem):
         raise MPMError("strength_reduction() needs an mpm.QuasiStaticProblem.")
@@ -87,7 +132,8 @@ def strength_reduction(
         )
     comm = problem.bodies[0].V.mesh.comm
     require_same(comm, step=step, tolerance=tolerance, most=most, displacement=displacement)
-    numbers = [step, tolerance, most, 1.0 if displacement is None else displacement]
+    anywhere = displacement is None or displacement == np.inf
+    numbers = [step, tolerance, most, 1.0 if anywhere else displacement]
     if not all(
         isinstance(n, float | int | np.floating | np.integer)
         and not isinstance(n, bool)
@@ -101,6 +147,11 @@ def strength_reduction(
         raise MPMError(f"most= is a factor at which to stop, above 1, not {most:g}.")
     if any(body.load.value < 1.0 for body in problem.bodies) or problem.held_back > 0.0:
         raise MPMError("strength_reduction() begins at the whole load; call solve() first.")
+    if any(body.on_distortion == "split" for body in problem.bodies):
+        raise MPMError(
+            "strength_reduction() follows the nodes of the bodies, which a split of domains "
+            "changes; set on_distortion = 'error' of the bodies before."
+        )
     start = [body.converged_displacement.copy() for body in problem.bodies]
 
     def moved() -> float:
@@ -112,36 +163,71 @@ def strength_reduction(
         ]
         return float(max(comm.allgather(max(sizes))))
 
-    def stands(factor: float) -> bool:
-        """Whether there is equilibrium with strength divided by that."""
-        for points in problem.points:
-            points.weaken(factor)
-        state = problem.capture() if displacement is not None else None
-        try:
-            problem.step()
-        except (ConvergenceError, DomainDistortionError, ParticleOutsideError):
-            return False
-        if state is not None and displacement is not None and moved() > displacement:
-            problem.return_to(state)
-            return False
-        return True
-
-    good, bad, size = 1.0, np.inf, float(step)
+    limit = _elastic_displacement(problem) if displacement is None else float(displacement)
+    search = _Search(float(step), float(most))
     factors, displacements = [1.0], [0.0]
     try:
-        while bad - good > tolerance and good < most:
-            factor = min(good + size, 0.5 * (good + bad) if np.isfinite(bad) else np.inf, most)
-            factor = round(factor, DIGITS)
-            if stands(factor):
-                good = factor
-                # (there is a limit to end it, so what failed in longer steps is tried again)
-                bad = bad if displacement is None else np.inf
-                factors.append(good)
-                displacements.append(moved())
+        while search.bad - search.good > tolerance and search.good < most:
+            factor = search.next()
+            for points in problem.points:
+                points.weaken(factor)
+            way = _equilibrium(problem, moved, limit)
+            if way is not None and way <= limit:
+                search.stood(factor)
+                factors.append(factor)
+                displacements.append(way)
             else:
-                bad = factor
-                size = 0.5 * (factor - good)
+                search.fell(factor, too_far=way is not None)
     finally:
         for points in problem.points:
             points.weaken(1.0)
-    return StrengthReduction(good, float(bad), factors, displacements)
+    return StrengthReduction(search.good, float(search.bad), factors, displacements, limit)
+
+
+def _elastic_displacement(problem: QuasiStaticProblem) -> float:
+    """Return the strain of the stress at the modulus of shear, times the extent (collective)."""
+    comm = problem.bodies[0].V.mesh.comm
+    sums, corners = np.zeros(2), []
+    for body, points in zip(problem.bodies, problem.points, strict=True):
+        shear = points.undeformed_tangent()[:, 0, 1, 0, 1].reshape(body.num_local, -1)
+        strains = np.linalg.norm(body.stress.reshape(-1, 9), axis=1) / shear.mean(axis=1)
+        sums += body.initial_volume @ strains**2, body.initial_volume.sum()
+        corners.append(body.mesh.geometry.x[:, : body.V.mesh.geometry.dim])
+    x = np.concatenate(corners)
+    lower = np.min(comm.allgather(x.min(axis=0, initial=np.inf)), axis=0)
+    upper = np.max(comm.allgather(x.max(axis=0, initial=-np.inf)), axis=0)
+    extent = float(np.prod(upper - lower) ** (1.0 / len(lower)))
+    squares, volume = np.sum(comm.allgather(sums), axis=0)
+    way = extent * float(np.sqrt(squares / volume))
+    return way if way > 0.0 else np.inf
+
+
+def _equilibrium(
+    problem: QuasiStaticProblem, moved: Callable[[], float], limit: float
+) -> float | None:
+    """Look for equilibrium with the present strength, and stay there if it is within a limit.
+
+    Whatever else ends it, Ctrl-C or an error in a user's function, leaves the body where it was.
+
+    Returns:
+        How far the body has moved, ``None`` where there was no equilibrium.
+    """
+    comm, way = problem.bodies[0].V.mesh.comm, None
+    with held() as hold:
+        before = problem.capture()
+        try:
+            problem.step()
+            way = moved()
+            if interrupted(comm):
+                settle(comm)
+                raise KeyboardInterrupt
+        except (ConvergenceError, DomainDistortionError, ParticleOutsideError):
+            pass
+        except BaseException:
+            problem.return_to(before)
+            raise
+        if way is not None and way > limit:
+            problem.return_to(before)
+    if interrupted(comm, hold.left):
+        raise KeyboardInterrupt
+    return way
