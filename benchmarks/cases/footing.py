@@ -133,14 +133,13 @@ except mpm.MPMError as error:
 # below an earlier pressure, over the limit.
 
 load, pressure = np.array(path).T
-before = float(np.interp(0.9 * load[-1], load, pressure))
 drop = float(np.max(np.maximum.accumulate(pressure) - pressure)) / limit
 numbers = {
     **kit.outcome(problem.history, failure),
     "pressure": pressure[-1],
     "limit": limit,
     "ratio": pressure[-1] / limit,
-    "plateau": pressure[-1] / before - 1.0 if before > 0.0 else np.nan,
+    "plateau": kit.rise(load, pressure),
     "drop": drop,
     "peak": pressure.max() / limit,
     "most_solves": max((step.iterations for step in problem.history.steps), default=0),

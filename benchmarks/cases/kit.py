@@ -214,6 +214,12 @@ def mean(values: Any, weights: Any) -> float:
     return total(values * weights) / total(weights)
 
 
+def rise(place: Sequence[float], load: Sequence[float]) -> float:
+    """By which share a load rose over the last tenth of its path: nothing at a limit load."""
+    before = float(np.interp(0.9 * place[-1], place, load))
+    return load[-1] / before - 1.0 if before > 0.0 else np.nan
+
+
 def nodes(particles: mpm.Particles) -> np.ndarray:
     """Present positions of the nodes that this rank owns, shape `(n, gdim)`."""
     gdim = particles.mesh.geometry.dim

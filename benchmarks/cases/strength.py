@@ -30,6 +30,12 @@ parser.add_argument(
 )
 parser.add_argument("--steps", type=kit.whole, default=20, help="steps of the footing")
 parser.add_argument("--degree", type=int, choices=(1, 2), default=1, help="of the footing's basis")
+parser.add_argument(
+    "--fine",
+    type=kit.positive,
+    default=3.0,
+    help="reach of equal cells from the footing's axis, half widths; two thirds of it downwards",
+)
 parser.add_argument("--rough", action="store_true", help="a rough strip, not a smooth one")
 parser.add_f_bar("patch")
 parser.add_mixed()
@@ -39,6 +45,8 @@ parser.add_argument(
 parser.add_stabilisation()
 parser.add_argument("--dilation-angle", type=float, help="of the footing's soil, else associated")
 args = parser.parse()
+if not 1.0 <= args.fine <= 5.0:
+    parser.error(f"argument --fine: {args.fine:g} is not from 1 to 5")
 
 comm, kind = MPI.COMM_WORLD, kit.DOMAINS[args.domain]
 has_strip = args.case.startswith("footing")
@@ -103,7 +111,8 @@ else:
     # As in footing.py a line of the background is a little beyond the strip's edge, and one a
     # little below the ground.
     young, size = 1e6, 3.0
-    across, up = kit.lines(h, 1.5, size), size - kit.lines(h, 1.0, size)[::-1]
+    across, down = (kit.lines(h, share * args.fine * height, size) for share in (1.0, 2.0 / 3.0))
+    up = size - down[::-1]
     taper = np.clip((size - across) / 1.5, 0.0, 1.0) * (across > 0.0)
     over = 0.002 * h
     heights = np.append(up - over * np.clip(up, 0.0, 1.0), size - over + h * np.arange(1, 3))
@@ -187,6 +196,7 @@ numbers = {
     "factor": factor,
     "exact": exact,
     "ratio": factor / exact,
+    "plateau": kit.rise(*zip(*path, strict=True)) if has_strip else np.nan,
     "particles": particles.num_global,
 }
 rows = [
@@ -194,6 +204,8 @@ rows = [
     ("linear solves", f"{numbers['iterations']}, {numbers['cutbacks']} cutbacks"),
     ("factor", f"{factor:.4g}, known {exact:.4g}, ratio {factor / exact:.3f}"),
 ]
+if has_strip:
+    rows.append(("rise over the last tenth", f"{100.0 * numbers['plateau']:.2f} %"))
 if args.plot:
     fig, axes = kit.figure(13.0, 5.0, [["soil", "path"]], width_ratios=[1.6, 1.0])
     colours = mpm.plot.domains(

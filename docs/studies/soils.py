@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The table of factors of safety in docs/limit-loads.md."""
+"""The tables of factors of safety and of strips in docs/limit-loads.md."""
 
 from __future__ import annotations
 
@@ -17,6 +17,22 @@ def factors(case: str, known: str) -> list[str]:
     return [*found, known]
 
 
+#: A strip on soil with weight: one domain of four points in a cell, and no ghost penalty.
+WEIGHT = (
+    "footing_weight --friction-angle 30 --f-bar none --domains-per-cell 1 --quadrature-degree 3 "
+    "--stabilisation none --fine 2"
+)
+
+
+def strip(options: str) -> list[str]:
+    found = []
+    for n in (4, 8, 16):
+        command = f"--degree 2 --steps 12 --cell {1 / n} --case {options}"
+        r = run("strength", *command.split())
+        found += [share(r, f"{r['ratio']:.3f}"), f"{100 * r['plateau']:.2f} %", r["iterations"]]
+    return found
+
+
 def tables() -> dict[str, Table]:
     rows = {
         "this slope, factor of safety": (
@@ -31,5 +47,15 @@ def tables() -> dict[str, Table]:
             ["", "cells of H/10", "solves", "H/20", "solves", "known"],
             {label: partial(factors, *asked) for label, asked in rows.items()},
             cases=["strength"],
-        )
+        ),
+        "limit-loads/strips": Table(
+            "limit-loads",
+            ["", *(text for n in (4, 8, 16) for text in (f"cells of b/{n}", "rise", "solves"))],
+            {
+                "$N_c$, 20°, smooth": partial(strip, "footing"),
+                "$N_\\gamma$, 30°, smooth": partial(strip, WEIGHT),
+                "$N_\\gamma$, 30°, rough": partial(strip, f"{WEIGHT} --rough"),
+            },
+            cases=["strength"],
+        ),
     }

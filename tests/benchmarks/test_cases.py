@@ -285,7 +285,7 @@ KEYS = {
     "vortex": {"displacement_error", "velocity_error"},
     "column_dynamic": {"toe", "top"},
     "sand_column": {"run_out", "experiment", "ratio", "deposit", "front", "height_at_wall"},
-    "strength": {"factor", "exact", "ratio", "particles"},
+    "strength": {"factor", "exact", "ratio", "plateau", "particles"},
     "consolidation": {"error", "degree", "error_degree", "particles"},
     "penetration": {"force", "depth", "ratio", "iterations_per_step", "penetration"},
     "hertz": {"force", "error_force", "error_radius", "error_pressure", "error_most"},
