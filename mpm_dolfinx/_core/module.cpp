@@ -15,6 +15,7 @@
 #include <nanobind/stl/vector.h>
 
 #include "arrays.h"
+#include "background.h"
 #include "closest.h"
 #include "contact.h"
 #include "domains.h"
@@ -231,6 +232,17 @@ auto update_with_history(Law law, const Reals& gradient, const Reals& old_gradie
   return to_numpy(update_logarithmic(u, static_cast<int>(gradient.shape(2))));
 }
 
+// The rows of T by the background's basis at points, with offsets of PETSc's kind of integer.
+template <typename Index>
+auto rows_of_transfer(Offsets nodes, Reals values, int bs, Array<Index> offsets)
+{
+  require(nodes.ndim() == 2 && values.size() == nodes.size(), "nodes and values (n, k)");
+  require(offsets.size() == nodes.shape(0) * bs + 1, "offsets of rows (n bs + 1)");
+  RowEntries<Index> found = transfer_rows(nodes.shape(0), nodes.shape(1), bs, nodes.data(),
+                                          values.data(), offsets.data());
+  return std::make_pair(to_numpy(std::move(found.columns)), to_numpy(std::move(found.values)));
+}
+
 Target target_of(const Domains& domains, const Offsets& offsets, const Indices& positions,
                  RealsOut& values)
 {
@@ -288,6 +300,40 @@ NB_MODULE(_loops, m)
         "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a, "support_offsets"_a,
         "support_nodes"_a, "result"_a.noconvert(),
         "Set the gradients of the background basis at each domain's single point.");
+
+  m.def("locate",
+        [](const std::vector<std::pair<Reals, double>>& lines, Offsets table, Offsets first,
+           Reals slopes, Reals centres, Reals middle, Reals slack, std::pair<double, double> small,
+           Reals points, OffsetsOut cells, RealsOut reference, RealsOut outside) {
+    const std::size_t dim = lines.size(), n = first.size(), count = cells.size();
+    require((dim == 2 || dim == 3) && table.ndim() == dim, "lines and a table of boxes");
+    require(slopes.size() == n * dim * dim && centres.size() == n * dim && middle.size() == dim
+                && slack.size() == n,
+            "maps of cells");
+    require(points.size() == count * dim && reference.size() == points.size()
+                && outside.size() == count,
+            "points (n, dim)");
+    Boxes boxes{static_cast<int>(dim), {}, table.data(), first.data(), slopes.data(),
+                centres.data(), middle.data(), slack.data()};
+    for (std::size_t i = 0; i < dim; ++i)
+    {
+      const auto& [values, size] = lines[i];
+      require(values.size() == table.shape(i) + 1, "lines around boxes");
+      boxes.lines[i] = {values.size(), values.data(), size};
+    }
+    locate(boxes, {small.first, small.second}, points.data(), count, cells.data(),
+           reference.data(), outside.data());
+  },
+        "lines"_a, "table"_a, "first"_a, "slopes"_a, "centres"_a, "middle"_a, "slack"_a, "small"_a,
+        "points"_a, "cells"_a.noconvert(), "reference"_a.noconvert(), "outside"_a.noconvert(),
+        "Set the cells of points among the boxes of a grid, their reference coordinates and how "
+        "far these lie outside.");
+
+  const char* of_transfer = "Set the offsets of the rows of T; return their columns and values.";
+  m.def("transfer_rows", rows_of_transfer<std::int32_t>, "nodes"_a, "values"_a, "bs"_a,
+        "offsets"_a.noconvert(), of_transfer);
+  m.def("transfer_rows", rows_of_transfer<std::int64_t>, "nodes"_a, "values"_a, "bs"_a,
+        "offsets"_a.noconvert(), of_transfer);
 
   m.def("pattern",
         [](Offsets row_offsets, Indices row_nodes, std::size_t num_rows, Offsets column_offsets,

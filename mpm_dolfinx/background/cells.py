@@ -17,6 +17,7 @@ import basix.ufl
 from dolfinx import fem, mesh
 
 from .. import _compat
+from .._core import loops
 
 __all__ = ["COORDINATES", "DROP", "TOLERANCE", "CellTable", "Cells", "cell_volumes"]
 
@@ -207,10 +208,15 @@ class Cells:
         cell = np.zeros(n, dtype=np.int64)
         reference = np.tile(self.middle, (n, 1))
         violation = np.full(n, np.inf)
+        if self.grid is not None and loops is not None:
+            self._locate_in_grid(self.grid, points, cell, reference, violation)
+        if violation.max(initial=0.0) <= TOLERANCE:
+            return cell, reference, violation
         for start in range(0, n if len(self.vertices) else 0, BLOCK):
             block = np.arange(start, min(start + BLOCK, n))
+            block = block[violation[block] > TOLERANCE]
             block = block[np.isfinite(points[block]).all(axis=1)]
-            if self.grid is not None:
+            if self.grid is not None and loops is None:
                 inside, found = self.grid.find(points[block], self.index)
                 known = block[inside]
                 cell[known] = found
@@ -223,6 +229,30 @@ class Cells:
             known = block[hit]
             cell[known], reference[known], violation[known] = found, coordinates, outside
         return cell, reference, violation
+
+    def _locate_in_grid(
+        self,
+        grid: RegularGrid,
+        points: NDArray[np.float64],
+        cell: NDArray[np.int64],
+        reference: NDArray[np.float64],
+        violation: NDArray[np.float64],
+    ) -> None:
+        """Set what :meth:`locate` returns of points in the boxes of a grid."""
+        loops.locate(
+            grid.spaced_lines,
+            grid.table,
+            self.index,
+            self._slopes,
+            self._centres,
+            self.middle,
+            self.slack,
+            (COORDINATES, FACET),
+            points,
+            cell,
+            reference,
+            violation,
+        )
 
     def _search(
         self, points: NDArray[np.float64]
@@ -252,12 +282,19 @@ class RegularGrid:
     Args:
         lines: Coordinates of the grid lines in each direction.
         table: Cell in each box, -1 where there is none.
+
+    Attributes:
+        table: As given.
+        spaced_lines: The lines, and their distance where it is the same everywhere, else 0.
     """
 
     def __init__(self, lines: list[NDArray[np.float64]], table: NDArray[np.int64]) -> None:
         self._lines = lines
-        self._table = table
+        self.table = table
         self._sizes = [_even(line) for line in lines]
+        self.spaced_lines = [
+            (line, size or 0.0) for line, size in zip(lines, self._sizes, strict=True)
+        ]
 
     @classmethod
     def of(cls, vertices: NDArray[np.float64]) -> RegularGrid | None:
@@ -314,13 +351,13 @@ class RegularGrid:
             low.append(np.where(x - line[place] <= reach, np.maximum(place - 1, 0), place))
             beyond = np.minimum(place + 1, len(line) - 2)
             high.append(np.where(line[place + 1] - x <= reach, beyond, place))
-        cell = self._table[tuple(high)]
+        cell = self.table[tuple(high)]
         differ = low[0] != high[0]
         for a, b in zip(low[1:], high[1:], strict=True):
             differ |= a != b
         between = np.flatnonzero(differ)
         for pick in product(*zip(low, high, strict=True)) if len(between) else ():
-            other = self._table[tuple(p[between] for p in pick)]
+            other = self.table[tuple(p[between] for p in pick)]
             mine = cell[between]
             better = (other >= 0) & ((mine < 0) | (index[other] < index[mine]))
             cell[between[better]] = other[better]

@@ -4,12 +4,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from petsc4py import PETSc
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dolfinx import fem
 
+from .._core import loops
 from ..background.basis import PointBasis
 
 __all__ = ["transfer_matrix"]
@@ -30,20 +34,35 @@ def transfer_matrix(basis: PointBasis, W: fem.FunctionSpace, V: fem.FunctionSpac
     rows = W.dofmap.index_map
     columns = V.dofmap.index_map
     owned = rows.size_local
-    values, nodes = basis.values[:owned], basis.nodes[:owned]
+    csr = _entries(basis.nodes[:owned], basis.values[:owned], bs)
+    sizes = (
+        (owned * bs, rows.size_global * bs),
+        (columns.size_local * bs, columns.size_global * bs),
+    )
+    return PETSc.Mat().createAIJ(sizes, csr=csr, comm=W.mesh.comm)
+
+
+def _entries(
+    nodes: NDArray[np.int64], values: NDArray[np.float64], bs: int
+) -> tuple[NDArray[np.integer[Any]], NDArray[np.integer[Any]], NDArray[np.float64]]:
+    """Return offsets, columns and values of rows for each component, sorted and without zeros.
+
+    Args:
+        nodes: Global nodes of V, shape ``(n, k)``.
+        values: Basis there, shape ``(n, k)``.
+        bs: Number of components.
+    """
+    if loops is not None:
+        offsets = np.empty(len(nodes) * bs + 1, dtype=PETSc.IntType)
+        columns, data = loops.transfer_rows(nodes, values, bs, offsets)
+        return offsets, columns, data
     order = np.argsort(nodes, axis=1)
     nodes = np.take_along_axis(nodes, order, axis=1)
     values = np.take_along_axis(values, order, axis=1)
     kept = values != 0.0
     counts = np.repeat(kept.sum(axis=1), bs)
-    indptr = np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType)
-    component = np.arange(bs)[None, :, None]
-    shape = (owned, bs, nodes.shape[1])
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType)
+    shape = (len(nodes), bs, nodes.shape[1])
     keep = np.broadcast_to(kept[:, None, :], shape)
-    indices = (nodes[:, None, :] * bs + component)[keep].astype(PETSc.IntType)
-    data = np.broadcast_to(values[:, None, :], shape)[keep]
-    sizes = (
-        (owned * bs, rows.size_global * bs),
-        (columns.size_local * bs, columns.size_global * bs),
-    )
-    return PETSc.Mat().createAIJ(sizes, csr=(indptr, indices, data), comm=W.mesh.comm)
+    columns = (nodes[:, None, :] * bs + np.arange(bs)[None, :, None])[keep].astype(PETSc.IntType)
+    return offsets, columns, np.broadcast_to(values[:, None, :], shape)[keep]

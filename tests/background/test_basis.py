@@ -9,6 +9,8 @@ import pytest
 import scenes
 from scenes import ALL, HEXAHEDRON, PLANE, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 
+from mpm_dolfinx._core import loops
+from mpm_dolfinx.background import cells
 from mpm_dolfinx.background.basis import BackgroundBasis
 
 MESHES = {
@@ -198,3 +200,52 @@ def test_ranks_without_points_or_cells(cell):
     assert basis.found.shape == (len(points),) and basis.found.all()
     x = scenes.coordinates(V)
     np.testing.assert_allclose(to_dense(basis, V) @ x, points, atol=1e-14)
+
+
+def hollow(domain):
+    """Return the cells of a domain that are not in its last corner."""
+    dim = domain.topology.dim
+    count = domain.topology.index_map(dim).size_local
+    middle = scenes.mesh.compute_midpoints(domain, dim, np.arange(count, dtype=np.int32))
+    keep = np.flatnonzero((middle[:, :dim] < 0.5).any(axis=1)).astype(np.int32)
+    return scenes.mesh.create_submesh(domain, dim, keep)[0]
+
+
+def graded(domain):
+    """Make cells near the origin smaller."""
+    domain.geometry.x[:] = domain.geometry.x**1.5
+    return domain
+
+
+@pytest.mark.skipif(loops is None, reason="the package was built without a compiler")
+@pytest.mark.parametrize("cell", [QUADRILATERAL, HEXAHEDRON], ids=scenes.name)
+@pytest.mark.parametrize("change", [lambda m: m, graded, hollow], ids=["even", "graded", "hollow"])
+@pytest.mark.parametrize("away", [0.0, 1e4])
+def test_compiled_search_in_a_grid_finds_what_numpy_does(cell, change, away, monkeypatch):
+    domain = change(scenes.unit(4, cell))
+    dim = domain.geometry.dim
+    domain.geometry.x[:, :dim] += away
+    V = scenes.vectors(domain)
+    corners = scenes.coordinates(V)
+    random = np.random.default_rng(5)
+    pairs = random.integers(len(corners), size=(2, 300))
+    points = np.concatenate(
+        [
+            corners,
+            0.5 * (corners[pairs[0]] + corners[pairs[1]]),  # on facets, edges and vertices too
+            corners + random.choice([-1e-13, 1e-13, 1e-11, 1e-6], corners.shape),
+            away + random.uniform(-0.2, 1.2, (200, dim)),
+            [[np.nan] * dim, [np.inf, *[0.5] * (dim - 1)]],
+        ]
+    )
+    known = BackgroundBasis(V)
+    for _ in range(2):  # on several ranks the first learns of cells
+        compiled = known.at(points)
+    with monkeypatch.context() as patch:
+        patch.setattr(cells, "loops", None)
+        reference = known.at(points)
+    assert 0 < np.count_nonzero(compiled.found) < len(points)
+    for one, other in zip(compiled, reference, strict=True):
+        if one is not None and one.dtype != np.float64:
+            np.testing.assert_array_equal(one, other)
+    np.testing.assert_allclose(compiled.values, reference.values, rtol=0.0, atol=1e-15)

@@ -11,6 +11,8 @@ from transfer.reference import PAIRS, SOLID, basis_by_loop, local_positions, sce
 from dolfinx import geometry
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx._core import loops
+from mpm_dolfinx.transfer import matrix
 
 
 @pytest.mark.parametrize(("background", "cell"), [*PAIRS, *SOLID], ids=scenes.name)
@@ -75,3 +77,16 @@ def test_T_is_the_identity_where_particles_are_cells(cell):
     identity = np.kron(same.all(axis=2), np.eye(V.mesh.geometry.dim))
     np.testing.assert_allclose(scenes.dense(particles.T), identity, atol=1e-12)
     assert scenes.WORLD.allreduce(len(particles.active_dofs)) == particles.T.getSize()[1]
+
+
+@pytest.mark.skipif(loops is None, reason="the package was built without a compiler")
+@pytest.mark.parametrize(("background", "cell"), [*PAIRS, *SOLID[:2]], ids=scenes.name)
+def test_compiled_rows_are_those_of_numpy(background, cell, monkeypatch):
+    particles = scene(background, cell)
+    rows = particles.transfer.rows.basis
+    compiled = matrix.transfer_matrix(rows, particles.W, particles.V)
+    monkeypatch.setattr(matrix, "loops", None)
+    reference = matrix.transfer_matrix(rows, particles.W, particles.V)
+    for one, other in zip(compiled.getValuesCSR(), reference.getValuesCSR(), strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
