@@ -21,6 +21,7 @@ from ..constitutive.averaging import LowRankTerm
 from ..errors import MPMError
 from ..history import Statistics
 from ..parallel.exchange import swap
+from ..parallel.totals import over_ranks
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..transfer.touched import TouchedNodes, TransferRows
@@ -285,7 +286,7 @@ class FusedTangent:
         same = self._A is not None and self._A.getSizes()[0] == sizes
         for block, field in zip(self._blocks, fields, strict=True):
             same &= block.restrict(field)
-        if not self._comm.allreduce(same, MPI.LAND):
+        if not over_ranks(self._comm, same, MPI.LAND):
             self._make_matrix(fields, sizes)
             self._statistics.count("patterns")
         for block, field in zip(self._blocks, fields, strict=True):

@@ -50,6 +50,10 @@ def assemble_into(
 def marked(V: fem.FunctionSpace, nodes: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return which of this rank's own nodes any rank names by their global numbers."""
     imap = V.dofmap.index_map
+    if V.mesh.comm.size == 1:
+        alone = np.zeros(imap.size_local, dtype=bool)
+        alone[nodes] = True
+        return alone
     mark = PETSc.Vec().createMPI((imap.size_local, imap.size_global), comm=V.mesh.comm)
     named = np.unique(nodes).astype(PETSc.IntType)
     mark.setValues(named, np.ones(len(named)), addv=PETSc.InsertMode.ADD_VALUES)

@@ -41,8 +41,8 @@ class _Given(NamedTuple):
     def require_same(self) -> None:
         """Raise an error where the parameters are other objects now."""
         now = self.material.parameters
-        if now.keys() != self.parameters.keys() or any(
-            now[name] is not value for name, value in self.parameters.items()
+        if len(now) != len(self.parameters) or any(
+            now.get(name) is not value for name, value in self.parameters.items()
         ):
             raise MPMError(
                 f"Parameters of a {type(self.material).__name__} were replaced after the problem "

@@ -98,6 +98,8 @@ class JacobianBound:
         result = np.zeros(len(nodes), dtype=bool)
         cell = np.arange(len(nodes))
         open_ = self.coefficients(nodes) * sign[:, None]
+        if (open_ > 0.0).all():
+            return result
         for halving in range(HALVINGS + 1):
             wrong = ~(open_[:, self._corners] > 0.0).all(axis=1)
             result[cell[wrong]] = True

@@ -8,6 +8,7 @@ Where the plain formula is safe it is used, so that ordinary numbers are the sam
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from mpi4py import MPI
@@ -15,6 +16,8 @@ from petsc4py import PETSc
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .totals import over_ranks
 
 __all__ = ["joint_norm", "norm", "sign_of_product", "unit_sized"]
 
@@ -69,14 +72,16 @@ def joint_norm(
     values: NDArray[np.float64] | Sequence[float], comm: MPI.Comm = MPI.COMM_SELF
 ) -> float:
     """Return the Euclidean norm of the numbers of all ranks, whatever their size (collective)."""
+    if comm.size == 1 and not isinstance(values, np.ndarray):
+        return math.hypot(*values)
     array = np.asarray(values, dtype=np.float64)
     with np.errstate(over="ignore"):
-        plain = float(np.sqrt(comm.allreduce(float(array @ array))))
+        plain = float(np.sqrt(over_ranks(comm, float(array @ array))))
     if _is_safe(plain) or np.isnan(plain):
         return plain
-    largest = comm.allreduce(float(np.abs(array).max(initial=0.0)), MPI.MAX)
+    largest = over_ranks(comm, float(np.abs(array).max(initial=0.0)), MPI.MAX)
     if largest == 0.0 or not np.isfinite(largest):
         return float(largest)
     exponent = _exponent(largest)
     array = np.ldexp(array, -exponent)
-    return float(np.ldexp(np.sqrt(comm.allreduce(float(array @ array))), exponent))
+    return float(np.ldexp(np.sqrt(over_ranks(comm, float(array @ array))), exponent))

@@ -390,8 +390,10 @@ class Domains:
 
     def inverted(self) -> NDArray[np.int64]:
         """Return global indices of domains with ``det F <= 0`` or not finite at a point."""
-        gradient = self.displacement_gradient()
-        return np.asarray(self.global_index[~(volume_ratio(gradient) > 0.0).all(axis=1)])
+        positive = volume_ratio(self.displacement_gradient()) > 0.0
+        if positive.all():
+            return self.global_index[:0]
+        return np.asarray(self.global_index[~positive.all(axis=1)])
 
     def crossed(self) -> NDArray[np.int64]:
         """Return global indices of quadrilaterals whose edges cross.
@@ -403,7 +405,10 @@ class Domains:
         quadrilateral = self.mesh.basix_cell() == basix.CellType.quadrilateral
         if not quadrilateral or shapes.discontinuous or shapes.degree > 1:
             return self.global_index[:0]
-        inwards = (self.corner_jacobians() <= 0.0).sum(axis=1)
+        turned = self.corner_jacobians() <= 0.0
+        if not turned.any():
+            return self.global_index[:0]
+        inwards = turned.sum(axis=1)
         return np.asarray(self.global_index[(inwards >= 2) & ~self.triangular])
 
     def behind_axis(self) -> NDArray[np.int64]:

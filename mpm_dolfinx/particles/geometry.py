@@ -189,8 +189,16 @@ class Geometry:
             points: Shape ``(nq, tdim)``.
             domains: Nodes of the owned domains, shape ``(n, k, gdim)``.
         """
-        slopes = self.shape_functions.tabulate(1, points)[1:, :, :, 0]
-        return np.asarray(np.linalg.det(np.einsum("jqk,nki->nqij", slopes, domains)))
+        return _determinants(self._slopes(points), domains)
+
+    def _slopes(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return derivatives of the shape functions at reference points, ``(tdim, nq, k)``."""
+        return np.asarray(self.shape_functions.tabulate(1, points)[1:, :, :, 0])
+
+    @cached_property
+    def _corner_slopes(self) -> NDArray[np.float64]:
+        """Derivatives of the shape functions at the corners."""
+        return self._slopes(basix.geometry(self.mesh.basix_cell()))
 
     def corner_jacobians(self, domains: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return det dx/dxi at the corners of domains, positive as in the mesh, ``(n, corners)``.
@@ -198,5 +206,9 @@ class Geometry:
         Args:
             domains: Nodes of the owned domains, shape ``(n, k, gdim)``.
         """
-        points = basix.geometry(self.mesh.basix_cell())
-        return self.orientation[:, None] * self.jacobians(points, domains)
+        return self.orientation[:, None] * _determinants(self._corner_slopes, domains)
+
+
+def _determinants(slopes: NDArray[np.float64], domains: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return det dx/dxi of domains by derivatives of their shape functions, shape ``(n, nq)``."""
+    return np.asarray(np.linalg.det(np.einsum("jqk,nki->nqij", slopes, domains)))

@@ -19,6 +19,7 @@ from ..background.basis import BackgroundBasis, PointBasis
 from ..background.ownership import ranks_of_background
 from ..errors import MPMError, ParticleOutsideError, agree
 from ..meshes.boxes import mesh_of_boxes
+from ..meshes.quadrature import volume_ratio
 from ..meshes.redistribution import Carrier, Redistribution, cell_centres
 from ..meshes.remesh import Column, Cuts, Remesh
 from ..meshes.trail import Trail
@@ -608,11 +609,13 @@ class Particles(MaterialDomains):
 
         They are those of the last converged step, without deleted particles.
         """
-        there = ~self.deleted
-        nodal = self._converged_corners()
-        points = np.einsum("qk,nki->nqi", self.quadrature.shapes, nodal[there])
-        jacobian = np.linalg.det(np.eye(self._geometry.gdim) + self.converged_gradient()[there])
-        volumes = self.quadrature.weights[there] * jacobian
+        nodal, gradient = self._converged_corners(), self.converged_gradient()
+        weights = self.quadrature.weights
+        if self.deletion is not None:
+            there = ~self.deleted
+            nodal, gradient, weights = nodal[there], gradient[there], weights[there]
+        points = np.einsum("qk,nki->nqi", self.quadrature.shapes, nodal)
+        volumes = weights * volume_ratio(gradient)
         return points.reshape(-1, self._geometry.gdim), volumes.ravel()
 
     def options(self) -> dict[str, Any]:

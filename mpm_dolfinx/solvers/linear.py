@@ -17,6 +17,7 @@ import numpy as np
 from ..errors import MPMError
 from ..history import Statistics
 from ..parallel.magnitudes import unit_sized
+from ..parallel.totals import over_ranks
 from .multigrid import SHIFT, Multigrid
 from .saddle import Fields, SaddleMultigrid
 
@@ -321,7 +322,7 @@ class ShiftedFactor:
         if self.shift > 0.0 and self.D is None:
             self.D = self.shift * levels.diagonal(K)
             negative = int(np.count_nonzero(self.D.array_r < 0.0))
-            self.num_negative = K.comm.tompi4py().allreduce(negative)
+            self.num_negative = over_ranks(K.comm.tompi4py(), negative)
         self._negative = False
         if self.iterates:
             self._make_levels(K, levels, damping)

@@ -18,6 +18,7 @@ from ..history import Statistics
 from ..log import NEWTON, tell
 from ..parallel.garbage import weakly
 from ..parallel.magnitudes import norm, sign_of_product
+from ..parallel.totals import over_ranks
 from .line_search import LineSearch, stalled
 from .linear import Indefinite, Levels, ShiftedFactor
 from .mechanism import Resisting, mechanism, not_held
@@ -242,7 +243,7 @@ class NewtonSolver:
     def _start(self, sizes: tuple[int, int]) -> PETSc.Vec:
         """Return the zero vector of unknowns, with vectors and SNES of its size."""
         same = self.x is not None and self.x.getSizes() == sizes
-        if self._comm.allreduce(same, MPI.LAND):
+        if over_ranks(self._comm, same, MPI.LAND):
             assert self.x is not None
             self.x.set(0.0)
             return self.x
@@ -382,7 +383,7 @@ class NewtonSolver:
 
     def _same(self, a: PETSc.Vec, b: PETSc.Vec) -> bool:
         same = np.array_equal(a.array_r, b.array_r)
-        return bool(self._comm.allreduce(same, MPI.LAND)) if self._comm.size > 1 else same
+        return over_ranks(self._comm, same, MPI.LAND)
 
     def _evaluate(self, x: PETSc.Vec) -> MPMError | None:
         assert self.F is not None

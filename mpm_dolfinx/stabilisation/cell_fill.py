@@ -66,7 +66,7 @@ class CellFill(NamedTuple):
             points, volumes = body.quadrature_points()
             at = body.background_basis.at(points)
             for cells, values in _sent(comm, at, at.found, volumes):
-                np.add.at(volume[:, number], cells, values)
+                volume[:, number] += np.bincount(cells, weights=values, minlength=count)
             rows = body.node_basis.part(body.W.dofmap.index_map.size_local)
             bits = ((rows.values != 0.0) * bit).sum(axis=1, dtype=np.uint64)
             for cells, values in _sent(comm, rows, rows.found, bits):
@@ -84,8 +84,10 @@ class CellFill(NamedTuple):
 
 def _sent(
     comm: MPI.Comm, at: PointBasis, which: NDArray[np.bool_], values: NDArray[Any]
-) -> list[tuple[NDArray[np.int64], NDArray[Any]]]:
+) -> list[tuple[NDArray[np.integer[Any]], NDArray[Any]]]:
     """Send values at some points to the owners of their cells; return what comes (collective)."""
     assert at.cell is not None and at.rank is not None
+    if comm.size == 1:
+        return [(at.cell[which], values[which])]
     chosen = [which & (at.rank == r) for r in range(comm.size)]
     return comm.alltoall([(at.cell[pick], values[pick]) for pick in chosen])

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..assembly.petsc import blocked, marked
 from ..background.pairs import CellPairs
 from ..background.polynomials import CellPolynomials
+from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
 from ..transfer.touched import TouchedNodes
 from .cell_fill import CellFill, poorly_filled
@@ -50,6 +51,8 @@ class GhostPenalty(Cure):
         self._least = least * sum(_num_nodes(body) for body in bodies)
         self._acts = False
         self._known: dict[bytes, NDArray[np.float64]] = {}
+        self._chosen = np.zeros((0, 2), dtype=np.int64)
+        self._unit: NDArray[np.float64] | None = None  # matrices of the pairs that are chosen
 
     @cached_property
     def _cells(self) -> CellPairs:
@@ -67,7 +70,7 @@ class GhostPenalty(Cure):
     def unknowns(self, touched: TouchedNodes, held: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """See :meth:`Cure.unknowns`: also all dofs of cells that are tied together."""
         active = touched.has_weight
-        self._acts = self._V.mesh.comm.allreduce(len(touched.active)) >= self._least
+        self._acts = over_ranks(self._V.mesh.comm, len(touched.active)) >= self._least
         if self._acts:
             self._choose()
             active = active | self._marked
@@ -82,10 +85,11 @@ class GhostPenalty(Cure):
         a, b = cells.pairs.T
         poor = poorly_filled(fill)
         chosen = cells.pairs[cells.mine & active[a] & active[b] & (poor[a] | poor[b])]
-        self._chosen = chosen
+        if not np.array_equal(chosen, self._chosen):
+            self._chosen, self._unit = chosen, None
         self._shares = fill[chosen].sum(axis=1)
         self._marked = marked(self._V, cells.nodes[chosen])
-        self._num_chosen: int = self._V.mesh.comm.allreduce(len(chosen))
+        self._num_chosen: int = over_ranks(self._V.mesh.comm, len(chosen))
 
     def penalty(self, moduli: Sequence[float]) -> PETSc.Mat | None:
         """See :meth:`Cure.penalty`."""
@@ -97,7 +101,9 @@ class GhostPenalty(Cure):
         mean = self._shares @ body / np.where(total > 0.0, total, 1.0)
         modulus = PENALTY * np.where(total > 0.0, mean, body.min())
         nodes = cells.nodes[chosen].reshape(len(chosen), 2 * cells.nodes.shape[1])
-        values = modulus[:, None, None] * self._penalties(cells.vertices[chosen])
+        if self._unit is None:
+            self._unit = self._penalties(cells.vertices[chosen])
+        values = modulus[:, None, None] * self._unit
         rows = np.broadcast_to(nodes[:, :, None], values.shape)
         columns = np.broadcast_to(nodes[:, None, :], values.shape)
         return blocked(self._V, rows.ravel(), columns.ravel(), values.ravel(), bs)

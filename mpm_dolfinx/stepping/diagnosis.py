@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import ConvergenceError, DomainDistortionError, MPMError, agreed
 from ..history import Statistics
+from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
 from ..system.field import Field
 from ..system.reduced import ReducedSystem
@@ -31,7 +32,7 @@ def count_folded(bodies: Sequence[Particles], statistics: Statistics) -> None:
     """Count the curved domains that are folded (collective)."""
     curved = [body for body in bodies if body.W.ufl_element().degree > 1]
     if curved:
-        folded = curved[0].mesh.comm.allreduce(sum(len(body.folded()) for body in curved))
+        folded = over_ranks(curved[0].mesh.comm, sum(len(body.folded()) for body in curved))
         statistics["folded_domains"] = max(statistics["folded_domains"], folded)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import ParticleOutsideError
 from ..history import History, Loss
+from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
 
 __all__ = ["may_stop", "move_bodies"]
@@ -56,7 +57,7 @@ def move_bodies(
             body.restore(converged)
         raise
     for number, (body, which) in enumerate(zip(bodies, leaving, strict=True)):
-        if body.V.mesh.comm.allreduce(len(which)) > 0:
+        if over_ranks(body.V.mesh.comm, len(which)) > 0:
             _record(history, _loss(body, number, masses(number), which, load))
             body.delete(which)
 

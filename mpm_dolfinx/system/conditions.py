@@ -15,6 +15,7 @@ from dolfinx import fem
 
 from .. import _compat
 from ..errors import MPMError
+from ..parallel.totals import over_ranks
 
 __all__ = ["dirichlet_values", "fixed_dofs", "force_at"]
 
@@ -29,7 +30,7 @@ def dirichlet_values(bcs: Sequence[fem.DirichletBC], V: fem.FunctionSpace) -> ND
     values = np.zeros((layout.size_local + layout.num_ghosts) * V.dofmap.index_map_bs)
     for bc in bcs:
         bc.set(values, None, 1.0)
-    if not V.mesh.comm.allreduce(bool(np.isfinite(values).all()), MPI.LAND):
+    if not over_ranks(V.mesh.comm, bool(np.isfinite(values).all()), MPI.LAND):
         raise MPMError("A Dirichlet condition has a value that is not finite")
     return values
 

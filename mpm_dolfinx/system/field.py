@@ -22,11 +22,13 @@ from ..assembly.fused import Restriction
 from ..background.grids import cell_lines, coarser, grid_lines
 from ..meshes.boxes import BOX_CELLS
 from ..parallel.magnitudes import joint_norm, norm
+from ..parallel.totals import over_ranks
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..solvers.linear import Coarsening
 from ..stabilisation.cure import Cure
 from ..transfer.touched import TouchedNodes, TransferRows
+from .conditions import fixed_dofs
 from .hierarchy import FieldDofs
 from .numbering import FreeDofs
 from .predictor import map_to_background
@@ -162,6 +164,7 @@ class Field:
         self.motions = [Motion(body) for body in bodies]
         self.moduli: list[float] | None = None
         self.free: FreeDofs | None = None
+        self._looked_up: list[fem.DirichletBC] | None = None
         self._lines: list[NDArray[np.float64]] | None = None
         self._background = background
         self._cure = Cure() if cure is None else cure
@@ -189,7 +192,7 @@ class Field:
         self._change = change[: self._owned]
         self._totals = np.zeros(self._owned) if before is None else before[: self._owned]
         self._imposed = False
-        self.prescribes = bool(self._comm.allreduce(bool(np.any(change)), MPI.LOR))
+        self.prescribes = over_ranks(self._comm, bool(np.any(change)), MPI.LOR)
 
     # -- Unknowns -------------------------------------------------------------------------
 
@@ -200,9 +203,7 @@ class Field:
         supported = np.zeros(self._owned, dtype=bool)
         if self._background is not None:
             supported[self._background.support()] = True
-        self._fixed = np.zeros(self._owned, dtype=bool)
-        for bc in self.conditions:
-            self._fixed[_compat.own_dofs(bc, self.V)] = True
+        self._fixed = self._held()
         free = self._cure.unknowns(self.touched, supported | self._fixed)
         free |= supported & ~self._cure.followers(self._owned)
         self.dofs = np.flatnonzero(free & ~self._fixed).astype(np.int32)
@@ -215,6 +216,13 @@ class Field:
         self._penalty: tuple[PETSc.Mat, PETSc.Mat] | None = None
         self._product: PETSc.Mat | None = None
         return self.free
+
+    def _held(self) -> NDArray[np.bool_]:
+        """Return which of this rank's own dofs of V have a condition, looked up once for each."""
+        conditions, known = self.conditions, self._looked_up
+        if known is None or list(map(id, conditions)) != list(map(id, known)):
+            self._looked_up, self._fixed = conditions, fixed_dofs(conditions, self.V)
+        return self._fixed
 
     def forget(self) -> None:
         """Forget the unknowns."""
@@ -338,7 +346,9 @@ class Field:
     def impose(self) -> bool:
         """Impose the step's Dirichlet values from now on; return whether there are any."""
         self._imposed = True
-        return bool(self._comm.allreduce(bool(np.any(self._lifts())), MPI.LOR))
+        if not self.prescribes:
+            return False
+        return over_ranks(self._comm, bool(np.any(self._lifts())), MPI.LOR)
 
     def _lifts(self) -> NDArray[np.float64]:
         return np.where(self._fixed, self._change, 0.0)

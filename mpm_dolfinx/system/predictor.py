@@ -12,6 +12,8 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
+from ..parallel.totals import over_ranks
+
 __all__ = ["Predictor", "map_to_background"]
 
 type Increments = list[NDArray[np.float64]]
@@ -118,7 +120,7 @@ def map_to_background(
     for T, increment in zip(transfers, increments, strict=True):
         indptr, columns, values = T.getValuesCSR()
         size = T
-        if T.comm.tompi4py().allreduce(bool(values.min(initial=0.0) < 0.0), MPI.LOR):
+        if over_ranks(T.comm.tompi4py(), bool(values.min(initial=0.0) < 0.0), MPI.LOR):
             size = T.copy()
             size.setValuesCSR(indptr, columns, np.abs(values))
             size.assemble()

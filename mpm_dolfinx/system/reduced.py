@@ -21,6 +21,7 @@ from ..history import Statistics
 from ..parallel.balance import imbalance
 from ..parallel.interruption import Interrupted, note, noted
 from ..parallel.magnitudes import joint_norm, norm
+from ..parallel.totals import over_ranks
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..solvers.linear import Coarsening
@@ -466,7 +467,7 @@ class ReducedSystem:
     def smooth(self) -> bool:
         """Return whether no history changes in the last residual, nor contact."""
         smooth = [term.smooth() for term in self._terms]
-        return bool(self._comm.allreduce(all(smooth), MPI.LAND))
+        return over_ranks(self._comm, all(smooth), MPI.LAND)
 
     def load_derivative(self, order: int = 1) -> tuple[list[PETSc.Vec], float]:
         """Return :meth:`BodyForms.load_derivative` on all dofs of each V (collective)."""
@@ -572,8 +573,8 @@ class ReducedSystem:
             else:
                 values[part] = np.abs(values[part])
             own = np.abs(values[part])
-            largest = self._comm.allreduce(float(own.max(initial=0.0)), MPI.MAX)
-            sums = self._comm.allreduce(float(np.sign(values[part]).sum()))
+            largest = over_ranks(self._comm, float(own.max(initial=0.0)), MPI.MAX)
+            sums = over_ranks(self._comm, float(np.sign(values[part]).sum()))
             values[part] = np.where(own == 0.0, np.copysign(largest, sums), values[part])
         return found
 
