@@ -24,7 +24,7 @@ from ..system.inertia import Inertia
 from ..system.term import Term
 from .arguments import as_bodies, as_supports, as_terms
 from .motion import MovingProblem, initial_velocities, rayleigh_of, require_motion
-from .particle_problem import Contribution
+from .parts import Contribution
 from .quasistatic import QuasiStaticProblem
 from .setup import BodySetup
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -18,13 +18,7 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem
 
-from ..assembly.background_forms import BackgroundForms
-from ..assembly.body_forms import BodyForms, PointStress
-from ..assembly.field_forms import FieldForms
-from ..assembly.fused import is_fast
-from ..assembly.rules import data_at_points
 from ..boundary.supports import Support
-from ..constitutive.averaging import Linearised
 from ..constitutive.points import MaterialPoints
 from ..contact.contact import Contact
 from ..contact.rigid_body import RigidBody
@@ -39,20 +33,18 @@ from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
 from ..solvers.linear import chosen
 from ..solvers.newton import NewtonSolver
-from ..stabilisation.choice import stabilisation_of
 from ..stepping.automatic import ErrorControl
 from ..stepping.diagnosis import crossed
 from ..stepping.displacement_control import DisplacementControl
 from ..stepping.loading import Mender, Stepper
 from ..stepping.progress import with_bar
-from ..system.body import BodyTerm, PointHistory, StepForce
 from ..system.conditions import force_at
-from ..system.field import Field, ValueField
+from ..system.field import ValueField
 from ..system.predictor import Predictor
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
 from ..system.term import PointMaterial, Term, UserTerm
-from ..system.values import FieldTerm, FormsTerm
+from ..system.values import FieldTerm
 from .arguments import (
     as_bodies,
     as_conditions,
@@ -60,49 +52,20 @@ from .arguments import (
     as_terms,
     by_space,
     one_for_each,
-    require_background_fields,
     require_entity_maps,
-    require_own_fields,
     require_truth,
     residuals_of,
 )
+from .parts import Contribution, Parts
 from .setup import Numerics
 from .staging import Change, Staging
 from .state import ProblemState
 from .summary import in_one_line, on_a_screen
 
-__all__ = ["Contribution", "Law", "ParticleProblem"]
+__all__ = ["Law", "ParticleProblem"]
 
 #: What goes with automatic steps, and is of no meaning to others.
 AUTOMATIC = {"tolerance": 1e-2, "output_at": (), "first_step": 0.05, "length": None}
-
-
-class Contribution(NamedTuple):
-    """What a body adds to the system.
-
-    Attributes:
-        residual: Form on the body mesh, or ``None``.
-        tangent: Form on the body mesh; ``None`` is the residual's derivative.
-        internal: Stress whose virtual work is not in the residual, or ``None``.
-        low_rank: What the tangent has besides forms and the pointwise one, or ``None``.
-        symmetric: Whether the tangent is symmetric.
-        material: The material at its points, if the above hold one.
-        injected: Functions in the forms for stress and tangent of the material, or ``None``.
-        contact: Whether the forms have one-sided supports.
-        of_step: What among its forces may be of a whole step in time.
-        static: Whether the body is in equilibrium at each step's end, in a motion of others.
-    """
-
-    residual: ufl.Form | None
-    tangent: ufl.Form | None
-    internal: PointStress | None
-    low_rank: Linearised | None
-    symmetric: bool
-    material: PointHistory | None = None
-    injected: tuple[fem.Function, fem.Function] | None = None
-    contact: bool = False
-    of_step: Sequence[StepForce] = ()
-    static: bool = False
 
 
 type Law = tuple[str, dict[str, Any]]
@@ -290,11 +253,10 @@ class ParticleProblem:
 
         It is called again whenever these are other ones.
         """
-        groups = by_space(self.bodies)
-        meshes = [group[0].V.mesh for group in groups]
+        meshes = [group[0].V.mesh for group in by_space(self.bodies)]
         clean_up = Cleaner(self._comm, [*meshes, *(body.mesh for body in self.bodies)])
         try:
-            self._build_system(groups, clean_up)
+            self._build_system(clean_up)
         except BaseException:
             clean_up.end()  # what is half built is freed by the next problem
             raise
@@ -305,65 +267,30 @@ class ParticleProblem:
         for number, term in enumerate(self.terms):
             term.take_part(number, self.bodies, materials)
 
-    def _build_system(self, groups: list[list[Particles]], clean_up: Cleaner) -> None:
+    def _build_system(self, clean_up: Cleaner) -> None:
         """Make the system and its solver (collective).
 
         Args:
-            groups: The bodies on each background space.
             clean_up: Frees what is out of use.
         """
         numerics = self._numerics
         contributions = self._contributions()
-        mapped = numerics.entity_maps is not None
-        for number, given in enumerate(contributions):
-            for form, what in ((given.residual, "residual R"), (given.tangent, "tangent J")):
-                require_own_fields(form, number, self.bodies, what, self.fields, mapped)
-        fast, options = is_fast(numerics.assembly), numerics.of_forms
-        self.body_terms = [
-            BodyTerm(
-                body,
-                BodyForms(
-                    c.residual,
-                    c.tangent,
-                    body,
-                    c.internal,
-                    c.low_rank,
-                    fast,
-                    [field for field in self.fields if field.particles is body],
-                    **options,
-                ),
-                c.material,
-                c.injected,
-                c.contact,
-                c.of_step,
-                c.static,
-            )
-            for body, c in zip(self.bodies, contributions, strict=True)
-            if self._moves(c)
-        ]
-        self._field_terms = self._couplings(contributions)
+        parts = Parts(
+            self.bodies, contributions, self.fields, self._of_fields, self._background, numerics
+        )
+        parts.require_own_fields()
+        self.body_terms = parts.body_terms()
+        self._field_terms = self._couplings(parts)
         carried = self.carried
-        moving = [
-            body for body, c in zip(self.bodies, contributions, strict=True) if self._moves(c)
-        ]
-        groups = by_space(moving)
         self._let_take_part([given.material for given in contributions])
-        on_backgrounds = _on_backgrounds(self._background, groups, **options)
-        remove = numerics.dependent_dofs == "remove"
         fields = [
-            Field(
-                group,
-                self.bcs,
-                forms,
-                stabilisation_of(numerics.stabilisation, group, remove, forms is not None),
-            )
-            for group, forms in zip(groups, on_backgrounds, strict=True)
+            *parts.displacement_fields(self.bcs),
+            *(ValueField(group, self.bcs) for group in by_space(carried)),
         ]
-        fields += [ValueField(group, self.bcs) for group in by_space(carried)]
         statistics = self.history.statistics
         self._held.follow([*self.bodies, *carried], [field.V for field in fields])
         reduced = ReducedSystem(
-            [*moving, *carried],
+            [*parts.moving, *carried],
             fields,
             [*self.body_terms, *self._field_terms, *self.terms, UserTerm(self), self._held],
             statistics,
@@ -383,18 +310,7 @@ class ParticleProblem:
             chosen(numerics.linear_solver, degree),
         )
         self._stepper.follow(reduced, newton, clean_up)
-        forms = [f for given in contributions for f in (given.residual, given.tangent) if f]
-        forms += self._of_fields
-        every = [*forms, *_as_list(self._background)]
-        loads = [constant for body in self.bodies for constant in (body.load, body.proportional)]
-        self._constants = [
-            constant
-            for form in every
-            for constant in form.constants()
-            if not any(constant is load for load in loads)
-        ]
-        own = {function for field in self.fields for function in (field, field.previous)}
-        self._data = set().union(*map(data_at_points, forms)) - own
+        self._constants, self._data = parts.constants(), parts.data_at_points()
 
     def _contributions(self) -> list[Contribution]:
         """Return what each body adds to the system, on its present mesh (collective)."""
@@ -405,10 +321,6 @@ class ParticleProblem:
     _of_fields: Sequence[ufl.Form] = ()
     _field_terms: Sequence[FieldTerm] = ()
 
-    def _moves(self, given: Contribution) -> bool:
-        """Return whether the displacement of a body is an unknown."""
-        return given.residual is not None or given.internal is not None or not self._of_fields
-
     def _spaces_of_fields(self) -> list[fem.FunctionSpace]:
         """Return the background spaces of fields, in the order in which they come first."""
         spaces: list[fem.FunctionSpace] = []
@@ -417,30 +329,13 @@ class ParticleProblem:
                 spaces.append(field.background)
         return spaces
 
-    def _couplings(self, contributions: Sequence[Contribution]) -> list[FieldTerm]:
+    def _couplings(self, parts: Parts) -> Sequence[FieldTerm]:
         """Return what has unknowns besides displacements (collective).
 
         Args:
-            contributions: What each body adds to the system.
+            parts: What the system is put together from.
         """
-        found: list[FieldTerm] = []
-        for number, (body, given) in enumerate(zip(self.bodies, contributions, strict=True)):
-            own = [
-                (field, form)
-                for field, form in zip(self.fields, self._of_fields, strict=True)
-                if field.particles is body
-            ]
-            for _, form in own:
-                require_own_fields(form, number, self.bodies, "residual of a field", self.fields)
-            if not own:
-                continue
-            fields = [field for field, _ in own]
-            options = self._numerics.of_forms
-            forms = FieldForms(body, fields, given.residual, [form for _, form in own], **options)
-            moving = body if self._moves(given) else None
-            carried = [CarriedField(field) for field in fields]
-            found.append(FormsTerm(moving, carried, forms, given.symmetric))
-        return found
+        return parts.field_terms()
 
     def __del__(self) -> None:
         """Leave PETSc's objects to the next clean-up; at the program's end PETSc drops them.
@@ -980,35 +875,3 @@ class ParticleProblem:
         """Return Functions at quadrature points that the forms hold and no history keeps."""
         keeps = type(self).converged_state is not ParticleProblem.converged_state
         return set() if keeps else self._data
-
-
-def _as_list(background: Any) -> list[Any]:
-    """Return one form on the background, several or none as a list."""
-    if background is None:
-        return []
-    return list(background) if isinstance(background, list | tuple) else [background]
-
-
-def _on_backgrounds(
-    background: Any, groups: Sequence[Sequence[Particles]], **options: Any
-) -> list[BackgroundForms | None]:
-    """Return the terms on each background space, by the space of their test functions.
-
-    Args:
-        background: A form, or a list of forms, or ``None``.
-        groups: The bodies on each space.
-        **options: Passed on to ``dolfinx.fem.form``.
-    """
-    own: list[list[Any]] = [[] for _ in groups]
-    for form in _as_list(background):
-        if not isinstance(form, ufl.Form):
-            raise MPMError(f"background must be UFL forms, not {type(form).__name__}.")
-        arguments = form.arguments()
-        spaces = [argument.ufl_function_space() for argument in arguments]
-        number = next((n for n, group in enumerate(groups) if group[0].V in spaces), 0)
-        require_background_fields(form, groups[number])
-        own[number].append(form)
-    return [
-        BackgroundForms(sum(mine[1:], mine[0]), group[0], **options) if mine else None
-        for mine, group in zip(own, groups, strict=True)
-    ]

@@ -37,7 +37,8 @@ from ..particles.particles import Particles
 from ..reals import as_reals
 from ..system.term import PointMaterial
 from .arguments import as_bodies
-from .particle_problem import Contribution, Law
+from .particle_problem import Law
+from .parts import Contribution
 from .quasistatic import QuasiStaticProblem
 from .setup import BodySetup
 from .through_time import TimeProblem

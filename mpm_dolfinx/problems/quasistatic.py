@@ -36,7 +36,8 @@ from ..system.term import Term
 from ..system.values import FieldTerm
 from .arguments import as_bodies, as_loads, as_supports, as_terms
 from .initial_stress import initial_stress_at_points, of_all_ranks
-from .particle_problem import Contribution, Law, ParticleProblem
+from .particle_problem import Law, ParticleProblem
+from .parts import Contribution, Parts
 from .remeshing import Remeshing, as_indices
 from .setup import BodySetup, Numerics, Setup
 from .stages import Addition, Given, Removal, chosen_cells
@@ -587,10 +588,10 @@ class QuasiStaticProblem(ParticleProblem):
         """Return what of a body's forces at a step's end is force; ``None`` without motion."""
         return None
 
-    def _couplings(self, contributions: Sequence[Contribution]) -> list[FieldTerm]:
+    def _couplings(self, parts: Parts) -> Sequence[FieldTerm]:
         """See :meth:`ParticleProblem._couplings`."""
         if self.setup.mixed is None:
-            return super()._couplings(contributions)
+            return super()._couplings(parts)
         found: list[FieldTerm] = []
         for body, field, acting, points in zip(
             self.bodies, self.pressure, self._acting, self._stresses, strict=True

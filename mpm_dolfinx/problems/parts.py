@@ -1,0 +1,220 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What the system of a problem is put together from: what bodies and fields add to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import ufl
+from dolfinx import fem
+
+from ..assembly.background_forms import BackgroundForms
+from ..assembly.body_forms import BodyForms, PointStress
+from ..assembly.field_forms import FieldForms
+from ..assembly.fused import is_fast
+from ..assembly.rules import data_at_points
+from ..constitutive.averaging import Linearised
+from ..errors import MPMError
+from ..particles.field import CarriedField, ParticleField
+from ..particles.particles import Particles
+from ..stabilisation.choice import stabilisation_of
+from ..system.body import BodyTerm, PointHistory, StepForce
+from ..system.field import Field
+from ..system.values import FormsTerm
+from .arguments import by_space, require_background_fields, require_own_fields
+from .setup import Numerics
+
+__all__ = ["Contribution", "Parts"]
+
+
+class Contribution(NamedTuple):
+    """What a body adds to the system.
+
+    Attributes:
+        residual: Form on the body mesh, or ``None``.
+        tangent: Form on the body mesh; ``None`` is the residual's derivative.
+        internal: Stress whose virtual work is not in the residual, or ``None``.
+        low_rank: What the tangent has besides forms and the pointwise one, or ``None``.
+        symmetric: Whether the tangent is symmetric.
+        material: The material at its points, if the above hold one.
+        injected: Functions in the forms for stress and tangent of the material, or ``None``.
+        contact: Whether the forms have one-sided supports.
+        of_step: What among its forces may be of a whole step in time.
+        static: Whether the body is in equilibrium at each step's end, in a motion of others.
+    """
+
+    residual: ufl.Form | None
+    tangent: ufl.Form | None
+    internal: PointStress | None
+    low_rank: Linearised | None
+    symmetric: bool
+    material: PointHistory | None = None
+    injected: tuple[fem.Function, fem.Function] | None = None
+    contact: bool = False
+    of_step: Sequence[StepForce] = ()
+    static: bool = False
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a system is put together from, on the present meshes of the bodies.
+
+    Args:
+        bodies: The bodies.
+        contributions: What each adds.
+        fields: Unknowns besides displacements.
+        residuals: Their residuals.
+        background: Forms on the backgrounds, one, several or ``None``.
+        numerics: How the problem is solved.
+    """
+
+    bodies: Sequence[Particles]
+    contributions: Sequence[Contribution]
+    fields: Sequence[ParticleField]
+    residuals: Sequence[ufl.Form]
+    background: Any
+    numerics: Numerics
+
+    def require_own_fields(self) -> None:
+        """Raise an error where a form has unknowns of another body.
+
+        Raises:
+            MPMError: It has.
+        """
+        mapped = self.numerics.entity_maps is not None
+        for number, given in enumerate(self.contributions):
+            for form, what in ((given.residual, "residual R"), (given.tangent, "tangent J")):
+                require_own_fields(form, number, self.bodies, what, self.fields, mapped)
+
+    def _moves(self, given: Contribution) -> bool:
+        """Return whether the displacement of a body is an unknown."""
+        return given.residual is not None or given.internal is not None or not self.residuals
+
+    @property
+    def moving(self) -> list[Particles]:
+        """The bodies whose displacements are unknowns."""
+        return [
+            body
+            for body, given in zip(self.bodies, self.contributions, strict=True)
+            if self._moves(given)
+        ]
+
+    def body_terms(self) -> list[BodyTerm]:
+        """Return the terms of bodies that move (collective)."""
+        fast = is_fast(self.numerics.assembly)
+        return [
+            BodyTerm(
+                body,
+                BodyForms(
+                    given.residual,
+                    given.tangent,
+                    body,
+                    given.internal,
+                    given.low_rank,
+                    fast,
+                    [field for field in self.fields if field.particles is body],
+                    **self.numerics.of_forms,
+                ),
+                given.material,
+                given.injected,
+                given.contact,
+                given.of_step,
+                given.static,
+            )
+            for body, given in zip(self.bodies, self.contributions, strict=True)
+            if self._moves(given)
+        ]
+
+    def field_terms(self) -> list[FormsTerm]:
+        """Return the terms of unknowns besides displacements (collective)."""
+        found: list[FormsTerm] = []
+        for number, (body, given) in enumerate(zip(self.bodies, self.contributions, strict=True)):
+            own = [
+                (field, form)
+                for field, form in zip(self.fields, self.residuals, strict=True)
+                if field.particles is body
+            ]
+            for _, form in own:
+                require_own_fields(form, number, self.bodies, "residual of a field", self.fields)
+            if not own:
+                continue
+            fields = [field for field, _ in own]
+            options = self.numerics.of_forms
+            forms = FieldForms(body, fields, given.residual, [form for _, form in own], **options)
+            moving = body if self._moves(given) else None
+            carried = [CarriedField(field) for field in fields]
+            found.append(FormsTerm(moving, carried, forms, given.symmetric))
+        return found
+
+    def displacement_fields(self, bcs: Sequence[fem.DirichletBC]) -> list[Field]:
+        """Return the fields of displacement, one for each background space (collective).
+
+        Args:
+            bcs: Dirichlet conditions.
+        """
+        groups = by_space(self.moving)
+        remove = self.numerics.dependent_dofs == "remove"
+        return [
+            Field(
+                group,
+                bcs,
+                forms,
+                stabilisation_of(self.numerics.stabilisation, group, remove, forms is not None),
+            )
+            for group, forms in zip(groups, self._on_backgrounds(groups), strict=True)
+        ]
+
+    def _on_backgrounds(
+        self, groups: Sequence[Sequence[Particles]]
+    ) -> list[BackgroundForms | None]:
+        """Return the terms on each background space, by the space of their test functions.
+
+        Args:
+            groups: The bodies on each space.
+        """
+        own: list[list[Any]] = [[] for _ in groups]
+        for form in self._background_forms:
+            if not isinstance(form, ufl.Form):
+                raise MPMError(f"background must be UFL forms, not {type(form).__name__}.")
+            arguments = form.arguments()
+            spaces = [argument.ufl_function_space() for argument in arguments]
+            number = next((n for n, group in enumerate(groups) if group[0].V in spaces), 0)
+            require_background_fields(form, groups[number])
+            own[number].append(form)
+        options = self.numerics.of_forms
+        return [
+            BackgroundForms(sum(mine[1:], mine[0]), group[0], **options) if mine else None
+            for mine, group in zip(own, groups, strict=True)
+        ]
+
+    @property
+    def _background_forms(self) -> list[Any]:
+        """The forms on backgrounds as a list."""
+        given = self.background
+        if given is None:
+            return []
+        return list(given) if isinstance(given, list | tuple) else [given]
+
+    @property
+    def _forms(self) -> list[ufl.Form]:
+        """The forms on bodies."""
+        pairs = [(given.residual, given.tangent) for given in self.contributions]
+        return [*(form for pair in pairs for form in pair if form), *self.residuals]
+
+    def constants(self) -> list[fem.Constant]:
+        """Return the Constants of all forms, without loads of bodies."""
+        loads = [constant for body in self.bodies for constant in (body.load, body.proportional)]
+        return [
+            constant
+            for form in (*self._forms, *self._background_forms)
+            for constant in form.constants()
+            if not any(constant is load for load in loads)
+        ]
+
+    def data_at_points(self) -> set[fem.Function]:
+        """Return Functions at quadrature points in the forms, without unknowns."""
+        own = {function for field in self.fields for function in (field, field.previous)}
+        return set().union(*map(data_at_points, self._forms)) - own
