@@ -13,7 +13,7 @@ import numpy as np
 from case_runs import ROOT, Table, run, scientific
 
 sys.path.append(str(ROOT / "tests"))
-from problems import test_remeshing as bodies
+import splits
 
 SCENES = [
     (0.5, 1, 20),
@@ -56,16 +56,16 @@ SUMS = {
 def before_and_after() -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:
     """Sums of a split column, and of rebased blocks in the plane and in space."""
     found = []
-    split = bodies.half_way(bodies.column())
-    quadrilaterals = bodies.half_way(bodies.block_of(bodies.QUADRILATERAL), 4)
-    hexahedra = bodies.half_way(bodies.block_of(bodies.HEXAHEDRON), 4)
+    split = splits.half_way(splits.column())
+    quadrilaterals = splits.half_way(splits.block_of(splits.QUADRILATERAL), 4)
+    hexahedra = splits.half_way(splits.block_of(splits.HEXAHEDRON), 4)
     for problem in (split, quadrilaterals, hexahedra):
-        before = bodies.sums(problem)
+        before = splits.sums(problem)
         if problem is split:
-            problem.split(bodies.some(problem.particles))
+            problem.split(splits.some(problem.particles))
         else:
             problem.rebase()
-        found.append((before, bodies.sums(problem)))
+        found.append((before, splits.sums(problem)))
     return found
 
 

@@ -102,11 +102,6 @@ class Support:
         self._sums: list[fem.Form] | None = None
         self._power: fem.Form | None = None
 
-    @property
-    def has_modulus(self) -> bool:
-        """Whether the modulus is known."""
-        return self._modulus
-
     def scale(self, modulus: Any) -> None:
         """Set the modulus that the penalty is relative to (collective).
 
