@@ -92,7 +92,8 @@ if comm.rank == 0:
 
 fig, axes = None, {"beam": None}
 if comm.rank == 0:
-    fig, axes = plt.subplot_mosaic([["beam", "tip"]], figsize=(12, 5), layout="compressed")
+    fig, axes = plt.subplot_mosaic([["beam", "tip"]], figsize=(9, 5), layout="compressed")
+    fig.get_layout_engine().set(w_pad=0.15)
 mpm.plot.scene(problem, "mises", ax=axes["beam"], label="von Mises stress, Pa")
 if comm.rank == 0:
     way = np.array(path)

@@ -160,10 +160,10 @@ if comm.rank == 0:
 fig, axes = None, {"soil": None}
 if comm.rank == 0:
     fig, axes = plt.subplot_mosaic([["soil", "path"]], figsize=(13, 4.5), layout="compressed")
-mpm.plot.scene(problem, "plastic_strain", ax=axes["soil"], warp=60.0, background=False)
+mpm.plot.scene(problem, "plastic_strain", ax=axes["soil"], warp=20.0, limits=(0.0, 0.01))
 if comm.rank == 0:
     axes["soil"].set(xlim=(0.0, 2.0), ylim=(size - 1.15, size + 0.18), xlabel="x, m", ylabel="y, m")
-    axes["soil"].set_title("Soil under the strip, displacement times 60")
+    axes["soil"].set_title("Soil under the strip, displacement times 20")
     axes["path"].axhline(limit, color="0.2", ls="--", label="Prandtl")
     axes["path"].plot(1e3 * settlement * load, pressure, label="particles")
     axes["path"].set(xlabel="settlement, mm", ylabel="mean pressure, kPa")

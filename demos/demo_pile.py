@@ -138,6 +138,7 @@ if comm.rank == 0:
 axes = dict.fromkeys(("clay", "force", "N"))
 if comm.rank == 0:
     figure, axes = plt.subplot_mosaic([list(axes)], figsize=(14, 5.2), layout="compressed")
+    figure.get_layout_engine().set(w_pad=0.15)
 view = {"limits": (0.0, 2.0), "background": False, "title": ""}
 mpm.plot.scene(problem, "plastic_strain", ax=axes["clay"], **view)
 if comm.rank == 0:
