@@ -327,6 +327,60 @@ def test_contact_follows_other_meshes_of_the_bodies(what):
     assert np.abs(problem.reaction(touch) - end).max() < bound * np.abs(end).max()
 
 
+def test_a_pair_of_a_body_that_is_split_goes_on_from_a_checkpoint(mpi_tmp_path):
+    cells = (QUADRILATERAL, QUADRILATERAL)
+    problem, touch, path = two(cells)
+    for number, _ in enumerate(problem.steps(8, update=path)):
+        if number == 4:
+            before = problem.reaction(touch)
+            problem.split(np.arange(0, problem.bodies[1].num_global, 3), body=1)
+            assert np.abs(problem.reaction(touch) - before).max() < 1e-8 * np.abs(before).max()
+        if number == 5:
+            problem.save(mpi_tmp_path / "split")
+    other, again, path = two(cells)
+    other.restore(mpi_tmp_path / "split")
+    other.solve(8, update=path)
+    end = problem.reaction(touch)
+    assert np.abs(other.reaction(again) - end).max() < 1e-9 * np.abs(end).max()
+    same_run(outcome(other), outcome(problem), 1e-9)
+
+
+@pytest.mark.parametrize("passes", [1, 2])
+def test_a_pair_of_a_body_that_has_lost_domains_is_that_of_a_shorter_body(passes):
+    # Nothing depends on the past here: elastic bodies without friction.
+    found = []
+    for columns, outside in ((14, "delete"), (13, "error")):
+        Va, Vb = spaces([-0.3, -0.3], [1.5, 1.2], [12, 10])
+        shape = scenes.box([0.0, 0.0], [0.1 * columns, 0.4], [columns, 4], QUADRILATERAL)
+        lower = mpm.Particles(shape, Va, outside=outside)
+        upper = mpm.Particles(scenes.box([0.1, 0.4], [0.9, 0.8], [6, 3], TRIANGLE), Vb)
+        touch = contact.Pair(upper, lower, passes=passes)
+        base, top = (
+            fem.locate_dofs_geometrical(V, where)
+            for V, where in ((Va, lambda x: x[1] < 0.01), (Vb, lambda x: x[1] > 0.7))
+        )
+        aside, down = (fem.Constant(V.mesh, np.zeros(2)) for V in (Va, Vb))
+        problem = mpm.QuasiStaticProblem(
+            [lower, upper],
+            Hencky(YOUNG, POISSON),
+            bcs=[fem.dirichletbc(aside, base, Va), fem.dirichletbc(down, top, Vb)],
+            terms=[touch],
+        )
+
+        def path(t, aside=aside, down=down):
+            aside.value[0] = 0.34 * min(t, 0.5)
+            down.value[1] = -0.04 * max(t - 0.5, 0.0)
+
+        problem.solve(4, update=path)
+        stress = scenes.in_order(upper, upper.stress)
+        found.append((problem.reaction(touch), stress, int(lower.deleted.sum())))
+    (force, stress, lost), (known, exact, _) = found
+    assert WORLD.allreduce(lost) == 4
+    assert abs(known[1]) > 1.0
+    assert np.abs(force - known).max() < 1e-8 * np.abs(known).max()
+    assert np.abs(stress - exact).max() < 1e-8 * np.abs(exact).max()
+
+
 def test_bodies_of_different_degrees_come_to_touch():
     Va, Vb = spaces([-0.5] * 3, [1.5, 1.5, 2.5], [2, 2, 3])
     a = mpm.Particles(scenes.box([0.0, 0.0, 1.01], [1.0, 1.0, 2.0], [1] * 3, TETRAHEDRON), Va)
