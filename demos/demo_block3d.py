@@ -90,8 +90,8 @@ for step in problem.steps(40, update):
 
 # ## Result
 #
-# The force is above that of smooth plates, as friction holds the ends together. The picture shows the
-# eighth from the middle of the block: what is dark below sticks to the plate.
+# The force is above that of smooth plates, as friction holds the ends together. The picture shows
+# the eighth from the middle of the block: what is dark below sticks to the plate.
 
 way, force = np.array(curve).T
 volume = [comm.allreduce(v.sum()) for v in (particles.volume, particles.initial_volume)]
