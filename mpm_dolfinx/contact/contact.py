@@ -257,9 +257,9 @@ def cross(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
 def stiffness(
     surface: Surface, modulus: float | None, material: PointMaterial | None, what: str
 ) -> NDArray[np.float64]:
-    """Return modulus over thickness of the domain behind each facet, shape ``(m,)`` (collective).
+    """Return modulus over height of the domain behind each facet, shape ``(m,)`` (collective).
 
-    The thickness is over the square of the degree of the shape functions: so much stiffer is a
+    The height is over the square of the degree of the shape functions: so much stiffer is a
     domain against what acts on its surface.
 
     Args:

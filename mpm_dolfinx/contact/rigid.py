@@ -48,9 +48,9 @@ class Rigid(Contact):
     """Contact of a body with a rigid obstacle, with friction.
 
     Points on the body's facets may touch the obstacle, stick, slide and lift off. The pressure is
-    ``penalty M / h`` times the penetration, M a modulus of the material and h the thickness of the
-    domain behind the facet (over the square of its degree), so that ``penalty`` is a number
-    without unit. It makes the
+    ``penalty M / h`` times the penetration, M a modulus of the material and h the height of the
+    domain behind over the facet (and over the square of its degree), so that ``penalty`` is a
+    number without unit. It makes the
     body softer by about one layer of domains, and should stay near 1: where facets
     are chords of a curved surface, a larger one puts all load on their ends. Friction
     remembers where each point has stuck to the obstacle.

@@ -37,6 +37,9 @@ __all__ = [
 #: Highest degree of a rule on a facet: 51 points each way.
 MOST = 100
 
+#: Cells that narrow to a point over each of their facets.
+SIMPLICES = (basix.CellType.triangle, basix.CellType.tetrahedron)
+
 #: Position, relative to the coordinates of a body, at which a point touches: their round-off.
 TOUCH = 1e-12
 
@@ -133,7 +136,8 @@ class Surface:
         slopes: Their derivatives, shape ``(gdim - 1, nq, k)``.
         weights: Undeformed area of each point, all around the axis of a body of revolution,
             shape ``(m, nq)``; 0 where deleted.
-        thickness: Undeformed volume over area of the domain behind each facet, shape ``(m,)``.
+        thickness: Undeformed height of the domain behind each facet, shape ``(m,)``: volume over
+            area, times the dimension for triangles and tetrahedra.
         outward: Whether the normal that the facet's order of nodes gives points outwards, as
             1 or -1, shape ``(m,)``.
         extent: Largest coordinate of the undeformed body.
@@ -208,7 +212,8 @@ class Surface:
         centre = (self.shapes @ x[self.nodes]).mean(axis=1)
         n = normals(edges).mean(axis=1)
         self.outward = np.where(((centre - middle) * n).sum(axis=1) < 0.0, -1.0, 1.0)
-        self.thickness = self.particles.initial_volume[self.cells] / area.sum(axis=1)
+        narrowing = self.gdim if cell in SIMPLICES else 1
+        self.thickness = narrowing * self.particles.initial_volume[self.cells] / area.sum(axis=1)
         extent = float(np.abs(self.particles.initial_domains).max(initial=0.0))
         self.extent = float(body.comm.allreduce(extent, MPI.MAX))
         self._around = np.ones_like(area)

@@ -137,7 +137,8 @@ def test_tangent_in_space(cell):
     problem = mpm.QuasiStaticProblem(particles, Hencky(1e3, POISSON), bcs=bcs, terms=[ball])
     problem.solve(3, update=lambda t: ball.move((0.05 * t, 0.0, -0.1 * t)))
     assert WORLD.allreduce(int(ball.touches.sum())) > 0
-    assert error_of_blocks(problem, step=1e-7, size=1e-5) < 1e-7
+    # (within 1e-7 a point of the tetrahedra begins to slip)
+    assert error_of_blocks(problem, step=1e-8, size=1e-5) < 1e-7
 
 
 def test_a_body_of_revolution_has_an_exact_tangent():
