@@ -167,7 +167,7 @@ class Pass:
         high = corners.max(axis=(0, 1), initial=-np.inf) + 2.0 * self.reach
         within = ((x >= low) & (x <= high)).all(axis=2).any(axis=1)
         if self.memory is not None:
-            within |= (self.memory.facet >= 0).reshape(within.shape[0], -1).any(axis=1)
+            within |= (self.memory.facet >= 0).reshape(len(within), source.nq).any(axis=1)
         self._facets = np.flatnonzero(within)
         points = self._facets[:, None] * source.nq + np.arange(source.nq)
         self._which, self._known = points.ravel(), None
@@ -245,7 +245,7 @@ class Pass:
     def _untouched(self, x: NDArray[np.float64]) -> Outcome:
         """Return what there is of all points, at x, to which nothing is near."""
         shape = len(self.source.cells), self.source.nq
-        place, zero, none = x.reshape(*shape, -1), np.zeros(shape), np.zeros(shape, dtype=bool)
+        place, zero, none = x.reshape(*shape, x.shape[-1]), np.zeros(shape), np.zeros(shape, bool)
         return Outcome(place, np.full(shape, np.inf), zero, np.zeros_like(place), none, none)
 
     def _remembered(self, x: NDArray[np.float64], known: Memory) -> Memory:
@@ -324,10 +324,10 @@ class Pass:
             done = [-float(w @ (part * change).sum(axis=(1, 2))) for part in (pushes, rubs)]
             self.works = done[0], done[1]
         self._trial = Outcome(
-            x.reshape(*shape, -1),
+            x.reshape(*shape, x.shape[-1]),
             gap.reshape(shape),
             pressure.reshape(shape),
-            force.reshape(*shape, -1),
+            force.reshape(*shape, x.shape[-1]),
             inside.reshape(shape),
             slips.reshape(shape),
         )

@@ -176,7 +176,7 @@ def _at_points(value: Any, particles: Particles) -> Array:
     if callable(value):
         x = np.zeros((3, n * nq))
         points = particles.initial_points
-        x[: points.shape[-1]] = points.reshape(n * nq, -1).T
+        x[: points.shape[-1]] = points.reshape(n * nq, points.shape[-1]).T
         try:
             found = as_reals(value(x))
         except MPMError:

@@ -49,7 +49,7 @@ class PressureTerm(FieldTerm):
         numbers = particles.W.dofmap.index_map.local_to_global(nodes.ravel()).reshape(nodes.shape)
         self._order = np.argsort(numbers, axis=1)
         columns = np.take_along_axis(numbers, self._order, axis=1)[:, :, None] * gdim
-        columns = (columns + np.arange(gdim)).reshape(n, 1, -1)
+        columns = (columns + np.arange(gdim)).reshape(n, 1, nodes.shape[1] * gdim)
         self._columns = np.repeat(columns, nq, axis=1).ravel().astype(PETSc.IntType)
         width = nodes.shape[1] * gdim
         self._offsets = (width * np.arange(n * nq + 1)).astype(PETSc.IntType)

@@ -156,7 +156,9 @@ def test_pressure_between_cylinders_is_that_of_hertz(passes, order):
     assert problem.history.cutbacks == 0
 
 
-def two(cells=(QUADRILATERAL, TRIANGLE), friction=0.3, comm=WORLD, degree=1, tilt=0.0, **options):
+def two(
+    cells=(QUADRILATERAL, TRIANGLE), friction=0.3, comm=WORLD, degree=1, tags_of=None, **options
+):
     """Return a small block that is pressed on a large one and dragged along it."""
     Va, Vb = spaces([-0.4, -0.2], [2.4, 1.8], [14, 10], comm=comm, degree=degree)
     a = mpm.Particles(
@@ -165,6 +167,8 @@ def two(cells=(QUADRILATERAL, TRIANGLE), friction=0.3, comm=WORLD, degree=1, til
     b = mpm.Particles(
         scenes.box([0.0, 0.0], [2.0, 1.0], [16, 8], cells[1], comm), Vb, degree=degree
     )
+    if tags_of is not None:
+        options |= {"facet_tags": tags_of(a.mesh, b.mesh), "tags": (1, 1)}
     touch = contact.Pair(a, b, friction, **options)
     top = fem.locate_dofs_geometrical(Va, lambda x: x[1] > 1.39)
     base = fem.locate_dofs_geometrical(Vb, lambda x: x[1] < 0.01)
@@ -264,6 +268,22 @@ def test_a_dragged_block_is_the_same_on_any_number_of_ranks():
     assert np.abs(problem.reaction(touch) - force).max() < 1e-9 * np.abs(force).max()
     assert abs(touch.moment((0, 0)) - alone.moment((0, 0)))[0] < 1e-9 * np.abs(force).max()
     same_run(outcome(problem), outcome(other), 1e-9)
+
+
+@pytest.mark.mpi
+def test_ranks_without_facets_of_a_body_take_part():
+    def pressed(comm):
+        def tags(a, b):
+            foot = scenes.facet_tags(a, lambda x: np.isclose(x[1], 1.0) & (x[0] < 0.33))
+            return [foot, scenes.facet_tags(b, scenes.at(1, 1.0))]
+
+        problem, touch, path = two(comm=comm, tags_of=tags)
+        problem.solve(2, update=lambda t: path(0.25 * t))
+        return problem.reaction(touch), comm.allgather(len(touch.points))
+
+    force, points = pressed(WORLD)
+    alone, _ = pressed(scenes.MPI.COMM_SELF)
+    assert np.abs(force - alone).max() < 1e-9 * np.abs(alone).max() and 0 in points
 
 
 def test_a_step_that_fails_leaves_everything_as_it_was():
