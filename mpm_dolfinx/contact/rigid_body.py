@@ -54,6 +54,9 @@ LOOSE = 1e-11
 NEAR, LEAST = 1e-7, 8.0
 #: Most that a body turns in one iteration.
 MOST_TURN = 0.5
+#: Drag on a body that creeps to its balance, over the largest stiffness, to begin with; by how much
+#: it changes in an iteration at most, down and up; and how much larger the residual may become.
+DRAG, FADES, RISES, GROWS = 0.1, 0.25, 4.0, 2.0
 
 
 class Balance(NamedTuple):
@@ -312,10 +315,13 @@ class RigidBody(Term):
         enough = AT_ROUND_OFF * size + float(total[-1])
         return Balance(inertial + total[:-2] - given, size, enough, state)
 
+    def _scale(self) -> NDArray[np.float64]:
+        """Return 1 for forces, and for moments the length over which they are compared."""
+        return np.where(np.arange(len(self._held)) < self.shape.dim, 1.0, self._lever)
+
     def _levelled(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return forces, and moments over the length that they are compared by."""
-        gdim = self.shape.dim
-        return np.concatenate([forces[:gdim], forces[gdim:] / self._lever])
+        return forces / self._scale()
 
     def _slopes(
         self, state: State, theta: NDArray[np.float64], on_nodes: bool
@@ -337,7 +343,7 @@ class RigidBody(Term):
         Nothing is in the rows of what is fixed. Directions without any stiffness are left out.
         """
         free = ~self._held
-        scale = np.where(np.arange(len(K)) < self.shape.dim, 1.0, self._lever)[free]
+        scale = self._scale()[free]
         A = K[np.ix_(free, free)] / scale[:, None] / scale
         U, sizes, V = np.linalg.svd(A)
         kept = sizes > LOOSE * sizes.max(initial=0.0) if sizes.max(initial=0.0) > 0.0 else sizes > 0
@@ -356,14 +362,59 @@ class RigidBody(Term):
             assert self._condensed is not None
             starts = [*self._condensed.followed(), self._found, *starts]
         failure: MPMError | None = None
-        for s in starts:
-            try:
-                self._find(s)
-                self._begins = False
-                return None
-            except MPMError as error:
-                failure = error
+        # (later a shorter iteration of all unknowns finds it in fewer of them)
+        for creeps in (False, True)[: 2 if self._begins else 1]:
+            for s in starts:
+                try:
+                    self._find(self._crept(s) if creeps else s)
+                    self._begins = False
+                    return None
+                except MPMError as error:
+                    failure = error
         return failure
+
+    def _crept(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where the body creeps to from some step of it, against a drag that fades.
+
+        Where points come to touch and lift off on its way, Newton's method goes to and fro between
+        places of no balance; what creeps goes downhill (pseudo-transient continuation, the drag in
+        proportion to the residual: Kelley & Keyes 1998, SIAM J. Numer. Anal. 35, section 2.2).
+
+        Raises:
+            MPMError: It begins where nothing touches it, and finds nothing on its way (collective).
+        """
+        gdim, free = self.shape.dim, ~self._held
+        scale = self._scale()[free]
+        now = self._put(s)
+        norm, drag = self._size_of(now.residual), 0.0
+        for _ in range(MOST_ITERATIONS):
+            if norm <= now.enough:
+                break
+            K, _ = self._slopes(now.state, s[gdim:], False)
+            A = K[np.ix_(free, free)] / scale[:, None] / scale
+            drag = drag or DRAG * float(np.linalg.norm(A, 2))
+            if drag == 0.0:
+                s = self._fallen(s, -now.residual, norm / now.size)
+                now = self._put(s)
+                norm = self._size_of(now.residual)
+                continue
+            step = np.zeros_like(s)
+            A += drag * np.eye(len(A))
+            step[free] = np.linalg.solve(A, now.residual[free] / scale) / scale
+            step = self._turned_at_most(step)
+            tried = self._put(s - step)
+            if (found := self._size_of(tried.residual)) > GROWS * norm:
+                drag *= RISES
+                now = self._put(s)
+                continue
+            drag *= max(found / norm, FADES)
+            s, norm, now = s - step, found, tried
+        return s
+
+    def _turned_at_most(self, step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a step, or as much of it as the body may turn in one iteration."""
+        turn = float(np.linalg.norm(step[self.shape.dim :]))
+        return step * (min(1.0, MOST_TURN / turn) if turn > 0.0 else 1.0)
 
     def _find(self, s: NDArray[np.float64]) -> None:
         """Solve for the balance of the body from some step of it (collective).
@@ -392,9 +443,7 @@ class RigidBody(Term):
                 now = self._put(s)
                 norm = self._size_of(now.residual)
                 continue
-            step = inverse @ R
-            turn = float(np.linalg.norm(step[gdim:]))
-            step *= min(1.0, MOST_TURN / turn) if turn > 0.0 else 1.0
+            step = self._turned_at_most(inverse @ R)
             floor = norm <= now.enough
             for _ in range(1 if floor else MOST_HALVINGS):
                 tried = self._put(s - step)
@@ -410,7 +459,9 @@ class RigidBody(Term):
                 break
         if not norm <= now.enough:
             raise ConvergenceError(
-                f"The forces on a RigidBody do not balance: {norm / now.size:.1e} of them are left"
+                f"The forces on a RigidBody do not balance: {norm / now.size:.1e} of them are "
+                "left; where it slides or rolls away, hold more of it (fixed=), or give it a mass "
+                "in a DynamicProblem"
             )
         self._found, self._trial = s, now.state
 
