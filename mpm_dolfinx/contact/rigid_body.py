@@ -378,7 +378,7 @@ class RigidBody(Term):
 
         Where points come to touch and lift off on its way, Newton's method goes to and fro between
         places of no balance; what creeps goes downhill (pseudo-transient continuation, the drag in
-        proportion to the residual: Kelley & Keyes 1998, SIAM J. Numer. Anal. 35, section 2.2).
+        proportion to the residual: Kelley & Keyes 1998, SIAM J. Numer. Anal. 35).
 
         Raises:
             MPMError: It begins where nothing touches it, and finds nothing on its way (collective).

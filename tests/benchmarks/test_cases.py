@@ -23,7 +23,7 @@ LONG = {
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
     *("slope", "vertical-cut", "footing-friction", "footing-weight-rough", "footing-edge"),
     *("finer-footing", "mixed-footing"),
-    *("stiff-footing", "hertz", "hertz-penalty", "expansion-whole", "pile-deep"),
+    *("stiff-footing", "hertz", "hertz-penalty", "hertz-tets", "expansion-whole", "pile-deep"),
     *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
 }
 COMMON = {"completed", "load", "iterations", "cutbacks", "failure"}
@@ -176,6 +176,11 @@ RUNS = {
         "hertz",
         "",
         {"error_force": 0.03, "error_radius": 0.03, "error_pressure": 0.08, "iterations": 26},
+    ),
+    "hertz-tets": (
+        "hertz",
+        "--domain tet",
+        {"error_force": 0.03, "error_radius": 0.03, "error_pressure": 0.08, "iterations": 24},
     ),
     "hertz-coarse": (
         "hertz",

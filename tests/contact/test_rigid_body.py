@@ -73,7 +73,7 @@ def test_an_impact_keeps_energy_momentum_and_angular_momentum(shape, friction):
     momentum = problem.momentum + ball.momentum
     turning = problem.angular_momentum + ball.angular_momentum
     whole, pushed, before = ball.kinetic_energy, 0, ball.momentum
-    for _ in problem.steps(0.24, 0.02):
+    for _ in problem.steps(0.28, 0.02):
         assert energy(problem, ball) == pytest.approx(whole, rel=1e-10)
         assert np.abs(problem.momentum + ball.momentum - momentum).max() < 1e-12
         assert np.abs(problem.angular_momentum + ball.angular_momentum - turning).max() < 1e-12
@@ -82,21 +82,21 @@ def test_an_impact_keeps_energy_momentum_and_angular_momentum(shape, friction):
         before, pushed = ball.momentum, pushed + bool(force[1] < 0.0)
     assert pushed > 6 and not force.any()
     assert ball.velocity[1] > 0.2 and problem.momentum[1] < -0.3 * MASS
-    assert abs(ball.spin[0] - 2.0) > (0.2 if shape == "box" else 1e-6)
+    assert abs(ball.spin[0] - 2.0) > (0.1 if shape == "box" else 1e-6)
     account = problem.history.energies
     assert np.ptp([e.balance for e in account]) < 1e-12
     assert account[-1].damping > 1e-2 * whole if friction else account[-1].damping == 0.0
     assert np.mean(problem.history.iterations) < 5.0 and problem.history.cutbacks == 0
 
 
-@pytest.mark.parametrize("strength", [5.0, 50.0])
+@pytest.mark.parametrize("strength", [4.0, 50.0])
 def test_an_impact_on_metal_takes_what_yielding_takes(strength):
     # The work of a radial return, found from the plastic strains: nothing is won or lost besides,
     # neither where metal yields nor where it is struck too softly for that.
     law = VonMises(YOUNG, POISSON, yield_stress=strength, hardening=10.0)
     problem, ball = thrown("box", law=law)
     volumes, whole, taken = problem.points[0].weights.ravel(), ball.kinetic_energy, 0.0
-    for _ in problem.steps(0.24, 0.02):
+    for _ in problem.steps(0.28, 0.02):
         kappa = problem.points[0].plastic_strain().ravel()
         taken = WORLD.allreduce(float(volumes @ ((strength + 5.0 * kappa) * kappa)))
         assert energy(problem, ball) + taken == pytest.approx(whole, rel=1e-10)
