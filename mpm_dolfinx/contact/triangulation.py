@@ -444,18 +444,36 @@ def _merged(
 def _oriented(
     x: NDArray[np.float64], facets: NDArray[np.int64], outside: Any, what: str
 ) -> NDArray[np.int64]:
-    """Return facets whose normals point outwards."""
+    """Return facets whose normals point outwards.
+
+    Raises:
+        MPMError: They are no surface, or nothing tells its sides.
+    """
+    borders = _borders(x, facets, what)
+    outwards = (
+        _open_outwards(x, facets, outside, borders, what)
+        if borders
+        else _closed_outwards(x, facets, outside, what)
+    )
+    return facets if outwards else facets[:, ::-1].copy()
+
+
+def _borders(x: NDArray[np.float64], facets: NDArray[np.int64], what: str) -> int:
+    """Return how many points or edges belong to one facet only.
+
+    Raises:
+        MPMError: Some belong to more than two, or facets are turned against each other.
+    """
     dim = facets.shape[1]
+    turned = 0
     if dim == 2:
-        ends = np.bincount(facets.ravel(), minlength=len(x))
-        most, borders = int(ends.max()), int(np.count_nonzero(ends == 1))
-        turned = 0
+        count = np.bincount(facets.ravel(), minlength=len(x))
     else:
         keys, number, count = edges_of(facets)
-        most, borders = int(count.max()), int(np.count_nonzero(count == 1))
         ahead = np.where(facets == keys[number][:, :, 0], 1, -1)
         sense = np.bincount(number.ravel(), weights=ahead.ravel())
         turned = int(np.count_nonzero((count == 2) & (sense != 0.0)))
+    most = int(count.max())
     if most > 2:
         raise MPMError(
             f"{what} is none: {'a point' if dim == 2 else 'an edge'} of it belongs to {most} "
@@ -466,24 +484,44 @@ def _oriented(
             f"{what} has triangles that are turned against each other at {turned} edges; make "
             "their normals consistent, e.g. by pyvista's compute_normals(consistent_normals=True)."
         )
-    corners = x[facets]
-    if borders:
-        if outside is None:
-            raise MPMError(
-                f"{what} is open: {borders} {'ends' if dim == 2 else 'edges'} belong to one "
-                f"{'segment' if dim == 2 else 'triangle'} only; say on which side it is free by "
-                "outside=, or close it."
-            )
-        way = as_direction(outside, "outside", dim)
-        whole = _area_vectors(corners) @ way
-        if abs(whole.sum()) <= SAME * np.abs(whole).sum():
-            raise MPMError(f"outside={outside!r} does not tell the sides of the surface apart.")
-        return facets if whole.sum() > 0.0 else facets[:, ::-1].copy()
+    return int(np.count_nonzero(count == 1))
+
+
+def _open_outwards(
+    x: NDArray[np.float64], facets: NDArray[np.int64], outside: Any, borders: int, what: str
+) -> bool:
+    """Return whether the normals of an open surface point to where it is free.
+
+    Raises:
+        MPMError: Nothing tells where that is.
+    """
+    dim = facets.shape[1]
+    if outside is None:
+        raise MPMError(
+            f"{what} is open: {borders} {'ends' if dim == 2 else 'edges'} belong to one "
+            f"{'segment' if dim == 2 else 'triangle'} only; say on which side it is free by "
+            "outside=, or close it."
+        )
+    whole = _area_vectors(x[facets]) @ as_direction(outside, "outside", dim)
+    if abs(whole.sum()) <= SAME * np.abs(whole).sum():
+        raise MPMError(f"outside={outside!r} does not tell the sides of the surface apart.")
+    return bool(whole.sum() > 0.0)
+
+
+def _closed_outwards(
+    x: NDArray[np.float64], facets: NDArray[np.int64], outside: Any, what: str
+) -> bool:
+    """Return whether the normals of a closed surface point out of it.
+
+    Raises:
+        MPMError: It encloses nothing, parts are inside out, or it was told where its outside is.
+    """
     if outside is not None:
         raise MPMError(
             f"{what} is closed, and has its outside; leave outside= away (contact.cavity turns it "
             "inside out)."
         )
+    dim, corners = facets.shape[1], x[facets]
     middle = x.mean(axis=0)
     volumes = (_area_vectors(corners) * (corners[:, 0] - middle)).sum(axis=1)
     volume = volumes.sum()
@@ -496,7 +534,7 @@ def _oriented(
             "their facets round, or make them shapes of their own (a part within another one is "
             "its hole)."
         )
-    return facets if volume > 0.0 else facets[:, ::-1].copy()
+    return bool(volume > 0.0)
 
 
 def _inside_out(
