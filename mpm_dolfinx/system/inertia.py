@@ -593,47 +593,9 @@ class Inertia(Term):
     def commit(self) -> Callable[[], None]:
         """See :meth:`Term.commit`: take the new velocities, forces and energies."""
         undo = self._undo()
-        if self.scheme == "euler":
-            taken = [v.duplicate() for v in self._v]
-            factor = 1.0
-            for v in taken:
-                v.set(0.0)
-        else:
-            taken = self._projected if self.out_of_range == "project" else self._v
-            factor = 2.0
-        lost = [v.copy() for v in self._v]
-        new = [w.copy() for w in self._w]
-        for body, v, before, out in zip(self.bodies, new, taken, lost, strict=True):
-            still = self.is_static(body)
-            v.scale((1.0 if still else factor) / self.dt)
-            if not still:
-                v.axpy(-1.0, before)
-            out.axpy(-1.0, v if self.scheme == "euler" else before)
-        out_of_range = self._times_mass(lost)
-        loss = 0.5 * _dot(lost, out_of_range)
-        if self.scheme != "euler":
-            loss -= _dot(new, out_of_range)
-        damped = self._damping / self.dt * _dot(self._w, self._times_mass(self._w))
+        new, lost = self._new_velocities()
         kinetic = 0.5 * _dot(new, self._times_mass(new))
-        on_background, prescribed, left = self.share * self._followed.works()
-        whole, resisted = np.sum([term.step_work() for term in self._others], axis=0)
-        parts = [self._forces, self._external]
-        before = [self._vectors(functions) for functions in parts]
-        self._note_forces(balanced=True)
-        begin, end = (0.0, 1.0) if self.scheme == "euler" else (0.5, 0.5)
-        ends, loads = (
-            begin * _dot(self._w, old) + end * _dot(self._w, self._vectors(functions))
-            for old, functions in zip(before, parts, strict=True)
-        )
-        works = {
-            "internal": ends - loads + whole,
-            "external": -loads,
-            "lost": loss,
-            "damping": damped + resisted,
-            "stabilisation": on_background,
-            "prescribed": prescribed,
-            "residual": -left,
-        }
+        works = self._works_of_step(self._kinetic_loss(new, lost))
         if self._present_deleted() != self._deleted:
             # Forces of particles that the step's end has deleted are in its balance, but gone now.
             used = sum(work for name, work in works.items() if name not in GIVEN)
@@ -651,6 +613,64 @@ class Inertia(Term):
         self.settle()
         self._note_energy()
         return undo
+
+    def _new_velocities(self) -> tuple[list[PETSc.Vec], list[PETSc.Vec]]:
+        """Return the velocities at the step's end, and what of those before it they have lost."""
+        if self.scheme == "euler":
+            taken = [v.duplicate() for v in self._v]
+            factor = 1.0
+            for v in taken:
+                v.set(0.0)
+        else:
+            taken = self._projected if self.out_of_range == "project" else self._v
+            factor = 2.0
+        lost = [v.copy() for v in self._v]
+        new = [w.copy() for w in self._w]
+        for body, v, before, out in zip(self.bodies, new, taken, lost, strict=True):
+            still = self.is_static(body)
+            v.scale((1.0 if still else factor) / self.dt)
+            if not still:
+                v.axpy(-1.0, before)
+            out.axpy(-1.0, v if self.scheme == "euler" else before)
+        return new, lost
+
+    def _kinetic_loss(self, new: list[PETSc.Vec], lost: list[PETSc.Vec]) -> float:
+        """Return the kinetic energy that the step's velocities have lost.
+
+        Args:
+            new: Velocities at the step's end.
+            lost: What of those before it they have lost.
+        """
+        out_of_range = self._times_mass(lost)
+        loss = 0.5 * _dot(lost, out_of_range)
+        return loss if self.scheme == "euler" else loss - _dot(new, out_of_range)
+
+    def _works_of_step(self, loss: float) -> dict[str, float]:
+        """Return the works of the step by name, and note the forces at its end.
+
+        Args:
+            loss: Kinetic energy that its velocities have lost.
+        """
+        damped = self._damping / self.dt * _dot(self._w, self._times_mass(self._w))
+        on_background, prescribed, left = self.share * self._followed.works()
+        whole, resisted = np.sum([term.step_work() for term in self._others], axis=0)
+        parts = [self._forces, self._external]
+        before = [self._vectors(functions) for functions in parts]
+        self._note_forces(balanced=True)
+        begin, end = (0.0, 1.0) if self.scheme == "euler" else (0.5, 0.5)
+        ends, loads = (
+            begin * _dot(self._w, old) + end * _dot(self._w, self._vectors(functions))
+            for old, functions in zip(before, parts, strict=True)
+        )
+        return {
+            "internal": ends - loads + whole,
+            "external": -loads,
+            "lost": loss,
+            "damping": damped + resisted,
+            "stabilisation": on_background,
+            "prescribed": prescribed,
+            "residual": -left,
+        }
 
     def _undo(self) -> Callable[[], None]:
         """Return what takes a commit back."""
