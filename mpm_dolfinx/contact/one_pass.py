@@ -615,7 +615,7 @@ class Pass:
         at = near.find(memory.facet)
         # (one beside a thin body may have been behind its far side already)
         before = np.isfinite(memory.gap) & (memory.gap > -0.25 * self.reach)
-        was = np.flatnonzero((at >= 0) & before & (self._weights > 0.0))
+        was = np.flatnonzero((at >= 0) & before & ~found.near & (self._weights > 0.0))
         if len(was) == 0:
             return False
         X = self._nodes[at[was]]
@@ -624,7 +624,7 @@ class Pass:
         r, n = separated(near.tabulate(inner), x[was], X, near.outward[at[was]])
         deep = (r * n).sum(axis=1) < -0.75 * self.reach
         beside = np.linalg.norm(s - inner, axis=1) > 0.5
-        return bool(np.any(deep & ~beside & ~found.near[was]))
+        return bool(np.any(deep & ~beside))
 
     def _near_place(self, x: NDArray[np.float64], X: NDArray[np.float64]) -> NDArray[np.float64]:
         assert self._near is not None

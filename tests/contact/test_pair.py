@@ -286,6 +286,31 @@ def test_ranks_without_facets_of_a_body_take_part():
     assert np.abs(force - alone).max() < 1e-9 * np.abs(alone).max() and 0 in points
 
 
+def test_a_step_through_the_other_body_is_refused():
+    Va, Vb = spaces([-0.5, -0.5], [1.5, 2.0], [8, 10])
+    upper = scenes.box([0.3, 1.02], [0.7, 1.42], [4, 4], QUADRILATERAL)
+    lower = scenes.box([0.0, 0.5], [1.0, 1.0], [8, 4], QUADRILATERAL)
+    a, b = mpm.Particles(upper, Va), mpm.Particles(lower, Vb)
+    way = fem.Constant(Va.mesh, np.zeros(2))
+    base = fem.locate_dofs_geometrical(Vb, lambda x: x[1] < 0.6)
+    problem = mpm.QuasiStaticProblem(
+        [a, b],
+        Hencky(YOUNG, POISSON),
+        bcs=[
+            fem.dirichletbc(way, fem.locate_dofs_geometrical(Va, lambda x: x[1] > -1.0), Va),
+            fem.dirichletbc(np.zeros(2), base, Vb),
+        ],
+        terms=[touch := contact.Pair(a, b)],
+    )
+    way.value[1] = -1.2  # it comes out below, and touches nothing there
+    with pytest.raises(mpm.ConvergenceError, match="goes through the other one"):
+        problem.step()
+    assert scenes.largest(a.displacement.x.array) == 0.0
+    way.value[1] = -0.03
+    problem.step()
+    assert touch.reaction[1] > 0.0
+
+
 def test_a_step_that_fails_leaves_everything_as_it_was():
     problem, touch, path = two()
     steps = problem.steps(8, update=path)
