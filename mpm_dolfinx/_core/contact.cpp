@@ -50,6 +50,19 @@ struct Foot
   bool inside, slips;
 };
 
+// That of the gap, or of a traction of the body that presses, but for what gap is left.
+template <typename T, int dim>
+T pressure_of(const Foot<T, dim>& foot, const core::Meeting& m, std::size_t p)
+{
+  const double k = m.stiffness[p];
+  T pressure = T(-k * foot.gap);
+  if (!m.behind)
+    return foot.inside ? pressure : T(0.0);
+  for (int i = 0; i < dim; ++i)
+    pressure = pressure + m.behind[p * dim + i] * foot.n[i];
+  return value_of(pressure) >= -k * m.touch ? pressure : T(0.0);
+}
+
 template <typename T, int dim, int bends>
 Foot<T, dim> foot_of(const Ways<T, dim, bends>& ways, const core::Meeting& m, std::size_t p)
 {
@@ -99,7 +112,8 @@ Foot<T, dim> foot_of(const Ways<T, dim, bends>& ways, const core::Meeting& m, st
   const double gap = value_of(foot.gap);
   foot.inside = gap <= m.touch;
   foot.slips = false;
-  foot.pressure = foot.inside ? T(-m.stiffness[p] * foot.gap) : T(0.0);
+  foot.pressure = pressure_of<T, dim>(foot, m, p);
+  foot.inside = foot.inside || value_of(foot.pressure) != 0.0;
   if (m.smooth || !foot.inside)
     return foot;
   // The share of its way that a point has touched, and the shear where all stick.

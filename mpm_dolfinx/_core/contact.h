@@ -21,6 +21,7 @@ struct Meeting
   const double *stiffness, *tangential;
   const std::uint8_t* touched;
   const double *gap, *stretch; // at the last converged step; of areas
+  const double* behind;        // tractions (points, dim) that press, or null
   double friction, cohesion, limit, touch;
   bool smooth; // whether there is no friction
 };

@@ -64,7 +64,7 @@ Meeting meeting_of(const Reals& x, const std::vector<Reals>& tables,
                    const std::vector<double>& law, bool smooth)
 {
   require(x.ndim() == 3 && (x.shape(2) == 2 || x.shape(2) == 3), "places (n, count, 2 or 3)");
-  require(tables.size() == 4 && points.size() == 5 && law.size() == 4, "tables, points and law");
+  require(tables.size() == 4 && points.size() == 6 && law.size() == 4, "tables, points and law");
   const std::size_t n = x.shape(0), sides = x.shape(2) - 1;
   require(tables[0].ndim() == 2, "shape functions (n, nodes)");
   const std::size_t nodes = tables[0].shape(1);
@@ -72,8 +72,10 @@ Meeting meeting_of(const Reals& x, const std::vector<Reals>& tables,
               && tables[2].size() == n * sides * sides * nodes && tables[3].size() == n * nodes,
           "shape functions with first and second derivatives, and those of anchors");
   require(x.shape(1) == 1 + (smooth ? nodes : 2 * nodes), "places of a point, nodes and anchors");
-  for (const Reals& values : points)
-    require(values.size() == n, "values (n,)");
+  for (std::size_t i = 0; i < 5; ++i)
+    require(points[i].size() == n, "values (n,)");
+  const Reals& behind = points[5];
+  require(behind.size() == 0 || behind.size() == n * x.shape(2), "tractions (n, dim) or none");
   require(touched.size() == n, "touched (n,)");
   return {n,
           static_cast<int>(x.shape(1)),
@@ -89,6 +91,7 @@ Meeting meeting_of(const Reals& x, const std::vector<Reals>& tables,
           touched.data(),
           points[3].data(),
           points[4].data(),
+          behind.size() == 0 ? nullptr : behind.data(),
           law[0],
           law[1],
           law[2],

@@ -14,23 +14,19 @@ taken at the points of a facet.
 from __future__ import annotations
 
 from itertools import product
-from typing import Any
-
-from petsc4py import PETSc
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 import basix
 
-from .. import _compat
-from ..assembly.petsc import MatrixSum
 from ..constitutive.averaging import VolumeAveraging
 from ..meshes.quadrature import quadrature_rule
 from ..system.term import PointMaterial
-from .surface import Surface, global_dofs
+from .surface import Surface
 
-__all__ = ["Behind", "ThroughGroups", "extrapolation"]
+__all__ = ["At", "Behind", "extrapolation"]
 
 type Array = NDArray[np.float64]
 
@@ -65,6 +61,20 @@ def extrapolation(cell: basix.CellType, points: Array, places: Array, degree: in
     return np.full((len(places), len(points)), 1.0 / len(points))
 
 
+class At(NamedTuple):
+    """Points on facets, and a direction at each.
+
+    Attributes:
+        facets: Numbers of their facets, shape ``(n,)``.
+        places: Numbers of the points on these, shape ``(n,)``.
+        along: The directions, shape ``(n, gdim)``.
+    """
+
+    facets: NDArray[np.int64]
+    places: NDArray[np.int64]
+    along: Array
+
+
 class Behind:
     """Tractions ``P N`` at the points of a surface by the stress of the domains behind it.
 
@@ -72,13 +82,18 @@ class Behind:
 
     Args:
         surface: The surface, settled on the present mesh.
+
+    Attributes:
+        surface: As given.
+        nodes: Local nodes of W of the domain behind each facet, shape ``(m, k)``.
     """
 
     def __init__(self, surface: Surface) -> None:
         particles = surface.particles
         body = particles.mesh
         cell, gdim = body.basix_cell(), surface.gdim
-        self._surface, self._cells = surface, surface.cells
+        self.surface = surface
+        self._cells = surface.cells
         self.nodes: NDArray[np.int64] = particles.domain_nodes[surface.cells].astype(np.int64)
         rule, _ = quadrature_rule(cell, particles.quadrature_degree)
         degree = int(particles.W.ufl_element().degree)
@@ -97,121 +112,68 @@ class Behind:
             turned *= (taken[cut] / np.linalg.det(G)[:, None])[:, :, :, None]
             self._weights[cut] = turned * surface.mesh_area_ratio[cut, :, None, None]
 
-    def tractions(self, stress: PointMaterial) -> Array:
-        """Return the tractions, shape ``(m, nq, gdim)``."""
-        P = self._of_cells(stress.first_piola)
-        return np.asarray(np.einsum("mpiJ,mqpJ->mqi", P, self._weights))
+    def tractions(self, stress: PointMaterial, which: NDArray[Any] | None = None) -> Array:
+        """Return the tractions, shape ``(m, nq, gdim)``.
 
-    def _of_cells(self, values: Array) -> Array:
-        """Return values at all points at those behind the facets, in the body's dimensions."""
-        count, gdim = self._weights.shape[2], self._surface.gdim
+        Args:
+            stress: The stress.
+            which: Numbers of the facets; ``None``: all.
+        """
+        chosen = slice(None) if which is None else which
+        P = self._of_cells(stress.first_piola, self._cells[chosen])
+        return np.asarray(np.einsum("mpiJ,mqpJ->mqi", P, self._weights[chosen]))
+
+    def _of_cells(self, values: Array, cells: NDArray[Any]) -> Array:
+        """Return values at all points at those of some cells, in the body's dimensions."""
+        count, gdim = self._weights.shape[2], self.surface.gdim
         dim = values.shape[-1]
-        found = values.reshape(-1, count, *values.shape[1:])[self._cells]
+        found = values.reshape(-1, count, *values.shape[1:])[cells]
         if dim == gdim:
             return np.asarray(found)
         return np.asarray(found[:, :, :gdim, :gdim])
 
-    def slopes(self, stress: PointMaterial, along: Array, which: NDArray[np.integer[Any]]) -> Array:
+    def slopes(self, stress: PointMaterial, at: At) -> Array:
         """Return the derivatives of tractions in some directions by the domains' nodes.
 
         Without what F-bar has from other points of a group.
 
         Args:
             stress: The stress.
-            along: Directions, shape ``(f, nq, gdim)``.
-            which: Numbers of the facets, shape ``(f,)``.
+            at: Points and directions.
 
         Returns:
-            Shape ``(f, nq, k, gdim)``.
+            Shape ``(n, k gdim)``.
         """
-        gdim, cells, M = self._surface.gdim, self._cells[which], self._weights[which]
+        gdim, nq = self.surface.gdim, self.surface.nq
+        which, facet = np.unique(at.facets, return_inverse=True)
+        along = np.zeros((len(which), nq, gdim))
+        along[facet, at.places] = at.along
+        cells, M = self._cells[which], self._weights[which]
         A = stress.tangent.reshape(-1, M.shape[2], *stress.tangent.shape[1:])[cells]
         change = np.einsum("fqi,fqpJ,fpiJkL->fqpkL", along, M, A[:, :, :gdim, :gdim], optimize=True)
-        gradients = self._surface.particles.quadrature.gradients[cells]
+        gradients = self.surface.particles.quadrature.gradients[cells]
         slopes = np.einsum("fqpkL,fpaL->fqak", change[..., :gdim, :gdim], gradients, optimize=True)
         if stress.hoop is not None:
             slopes[..., 0] += np.einsum("fqp,fpa->fqa", change[..., 2, 2], stress.hoop[cells])
-        return np.asarray(slopes)
+        return np.asarray(slopes[facet, at.places].reshape(len(facet), slopes.shape[2] * gdim))
 
-    def through_groups(self, averaging: VolumeAveraging, along: Array) -> tuple[Array, Array]:
+    def through_groups(self, averaging: VolumeAveraging, at: At) -> tuple[Array, Array]:
         """Return by how much tractions in some directions grow with what is summed over groups.
 
         Args:
             averaging: F-bar.
-            along: Directions at all points, shape ``(m, nq, gdim)``.
+            at: Points and directions.
 
         Returns:
             Factors of the sums of ``gamma : dF`` and of ``right : dF`` (:class:`GroupedTangent`),
-            each of shape ``(m, nq)``.
+            each of shape ``(n,)``.
         """
         h, gamma, left, _ = averaging.grouped_tangent()
-        whole = h[self._cells][:, None, None, None] * gamma[self._cells] + left[self._cells]
-        gdim = self._surface.gdim
+        cells, weights = self._cells[at.facets], self._weights[at.facets, at.places]
+        whole = h[cells][:, None, None, None] * gamma[cells] + left[cells]
+        gdim = self.surface.gdim
         first, second = (
-            np.einsum("mqi,mqpJ,mpiJ->mq", along, self._weights, part, optimize=True)
-            for part in (whole[:, :, :gdim, :gdim], gamma[self._cells][:, :, :gdim, :gdim])
+            np.einsum("ni,npJ,npiJ->n", at.along, weights, part[:, :, :gdim, :gdim], optimize=True)
+            for part in (whole, gamma[cells])
         )
         return first, second
-
-
-class ThroughGroups:
-    """What tractions of contact have from all points of the groups of F-bar, as a tangent on W.
-
-    Args:
-        behind: The stress behind the facets.
-        surface: The surface of these.
-        averaging: F-bar.
-    """
-
-    def __init__(self, behind: Behind, surface: Surface, averaging: VolumeAveraging) -> None:
-        self._behind, self._surface, self._averaging = behind, surface, averaging
-        particles = surface.particles
-        number = averaging.groups.number
-        self._left = [self._empty(number[surface.cells], surface.nodes) for _ in range(2)]
-        self._right = [self._empty(number, particles.domain_nodes) for _ in range(2)]
-        self._products: list[PETSc.Mat | None] = [None, None]
-        self._total = MatrixSum()
-
-    def _empty(self, groups: NDArray[np.int64], nodes: NDArray[Any]) -> PETSc.Mat:
-        """Return a matrix with a row for each group and the dofs of W as columns (collective).
-
-        Args:
-            groups: Groups of some cells, shape ``(m,)``.
-            nodes: Their nodes with entries, shape ``(m, k)``.
-        """
-        W = self._surface.particles.W
-        layout, gdim = W.dofmap.index_map, W.dofmap.index_map_bs
-        dofs = global_dofs(W, nodes.astype(np.int64))
-        rows = np.repeat(groups, dofs.shape[1])
-        matrix = PETSc.Mat().create(comm=W.mesh.comm)
-        every = self._averaging.groups
-        columns = (layout.size_local * gdim, layout.size_global * gdim)
-        matrix.setSizes(((every.owned, every.count), columns))
-        matrix.setType("aij")
-        places = (part.ravel().astype(PETSc.IntType) for part in (rows, dofs))
-        _compat.set_entry_places(matrix, *places)
-        return matrix
-
-    def added_to(self, K: PETSc.Mat, along: Array, forces: Array) -> PETSc.Mat:
-        """Return K on W plus the part, the same object for the same K (collective).
-
-        Args:
-            K: The rest of the tangent.
-            along: Directions in which tractions of the stress act, shape ``(m, nq, gdim)``.
-            forces: What residuals have by a unit of these, of the same shape.
-        """
-        _, gamma, _, right = self._averaging.grouped_tangent()
-        factors = self._behind.through_groups(self._averaging, along)
-        shapes = self._surface.shapes
-        for matrix, factor in zip(self._left, factors, strict=True):
-            nodal = np.einsum("qa,mqi->mai", shapes, factor[:, :, None] * forces)
-            _compat.set_entries(matrix, np.ascontiguousarray(nodal).ravel())
-        for matrix, part in zip(self._right, (gamma, right), strict=True):
-            nodal = self._averaging.nodal(part)
-            _compat.set_entries(matrix, np.ascontiguousarray(nodal).ravel())
-        products = [
-            left.transposeMatMult(other, result=result)
-            for left, other, result in zip(self._left, self._right, self._products, strict=True)
-        ]
-        self._products = list(products)
-        return self._total.of([K, *products])

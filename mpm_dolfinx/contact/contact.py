@@ -18,11 +18,15 @@ from ..errors import MPMError, agree
 from ..io.snapshot import Kept, Taken
 from ..meshes.remesh import Column
 from ..particles.particles import Particles
+from ..reals import is_one_of
 from ..system.term import PointMaterial, Term
 from .law import Coulomb
 from .surface import Surface
 
 __all__ = ["Contact", "Outcome", "stiffness"]
+
+#: What the pressure is made of.
+LAWS = ("penalty", "nitsche")
 
 
 @dataclass(frozen=True)
@@ -53,10 +57,19 @@ class Contact(Term):
         bodies: The bodies.
         friction: The law of friction.
         axisymmetric: Whether ``x[0]`` is a radius.
+        law: What the pressure is made of.
+
+    Raises:
+        MPMError: There is no such law.
     """
 
-    def __init__(self, bodies: Sequence[Particles], friction: Coulomb, axisymmetric: bool) -> None:
+    def __init__(
+        self, bodies: Sequence[Particles], friction: Coulomb, axisymmetric: bool, law: str
+    ) -> None:
+        if not is_one_of(law, LAWS):
+            raise MPMError(f"law must be one of {', '.join(map(repr, LAWS))}, not {law!r}.")
         super().__init__(bodies)
+        self._nitsche = law == "nitsche"
         self.friction = friction
         self.axisymmetric = axisymmetric
         self._materials: Sequence[PointMaterial | None] = [None] * len(self.bodies)
@@ -80,7 +93,12 @@ class Contact(Term):
     @property
     def symmetric(self) -> bool:
         """See :attr:`Term.symmetric`."""
-        return self.friction.smooth and not self._of_step
+        return self.friction.smooth and not self._of_step and not self._nitsche
+
+    @property
+    def takes_stress(self) -> bool:
+        """See :attr:`Term.takes_stress`."""
+        return self._nitsche
 
     @property
     def one_sided(self) -> bool:
@@ -95,7 +113,17 @@ class Contact(Term):
         return self._share < 1.0
 
     def pace(self, dt: float, share: float) -> None:
-        """See :meth:`Term.pace`: where others take means of forces, contact has one of the step."""
+        """See :meth:`Term.pace`: where others take means of forces, contact has one of the step.
+
+        Raises:
+            MPMError: The forces of the scheme are no ones of a step's end, where those of the
+                stress are.
+        """
+        if self._nitsche and share < 1.0:
+            raise MPMError(
+                f"law='nitsche' of a {type(self).__name__} has forces of a step's end, and would "
+                "add energy with each impact in this scheme; use scheme='euler', or law='penalty'."
+            )
         self._share = share
 
     def end_forces(self) -> Sequence[PETSc.Vec]:

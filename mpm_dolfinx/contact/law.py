@@ -176,7 +176,7 @@ def nitsche(
     if H is not None:
         slope = np.einsum("nij,ni->nj", H, behind) - points.stiffness[:, None] * n
         slope = np.where(acts[:, None], slope, 0.0)
-    return Push(np.where(p.real > 0.0, p, 0.0), acts, slope)
+    return Push(np.where(acts, p, 0.0), acts, slope)
 
 
 def _since_touch(

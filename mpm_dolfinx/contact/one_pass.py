@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
@@ -16,11 +17,13 @@ from numpy.typing import NDArray
 import basix
 
 from .. import _compat
+from .behind import At
 from .contact import Outcome
 from .facets import Closest, NearFacets, separated
 from .law import Coulomb, Points
+from .nitsche import Nitsche, Spread
 from .pair_matrices import Met
-from .stencil import Foot, Start, Stencil, Sums, acting_now, add_tangents, projected
+from .stencil import Foot, Start, Stencil, Sums, acting_now, add_tangents, by_stress, projected
 from .surface import Surface, global_nodes
 
 __all__ = ["Memory", "Pass"]
@@ -84,6 +87,7 @@ class Pass:
     Attributes:
         share: Share of what both passes bear.
         of_step: Whether forces are those of whole steps of a motion.
+        stress: The stress behind the points, where that presses.
         memory: What is known of all points.
         outcome: What acted on all points at the last converged step.
         learned: How often it has learned of other facets.
@@ -104,6 +108,7 @@ class Pass:
         self.memory: Memory | None = None
         self.stencil: Stencil | None = None
         self.of_step = False
+        self.stress: Nitsche | None = None
         self.works = (0.0, 0.0)
         self.learned = 0
         self._near: NearFacets | None = None
@@ -305,6 +310,13 @@ class Pass:
         within = found.near & (gap <= self.touch) & borne
         inside = pressed = within
         self._within, self._offset = within, np.zeros(len(x))
+        self._behind: NDArray[np.float64] | None = None
+        if self.stress is not None:
+            self._behind = self.share * self._flat(self.stress.tractions(self._facets))
+            # as far as it may press
+            k = self._penalties[0] * np.repeat(self._stiffness[self._facets], self.source.nq)
+            reach = self.touch + np.linalg.norm(self._behind, axis=1) / k
+            pressed = found.near & (found.gap <= reach) & borne
         if self.of_step:
             found, inside, pressed = self._over_step(found, within, x, nodes)
             pressed &= borne
@@ -316,6 +328,9 @@ class Pass:
         pushes, rubs, acts = acting_now(self.law, self.stencil, self.touch, self.target.extent)
         both = pushes + rubs
         force[which], pressure[which], slips[which] = both[:, 0], acts.pressure, acts.slips
+        if self._behind is not None:
+            inside = within.copy()
+            inside[which] = acts.inside
         self.reaction = both[:, 1:]
         self.shear = acts.shear
         if self.stencil.start is not None:
@@ -474,6 +489,7 @@ class Pass:
             points,
             near.outward[facet],
             start,
+            None if self._behind is None else self._behind[which],
         )
 
     def forces(self) -> tuple[PETSc.Vec, PETSc.Vec]:
@@ -523,6 +539,23 @@ class Pass:
             values,
         )
         add_tangents(self.law, self.stencil, self.touch, self.target.extent, sums)
+
+    def by_stress(self, factor: float) -> tuple[At, Sequence[Spread]]:
+        """Return points with normals, and how forces on both bodies grow with the stress behind.
+
+        Args:
+            factor: As for :meth:`add_tangents`.
+        """
+        near, source = self._near, self.source
+        assert near is not None and self.stencil is not None
+        which = self.stencil.which
+        normals, forces = by_stress(self.law, self.stencil, self.touch)
+        w = -factor * self.share * self._weights[which]
+        forces = w[:, None, None] * forces
+        at = At(self._facets[which // source.nq], which % source.nq, normals)
+        numbers, dofs = near.number[self._facet], near.dofs[self._facet]
+        others = Spread.over_met(at, numbers, dofs, forces[:, 1:], len(source.cells))
+        return at, [Spread.over_facets(source, at, forces[:, 0]), others]
 
     # -- The next step --------------------------------------------------------------------------
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from dolfinx import mesh
 
+from ..assembly.petsc import MatrixSum
 from ..errors import ConvergenceError, MPMError, agree, agreed
 from ..io.snapshot import Taken
 from ..meshes.remesh import Column
@@ -29,6 +30,7 @@ from ..particles.particles import Particles
 from ..system.term import PointMaterial
 from .contact import Contact, Outcome, stiffness
 from .law import Coulomb, as_friction
+from .nitsche import Nitsche, require_stress
 from .one_pass import Pass
 from .pair_matrices import PairMatrices
 from .shapes import as_positive
@@ -67,6 +69,7 @@ class Pair(Contact):
         quadrature_degree: Degree of the rule on each facet; ``None`` is 9 in the plane and 5 in
             space, since the facets on the other side have kinks.
         axisymmetric: As there.
+        law: As there: with ``"nitsche"`` each pass takes the stress of its own points' body.
 
     Raises:
         MPMError: What makes no sense.
@@ -86,6 +89,7 @@ class Pair(Contact):
         tangential_penalty: float = 1.0,
         quadrature_degree: int | None = None,
         axisymmetric: bool = False,
+        law: str = "penalty",
     ) -> None:
         for body in (a, b):
             if not isinstance(body, Particles):
@@ -106,10 +110,10 @@ class Pair(Contact):
         for name, value in (("facet_tags", facet_tags), ("tags", tags), ("moduli", moduli)):
             if not isinstance(value, list | tuple) or len(value) != 2:
                 raise MPMError(f"{name} of a Pair must be two, one for each body, not {value!r}.")
-        law = as_friction(friction)
+        rubs = as_friction(friction)
         require_same(
             a.mesh.comm,
-            friction=[law.friction, law.cohesion, law.limit],
+            friction=[rubs.friction, rubs.cohesion, rubs.limit],
             tags=list(tags),
             moduli=list(moduli),
             passes=passes,
@@ -117,8 +121,9 @@ class Pair(Contact):
             tangential_penalty=tangential_penalty,
             quadrature_degree=quadrature_degree,
             axisymmetric=axisymmetric,
+            law=law,
         )
-        super().__init__([a, b], law, axisymmetric)
+        super().__init__([a, b], rubs, axisymmetric, law)
         self._moduli = [None if m is None else as_positive(m, "modulus") for m in moduli]
         penalties = (
             as_positive(penalty, "penalty"),
@@ -130,7 +135,7 @@ class Pair(Contact):
             for body, some, tag in zip((a, b), facet_tags, tags, strict=True)
         ]
         self._passes = [
-            Pass(self._surfaces[i], self._surfaces[1 - i], law, penalties) for i in range(passes)
+            Pass(self._surfaces[i], self._surfaces[1 - i], rubs, penalties) for i in range(passes)
         ]
         self._made, self._begins = False, True
 
@@ -144,8 +149,12 @@ class Pair(Contact):
     ) -> None:
         """See :meth:`Term.take_part`."""
         super().take_part(number, bodies, materials)
+        if self._nitsche:
+            for material, _ in zip(self._materials, self._passes, strict=False):
+                require_stress(material, "a Pair")
         first = not self._made
         self._settle()
+        self._take_stress()
         if first:
             self._require_apart()
 
@@ -165,7 +174,19 @@ class Pair(Contact):
             each.settle(k[i], k[1 - i], shares[i])
             each.begin_anew()
         self._made = True
+        self._take_stress()
         self._new_pattern()
+
+    def _take_stress(self) -> None:
+        """Take the stress behind the points of each pass, where the pressure is that."""
+        if not self._nitsche:
+            return
+        spaces = [body.W for body in self.bodies]
+        for each, material in zip(self._passes, self._materials, strict=False):
+            assert material is not None
+            each.stress = Nitsche(each.source, material, spaces)
+            spaces = spaces[::-1]
+        self._begins = True
 
     def _shares(self) -> list[float]:
         """Return what each pass bears (collective).
@@ -186,7 +207,11 @@ class Pair(Contact):
 
     def _new_pattern(self) -> None:
         self._matrices = PairMatrices([body.W for body in self.bodies])
+        self._sums = {(i, j): MatrixSum() for i in (0, 1) for j in (0, 1)}
         self._learned = [each.learned for each in self._passes]
+        for each in self._passes:
+            if each.stress is not None:
+                each.stress.new_pattern()
 
     def _require_apart(self) -> None:
         for each in self._passes:
@@ -262,7 +287,14 @@ class Pair(Contact):
         groups = self._matrices.groups([each.met() for each in self._passes])
         for each, (group, positions) in zip(self._passes, groups, strict=True):
             each.add_tangents(1.0 / self._share, group, positions, self._matrices.values)
-        return self._matrices.assembled()
+        found = {place: [K] for place, K in self._matrices.assembled().items()}
+        for own, each in enumerate(self._passes):
+            if each.stress is not None:
+                parts = each.stress.tangents(*each.by_stress(1.0 / self._share))
+                for row, K in enumerate(parts if own == 0 else parts[::-1]):
+                    if K is not None:
+                        found.setdefault((row, own), []).append(K)
+        return {place: self._sums[place].of(parts) for place, parts in found.items()}
 
     # -- What it remembers ----------------------------------------------------------------------
 

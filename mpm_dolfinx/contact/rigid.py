@@ -15,17 +15,19 @@ from numpy.typing import NDArray
 
 from dolfinx import mesh
 
+from ..assembly.petsc import MatrixSum
 from ..errors import ConvergenceError, MPMError, agree, agreed
 from ..io.snapshot import Taken
 from ..meshes.remesh import Column
 from ..parallel.given import require_same
 from ..particles.particles import Particles
-from ..reals import as_reals, is_one_of
+from ..reals import as_reals
 from ..system.term import PointMaterial
+from .behind import At
 from .contact import Contact, Outcome, stiffness
 from .law import Coulomb, as_friction
 from .memory import Memory
-from .nitsche import Nitsche
+from .nitsche import Nitsche, Spread, require_stress
 from .obstacle_tractions import ObstacleTractions
 from .placed import Placed, framed, placed
 from .reach import Reach, is_near
@@ -36,8 +38,6 @@ from .ways import OPPOSITE, passes
 
 __all__ = ["Rigid"]
 
-#: What the pressure is made of.
-LAWS = ("penalty", "nitsche")
 #: Penetration, over the thickness of the domain behind, of a body that is given in an obstacle.
 OVERLAP = 0.1
 #: Most points of each rank at which the shapes of ranks are compared.
@@ -108,8 +108,6 @@ class Rigid(Contact):
         if shape.dim != gdim:
             raise MPMError(f"The shape is one in {shape.dim} dimensions, the body in {gdim}.")
         rubs = as_friction(friction)
-        if not is_one_of(law, LAWS):
-            raise MPMError(f"law must be one of {', '.join(map(repr, LAWS))}, not {law!r}.")
         require_same(
             particles.mesh.comm,
             friction=[rubs.friction, rubs.cohesion, rubs.limit],
@@ -121,8 +119,7 @@ class Rigid(Contact):
             axisymmetric=axisymmetric,
             law=law,
         )
-        super().__init__([particles], rubs, axisymmetric)
-        self._nitsche = law == "nitsche"
+        super().__init__([particles], rubs, axisymmetric, law)
         self.shape = shape
         self._modulus = None if modulus is None else as_positive(modulus, "modulus")
         penalties = (
@@ -211,7 +208,7 @@ class Rigid(Contact):
         """See :meth:`Term.take_part`."""
         super().take_part(number, bodies, materials)
         if self._nitsche:
-            self._require_stress()
+            require_stress(self._materials[0], "a Rigid")
         self._tractions.of_step = self._of_step
         self._take_stress()
         first = self._memory is None
@@ -221,48 +218,10 @@ class Rigid(Contact):
             assert self._memory is not None
             self._require_apart(self._memory)
 
-    def _require_stress(self) -> None:
-        """Raise an error where no material gives the stress behind the facets.
-
-        Raises:
-            MPMError: There is none, or it is no stress of the displacement alone.
-        """
-        instead = "use law='penalty'"
-        material = self._materials[0]
-        if material is None:
-            raise MPMError(
-                "law='nitsche' of a Rigid takes the stress of the body's material, which is in the "
-                f"forms of this problem alone; use a QuasiStaticProblem, or {instead}."
-            )
-        if material.mean_stress is not None:
-            raise MPMError(
-                "law='nitsche' of a Rigid does not go with mixed='pressure', whose stress depends "
-                f"on another field; {instead}, or f_bar='patch'."
-            )
-
     def pace(self, dt: float, share: float) -> None:
-        """See :meth:`Term.pace`.
-
-        Raises:
-            MPMError: The forces of the scheme are no ones of a step's end.
-        """
-        if self._nitsche and share < 1.0:
-            raise MPMError(
-                "law='nitsche' of a Rigid has forces of a step's end, and would add energy with "
-                "each impact in this scheme; use scheme='euler', or law='penalty'."
-            )
+        """See :meth:`Contact.pace`."""
         super().pace(dt, share)
         self._tractions.of_step = self._of_step
-
-    @property
-    def symmetric(self) -> bool:
-        """See :attr:`Term.symmetric`."""
-        return super().symmetric and not self._nitsche
-
-    @property
-    def takes_stress(self) -> bool:
-        """See :attr:`Term.takes_stress`."""
-        return self._nitsche
 
     def _require_same_shape(self) -> None:
         """Raise an error where ranks have different shapes, by some distances (collective)."""
@@ -279,8 +238,8 @@ class Rigid(Contact):
         """Take the present mesh of the body (collective)."""
         if self._surface.settle():
             self._take_stiffness()
-            self._new_pattern()
             self._take_stress()
+            self._new_pattern()
             self._begin_anew(self._pose)
 
     def _take_stiffness(self) -> None:
@@ -311,7 +270,9 @@ class Rigid(Contact):
 
     def _new_pattern(self) -> None:
         W = self.bodies[0].W
-        self._matrix = PointMatrix(W, W)
+        self._matrix, self._sum = PointMatrix(W, W), MatrixSum()
+        if self._tractions.nitsche is not None:
+            self._tractions.nitsche.new_pattern()
 
     def _require_apart(self, memory: Memory) -> None:
         """Raise an error where the body is in the obstacle from the beginning (collective)."""
@@ -440,14 +401,12 @@ class Rigid(Contact):
         if tractions.nitsche is None:
             K = self._matrix.of(parts)
             return {} if K is None else {(0, 0): K}
-        force = np.zeros_like(trial.normal)
-        force.reshape(-1, surface.gdim)[flat] = tractions.by_stress(trial, memory, flat)
-        force *= -surface.weights[:, :, None]
-        along = trial.normal @ trial.pose.Q.T
-        K = self._matrix.of([*parts, tractions.nitsche.blocks(which, dofs, along, force)])
-        if K is None:
-            return {}
-        return {(0, 0): tractions.nitsche.with_groups(K, along, force)}
+        along = (trial.normal @ trial.pose.Q.T).reshape(-1, surface.gdim)[flat]
+        at = At(flat // surface.nq, flat % surface.nq, along)
+        force = -surface.weights.ravel()[flat, None] * tractions.by_stress(trial, memory, flat)
+        by_stress = tractions.nitsche.tangents(at, [Spread.over_facets(surface, at, force)])
+        found = [K for K in (self._matrix.of(parts), *by_stress) if K is not None]
+        return {(0, 0): self._sum.of(found)} if found else {}
 
     # -- What it remembers ------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from .._core import loops
 from .facets import Table, solved
-from .law import Coulomb, Points, Traction, traction
+from .law import Coulomb, Points, Traction, nitsche, push_derivative, traction
 from .surface import normals
 from .whole_step import corrected, deformation, mean_pressure
 
@@ -31,11 +31,15 @@ __all__ = [
     "acting_now",
     "add_tangents",
     "by_complex_step",
+    "by_stress",
     "projected",
 ]
 
 #: Step of the complex derivative, and most points of which it is taken at once.
 STEP, AT_ONCE = 1e-40, 4096
+
+
+type Array = NDArray[np.float64]
 
 
 class Start(NamedTuple):
@@ -67,6 +71,7 @@ class Stencil(NamedTuple):
         points: Stiffness and memory.
         outward: As that of :class:`Surface`.
         start: Where the step begins, if it is one of a motion.
+        behind: Tractions by the stress behind the points, where these press, shape ``(n, gdim)``.
     """
 
     which: NDArray[np.int64]
@@ -77,6 +82,7 @@ class Stencil(NamedTuple):
     points: Points
     outward: NDArray[np.float64]
     start: Start | None
+    behind: NDArray[np.float64] | None = None
 
 
 class Sums(NamedTuple):
@@ -180,7 +186,10 @@ def acting(law: Coulomb, stencil: Stencil, z: NDArray[Any], touch: float, extent
     if not law.smooth:
         delta = x - np.einsum("nk,nki->ni", stencil.anchored, z[:, 1 + count :])
     if start is None:
-        acts = traction(law, stencil.points, delta, foot.gap, foot.n, touch)
+        pressure = None
+        if stencil.behind is not None:
+            pressure = nitsche(stencil.points, stencil.behind, foot.gap, foot.n, touch).pressure
+        acts = traction(law, stencil.points, delta, foot.gap, foot.n, touch, pressure)
         gradient = _gradient(foot)
     else:
         gap, middle, change = foot.gap, 0.5 * (start.x + both), both - start.x
@@ -192,22 +201,54 @@ def acting(law: Coulomb, stencil: Stencil, z: NDArray[Any], touch: float, extent
         p = mean_pressure(stencil.points.stiffness, before, gap, touch)
         acts = traction(law, stencil.points, delta, gap, foot.n, touch, p)
     pushes = acts.pressure[:, None, None] * gradient
+    return Acting(pushes, _rubs(foot, acts.shear), acts)
+
+
+def _rubs(foot: Foot, shear: NDArray[Any]) -> NDArray[Any]:
+    """Return what shear does to points and to nodes of their facets, ``(n, 1 + k, i)``."""
     # the arm g n turns with the facet
     A = foot.along
-    along = solved(A @ A.swapaxes(1, 2), np.einsum("nei,ni->ne", A, acts.shear))
+    along = solved(A @ A.swapaxes(1, 2), np.einsum("nei,ni->ne", A, shear))
     turn = -foot.gap[:, None] * np.einsum("nek,ne->nk", foot.dN, along)
-    rubs = -(foot.N[:, :, None] * acts.shear[:, None, :] + turn[:, :, None] * foot.n[:, None])
-    return Acting(pushes, np.concatenate([acts.shear[:, None], rubs], axis=1), acts)
+    on_nodes = -(foot.N[:, :, None] * shear[:, None, :] + turn[:, :, None] * foot.n[:, None])
+    return np.concatenate([shear[:, None], on_nodes], axis=1)
+
+
+def by_stress(law: Coulomb, stencil: Stencil, touch: float) -> tuple[Array, Array]:
+    """Return how forces grow with the traction of the stress behind along the normal.
+
+    Args:
+        law: As for :func:`acting`.
+        stencil: As there, with such tractions.
+        touch: As there.
+
+    Returns:
+        The normals, shape ``(n, gdim)``, and derivatives of forces on points and nodes of their
+        facets, shape ``(n, 1 + k, gdim)``.
+    """
+    assert stencil.behind is not None
+    x, X = stencil.x[:, 0], stencil.x[:, 1 : 1 + stencil.anchored.shape[1]]
+    foot = projected(stencil.table, x, X, stencil.outward)
+    push = nitsche(stencil.points, stencil.behind, foot.gap, foot.n, touch)
+    by = _gradient(foot)
+    if not law.smooth:
+        delta = x - np.einsum(
+            "nk,nki->ni", stencil.anchored, stencil.x[:, 1 + stencil.anchored.shape[1] :]
+        )
+        along = push_derivative(law, stencil.points, delta, foot.gap, foot.n, touch, push) - foot.n
+        by = by + _rubs(foot, along)
+    return foot.n, by * push.acts[:, None, None]
 
 
 def _compiled_arguments(law: Coulomb, stencil: Stencil, touch: float) -> tuple[Any, ...]:
     """Return what the compiled loops take."""
     points = stencil.points
     arrays = [points.stiffness, points.tangential, points.gap, points.stretch]
+    behind = np.zeros(0) if stencil.behind is None else stencil.behind
     return (
         np.ascontiguousarray(stencil.x),
         [np.ascontiguousarray(part) for part in (*stencil.table, stencil.anchored)],
-        [np.ascontiguousarray(part) for part in (stencil.outward, *arrays)],
+        [np.ascontiguousarray(part) for part in (stencil.outward, *arrays, behind)],
         points.touched.view(np.uint8),
         [law.friction, law.cohesion, law.limit, touch],
         law.smooth,

@@ -416,18 +416,18 @@ class PointMatrix:
     """A matrix on W of bodies by dense blocks, whose pattern grows as blocks come up.
 
     Args:
-        rows: Space of its rows, or their number, if all are on the first rank.
+        rows: Space of its rows; or their number, if all are on the first rank; or the number of
+            those of this rank and of all.
         columns: Space of its columns.
     """
 
-    def __init__(self, rows: fem.FunctionSpace | int, columns: fem.FunctionSpace) -> None:
+    def __init__(
+        self, rows: fem.FunctionSpace | int | tuple[int, int], columns: fem.FunctionSpace
+    ) -> None:
         self._comm: MPI.Comm = columns.mesh.comm
-        self._sizes = tuple(
-            (space if self._comm.rank == 0 else 0, space)
-            if isinstance(space, int)
-            else sizes_of(space)
-            for space in (rows, columns)
-        )
+        if isinstance(rows, int):
+            rows = rows if self._comm.rank == 0 else 0, rows
+        self._sizes = rows if isinstance(rows, tuple) else sizes_of(rows), sizes_of(columns)
         self._matrix: PETSc.Mat | None = None
         self._places: dict[int, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
         self._size = 0

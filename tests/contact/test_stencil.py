@@ -26,8 +26,11 @@ FRICTION = {
 }
 
 
-def meeting(side, law, count=60):
-    """Return points that stick, slip, have just come and are away, at bent facets."""
+def meeting(side, law, count=60, pressed=False):
+    """Return points that stick, slip, have just come and are away, at bent facets.
+
+    Those that are pressed have a stress behind them.
+    """
     cell, degree = SIDES[side]
     variant = basix.LagrangeVariant.gll_warped
     element = basix.create_element(basix.ElementFamily.P, cell, degree, variant)
@@ -62,15 +65,17 @@ def meeting(side, law, count=60):
         points,
         some.choice([-1.0, 1.0], count),
         None,
+        some.normal(size=(count, e + 1)) if pressed else None,
     )
 
 
 @pytest.mark.skipif(loops is None, reason="needs the compiled loops")
+@pytest.mark.parametrize("pressed", [False, True])
 @pytest.mark.parametrize("friction", FRICTION)
 @pytest.mark.parametrize("side", SIDES)
-def test_compiled_loops_do_what_numpy_and_the_complex_step_do(side, friction):
+def test_compiled_loops_do_what_numpy_and_the_complex_step_do(side, friction, pressed):
     law = FRICTION[friction]
-    points = meeting(side, law)
+    points = meeting(side, law, pressed=pressed)
     told = stencil.acting_now(law, points, TOUCH, EXTENT)
     known = stencil.acting(law, points, points.x, TOUCH, EXTENT)
     assert 10 < known.acts.inside.sum() < 50 and (law.smooth or known.acts.slips.any())
@@ -96,11 +101,12 @@ def sums(points, groups=7, blocks=50):
 
 
 @pytest.mark.skipif(loops is None, reason="needs the compiled loops")
+@pytest.mark.parametrize("pressed", [False, True])
 @pytest.mark.parametrize("friction", FRICTION)
 @pytest.mark.parametrize("side", SIDES)
-def test_compiled_tangents_are_the_complex_steps_summed_up(monkeypatch, side, friction):
+def test_compiled_tangents_are_the_complex_steps_summed_up(monkeypatch, side, friction, pressed):
     law = FRICTION[friction]
-    points = meeting(side, law)
+    points = meeting(side, law, pressed=pressed)
     found, known = sums(points), sums(points)
     stencil.add_tangents(law, points, TOUCH, EXTENT, found)
     with monkeypatch.context() as without:
@@ -113,6 +119,22 @@ def test_compiled_tangents_are_the_complex_steps_summed_up(monkeypatch, side, fr
     D = stencil.by_complex_step(law, points, TOUCH, EXTENT)
     loops.add_derivatives(D, *again[:4], again.values)
     np.testing.assert_allclose(again.values, known.values, atol=1e-14 * scale)
+
+
+@pytest.mark.parametrize("friction", FRICTION)
+@pytest.mark.parametrize("side", SIDES)
+def test_forces_grow_with_the_stress_behind_as_a_complex_step_says(side, friction):
+    law = FRICTION[friction]
+    points = meeting(side, law, pressed=True)
+    normals, forces = stencil.by_stress(law, points, TOUCH)
+    assert 10 < forces.any(axis=(1, 2)).sum() < 50
+    for i in range(normals.shape[1]):
+        tried = points._replace(
+            behind=points.behind + 1j * stencil.STEP * np.eye(len(normals[0]))[i]
+        )
+        pushes, rubs, _ = stencil.acting(law, tried, points.x, TOUCH, EXTENT)
+        slopes = (pushes + rubs).imag / stencil.STEP
+        np.testing.assert_allclose(forces * normals[:, i, None, None], slopes, atol=1e-12)
 
 
 @pytest.mark.parametrize("side", SIDES)
