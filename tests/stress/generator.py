@@ -843,7 +843,7 @@ def nitsche(rng: Random, index: int) -> Scene:
     return made
 
 
-@scene_class(14)
+@scene_class(20)
 def paired(rng: Random, index: int) -> Scene:
     """Two bodies on backgrounds of their own, at rest and in motion, in the plane and in space."""
     dim = 3 if index % 5 == 4 else 2
@@ -883,7 +883,7 @@ def paired(rng: Random, index: int) -> Scene:
     )
 
 
-@scene_class(7)
+@scene_class(24)
 def driven(rng: Random, index: int) -> Scene:
     """Rigid bodies of every shape that forces drive, at rest and in motion."""
     dim = 3 if index % 4 > 1 else 2
