@@ -111,9 +111,9 @@ def strength_reduction(
         tolerance: Width to which the factor is found.
         most: A factor at which to stop, should the body hold.
         displacement: Largest displacement, from the beginning of the reduction, that counts as
-            equilibrium; ``np.inf``: any. By default it is the strain of the body's stress at its
-            modulus of shear, in the mean (of squares) over the body, times its extent, the mean
-            (geometric) of the sides of a box around it: for a slope some ``2 density gravity
+            equilibrium; ``np.inf``: any. By default it is half the strain of the body's stress at
+            its modulus of shear, in the mean (of squares) over the body, times its extent, the mean
+            (geometric) of the sides of a box around it: for a slope some ``density gravity
             H^2 / young``.
 
     Returns:
@@ -185,7 +185,7 @@ def strength_reduction(
 
 
 def _elastic_displacement(problem: QuasiStaticProblem) -> float:
-    """Return the strain of the stress at the modulus of shear, times the extent (collective)."""
+    """Return half the strain of the stress at the modulus of shear, times extent (collective)."""
     comm = problem.bodies[0].V.mesh.comm
     sums, corners = np.zeros(2), []
     for body, points in zip(problem.bodies, problem.points, strict=True):
@@ -198,7 +198,7 @@ def _elastic_displacement(problem: QuasiStaticProblem) -> float:
     upper = np.max(comm.allgather(x.max(axis=0, initial=-np.inf)), axis=0)
     extent = float(np.prod(upper - lower) ** (1.0 / len(lower)))
     squares, volume = np.sum(comm.allgather(sums), axis=0)
-    way = extent * float(np.sqrt(squares / volume))
+    way = 0.5 * extent * float(np.sqrt(squares / volume))
     return way if way > 0.0 else np.inf
 
 
