@@ -40,7 +40,7 @@ class Coarsening(IntEnum):
 #: Unknowns from which on multigrid takes less time than a factorisation, by dimension of space.
 CROSSOVER = {
     2: dict.fromkeys(Coarsening, 40000),
-    3: {Coarsening.GOOD: 3000, Coarsening.FAIR: 8000, Coarsening.POOR: 20000},
+    3: {Coarsening.GOOD: 3000, Coarsening.FAIR: 8000, Coarsening.POOR: 50000},
 }
 #: The same in a motion, where the mass takes it three times the iterations.
 CROSSOVER_IN_MOTION = {2: 40000, 3: 5000}
@@ -51,6 +51,10 @@ HIGHEST = 2
 #: Values of MUMPS's INFOG(1) that more workspace cures.
 OUT_OF_WORKSPACE = (-8, -9)
 FACTORS = ("lu", "cholesky")
+#: Most unknowns, by dimension of space, whose tangent PETSc's own Cholesky factorises: of so few
+#: MUMPS takes more to set a factor up than to compute it. Their order, and the pivot, relative to
+#: its row, that counts as none: those of the shift are as small as round-off.
+FEW, ORDER, NO_PIVOT = {2: 400, 3: 150}, "nd", 0.0
 #: Most iterations of a refinement, and how often it begins anew.
 KRYLOV, REFINEMENTS = 60, 4
 #: Options of MUMPS unless others are given: K scaled by its diagonal, as the shift is.
@@ -190,6 +194,8 @@ class ShiftedFactor:
         pc.setFactorSolverType("mumps")
         self._options = {prefix + key: value for key, value in options.items()}
         self._prefix, self._dim = prefix, dim
+        given = {*PETSc.Options(prefix).getAll(), *options}
+        said = any(key.startswith(("ksp_", "pc_", "mat_")) for key in given)
         with _options_refused(), self._own_options() as database:
             snes.setFromOptions()
             own = database.hasName(f"{prefix}pc_factor_mat_solver_type")
@@ -205,6 +211,8 @@ class ShiftedFactor:
                     pc.setFactorSolverType("mumps")  # changing the type had dropped it
                 _require_factor(pc)
         self._direct = ksp.getType(), pc.getType(), pc.getFactorSolverType()
+        suits = symmetric and shift > 0.0 and not said and snes.comm.size == 1
+        self._few = FEW.get(dim, 0) if suits else 0
 
     @contextmanager
     def _own_options(self, size: int = 0) -> Iterator[PETSc.Options]:
@@ -237,7 +245,22 @@ class ShiftedFactor:
         if iterates != self.iterates:
             self._choose(iterates)
         if not iterates:
+            self._choose_package(size)
             self._iterate_with_factor(size)
+
+    def _choose_package(self, size: int) -> None:
+        """Let PETSc's own factor take few unknowns, which nothing constrains."""
+        pc = self._ksp.getPC()
+        few = 0 < size <= self._few and not self._constrained
+        package = PETSc.Mat.SolverType.PETSC if few else self._direct[2]
+        if self._few == 0 or pc.getFactorSolverType() == package:
+            return
+        self._ksp.reset()
+        self.K = None
+        pc.setFactorSolverType(package)
+        if few:
+            pc.setFactorOrdering(ORDER)
+            pc.setFactorPivot(NO_PIVOT)
 
     def _compresses(self, size: int) -> bool:
         """Return whether factors have blocks of low rank."""
@@ -646,9 +669,12 @@ class ShiftedFactor:
         if self.iterates:
             return int(self._negative)
         pc = self._ksp.getPC()
-        if pc.getType() != "cholesky" or pc.getFactorSolverType() != "mumps":
+        if pc.getType() != "cholesky":
             return 0
-        return int(pc.getFactorMatrix().getMumpsInfog(12))
+        package = pc.getFactorSolverType()
+        if package == PETSc.Mat.SolverType.PETSC and not pc.getFailedReason():
+            return int(pc.getFactorMatrix().getInertia()[0])
+        return int(pc.getFactorMatrix().getMumpsInfog(12)) if package == "mumps" else 0
 
 
 @contextmanager

@@ -2,14 +2,17 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """PETSc options, direct and iterative solvers."""
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
+import pytest
 import scenes
 from scenes import QUADRILATERAL, TRIANGLE, WORLD
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import Hencky
+from mpm_dolfinx.solvers import linear
 
 
 def test_results_do_not_depend_on_the_direct_solver():
@@ -92,3 +95,69 @@ def test_options_of_the_factor_reach_it():
     factor = problem.solver.getKSP().getPC().getFactorMatrix()
     assert factor.getMumpsIcntl(7) == 0 and factor.getMumpsIcntl(14) == 77
     assert not PETSc.Options().hasName("mpm_mat_mumps_icntl_7")
+
+
+class Alone:
+    """What a factor asks about unknowns that are displacements alone."""
+
+    constrained = False
+    coarsening = linear.Coarsening.GOOD
+
+    def diagonal(self, K):
+        diagonal = K.getDiagonal()
+        diagonal.abs()
+        return diagonal
+
+
+@pytest.mark.parametrize("few", [True, False])
+@pytest.mark.parametrize("negative", [0, 1, 7])
+def test_negative_pivots_are_the_negative_eigenvalues(few, negative, monkeypatch):
+    n = 40
+    if not few:
+        monkeypatch.setattr(linear, "FEW", {})
+    random = np.random.default_rng(negative)
+    basis = np.linalg.qr(random.standard_normal((n, n)))[0]
+    eigenvalues = random.uniform(1.0, 100.0, n)
+    eigenvalues[:negative] *= -1.0
+    dense = (basis * eigenvalues) @ basis.T
+    dense = 0.5 * (dense + dense.T)
+    own = MPI.COMM_SELF
+    csr = np.arange(0, n * n + 1, n, dtype=np.int32), np.tile(np.arange(n, dtype=np.int32), n)
+    K = PETSc.Mat().createAIJ((n, n), csr=(*csr, dense.ravel()), comm=own)
+    snes = PETSc.SNES().create(own)
+    factor = linear.ShiftedFactor(snes, "pivots_", {}, True, 1e-13, 2, mpm.Statistics())
+    factor.begin(n, Alone())
+    factor.set(K, Alone())
+    package = snes.getKSP().getPC().getFactorSolverType()
+    assert package == ("petsc" if few else "mumps")
+    assert factor.negative_pivots() == negative
+    b = K.createVecLeft()
+    b.array_w[:] = random.standard_normal(n)
+    x = b.duplicate()
+    factor.solve(b, x)
+    np.testing.assert_allclose(x.array_r, np.linalg.solve(dense, b.array_r), rtol=1e-9)
+
+
+@pytest.mark.skip_in_parallel
+def test_few_unknowns_are_factorised_by_petsc_with_the_same_result(monkeypatch):
+    # Unknowns of the column become more as it spreads over the cells: packages change on the way.
+    moved, packages = [], []
+    for few in (0, 80, 10000):
+        monkeypatch.setattr(linear, "FEW", {2: few})
+        problem = scenes.slump(TRIANGLE, 15e3, h=1.0)
+        used = set()
+        for _ in problem.steps(10):
+            used.add(problem.solver.getKSP().getPC().getFactorSolverType())
+        packages.append(used)
+        moved.append(scenes.own(problem.particles.displacement).copy())
+    assert packages == [{"mumps"}, {"mumps", "petsc"}, {"petsc"}]
+    assert scenes.largest(moved[0]) > 1.0
+    for other in moved[1:]:
+        assert scenes.largest(moved[0] - other) < 1e-6
+
+
+def test_what_options_say_of_the_factor_holds_for_few_unknowns_too():
+    problem = scenes.block(petsc_options={"mat_mumps_icntl_14": 30})
+    problem.solve(steps=1)
+    assert problem.solver.getKSP().getPC().getFactorSolverType() == "mumps"
+    assert problem.history.statistics["free_dofs"] <= linear.FEW[2]
