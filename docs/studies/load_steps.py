@@ -1,10 +1,11 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The table of docs/load-steps.md: errors of steps chosen by a tolerance, and of equal ones."""
+"""The tables of docs/load-steps.md: errors of steps chosen by a tolerance, and of equal ones."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -24,6 +25,7 @@ spec.loader.exec_module(scenes)
 rollers, kit = scenes.rollers, scenes.kit
 
 QUAD = mesh.CellType.quadrilateral
+type Pressed = tuple[mpm.QuasiStaticProblem, Callable[[float], None]]
 
 
 def collapse() -> mpm.QuasiStaticProblem:
@@ -37,34 +39,11 @@ def collapse() -> mpm.QuasiStaticProblem:
     )
 
 
-def lines(fine: float, h: float, size: float) -> np.ndarray:
-    """Return grid lines from 0 to a size, at first h apart."""
-    cells = np.full(round(fine / h), h)
-    longer = h * 1.2 ** np.arange(1, 100)
-    longer = longer[: 1 + np.argmax(np.cumsum(longer) >= size - cells.sum())]
-    longer *= (size - cells.sum()) / longer.sum()
-    return np.concatenate([[0.0], np.cumsum(cells), cells.sum() + np.cumsum(longer)])
-
-
-def grid(x: np.ndarray, y: np.ndarray) -> mesh.Mesh:
-    """Return a mesh of quadrilaterals with given lines."""
-    domain = kit.box([len(x) - 1.0, len(y) - 1.0], [len(x) - 1, len(y) - 1], QUAD)
-    for axis, along in enumerate((x, y)):
-        place = domain.geometry.x[:, axis]
-        place[:] = np.interp(place, np.arange(len(along)), along)
-    return domain
-
-
-def halved(x: np.ndarray) -> np.ndarray:
-    """Return lines with one more in the middle of each interval."""
-    return np.interp(np.arange(2 * len(x) - 1) / 2.0, np.arange(len(x)), x)
-
-
 def footing() -> mpm.QuasiStaticProblem:
     """A strip of 1 m that sinks 2 mm into clay, half of it; cells of 0.125 m below it."""
     h, size = 0.125, 5.0
-    across, up = lines(1.75, h, size), size - lines(1.0, h, size)[::-1]
-    background = grid(across, np.append(up, size + h * np.arange(1, 3)))
+    across, up = kit.lines(h, 1.75, size), size - kit.lines(h, 1.0, size)[::-1]
+    background = kit.grid([across, np.append(up, size + h * np.arange(1, 3))], QUAD)
     V = fem.functionspace(background, ("Lagrange", 1, (2,)))
     background.topology.create_connectivity(1, 2)
     sides = [
@@ -72,15 +51,38 @@ def footing() -> mpm.QuasiStaticProblem:
         (1, lambda x: np.isclose(x[1], 0.0), 0.0),
         (1, lambda x: np.isclose(x[1], size) & (x[0] < 0.5 + 1e-9), -0.002),
     ]
+    domains = kit.grid([kit.divided(across, 2), kit.divided(up, 2)], QUAD)
+    body = mpm.Particles(domains, V, quadrature_degree=2)
+    law = mpm.materials.VonMises(1e7, 0.48, rho_y=np.sqrt(2.0) * 490.0)
+    return mpm.QuasiStaticProblem(body, law, bcs=held(V, sides), f_bar="patch")
+
+
+def slits() -> mpm.QuasiStaticProblem:
+    """A plate of 2 m by 4 m, slit from both sides to its half, pulled by 0.1 m; a quarter of it."""
+    h, pulled = 0.125, 0.1
+    across, up = h * np.arange(9), h * np.arange(17)
+    background = kit.grid([np.append(-h, across), np.append(up, up[-1] + h)], QUAD)
+    V = fem.functionspace(background, ("Lagrange", 1, (2,)))
+    background.topology.create_connectivity(1, 2)
+    sides = [
+        (0, lambda x: np.isclose(x[0], 1.0), 0.0),
+        (1, lambda x: np.isclose(x[1], 0.0) & (x[0] > 0.5 - 1e-9), 0.0),
+        (1, lambda x: np.isclose(x[1], 2.0) | np.isclose(x[1], 2.0 + h), pulled),
+    ]
+    domains = kit.grid([kit.divided(across, 2), kit.divided(up, 2)], QUAD)
+    body = mpm.Particles(domains, V, quadrature_degree=2)
+    law = mpm.materials.VonMises(1e7, 0.48, rho_y=np.sqrt(2.0) * 490.0)
+    return mpm.QuasiStaticProblem(body, law, bcs=held(V, sides), f_bar="patch")
+
+
+def held(V: fem.FunctionSpace, sides: Sequence[tuple]) -> list[fem.DirichletBC]:
+    """Conditions from an axis, a place and a value each."""
     bcs = []
     for axis, where, value in sides:
-        dofs = fem.locate_dofs_topological(
-            V.sub(axis), 1, mesh.locate_entities(background, 1, where)
-        )
+        edges = mesh.locate_entities(V.mesh, 1, where)
+        dofs = fem.locate_dofs_topological(V.sub(axis), 1, edges)
         bcs.append(fem.dirichletbc(value, dofs, V.sub(axis)))
-    body = mpm.Particles(grid(halved(across), halved(up)), V, quadrature_degree=2)
-    law = mpm.materials.VonMises(1e7, 0.48, rho_y=np.sqrt(2.0) * 490.0)
-    return mpm.QuasiStaticProblem(body, law, bcs=bcs, f_bar="patch")
+    return bcs
 
 
 def column(weight: float, domain: str):
@@ -95,6 +97,7 @@ CASES = {
     "free column, 80 kN/m³, triangles": (column(80e3, "tri"), 640),
     "block that slumps": (collapse, 640),
     "footing": (footing, 320),
+    "plate with slits": (slits, 320),
     "column between rollers": (lambda: scenes.column_roller(32).problem, 320),
     "elastic column": (lambda: scenes.compaction(16).problem, 320),
     "elastic cantilever": (lambda: scenes.cantilever(0.5).problem, 320),
@@ -138,8 +141,71 @@ def cells(case: str) -> list[str]:
     return found
 
 
+def pressed(shape: mpm.contact.Shape, domain: str) -> Pressed:
+    """Clay, half of it, into which an obstacle is pressed 0.3 m deep; two domains a cell."""
+    h = 0.25
+    across, up = kit.lines(h, 1.5, 4.0), -kit.lines(h, 1.0, 2.5)[::-1]
+    places = [across, np.append(up, h * np.arange(1, 5))]
+    V = fem.functionspace(kit.grid(places, QUAD), ("Lagrange", 1, (2,)))
+    rule = 2 if domain == "quad" else None
+    halves = [kit.divided(along, 2) for along in (across, up)]
+    body = mpm.Particles(kit.grid(halves, kit.DOMAINS[domain]), V, quadrature_degree=rule)
+    ground = np.sort(mesh.locate_entities_boundary(body.mesh, 1, lambda x: np.isclose(x[1], 0.0)))
+    tags = mesh.meshtags(body.mesh, 1, ground, np.full(len(ground), 1, np.int32))
+    obstacle = mpm.contact.Rigid(body, shape, facet_tags=tags, tag=1, tangential_penalty=0.1)
+    problem = mpm.QuasiStaticProblem(
+        body,
+        mpm.materials.VonMises(500.0, 0.45, rho_y=np.sqrt(2.0)),
+        bcs=rollers(V, (0, 0.0), (0, 4.0), (1, -2.5)),
+        f_bar="patch",
+        terms=[obstacle],
+    )
+    return problem, lambda t: obstacle.move((0.0, -0.3 * t))
+
+
+DISC = mpm.contact.disc((0.0, 0.5), 0.5)
+WEDGE = mpm.contact.polygon([(0.0, 0.0), (3.0, 3.0), (-3.0, 3.0)])
+DRIVEN = {
+    "disc": partial(pressed, DISC, "quad"),
+    "disc, triangles": partial(pressed, DISC, "tri"),
+    "wedge": partial(pressed, WEDGE, "quad"),
+}
+
+
+@cache
+def driven_by(case: str, count: int) -> tuple[int, np.ndarray]:
+    """Return linear solves and the end of a run of equal steps."""
+    problem, path = DRIVEN[case]()
+    return problem.solve(count, update=path).total_iterations, nodal(problem)
+
+
+def driven_cells(case: str) -> list[str]:
+    """Return steps, solves and errors by tolerance, and those of equal steps."""
+    exact = 2.0 * driven_by(case, 240)[1] - driven_by(case, 120)[1]
+
+    def off(end: np.ndarray) -> str:
+        return scientific(float(np.linalg.norm(end - exact) / np.linalg.norm(exact)))
+
+    found = []
+    for tolerance in (0.02, 0.01):
+        problem, path = DRIVEN[case]()
+        history = problem.solve("auto", tolerance=tolerance, update=path)
+        found += [f"{len(history.steps)}, {history.total_iterations}", off(nodal(problem))]
+    for count in (60, 120):
+        solves, end = driven_by(case, count)
+        found.append(f"{solves}, {off(end)}")
+    return found
+
+
 def tables() -> dict[str, Table]:
     head = ["", "0.02: steps, rejected, solves", "error", "0.01: steps, rejected, solves", "error"]
     head += ["20 equal steps: solves, error", "80"]
     rows = {case: partial(cells, case) for case in CASES}
-    return {"load-steps/errors": Table("load-steps", head, rows, quick=["elastic cantilever"])}
+    driven = ["", "0.02: steps, solves", "error", "0.01: steps, solves", "error"]
+    driven += ["60 equal steps: solves, error", "120"]
+    return {
+        "load-steps/errors": Table("load-steps", head, rows, quick=["elastic cantilever"]),
+        "load-steps/driven": Table(
+            "load-steps", driven, {case: partial(driven_cells, case) for case in DRIVEN}
+        ),
+    }

@@ -363,6 +363,11 @@ class Rigid(Contact):
         assert self._trial is not None and self._memory is not None
         return not bool(self._trial.touched.any() or self._memory.touched.any())
 
+    def drives(self) -> bool:
+        """See :meth:`Term.drives`."""
+        assert self._memory is not None
+        return not self._pose.same_as(self._memory.pose) and not self.smooth()
+
     def residuals(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.residuals`."""
         assert self._trial is not None

@@ -77,6 +77,11 @@ class Pose:
         """The rotation."""
         return rotation(self.angle)
 
+    def same_as(self, other: Pose) -> bool:
+        """Return whether another pose is this one, to the last bit."""
+        same = np.array_equal(self.offset, other.offset)
+        return same and np.array_equal(self.angle, other.angle)
+
     def mean(self, other: Pose) -> NDArray[np.float64]:
         """Return the mean of the rotations of two poses, which is none itself."""
         return np.asarray(0.5 * (self.Q + other.Q))

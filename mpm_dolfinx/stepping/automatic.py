@@ -38,6 +38,8 @@ MANY = 10
 ELASTIC = 0.02
 #: Factor of the tolerance where errors are compared with the motion so far, or with a length.
 OF_MOTION, OF_LENGTH = 8.0, 5.0
+#: The same where an obstacle drives the motion: nothing relaxes what it has pushed aside wrongly.
+OF_DRIVEN = 1.5
 #: Share of what is left to the next level from which a step covers half of it.
 HALF = 0.5
 
@@ -51,12 +53,14 @@ class StepError:
         motion: Motion of the run up to its end, likewise.
         smooth: Whether no history has changed in it, nor contact.
         touches: Whether one has, where bodies may touch and let go.
+        driven: Whether points yield in it that an obstacle pushes on its own path.
     """
 
     error: float
     motion: float
     smooth: bool
     touches: bool = False
+    driven: bool = False
 
 
 def error_of_step(reduced: ReducedSystem, size: float, comm: MPI.Comm) -> StepError:
@@ -88,7 +92,8 @@ def error_of_step(reduced: ReducedSystem, size: float, comm: MPI.Comm) -> StepEr
     nodes = comm.allreduce(sum(len(u) for u in increments)) / gdim
     rms = [joint_norm(np.concatenate(values), comm) / math.sqrt(nodes) for values in (error, moved)]
     smooth = reduced.smooth()
-    return StepError(rms[0], rms[1], smooth, not smooth and reduced.one_sided())
+    touches = not smooth and reduced.one_sided()
+    return StepError(rms[0], rms[1], smooth, touches, touches and reduced.is_driven())
 
 
 class ErrorControl:
@@ -98,8 +103,10 @@ class ErrorControl:
     far, or ``w e / ((5 tolerance)^2 length)``, the next step is larger by
     ``0.9 q^-0.35 q_before^0.2`` (a PI controller: Gustafsson 1991), and one with q > 4 is taken
     back; w is 1, or 0.02 where nothing yields. A first step in which something touches is taken
-    back down to a quarter. The error of the run is then in proportion to the
-    tolerance.
+    back down to a quarter. Where an obstacle on its own path pushes points that yield, the errors
+    add up and the motion goes on as it does: they are compared with the motion so far over the
+    share t of the run, ``q = e / ((1.5 tolerance)^2 |d| / t)``. The error of the run is then in
+    proportion to the tolerance.
 
     Args:
         tolerance: Error allowed in the end, relative to the motion.
@@ -205,10 +212,13 @@ class ErrorControl:
         Args:
             found: What is estimated.
         """
-        if self._length is None:
-            allowed = (OF_MOTION * self._tolerance) ** 2 * found.motion
+        if self._length is not None:
+            factor, motion = OF_LENGTH, self._length
         else:
-            allowed = (OF_LENGTH * self._tolerance) ** 2 * self._length
+            factor, motion = OF_MOTION, found.motion
+        if found.driven:
+            factor, motion = OF_DRIVEN, self._length or found.motion / self.target
+        allowed = (factor * self._tolerance) ** 2 * motion
         self._touches = found.touches
         error = found.error * (ELASTIC if found.smooth else 1.0)
         self._ratio = error / allowed if error > 0.0 else 0.0

@@ -199,6 +199,10 @@ class Term:
         """Return whether no history changes in the last residual, nor contact."""
         return True
 
+    def drives(self) -> bool:
+        """Return whether it touches bodies and moves on its own path in this step, on this rank."""
+        return False
+
     def residuals(self) -> Sequence[PETSc.Vec]:
         """Return the forces on W of each body, or nothing."""
         return ()
