@@ -470,12 +470,12 @@ class ReducedSystem:
         return over_ranks(self._comm, all(smooth), MPI.LAND)
 
     def is_driven(self) -> bool:
-        """Return whether something moves on its own path against bodies in which history changes."""
-        drives = any([term.drives() for term in self._terms])
-        if not self._comm.allreduce(drives, MPI.LOR):
+        """Return whether something moves on its own path against bodies whose history changes."""
+        drives = [term.drives() for term in self._terms]
+        if not over_ranks(self._comm, any(drives), MPI.LOR):
             return False
-        smooth = all([term.smooth() for term in self._terms if not term.one_sided])
-        return not self._comm.allreduce(smooth, MPI.LAND)
+        smooth = [term.smooth() for term in self._terms if not term.one_sided]
+        return not over_ranks(self._comm, all(smooth), MPI.LAND)
 
     def load_derivative(self, order: int = 1) -> tuple[list[PETSc.Vec], float]:
         """Return :meth:`BodyForms.load_derivative` on all dofs of each V (collective)."""
