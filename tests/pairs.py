@@ -4,7 +4,7 @@
 
 import numpy as np
 import scenes
-from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD
+from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD, anywhere
 
 from dolfinx import fem
 
@@ -178,3 +178,41 @@ def balance(problem, touch):
         total += WORLD.allreduce(f.sum(axis=0))
         moment += WORLD.allreduce((x[:, 0] * f[:, 1] - x[:, 1] * f[:, 0]).sum())
     return total, moment
+
+
+def go_on_other_meshes(what, **options):
+    """Drag a block along another, with other meshes half-way; the force stays, and ends as without.
+
+    Args:
+        what: "move", "rebase" or "split".
+        options: As for :func:`two`.
+
+    Returns:
+        The problem at its end.
+    """
+    options["cells"] = (QUADRILATERAL, QUADRILATERAL)
+    problem, touch, path = two(**options)
+    other, alone, same = two(**options)
+    for number, _ in enumerate(problem.steps(8, update=path)):
+        if number != 4:
+            continue
+        before = problem.reaction(touch)
+        if what == "move":
+            ranks = [anywhere(body.mesh, number) for body in problem.bodies]
+
+            def change(ranks=ranks):
+                for body, to in zip(problem.bodies, ranks, strict=True):
+                    body.move(to)
+
+            problem.renew(change, lambda state: state)
+        elif what == "rebase":
+            problem.rebase()
+        else:
+            problem.split(np.arange(0, 128, 2), body=1)
+        after = problem.reaction(touch)
+        assert np.abs(after - before).max() < 1e-8 * np.abs(before).max()
+    other.solve(8, update=same)
+    end = other.reaction(alone)
+    bound = 5e-2 if what == "split" else 1e-6
+    assert np.abs(problem.reaction(touch) - end).max() < bound * np.abs(end).max()
+    return problem

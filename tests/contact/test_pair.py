@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scenes
 from compare import error_of_a_term, outcome, same_run
-from pairs import POISSON, YOUNG, balance, hertz, patch, spaces, two
-from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD, anywhere
+from pairs import POISSON, YOUNG, balance, go_on_other_meshes, hertz, patch, spaces, two
+from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 
 from dolfinx import fem, mesh
 
@@ -201,30 +201,7 @@ def test_a_checkpoint_goes_on_as_the_run_does(mpi_tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["move", "rebase", "split"])
 def test_contact_follows_other_meshes_of_the_bodies(what):
-    problem, touch, path = two(cells=(QUADRILATERAL, QUADRILATERAL))
-    other, alone, same = two(cells=(QUADRILATERAL, QUADRILATERAL))
-    for number, _ in enumerate(problem.steps(8, update=path)):
-        if number != 4:
-            continue
-        before = problem.reaction(touch)
-        if what == "move":
-            ranks = [anywhere(body.mesh, number) for body in problem.bodies]
-
-            def change(ranks=ranks):
-                for body, to in zip(problem.bodies, ranks, strict=True):
-                    body.move(to)
-
-            problem.renew(change, lambda state: state)
-        elif what == "rebase":
-            problem.rebase()
-        else:
-            problem.split(np.arange(0, 128, 2), body=1)
-        after = problem.reaction(touch)
-        assert np.abs(after - before).max() < 1e-8 * np.abs(before).max()
-    other.solve(8, update=same)
-    end = other.reaction(alone)
-    bound = 5e-2 if what == "split" else 1e-6
-    assert np.abs(problem.reaction(touch) - end).max() < bound * np.abs(end).max()
+    go_on_other_meshes(what)
 
 
 def test_a_pair_of_a_body_that_is_split_goes_on_from_a_checkpoint(mpi_tmp_path):

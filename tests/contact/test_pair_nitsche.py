@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scenes
 from compare import error_of_blocks, outcome, same_run
-from pairs import POISSON, YOUNG, balance, hertz, patch, spaces, two
-from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD, anywhere
+from pairs import POISSON, YOUNG, balance, go_on_other_meshes, hertz, patch, spaces, two
+from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 
 import ufl
 from dolfinx import fem
@@ -257,31 +257,7 @@ def test_a_checkpoint_goes_on_as_the_run_does(mpi_tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["move", "rebase", "split"])
 def test_it_follows_other_meshes_of_the_bodies(what):
-    options = {"cells": (QUADRILATERAL, QUADRILATERAL), "law": "nitsche"}
-    problem, touch, path = two(**options)
-    other, alone, same = two(**options)
-    for number, _ in enumerate(problem.steps(8, update=path)):
-        if number != 4:
-            continue
-        before = problem.reaction(touch)
-        if what == "move":
-            ranks = [anywhere(body.mesh, number) for body in problem.bodies]
-
-            def change(ranks=ranks):
-                for body, to in zip(problem.bodies, ranks, strict=True):
-                    body.move(to)
-
-            problem.renew(change, lambda state: state)
-        elif what == "rebase":
-            problem.rebase()
-        else:
-            problem.split(np.arange(0, 128, 2), body=1)
-        after = problem.reaction(touch)
-        assert np.abs(after - before).max() < 1e-8 * np.abs(before).max()
-    other.solve(8, update=same)
-    end = other.reaction(alone)
-    bound = 5e-2 if what == "split" else 1e-6
-    assert np.abs(problem.reaction(touch) - end).max() < bound * np.abs(end).max()
+    problem = go_on_other_meshes(what, law="nitsche")
     assert error_of_blocks(problem, step=1e-7, size=1e-5) < 1e-7
 
 
