@@ -4,10 +4,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import ConvergenceError, DomainDistortionError, MPMError, ParticleOutsideError
 from ..parallel.given import require_same
@@ -16,6 +16,8 @@ from .quasistatic import QuasiStaticProblem
 from .through_time import TimeProblem
 
 __all__ = ["StrengthReduction", "strength_reduction"]
+
+type Array = NDArray[np.float64]
 
 #: Decimals of a factor: sums of steps are told as 1.2, not as 1.2000000000000002.
 DIGITS = 12
@@ -123,6 +125,37 @@ def strength_reduction(
         MPMError: The problem is not at its whole load, its steps have a duration (PorousProblem,
             DynamicProblem), a material has no strength, or domains may be split.
     """
+    _require(problem, step, tolerance, most, displacement)
+    start = [body.converged_displacement.copy() for body in problem.bodies]
+    limit = _elastic_displacement(problem) if displacement is None else float(displacement)
+    search = _Search(float(step), float(most))
+    factors, displacements = [1.0], [0.0]
+    try:
+        while search.bad - search.good > tolerance and search.good < most:
+            factor = search.next()
+            for points in problem.points:
+                points.weaken(factor)
+            way = _equilibrium(problem, start, limit)
+            if way is not None and way <= limit:
+                search.stood(factor)
+                factors.append(factor)
+                displacements.append(way)
+            else:
+                search.fell(factor, too_far=way is not None)
+    finally:
+        for points in problem.points:
+            points.weaken(1.0)
+    return StrengthReduction(search.good, float(search.bad), factors, displacements, limit)
+
+
+def _require(
+    problem: QuasiStaticProblem,
+    step: float,
+    tolerance: float,
+    most: float,
+    displacement: float | None,
+) -> None:
+    """Raise an error where :func:`strength_reduction` was given what it cannot do (collective)."""
     if not isinstance(problem, QuasiStaticProblem):
         raise MPMError("strength_reduction() needs an mpm.QuasiStaticProblem.")
     if isinstance(problem, TimeProblem):
@@ -152,36 +185,16 @@ def strength_reduction(
             "strength_reduction() follows the nodes of the bodies, which a split of domains "
             "changes; set on_distortion = 'error' of the bodies before."
         )
-    start = [body.converged_displacement.copy() for body in problem.bodies]
 
-    def moved() -> float:
-        here = [body.converged_displacement for body in problem.bodies]
-        gdim = problem.bodies[0].V.mesh.geometry.dim
-        sizes = [
-            np.linalg.norm((now - then).reshape(-1, gdim), axis=1).max(initial=0.0)
-            for now, then in zip(here, start, strict=True)
-        ]
-        return float(max(comm.allgather(max(sizes))))
 
-    limit = _elastic_displacement(problem) if displacement is None else float(displacement)
-    search = _Search(float(step), float(most))
-    factors, displacements = [1.0], [0.0]
-    try:
-        while search.bad - search.good > tolerance and search.good < most:
-            factor = search.next()
-            for points in problem.points:
-                points.weaken(factor)
-            way = _equilibrium(problem, moved, limit)
-            if way is not None and way <= limit:
-                search.stood(factor)
-                factors.append(factor)
-                displacements.append(way)
-            else:
-                search.fell(factor, too_far=way is not None)
-    finally:
-        for points in problem.points:
-            points.weaken(1.0)
-    return StrengthReduction(search.good, float(search.bad), factors, displacements, limit)
+def _moved(problem: QuasiStaticProblem, start: list[Array]) -> float:
+    """Return how far a node has moved since it was displaced as given, at most (collective)."""
+    comm, gdim = problem.bodies[0].V.mesh.comm, problem.bodies[0].V.mesh.geometry.dim
+    sizes = [
+        np.linalg.norm((body.converged_displacement - then).reshape(-1, gdim), axis=1)
+        for body, then in zip(problem.bodies, start, strict=True)
+    ]
+    return float(max(comm.allgather(max(size.max(initial=0.0) for size in sizes))))
 
 
 def _elastic_displacement(problem: QuasiStaticProblem) -> float:
@@ -202,9 +215,7 @@ def _elastic_displacement(problem: QuasiStaticProblem) -> float:
     return way if way > 0.0 else np.inf
 
 
-def _equilibrium(
-    problem: QuasiStaticProblem, moved: Callable[[], float], limit: float
-) -> float | None:
+def _equilibrium(problem: QuasiStaticProblem, start: list[Array], limit: float) -> float | None:
     """Look for equilibrium with the present strength, and stay there if it is within a limit.
 
     Whatever else ends it, Ctrl-C or an error in a user's function, leaves the body where it was.
@@ -217,7 +228,7 @@ def _equilibrium(
         before = problem.capture()
         try:
             problem.step()
-            way = moved()
+            way = _moved(problem, start)
             if interrupted(comm):
                 settle(comm)
                 raise KeyboardInterrupt
