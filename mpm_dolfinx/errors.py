@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
+    "TRIAL_ERRORS",
     "ConvergenceError",
     "DomainDistortionError",
     "MPMError",
@@ -23,6 +24,7 @@ __all__ = [
     "agree",
     "agreed",
     "as_ours",
+    "gravest",
     "name_particles",
     "on_all_ranks",
     "warn",
@@ -80,12 +82,24 @@ class ConvergenceError(MPMError):
     """Newton's method, or a constitutive update, did not converge."""
 
 
+#: What says of a trial only that it has gone too far, so that a shorter one may do. All else, such
+#: as what a user's code raises, ends the step.
+TRIAL_ERRORS = (ConvergenceError, DomainDistortionError)
+
+
 def name_particles(particles: Sequence[int], most: int = 8) -> str:
     """Return a short list of particles for a message, e.g. ``particles 3, 4 and 9 more``."""
     shown = ", ".join(str(p) for p in particles[:most])
     rest = len(particles) - most
     word = "particle" if len(particles) == 1 else "particles"
     return f"{word} {shown}" + (f" and {rest} more" if rest > 0 else "")
+
+
+def gravest[E: BaseException](errors: Iterable[E | None]) -> E | None:
+    """Return the first error that is more than one of a trial, or else the first one, if any."""
+    found = [error for error in errors if error is not None]
+    grave = (error for error in found if not isinstance(error, TRIAL_ERRORS))
+    return next(grave, found[0] if found else None)
 
 
 def agreed[E: BaseException](comm: MPI.Comm, error: E | None) -> E | None:
@@ -96,14 +110,14 @@ def agreed[E: BaseException](comm: MPI.Comm, error: E | None) -> E | None:
         error: This rank's error.
 
     Returns:
-        The lowest failing rank's error, or ``None``; one of this package has the particles of
-        all ranks that have one of its class.
+        The gravest error, of several the lowest rank's, or ``None``; one of this package has the
+        particles of all ranks that have one of its class.
     """
     if comm.size == 1 or not comm.allreduce(error is not None, MPI.LOR):
         return error
     errors = comm.allgather(None if error is None else _sendable(error))
-    rank = next(r for r, e in enumerate(errors) if e is not None)
-    first = errors[rank]
+    first = gravest(errors)
+    rank = next(r for r, e in enumerate(errors) if e is first)
     if isinstance(first, MPMError):
         particles = {p for e in errors if type(e) is type(first) for p in e.particles}
         common = type(first)(first.message, particles, first.load)

@@ -27,7 +27,7 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ConvergenceError, MPMError, agree
+from ..errors import TRIAL_ERRORS, ConvergenceError, MPMError, agree
 from ..io.snapshot import Kept, Taken
 from ..parallel.given import require_same
 from ..particles.particles import Particles
@@ -369,7 +369,7 @@ class RigidBody(Term):
                     self._find(self._crept(s) if creeps else s)
                     self._begins = False
                     return None
-                except MPMError as error:
+                except TRIAL_ERRORS as error:
                     failure = error
         return failure
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import MPMError, as_ours
+from ..errors import ConvergenceError, MPMError, as_ours
 from ..reals import as_reals
 
 __all__ = [
@@ -278,7 +278,9 @@ class _Given(Shape):
         except Exception as error:
             raise as_ours(error, "The signed distance of a shape") from error
         if phi.shape != (len(y),) or not np.isfinite(phi).all():
-            raise MPMError(
+            # No number is what points far out may have at a trial that has gone too far.
+            kind = MPMError if phi.shape != (len(y),) else ConvergenceError
+            raise kind(
                 f"A signed distance must return {len(y)} finite numbers for points of the shape "
                 f"{y.shape}, not an array of the shape {phi.shape}."
             )

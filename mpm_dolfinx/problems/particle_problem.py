@@ -799,7 +799,9 @@ class ParticleProblem:
         """Update what the forms hold besides the displacement; return why that cannot be.
 
         Called before each assembly with ``particles.displacement`` set. Must not change the
-        history. It may differ between ranks.
+        history. A ``ConvergenceError`` or ``DomainDistortionError`` refuses this displacement, and
+        smaller steps are tried; all else, returned or raised, ends the step. It may differ between
+        ranks.
         """
         return None
 

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import (
-    ConvergenceError,
-    DomainDistortionError,
+    TRIAL_ERRORS,
     MPMError,
     ParticleOutsideError,
     agree,
@@ -287,7 +286,7 @@ class Stepper:
         except Interrupted:
             self.go_back()
             self._leave(update)
-        except (ConvergenceError, DomainDistortionError) as error:
+        except TRIAL_ERRORS as error:
             self._take_back(run.size, end, str(error))
             no_equilibrium = self.newton.no_equilibrium
             if run.control.cut_back(no_equilibrium):

@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 from ..assembly.body_forms import BodyForms
 from ..assembly.fused import Coupling, FusedTangent, Masses
 from ..assembly.petsc import MatrixSum
-from ..errors import DomainDistortionError, MPMError, agree, agreed, as_ours
+from ..errors import (
+    TRIAL_ERRORS,
+    ConvergenceError,
+    DomainDistortionError,
+    MPMError,
+    agree,
+    agreed,
+    as_ours,
+    gravest,
+)
 from ..history import Statistics
 from ..parallel.balance import imbalance
 from ..parallel.interruption import Interrupted, note, noted
@@ -373,9 +382,10 @@ class ReducedSystem:
             body.T.multTransposeAdd(vector, target, target)
 
     def residual(self, x: PETSc.Vec, F: PETSc.Vec) -> MPMError | None:
-        """Evaluate the residual at x, or say why that cannot be.
+        """Evaluate the residual at x, or say by which of the ``TRIAL_ERRORS`` that cannot be.
 
         Raises:
+            MPMError: What any rank has met that no other x mends, as an error of a user's code.
             BaseException: What a user's code has raised on any rank to end the program.
         """
         for field in self.fields:
@@ -386,7 +396,7 @@ class ReducedSystem:
                 inverted = motion.particles.inverted()
                 failure = failure or DomainDistortionError.of("turn inside out", inverted)
             failure = agreed(self._comm, failure) or agreed(self._comm, self._updated())
-        if isinstance(failure, MPMError):
+        if isinstance(failure, TRIAL_ERRORS):
             return failure
         if failure is not None:
             raise failure
@@ -450,12 +460,8 @@ class ReducedSystem:
         return vectors
 
     def _updated(self) -> BaseException | None:
-        """Update the terms; return the first failure."""
-        failure: BaseException | None = None
-        for term in self._terms:
-            found = _updated(term)
-            failure = failure or found
-        return failure
+        """Update the terms; return the gravest failure."""
+        return gravest([_updated(term) for term in self._terms])
 
     def _stiffness(self, field: Field) -> list[float]:
         """Return the shear modulus of each body of a field."""
@@ -913,6 +919,8 @@ def _updated(term: Term) -> BaseException | None:
     except KeyboardInterrupt:
         note()
         return Interrupted()
+    except np.linalg.LinAlgError as error:  # as of numbers that an x far off has made too large
+        return ConvergenceError(f"{term.evaluation} broke down ({error})")
     except Exception as error:
         return as_ours(error, term.evaluation)
     except BaseException as error:

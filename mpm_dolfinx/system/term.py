@@ -191,7 +191,8 @@ class Term:
     def update(self) -> MPMError | None:
         """Update what the forces depend on; return why that cannot be. It must not be kept yet.
 
-        Failures may differ between ranks.
+        A ``ConvergenceError`` or ``DomainDistortionError`` refuses these displacements, and smaller
+        steps are tried; all else, returned or raised, ends the step. It may differ between ranks.
         """
         return None
 

@@ -538,3 +538,31 @@ def test_what_makes_no_sense_is_refused():
             mpm.MPMError,
             sentence,
         )
+
+
+def test_an_error_in_any_one_call_of_a_shape_ends_the_step():
+    # A RigidBody looks for its balance from several starts, and no error is one of a start.
+    last = WORLD.size - 1
+    plate_shape = contact.box((-0.4, 1.0), (1.4, 1.4), 0.05)
+
+    def settle(number=0):
+        def distance(y):
+            calls.append(len(y))
+            if len(calls) == number and WORLD.rank == last:
+                raise ZeroDivisionError("no distance")
+            return plate_shape.distance(y)[0]
+
+        calls = []
+        V = scenes.vectors(box([-0.3, -0.2], [1.3, 1.2], [8, 7], QUADRILATERAL))
+        particles = mpm.Particles(box([0.0, 0.0], [1.0, 1.0], [4, 4], QUADRILATERAL), V)
+        shape = contact.signed_distance(distance, (0.5, 1.2))
+        plate = contact.RigidBody(particles, shape, centre=(0.5, 1.0), fixed=("rotation",))
+        law = Hencky(YOUNG, POISSON)
+        problem = mpm.QuasiStaticProblem(particles, law, bcs=[base(V, 0.01)], terms=[plate])
+        begun = len(calls)
+        problem.solve(1, update=lambda t: plate.push((0.0, -8.0 * t), 0.0))
+        return begun, len(calls)
+
+    begun, done = WORLD.bcast(settle(), last)
+    for number in range(begun + 1, done + 1, (done - begun) // 12):
+        raises(lambda: settle(number), mpm.MPMError, "ZeroDivisionError: no distance")

@@ -10,6 +10,7 @@ import threading
 import numpy as np
 import pytest
 import scenes
+from marks import slow
 from scenes import TRIANGLE, WORLD
 from stress import interrupts
 
@@ -213,6 +214,33 @@ def test_an_error_in_a_material_is_told(when):
 
 def divide():
     return 1 / 0
+
+
+@pytest.mark.parametrize("refused", [True, *slow(False)])
+def test_an_error_in_any_one_evaluation_ends_the_step(refused):
+    # Some are at trials that the line search gives up for shorter ones.
+    whole = scenes.slump(TRIANGLE, 15e3, h=1.0)
+    count = at_evaluation(whole, 0, divide)
+    whole.solve(2)
+    assert whole.history.statistics["halvings"] > 0
+    for number in range(1, count[0] + 1):
+        problem = scenes.slump(TRIANGLE, 15e3, h=1.0)
+        done = at_evaluation(problem, number, divide, WORLD.size - 1)
+        if refused:  # at the same evaluation, by a term before that and by the first rank
+            refuse_after(problem.body_terms[0], done, number - 1)
+        error = interrupt(problem, mpm.MPMError, steps=2)
+        assert "ZeroDivisionError" in str(error)
+
+
+def refuse_after(term, done, number):
+    """Let a term refuse all displacements after a number of evaluations."""
+    update = term.update
+
+    def refusing():
+        found = update()
+        return mpm.ConvergenceError("Too far") if done[0] >= number else found
+
+    term.update = refusing
 
 
 def test_an_error_in_a_call_of_petsc_comes_out_as_itself():
