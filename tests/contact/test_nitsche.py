@@ -114,7 +114,8 @@ def test_tangent_is_that_of_differences(name):
     problem, die, path = dragged(law="nitsche", **TANGENTS[name])
     problem.solve(4, update=path)
     assert WORLD.allreduce(int(die.touches.sum())) > 0
-    assert error_of_blocks(problem, step=1e-7, size=1e-5) < 1e-7
+    # (the motion is that of numbers of unknowns: on any ranks no point may begin to slip in a step)
+    assert error_of_blocks(problem, step=1e-8, size=1e-5) < 1e-7
 
 
 @pytest.mark.parametrize("f_bar", ["none", "patch"])
