@@ -22,7 +22,7 @@ import mpm_dolfinx as mpm
 CASES = Path(__file__).parent / "cases"
 BOUND = 1e-9
 #: Ratios of two numbers of a run, less one.
-RISES = ("plateau",)
+RISES = ("plateau", "energy_change", "energy_largest")
 
 #: Cases and their arguments.
 RUNS = (
