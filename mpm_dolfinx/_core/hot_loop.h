@@ -3,9 +3,11 @@
 
 #pragma once
 
-// A loop that is compiled for processors with and without AVX2; the loader picks one.
+// A loop that is compiled for processors with and without AVX2; the loader picks one. ("avx2" asks
+// what the processor can do, where the name of one asks for that very model. Without fused
+// multiplication and addition both round alike, so that results do not go with the processor.)
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
-#define HOT_LOOP __attribute__((target_clones("arch=haswell", "default"), flatten))
+#define HOT_LOOP __attribute__((target_clones("avx2", "default"), flatten))
 #else
 #define HOT_LOOP
 #endif
