@@ -21,8 +21,8 @@
 #
 # which grows until there is no equilibrium any more (Zienkiewicz, Humpheson & Lewis 1975). The last
 # $F$ with equilibrium is the factor of safety. No slip surface has to be guessed: it is what the
-# plastic strain shows. As the geometry is followed, a slope that slides may come to rest further
-# down; so a limit of the displacement, some times that by its weight, says what counts as standing.
+# plastic strain shows. As a slope that slides may come to rest further down, a limit of the
+# displacement, some times that by its weight, says what counts as standing.
 #
 # ## Implementation
 
@@ -38,8 +38,7 @@ import mpm_dolfinx as mpm
 comm, quadrilateral = MPI.COMM_WORLD, mesh.CellType.quadrilateral
 H, CREST, FOOT = 10.0, 12.5, 20.0  # m: height, width of crest and slope
 h = H / 16  # background cells, m
-DENSITY, GRAVITY = 2000.0, (0.0, -10.0)  # kg/m3, m/s2
-YOUNG = 1e8  # Pa
+DENSITY, GRAVITY, YOUNG = 2000.0, (0.0, -10.0), 1e8  # kg/m3, m/s2, Pa
 SILT, SEAM = 1, 2
 
 width = CREST + FOOT
