@@ -3,6 +3,7 @@
 """Two bodies in contact that several tests need."""
 
 import numpy as np
+import pytest
 import scenes
 from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD, anywhere
 
@@ -178,6 +179,30 @@ def balance(problem, touch):
         total += WORLD.allreduce(f.sum(axis=0))
         moment += WORLD.allreduce((x[:, 0] * f[:, 1] - x[:, 1] * f[:, 0]).sum())
     return total, moment
+
+
+def fail_after(count, **options):
+    """Drag a block along another for some steps of 8, let one fail, and compare all bit by bit.
+
+    Args:
+        count: How many steps.
+        options: As for :func:`two`.
+    """
+    problem, touch, path = two(**options)
+    steps = problem.steps(8, update=path)
+    for _ in range(count):
+        next(steps)
+    before = [{k: c.values.copy() for k, c in touch.columns(i).items()} for i in (0, 1)]
+    force, d = problem.reaction(touch), [b.displacement.x.array.copy() for b in problem.bodies]
+    problem.bcs[0].g.value[:] = [0.0, -0.9]
+    with pytest.raises(mpm.MPMError):
+        problem.step()
+    assert np.array_equal(force, problem.reaction(touch))
+    for body, array in zip(problem.bodies, d, strict=True):
+        assert np.array_equal(array, body.displacement.x.array)
+    for number, columns in enumerate(before):
+        for key, column in touch.columns(number).items():
+            assert np.array_equal(columns[key], column.values), key
 
 
 def go_on_other_meshes(what, **options):
