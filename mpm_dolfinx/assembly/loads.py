@@ -34,9 +34,8 @@ class VirtualWork:
         i, j, k, m = ufl.indices(4)
         trial = self._strain.ufl_gradient(ufl.TrialFunction(self._body.W))
         test = self._strain.ufl_gradient(self._v)
-        work = self._strain.turn * ufl.inner(P, test) * self._body.dx
-        tangent = self._strain.turn * A[i, j, k, m] * trial[k, m] * test[i, j] * self._body.dx
-        return work, tangent
+        work = self._strain.integral(ufl.inner(P, test))
+        return work, self._strain.integral(A[i, j, k, m] * trial[k, m] * test[i, j])
 
     def mass(self, density: Any, test: Any) -> ufl.Form:
         """Return the integral of the density times a test function."""

@@ -12,7 +12,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from ufl.algorithms.estimate_degrees import estimate_total_polynomial_degree
-from ufl.classes import Grad
+from ufl.classes import Division, Grad, Indexed, SpatialCoordinate
 from ufl.corealg.traversal import traverse_unique_terminals, unique_pre_traversal
 
 from .. import _compat
@@ -129,6 +129,32 @@ def _require_no_gradient(integral: Any) -> None:
             )
 
 
+def _require_radius_seen(integral: Any, degree: int, *unknowns: fem.Function) -> None:
+    """Raise an error where the one point of a quadrilateral stands for strains around an axis.
+
+    They are told by an unknown or an argument over ``x[0]``.
+    """
+    one_point = degree <= 1 and integral.ufl_domain().ufl_cell().cellname == "quadrilateral"
+    if integral.integral_type() != "cell" or not one_point:
+        return
+    for node in unique_pre_traversal(integral.integrand()):
+        if not isinstance(node, Division):
+            continue
+        moved, radius = node.ufl_operands
+        if not isinstance(radius, Indexed) or int(radius.ufl_operands[1][0]) != 0:
+            continue
+        if isinstance(radius.ufl_operands[0], SpatialCoordinate) and any(
+            isinstance(t, ufl.Argument) or any(t is u for u in unknowns)
+            for t in traverse_unique_terminals(moved)
+        ):
+            raise MPMError(
+                "The form divides a displacement by the radius x[0] at the one point of a "
+                "quadrilateral, which is wrong at the axis however small domains are; make the "
+                "particles with quadrature_degree=2, or give a QuasiStaticProblem or a "
+                "DynamicProblem axisymmetric=True."
+            )
+
+
 def _name_of(terminal: Any, integral: Any) -> str:
     """Return what a Function or an argument is called, by its number in the integral."""
     if isinstance(terminal, ufl.Argument):
@@ -154,7 +180,8 @@ def split_by_rule(form: ufl.Form, *unknowns: fem.Function) -> list[ufl.Form]:
         The parts, whose sum is ``form``.
 
     Raises:
-        MPMError: Where data at quadrature points meet another rule.
+        MPMError: Where data at quadrature points meet another rule, or one point of a
+            quadrilateral a strain around an axis.
     """
     parts: dict[tuple[bool, str, int, str, int], list[Any]] = defaultdict(list)
     markers: list[Any] = []
@@ -162,6 +189,7 @@ def split_by_rule(form: ufl.Form, *unknowns: fem.Function) -> list[ufl.Form]:
         if vanishes(integral):
             continue
         degree, scheme = _rule(integral)
+        _require_radius_seen(integral, degree, *unknowns)
         metadata = dict(integral.metadata())
         metadata.update(quadrature_degree=degree, quadrature_rule=scheme)
         one = integral.reconstruct(metadata=metadata)

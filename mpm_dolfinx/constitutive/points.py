@@ -486,11 +486,12 @@ class MaterialPoints:
         self, stress: NDArray[np.float64], tangent: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return a first Piola stress at all points and its tangent as :meth:`on_mesh` does."""
-        if not self._particles.rebased:
+        before = self.strain.before_mesh()
+        if before is None:
             return stress, tangent
-        gdim = self._particles.mesh.geometry.dim
+        gdim = before.shape[-1]
         G = np.tile(np.eye(self.dim), (len(stress), 1, 1))
-        G[:, :gdim, :gdim] += self._particles.reference.gradient.reshape(-1, gdim, gdim)
+        G[:, :gdim, :gdim] = before.reshape(-1, gdim, gdim)
         volume = np.linalg.det(G)[:, None, None]
         stress = np.einsum("niJ,nMJ->niM", stress, G) / volume
         tangent = np.einsum("niJkL,nMJ,nNL->niMkN", tangent, G, G, optimize=True)

@@ -82,6 +82,22 @@ class Strain:
 
     # -- In UFL ---------------------------------------------------------------------------
 
+    def before_mesh(self) -> Array | None:
+        """Return the deformation gradient of the mesh that :meth:`ufl_gradient` does not see.
+
+        Returns:
+            Shape ``(n, nq, gdim, gdim)``, or ``None`` where it sees all.
+        """
+        if not self.particles.rebased:
+            return None
+        gradient = self.particles.reference.gradient
+        return np.asarray(np.eye(gradient.shape[-1]) + gradient)
+
+    def integral(self, work: Any) -> ufl.Form:
+        """Return the integral of a stress times a gradient of :meth:`ufl_gradient`."""
+        form: ufl.Form = self.turn * work * self.particles.dx
+        return form
+
     @property
     def turn(self) -> Any:
         """Length of the way around the axis in the undeformed body, or 1."""
@@ -111,6 +127,7 @@ class Revolution(Strain):
     def __init__(self, particles: Particles) -> None:
         super().__init__(particles)
         particles.require_radius()
+        particles.revolve(True)
         self.dim = 3
         self._mesh_radius = ufl.SpatialCoordinate(particles.mesh)[0]
         self._radius = self._mesh_radius if particles.origin is None else particles.origin[0]
@@ -133,6 +150,25 @@ class Revolution(Strain):
         words = "reach across the axis x[0] = 0 (nodes on it must be held against the radius)"
         return words, self.particles.behind_axis()
 
+    def before_mesh(self) -> Array | None:
+        """See :meth:`Strain.before_mesh`."""
+        return super().before_mesh() if self.particles.means is None else None
+
+    def integral(self, work: Any) -> ufl.Form:
+        """See :meth:`Strain.integral`."""
+        means = self.particles.means
+        if means is None:
+            return super().integral(work)
+        form: ufl.Form = means.share * work * self.particles.dx
+        return form
+
+    def ufl_gradient(self, w: Any) -> Any:
+        """See :meth:`Strain.ufl_gradient`."""
+        means = self.particles.means
+        if means is None:
+            return super().ufl_gradient(w)
+        return _in_space(means.gradient(w), means.hoop(w))
+
     @property
     def turn(self) -> Any:
         """See :class:`Strain`."""
@@ -145,9 +181,12 @@ class Revolution(Strain):
 
     def with_turn(self, gradient: Any, w: Any) -> Any:
         """See :meth:`Strain.with_turn`."""
-        g = gradient
-        hoop = w[0] / self._radius
-        return ufl.as_tensor([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, hoop]])
+        return _in_space(gradient, w[0] / self._radius)
+
+
+def _in_space(g: Any, hoop: Any) -> Any:
+    """Return a gradient in the plane with a hoop strain."""
+    return ufl.as_tensor([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, hoop]])
 
 
 def strain_of(particles: Particles, axisymmetric: bool) -> Strain:
@@ -157,4 +196,7 @@ def strain_of(particles: Particles, axisymmetric: bool) -> Strain:
         particles: The body.
         axisymmetric: Whether it is one of revolution.
     """
-    return Revolution(particles) if axisymmetric else Strain(particles)
+    if axisymmetric:
+        return Revolution(particles)
+    particles.revolve(False)
+    return Strain(particles)

@@ -19,6 +19,7 @@ __all__ = [
     "DomainQuadrature",
     "default_degree",
     "exact_degree",
+    "means_around_axis",
     "nodal_forces",
     "quadrature_element",
     "quadrature_rule",
@@ -152,6 +153,22 @@ def volumes_and_averages(
         volumes[part] = sizes.sum(axis=1)
         averages[part] = sizes @ shapes / volumes[part, None]
     return volumes, averages
+
+
+def means_around_axis(rule: DomainQuadrature, domains: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return means of shape functions' gradients over domains that are turned around ``x[0] = 0``.
+
+    Args:
+        rule: A rule on the body mesh that is exact for products of two shape functions.
+        domains: Nodes of the undeformed domains, shape ``(n, k, 2)``.
+
+    Returns:
+        Gradients in the undeformed domains, shape ``(n, k, 2)``.
+    """
+    before = np.einsum("nki,nqkj->nqij", domains, rule.gradients)
+    volumes = rule.weights * np.linalg.det(before) * (domains[:, :, 0] @ rule.shapes.T)
+    parts = volumes / volumes.sum(axis=1, keepdims=True)
+    return np.asarray(np.einsum("nq,nqkj,nqji->nki", parts, rule.gradients, np.linalg.inv(before)))
 
 
 def _geometry(

@@ -14,9 +14,16 @@ import ufl
 from dolfinx import fem, mesh
 
 from ..errors import MPMError, agree
-from ..meshes.quadrature import DomainQuadrature, quadrature_rule, volume_ratio, with_hoop
+from ..meshes.quadrature import (
+    DomainQuadrature,
+    means_around_axis,
+    quadrature_rule,
+    volume_ratio,
+    with_hoop,
+)
 from .deletion import Deletion
 from .geometry import Geometry
+from .means import MeansInUFL
 from .reference import Reference
 
 __all__ = ["Domains", "separate_nodes"]
@@ -38,6 +45,8 @@ class Domains:
         deletion: Which domains are deleted, or ``None`` where none may be.
         mass_share: Factor of the density that keeps the mass at each node where domains were
             split or the body rebased, otherwise ``None``.
+        means: Where the rule's one point stands for means around an axis, how they follow in UFL
+            from what is there (see :class:`MeansInUFL`), otherwise ``None``.
         origin: Undeformed positions of the nodes of W where the body was rebased, otherwise
             ``None``.
     """
@@ -52,6 +61,7 @@ class Domains:
         self._geometry = geometry
         self.displacement = fem.Function(geometry.W, name="displacement")
         self.quadrature = geometry.rule()
+        self.means: MeansInUFL | None = None
         self.deletion = Deletion(geometry.mesh, geometry.W) if deletable else None
         self._gradient: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self._reference: Reference | None = None
@@ -141,16 +151,43 @@ class Domains:
         The history's rule then has the volumes and gradients of the undeformed body. Its arrays
         stay the same ones.
         """
-        plain = self.mesh_rule()
-        before = np.eye(self._geometry.gdim) + reference.gradient
-        np.matmul(plain.gradients, before, out=self.quadrature.gradients)
-        np.divide(plain.weights, np.linalg.det(before), out=self.quadrature.weights)
-        self._reference, self._gradient = reference, None
+        self._reference = reference
+        self._set_rule()
         if self.origin is not None:
             self.origin.x.array.reshape(-1, self._geometry.gdim)[self.domain_nodes] = (
                 reference.domains
             )
             self.origin.x.scatter_forward()
+
+    def revolve(self, around: bool) -> None:
+        """Take the body for one of revolution about ``x[0] = 0``, or no longer.
+
+        The gradients at the one point of a quadrilateral are means over its volume all around
+        then, and so are the hoop strains: at the axis, values at the middle would not be near
+        them however small domains are. The rule's arrays stay the same ones.
+        """
+        quadrilateral = self.mesh.basix_cell() == basix.CellType.quadrilateral
+        before = self.means
+        self.means = None
+        if around and quadrilateral and self.num_points == 1:
+            self.means = before or MeansInUFL(self._geometry)
+        if self.means is not before:
+            self._set_rule()
+
+    def _set_rule(self) -> None:
+        """Set the volumes and gradients of the history's rule in the undeformed body."""
+        rule, self._gradient = self.quadrature, None
+        plain = self.mesh_rule()
+        if self.means is not None:
+            exact = self._geometry.exact_rule()
+            rule.gradients[:, 0] = means_around_axis(exact, self.initial_domains)
+            rule.weights[:, 0] = self.initial_volume
+            share = self.point_volumes(axisymmetric=True) / plain.weights
+            self.means.set(rule.gradients[:, 0], self.hoop[:, 0], share[:, 0])
+            return
+        before = np.eye(self._geometry.gdim) + self.reference.gradient
+        np.matmul(plain.gradients, before, out=rule.gradients)
+        np.divide(plain.weights, np.linalg.det(before), out=rule.weights)
 
     def mass_shares(self) -> NDArray[np.float64]:
         """Return the factors of the density at the nodes of the owned domains, ``(n, k)``."""
@@ -293,15 +330,23 @@ class Domains:
         return gradient
 
     @property
+    def _radial_shapes(self) -> NDArray[np.float64]:
+        """Shape functions at the history's points, or their averages, ``(n, nq, k)``."""
+        shapes = self.quadrature.shapes
+        if self.means is not None:
+            return self.averages[:, None]
+        return np.broadcast_to(shapes, (self.num_local, *shapes.shape))
+
+    @property
     def radii(self) -> NDArray[np.float64]:
         """Undeformed radius of the history's points, shape ``(n, nq)``."""
         radii = self.initial_domains[:, :, 0]
-        return np.asarray(np.einsum("qk,nk->nq", self.quadrature.shapes, radii))
+        return np.asarray(np.einsum("nqk,nk->nq", self._radial_shapes, radii))
 
     @property
     def hoop(self) -> NDArray[np.float64]:
         """Hoop strain that a radial displacement of each node causes, shape ``(n, nq, k)``."""
-        return np.asarray(self.quadrature.shapes / self.radii[:, :, None])
+        return np.asarray(self._radial_shapes / self.radii[:, :, None])
 
     def point_volumes(self, axisymmetric: bool = False) -> NDArray[np.float64]:
         """Return the reference volume of the history's points, shape ``(n, nq)``.
@@ -340,6 +385,11 @@ class Domains:
         return self._reference.domains.copy()
 
     @property
+    def averages(self) -> NDArray[np.float64]:
+        """Averages of the shape functions over the undeformed domains, shape ``(n, k)``."""
+        return self.mesh_averages if self._reference is None else self._reference.averages
+
+    @property
     def initial_volume(self) -> NDArray[np.float64]:
         """Volume of the undeformed domains, shape ``(n,)``; an area in the plane."""
         volume = self._geometry.volumes if self._reference is None else self._reference.volume
@@ -374,8 +424,7 @@ class Domains:
 
     def mean(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return averages over the undeformed domains of values at nodes ``(n, k, gdim)``."""
-        averages = self.mesh_averages if self._reference is None else self._reference.averages
-        return np.asarray(np.einsum("nk,nki->ni", averages, nodal))
+        return np.asarray(np.einsum("nk,nki->ni", self.averages, nodal))
 
     def _at_points(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(np.einsum("qk,nki->nqi", self.quadrature.shapes, nodal))
