@@ -334,7 +334,7 @@ class Domains:
         """Shape functions at the history's points, or their averages, ``(n, nq, k)``."""
         shapes = self.quadrature.shapes
         if self.means is not None:
-            return self.averages[:, None]
+            return self._averages[:, None]
         return np.broadcast_to(shapes, (self.num_local, *shapes.shape))
 
     @property
@@ -385,7 +385,7 @@ class Domains:
         return self._reference.domains.copy()
 
     @property
-    def averages(self) -> NDArray[np.float64]:
+    def _averages(self) -> NDArray[np.float64]:
         """Averages of the shape functions over the undeformed domains, shape ``(n, k)``."""
         return self.mesh_averages if self._reference is None else self._reference.averages
 
@@ -424,7 +424,7 @@ class Domains:
 
     def mean(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return averages over the undeformed domains of values at nodes ``(n, k, gdim)``."""
-        return np.asarray(np.einsum("nk,nki->ni", self.averages, nodal))
+        return np.asarray(np.einsum("nk,nki->ni", self._averages, nodal))
 
     def _at_points(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(np.einsum("qk,nki->nqi", self.quadrature.shapes, nodal))
