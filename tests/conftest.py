@@ -26,7 +26,7 @@ from petsc4py import PETSc
 import numpy as np
 import pytest
 from marks import between_ranks
-from programs import patient_compilers, remembered_forms
+from programs import patient_compilers, remembered_forms, whole_forms
 
 comm = MPI.COMM_WORLD.Dup()
 
@@ -70,6 +70,9 @@ def pytest_configure(config: pytest.Config) -> None:
             returncode=4,
         )
     with contextlib.ExitStack() as stack:
+        if comm.rank == 0:
+            stack.enter_context(whole_forms())
+        comm.Barrier()
         stack.enter_context(patient_compilers())
         stack.enter_context(remembered_forms())
         config.add_cleanup(stack.pop_all().close)

@@ -3,8 +3,10 @@
 """Programs that tests start in processes of their own, and what these find there."""
 
 import contextlib
+import fcntl
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -31,6 +33,43 @@ def run(*arguments, cwd=None, **environment):
     )
 
 
+#: Where DOLFINx keeps compiled forms, and where tests do: others' that were killed meanwhile leave
+#: files for which FFCx waits.
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+USUAL, OWN = CACHE / "fenics", CACHE / "mpm_dolfinx_tests"
+#: The end of the name of FFCx's note that a module is ready.
+READY = ".c.cached"
+
+
+@contextlib.contextmanager
+def whole_forms(usual: Path = USUAL, own: Path = OWN) -> Iterator[None]:
+    """Keep the forms of tests, without those that a run was killed at; one rank does this.
+
+    Who runs tests holds a lock, which ends with his process. Where nobody else does, forms that are
+    begun only are taken away, and those that are ready in the usual cache need not be compiled.
+    """
+    own.mkdir(parents=True, exist_ok=True)
+    with (own / "lock").open("a") as lock:
+        with contextlib.suppress(BlockingIOError):
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            for module in {file.stem for file in own.glob("*.c")} - _ready(own):
+                for file in own.glob(f"{module}.*"):
+                    file.unlink()
+            for module in _ready(usual) - _ready(own):
+                note = f"{module}{READY}"
+                for file in usual.glob(f"{module}.*"):
+                    if file.name != note:
+                        shutil.copy2(file, own)
+                shutil.copy2(usual / note, own)
+        fcntl.flock(lock, fcntl.LOCK_SH)
+        yield
+
+
+def _ready(cache: Path) -> set[str]:
+    """Return the names of the modules that FFCx has compiled."""
+    return {note.name.removesuffix(READY) for note in cache.glob(f"*{READY}")}
+
+
 @contextlib.contextmanager
 def patient_compilers() -> Iterator[None]:
     """Have DOLFINx wait for a form that another process compiles, here and in what is started.
@@ -43,6 +82,7 @@ def patient_compilers() -> Iterator[None]:
     options = {"timeout": int(PATIENCE)}
     with contextlib.suppress(OSError):
         options |= json.loads((own / name).read_text("utf-8"))
+    options["cache_dir"] = str(OWN)
     before = os.environ.get("XDG_CONFIG_HOME")
     with tempfile.TemporaryDirectory(prefix="mpm_dolfinx_") as folder:
         path = folder / name

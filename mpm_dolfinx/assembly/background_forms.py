@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ufl
-from dolfinx import fem
 from dolfinx.fem import petsc as fem_petsc
 
 from .. import _compat
 from ..errors import MPMError
+from ..parallel.compilation import compiled_form
 from ..particles.particles import Particles
 from .petsc import MatrixSum, assemble_into, assemble_matrix
 from .rules import depends_on, form_of_rank, split_by_rule
@@ -40,8 +40,8 @@ class BackgroundForms:
         tangents = [ufl.derivative(p, u) for p in parts if depends_on(p, u)]
         if not tangents:
             raise MPMError("The background form does not depend on particles.increment.")
-        self._residuals = [fem.form(p, **options) for p in parts]
-        self._tangents = [fem.form(t, **options) for t in tangents]
+        self._residuals = [compiled_form(p, **options) for p in parts]
+        self._tangents = [compiled_form(t, **options) for t in tangents]
         self._matrices = [fem_petsc.create_matrix(t) for t in self._tangents]
         self._sum = MatrixSum()
         self.r: PETSc.Vec = _compat.create_vector(particles.V)

@@ -22,6 +22,7 @@ from .._core import loops
 from ..constitutive.averaging import Linearised, LowRankTerm
 from ..errors import MPMError
 from ..meshes.quadrature import nodal_forces, with_hoop
+from ..parallel.compilation import compiled_form
 from ..particles.particles import Particles
 from .low_rank import LowRankTangent
 from .petsc import assemble_into, assemble_matrix
@@ -159,7 +160,7 @@ class BodyForms:
         self.external: PETSc.Vec = _compat.create_vector(particles.W)
 
     def _compile(self, forms: list[ufl.Form]) -> list[fem.Form]:
-        return [fem.form(form, **self._options) for form in forms]
+        return [compiled_form(form, **self._options) for form in forms]
 
     @property
     def low_rank(self) -> LowRankTangent | None:

@@ -18,6 +18,7 @@ from ufl.algorithms import expand_derivatives
 
 from .. import _compat
 from ..errors import MPMError
+from ..parallel.compilation import compiled_form
 from ..particles.field import ParticleField
 from ..particles.particles import Particles
 from .petsc import assemble_into, assemble_matrix
@@ -69,7 +70,7 @@ class FieldForms:
         self._loaded: list[list[fem.Form]] = []
         self.follows_load = False
         for own in self._parts:
-            compiled = [(part, fem.form(part, **options)) for part in own]
+            compiled = [(part, compiled_form(part, **options)) for part in own]
             self._live.append([form for part, form in compiled if follows(part, *unknowns)])
             self._dead.append([form for part, form in compiled if not follows(part, *unknowns)])
             loaded = [(part, form) for part, form in compiled if self._has_load(part)]
@@ -105,7 +106,7 @@ class FieldForms:
                 forms = [expand_derivatives(ufl.derivative(part, unknown, trial)) for part in own]
                 forms = [form for form in forms if not form.empty() and not is_zero(form)]
                 if forms:
-                    found[i, j] = [fem.form(form, **self._options) for form in forms]
+                    found[i, j] = [compiled_form(form, **self._options) for form in forms]
         return found
 
     def _space(self, number: int) -> fem.FunctionSpace:
@@ -117,7 +118,7 @@ class FieldForms:
             test = ufl.TestFunction(self._space(pair[0]))
             trial = ufl.TrialFunction(self._space(pair[1]))
             product = _component(test) * _component(trial) * self._particles.dx
-            form = fem.form(product, **self._options)
+            form = compiled_form(product, **self._options)
             self._matrices[pair] = fem_petsc.create_matrix(form)
         return self._matrices[pair]
 
@@ -163,7 +164,7 @@ class FieldForms:
             forms = []
             for part in self._parts[number]:
                 swap = {part.arguments()[0]: ufl.TestFunction(space)}
-                forms.append(fem.form(ufl.replace(part, swap), **self._options))
+                forms.append(compiled_form(ufl.replace(part, swap), **self._options))
             self._broken[number] = forms, _compat.create_vector(space)
         broken = self._broken[number]
         assert broken is not None

@@ -16,6 +16,7 @@ from .. import _compat
 from ..errors import MPMError, agree, as_ours
 from ..materials.base import Material
 from ..meshes.quadrature import quadrature_rule
+from ..parallel.compilation import compiled_expression
 from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..reals import as_reals, holds_ufl
@@ -96,7 +97,7 @@ class NotNegative:
         if not isinstance(self.value, fem.Constant | fem.Function):
             degree = particles.dx_exact.metadata()["quadrature_degree"]
             points, _ = quadrature_rule(particles.mesh.basix_cell(), degree)
-            self._at_points = fem.Expression(self.value, points)
+            self._at_points = compiled_expression(self.value, points, particles.mesh.comm)
 
     def require(self) -> None:
         """Look at the present values at the points of integration (collective).

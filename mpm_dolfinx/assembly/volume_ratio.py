@@ -17,6 +17,7 @@ from ..constitutive.averaging import LowRankTerm, VolumeAveraging
 from ..constitutive.strain import Strain
 from ..errors import MPMError
 from ..meshes.quadrature import volume_ratio
+from ..parallel.compilation import compiled_form
 from ..particles.particles import Particles
 from .rules import depends_on, split_by_rule
 
@@ -127,7 +128,7 @@ class AveragedVolumeRatio(fem.Function):
 
     def _compile(self, form: ufl.Form) -> list[fem.Form]:
         form = ufl.algorithms.expand_derivatives(form)
-        return [fem.form(part) for part in split_by_rule(form, self.particles.displacement)]
+        return [compiled_form(part) for part in split_by_rule(form, self.particles.displacement)]
 
     def _of_domains(self, forms: list[fem.Form], shape: tuple[int, ...] = ()) -> Array:
         """Return what the owned domains have of forms, shape ``(n, *shape)``."""

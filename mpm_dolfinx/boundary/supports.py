@@ -27,6 +27,7 @@ from ufl.algorithms.analysis import extract_coefficients, extract_constants
 
 from ..assembly.inputs import as_expression, is_tag, known_tags
 from ..errors import MPMError, agree, warn
+from ..parallel.compilation import compiled_form
 from ..particles.particles import Particles
 
 __all__ = ["Dashpot", "Plane", "Support", "dashpot", "fixed", "plane", "roller"]
@@ -110,7 +111,7 @@ class Support:
         """
         each = ufl.TestFunction(self._stiffness.function_space)
         area, volume, weighted = (
-            fem.assemble_vector(fem.form(form)).array
+            fem.assemble_vector(compiled_form(form)).array
             for form in (
                 each * self._ds,
                 each * self.particles.dx_exact,
@@ -238,7 +239,7 @@ class Support:
             form = -self._turn * ufl.inner(self._of_step(), motion) * self._ds
             if self.particles.deletion is not None:
                 form = self.particles.deletion.present_only(form)
-            self._power = fem.form(form)
+            self._power = compiled_form(form)
         return float(np.real(fem.assemble_scalar(self._power)))
 
     @property
@@ -249,7 +250,7 @@ class Support:
             forms = [self._turn * self._traction[i] * self._ds for i in range(gdim)]
             if self.particles.deletion is not None:
                 forms = [self.particles.deletion.present_only(form) for form in forms]
-            self._sums = [fem.form(form) for form in forms]
+            self._sums = [compiled_form(form) for form in forms]
         mine = np.array([fem.assemble_scalar(form) for form in self._sums])
         return np.asarray(self.particles.mesh.comm.allreduce(mine))
 

@@ -17,6 +17,7 @@ from dolfinx import fem, mesh
 from ..background.basis import BackgroundBasis, PointBasis
 from ..errors import MPMError, ParticleOutsideError, agree
 from ..meshes.quadrature import DomainQuadrature
+from ..parallel.compilation import compiled_expression
 from ..parallel.given import require_same
 from ..transfer.matrix import transfer_matrix
 from ..transfer.transfer import Transfer
@@ -311,9 +312,8 @@ class CarriedField:
         """Return the undeformed positions of the history's points, ``(n, nq, gdim)``."""
         gdim = self.mesh.geometry.dim
         x = self.field.particles.quadrature_function("x", (gdim,))
-        where = fem.Expression(
-            ufl.SpatialCoordinate(self.mesh), x.function_space.ufl_element().custom_quadrature()[0]
-        )
+        points = x.function_space.ufl_element().custom_quadrature()[0]
+        where = compiled_expression(ufl.SpatialCoordinate(self.mesh), points, self.mesh.comm)
         x.interpolate(where)
         count = self.W.dofmap.index_map.size_local
         return np.asarray(x.x.array[: count * gdim]).reshape(

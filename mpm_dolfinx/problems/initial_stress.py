@@ -17,6 +17,7 @@ from dolfinx import fem
 from ..assembly.inputs import as_expression
 from ..errors import MPMError, agree, as_ours
 from ..meshes.quadrature import quadrature_rule
+from ..parallel.compilation import compiled_expression
 from ..particles.particles import Particles
 from ..reals import as_reals
 
@@ -155,7 +156,8 @@ def initial_stress_at_points(value: Any, particles: Particles) -> Array:
         made = fem.Constant(particles.mesh, 1.0) * made  # a constant one knows no ranks
         points, _ = quadrature_rule(particles.mesh.basix_cell(), particles.quadrature_degree)
         cells = np.arange(n, dtype=np.int32)
-        evaluated: Any = fem.Expression(made, points).eval(particles.mesh, cells)
+        at_points = compiled_expression(made, points, particles.mesh.comm)
+        evaluated: Any = at_points.eval(particles.mesh, cells)
         values: Array = evaluated.reshape(n, nq, 3, 3)
     else:
         with agree(particles.mesh.comm):

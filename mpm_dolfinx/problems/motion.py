@@ -26,6 +26,7 @@ from ..contact.contact import Contact
 from ..contact.rigid_body import RigidBody
 from ..errors import MPMError, agree, as_ours
 from ..history import Energy
+from ..parallel.compilation import compiled_expression, compiled_form
 from ..parallel.garbage import weakly
 from ..particles.particles import Particles
 from ..reals import as_reals
@@ -115,7 +116,7 @@ class MovingProblem(TimeProblem):
         form = self._mass_form(number, product)
         if body.deletion is not None:
             form = body.deletion.present_only(form)
-        matrix = fem.assemble_matrix(fem.form(form, **self._numerics.of_forms))
+        matrix = fem.assemble_matrix(compiled_form(form, **self._numerics.of_forms))
         n, k = body.domain_nodes.shape
         return np.array(matrix.data[: n * k * k].reshape(n, k, k))
 
@@ -249,7 +250,7 @@ def _velocity(value: Any, body: Particles) -> fem.Function:
     else:
         expression = as_expression(value, body, "velocity", (body.mesh.geometry.dim,))
         points = _compat.interpolation_points(body.W)
-        velocity.interpolate(fem.Expression(expression, points))
+        velocity.interpolate(compiled_expression(expression, points, body.mesh.comm))
     velocity.x.scatter_forward()
     finite = bool(np.isfinite(velocity.x.array).all())
     if body.mesh.comm.allreduce(not finite):

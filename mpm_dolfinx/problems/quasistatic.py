@@ -25,6 +25,7 @@ from ..constitutive.step_stress import StepStress
 from ..constitutive.strain import Strain, strain_of
 from ..errors import DomainDistortionError, MPMError, agree, agreed, warn
 from ..io.checkpoint import Snapshot
+from ..parallel.compilation import compiled_form
 from ..parallel.given import require_same
 from ..particles.domains import separate_nodes
 from ..particles.field import CarriedField, ParticleField
@@ -710,7 +711,7 @@ class QuasiStaticProblem(ParticleProblem):
         body, (work, density) = self.bodies[number], self._density[number]
         space = separate_nodes(body.W)
         test = body.mass_ratio * ufl.TestFunction(space)
-        vector = fem.assemble_vector(fem.form(work.mass(density.value, test)))
+        vector = fem.assemble_vector(compiled_form(work.mass(density.value, test)))
         return np.asarray(vector.array[space.dofmap.list[: body.num_local]])
 
     def mass_matrices(self, number: int) -> NDArray[np.float64]:
@@ -721,7 +722,7 @@ class QuasiStaticProblem(ParticleProblem):
         body, (work, density) = self.bodies[number], self._density[number]
         space = separate_nodes(body.W)
         product = body.volume_ratio * (ufl.TrialFunction(space) * ufl.TestFunction(space))
-        matrix = fem.assemble_matrix(fem.form(work.mass(density.value, product)))
+        matrix = fem.assemble_matrix(compiled_form(work.mass(density.value, product)))
         n, k = body.num_local, space.dofmap.list.shape[1]
         return matrix.data[: n * k * k].reshape(n, k, k)
 

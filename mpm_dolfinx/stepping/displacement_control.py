@@ -19,6 +19,7 @@ from ..assembly.rules import depends_on, split_by_rule
 from ..background.basis import BackgroundBasis
 from ..background.cells import COORDINATES, TOLERANCE
 from ..errors import MPMError, agree
+from ..parallel.compilation import compiled_form
 from ..parallel.given import require_same
 from ..particles.geometry import RING
 from ..particles.particles import Particles
@@ -195,11 +196,14 @@ class DisplacementControl:
             raise MPMError("functional must be linear in the displacement of the particles.")
         vector = la.vector(particles.W.dofmap.index_map, particles.W.dofmap.index_map_bs)
         for part in split_by_rule(slope, d):
-            fem.assemble_vector(vector.array, fem.form(part))
+            form: Any = compiled_form(part)
+            fem.assemble_vector(vector.array, form)
         vector.scatter_reverse(la.InsertMode.add)
         row = vector.array[: self._row.getLocalSize()].copy()
         comm = particles.mesh.comm
-        whole = sum(fem.assemble_scalar(fem.form(part)) for part in split_by_rule(functional, d))
+        whole = sum(
+            fem.assemble_scalar(compiled_form(part)) for part in split_by_rule(functional, d)
+        )
         linear = float(row @ d.x.array[: len(row)])
         whole, linear = comm.allreduce(np.array([whole, linear]))
         size = comm.allreduce(float(np.abs(row) @ np.abs(d.x.array[: len(row)])))
