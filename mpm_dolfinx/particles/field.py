@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem, mesh
 
+from .. import _compat
 from ..background.basis import BackgroundBasis, PointBasis
 from ..errors import MPMError, ParticleOutsideError, agree
-from ..meshes.quadrature import DomainQuadrature
+from ..meshes.quadrature import DomainQuadrature, quadrature_rule
 from ..parallel.compilation import compiled_expression
 from ..parallel.given import require_same
 from ..transfer.matrix import transfer_matrix
@@ -79,6 +80,10 @@ class Body(Protocol):
     def num_points(self) -> int:
         """Number of quadrature points of each domain."""
 
+    @property
+    def quadrature_degree(self) -> int:
+        """Degree of the rule that carries the history."""
+
     def quadrature_function(self, name: str, shape: tuple[int, ...] = ()) -> fem.Function:
         """Return a Function for data at the history's points."""
 
@@ -127,6 +132,16 @@ class ParticleField(fem.Function):
     def W(self) -> fem.FunctionSpace:
         """Space of test functions, on the body mesh."""
         return self.function_space
+
+    def at_points(self) -> NDArray[np.float64]:
+        """Return the values at the history's points, shape ``(n, nq)``, ``(n, nq, k)``."""
+        body, block = self.particles, self.W.dofmap.bs
+        values = self.x.array.reshape(-1, block)[self.W.dofmap.list[: body.num_local]]
+        if self.at == "nodes":
+            points, _ = quadrature_rule(body.mesh.basix_cell(), body.quadrature_degree)
+            shapes = _compat.tabulated(self.W.ufl_element().basix_element, 0, points)[0]
+            values = np.einsum("qk,nki->nqi", shapes, values)
+        return np.asarray(values[..., 0] if block == 1 else values)
 
     def set(self, values: Any) -> None:
         """Set present and converged values, before the first step.

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -44,6 +45,15 @@ class Response(Protocol):
         """Return the accumulated plastic strain, shape ``(n, nq)``."""
 
 
+class Unknown(Protocol):
+    """An unknown of a problem on a body besides its displacement."""
+
+    name: str
+
+    def at_points(self) -> NDArray[np.float64]:
+        """Return its values at the points, shape ``(n, nq, ...)``."""
+
+
 class MaterialDomains(Domains):
     """Domains for whose stress and internal variables a response may answer.
 
@@ -57,10 +67,20 @@ class MaterialDomains(Domains):
         """See :class:`Domains`; no response answers for the domains of another mesh yet."""
         super()._live_on(geometry, deletable)
         self._response: Response | None = None
+        self._unknowns: Sequence[Unknown] = ()
+        self._pore_pressure: Unknown | None = None
 
     def attach(self, response: Response) -> None:
         """Let a response answer for stress and internal variables."""
         self._response = response
+
+    def attach_unknowns(self, unknowns: Sequence[Unknown]) -> None:
+        """Let unknowns of a problem, besides displacements, be among the fields."""
+        self._unknowns = unknowns
+
+    def fill_pores(self, pressure: Unknown) -> None:
+        """Let the pores be full of water with a pressure: the response's stress is effective."""
+        self._pore_pressure = pressure
 
     def _average(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return volume averages of values ``(n, nq, ...)`` over the undeformed domains."""
@@ -128,13 +148,26 @@ class MaterialDomains(Domains):
 
         ``volume_ratio`` and, where there is a material, ``stress`` (Cauchy), ``pressure``
         (mean of the normal stresses, compression positive) and ``plastic_strain``; with
-        ``outside="delete"`` also ``deleted`` (1 where a particle is).
+        ``outside="delete"`` also ``deleted`` (1 where a particle is). Unknowns besides the
+        displacement stand here by their names, as means over the domains.
+
+        Of a body with water in its pores ``stress`` is the effective stress,
+        ``mean_effective_stress`` its mean (compression positive); ``total_stress`` is that less
+        ``pore_pressure``. Nothing is called ``pressure`` there.
         """
         values = {"volume_ratio": self.volume / self.initial_volume}
+        unknowns = {one.name: self._average(one.at_points()) for one in self._unknowns}
         if self.has_material:
-            values["stress"] = self.stress
-            values["pressure"] = -np.trace(values["stress"], axis1=1, axis2=2) / 3.0
+            stress = values["stress"] = self.stress
+            mean = -np.trace(stress, axis1=1, axis2=2) / 3.0
+            if self._pore_pressure is None:
+                values["pressure"] = mean
+            else:
+                water = unknowns[self._pore_pressure.name]
+                values["mean_effective_stress"] = mean
+                values["total_stress"] = stress - water[:, None, None] * np.eye(3)
             values["plastic_strain"] = self.plastic_strain
+        values = unknowns | values
         if self.deletion is not None:
             values["deleted"] = self.deleted.astype(np.float64)
         return values

@@ -65,7 +65,7 @@ def values_of(
     comm: MPI.Comm = bodies[0].mesh.comm
     with agree(comm):
         if isinstance(field, str):
-            return [_named(problem, bodies, number, field) for number in range(len(bodies))]
+            return _named([_known(problem, bodies, n) for n in range(len(bodies))], bodies, field)
         several = isinstance(field, list | tuple) and len(bodies) > 1
         each: Sequence[Any] = field if several else [field]  # type: ignore[assignment]
         if len(each) != len(bodies):
@@ -96,9 +96,20 @@ def _of_function(body: Particles, function: fem.Function) -> NDArray[np.float64]
 
 
 def _named(
-    problem: Any, bodies: Sequence[Particles], number: int, name: str
-) -> NDArray[np.float64]:
-    """Return the values of a field by its name."""
+    known: Sequence[dict[str, NDArray[np.float64]]], bodies: Sequence[Particles], name: str
+) -> list[NDArray[np.float64]]:
+    """Return the values of a field by its name, no numbers in bodies that have no such field."""
+    names: set[str] = set().union(*known)
+    if name not in names:
+        raise MPMError(f"There is no field {name!r}; there are {', '.join(sorted(names))}.")
+    none = (np.full(body.num_local, np.nan) for body in bodies)
+    return [own.get(name, empty) for own, empty in zip(known, none, strict=True)]
+
+
+def _known(
+    problem: Any, bodies: Sequence[Particles], number: int
+) -> dict[str, NDArray[np.float64]]:
+    """Return the fields of a body by their names."""
     body = bodies[number]
     gdim = body.mesh.geometry.dim
     vectors = {"displacement": body.centroid - body.initial_centroid}
@@ -112,15 +123,15 @@ def _named(
     for key, values in vectors.items():
         known[key] = np.linalg.norm(values, axis=1)
         known |= {f"{key}_{AXES[i]}": values[:, i] for i in range(gdim)}
-    for key, values in body.fields().items():
+    fields = body.fields()
+    for key, values in fields.items():
         if values.ndim == 1:
             known[key] = values
-    if body.has_material:
-        stress = body.stress
+    for key in {"stress", "total_stress"} & fields.keys():
         for i, j in zip(*np.triu_indices(3), strict=True):
-            known[f"stress_{AXES[i]}{AXES[j]}"] = stress[:, i, j]
+            known[f"{key}_{AXES[i]}{AXES[j]}"] = fields[key][:, i, j]
+    if body.has_material:
+        stress = fields["stress"]
         deviator = stress - np.trace(stress, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
         known["mises"] = np.sqrt(1.5) * np.linalg.norm(deviator, axis=(1, 2))
-    if name not in known:
-        raise MPMError(f"There is no field {name!r}; there are {', '.join(sorted(known))}.")
-    return np.asarray(known[name], dtype=np.float64)
+    return {key: np.asarray(values, dtype=np.float64) for key, values in known.items()}

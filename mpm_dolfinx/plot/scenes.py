@@ -34,6 +34,8 @@ MARK = 3.0
 #: Colour of obstacles; in the plane and in space, how far they are shown around the bodies, over
 #: the extent of these, and samples of their distance along the longest side.
 OBSTACLE = "#b9b2a6"
+#: Grey of bodies without a field.
+NO_FIELD = "0.8"
 NEAR, SAMPLES = {2: 0.3, 3: 0.2}, {2: 300, 3: 60}
 
 
@@ -113,10 +115,13 @@ def scene(
         problem: A problem, particles, or a list of particles.
         field: ``"displacement"`` (its length), ``"displacement_x"`` and so on, ``"volume_ratio"``;
             with a material ``"stress_xx"`` and so on, ``"mises"``, ``"pressure"``,
-            ``"plastic_strain"``; of a moving body ``"velocity"``; ``"contact_pressure"`` at points
-            of contact. Or values of your own, shape ``(n,)``, one for each particle that this rank
-            owns, or a Function on the body's mesh, of which each domain shows the mean; for several
-            bodies a list. ``None``: no colours.
+            ``"plastic_strain"``; with water in its pores ``"pore_pressure"``,
+            ``"mean_effective_stress"`` instead of ``"pressure"``, ``"total_stress_xx"`` and so on;
+            unknowns besides by their names; of a moving body ``"velocity"``;
+            ``"contact_pressure"`` at points of contact. A body that has no such field is grey. Or
+            values of your own, shape ``(n,)``, one for each particle that this rank owns, or a
+            Function on the body's mesh, of which each domain shows the mean; for several bodies a
+            list. ``None``: no colours.
         path: Where to save it, e.g. ``"scene.png"``.
         ax: Axes of matplotlib to draw on; only those of rank 0 count. A figure is made without.
         warp: Factor on the displacement.
@@ -356,7 +361,9 @@ def _filled(
 def _colours(look: Look, limits: tuple[float, float]) -> Any:
     """Return what gives values their colours."""
     normalise = import_module("matplotlib.colors").Normalize(*limits)
-    return import_module("matplotlib.cm").ScalarMappable(normalise, look.cmap)
+    colours = import_module("matplotlib.cm").ScalarMappable(normalise, look.cmap)
+    colours.set_cmap(colours.cmap.with_extremes(bad=NO_FIELD))
+    return colours
 
 
 def _draw_plane(shot: Shot, look: Look, limits: tuple[float, float], ax: Any) -> Any:
@@ -371,7 +378,7 @@ def _draw_plane(shot: Shot, look: Look, limits: tuple[float, float], ax: Any) ->
     count = sum(len(polygons) for polygons in shot.bodies)
     lines = count < 20000 if look.lines is None else look.lines
     for number, polygons in enumerate(shot.bodies):
-        filled = "0.8" if shot.values is None else colours.to_rgba(shot.values[number])
+        filled = NO_FIELD if shot.values is None else colours.to_rgba(shot.values[number])
         width = float(np.clip(12.0 / np.sqrt(max(count, 1)), 0.1, 0.5))
         style = {"edgecolors": "0.2" if lines else "face", "linewidths": width}
         ax.add_collection(collections.PolyCollection(polygons, facecolors=filled, **style))
@@ -437,7 +444,7 @@ def _rendered(shot: Shot, look: Look, limits: tuple[float, float]) -> NDArray[np
         plotter = pyvista.Plotter(off_screen=True, window_size=pixels, lighting="three lights")
         for number, body in enumerate(shot.bodies):
             body = body.copy()
-            colour: dict[str, Any] = {"color": "lightgrey"}
+            colour: dict[str, Any] = {"color": "lightgrey", "nan_color": "lightgrey"}
             if shot.values is not None:
                 body.cell_data["shown"] = shot.values[number]
                 colour = {"scalars": "shown", "cmap": look.cmap, "clim": limits}

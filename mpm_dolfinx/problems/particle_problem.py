@@ -310,6 +310,8 @@ class ParticleProblem:
             chosen(numerics.linear_solver, degree),
         )
         self._stepper.follow(reduced, newton, clean_up)
+        for body in self.bodies:
+            body.attach_unknowns([one for one in self.fields if one.particles is body])
         self._constants, self._data = parts.constants(), parts.data_at_points()
 
     def _contributions(self) -> list[Contribution]:
@@ -657,7 +659,8 @@ class ParticleProblem:
         """Add the present state to a time series for ParaView (collective).
 
         The domains are written at their current positions, with displacement, volume ratio
-        and, where there is a material, Cauchy stress, pressure and plastic strain.
+        and, where there is a material, Cauchy stress, pressure and plastic strain; of a body with
+        water effective and total stress and the pore pressure; unknowns besides by their names.
 
         Args:
             path: A ``.pvd`` file; the first call replaces it, unless the problem was restored

@@ -240,6 +240,12 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
                 )
         super()._let_take_part(materials)
 
+    def _build(self) -> None:
+        """See :meth:`ParticleProblem._build`."""
+        super()._build()
+        for filled in self._filled:
+            filled.particles.fill_pores(filled.field)
+
     def _porous(self) -> list[tuple[Particles, _Pores]]:
         """Return the bodies with water that the problem has."""
         own = [given.particles for given in self.setup.bodies]

@@ -72,6 +72,10 @@ def test_taylor_hood_against_stock_finite_elements(cell):
     same_values(problem.particles.displacement, w.sub(0).collapse())
     same_values(p, w.sub(1).collapse())
     assert np.array_equal(p.previous.x.array, p.x.array)
+    domain = problem.particles.mesh
+    mean = fem.assemble_scalar(fem.form(p * problem.particles.dx))
+    shown = problem.particles.fields()["pressure"] @ problem.particles.initial_volume
+    assert domain.comm.allreduce(shown) == pytest.approx(domain.comm.allreduce(mean), rel=1e-12)
 
 
 @leaves

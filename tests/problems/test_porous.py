@@ -16,6 +16,7 @@ from dolfinx import fem
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import Hencky, LinearElastic, SmallStrainVonMises, VonMises
+from mpm_dolfinx.plot.fields import values_of
 
 SOIL = LinearElastic(1e3, 0.25)
 
@@ -562,3 +563,39 @@ def test_what_lies_on_the_mesh_of_before_is_refused(name):
     for change in (problem.rebase, lambda: problem.repartition(0.0)):
         raises(change, mpm.MPMError, f"{name} is written on the present body mesh")
     scenes.assert_same_state(before, scenes.state(problem))
+
+
+def test_fields_of_a_body_with_water(mpi_tmp_path):
+    """Total stress bears the load at any time; pictures and files have it, and pore pressure."""
+    problem, p, _ = column()
+    problem.solve(0.02, 0.005)
+    body = problem.particles
+    fields = body.fields()
+    assert "pressure" not in fields
+    nodes = p.x.array[p.W.dofmap.list[: body.num_local]]
+    water = fields["pore_pressure"]
+    assert (water >= nodes.min(axis=1) - 1e-12).all() and (water <= nodes.max(axis=1) + 1e-12).all()
+    assert scenes.largest(fields["total_stress"][:, 1, 1] + 1.0) < 0.01
+    mean = np.trace(fields["total_stress"], axis1=1, axis2=2) / 3.0
+    np.testing.assert_allclose(-mean, fields["mean_effective_stress"] + water, atol=1e-12)
+    (shown,) = values_of(problem, [body], "pore_pressure")
+    assert np.array_equal(shown, water)
+    raises(lambda: values_of(problem, [body], "pressure"), mpm.MPMError, "no field 'pressure'")
+    problem.write(mpi_tmp_path / "soil.pvd")
+    text = (mpi_tmp_path / "soil_000000.vtu").read_bytes()
+    assert all(f'Name="{name}"'.encode() in text for name in ("pore_pressure", "total_stress"))
+
+
+def test_a_body_without_water_has_no_pore_pressure():
+    """It is grey in pictures of that; its stress is total, and its pressure the mean of it."""
+    background = scenes.box([0.0, 0.0], [1.0, 1.5], (2, 3), QUADRILATERAL)
+    V = scenes.vectors(background, 2)
+    made = ([0.0, 0.0], [1.0, 1.0], (4, 4)), ([0.0, 1.0], [1.0, 1.5], (4, 2))
+    bodies = [
+        mpm.Particles(scenes.box(*size, QUADRILATERAL), V, degree=2, quadrature_degree=4)
+        for size in made
+    ]
+    problem = mpm.PorousProblem(bodies, SOIL, [1.0, None], bcs=[scenes.fix(V, scenes.at(1, 0.0))])
+    soil, footing = values_of(problem, bodies, "pore_pressure")
+    assert not np.isnan(soil).any() and np.isnan(footing).all()
+    assert {"pressure"} == bodies[1].fields().keys() - bodies[0].fields().keys()
