@@ -428,8 +428,9 @@ bool find_closest_in(const core::Search& search, const core::Found& found)
       nearest = far;
       const Place<dim> foot(corners, search.nodes, s);
       const double gap = dot(difference<dim>(x, foot.x), foot.normal(search.outward[facet]));
-      // A point behind the end of an open surface, or beside an edge, touches nothing; nor does one
-      // beside the edge of a thin body that faces its far side.
+      // A point beside the end of an open surface, or beside an edge, touches nothing, behind the
+      // plane of the facet nor at a gap; nor does one beside the edge of a thin body that faces its
+      // far side.
       double size = 0.0, over = 0.0;
       for (int e = 0; e < sides; ++e)
       {
@@ -440,7 +441,7 @@ bool find_closest_in(const core::Search& search, const core::Found& found)
       size = std::sqrt(size);
       over *= size;
       const double depth = std::abs(gap);
-      const bool off = gap < 0.0 && over > std::max(1e-9 * size, 0.2 * std::min(depth, 0.1 * size))
+      const bool off = over > std::max(1e-9 * size, 0.2 * std::min(depth, 0.1 * size))
                        && (far > 2.0 * depth + 1e-12 * size || gap < -0.5 * size);
       found.facet[p] = facet;
       found.gap[p] = gap;

@@ -281,11 +281,12 @@ class NearFacets:
         table, X = self.tabulate(s[first]), nodes[facets[first]]
         r, n_of = separated(table, points[who], X, self.outward[facets[first]])
         gap[who] = g = (r * n_of).sum(axis=1)
-        # A point behind the end of an open surface, or beside an edge, touches nothing; nor does
-        # one beside the edge of a thin body that faces its far side.
+        # A point beside the end of an open surface, or beside an edge, touches nothing, behind the
+        # plane of the facet nor at a gap; nor does one beside the edge of a thin body that faces
+        # its far side.
         size = np.linalg.norm(np.einsum("nek,nki->nei", table[1], X), axis=2).max(axis=1)
         over = np.abs(s[first] - inner[first]).max(axis=1) * size
-        off = (g < 0.0) & (over > np.maximum(1e-9 * size, 0.2 * np.minimum(np.abs(g), 0.1 * size)))
+        off = over > np.maximum(1e-9 * size, 0.2 * np.minimum(np.abs(g), 0.1 * size))
         off &= (far[first] > 2.0 * np.abs(g) + 1e-12 * size) | (g < -0.5 * size)
         near[who] = ~off
         beside[who] = over / size

@@ -73,3 +73,50 @@ def test_no_place_on_any_facet_is_nearer(kind):
     at, _, _ = known.tabulate(known.clamped(found.place[has]))
     far = np.linalg.norm(x[has] - np.einsum("nk,nki->ni", at, nodes[found.facet[has]]), axis=1)
     assert (far <= least[has] * (1.0 + 1e-9)).all()
+
+
+@pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("kind", [TRIANGLE, TETRAHEDRON, HEXAHEDRON])
+def test_points_beside_the_end_of_a_surface_touch_nothing(kind, compiled):
+    # above its plane as below it, where a pressure by stress may act at a gap
+    dim = 2 if kind == TRIANGLE else 3
+    V = scenes.vectors(box([-1.0] * dim, [2.0] * dim, [3] * dim, GRID[dim], WORLD))
+    mesh = box([0.0] * dim, [1.0] * dim, [5, 4, 3][:dim], kind, WORLD)
+    tags = scenes.facet_tags(mesh, scenes.at(dim - 1, 1.0))
+    surface = Surface(mpm.Particles(mesh, V), tags, 1, 3, False, "A test")
+    surface.settle()
+    nodes = surface.own_nodes()
+    x = np.full((400, dim), 0.4)
+    x[:, 0] = np.linspace(-0.1, 1.1, len(x))
+    x[:, -1] = 1.0 + 2e-4 * np.array([1.0, -1.0, 1e-12, -1e-12])[np.arange(len(x)) % 4]
+    known = facets.NearFacets(surface, np.arange(len(surface.cells)), x, 3.0 * REACH, nodes)
+    found = known.closest(x, None, known.positions(nodes), REACH, compiled=compiled)
+    assert (found.facet >= 0).all()
+    assert np.array_equal(found.near, (x[:, 0] >= 0.0) & (x[:, 0] <= 1.0))
+
+
+@pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("compiled", [True, False])
+def test_points_over_the_edges_of_a_bent_surface_face_it(compiled):
+    V = scenes.vectors(box([-2.0, -2.0], [2.0, 2.0], [3, 3], QUADRILATERAL, WORLD))
+    mesh = box([-1.0, 0.0], [1.0, 1.0], [8, 4], QUADRILATERAL, WORLD)
+    # the arc of a circle: corners of 9.6 degrees
+    X = mesh.geometry.x
+    X[:, :2] = np.column_stack([np.sin(0.67 * X[:, 0]), np.cos(0.67 * X[:, 0])]) * (
+        0.5 + 0.5 * X[:, 1:2]
+    )
+
+    def outer(x):
+        return np.abs(np.hypot(x[0], x[1]) - 1.0) < 1e-9
+
+    tags = scenes.facet_tags(mesh, outer)
+    surface = Surface(mpm.Particles(mesh, V), tags, 1, 3, False, "A test")
+    surface.settle()
+    nodes = surface.own_nodes()
+    angle = np.linspace(-0.66, 0.66, 400)
+    radius = 1.0 + np.array([0.05, 1e-3, 1e-6])[np.arange(len(angle)) % 3]
+    x = radius[:, None] * np.column_stack([np.sin(angle), np.cos(angle)])
+    known = facets.NearFacets(surface, np.arange(len(surface.cells)), x, 3.0 * REACH, nodes)
+    found = known.closest(x, None, known.positions(nodes), REACH, compiled=compiled)
+    assert found.near.all() and (found.beside > 0.0).any()

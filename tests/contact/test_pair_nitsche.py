@@ -67,6 +67,44 @@ def test_blocks_leave_no_gap(cells):
     assert scenes.largest(touch.gap[touch.touches]) < 5e-3 * 0.01
 
 
+@pytest.mark.parametrize("passes", [1, 2])
+@pytest.mark.parametrize("law", ["nitsche", "penalty"])
+@pytest.mark.parametrize(
+    "cells",
+    [
+        (QUADRILATERAL, TRIANGLE),
+        (TRIANGLE, TRIANGLE),
+        pytest.param((TRIANGLE, QUADRILATERAL), marks=SLOW),
+        pytest.param((HEXAHEDRON, HEXAHEDRON), marks=SLOW),
+        pytest.param((TETRAHEDRON, TETRAHEDRON), marks=SLOW),
+    ],
+)
+def test_points_that_face_nothing_are_not_pressed(cells, law, passes):
+    # the ground around a small block: in one plane with its base, and under stress
+    dim = 2 if cells[0] in scenes.PLANE else 3
+    up = np.eye(dim)[-1]
+    wide = 1.0 - up
+    Va, Vb = spaces(-0.2 * np.ones(dim), 1.2 * wide + up, [7] * (dim - 1) + [6])
+    upper = scenes.box(0.23 * wide + 0.5 * up, 0.79 * wide + 0.8 * up, [3] * dim, cells[0])
+    ground = scenes.box(0.0 * up, wide + 0.5 * up, [8] * (dim - 1) + [4], cells[1])
+    a, b = mpm.Particles(upper, Va), mpm.Particles(ground, Vb)
+    touch = contact.Pair(b, a, law=law, passes=passes)
+    motion = fem.Constant(Va.mesh, -0.02 * up)
+    top = fem.locate_dofs_geometrical(Va, lambda x: x[dim - 1] > 0.7)
+    base = fem.locate_dofs_geometrical(Vb, lambda x: x[dim - 1] < 0.01)
+    bcs = [fem.dirichletbc(motion, top, Va), fem.dirichletbc(np.zeros(dim), base, Vb)]
+    problem = mpm.QuasiStaticProblem([a, b], Hencky(YOUNG, POISSON), bcs=bcs, terms=[touch])
+    problem.solve(1)
+    x, p, gap = (scenes.gather(v) for v in (touch.points, touch.pressure, touch.gap))
+    foot = scenes.gather(a.domains.reshape(-1, dim))[:, :-1]
+    # (how deep they are is how far beside an edge they may still be behind it)
+    depth = 2.0 * max(-gap.min(), 0.0)
+    low, high = foot.min(axis=0) - depth, foot.max(axis=0) + depth
+    outside = ((x[:, :-1] < low) | (x[:, :-1] > high)).any(axis=1)
+    assert outside.sum() > 0.2 * len(x) and (p[~outside] > 0.0).sum() > 2
+    assert (p[outside] == 0.0).all()
+
+
 def test_blocks_of_large_strain_have_no_compliance_of_contact():
     # uniaxial stress of logarithmic strain: sigma = E' ln(0.8), over the width it has then
     exact = -YOUNG / (1 - POISSON**2) * np.log(0.8) / 0.8
@@ -209,8 +247,18 @@ def test_tangent_in_space(cells):
 
 
 @pytest.mark.mpi
-def test_a_dragged_block_is_the_same_on_any_number_of_ranks():
-    options = {"law": "nitsche", "rule": 2, "f_bar": "patch"}
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"rule": 2, "f_bar": "patch"},
+        {},
+        {"friction": 0.0},
+        pytest.param({"cells": (TRIANGLE, TRIANGLE), "passes": 1}, marks=SLOW),
+        pytest.param({"cells": (TRIANGLE, TRIANGLE), "law": "penalty"}, marks=SLOW),
+    ],
+)
+def test_a_dragged_block_is_the_same_on_any_number_of_ranks(options):
+    options = {"law": "nitsche", **options}
     problem, touch, path = two(**options)
     other, alone, same = two(comm=scenes.MPI.COMM_SELF, **options)
     problem.solve(6, update=path)
