@@ -38,10 +38,12 @@ def heavy(
     return mpm.QuasiStaticProblem(particles, law, body_force=(0.0, -weight), bcs=bcs, **options)
 
 
+class InPython(mpm.materials.Hencky):
+    """Hencky's law as one that is derived from it: without its compiled update."""
+
+
 def elastic(**options: Any) -> mpm.materials.Material:
-    law = mpm.materials.Hencky(1e3, 0.3)
-    law.compiled = options.get("compiled", True)
-    return law
+    return (mpm.materials.Hencky if options.get("compiled", True) else InPython)(1e3, 0.3)
 
 
 def run(problem: mpm.QuasiStaticProblem, steps: int, rebuild: bool = False) -> None:
@@ -94,10 +96,6 @@ def cases(n: int, h: float) -> dict[str, tuple[str, Callable[[], Any], Callable[
     return {
         "shared nodes are located once": ("nodes", *pair(sinks, {}, {"apart": True})),
         "the pattern is kept": ("patterns", *pair(sinks, {}, {"rebuild": True})),
-        "the body's own matrix is not formed": (
-            "residuals",
-            *pair(sinks, {}, {"assembly": "reference"}),
-        ),
         "compiled update": ("residuals", *pair(materials, {"compiled": True}, {"compiled": False})),
         "no history without plasticity": (
             "residuals",

@@ -102,8 +102,6 @@ in_source python -c '
 import mpm_dolfinx
 import dolfinx
 from petsc4py import PETSc
-from mpm_dolfinx import _core
-loops = "without" if _core.loops is None else "with"
 petsc = ".".join(map(str, PETSc.Sys.getVersion()))
-print(f"DOLFINx {dolfinx.__version__}, PETSc {petsc}, {loops} the compiled loops")'
+print(f"DOLFINx {dolfinx.__version__}, PETSc {petsc}")'
 in_source bash scripts/run_tests.sh "$@"

@@ -31,12 +31,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 import mpm_dolfinx
-from mpm_dolfinx import _core
 
 where = Path(mpm_dolfinx.__file__)
 assert not where.is_relative_to(os.environ["TREE"]), where
 assert version("mpm-dolfinx") == mpm_dolfinx.__version__
-assert _core.loops is not None, "the wheel has no compiled loops"
 print(f"mpm_dolfinx {mpm_dolfinx.__version__} in {where.parent}")
 EOF
 "$place/env/bin/python" readme.py

@@ -17,7 +17,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 from mpi4py import MPI
@@ -204,3 +204,18 @@ def mpi_tmp_path() -> Iterator[Path]:
         comm.Barrier()
     if comm.rank == 0:
         shutil.rmtree(path, ignore_errors=True)
+
+
+@pytest.fixture
+def take() -> Iterator[Callable[[str], None]]:
+    """A function that lets the rest of a test take a route of assembly."""
+    from routes import on_route
+
+    with contextlib.ExitStack() as stack:
+        yield lambda route: stack.enter_context(on_route(route))
+
+
+@pytest.fixture
+def route(request: pytest.FixtureRequest, take: Callable[[str], None]) -> None:
+    """Let a test take the route that is its parameter."""
+    take(request.param)

@@ -1,11 +1,20 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Laws whose updates fail at will, for tests of what becomes of the step."""
+"""Laws that are updated in Python, and laws whose updates fail at will."""
+
+import copy
 
 import numpy as np
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import Hencky, VonMises
+
+
+def in_python(law):
+    """Return the same law without its compiled update, as laws derived from it are."""
+    found = copy.copy(law)
+    found.__class__ = type(type(law).__name__, (type(law),), {})
+    return found
 
 
 class Brittle(VonMises):

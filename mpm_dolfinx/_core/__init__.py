@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The compiled loops, where they were built."""
+"""The compiled loops."""
 
 from __future__ import annotations
 
@@ -13,9 +13,12 @@ __all__ = ["loops"]
 def _load() -> Any:
     try:
         return import_module("mpm_dolfinx._core._loops")
-    except ImportError:
-        return None
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            "mpm_dolfinx has no compiled loops: it was installed without a C++ compiler; install "
+            "one, or a wheel, and then mpm_dolfinx again."
+        ) from error
 
 
-#: The compiled module; ``None`` where the package was installed without a C++ compiler.
+#: The compiled module.
 loops: Any = _load()

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Residuals and tangents on the body mesh, by compiled loops or by DOLFINx.
+"""Residuals and tangents on the body mesh.
 
 Loads and conditions of a user become UFL on the body mesh (:mod:`~mpm_dolfinx.assembly.inputs`,
 :mod:`~mpm_dolfinx.assembly.loads`); each integral gets the quadrature rule that it needs

@@ -71,17 +71,15 @@ class BodyForms:
         internal: Stress whose virtual work ``P : grad v`` is added by the compiled loops.
         low_rank: What the tangent has besides the forms and the pointwise one of ``internal``;
             that of an averaged volume ratio in R is known.
-        fast: Whether :attr:`fused` forms are left to the compiled loops.
         others: Unknowns of the body besides the displacement.
         **options: Passed on to ``dolfinx.fem.form``.
 
     Attributes:
         internal: As given.
         fused: Parts of the tangent that the compiled loops assemble.
-        stock: Parts of the tangent in :attr:`K`.
+        stock: The other forms of the tangent, which DOLFINx assembles.
         follows_load: Whether what the load factor does depends on the displacement.
-        K: The stock parts of the tangent, on W, as assembled last; on the reference route with
-            the low-rank part.
+        K: The stock parts of the tangent, on W, as assembled last.
         factor: How often the reduced tangent has the fused and internal parts.
 
     Raises:
@@ -95,12 +93,10 @@ class BodyForms:
         particles: Particles,
         internal: PointStress | None = None,
         low_rank: Linearised | None = None,
-        fast: bool = False,
         others: Sequence[fem.Function] = (),
         **options: Any,
     ) -> None:
         self._options = options
-        self._fast = fast
         self._particles = particles
         self.internal = internal
         self.factor = 1.0
@@ -139,13 +135,7 @@ class BodyForms:
             if any(constant is load for constant in part.constants())
         ]
         self.follows_load = any(any(c is load for c in part.constants()) for part in live)
-        # (loops pack what a form holds by the cells of its own mesh)
-        together = [
-            fast
-            and not couples_cells(form)
-            and all(c.function_space.mesh is particles.mesh for c in form.coefficients())
-            for form in tangents
-        ]
+        together = [self.takes(form) for form in tangents]
         compiled = self._compile(tangents)
         self.fused = [form for form, fuse in zip(compiled, together, strict=True) if fuse]
         self.stock = [form for form, fuse in zip(compiled, together, strict=True) if not fuse]
@@ -155,9 +145,19 @@ class BodyForms:
         self._source = source
         self._low_rank = None if source is None else LowRankTangent(particles, source)
         whole = internal is not None and particles.num_points > 1
-        self._by_domains = fast and whole and source is not None and source.groups.single
+        self._by_domains = whole and source is not None and source.groups.single
         self.r: PETSc.Vec = _compat.create_vector(particles.W)
         self.external: PETSc.Vec = _compat.create_vector(particles.W)
+
+    def takes(self, form: ufl.Form) -> bool:
+        """Return whether the compiled loops can assemble a form of the tangent.
+
+        It must not couple cells, and what it holds is packed by the cells of the body mesh.
+        """
+        mesh = self._particles.mesh
+        return not couples_cells(form) and all(
+            each.function_space.mesh is mesh for each in form.coefficients()
+        )
 
     def _compile(self, forms: list[ufl.Form]) -> list[fem.Form]:
         return [compiled_form(form, **self._options) for form in forms]
@@ -165,7 +165,7 @@ class BodyForms:
     @property
     def low_rank(self) -> LowRankTangent | None:
         """What the tangent has besides stock, fused and internal parts, if anything."""
-        return self._low_rank if self._fast and not self._by_domains else None
+        return None if self._by_domains else self._low_rank
 
     def low_rank_of_domains(self) -> LowRankTerm | None:
         """Return what the internal tangent has besides, each domain for itself, if anything."""
@@ -265,7 +265,7 @@ class BodyForms:
             part = self.r.duplicate()
             assemble_into(part, [], self._internal_stiffness_force(self.internal, w))
             total.axpy(1.0, part)
-        if self._fast and self._low_rank is not None:
+        if self._low_rank is not None:
             total.axpy(1.0, self.low_rank_force(w))
         return total
 
@@ -337,8 +337,6 @@ class BodyForms:
         for form in self.stock:
             assemble_matrix(self._sparse, form)
         self._sparse.assemble()
-        if self._low_rank is not None and not self._fast:
-            self.K = self._low_rank.added_to(self._sparse)
         return self.K
 
     @cached_property

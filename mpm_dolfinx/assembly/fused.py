@@ -1,10 +1,9 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The fast route: ``T^T K T`` domain by domain, in one compiled loop."""
+"""``T^T K T`` domain by domain, in one compiled loop."""
 
 from __future__ import annotations
 
-import os
 import weakref
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
@@ -18,7 +17,6 @@ from numpy.typing import NDArray
 from .. import _compat
 from .._core import loops
 from ..constitutive.averaging import LowRankTerm
-from ..errors import MPMError
 from ..history import Statistics
 from ..parallel.exchange import swap
 from ..parallel.totals import over_ranks
@@ -28,40 +26,15 @@ from ..transfer.touched import TouchedNodes, TransferRows
 from .body_forms import BodyForms, no_values
 
 __all__ = [
-    "ROUTES",
     "CoupledBlocks",
     "Coupling",
     "FusedTangent",
     "Masses",
     "Restriction",
-    "is_fast",
 ]
 
-ROUTES = ("auto", "fast", "reference")
 #: Most room for the entries of a matrix, in what they need.
 ROOM = 1.1
-
-
-def is_fast(route: str) -> bool:
-    """Return whether a route is that of the compiled loops.
-
-    Args:
-        route: ``"fast"``, ``"reference"``, or ``"auto"``: what the environment variable
-            ``MPM_DOLFINX_ASSEMBLY`` says, or else fast where the loops were built.
-
-    Raises:
-        MPMError: There is no such route, or no compiled loops to be fast.
-    """
-    if route == "auto":
-        route = os.environ.get("MPM_DOLFINX_ASSEMBLY", "fast" if loops else "reference")
-    if route not in ROUTES[1:]:
-        raise MPMError(f"Unknown assembly={route!r}; choose 'auto', 'fast' or 'reference'.")
-    if route == "fast" and loops is None:
-        raise MPMError(
-            "assembly='fast' needs the compiled loops, and the package was built without a C++ "
-            "compiler; install one and build the package again, or use assembly='reference'."
-        )
-    return route == "fast"
 
 
 class Support:

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The virtual work of stress and loads on a body, in UFL."""
+"""The virtual work of loads on a body, in UFL."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import ufl
-from dolfinx import fem
 
 from ..constitutive.strain import Strain
 from .inputs import as_expression, facet_measure
@@ -28,14 +27,6 @@ class VirtualWork:
         self._body = strain.particles
         self._dim = self._body.mesh.geometry.dim
         self._v = ufl.TestFunction(self._body.W)
-
-    def internal(self, P: fem.Function, A: fem.Function) -> tuple[ufl.Form, ufl.Form]:
-        """Return the internal virtual work and its tangent."""
-        i, j, k, m = ufl.indices(4)
-        trial = self._strain.ufl_gradient(ufl.TrialFunction(self._body.W))
-        test = self._strain.ufl_gradient(self._v)
-        work = self._strain.integral(ufl.inner(P, test))
-        return work, self._strain.integral(A[i, j, k, m] * trial[k, m] * test[i, j])
 
     def mass(self, density: Any, test: Any) -> ufl.Form:
         """Return the integral of the density times a test function."""

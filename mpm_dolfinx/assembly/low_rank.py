@@ -11,7 +11,6 @@ import numpy as np
 from .. import _compat
 from ..constitutive.averaging import Array, Linearised
 from ..particles.particles import Particles
-from .petsc import MatrixSum
 
 __all__ = ["LowRankTangent", "ReducedLowRank"]
 
@@ -33,18 +32,10 @@ class LowRankTangent:
         self._nodes = particles.domain_nodes
         self._factors: list[PETSc.Mat] = []
         self._pairs: list[tuple[int, int]] = []
-        self._total = MatrixSum()
-        self._products = _Products()
 
     def times(self, nodal: Array) -> Array:
         """Return :meth:`LowRankTerm.times` of the present part (collective)."""
         return self._source.linearise().times(nodal)
-
-    def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
-        """Return K on W plus the low-rank part, always the same object (collective)."""
-        factors = self._filled()
-        parts = [K, *self._products.of(factors, self._pairs)]
-        return self._total.of(parts)
 
     def reduced(self, T: PETSc.Mat, last: ReducedLowRank | None) -> ReducedLowRank:
         """Return ``T^T`` times the part times T (collective).

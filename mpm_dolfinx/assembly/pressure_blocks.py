@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The fast route for a pressure at a body's points: its blocks, reduced domain by domain."""
+"""The blocks of a pressure at a body's points, reduced domain by domain."""
 
 from __future__ import annotations
 

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from functools import cached_property
-from itertools import product
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -208,7 +207,7 @@ class Cells:
         cell = np.zeros(n, dtype=np.int64)
         reference = np.tile(self.middle, (n, 1))
         violation = np.full(n, np.inf)
-        if self.grid is not None and loops is not None:
+        if self.grid is not None:
             self._locate_in_grid(self.grid, points, cell, reference, violation)
         if violation.max(initial=0.0) <= TOLERANCE:
             return cell, reference, violation
@@ -216,13 +215,6 @@ class Cells:
             block = np.arange(start, min(start + BLOCK, n))
             block = block[violation[block] > TOLERANCE]
             block = block[np.isfinite(points[block]).all(axis=1)]
-            if self.grid is not None and loops is None:
-                inside, found = self.grid.find(points[block], self.index)
-                known = block[inside]
-                cell[known] = found
-                reference[known] = self.pull_back(found, points[known])
-                violation[known] = self.violation(found, reference[known])
-                block = block[violation[block] > TOLERANCE]
             if len(block) == 0:
                 continue
             hit, found, coordinates, outside = self._search(points[block])
@@ -289,12 +281,8 @@ class RegularGrid:
     """
 
     def __init__(self, lines: list[NDArray[np.float64]], table: NDArray[np.int64]) -> None:
-        self._lines = lines
         self.table = table
-        self._sizes = [_even(line) for line in lines]
-        self.spaced_lines = [
-            (line, size or 0.0) for line, size in zip(lines, self._sizes, strict=True)
-        ]
+        self.spaced_lines = [(line, _even(line)) for line in lines]
 
     @classmethod
     def of(cls, vertices: NDArray[np.float64]) -> RegularGrid | None:
@@ -321,54 +309,11 @@ class RegularGrid:
         table[tuple(places)] = np.arange(len(vertices))
         return cls(lines, table)
 
-    @staticmethod
-    def _place(
-        line: NDArray[np.float64], size: float | None, x: NDArray[np.float64]
-    ) -> NDArray[np.int64]:
-        """Return the interval of a line that holds each coordinate, or is next to it."""
-        if size is None:
-            return np.asarray(np.clip(np.searchsorted(line, x, "right") - 1, 0, len(line) - 2))
-        place = np.clip((x - line[0]) / size, 0, len(line) - 2).astype(np.int64)
-        place -= (x < line[place]) & (place > 0)
-        place += (x >= line[place + 1]) & (place < len(line) - 2)
-        return np.asarray(place)
 
-    def find(
-        self, points: NDArray[np.float64], index: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return which points lie in boxes with a cell, and these cells.
-
-        Args:
-            points: Points, shape ``(n, gdim)``.
-            index: Input index of each cell; on a facet the first cell wins.
-        """
-        low, high = [], []
-        for line, size, x in zip(self._lines, self._sizes, points.T, strict=True):
-            place = self._place(line, size, x)
-            ends = line[place], line[place + 1]
-            error = COORDINATES * np.maximum(np.abs(ends[0]), np.abs(ends[1]))
-            reach = np.maximum(FACET * (ends[1] - ends[0]), error)
-            low.append(np.where(x - line[place] <= reach, np.maximum(place - 1, 0), place))
-            beyond = np.minimum(place + 1, len(line) - 2)
-            high.append(np.where(line[place + 1] - x <= reach, beyond, place))
-        cell = self.table[tuple(high)]
-        differ = low[0] != high[0]
-        for a, b in zip(low[1:], high[1:], strict=True):
-            differ |= a != b
-        between = np.flatnonzero(differ)
-        for pick in product(*zip(low, high, strict=True)) if len(between) else ():
-            other = self.table[tuple(p[between] for p in pick)]
-            mine = cell[between]
-            better = (other >= 0) & ((mine < 0) | (index[other] < index[mine]))
-            cell[between[better]] = other[better]
-        inside = np.flatnonzero(cell >= 0)
-        return inside, cell[inside]
-
-
-def _even(line: NDArray[np.float64]) -> float | None:
-    """Return the size of a line's intervals where all have the same."""
+def _even(line: NDArray[np.float64]) -> float:
+    """Return the size of a line's intervals where all have the same, else 0."""
     size = float((line[-1] - line[0]) / (len(line) - 1))
-    return None if np.ptp(np.diff(line)) > 1e-6 * size else size
+    return 0.0 if np.ptp(np.diff(line)) > 1e-6 * size else size
 
 
 def _solve(matrix: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,7 +17,6 @@ from dolfinx import fem, mesh
 from .. import _compat
 from ..errors import MPMError, agree
 from ..materials.base import Material, Refused, check_parameter
-from ..materials.compiled import CompiledMaterial
 from ..particles.particles import Particles
 from .governed import Governed
 from .pressure import MeanStress, is_split, without_bulk
@@ -59,7 +58,6 @@ class Assignment:
         dim: Dimension of stress and strain.
         materials: One material, or one for each tag of ``cell_tags``.
         cell_tags: Tags of the body's cells.
-        compiled: Whether materials may use their compiled updates.
         mean_stress: The pressure in place of the mean stress, if there is one.
 
     Attributes:
@@ -77,12 +75,10 @@ class Assignment:
         dim: int,
         materials: Materials,
         cell_tags: mesh.MeshTags | None,
-        compiled: bool,
         mean_stress: MeanStress | None,
     ) -> None:
         self._particles = particles
         self._dim = dim
-        self._compiled = compiled
         self._mean_stress = mean_stress
         self.weakening = 1.0
         self.duration = math.inf
@@ -233,9 +229,6 @@ class Assignment:
             material = material.with_parameters(**replaced).at(points)
         if weakened and self.weakening != 1.0:
             material = material.weakened(self.weakening)
-        if not self._compiled and isinstance(material, CompiledMaterial):
-            material = material.with_parameters()
-            material.compiled = False
         return material
 
     def _per_cell(self, name: str, value: Any) -> NDArray[np.float64]:

@@ -58,13 +58,11 @@ class MaterialPoints:
         materials: One material, or one for each tag of ``cell_tags``.
         cell_tags: Tags of the body's cells.
         f_bar: Kind of average of the volume ratio, or ``"none"``.
-        compiled: Whether materials may use their compiled updates.
         pressure: A Function at the points that takes the place of the mean stress, if any.
 
     Attributes:
         dim: Dimension of stress and strain, 2 in plane strain.
         strain: As given.
-        compiled: As given.
         mean_stress: The pressure in place of the mean stress, or ``None``.
         averaging: F-bar, or ``None``; the material then sees Fbar, and what follows is what
             does work on F.
@@ -82,20 +80,16 @@ class MaterialPoints:
         materials: Materials,
         cell_tags: mesh.MeshTags | None,
         f_bar: str = "none",
-        compiled: bool = True,
         pressure: ParticleField | None = None,
     ) -> None:
         self._particles = particles = strain.particles
-        self.compiled = compiled
         self.strain = strain
         self.dim = strain.dim
         self._points = particles.num_local * particles.num_points
         self.mean_stress: MeanStress | None = None
         if pressure is not None:
             self.mean_stress = MeanStress(pressure, (self._points, self.dim))
-        self._assignment = Assignment(
-            particles, self.dim, materials, cell_tags, compiled, self.mean_stress
-        )
+        self._assignment = Assignment(particles, self.dim, materials, cell_tags, self.mean_stress)
         with agree(particles.mesh.comm):
             states = [part.initial_state() for part in self._governed]
         shape = (self._points, self.dim, self.dim)
@@ -473,29 +467,6 @@ class MaterialPoints:
         )
         self.first_piola = stress.reshape(self.first_piola.shape)
         self.tangent = tangent.reshape(self.tangent.shape)
-
-    def on_mesh(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return first Piola stress and tangent with respect to the body mesh, as it is.
-
-        They differ from :attr:`first_piola` and :attr:`tangent` where the mesh is not the
-        undeformed body: ``P G^T / det G`` where it has G behind it.
-        """
-        return self.taken_to_mesh(self.first_piola, self.tangent)
-
-    def taken_to_mesh(
-        self, stress: NDArray[np.float64], tangent: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return a first Piola stress at all points and its tangent as :meth:`on_mesh` does."""
-        before = self.strain.before_mesh()
-        if before is None:
-            return stress, tangent
-        gdim = before.shape[-1]
-        G = np.tile(np.eye(self.dim), (len(stress), 1, 1))
-        G[:, :gdim, :gdim] = before.reshape(-1, gdim, gdim)
-        volume = np.linalg.det(G)[:, None, None]
-        stress = np.einsum("niJ,nMJ->niM", stress, G) / volume
-        tangent = np.einsum("niJkL,nMJ,nNL->niMkN", tangent, G, G, optimize=True)
-        return stress, tangent / volume[:, :, :, None, None]
 
     def _update_materials(self, gradient: NDArray[np.float64]) -> None:
         trial, volumes = [], []

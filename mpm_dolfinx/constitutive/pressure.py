@@ -213,7 +213,6 @@ def with_pressure(
     pressure: NDArray[np.float64],
     bulk: NDArray[np.float64],
     small: NDArray[np.bool_],
-    compiled: bool = True,
 ) -> Pressed:
     """Let a pressure take the place of the mean stress of a law that is linear in volume.
 
@@ -222,24 +221,12 @@ def with_pressure(
         pressure: Shape ``(n,)``.
         bulk: Bulk modulus of the law, shape ``(n,)``.
         small: Whether it is one of small strains, shape ``(n,)``.
-        compiled: Whether to use the compiled loop, where it was built.
     """
     gradient, first_piola, tangent, stress = answer
-    if compiled and loops is not None:
-        shapes = (first_piola.shape, tangent.shape, stress.shape, pressure.shape, gradient.shape)
-        found = Pressed(*(np.empty(shape) for shape in shapes))
-        loops.replace_mean_stress(*answer, pressure, bulk, small.view(np.uint8), *found)
-        return found
-    mean = stress[:, :3].sum(axis=1) / 3.0
-    change = pressure - mean
-    slope = slope_of_volume(gradient, small)
-    turning = np.where(small, 0.0, change)[:, None, None, None, None]
-    product = slope[:, :, :, None, None] * slope[:, None, None, :, :]
-    whole = tangent - bulk[:, None, None, None, None] * product
-    whole -= turning * product.swapaxes(2, 4)
-    own = stress.copy()
-    own[:, :3] += change[:, None]
-    return Pressed(first_piola + change[:, None, None] * slope, whole, own, mean / bulk, slope)
+    shapes = (first_piola.shape, tangent.shape, stress.shape, pressure.shape, gradient.shape)
+    found = Pressed(*(np.empty(shape) for shape in shapes))
+    loops.replace_mean_stress(*answer, pressure, bulk, small.view(np.uint8), *found)
+    return found
 
 
 def slope_of_volume(gradient: NDArray[np.float64], small: NDArray[np.bool_]) -> NDArray[np.float64]:

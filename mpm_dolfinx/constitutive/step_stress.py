@@ -320,39 +320,8 @@ class StepStress:
     def _mean(self, ends: _Ends) -> tuple[Array, Array]:
         """Return what acts over a step, and its derivative by F at the end, over the share."""
         averaging = self._points.averaging
-        if self._points.compiled and loops is not None and averaging is None:
-            return self._compiled_mean(ends)
-        small, factor = ends.kind == 0, 1.0 / self._share
-        P, P_n, A = ends.stress, ends.before, ends.tangent
-        if small.all() and averaging is None:
-            return factor * 0.5 * (P_n + P), factor * 0.5 * A
-        unit = np.eye(self._points.dim)
-        F, F_n = unit + self._tried, unit + self._H
-        try:
-            inverse = np.linalg.inv(F)
-            S, S_n = inverse @ P, np.linalg.solve(F_n, P_n)
-        except np.linalg.LinAlgError:
-            self._abandon()
-            raise ConvergenceError("A deformation gradient is singular") from None
-        dS = _times(inverse, A)
-        dS -= np.einsum("nIk,nLJ->nIJkL", inverse, S)
-        S_mean, dS_mean = 0.5 * (S + S_n), 0.5 * dS
-        F_mean = 0.5 * (F + F_n)
         if averaging is not None:
-            self._correct_groups(averaging, ends, F_mean, inverse, (S, S_mean, dS_mean))
-        elif ends.potentials is not None:
-            self._correct(S, S_mean, dS_mean, ends)
-        stress = F_mean @ S_mean
-        tangent = _times(F_mean, dS_mean)
-        for i in range(self._points.dim):
-            tangent[:, i, :, i, :] += 0.5 * S_mean.swapaxes(1, 2)
-        if small.any():
-            stress[small] = 0.5 * (P_n[small] + P[small])
-            tangent[small] = 0.5 * A[small]
-        return factor * stress, factor * tangent
-
-    def _compiled_mean(self, ends: _Ends) -> tuple[Array, Array]:
-        """Return what :meth:`_mean` does, by the compiled loops."""
+            return self._mean_of_groups(averaging, ends)
         stress, tangent = np.empty(ends.stress.shape), np.empty(ends.tangent.shape)
         none = np.zeros(0)
         singular = loops.step_stress(
@@ -372,23 +341,31 @@ class StepStress:
             raise ConvergenceError("A deformation gradient is singular")
         return stress, tangent
 
-    def _correct(self, S: Array, S_mean: Array, dS_mean: Array, ends: _Ends) -> None:
-        """Add Gonzalez' correction to S* and its derivative, in place."""
-        assert ends.potentials is not None
-        where = np.flatnonzero(ends.kind >= 2)
-        change, slope = _strain(self._tried[where], self._H[where])
-        size = np.einsum("nIJ,nIJ->n", change, change) + SMALL**2
-        work = ends.potentials[0][where] - ends.potentials[1][where]
-        c = (work - np.einsum("nIJ,nIJ->n", S_mean[where], change)) / size
-        acts = (ends.kind[where] == 2) | (c > 0.0)
-        where, change, slope, size, c = (part[acts] for part in (where, change, slope, size, c))
-        S, mean = S[where], S_mean[where]
-        dc = np.einsum("nIJ,nIJkL->nkL", S - mean - 2.0 * c[:, None, None] * change, slope)
-        dc -= np.einsum("nIJ,nIJkL->nkL", change, dS_mean[where])
-        dc /= size[:, None, None]
-        S_mean[where] += c[:, None, None] * change
-        dS_mean[where] += c[:, None, None, None, None] * slope
-        dS_mean[where] += change[:, :, :, None, None] * dc[:, None, None]
+    def _mean_of_groups(self, averaging: VolumeAveraging, ends: _Ends) -> tuple[Array, Array]:
+        """Return :meth:`_mean` with F-bar, which corrects group by group (collective)."""
+        small, factor = ends.kind == 0, 1.0 / self._share
+        P, P_n, A = ends.stress, ends.before, ends.tangent
+        unit = np.eye(self._points.dim)
+        F, F_n = unit + self._tried, unit + self._H
+        try:
+            inverse = np.linalg.inv(F)
+            S, S_n = inverse @ P, np.linalg.solve(F_n, P_n)
+        except np.linalg.LinAlgError:
+            self._abandon()
+            raise ConvergenceError("A deformation gradient is singular") from None
+        dS = _times(inverse, A)
+        dS -= np.einsum("nIk,nLJ->nIJkL", inverse, S)
+        S_mean, dS_mean = 0.5 * (S + S_n), 0.5 * dS
+        F_mean = 0.5 * (F + F_n)
+        self._correct_groups(averaging, ends, F_mean, inverse, (S, S_mean, dS_mean))
+        stress = F_mean @ S_mean
+        tangent = _times(F_mean, dS_mean)
+        for i in range(self._points.dim):
+            tangent[:, i, :, i, :] += 0.5 * S_mean.swapaxes(1, 2)
+        if small.any():
+            stress[small] = 0.5 * (P_n[small] + P[small])
+            tangent[small] = 0.5 * A[small]
+        return factor * stress, factor * tangent
 
     def _correct_groups(
         self,
@@ -470,28 +447,11 @@ class StepStress:
     def _resisting(self) -> tuple[Array, Array]:
         """Return the viscous stress P_v and its derivative by F at the step's end."""
         assert self._undeformed is not None
-        H, small = self._tried - self._H, self._small
+        ends = (np.ascontiguousarray(self._tried), np.ascontiguousarray(self._H))
+        P, A = np.empty(ends[0].shape), np.empty(self._undeformed.shape)
         factor = self._viscosity / self._dt
-        if self._points.compiled and loops is not None:
-            P, A = np.empty(H.shape), np.empty(self._undeformed.shape)
-            ends = (np.ascontiguousarray(self._tried), np.ascontiguousarray(self._H))
-            loops.damping(*ends, self._undeformed, small, factor, P, A)
-            return P, A
-        C = factor * self._undeformed
-        change, slope = _strain(self._tried, self._H)
-        change[small] = 0.5 * (H + H.swapaxes(1, 2))[small]
-        S = np.einsum("nIJKL,nKL->nIJ", C, change)
-        n, dim = len(H), self._points.dim
-        mean = np.eye(dim) + 0.5 * (self._tried + self._H)
-        mean[small] = np.eye(dim)
-        flat = (n, dim * dim, dim * dim)
-        dS = (C.reshape(flat) @ slope.reshape(flat)).reshape(C.shape)
-        dS[small] = C[small]
-        tangent = _times(mean, dS)
-        large = ~small
-        for i in range(dim):
-            tangent[large, i, :, i, :] += 0.5 * S[large].swapaxes(1, 2)
-        return mean @ S, tangent
+        loops.damping(*ends, self._undeformed, self._small, factor, P, A)
+        return P, A
 
     def initial_modulus(self) -> Array:
         """Return :meth:`MaterialPoints.initial_modulus` (collective)."""
@@ -500,10 +460,6 @@ class StepStress:
     def elastic(self) -> bool:
         """Return whether the history stays as it is in the last update."""
         return self._points.elastic()
-
-    def on_mesh(self) -> tuple[Array, Array]:
-        """Return stress and tangent with respect to the body mesh, as MaterialPoints does."""
-        return self._points.taken_to_mesh(self.first_piola, self.tangent)
 
     def commit(self) -> Callable[[], None]:
         """Make the last update the history, and take note of the work done in the step.

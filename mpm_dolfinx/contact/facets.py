@@ -221,7 +221,6 @@ class NearFacets:
         outward: NDArray[np.float64] | None,
         nodes: NDArray[np.float64],
         reach: float,
-        compiled: bool = True,
     ) -> Closest:
         """Return the closest facet of each point.
 
@@ -231,34 +230,57 @@ class NearFacets:
                 takes facets as they come.
             nodes: Nodes of the facets, of :meth:`positions`.
             reach: How near a facet must be.
-            compiled: Whether compiled loops may be used.
 
         Raises:
             numpy.linalg.LinAlgError: A facet has no area.
         """
-        n, e = len(points), self.gdim - 1
-        facet = np.full(n, -1, dtype=np.int64)
-        place, gap = np.zeros((n, e)), np.full(n, np.inf)
-        near, beside = np.zeros(n, dtype=bool), np.zeros(n)
-        found = Closest(facet, place, gap, near, beside)
-        if compiled and loops is not None and self.element.degree == 1:
-            good = loops.find_closest(
-                np.ascontiguousarray(points),
-                np.zeros((0, 1)) if outward is None else np.ascontiguousarray(outward),
-                np.ascontiguousarray(nodes),
-                np.ascontiguousarray(self.outward),
-                self.present.view(np.uint8),
-                [reach, FACING, SURELY_FACING, MAY_FACE, CLOSE],
-                PROJECTIONS,
-                facet,
-                place,
-                gap,
-                near.view(np.uint8),
-                beside,
-            )
-            if not good:
-                raise np.linalg.LinAlgError("A facet has no area.")
-            return found
+        if self.element.degree > 1:
+            return self.closest_curved(points, outward, nodes, reach)
+        found = self._nothing_near(len(points))
+        good = loops.find_closest(
+            np.ascontiguousarray(points),
+            np.zeros((0, 1)) if outward is None else np.ascontiguousarray(outward),
+            np.ascontiguousarray(nodes),
+            np.ascontiguousarray(self.outward),
+            self.present.view(np.uint8),
+            [reach, FACING, SURELY_FACING, MAY_FACE, CLOSE],
+            PROJECTIONS,
+            found.facet,
+            found.place,
+            found.gap,
+            found.near.view(np.uint8),
+            found.beside,
+        )
+        if not good:
+            raise np.linalg.LinAlgError("A facet has no area.")
+        return found
+
+    def _nothing_near(self, count: int) -> Closest:
+        """Return the answer for points to which no facet is near."""
+        return Closest(
+            np.full(count, -1, dtype=np.int64),
+            np.zeros((count, self.gdim - 1)),
+            np.full(count, np.inf),
+            np.zeros(count, dtype=bool),
+            np.zeros(count),
+        )
+
+    def closest_curved(
+        self,
+        points: NDArray[np.float64],
+        outward: NDArray[np.float64] | None,
+        nodes: NDArray[np.float64],
+        reach: float,
+    ) -> Closest:
+        """Return the closest facet of each point, whatever the degree of the facets.
+
+        Args:
+            points: As for :meth:`closest`, as are the others.
+            outward: See there.
+            nodes: See there.
+            reach: See there.
+        """
+        facet, place, gap, near, beside = found = self._nothing_near(len(points))
         which, facets = self._candidates(points, nodes, reach)
         which, facets, faces = self._facing(points, outward, nodes, which, facets, reach)
         which, facets = self._nearest(points, nodes, which, facets, faces)

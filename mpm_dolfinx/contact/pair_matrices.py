@@ -205,21 +205,12 @@ def _pattern(
         Where rows end, the nodes of columns, and the place of each pair, ``(g, rows, columns)``.
     """
     shapes = [(*a.shape, b.shape[1]) for (_, a), (_, b) in zip(rows, columns, strict=True)]
-    if loops is not None:
-        seen = []
-        for side, count in zip((rows, columns), counts, strict=True):
-            widths = np.concatenate([np.full(len(nodes), nodes.shape[1]) for _, nodes in side])
-            ends = np.concatenate([[0], np.cumsum(widths)]).astype(np.int64)
-            seen += [ends, np.concatenate([nodes.ravel() for _, nodes in side]), count]
-        ends, nodes, places = loops.pattern(*seen)
-    else:
-        pairs = [
-            (a[:, :, None].astype(np.int64) * counts[1] + b[:, None, :]).ravel()
-            for (_, a), (_, b) in zip(rows, columns, strict=True)
-        ]
-        keys, places = np.unique(np.concatenate(pairs), return_inverse=True)
-        row, nodes = np.divmod(keys, max(counts[1], 1))
-        ends = np.searchsorted(row, np.arange(counts[0] + 1))
+    seen: list[Any] = []
+    for side, count in zip((rows, columns), counts, strict=True):
+        widths = np.concatenate([np.full(len(nodes), nodes.shape[1]) for _, nodes in side])
+        ends = np.concatenate([[0], np.cumsum(widths)]).astype(np.int64)
+        seen += [ends, np.concatenate([nodes.ravel() for _, nodes in side]), count]
+    ends, nodes, places = loops.pattern(*seen)
     splits = np.split(places, np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1])
     parts = [part.reshape(shape) for part, shape in zip(splits, shapes, strict=True)]
     return ends, nodes, parts

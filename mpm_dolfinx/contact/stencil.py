@@ -264,7 +264,7 @@ def acting_now(law: Coulomb, stencil: Stencil, touch: float, extent: float) -> A
         touch: As there.
         extent: As there.
     """
-    if loops is None or stencil.start is not None:
+    if stencil.start is not None:
         return acting(law, stencil, stencil.x, touch, extent)
     n, _, gdim = stencil.x.shape
     pushes, rubs = (np.zeros((n, 1 + stencil.anchored.shape[1], gdim)) for _ in range(2))
@@ -294,21 +294,12 @@ def add_tangents(law: Coulomb, stencil: Stencil, touch: float, extent: float, su
     if len(stencil.x) == 0:
         return
     where = [np.ascontiguousarray(part) for part in sums[:4]]
-    if loops is not None and stencil.start is None:
+    if stencil.start is None:
         arguments = _compiled_arguments(law, stencil, touch)
         loops.add_tangents(*arguments, *where, sums.values)
         return
     D = by_complex_step(law, stencil, touch, extent)
-    if loops is not None:
-        loops.add_derivatives(D, *where, sums.values)
-        return
-    N = sums.shapes[:, :, None, None, None]
-    rows = (
-        np.concatenate([N * D[:, :1], D[:, 1:]], axis=1) * sums.weights[:, None, None, None, None]
-    )
-    own = rows[:, :, :, :1] * sums.shapes[:, None, None, :, None]
-    whole = np.concatenate([own, rows[:, :, :, 1:]], axis=3)
-    np.add.at(sums.values, sums.positions[sums.group], whole.swapaxes(2, 3))
+    loops.add_derivatives(D, *where, sums.values)
 
 
 def by_complex_step(

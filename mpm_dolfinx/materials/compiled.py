@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The compiled updates of the laws at finite strain; NumPy's are the reference."""
+"""The compiled updates of the laws at finite strain."""
 
 from __future__ import annotations
 
@@ -22,13 +22,8 @@ type Array = NDArray[np.float64]
 class CompiledMaterial(StrainMaterial):
     """A law that may have a compiled update: its class names it in ``_loop``.
 
-    Attributes:
-        compiled: Whether a compiled update is used where the law itself (not a law derived from
-            it) has one and the package was built with it; its answer differs from
-            :meth:`StrainMaterial.update` by round-off alone.
+    A law derived from it, which may integrate otherwise, is updated in Python.
     """
-
-    compiled: bool = True
 
     def _constants(self) -> tuple[Parameter, ...]:
         """Return what the compiled law has for parameters, as ``material.h`` lists them."""
@@ -37,7 +32,7 @@ class CompiledMaterial(StrainMaterial):
     def update(self, displacement_gradient: Array, state: State, tangent: bool = True) -> Update:
         """See :meth:`Material.update`."""
         loop = vars(type(self)).get("_loop")
-        if loop is None or loops is None or not self.compiled:
+        if loop is None:
             return super().update(displacement_gradient, state, tangent)
         H = np.ascontiguousarray(displacement_gradient)
         n, dim, _ = H.shape
@@ -59,7 +54,7 @@ class CompiledMaterial(StrainMaterial):
         """See :meth:`StrainMaterial.at_pressure`."""
         loop = vars(type(self)).get("_loop")
         remembers = "displacement_gradient" in state
-        if loop is None or loops is None or not self.compiled or not remembers:
+        if loop is None or not remembers:
             return super().at_pressure(displacement_gradient, state, pressure, shear)
         H = np.ascontiguousarray(displacement_gradient)
         n, dim, _ = H.shape

@@ -122,8 +122,6 @@ class DomainQuadrature:
             domain_nodes: Local nodes of each domain, shape ``(n, k)``.
         """
         n, nq, _, gdim = self.gradients.shape
-        if loops is None:
-            return self.displacement_gradient(displacement.reshape(-1, gdim)[domain_nodes])
         gradient = np.empty((n, nq, gdim, gdim))
         loops.displacement_gradient(displacement, domain_nodes, self.gradients, gradient)
         return gradient

@@ -98,10 +98,6 @@ class ParticleProblem:
         petsc_options: PETSc options for SNES, KSP and PC, without prefix.
         form_compiler_options: Options of FFCx.
         jit_options: Options of the compilation at run time.
-        assembly: ``"fast"``: the compiled loops assemble the reduced tangent domain by domain;
-            ``"reference"``: DOLFINx assembles on the body mesh and PETSc multiplies by T;
-            ``"auto"``: fast where the package was built with the loops, unless the environment
-            variable ``MPM_DOLFINX_ASSEMBLY`` says ``reference``.
         symmetric: Whether J is symmetric (an LDL^T factorisation instead of LU).
         shift: Diagonal shift in the factorisation, relative to the diagonal. Combinations of
             background dofs that move no node of the body make the reduced tangent singular;
@@ -156,7 +152,6 @@ class ParticleProblem:
         form_compiler_options: dict[str, Any] | None = None,
         jit_options: dict[str, Any] | None = None,
         *,
-        assembly: str = "auto",
         symmetric: bool = False,
         shift: float = 1e-13,
         line_search: bool = True,
@@ -188,7 +183,6 @@ class ParticleProblem:
             petsc_options=petsc_options,
             form_compiler_options=form_compiler_options,
             jit_options=jit_options,
-            assembly=assembly,
             shift=shift,
             line_search=line_search,
             dependent_dofs=dependent_dofs,

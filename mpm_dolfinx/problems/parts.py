@@ -14,7 +14,6 @@ from dolfinx import fem
 from ..assembly.background_forms import BackgroundForms
 from ..assembly.body_forms import BodyForms, PointStress
 from ..assembly.field_forms import FieldForms
-from ..assembly.fused import is_fast
 from ..assembly.rules import data_at_points
 from ..constitutive.averaging import Linearised
 from ..errors import MPMError
@@ -40,7 +39,6 @@ class Contribution(NamedTuple):
         low_rank: What the tangent has besides forms and the pointwise one, or ``None``.
         symmetric: Whether the tangent is symmetric.
         material: The material at its points, if the above hold one.
-        injected: Functions in the forms for stress and tangent of the material, or ``None``.
         contact: Whether the forms have one-sided supports.
         of_step: What among its forces may be of a whole step in time.
         static: Whether the body is in equilibrium at each step's end, in a motion of others.
@@ -52,7 +50,6 @@ class Contribution(NamedTuple):
     low_rank: Linearised | None
     symmetric: bool
     material: PointHistory | None = None
-    injected: tuple[fem.Function, fem.Function] | None = None
     contact: bool = False
     of_step: Sequence[StepForce] = ()
     static: bool = False
@@ -104,7 +101,6 @@ class Parts:
 
     def body_terms(self) -> list[BodyTerm]:
         """Return the terms of bodies that move (collective)."""
-        fast = is_fast(self.numerics.assembly)
         return [
             BodyTerm(
                 body,
@@ -114,12 +110,10 @@ class Parts:
                     body,
                     given.internal,
                     given.low_rank,
-                    fast,
                     [field for field in self.fields if field.particles is body],
                     **self.numerics.of_forms,
                 ),
                 given.material,
-                given.injected,
                 given.contact,
                 given.of_step,
                 given.static,

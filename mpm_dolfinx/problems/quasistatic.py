@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem
 
-from ..assembly.fused import is_fast
 from ..assembly.inputs import Density, functions_of
 from ..assembly.loads import VirtualWork
 from ..assembly.rules import depends_on
@@ -53,10 +52,9 @@ class QuasiStaticProblem(ParticleProblem):
     """Equilibrium of bodies with materials, under body force, tractions and supports.
 
     ``int P : grad v dX - load (int density b . v dX + int t . v dS) = 0`` on the undeformed
-    body; the first Piola stress P and its tangent dP/dF are Functions on a quadrature element,
-    injected into the UFL forms. With several bodies, ``material``, ``density``,
-    ``body_force``, ``tractions``, ``pressures``, ``cell_tags`` and ``facet_tags`` are each one
-    for all, or a list with one for each body.
+    body, with the first Piola stress P and its tangent dP/dF at quadrature points. With several
+    bodies, ``material``, ``density``, ``body_force``, ``tractions``, ``pressures``, ``cell_tags``
+    and ``facet_tags`` are each one for all, or a list with one for each body.
 
     Args:
         particles: The body, or a list of bodies. Those on the same V do not slip where they touch;
@@ -83,8 +81,6 @@ class QuasiStaticProblem(ParticleProblem):
             background cell).
         petsc_options_prefix: Prefix of the PETSc options.
         petsc_options: PETSc options, without prefix.
-        assembly: As in :class:`ParticleProblem`; the reference route also updates the built-in
-            materials by NumPy.
         shift: As in :class:`ParticleProblem`.
         line_search: As in :class:`ParticleProblem`.
         dependent_dofs: As in :class:`ParticleProblem`.
@@ -136,7 +132,6 @@ class QuasiStaticProblem(ParticleProblem):
         petsc_options_prefix: str = "mpm_",
         petsc_options: dict[str, Any] | None = None,
         *,
-        assembly: str = "auto",
         shift: float = 1e-13,
         line_search: bool = True,
         dependent_dofs: str = "shift",
@@ -176,7 +171,6 @@ class QuasiStaticProblem(ParticleProblem):
             petsc_options=petsc_options,
             form_compiler_options=form_compiler_options,
             jit_options=jit_options,
-            assembly=assembly,
             shift=shift,
             line_search=line_search,
             dependent_dofs=dependent_dofs,
@@ -220,7 +214,6 @@ class QuasiStaticProblem(ParticleProblem):
         self.pressure: list[ParticleField] = []
         self._left: dict[int, tuple[fem.Function, NDArray[np.float64]]] = {}
         self._remeshing = Remeshing(self)
-        self._compiled = is_fast(assembly)
         self._begin(particles, bcs, background, numerics, terms, self._remeshing)
         self._carry_stress(stresses)
         for body in bodies:
@@ -517,7 +510,6 @@ class QuasiStaticProblem(ParticleProblem):
             given.material,
             given.cell_tags,
             self.setup.f_bar,
-            self._compiled,
             next((field for field in self.pressure if field.particles is body), None),
         )
         if any(field.particles is body for field in self._new_pressures):
@@ -549,20 +541,13 @@ class QuasiStaticProblem(ParticleProblem):
             for load in loads
             if depends_on(load, body.displacement)
         ]
-        injected = None
-        if not self._compiled:
-            injected = _functions_at_points(body, history.dim)
-            internal, tangent = work.internal(*injected)
-            loads.append(internal)
-            slopes.append(tangent)
         return Contribution(
             sum(loads[1:], loads[0]) if loads else None,
             sum(slopes[1:], slopes[0]) if slopes else None,
-            acting if self._compiled else None,
+            acting,
             acting.grouped,
             symmetric,
             acting,
-            injected,
             any(support.one_sided for support in given.supports),
             of_step,
         )
@@ -598,7 +583,7 @@ class QuasiStaticProblem(ParticleProblem):
             self.bodies, self.pressure, self._acting, self._stresses, strict=True
         ):
             carried = CarriedField(field)
-            found.append(PressureTerm(body, carried, acting, self._compiled))
+            found.append(PressureTerm(body, carried, acting))
             if self.setup.mixed == "stabilised pressure":
                 found.append(PressureSmoothing(carried, points))
         return found
@@ -758,14 +743,6 @@ class QuasiStaticProblem(ParticleProblem):
         """
         values = [s.yield_function().max(axis=1, initial=-np.inf) for s in self._stresses]
         return np.concatenate(values)
-
-
-def _functions_at_points(body: Particles, dim: int) -> tuple[fem.Function, fem.Function]:
-    """Return Functions on a quadrature element for a body's stress and its tangent."""
-    return (
-        body.quadrature_function("first_piola", (dim, dim)),
-        body.quadrature_function("tangent", (dim,) * 4),
-    )
 
 
 def _for_each(value: Any, count: int, pairs: bool = False) -> list[Any]:

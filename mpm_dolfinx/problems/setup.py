@@ -20,7 +20,6 @@ import numpy as np
 import ufl
 from dolfinx import mesh
 
-from ..assembly.fused import is_fast
 from ..boundary.supports import Support
 from ..constitutive.averaging import F_BARS
 from ..errors import MPMError
@@ -52,7 +51,6 @@ class Numerics:
     petsc_options: dict[str, Any]
     form_compiler_options: dict[str, Any] | None
     jit_options: dict[str, Any] | None
-    assembly: str
     shift: float
     line_search: bool
     dependent_dofs: str
@@ -111,7 +109,6 @@ class Numerics:
     def in_words(self) -> dict[str, str]:
         """Return how the problem is solved, for a reader."""
         words = {
-            "assembly": f"{'fast' if is_fast(self.assembly) else 'reference'}",
             "shift": f"{self.shift:g}",
             "line search": "on" if self.line_search else "off",
             "predictor": "on" if self.predictor else "off",

@@ -12,8 +12,6 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from dolfinx import fem
-
 from ..assembly.body_forms import BodyForms
 from ..assembly.low_rank import ReducedLowRank
 from ..errors import MPMError
@@ -48,9 +46,6 @@ class PointHistory(PointMaterial, Protocol):
     def roll_back(self) -> None:
         """Return to the stress of the last converged step."""
 
-    def on_mesh(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return stress and tangent at the points, in the dimension of the forms."""
-
 
 class StepForce(Protocol):
     """A part of a body's forces that may be one of a whole step; see :meth:`Term.pace`."""
@@ -75,8 +70,6 @@ class BodyTerm(Term):
         particles: The body.
         forms: Its residual and tangent.
         material: Its material, if the forms hold one.
-        injected: Functions in the forms for the material's stress and its tangent, if they take
-            these by Functions.
         contact: Whether one-sided supports act on it.
         of_step: What among its forces may be of a whole step.
         static: Whether, in a motion of others, the body is in equilibrium at each step's end: its
@@ -94,7 +87,6 @@ class BodyTerm(Term):
         particles: Particles,
         forms: BodyForms,
         material: PointHistory | None = None,
-        injected: tuple[fem.Function, fem.Function] | None = None,
         contact: bool = False,
         of_step: Sequence[StepForce] = (),
         static: bool = False,
@@ -105,7 +97,6 @@ class BodyTerm(Term):
         self.particles = particles
         self.forms = forms
         self._material = material
-        self._injected = injected
         self._contact = contact
         self._T: PETSc.Mat | None = None
         self._low_rank: ReducedLowRank | None = None
@@ -146,12 +137,10 @@ class BodyTerm(Term):
             return ()
         for part in self._of_step:
             part.mute(True)
-        self._inject()
         force = self.forms.assemble_residual().copy()
         for part in self._of_step:
             part.mute(False)
             part.settle()
-        self._inject()
         return [force]
 
     def step_work(self) -> tuple[float, float]:
@@ -169,14 +158,7 @@ class BodyTerm(Term):
             self._material.update()
         except MPMError as error:
             return error
-        self._inject()
         return None
-
-    def _inject(self) -> None:
-        """Set the injected Functions to the present stress and tangent."""
-        if self._material is not None and self._injected is not None:
-            for function, values in zip(self._injected, self._material.on_mesh(), strict=True):
-                function.x.array[: values.size] = values.ravel()
 
     def smooth(self) -> bool:
         """See :meth:`Term.smooth`. It may differ between ranks."""
@@ -262,4 +244,3 @@ class BodyTerm(Term):
         self.forms.update_average()
         if self._material is not None:
             self._material.roll_back()
-            self._inject()

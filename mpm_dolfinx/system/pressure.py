@@ -30,7 +30,6 @@ class PressureTerm(FieldTerm):
         particles: The body.
         pressure: p, at its points.
         material: The material at its points.
-        fast: Whether the compiled loops reduce the tangent.
     """
 
     def __init__(
@@ -38,10 +37,9 @@ class PressureTerm(FieldTerm):
         particles: Particles,
         pressure: CarriedField,
         material: PressurePoints,
-        fast: bool = False,
     ) -> None:
         super().__init__(particles, [pressure])
-        self._coupling = PressureBlocks(particles, pressure, material) if fast else None
+        self._coupling = PressureBlocks(particles, pressure, material)
         self._particles, self._pressure, self._material = particles, pressure, material
         nodes = particles.domain_nodes
         gdim = particles.mesh.geometry.dim
@@ -64,13 +62,12 @@ class PressureTerm(FieldTerm):
         return self._material.symmetric
 
     @property
-    def coupling(self) -> Coupling | None:
+    def coupling(self) -> Coupling:
         """See :attr:`Term.coupling`."""
         return self._coupling
 
     def absolute_product(self, changes: Sequence[NDArray[np.float64]]) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.absolute_product`; forces on the body's nodes are left out."""
-        assert self._coupling is not None
         self._force.array_w[:] = self._coupling.sizes(*changes)
         return [self._none, self._force]
 

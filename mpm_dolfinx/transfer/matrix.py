@@ -52,17 +52,6 @@ def _entries(
         values: Basis there, shape ``(n, k)``.
         bs: Number of components.
     """
-    if loops is not None:
-        offsets = np.empty(len(nodes) * bs + 1, dtype=PETSc.IntType)
-        columns, data = loops.transfer_rows(nodes, values, bs, offsets)
-        return offsets, columns, data
-    order = np.argsort(nodes, axis=1)
-    nodes = np.take_along_axis(nodes, order, axis=1)
-    values = np.take_along_axis(values, order, axis=1)
-    kept = values != 0.0
-    counts = np.repeat(kept.sum(axis=1), bs)
-    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType)
-    shape = (len(nodes), bs, nodes.shape[1])
-    keep = np.broadcast_to(kept[:, None, :], shape)
-    columns = (nodes[:, None, :] * bs + np.arange(bs)[None, :, None])[keep].astype(PETSc.IntType)
-    return offsets, columns, np.broadcast_to(values[:, None, :], shape)[keep]
+    offsets = np.empty(len(nodes) * bs + 1, dtype=PETSc.IntType)
+    columns, data = loops.transfer_rows(nodes, values, bs, offsets)
+    return offsets, columns, data

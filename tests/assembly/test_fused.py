@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The fast route against the reference route: DOLFINx's assembly and PETSc's products."""
+"""Tangents of the compiled loops against DOLFINx's assembly and PETSc's products."""
 
 from itertools import product
 
@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 import scenes
 from marks import thinned
+from routes import on_route
 
 import ufl
 from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx._core import loops
-
-pytestmark = pytest.mark.skipif(loops is None, reason="the package was built without a compiler")
 
 QUADRILATERAL, TRIANGLE = mesh.CellType.quadrilateral, mesh.CellType.triangle
 HEXAHEDRON, TETRAHEDRON = mesh.CellType.hexahedron, mesh.CellType.tetrahedron
@@ -50,7 +48,7 @@ def floor(V):
     return fem.dirichletbc(moved, at, V.sub(dim - 1))
 
 
-def quasi_static(particles, assembly, **options):
+def quasi_static(particles, **options):
     V = (particles[0] if isinstance(particles, list) else particles).V
     dim = V.mesh.geometry.dim
     options.setdefault("material", PLASTIC)
@@ -59,49 +57,52 @@ def quasi_static(particles, assembly, **options):
         density=2.0,
         body_force=(0.5,) * dim,
         bcs=[floor(V)],
-        assembly=assembly,
         **options,
     )
 
 
+def evaluated(make, symmetric):
+    """Return residual, tangent and what follows from them in one state (collective)."""
+    problem = make()
+    system = problem.reduced
+    change = np.zeros(len(problem.bodies[0].increment.x.array))
+    problem.bcs[0].set(change, None, 1.0)
+    for body in problem.bodies:
+        body.load.value = 1.0
+    system.begin([change], 1.0)
+    first, local = system.sizes[1], system.sizes[0]
+    problem._stepper.newton._start(system.sizes)
+    x, F = problem._stepper.newton.x, problem._stepper.newton.F
+    assert system.residual(x, F) is None
+    system.tangent()
+    system.impose()
+    start = x.getOwnershipRange()[0]
+    x.array_w[:] = 0.02 * np.sin(1.7 * (start + np.arange(local)))
+    assert system.residual(x, F) is None
+    K = system.tangent()
+    lift = system.lift()
+    modulus = [share.shear_modulus() for share in problem.body_terms]
+    if symmetric:
+        skew = K.copy()
+        skew.transpose()
+        skew.axpy(-1.0, K)
+        assert skew.norm() < 1e-13 * K.norm()
+    return F.copy(), K.copy(), lift, system.motion(x), modulus, first
+
+
 def compare(make, symmetric=False):
-    """Compare residual, tangent and lift of both routes at the same state (collective)."""
-    found = []
-    for assembly in ("fast", "reference"):
-        problem = make(assembly)
-        system = problem.reduced
-        change = np.zeros(len(problem.bodies[0].increment.x.array))
-        problem.bcs[0].set(change, None, 1.0)
-        for body in problem.bodies:
-            body.load.value = 1.0
-        system.begin([change], 1.0)
-        first, local = system.sizes[1], system.sizes[0]
-        problem._stepper.newton._start(system.sizes)
-        x, F = problem._stepper.newton.x, problem._stepper.newton.F
-        assert system.residual(x, F) is None
-        system.tangent()
-        system.impose()
-        start = x.getOwnershipRange()[0]
-        x.array_w[:] = 0.02 * np.sin(1.7 * (start + np.arange(local)))
-        assert system.residual(x, F) is None
-        K = system.tangent()
-        lift = system.lift()
-        modulus = [share.shear_modulus() for share in problem.body_terms]
-        found.append((F.copy(), K.copy(), lift, system.motion(x), modulus, first))
-        if symmetric:
-            skew = K.copy()
-            skew.transpose()
-            skew.axpy(-1.0, K)
-            assert skew.norm() < 1e-13 * K.norm()
-    fast, reference = found
-    assert fast[5] == reference[5] > 0
-    for a, b in zip(fast[:3], reference[:3], strict=True):
+    """Compare residual, tangent and lift with the reference at the same state (collective)."""
+    found = evaluated(make, symmetric)
+    with on_route("reference"):
+        reference = evaluated(make, symmetric)
+    assert found[5] == reference[5] > 0
+    for a, b in zip(found[:3], reference[:3], strict=True):
         size = b.norm()
         assert size > 0.0
         a.axpy(-1.0, b)
         assert a.norm() < 1e-12 * size
-    assert fast[3] == pytest.approx(reference[3], rel=1e-12)
-    assert fast[4] == pytest.approx(reference[4], rel=1e-10)
+    assert found[3] == pytest.approx(reference[3], rel=1e-12)
+    assert found[4] == pytest.approx(reference[4], rel=1e-10)
 
 
 CELLS = [QUADRILATERAL, TRIANGLE, HEXAHEDRON, TETRAHEDRON]
@@ -112,26 +113,26 @@ CELLS = [QUADRILATERAL, TRIANGLE, HEXAHEDRON, TETRAHEDRON]
 def test_domains_of_any_cell_and_rule(cell, rule):
     dim = 3 if cell in (HEXAHEDRON, TETRAHEDRON) else 2
     particles = mpm.Particles(bent(cell), space(dim), quadrature_degree=rule)
-    compare(lambda assembly: quasi_static(particles, assembly))
+    compare(lambda: quasi_static(particles))
 
 
 @pytest.mark.parametrize("method", ["cpdi", "gimp", "mpm"])
 def test_other_methods(method):
     body = scenes.box([0.1, 0.1], [1.1, 1.1], [4, 4], QUADRILATERAL)
     particles = mpm.Particles(body, space(2), method=method)
-    compare(lambda assembly: quasi_static(particles, assembly))
+    compare(lambda: quasi_static(particles))
 
 
 @pytest.mark.parametrize("cell", [QUADRILATERAL, TRIANGLE], ids=scenes.name)
 def test_degree_two(cell):
     particles = mpm.Particles(bent(cell), space(2, 2), degree=2)
-    compare(lambda assembly: quasi_static(particles, assembly))
+    compare(lambda: quasi_static(particles))
 
 
 @pytest.mark.parametrize("stabilisation", ["ghost", "aggregate"])
 def test_stabilised(stabilisation):
     particles = mpm.Particles(bent(QUADRILATERAL), space(2, 2), degree=2)
-    compare(lambda assembly: quasi_static(particles, assembly, stabilisation=stabilisation))
+    compare(lambda: quasi_static(particles, stabilisation=stabilisation))
 
 
 def boundary_tags(body):
@@ -170,15 +171,12 @@ def test_every_combination(kind, f_bar, degree, follower, bodies):
             "facet_tags": [boundary_tags(body) for body in meshes],
         }
 
-    def make(assembly):
-        return quasi_static(
-            particles, assembly, f_bar=f_bar, axisymmetric=kind == "axisymmetric", **loads
-        )
+    def make():
+        return quasi_static(particles, f_bar=f_bar, axisymmetric=kind == "axisymmetric", **loads)
 
     if f_bar == "pair" and not plane:
-        for assembly in ("fast", "reference"):
-            with pytest.raises(mpm.MPMError, match="use 'domain' or 'patch'"):
-                make(assembly)
+        with pytest.raises(mpm.MPMError, match="use 'domain' or 'patch'"):
+            make()
         return
     compare(make, symmetric=not follower)
 
@@ -206,19 +204,15 @@ def test_a_law_without_symmetry_beside_deleted_domains(f_bar, rule, axisymmetric
     particles.leaving()
     particles.delete(np.flatnonzero(particles.global_index == 5))
     law = Friction(1e3, 0.3)
-    compare(
-        lambda assembly: quasi_static(
-            particles, assembly, material=law, f_bar=f_bar, axisymmetric=axisymmetric
-        )
-    )
+    compare(lambda: quasi_static(particles, material=law, f_bar=f_bar, axisymmetric=axisymmetric))
 
 
 @pytest.mark.parametrize("stabilisation", ["ghost", "aggregate"])
 def test_stabilised_patches_of_revolution(stabilisation):
     particles = mpm.Particles(bent(QUADRILATERAL), space(2, 2), degree=2)
     compare(
-        lambda assembly: quasi_static(
-            particles, assembly, stabilisation=stabilisation, f_bar="patch", axisymmetric=True
+        lambda: quasi_static(
+            particles, stabilisation=stabilisation, f_bar="patch", axisymmetric=True
         )
     )
 
@@ -228,38 +222,36 @@ def test_averaged_volume_ratio(over, rule):
     particles = mpm.Particles(bent(QUADRILATERAL), space(2), quadrature_degree=rule)
     F = ufl.Identity(2) + ufl.grad(particles.displacement)
 
-    def make(assembly):
+    def make():
         ratio = mpm.AveragedVolumeRatio(particles, over)
         energy = 5.0 * ufl.inner(F, F) / ufl.det(F) + 300.0 * (ratio - 1.0) ** 2
         R = ratio.residual(energy * particles.dx)
-        return mpm.ParticleProblem(R, particles, bcs=[floor(particles.V)], assembly=assembly)
+        return mpm.ParticleProblem(R, particles, bcs=[floor(particles.V)])
 
     compare(make)
 
 
 def test_triangular_background():
     particles = mpm.Particles(bent(TRIANGLE), space(2, 1, TRIANGLE))
-    compare(lambda assembly: quasi_static(particles, assembly))
+    compare(lambda: quasi_static(particles))
 
 
 def test_two_bodies():
     V = space(2)
     bodies = [mpm.Particles(bent(QUADRILATERAL, c), V) for c in (0.1, -0.9)]
-    compare(lambda assembly: quasi_static(bodies, assembly))
+    compare(lambda: quasi_static(bodies))
 
 
 def test_body_of_revolution():
     particles = mpm.Particles(bent(QUADRILATERAL), space(2))
-    compare(lambda assembly: quasi_static(particles, assembly, axisymmetric=True))
+    compare(lambda: quasi_static(particles, axisymmetric=True))
 
 
 def test_follower_pressure():
     body = bent(QUADRILATERAL)
     tags = boundary_tags(body)
     particles = mpm.Particles(body, space(2))
-    compare(
-        lambda assembly: quasi_static(particles, assembly, pressures=[(3.0, 7)], facet_tags=tags)
-    )
+    compare(lambda: quasi_static(particles, pressures=[(3.0, 7)], facet_tags=tags))
 
 
 @pytest.mark.parametrize("term", ["cells", "tagged cells", "facets", "inner facets"])
@@ -281,14 +273,10 @@ def test_ufl_terms(term):
         R += k * ufl.inner(d, v) * ufl.ds(body)
     if term == "inner facets":
         R += k * ufl.inner(ufl.jump(ufl.grad(d)), ufl.jump(ufl.grad(v))) * ufl.dS(body)
-    compare(
-        lambda assembly: mpm.ParticleProblem(
-            R, particles, bcs=[floor(particles.V)], assembly=assembly
-        )
-    )
+    compare(lambda: mpm.ParticleProblem(R, particles, bcs=[floor(particles.V)]))
 
 
-def sink(assembly):
+def sink():
     """Let a block sink a little into itself, its bottom held in both directions."""
     V = space(2)
     particles = mpm.Particles(bent(QUADRILATERAL), V)
@@ -298,23 +286,18 @@ def sink(assembly):
         mpm.materials.Hencky(1e4, 0.3),
         body_force=(0.0, -300.0),
         bcs=[fem.dirichletbc(np.zeros(2), held, V)],
-        assembly=assembly,
     )
     problem.solve(4)
     return problem
 
 
 def test_pattern_lasts_while_no_node_changes_its_cell():
-    fast, reference = sink("fast"), sink("reference")
-    statistics = fast.history.statistics
+    problem = sink()
+    with on_route("reference"):
+        reference = sink()
+    statistics = problem.history.statistics
     assert 1 <= statistics["patterns"] < statistics["transfers"] == 4
     there = reference.particles.displacement.x.array
     largest = scenes.largest(there)
     assert largest > 1e-3
-    assert fast.particles.displacement.x.array == pytest.approx(there, abs=1e-11 * largest)
-
-
-def test_unknown_route():
-    particles = mpm.Particles(bent(QUADRILATERAL), space(2))
-    with pytest.raises(mpm.MPMError, match="assembly='fused'; choose 'auto', 'fast'"):
-        quasi_static(particles, "fused")
+    assert problem.particles.displacement.x.array == pytest.approx(there, abs=1e-11 * largest)

@@ -8,7 +8,6 @@ import scenes
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD, box
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx._core import loops
 from mpm_dolfinx.contact import facets
 from mpm_dolfinx.contact.surface import Surface
 
@@ -37,14 +36,13 @@ def near_a_body(kind, degree=1):
 
 
 @pytest.mark.skip_in_parallel
-@pytest.mark.skipif(loops is None, reason="needs the compiled loops")
 @pytest.mark.parametrize("faced", [False, True])
 @pytest.mark.parametrize("kind", [TRIANGLE, QUADRILATERAL, TETRAHEDRON, HEXAHEDRON])
 def test_compiled_search_finds_what_that_by_numpy_finds(kind, faced):
     known, nodes, x, inner = near_a_body(kind)
     found, other = (
-        known.closest(x, inner if faced else None, nodes, REACH, compiled=compiled)
-        for compiled in (True, False)
+        search(x, inner if faced else None, nodes, REACH)
+        for search in (known.closest, known.closest_curved)
     )
     assert np.array_equal(found.facet, other.facet) and (found.facet >= 0).sum() > 50
     assert np.array_equal(found.near, other.near)

@@ -3,11 +3,9 @@
 """Matrices between nodes of two bodies whose facets meet."""
 
 import numpy as np
-import pytest
 import scenes
 from scenes import QUADRILATERAL, box
 
-from mpm_dolfinx.contact import pair_matrices
 from mpm_dolfinx.contact.pair_matrices import Met, PairMatrices
 
 BODIES = ((5, 3), (4, 6))
@@ -38,10 +36,7 @@ def dense(matrix):
     return matrix.comm.tompi4py().allreduce(own)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_blocks_are_where_their_nodes_say_also_where_others_come_up_later(monkeypatch, compiled):
-    if not compiled:
-        monkeypatch.setattr(pair_matrices, "loops", None)
+def test_blocks_are_where_their_nodes_say_also_where_others_come_up_later():
     W = spaces()
     comm = W[0].mesh.comm
     rng = np.random.default_rng(comm.rank)

@@ -69,7 +69,6 @@ def meeting(side, law, count=60, pressed=False):
     )
 
 
-@pytest.mark.skipif(loops is None, reason="needs the compiled loops")
 @pytest.mark.parametrize("pressed", [False, True])
 @pytest.mark.parametrize("friction", FRICTION)
 @pytest.mark.parametrize("side", SIDES)
@@ -100,23 +99,30 @@ def sums(points, groups=7, blocks=50):
     )
 
 
-@pytest.mark.skipif(loops is None, reason="needs the compiled loops")
+def add_by_numpy(D, where):
+    """Add derivatives at points to blocks, spread over the nodes of their own facets."""
+    N = where.shapes[:, :, None, None, None]
+    rows = np.concatenate([N * D[:, :1], D[:, 1:]], axis=1)
+    rows *= where.weights[:, None, None, None, None]
+    own = rows[:, :, :, :1] * where.shapes[:, None, None, :, None]
+    whole = np.concatenate([own, rows[:, :, :, 1:]], axis=3)
+    np.add.at(where.values, where.positions[where.group], whole.swapaxes(2, 3))
+
+
 @pytest.mark.parametrize("pressed", [False, True])
 @pytest.mark.parametrize("friction", FRICTION)
 @pytest.mark.parametrize("side", SIDES)
-def test_compiled_tangents_are_the_complex_steps_summed_up(monkeypatch, side, friction, pressed):
+def test_compiled_tangents_are_the_complex_steps_summed_up(side, friction, pressed):
     law = FRICTION[friction]
     points = meeting(side, law, pressed=pressed)
     found, known = sums(points), sums(points)
     stencil.add_tangents(law, points, TOUCH, EXTENT, found)
-    with monkeypatch.context() as without:
-        without.setattr(stencil, "loops", None)
-        stencil.add_tangents(law, points, TOUCH, EXTENT, known)
+    D = stencil.by_complex_step(law, points, TOUCH, EXTENT)
+    add_by_numpy(D, known)
     scale = np.abs(known.values).max()
     assert scale > 1.0
     np.testing.assert_allclose(found.values, known.values, atol=1e-14 * scale)
     again = sums(points)
-    D = stencil.by_complex_step(law, points, TOUCH, EXTENT)
     loops.add_derivatives(D, *again[:4], again.values)
     np.testing.assert_allclose(again.values, known.values, atol=1e-14 * scale)
 
@@ -163,7 +169,6 @@ def test_no_points_add_nothing():
     assert not where.values.any()
 
 
-@pytest.mark.skipif(loops is None, reason="needs the compiled loops")
 def test_blocks_that_are_not_there_are_refused():
     law = FRICTION["rough"]
     points = meeting("quadrilateral", law)

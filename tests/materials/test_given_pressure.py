@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Laws at a given pressure: their own answer to another volume, and its derivatives."""
 
+from copy import copy
+
 import numpy as np
 import pytest
+from laws import in_python
 from materials.test_compiled import COUNT, LAWS
 
-from mpm_dolfinx._core import loops
 from mpm_dolfinx.errors import DomainDistortionError
 from mpm_dolfinx.materials import MohrCoulomb, SmallStrainVonMises, VonMises
 from mpm_dolfinx.materials.given_pressure import ALPHA
@@ -96,12 +98,10 @@ def test_the_derivatives(name, dim):
         assert wrong.sum() <= COUNT // 10  # points at a kink
 
 
-@pytest.mark.skipif(loops is None, reason="the package was built without a compiler")
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("name", SOILS)
 def test_compiled_is_numpy(name, dim):
-    compiled, reference = SOILS[name], SOILS[name].with_parameters()
-    reference.compiled = False
+    compiled, reference = SOILS[name], in_python(SOILS[name])
     gradient, state, pressure = moved(compiled, dim)
     one, two = (law.at_pressure(gradient, state, pressure, SHEAR) for law in (compiled, reference))
     for mine, theirs in zip(one[:-1], two[:-1], strict=True):
@@ -111,11 +111,10 @@ def test_compiled_is_numpy(name, dim):
         np.testing.assert_allclose(one.state[key], values, rtol=1e-9, atol=1e-10 * size)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_a_pressure_beyond_the_apex(compiled):
+@pytest.mark.parametrize("route", [copy, in_python])
+def test_a_pressure_beyond_the_apex(route):
     """The stress is that of the apex, and the volume as large as the augmentation makes it."""
-    law = MohrCoulomb(1e3, 0.3, 2.0, 30.0)
-    law.compiled = compiled
+    law = route(MohrCoulomb(1e3, 0.3, 2.0, 30.0))
     state = law.initial_state(COUNT, 2)
     apex, none = 2.0 / np.tan(np.radians(30.0)), np.zeros((COUNT, 2, 2))
     pressure = np.linspace(apex, 2.0 * apex, COUNT)
@@ -126,10 +125,9 @@ def test_a_pressure_beyond_the_apex(compiled):
     np.testing.assert_allclose(-answer.gap[1:], opened[1:], rtol=1e-6, atol=1e-2)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_what_cannot_be_names_its_points(compiled):
-    law = VonMises(1e3, 0.3, rho_y=2.0)
-    law.compiled = compiled
+@pytest.mark.parametrize("route", [copy, in_python])
+def test_what_cannot_be_names_its_points(route):
+    law = route(VonMises(1e3, 0.3, rho_y=2.0))
     turned = np.zeros((3, 2, 2))
     turned[1, 0, 0] = -2.0
     with pytest.raises(DomainDistortionError) as error:

@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from laws import in_python
 from marks import thinned
 from materials.reference import rotation
 from materials.test_cam_clay import clay
@@ -45,11 +46,10 @@ def pressures(n, dim, K0=0.6, largest=20.0):
 
 
 @pytest.mark.parametrize(
-    ("law", "dim", "compiled"), thinned(3, product(LAWS, [2, 3], [True, False]))
+    ("law", "dim", "route"), thinned(3, product(LAWS, [2, 3], [copy.copy, in_python]))
 )
-def test_the_stress_is_that_which_was_asked_for(law, dim, compiled):
-    material, stress = LAWS[law].with_parameters(), pressures(9, dim)
-    material.compiled = compiled
+def test_the_stress_is_that_which_was_asked_for(law, dim, route):
+    material, stress = route(LAWS[law]), pressures(9, dim)
     state = material.stressed_state(stress, dim)
     H = np.zeros((9, dim, dim))
     answer = material.update(H, state)

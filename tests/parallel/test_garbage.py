@@ -10,6 +10,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import scenes
+from routes import on_route
 
 from dolfinx import fem
 
@@ -82,7 +83,8 @@ def split():
 
 
 def on_reference_route():
-    scenes.block(f_bar="patch", tractions=[], assembly="reference").solve(1)
+    with on_route("reference"):
+        scenes.block(f_bar="patch", tractions=[]).solve(1)
 
 
 def moving():

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from compare import EXACT, raises
 from marks import thinned
+from routes import ROUTES, on_route
 from scenes import (
     HEXAHEDRON,
     QUADRILATERAL,
@@ -185,14 +186,16 @@ def test_a_spinning_body_keeps_momentum_and_its_account(scheme, out):
     ("cell", "f_bar"), [(QUADRILATERAL, "domain"), (TRIANGLE, "pair"), (TRIANGLE, "patch")]
 )
 @pytest.mark.parametrize(
-    ("law", "assembly"),
+    ("law", "route"),
     [
-        (Hencky(100.0, 0.49), "fast"),
+        (Hencky(100.0, 0.49), "loops"),
         (Hencky(100.0, 0.49), "reference"),
-        (VonMises(100.0, 0.49, rho_y=99.0), "fast"),
+        (VonMises(100.0, 0.49, rho_y=99.0), "loops"),
     ],
+    indirect=["route"],
 )
-def test_with_f_bar_an_elastic_body_keeps_its_energy(law, cell, f_bar, assembly):
+@pytest.mark.usefixtures("route")
+def test_with_f_bar_an_elastic_body_keeps_its_energy(law, cell, f_bar):
     particles = square(cell, quadrature_degree=2 if f_bar == "domain" else None)
     problem = spinning(
         particles,
@@ -201,7 +204,6 @@ def test_with_f_bar_an_elastic_body_keeps_its_energy(law, cell, f_bar, assembly)
         scheme="conserving",
         out_of_range="reflect",
         f_bar=f_bar,
-        assembly=assembly,
     )
     turning = problem.angular_momentum
     history = problem.solve(0.4, 0.04)
@@ -267,9 +269,10 @@ def test_a_body_that_yields_keeps_its_angular_momentum(cell):
 
 def test_both_routes_conserve_alike():
     runs = []
-    for assembly in ("fast", "reference"):
-        problem = thrown(scheme="conserving", assembly=assembly, rayleigh=(0.1, 0.01))
-        problem.solve(0.2, 0.05)
+    for route in ROUTES:
+        with on_route(route):
+            problem = thrown(scheme="conserving", rayleigh=(0.1, 0.01))
+            problem.solve(0.2, 0.05)
         runs.append(run_of(problem))
     require_same(*runs, 1e-9)
 
@@ -286,13 +289,14 @@ def test_both_routes_conserve_alike():
     ],
 )
 def test_masses_reduced_domain_by_domain_are_those_of_stock_forms(
-    cell, degree, stabilisation, method
+    cell, degree, stabilisation, method, take
 ):
     # A linear body takes one solve if its tangent is exact; that of the reference route is made of
     # sparse products.
     gdim = 3 if cell == HEXAHEDRON else 2
     runs = []
-    for assembly in ("fast", "reference"):
+    for route in ROUTES:
+        take(route)
         V = vectors(box([0.0] * gdim, [2.0] * gdim, [5] * gdim, HEXAHEDRON if gdim == 3 else cell))
         if degree > 1:
             V = vectors(V.mesh, degree)
@@ -310,7 +314,6 @@ def test_masses_reduced_domain_by_domain_are_those_of_stock_forms(
             LinearElastic(10.0, 0.3),
             [1.0 + ufl.SpatialCoordinate(body.mesh)[0] for body in bodies],
             velocity=lambda x: np.stack([np.sin(7 * x[i] + i) for i in range(gdim)]),
-            assembly=assembly,
             stabilisation=stabilisation,
         )
         problem.solve(0.02, 0.01)
@@ -973,7 +976,7 @@ OTHERS = {
     "F-bar": ({"quadrature_degree": 2}, {"f_bar": "domain"}),
     "degree 3": ({"degree": 3}, {"stabilisation": None}),
     "aggregation": ({"degree": 2}, {"stabilisation": "aggregate"}),
-    "reference route": ({}, {"assembly": "reference"}),
+    "reference": ({}, {"route": "reference"}),
     "removed dofs": ({}, {"dependent_dofs": "remove"}),
     "conserving F-bar": ({"quadrature_degree": 2}, {"f_bar": "domain", "scheme": "conserving"}),
     "conserving degree 2": ({"degree": 2}, {"scheme": "conserving"}),
@@ -982,8 +985,10 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_other_methods_and_options_keep_momentum_and_the_account(name):
+def test_other_methods_and_options_keep_momentum_and_the_account(name, take):
     of_particles, options = OTHERS[name]
+    options = dict(options)
+    take(options.pop("route", "loops"))
     problem = spinning(square(**of_particles), velocity=lambda x: 0.3 + 0.5 * spin(x), **options)
     momentum, turning = problem.momentum, problem.angular_momentum
     history = problem.solve(0.4, 0.05)
@@ -1060,19 +1065,21 @@ def standing(f_bar="none"):
 
 
 @pytest.mark.parametrize(
-    ("scheme", "out", "f_bar", "assembly"),
+    ("scheme", "out", "f_bar", "route"),
     [
-        ("midpoint", "project", "none", "fast"),
-        ("midpoint", "reflect", "domain", "fast"),
+        ("midpoint", "project", "none", "loops"),
+        ("midpoint", "reflect", "domain", "loops"),
         ("conserving", "project", "none", "reference"),
-        ("conserving", "reflect", "none", "fast"),
-        ("euler", "project", "none", "fast"),
+        ("conserving", "reflect", "none", "loops"),
+        ("euler", "project", "none", "loops"),
     ],
+    indirect=["route"],
 )
-def test_a_body_without_inertia_beside_one_that_moves(scheme, out, f_bar, assembly):
+@pytest.mark.usefixtures("route")
+def test_a_body_without_inertia_beside_one_that_moves(scheme, out, f_bar):
     # Apart, each goes its own way: in equilibrium under a load that comes and goes, and as alone.
     law, times = VonMises(40.0, 0.3, rho_y=2.0), np.arange(1, 6) * 0.05
-    options = {"body_force": (0.0, -1.0), "assembly": assembly, "f_bar": f_bar}
+    options = {"body_force": (0.0, -1.0), "f_bar": f_bar}
     options |= {"petsc_options": {"snes_rtol": 1e-12}}
 
     def load(t):

@@ -17,7 +17,7 @@ E, NU, MU = 1e3, 0.3, 0.3
 DEGREE = 3
 
 
-def rubbing(cell, assembly, on_facets=True):
+def rubbing(cell, on_facets=True):
     """Return a block on a rough plane, whose friction remembers where each point sticks."""
     V = scenes.vectors(box([-1.0, -1.0], [4.0, 4.0], [10, 10], QUADRILATERAL))
     block = box([1.03, 1.07], [2.03, 1.57], [4, 2], cell)
@@ -70,7 +70,7 @@ def rubbing(cell, assembly, on_facets=True):
     kind = Rubbing if on_facets else mpm.ParticleProblem
     # (a term says that the body may be let go, so that smaller steps are tried where it is)
     options = {"entity_maps": maps, "terms": [mpm.Term([body])]} if on_facets else {}
-    problem = kind(R, body, assembly=assembly, petsc_options_prefix="ufl_", **options)
+    problem = kind(R, body, petsc_options_prefix="ufl_", **options)
     sums = [fem.form(part * ds(1), entity_maps=maps) for part in (pressure, shear)]
 
     def path(t):
@@ -80,11 +80,13 @@ def rubbing(cell, assembly, on_facets=True):
 
 
 @pytest.mark.parametrize(
-    ("cell", "assembly"),
-    [(QUADRILATERAL, "fast"), (TRIANGLE, "fast"), (QUADRILATERAL, "reference")],
+    ("cell", "route"),
+    [(QUADRILATERAL, "loops"), (TRIANGLE, "loops"), (QUADRILATERAL, "reference")],
+    indirect=["route"],
 )
-def test_friction_with_a_history_on_facets_slides_at_its_coefficient(cell, assembly):
-    problem, path, forces = rubbing(cell, assembly)
+@pytest.mark.usefixtures("route")
+def test_friction_with_a_history_on_facets_slides_at_its_coefficient(cell):
+    problem, path, forces = rubbing(cell)
     reached = []
     with pytest.raises(mpm.ConvergenceError):
         for step in problem.steps(8, update=path):
@@ -100,8 +102,8 @@ def test_friction_with_a_history_on_facets_slides_at_its_coefficient(cell, assem
 
 def test_what_cannot_be_is_said():
     with pytest.raises(mpm.MPMError, match="of another mesh, but must be written on"):
-        rubbing(QUADRILATERAL, "fast", on_facets=False)
-    problem, _, _ = rubbing(QUADRILATERAL, "fast")
+        rubbing(QUADRILATERAL, on_facets=False)
+    problem, _, _ = rubbing(QUADRILATERAL)
     with pytest.raises(mpm.MPMError, match="data on another mesh than the body's"):
         problem.save("never.ckpt")
     body = problem.particles

@@ -5,18 +5,16 @@
 import numpy as np
 import pytest
 import scenes
+from routes import ROUTES
 from scenes import QUADRILATERAL, WORLD, at, box, fix, vectors
 
 from dolfinx import fem
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx._core import loops
 from mpm_dolfinx.materials import Hencky, VonMises
 
-ROUTES = ["fast", "reference"] if loops is not None else ["reference"]
 
-
-def column(material, route="auto", **options):
+def column(material, **options):
     """Return a column under its weight, and its mesh before it is used by `material(mesh)`."""
     V = vectors(box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
     body = box([0.0, 0.0], [1.0, 1.5], [4, 6], QUADRILATERAL)
@@ -27,7 +25,6 @@ def column(material, route="auto", **options):
         body_force=(0.0, -20.0),
         bcs=[fix(V, at(0, 0.0), component=0), fix(V, at(1, 0.0), component=1)],
         f_bar="domain",
-        assembly=route,
         petsc_options={"snes_rtol": 1e-12},
     )
 
@@ -38,9 +35,10 @@ def piecewise(body, value):
     return field
 
 
-@pytest.mark.parametrize("route", ROUTES)
+@pytest.mark.parametrize("route", ROUTES, indirect=True)
+@pytest.mark.usefixtures("route")
 @pytest.mark.parametrize("kind", ["Function", "Constant"])
-def test_values_of_functions_and_constants_are_followed(kind, route):
+def test_values_of_functions_and_constants_are_followed(kind):
     held = {}
 
     def material(body):
@@ -48,13 +46,13 @@ def test_values_of_functions_and_constants_are_followed(kind, route):
         held["young"] = make(body, 500.0)
         return Hencky(held["young"], 0.3)
 
-    problem = column(material, route)
+    problem = column(material)
     if kind == "Function":
         held["young"].x.array[:] = 1000.0
     else:
         held["young"].value = 1000.0
     problem.solve(2)
-    other = column(lambda body: Hencky(1000.0, 0.3), route)
+    other = column(lambda body: Hencky(1000.0, 0.3))
     other.solve(2)
     gap = problem.particles.displacement.x.array - other.particles.displacement.x.array
     assert scenes.largest(gap) < 1e-12
@@ -67,8 +65,9 @@ def test_values_of_functions_and_constants_are_followed(kind, route):
     assert scenes.largest(problem.particles.displacement.x.array - stiff) > 1e-3
 
 
-@pytest.mark.parametrize("route", ROUTES)
-def test_a_path_lowers_a_strength(route):
+@pytest.mark.parametrize("route", ROUTES, indirect=True)
+@pytest.mark.usefixtures("route")
+def test_a_path_lowers_a_strength():
     # The block of one material is sheared to 0.02: what it bears is its strength at the end.
     V = vectors(box([-0.5, 0.0], [1.5, 1.0], [4, 2], QUADRILATERAL))
     body = box([0.0, 0.0], [1.0, 1.0], [4, 4], QUADRILATERAL)
@@ -79,7 +78,6 @@ def test_a_path_lowers_a_strength(route):
         mpm.Particles(body, V, quadrature_degree=2),
         VonMises(1e4, 0.3, rho_y=strength),
         bcs=[fem.dirichletbc(moved, dofs)],
-        assembly=route,
     )
 
     def path(t):
@@ -94,15 +92,16 @@ def test_a_path_lowers_a_strength(route):
     np.testing.assert_allclose(np.linalg.norm(size, axis=(1, 2)), 15.0, rtol=1e-9)
 
 
-@pytest.mark.parametrize("route", ROUTES)
-def test_a_value_that_is_not_allowed_stops_the_next_step(route):
+@pytest.mark.parametrize("route", ROUTES, indirect=True)
+@pytest.mark.usefixtures("route")
+def test_a_value_that_is_not_allowed_stops_the_next_step():
     held = {}
 
     def material(body):
         held["young"] = piecewise(body, 500.0)
         return Hencky(held["young"], 0.3)
 
-    problem = column(material, route)
+    problem = column(material)
     problem.solve(2)
     before = scenes.state(problem)
     if WORLD.rank == WORLD.size - 1:
@@ -114,30 +113,32 @@ def test_a_value_that_is_not_allowed_stops_the_next_step(route):
     problem.step()
 
 
-@pytest.mark.parametrize("route", ROUTES)
-def test_numbers_are_what_they_were(route):
+@pytest.mark.parametrize("route", ROUTES, indirect=True)
+@pytest.mark.usefixtures("route")
+def test_numbers_are_what_they_were():
     law = Hencky(500.0, 0.3)
     with pytest.raises(mpm.MPMError, match="young of a material cannot be set; give a DG0"):
         law.parameters["young"] = 1.0
-    problem = column(lambda body: law, route)
+    problem = column(lambda body: law)
     problem.solve(1)
     law.parameters = {**law.parameters, "young": 1.0}
     with pytest.raises(mpm.MPMError, match="Parameters of a Hencky were replaced after"):
         problem.step()
 
 
-@pytest.mark.parametrize("route", ROUTES)
-def test_arrays_are_copied(route):
+@pytest.mark.parametrize("route", ROUTES, indirect=True)
+@pytest.mark.usefixtures("route")
+def test_arrays_are_copied():
     values = {}
 
     def material(body):
         values["young"] = np.full(body.topology.index_map(2).size_local, 500.0)
         return Hencky(values["young"], 0.3)
 
-    problem = column(material, route)
+    problem = column(material)
     values["young"][:] = 1.0
     problem.solve(2)
-    other = column(lambda body: Hencky(500.0, 0.3), route)
+    other = column(lambda body: Hencky(500.0, 0.3))
     other.solve(2)
     gap = problem.particles.displacement.x.array - other.particles.displacement.x.array
     assert scenes.largest(gap) < 1e-12

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import EXACT, error_of_blocks, outcome, raises, same_run
+from routes import ROUTES, on_route
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 from stock import held, mixed_space, newton, same_values
 
@@ -193,10 +194,13 @@ def test_discontinuous_pressures_from_a_file_and_on_other_ranks(mpi_tmp_path):
 
 
 def test_both_routes():
-    fast, slow = beam(YIELDING, load=0.1), beam(YIELDING, load=0.1, assembly="reference")
-    for problem in (fast, slow):
-        problem.solve(steps=2)
-    same_run(outcome(fast), outcome(slow), 1e-9)
+    ends = []
+    for route in ROUTES:
+        with on_route(route):
+            problem = beam(YIELDING, load=0.1)
+            problem.solve(steps=2)
+        ends.append(outcome(problem))
+    same_run(*ends, 1e-9)
 
 
 def driven(**options):
@@ -224,18 +228,19 @@ def two_lifts(**options):
     [
         driven,
         two_lifts,
-        lambda **options: beam(cell=TETRAHEDRON, **options),
-        lambda **options: beam(stabilisation="aggregate", **options),
-        lambda **options: shell(cells=2, **options),
-        lambda **options: turning("midpoint", **options),
+        lambda: beam(cell=TETRAHEDRON),
+        lambda: beam(stabilisation="aggregate"),
+        lambda: shell(cells=2),
+        lambda: turning("midpoint"),
     ],
     ids=["driven", "two lifts", "in space", "aggregate", "revolution", "motion"],
 )
-def test_the_tangent_by_both_routes(make):
+def test_the_tangent_by_both_routes(make, take):
     """What the compiled loops add up domain by domain are products of matrices, to round-off."""
     found = []
-    for assembly in ("fast", "reference"):
-        problem = make(assembly=assembly)
+    for route in ROUTES:
+        take(route)
+        problem = make()
         reduced = problem.reduced
         ends = [np.zeros(len(field.bodies[0].increment.x.array)) for field in reduced.fields]
         for end, field in zip(ends, reduced.fields, strict=True):
@@ -448,10 +453,11 @@ def test_a_constant_pressure_is_not_smoothed():
 
 
 @pytest.mark.parametrize("cell", [QUADRILATERAL, TRIANGLE, TETRAHEDRON], ids=scenes.name)
-def test_routes_ranks_and_differences_of_a_stabilised_pressure(cell):
+def test_routes_ranks_and_differences_of_a_stabilised_pressure(cell, take):
     law = VonMises(30.0, 0.499, yield_stress=0.5)
     results = []
-    for options in ({}, {"assembly": "reference"}, {"comm": MPI.COMM_SELF}):
+    for options in ({}, {"comm": MPI.COMM_SELF}, {"route": "reference"}):
+        take(options.pop("route", "loops"))
         problem = simple(law, cell=cell, load=0.05, **options)
         problem.solve(2)
         results.append(outcome(problem))
@@ -576,10 +582,11 @@ def test_soils_under_a_strip(name):
     assert error_of_blocks(problem, step=1e-8, size=1e-6) <= 1e-5
 
 
-def test_both_routes_of_soils():
+def test_both_routes_of_soils(take):
     ends = []
-    for route in ("fast", "reference"):
-        problem = pressed(SOILS["mohr-coulomb"], 0.5, push=0.01, assembly=route)
+    for route in ROUTES:
+        take(route)
+        problem = pressed(SOILS["mohr-coulomb"], 0.5, push=0.01)
         problem.solve(steps=2)
         assert problem.particles.plastic_strain.max() > 1e-3
         ends.append(outcome(problem))

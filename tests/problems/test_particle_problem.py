@@ -9,6 +9,7 @@ import pytest
 import scenes
 from bad_input import body, held_background
 from compare import raises
+from routes import ROUTES, ReferenceForms
 from scenes import PLANE, QUADRILATERAL, TRIANGLE, WORLD
 
 import ufl
@@ -17,7 +18,6 @@ from dolfinx.fem.petsc import assemble_matrix
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import _compat
-from mpm_dolfinx.assembly.body_forms import BodyForms
 
 
 def test_a_problem_with_an_error_of_python():
@@ -199,7 +199,7 @@ def test_each_rule_of_a_residual_is_kept(cell):
     scenes.move(particles, lambda X: 0.1 * np.sin(4 * X[:, ::-1]))
     d, v, du = particles.displacement, ufl.TestFunction(particles.W), ufl.TrialFunction(particles.W)
     terms = mixed(d, v, (0, 3, 5), body)
-    forms = BodyForms(sum(terms[1:], terms[0]), None, particles)
+    forms = ReferenceForms(sum(terms[1:], terms[0]), None, particles)
     forms.assemble_external()
     vector, matrix = forms.assemble_residual().copy(), forms.assemble_tangent().copy()
     size, stiffness = vector.norm(), matrix.norm()
@@ -374,8 +374,9 @@ def pair_of_bodies(same_mesh=False):
     return [mpm.Particles(body, V) for body in meshes], [scenes.fix(V, scenes.at(1, 0.0))]
 
 
-@pytest.mark.parametrize("route", ["auto", "reference"])
-def test_a_term_that_is_zero_is_left_out(route):
+@pytest.mark.parametrize("route", ROUTES, indirect=True)
+@pytest.mark.usefixtures("route")
+def test_a_term_that_is_zero_is_left_out():
     found = []
     for extra in (False, True):
         (a, _), bcs = pair_of_bodies()
@@ -385,7 +386,7 @@ def test_a_term_that_is_zero_is_left_out(route):
         if extra:
             R += 0.0 * (v[0] * a.dx) + 0.0 * (ufl.inner(d, v) * ufl.ds)
             J += 0.0 * (ufl.inner(ufl.TrialFunction(a.W), v) * a.dx)
-        problem = mpm.ParticleProblem(R, a, J, bcs, assembly=route)
+        problem = mpm.ParticleProblem(R, a, J, bcs)
         problem.solve(2)
         found.append((d.x.array.copy(), problem.history.iterations))
     size = scenes.largest(found[0][0])
@@ -394,8 +395,9 @@ def test_a_term_that_is_zero_is_left_out(route):
     assert found[0][1] == found[1][1] and size > 1e-4
 
 
-@pytest.mark.parametrize("route", ["auto", "reference"])
-def test_loads_that_are_zero_load_nothing(route):
+@pytest.mark.parametrize("route", ROUTES, indirect=True)
+@pytest.mark.usefixtures("route")
+def test_loads_that_are_zero_load_nothing():
     (a, _), bcs = pair_of_bodies()
     x = ufl.SpatialCoordinate(a.mesh)
     problem = mpm.QuasiStaticProblem(
@@ -405,7 +407,6 @@ def test_loads_that_are_zero_load_nothing(route):
         pressures=[(0.0 * x[0], 1)],
         facet_tags=scenes.facet_tags(a.mesh, scenes.at(1, 0.5)),
         bcs=bcs,
-        assembly=route,
     )
     problem.solve(1)
     assert scenes.largest(a.displacement.x.array) == 0.0

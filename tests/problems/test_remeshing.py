@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import outcome, same_run
+from routes import ROUTES, on_route
 from scenes import ALL, HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 from splits import block_of, column, half_way, some, sums
 
@@ -18,9 +19,10 @@ import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import Hencky, LinearElastic, VonMises
 
 
-@pytest.mark.parametrize("assembly", ["auto", "reference"])
-def test_split_keeps_everything(assembly):
-    problem = half_way(column(assembly=assembly))
+@pytest.mark.parametrize("route", ROUTES, indirect=True)
+@pytest.mark.usefixtures("route")
+def test_split_keeps_everything():
+    problem = half_way(column())
     p = problem.particles
     before, which = sums(problem), some(p)
     per_particle = ("stress", "plastic_strain", "deformation_gradient", "point_stress")
@@ -52,9 +54,11 @@ def split_half_way(**options):
 
 
 def test_after_a_split_routes_and_ranks_agree():
-    results = [outcome(split_half_way(assembly=route)) for route in ("auto", "reference")]
+    results = [outcome(split_half_way())]
     if WORLD.size > 1:
         results.append(outcome(split_half_way(comm=scenes.MPI.COMM_SELF)))
+    with on_route("reference"):
+        results.append(outcome(split_half_way()))
     for other in results[1:]:
         same_run(other, results[0], 1e-9)
 
@@ -266,7 +270,7 @@ REBASED = [
     pytest.param(
         QUADRILATERAL,
         2,
-        {"axisymmetric": True, "f_bar": "domain", "assembly": "reference"},
+        {"axisymmetric": True, "f_bar": "domain", "route": "reference"},
         id="the reference route around an axis",
         marks=pytest.mark.slow,
     ),
@@ -274,7 +278,9 @@ REBASED = [
 
 
 @pytest.mark.parametrize(("cell", "degree", "options"), REBASED)
-def test_rebase_keeps_everything_and_changes_no_step(cell, degree, options):
+def test_rebase_keeps_everything_and_changes_no_step(cell, degree, options, take):
+    options = dict(options)
+    take(options.pop("route", "loops"))
     problem, plain = (block_of(cell, degree, **options) for _ in range(2))
     for each in (problem, plain):
         half_way(each, 4)

@@ -74,13 +74,15 @@ def heave(problem, depth=3.0):
         {"cell": HEXAHEDRON, "dim": 3},
         {"cell": TETRAHEDRON, "dim": 3},
         {"outside": "delete"},
-        {"assembly": "reference"},
+        {"route": "reference"},
         {"degree": 2, "space": 2, "mixed": "pressure"},
-        {"degree": 2, "space": 2, "mixed": "pressure", "assembly": "reference"},
+        {"degree": 2, "space": 2, "mixed": "pressure", "route": "reference"},
     ],
     ids=lambda options: ",".join(f"{v}" for v in options.values()) or "plain",
 )
-def test_excavation_heaves_the_floor(options):
+def test_excavation_heaves_the_floor(options, take):
+    options = dict(options)
+    take(options.pop("route", "loops"))
     problem = layer(**options)
     problem.solve()
     problem.remove(lambda x: x[2 if "dim" in options else 1] > 7.0, name="pit")

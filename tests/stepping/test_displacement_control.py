@@ -7,19 +7,17 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import scenes
+from routes import ROUTES
 from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD
 
 import ufl
 from dolfinx import fem
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx._core import loops
 from mpm_dolfinx.materials import Hencky, VonMises
 
-ROUTES = ["reference", "fast"] if loops is not None else ["reference"]
 
-
-def bar(material, height, stretch, route="auto", **options):
+def bar(material, height, stretch, **options):
     """Return a bar 0.5 by 1 pulled upwards by a unit traction, and the control of its end."""
     V = scenes.vectors(scenes.box([0.0, 0.0], [0.625, height], [4, 16], QUADRILATERAL))
     body = scenes.box([0.0, 0.0], [0.5, 1.0], [4, 16], QUADRILATERAL)
@@ -35,7 +33,6 @@ def bar(material, height, stretch, route="auto", **options):
         ],
         tractions=[((0.0, 1.0), 1)],
         facet_tags=scenes.facet_tags(body, scenes.at(1, 1.0)),
-        assembly=route,
         **options,
     )
     # Not a node of the body.
@@ -45,10 +42,11 @@ def bar(material, height, stretch, route="auto", **options):
 # -- Limit loads that are known ----------------------------------------------------------
 
 
-@pytest.mark.parametrize("route", ROUTES)
-def test_elastic_bar_beyond_its_largest_load(route):
+@pytest.mark.parametrize("route", ROUTES, indirect=True)
+@pytest.mark.usefixtures("route")
+def test_elastic_bar_beyond_its_largest_load():
     # Hencky: P = E' ln(stretch) / stretch, largest at the stretch e.
-    problem, control = bar(Hencky(1e3, 0.3), 5.0, np.exp(1.5), route)
+    problem, control = bar(Hencky(1e3, 0.3), 5.0, np.exp(1.5))
     problem.solve(steps=10, control=control)
     history = problem.history
     strain = np.log1p([step.displacement for step in history.steps])
@@ -64,13 +62,14 @@ def test_elastic_bar_beyond_its_largest_load(route):
     )
 
 
-@pytest.mark.parametrize("route", ROUTES)
-def test_limit_load_of_a_plastic_bar(route):
+@pytest.mark.parametrize("route", ROUTES, indirect=True)
+@pytest.mark.usefixtures("route")
+def test_limit_load_of_a_plastic_bar():
     # Uniaxial stress with linear hardening: P = tau / stretch, largest at ln(stretch) = 1 - y / H
     # (Considere 1885).
     young, y, H = 1e2, 1.0, 2.0
     material = VonMises(young, 0.3, yield_stress=y, hardening=H)
-    problem, control = bar(material, 2.5, np.exp(0.65), route, axisymmetric=True)
+    problem, control = bar(material, 2.5, np.exp(0.65), axisymmetric=True)
     problem.solve(steps=10, control=control)
     loads = np.array(problem.history.load)
     strain = np.log1p([step.displacement for step in problem.history.steps])
@@ -164,13 +163,12 @@ def test_one_step_is_that_of_finite_elements(displacement):
     np.testing.assert_allclose(problem.history.load, exact[-1:], rtol=1e-8)
 
 
-@pytest.mark.parametrize("route", ROUTES)
-def test_snap_through(route):
+@pytest.mark.parametrize("route", ROUTES, indirect=True)
+@pytest.mark.usefixtures("route")
+def test_snap_through():
     # Degree 2: what is left is the reset of the background.
     grid = scenes.box([0.0, -2.0], [SPAN, 2.0], [20, 8], QUADRILATERAL)
-    problem, control = particles_of_arch(
-        [20, 2], grid, 2.5, degree=2, symmetric=True, assembly=route
-    )
+    problem, control = particles_of_arch([20, 2], grid, 2.5, degree=2, symmetric=True)
     problem.solve(steps=10, control=control)
     loads = np.array(problem.history.load)
     exact = finite_elements([20, 2], np.linspace(0.0, 2.5, 11)[1:], degree=2)

@@ -94,14 +94,16 @@ def load(problem, bcs):
     "options",
     [
         {},
-        {"assembly": "reference"},
+        {"route": "reference"},
         {"stabilisation": "aggregate"},
         {"stabilisation": "ghost"},
         {"predictor": False, "line_search": False},
     ],
-    ids=["fast", "reference", "aggregate", "ghost", "plain"],
+    ids=["loops", "reference", "aggregate", "ghost", "plain"],
 )
-def test_bodies_on_backgrounds_of_their_own_do_not_know_of_each_other(options):
+def test_bodies_on_backgrounds_of_their_own_do_not_know_of_each_other(options, take):
+    options = dict(options)
+    take(options.pop("route", "loops"))
     problem, pairs = together(LAWS, DENSITIES, **options)
     load(problem, problem.bcs)
     assert [field.bodies for field in problem.reduced.fields] == [[body] for body, _ in pairs]
@@ -201,15 +203,17 @@ def test_bodies_of_one_problem_share_space_and_ranks():
     "options",
     [
         {},
-        {"assembly": "reference"},
+        {"route": "reference"},
         {"stabilisation": "aggregate"},
         {"background": True},
         {"f_bar": "patch"},
-        {"f_bar": "patch", "assembly": "reference"},
+        {"f_bar": "patch", "route": "reference"},
     ],
-    ids=["fast", "reference", "aggregate", "background", "patch", "patch by reference"],
+    ids=["loops", "reference", "aggregate", "background", "patch", "patch by reference"],
 )
-def test_the_tangent_is_one_object_within_a_step(options):
+def test_the_tangent_is_one_object_within_a_step(options, take):
+    options = dict(options)
+    take(options.pop("route", "loops"))
     # Its factor keeps the ordering then.
     pairs = [left(), right()]
     bodies = [particles for particles, _ in pairs]

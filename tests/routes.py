@@ -1,0 +1,114 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The reference: stress as data in UFL forms, DOLFINx's assembly, and PETSc's products with T."""
+
+from contextlib import contextmanager
+from unittest.mock import patch
+
+from petsc4py import PETSc
+
+import numpy as np
+
+import ufl
+
+from mpm_dolfinx.assembly.body_forms import BodyForms
+from mpm_dolfinx.assembly.petsc import MatrixSum
+from mpm_dolfinx.constitutive.strain import strain_of
+from mpm_dolfinx.materials.base import StrainMaterial
+from mpm_dolfinx.materials.compiled import CompiledMaterial
+from mpm_dolfinx.problems import parts
+
+#: Where tangents come from: compiled loops, domain by domain, or the reference.
+ROUTES = ["loops", "reference"]
+
+
+@contextmanager
+def on_route(route):
+    """Let problems that are made, and run, in this context take a route.
+
+    On the reference, laws are updated in Python too.
+    """
+    if route == "loops":
+        yield
+        return
+    with (
+        patch.object(parts, "BodyForms", ReferenceForms),
+        patch.object(CompiledMaterial, "update", StrainMaterial.update),
+        patch.object(CompiledMaterial, "at_pressure", StrainMaterial.at_pressure),
+    ):
+        yield
+
+
+class ReferenceForms(BodyForms):
+    """A residual of which DOLFINx assembles all, with stress and tangent as data at points."""
+
+    def __init__(self, R, J, particles, internal=None, low_rank=None, others=(), **options):
+        self._stress = internal
+        if internal is not None:
+            strain = self._strain = strain_of(particles, internal.hoop is not None)
+            dim = strain.dim
+            P = particles.quadrature_function("first_piola", (dim, dim))
+            A = particles.quadrature_function("tangent", (dim,) * 4)
+            self._data = P, A
+            i, j, k, m = ufl.indices(4)
+            v = ufl.TestFunction(particles.W)
+            test = strain.ufl_gradient(v)
+            trial = strain.ufl_gradient(ufl.TrialFunction(particles.W))
+            work = strain.integral(ufl.inner(P, test))
+            slope = strain.integral(A[i, j, k, m] * trial[k, m] * test[i, j])
+            R = work if R is None else R + work
+            J = slope if J is None else J + slope
+        super().__init__(R, J, particles, None, low_rank, others, **options)
+        self._identity, self._parts_on_W, self._whole = None, None, MatrixSum()
+
+    low_rank = None
+
+    def low_rank_of_domains(self):
+        return None
+
+    def takes(self, form):
+        return False
+
+    def _inject(self):
+        """Take stress and tangent to the body mesh as it is: ``P G^T / det G``, G behind it."""
+        if self._stress is None:
+            return
+        stress, tangent = self._stress.first_piola, self._stress.tangent
+        before = self._strain.before_mesh()
+        if before is not None:
+            gdim = before.shape[-1]
+            G = np.tile(np.eye(stress.shape[-1]), (len(stress), 1, 1))
+            G[:, :gdim, :gdim] = before.reshape(-1, gdim, gdim)
+            volume = np.linalg.det(G)[:, None, None]
+            stress = np.einsum("niJ,nMJ->niM", stress, G) / volume
+            tangent = np.einsum("niJkL,nMJ,nNL->niMkN", tangent, G, G, optimize=True)
+            tangent = tangent / volume[:, :, :, None, None]
+        for function, values in zip(self._data, (stress, tangent), strict=True):
+            function.x.array[: values.size] = values.ravel()
+
+    def assemble_residual(self):
+        self._inject()
+        return super().assemble_residual()
+
+    def absolute_contributions(self, domain_nodes):
+        self._inject()
+        return super().absolute_contributions(domain_nodes)
+
+    def assemble_tangent(self):
+        self._inject()
+        super().assemble_tangent()
+        if self._low_rank is not None:
+            if self._identity is None:
+                layout = self.r.getSizes()
+                ones = self.r.duplicate()
+                ones.set(1.0)
+                self._identity = PETSc.Mat().createAIJ((layout, layout), nnz=1, comm=self.r.comm)
+                self._identity.setDiagonal(ones)
+                self._identity.assemble()
+            last = self._low_rank.reduced(self._identity, self._parts_on_W)
+            self._parts_on_W = last
+            self.K = self._whole.of([self._sparse, *last.parts])
+        return self.K
+
+    def stiffness_force(self, w):
+        return self.K * w
