@@ -69,7 +69,6 @@ class BodyContact(Rigid):
     """The contact of one body with a rigid one that is where it is put.
 
     Args:
-        place: Its number among the contacts of the rigid body.
         particles: The body that deforms.
         shape: That of the rigid body.
         friction: As for :class:`Rigid`.
@@ -78,7 +77,6 @@ class BodyContact(Rigid):
 
     def __init__(
         self,
-        place: int,
         particles: Particles,
         shape: Shape,
         friction: float | Coulomb,
@@ -90,12 +88,6 @@ class BodyContact(Rigid):
                 "law='nitsche' is for a Rigid that moves on a path; a RigidBody has the penalty, "
                 "by which its forces balance."
             )
-        self._place = place
-
-    @property
-    def _key(self) -> str:
-        """See :class:`Contact`."""
-        return f"contact{self._number}_{self._place}"
 
     def move(self, offset: Any, angle: Any = 0.0) -> None:
         """Raise an error: the rigid body moves it.

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError, agree
+from ..io.identity import same
 from ..io.snapshot import Kept, Taken
 from ..meshes.remesh import Column
 from ..particles.particles import Particles
@@ -76,6 +77,21 @@ class Contact(Term):
         self._number = 0
         self._share = 1.0
         self._places: list[int] = []
+        self._joins, self._gone = True, list[Contact]()
+
+    @property
+    def contacts(self) -> Sequence[Contact]:
+        """The contacts that it consists of: itself."""
+        return (self,)
+
+    def come_after(self, gone: Sequence[Term]) -> None:
+        """See :meth:`Term.come_after`.
+
+        It begins anew; but points of a contact that is gone which touch it in the same place stick
+        to it where they have stuck to that one.
+        """
+        self._joins = True
+        self._gone = [contact for term in gone for contact in getattr(term, "contacts", ())]
 
     def take_part(
         self,
@@ -156,12 +172,15 @@ class Contact(Term):
 
     def kept(self) -> Sequence[Kept]:
         """See :meth:`Term.kept`."""
-        return [_Anchors(self, self._key)]
+        return [self.remembered(self.name or f"contact{self._number}")]
 
-    @property
-    def _key(self) -> str:
-        """What it is known by in a checkpoint."""
-        return f"contact{self._number}"
+    def remembered(self, key: str) -> Kept:
+        """Return what it remembers, by the key that this has."""
+        return _Anchors(self, key)
+
+    def known_by(self) -> list[Any]:
+        """Return what tells it from other contacts in a checkpoint, in types that JSON has."""
+        raise NotImplementedError
 
     def numbers(self) -> dict[str, Any]:
         """Return what is kept besides columns; see :class:`Kept`."""
@@ -264,7 +283,17 @@ class _Anchors(Kept):
 
     def numbers(self) -> dict[str, Any]:
         """See :class:`Kept`."""
-        return self._contact.numbers()
+        return self._contact.numbers() | {"known by": self._contact.known_by()}
+
+    def require(self, source: str, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        there, here = taken.numbers.get("known by"), self._contact.known_by()
+        if there is not None and not same(there, here):
+            raise MPMError(
+                f"{source} knows the contact {self.key!r} as {there}, and here it is {here}; give "
+                "terms in the order in which they came, or with the same names (contact.name)."
+            )
+        super().require(source, taken)
 
     def columns(self, body: int | None) -> dict[str, Column]:
         """See :class:`Kept`."""

@@ -12,8 +12,29 @@ from numpy.typing import NDArray
 
 from .contact import Outcome
 from .rotation import Pose
+from .surface import Surface
 
-__all__ = ["Memory", "Step"]
+__all__ = ["Grip", "Memory", "Step"]
+
+
+class Grip(NamedTuple):
+    """How points of a body hold on to an obstacle at a converged step.
+
+    Attributes:
+        surface: Where the points are.
+        touched: Which were in contact, shape ``(m, nq)``.
+        gap: Shape ``(m, nq)``.
+        normal: Normals, shape ``(m, nq, gdim)``.
+        anchor: Their anchors.
+        outcome: What acted.
+    """
+
+    surface: Surface
+    touched: NDArray[np.bool_]
+    gap: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    anchor: NDArray[np.float64]
+    outcome: Outcome
 
 
 class Step(NamedTuple):

@@ -271,7 +271,7 @@ class Pass:
         """Return particles that are deep in the other body at the beginning, and how deep."""
         depth = -self.outcome.gap
         bound = OVERLAP * self.source.thickness[:, None]
-        deep = (depth > bound) & (self.source.weights > 0.0)
+        deep = (depth > bound) & (self.source.weights > 0.0) & ~self.outcome.inside
         if not deep.any():
             return None
         cells = self.source.cells[deep.any(axis=1)]

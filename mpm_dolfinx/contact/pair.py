@@ -42,6 +42,9 @@ __all__ = ["Pair"]
 ALIKE, LEAST = 1.5, 0.2
 #: Degree of the rule on a facet, by the dimension of space: the other body's facets have kinks.
 DEGREES = {2: 9, 3: 5}
+#: Columns of what points remember, and of what acted, by its names there.
+MEMORY = ("touches", "anchor", "offset")
+OUTCOME = {"inside": "touches", "slips": "slips", "pressure": "pressure", "traction": "traction"}
 
 
 class Pair(Contact):
@@ -152,11 +155,42 @@ class Pair(Contact):
         if self._nitsche:
             for material, _ in zip(self._materials, self._passes, strict=False):
                 require_stress(material, "a Pair")
-        first = not self._made
-        self._settle()
+        self._settle(self._joins)
         self._take_stress()
-        if first:
+        if self._joins:
+            for contact in self._gone:
+                if isinstance(contact, Pair) and set(contact.bodies) == set(self.bodies):
+                    self._stand_in(contact)
             self._require_apart()
+            self._joins, self._gone = False, []
+
+    def _stand_in(self, before: Pair) -> None:
+        """Take over where points stick from a contact of the same bodies that is gone (collective).
+
+        Args:
+            before: That contact.
+        """
+        columns = [before.columns(place) for place in self._places]
+        every = [{name: column.values for name, column in own.items()} for own in columns]
+        points = [surface.nq for surface in self._surfaces]
+        alike = [own["area"].shape[2] for own in every] == points
+        if not alike or any("anchor" not in own for own in every[: len(self._passes)]):
+            return
+        self._take_over(every)
+        for each, surface, own in zip(self._passes, self._surfaces, every, strict=False):
+            each.outcome = replace(each.outcome, **_told(surface, own))
+
+    def _take_over(self, every: Sequence[dict[str, NDArray[Any]]]) -> None:
+        """Take areas, and where points stick (collective).
+
+        Args:
+            every: What :meth:`columns` has of each body.
+        """
+        for surface, columns in zip(self._surfaces, every, strict=True):
+            surface.restore(columns)
+        self._settle(again=True)
+        for each, surface, columns in zip(self._passes, self._surfaces, every, strict=False):
+            each.restore(*(surface.of_column(columns[name]) for name in MEMORY))
 
     def _settle(self, again: bool = False) -> None:
         """Take the present meshes of the bodies (collective)."""
@@ -376,22 +410,16 @@ class Pair(Contact):
         """See :meth:`Contact.take`."""
         self._settle()
         every = [taken.columns[place] for place in self._places]
-        for surface, columns in zip(self._surfaces, every, strict=True):
-            surface.restore(columns)
-        self._settle(again=True)
-        for each, surface, columns in zip(self._passes, self._surfaces, every, strict=False):
-            touched = surface.of_column(columns["touches"])
-            each.restore(
-                touched,
-                surface.of_column(columns["anchor"]),
-                surface.of_column(columns["offset"]),
-            )
+        self._take_over(every)
         self.update()
         for each, surface, columns in zip(self._passes, self._surfaces, every, strict=False):
-            each.outcome = replace(
-                each.after()[1],
-                inside=surface.of_column(columns["touches"]),
-                slips=surface.of_column(columns["slips"]),
-                pressure=surface.of_column(columns["pressure"]),
-                traction=surface.of_column(columns["traction"]),
-            )
+            each.outcome = replace(each.after()[1], **_told(surface, columns))
+
+    def known_by(self) -> list[Any]:
+        """See :meth:`Contact.known_by`."""
+        return [type(self).__name__, self._places, len(self._passes)]
+
+
+def _told(surface: Surface, columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return what is known of what acted at the points of a surface."""
+    return {name: surface.of_column(columns[column]) for name, column in OUTCOME.items()}

@@ -33,15 +33,13 @@ class Placed(NamedTuple):
 
 def placed(shape: Shape, pose: Pose) -> Placed:
     """Return a shape where it is put."""
-
-    def out(y: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray((y - shape.pivot) @ pose.Q.T + shape.pivot + pose.offset)
-
     bounds = None
     if shape.bounds is not None:
         corners = np.stack(np.meshgrid(*shape.bounds.T), axis=-1).reshape(-1, shape.dim)
-        bounds = np.array([f(out(corners), axis=0) for f in (np.min, np.max)])
-    facets = None if shape.outline is None else (out(shape.outline[0]), shape.outline[1])
+        bounds = np.array([f(unframed(shape, pose, corners), axis=0) for f in (np.min, np.max)])
+    facets = None
+    if shape.outline is not None:
+        facets = unframed(shape, pose, shape.outline[0]), shape.outline[1]
 
     def distance(x: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(shape.distance(framed(shape, pose, x))[0])
@@ -53,6 +51,11 @@ def framed(shape: Shape, pose: Pose, x: NDArray[Any]) -> NDArray[Any]:
     """Return positions ``(..., gdim)`` in the frame of a shape that is put somewhere."""
     arms = x.reshape(-1, x.shape[-1]) - (shape.pivot + pose.offset)
     return (arms @ pose.Q + shape.pivot).reshape(x.shape)
+
+
+def unframed(shape: Shape, pose: Pose, y: NDArray[Any]) -> NDArray[Any]:
+    """Return positions ``(..., gdim)`` of what is there in the frame of a shape."""
+    return np.asarray((y - shape.pivot) @ pose.Q.T + (shape.pivot + pose.offset))
 
 
 def distance_within(

@@ -26,10 +26,10 @@ from ..system.term import PointMaterial
 from .behind import At
 from .contact import Contact, Outcome, stiffness
 from .law import Coulomb, as_friction
-from .memory import Memory
+from .memory import Grip, Memory
 from .nitsche import Nitsche, Spread, require_stress
 from .obstacle_tractions import ObstacleTractions
-from .placed import Placed, framed, placed
+from .placed import Placed, framed, placed, unframed
 from .reach import Reach, is_near
 from .rotation import Pose
 from .shapes import Shape, as_positive
@@ -40,6 +40,8 @@ __all__ = ["Rigid"]
 
 #: Penetration, over the thickness of the domain behind, of a body that is given in an obstacle.
 OVERLAP = 0.1
+#: Difference of normals, and of gaps over the body's coordinates, of obstacles in the same place.
+SAME = 1e-10
 #: Most points of each rank at which the shapes of ranks are compared.
 LOOKED_AT = 16
 
@@ -211,12 +213,15 @@ class Rigid(Contact):
             require_stress(self._materials[0], "a Rigid")
         self._tractions.of_step = self._of_step
         self._take_stress()
-        first = self._memory is None
-        self._settle()
-        if first:
+        self._settle(self._joins)
+        if self._joins:
             self._require_same_shape()
+            for contact in self._gone:
+                if isinstance(contact, Rigid) and contact.bodies == self.bodies:
+                    self._stand_in(contact.grip())
             assert self._memory is not None
             self._require_apart(self._memory)
+            self._joins, self._gone = False, []
 
     def pace(self, dt: float, share: float) -> None:
         """See :meth:`Contact.pace`."""
@@ -234,9 +239,13 @@ class Rigid(Contact):
         told = distances.astype(np.float32).tolist()
         require_same(self._comm, shape=[type(self.shape).__name__, *told])
 
-    def _settle(self) -> None:
-        """Take the present mesh of the body (collective)."""
-        if self._surface.settle():
+    def _settle(self, anew: bool = False) -> None:
+        """Take the present mesh of the body (collective).
+
+        Args:
+            anew: Whether to begin anew on the same mesh too.
+        """
+        if self._surface.settle() or anew:
             self._take_stiffness()
             self._take_stress()
             self._new_pattern()
@@ -278,7 +287,7 @@ class Rigid(Contact):
         """Raise an error where the body is in the obstacle from the beginning (collective)."""
         surface = self._surface
         depth = -memory.gap / surface.thickness[:, None]
-        deep = (depth > OVERLAP) & (surface.weights > 0.0)
+        deep = (depth > OVERLAP) & (surface.weights > 0.0) & ~memory.touched
         with agree(self._comm):
             if deep.any():
                 place = np.unravel_index(np.argmax(np.where(deep, depth, 0.0)), depth.shape)
@@ -500,19 +509,31 @@ class Rigid(Contact):
     def numbers(self) -> dict[str, Any]:
         """Return where the obstacle was."""
         assert self._memory is not None
-        pose = self._memory.pose
-        return {"offset": pose.offset.tolist(), "angle": pose.angle.tolist()}
+        pose, aim = self._memory.pose, self._aim
+        return {
+            "offset": pose.offset.tolist(),
+            "angle": pose.angle.tolist(),
+            "aim": [aim.offset.tolist(), aim.angle.tolist()],
+        }
+
+    def known_by(self) -> list[Any]:
+        """See :meth:`Contact.known_by`."""
+        pivot = self.shape.pivot
+        depth = float(self.shape.distance(pivot[None])[0][0])
+        kind = type(self.shape).__name__.strip("_")
+        return [type(self).__name__, kind, pivot.tolist(), depth, self._places]
 
     def take(self, taken: Taken) -> None:
         """Take what was kept (collective)."""
         columns = taken.columns[self._places[0]]
         pose = Pose(*(np.array(taken.numbers[name]) for name in ("offset", "angle")))
+        aim = taken.numbers.get("aim", (pose.offset, pose.angle))
         surface = self._surface
         self._settle()
         surface.restore(columns)
         self._take_stress()
         self._take_stiffness()
-        self._pose = self._aim = pose
+        self._pose, self._aim = pose, Pose(*map(np.array, aim))
         self._begin_anew(pose)
         assert self._memory is not None
         touched = surface.of_column(columns["touches"])
@@ -529,6 +550,56 @@ class Rigid(Contact):
             outcome = self._evaluated_at_converged().outcome
         outcome = replace(outcome, inside=touched, slips=surface.of_column(columns["slips"]))
         self._memory = self._trial = replace(self._memory, outcome=outcome)
+
+    def grip(self) -> Grip:
+        """Return how its points hold on to the obstacle at the last converged step."""
+        assert self._memory is not None
+        memory, pose = self._memory, self._memory.pose
+        return Grip(
+            self._surface,
+            memory.touched,
+            memory.gap,
+            memory.normal @ pose.Q.T,
+            unframed(self.shape, pose, memory.anchor),
+            memory.outcome,
+        )
+
+    def _stand_in(self, before: Grip) -> None:
+        """Take over how points hold on to an obstacle that was in the same place.
+
+        Args:
+            before: Of the contact that is gone, on the same body.
+        """
+        surface, memory = self._surface, self._memory
+        assert memory is not None
+        if before.surface.nq != surface.nq:
+            return
+
+        def seen(values: NDArray[Any]) -> NDArray[Any]:
+            return surface.of_column(before.surface.column(values).values)
+
+        surface.restore({name: c.values for name, c in before.surface.columns().items()})
+        self._take_stiffness()
+        n = memory.normal @ memory.pose.Q.T
+        same = seen(before.touched) & (
+            np.abs(seen(before.gap) - memory.gap) <= SAME * surface.extent
+        )
+        same &= np.abs(seen(before.normal) - n).max(axis=2) <= SAME
+        anchor = framed(self.shape, memory.pose, seen(before.anchor))
+        acts = before.outcome
+        outcome = replace(
+            memory.outcome,
+            pressure=np.where(same, seen(acts.pressure), 0.0),
+            traction=np.where(same[:, :, None], seen(acts.traction), 0.0),
+            inside=same,
+            slips=same & seen(acts.slips),
+        )
+        self._memory = self._trial = replace(
+            memory,
+            touched=same | memory.touched,
+            anchor=np.where(same[:, :, None], anchor, memory.anchor),
+            outcome=outcome,
+        )
 
     @property
     def _tells_more(self) -> bool:

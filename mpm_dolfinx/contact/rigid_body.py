@@ -134,10 +134,7 @@ class RigidBody(Term):
         bodies: list[Any] = list(particles) if isinstance(particles, list | tuple) else [particles]
         if not bodies:
             raise MPMError("A RigidBody needs one body of mpm.Particles or more.")
-        self.contacts = [
-            BodyContact(place, body, shape, friction, **options)
-            for place, body in enumerate(bodies)
-        ]
+        self.contacts = [BodyContact(body, shape, friction, **options) for body in bodies]
         if any(one is other for i, one in enumerate(bodies) for other in bodies[:i]):
             raise MPMError("A RigidBody needs bodies that differ, not the same one twice.")
         super().__init__(bodies)
@@ -508,6 +505,11 @@ class RigidBody(Term):
 
     # -- The term -------------------------------------------------------------------------------
 
+    def come_after(self, gone: Sequence[Term]) -> None:
+        """See :meth:`Term.come_after`: it is and moves as before, points begin anew."""
+        for contact in self.contacts:
+            contact.come_after(gone)
+
     def take_part(
         self,
         number: int,
@@ -668,21 +670,30 @@ class RigidBody(Term):
 
     def kept(self) -> Sequence[Kept]:
         """See :meth:`Term.kept`."""
-        own = _KeptMotion(self, f"rigid_body{self._number}")
-        return [*(kept for contact in self.contacts for kept in contact.kept()), own]
+        of_contacts = self.name or f"contact{self._number}"
+        return [
+            *(one.remembered(f"{of_contacts}_{i}") for i, one in enumerate(self.contacts)),
+            _KeptMotion(self, self.name or f"rigid_body{self._number}"),
+        ]
 
     def numbers(self) -> dict[str, Any]:
         """Return where it is and how it moves, for a checkpoint."""
         values = self._memory._asdict() | {"turn": self._memory.turn.values}
-        return {name: value.tolist() for name, value in values.items()}
+        return {name: value.tolist() for name, value in values.items()} | {
+            "push": [part.tolist() for part in self._push],
+            "aim": [self._aim.offset.tolist(), self._aim.angle.tolist()],
+        }
 
     def take(self, taken: Taken) -> None:
         """Take what :meth:`numbers` returned."""
-        values = {name: np.array(v, dtype=np.float64) for name, v in taken.numbers.items()}
+        numbers = taken.numbers
+        values = {name: np.array(numbers[name], dtype=np.float64) for name in State._fields}
         turn = Turn(values.pop("turn"))
-        self._memory = self._trial = State(turn=turn, **values)
-        self._push = self._memory.force, self._memory.moment
-        self._aim = Pose(self._memory.place, self._memory.turn.angle)
+        last = self._memory = self._trial = State(turn=turn, **values)
+        force, moment = numbers.get("push", (last.force, last.moment))
+        self._push = np.array(force), np.array(moment)
+        offset, angle = numbers.get("aim", (last.place, last.turn.angle))
+        self._aim = Pose(np.array(offset), np.array(angle))
         self._begins = True
 
 

@@ -21,7 +21,7 @@ from ..particles.particles import Particles
 from .checkpoint import Snapshot
 from .snapshot import spaces_of
 
-__all__ = ["Identifiable", "identity", "require_same"]
+__all__ = ["Identifiable", "identity", "require_same", "same"]
 
 #: Relative difference up to which numbers of two problems count as the same.
 SAME = 1e-12
@@ -32,7 +32,7 @@ def require_same(present: dict[str, Any], snapshot: Snapshot, source: str, comm:
     known = snapshot.numbers["identity"]
     with agree(comm):
         for name, value in present.items():
-            if not _same(known.get(name), value):
+            if not same(known.get(name), value):
                 raise MPMError(f"{source} is of another problem: {name} is not the same.")
 
 
@@ -117,11 +117,12 @@ def _parameter(body: Particles, value: Any) -> Any:
     return [size, *_weighted(body.mesh.comm, index, places).tolist()]
 
 
-def _same(one: Any, two: Any) -> bool:
+def same(one: Any, two: Any) -> bool:
+    """Return whether what two problems are known by is the same, but for round-off."""
     if isinstance(one, dict) and isinstance(two, dict):
-        return one.keys() == two.keys() and all(_same(one[k], two[k]) for k in one)
+        return one.keys() == two.keys() and all(same(one[k], two[k]) for k in one)
     if isinstance(one, list | tuple) and isinstance(two, list | tuple):
-        return len(one) == len(two) and all(map(_same, one, two))
+        return len(one) == len(two) and all(map(same, one, two))
     if isinstance(one, float) and isinstance(two, float):
         return math.isclose(one, two, rel_tol=SAME) or (math.isnan(one) and math.isnan(two))
     return bool(one == two)

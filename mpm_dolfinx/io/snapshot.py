@@ -25,6 +25,7 @@ __all__ = [
     "Kept",
     "Taken",
     "adopt",
+    "belongs",
     "capture",
     "fill",
     "merged",
@@ -224,8 +225,8 @@ def merged(
         now: The state of now, which may have more bodies and backgrounds.
         bodies: Number of the bodies before and now.
         backgrounds: For each background now its number before, ``None`` where it is new.
-        renewed: Returns whether something that was there before is new too, by the number of its
-            body (``None``: a number) and its name.
+        renewed: Returns whether something that was there before is new too, or no more, by the
+            number of its body (``None``: a number, or on a background) and its name.
     """
     old, new = bodies
     numbers = now.numbers | {n: v for n, v in before.numbers.items() if not renewed(None, n)}
@@ -235,8 +236,28 @@ def merged(
         tables.append(Table(present.rows, present.columns | columns))
     tables += now.tables[old:new]
     for number, known in enumerate(backgrounds):
-        tables.append(now.tables[new + number] if known is None else before.tables[old + known])
+        present = now.tables[new + number]
+        if known is not None:
+            earlier = before.tables[old + known]
+            columns = {n: v for n, v in earlier.columns.items() if not renewed(None, n)}
+            present = _over(Table(earlier.rows, columns), present)
+        tables.append(present)
     return Snapshot(numbers, tables)
+
+
+def _over(one: Table, other: Table) -> Table:
+    """Return the columns of two tables of some rows each, those of the first where both have them.
+
+    What a table does not have a row for is zero.
+    """
+    rows = np.union1d(one.rows, other.rows)
+    columns = {}
+    for table in (other, one):
+        places = np.searchsorted(rows, table.rows)
+        for name, values in table.columns.items():
+            columns[name] = np.zeros((len(rows), *values.shape[1:]), values.dtype)
+            columns[name][places] = values
+    return Table(rows, columns)
 
 
 def require_key(key: str, things: Sequence[Kept], bodies: int) -> None:
@@ -247,7 +268,7 @@ def require_key(key: str, things: Sequence[Kept], bodies: int) -> None:
         things: What is kept already.
         bodies: Number of the bodies.
     """
-    taken = {"identity", "series", *(thing.key for thing in things if thing.key)}
+    taken = {"identity", "series", "keys", *(thing.key for thing in things if thing.key)}
     for thing in things:
         names = list(thing.numbers())
         for body in (*range(bodies), None):
@@ -260,6 +281,11 @@ def require_key(key: str, things: Sequence[Kept], bodies: int) -> None:
         )
 
 
+def belongs(name: str, keys: Sequence[str]) -> bool:
+    """Return whether something of a state has one of some keys."""
+    return f"{name} ".startswith(tuple(f"{key} " for key in keys if key))
+
+
 def _name(key: str, name: str) -> str:
     """Return what something that is kept is called in a state."""
     return f"{key} {name}".strip()
@@ -268,10 +294,9 @@ def _name(key: str, name: str) -> str:
 def _of_key[Value](key: str, keys: Sequence[str], state: Mapping[str, Value]) -> dict[str, Value]:
     """Return what a state holds under a key, by its own names; under none, what no other has."""
     if not key:
-        others = tuple(f"{other} " for other in keys if other)
-        return {name: v for name, v in state.items() if not f"{name} ".startswith(others)}
-    whole = f"{key} "
-    return {name[len(whole) :]: v for name, v in state.items() if f"{name} ".startswith(whole)}
+        return {name: value for name, value in state.items() if not belongs(name, keys)}
+    whole = len(key) + 1
+    return {name[whole:]: value for name, value in state.items() if belongs(name, [key])}
 
 
 def _columns(
@@ -280,12 +305,12 @@ def _columns(
     """Return all that is kept on the cells of a mesh, of a body or a background (collective)."""
     body, background = place
     columns: dict[str, Column] = {}
-    keys = tuple(f"{thing.key} " for thing in things if thing.key)
+    keys = [thing.key for thing in things]
     for thing in things:
         mine = thing.columns(body) if background is None else thing.on_background(background)
         with agree(comm):
             for name, column in mine.items():
-                if not thing.key and f"{name} ".startswith(keys):
+                if not thing.key and belongs(name, keys):
                     raise MPMError(
                         f"{name!r} belongs to the body, so {name.split(' ')[0]!r} cannot be the "
                         "key of something that is kept."

@@ -27,6 +27,7 @@ from .motion import MovingProblem, initial_velocities, rayleigh_of, require_moti
 from .parts import Contribution
 from .quasistatic import QuasiStaticProblem
 from .setup import BodySetup
+from .stages import join
 
 __all__ = ["DynamicParticleProblem", "DynamicProblem"]
 
@@ -118,6 +119,8 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
                 its.x.array[:] = 0.0
         self.inertia = Inertia(bodies, start, scheme, out_of_range, damping, self._energies, static)
         given = as_terms(terms, bodies)
+        if after is not None:
+            join(given, after.terms)
         governed = [body.governed_by for body in bodies]
         try:
             super().__init__(

@@ -258,8 +258,8 @@ class ParticleProblem:
 
     def _let_take_part(self, materials: Sequence[PointMaterial | None]) -> None:
         """Tell terms of bodies and materials (collective)."""
-        for number, term in enumerate(self.terms):
-            term.take_part(number, self.bodies, materials)
+        for term in self.terms:
+            term.take_part(self._state.number(term), self.bodies, materials)
 
     def _build_system(self, clean_up: Cleaner) -> None:
         """Make the system and its solver (collective).

@@ -25,7 +25,7 @@ from .arguments import as_bodies, as_conditions, as_terms, by_space
 from .initial_stress import initial_stress_at_points
 from .setup import BodySetup, Setup
 
-__all__ = ["Addition", "Given", "Removal", "Staged", "chosen_cells"]
+__all__ = ["Addition", "Given", "Removal", "Staged", "chosen_cells", "join"]
 
 
 class Staged(Protocol):
@@ -115,6 +115,7 @@ class Given(_Change):
             for known, changes in zip(problem.setup.bodies, self._bodies, strict=True)
         ]
         problem.setup = replace(problem.setup, bodies=tuple(setups), terms=tuple(self._terms))
+        join(self._terms, problem.terms)
         problem.bcs, problem.terms = self._bcs, self._terms
 
     def settle(self) -> None:
@@ -197,6 +198,19 @@ class Addition(_Change):
     def renews(self, body: int | None, name: str) -> bool:
         """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         return body is None and name in ("moduli", "cuts", "fields units")
+
+
+def join(terms: Sequence[Term], before: Sequence[Term]) -> None:
+    """Let the terms that are new join those that stay (collective).
+
+    Args:
+        terms: All that act from now on.
+        before: Those that have acted.
+    """
+    gone = [term for term in before if all(term is not other for other in terms)]
+    for term in terms:
+        if all(term is not other for other in before):
+            term.come_after(gone)
 
 
 def chosen_cells(particles: Particles, which: Any, tags: Any, cell_tags: Any) -> NDArray[np.int64]:

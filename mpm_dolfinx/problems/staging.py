@@ -20,7 +20,7 @@ from dolfinx import fem
 from ..errors import MPMError
 from ..history import History, Stage
 from ..io.checkpoint import Snapshot
-from ..io.snapshot import merged
+from ..io.snapshot import belongs, merged
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..stepping.loading import Stepper
@@ -141,20 +141,28 @@ class Staging:
             )
         first = state.identity()
         before = None if sudden else self._standing_forces()
-        spaces, count, kept = state.spaces, len(problem.bodies), list(state.kept)
+        spaces, count = state.spaces, len(problem.bodies)
+        kept, numbered = state.kept, list(state.numbered)
 
         def carry(snapshot: Snapshot) -> Snapshot:
             state.keep_terms()
             change.settle()
             numbers = (count, len(problem.bodies))
             backgrounds = [_number_of(V, spaces) for V in state.spaces]
-            found = merged(snapshot, state.capture(), numbers, backgrounds, change.renews)
+            # What something remembers is its own: another one that has its key has no part in it.
+            stay = [thing for _, thing in state.kept]
+            gone = [one.key for _, one in kept if all(one is not thing for thing in stay)]
+
+            def renewed(body: int | None, name: str) -> bool:
+                return belongs(name, gone) or change.renews(body, name)
+
+            found = merged(snapshot, state.capture(), numbers, backgrounds, renewed)
             found.numbers.update({"past": [], "release remaining": 0.0})
             return found
 
         def undo() -> None:
             change.undo()
-            state.kept = kept
+            state.kept, state.numbered = kept, numbered
 
         problem.renew(change.make, carry, undo)
         self._stepper.begin_stage()

@@ -90,6 +90,8 @@ class ProblemState:
     Attributes:
         kept: What goes with the problem besides what every problem has, and the term that it
             belongs to, if any.
+        numbered: The terms in the order in which they came, ``None`` for those that are gone: what
+            has no name is known by its place here, which no other term ever has.
     """
 
     def __init__(
@@ -104,6 +106,7 @@ class ProblemState:
         self._stepper, self._release = stepper, release
         self._output, self._history_at = output, history_at
         self.kept: list[tuple[Term | None, Kept]] = []
+        self.numbered: list[Term | None] = []
         self._stages: list[str] = []
         self._identity: dict[str, Any] | None = None
 
@@ -141,17 +144,27 @@ class ProblemState:
         require_key(thing.key, things, len(self._problem.bodies))
         self.kept.append((owner, thing))
 
+    def number(self, term: Term) -> int:
+        """Return the number of a term among all that have come to the problem."""
+        for number, known in enumerate(self.numbered):
+            if known is term:
+                return number
+        self.numbered.append(term)
+        return len(self.numbered) - 1
+
     def keep_terms(self) -> None:
-        """Let what terms keep go with the problem, if it does not yet."""
-        for term in [*self._problem.terms, self._release]:
+        """Let go with the problem what its terms keep, and what other terms kept no longer."""
+        terms = [*self._problem.terms, self._release]
+
+        def acts(owner: Term | None) -> bool:
+            return any(owner is term for term in terms)
+
+        self.kept = [(owner, thing) for owner, thing in self.kept if owner is None or acts(owner)]
+        self.numbered = [term if acts(term) else None for term in self.numbered]
+        for term in terms:
             if all(owner is not term for owner, _ in self.kept):
                 for thing in term.kept():
                     self.keep(thing, term)
-
-    def _acts(self, owner: Term | None) -> bool:
-        """Return whether a term acts in the problem; the user's own things have no owner."""
-        terms = [*self._problem.terms, self._release]
-        return owner is None or any(owner is term for term in terms)
 
     def _all(
         self, functions: Sequence[fem.Function], whole: bool = True
@@ -183,7 +196,7 @@ class ProblemState:
             kept.Values(carried, problem.reduced),
             kept.Increments(problem.reduced, problem.bodies, carried),
             kept.Past(problem.history, problem.reduced, self._comm),
-            *(thing for owner, thing in self.kept if self._acts(owner)),
+            *(thing for _, thing in self.kept),
             standing,
         ]
         return things, standing
@@ -228,7 +241,12 @@ class ProblemState:
         snapshot = capture(things, self._problem.bodies, self.spaces)
         snapshot.numbers["identity"] = self.identity() | {"the stages": list(self._stages)}
         snapshot.numbers["series"] = self._output.written()
+        snapshot.numbers["keys"] = self._keys()
         return snapshot
+
+    def _keys(self) -> list[str]:
+        """Return the keys of what terms and users keep."""
+        return [thing.key for _, thing in self.kept]
 
     def adopt(
         self,
@@ -267,6 +285,7 @@ class ProblemState:
                     f"through {self._stages}; make it as at first and repeat the calls of stage, "
                     "remove and add."
                 )
+            self._require_keys(snapshot.numbers.get("keys"), source)
         identity.require_same(self.identity(), snapshot, source, self._comm)
         written = snapshot.numbers.get("series", {})
         series = read_series(self._comm, written)
@@ -275,3 +294,19 @@ class ProblemState:
         self._stepper.resume(run if resume else None)
         history = problem.history
         self._output.go_back(series, written, history.time, len(history.steps))
+
+    def _require_keys(self, there: list[str] | None, source: str) -> None:
+        """Raise an error unless terms and users keep the same things as in a state, by name."""
+        here = self._keys()
+        if there is None or set(there) == set(here):
+            return
+        raise MPMError(
+            f"{source} is of a problem in which terms and users keep {_listed(there)}, and here "
+            f"they keep {_listed(here)}; give the same terms, in the order they came in, or by "
+            "the same names (term.name), and keep() the same things."
+        )
+
+
+def _listed(keys: Sequence[str]) -> str:
+    """Return names in words."""
+    return ", ".join(repr(key) for key in sorted(keys)) or "nothing"

@@ -76,11 +76,14 @@ class Term:
             scale of forces, as loads and reactions do.
         axisymmetric: Whether its forces are those of a body of revolution, ``None`` where it does
             not say; a problem refuses one that differs.
+        name: One word by which a checkpoint knows what it remembers, if it is given (before the
+            term is); otherwise it is known by the order in which terms have come to the problem.
     """
 
     evaluation: ClassVar[str] = "update()"
     from_outside: ClassVar[bool] = True
     axisymmetric: bool | None = None
+    name: str | None = None
 
     def __init__(self, bodies: Sequence[Particles] = ()) -> None:
         self.bodies: tuple[Particles, ...] = tuple(bodies)
@@ -118,6 +121,15 @@ class Term:
         """Whether what the load factor does depends on the displacement."""
         return False
 
+    def come_after(self, gone: Sequence[Term]) -> None:
+        """Take note that it comes to a problem that goes on, before :meth:`take_part` (collective).
+
+        What it remembers of the bodies from an earlier time is void, as they have moved since.
+
+        Args:
+            gone: The terms that act no longer, which it may stand in place of.
+        """
+
     def take_part(
         self,
         number: int,
@@ -127,7 +139,7 @@ class Term:
         """Take note of the problem, each time that this is built on meshes of its bodies.
 
         Args:
-            number: Number of the term among the problem's.
+            number: Number of the term among all that have come to the problem.
             bodies: All bodies of the problem.
             materials: The material at the points of each, where the problem knows it.
         """

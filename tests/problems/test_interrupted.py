@@ -181,14 +181,19 @@ KINDS = {
 
 
 def captured(problem):
-    """Return all that a checkpoint would hold, but for what tells of attempts."""
+    """Return all that a checkpoint would hold, but for what tells of attempts and was asked for."""
     snapshot = problem.capture()
     arrays = {
         f"{number} {name}": np.array(values)
         for number, table in enumerate(snapshot.tables)
         for name, values in table.columns.items()
     }
-    numbers = {name: v for name, v in snapshot.numbers.items() if name not in COUNTS}
+    asked = ("aim", "push")
+    numbers = {
+        name: value
+        for name, value in snapshot.numbers.items()
+        if name not in COUNTS and not name.endswith(asked)
+    }
     return json.dumps(numbers, sort_keys=True), arrays
 
 
