@@ -245,8 +245,8 @@ class ProblemState:
         return snapshot
 
     def _keys(self) -> list[str]:
-        """Return the keys of what terms and users keep."""
-        return [thing.key for _, thing in self.kept]
+        """Return the keys of what terms keep."""
+        return [thing.key for owner, thing in self.kept if owner is not None]
 
     def adopt(
         self,
@@ -296,14 +296,14 @@ class ProblemState:
         self._output.go_back(series, written, history.time, len(history.steps))
 
     def _require_keys(self, there: list[str] | None, source: str) -> None:
-        """Raise an error unless terms and users keep the same things as in a state, by name."""
+        """Raise an error unless terms keep the same things as in a state, by name."""
         here = self._keys()
         if there is None or set(there) == set(here):
             return
         raise MPMError(
-            f"{source} is of a problem in which terms and users keep {_listed(there)}, and here "
+            f"{source} is of a problem in which terms keep {_listed(there)}, and here "
             f"they keep {_listed(here)}; give the same terms, in the order they came in, or by "
-            "the same names (term.name), and keep() the same things."
+            "the same names (term.name)."
         )
 
 
