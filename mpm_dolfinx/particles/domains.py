@@ -362,7 +362,7 @@ class Domains:
         with agree(self.mesh.comm):
             if self._geometry.gdim != 2:
                 raise MPMError("An axisymmetric body is a mesh in the (r, z) plane.")
-            left = self.initial_domains[:, :, 0].min(axis=1) < -1e-12
+            left = _reach_behind(self.initial_domains[:, :, 0])
             if left.any():
                 raise MPMError(
                     "The domains of {particles} have a negative radius; an axisymmetric body "
@@ -467,9 +467,7 @@ class Domains:
         """
         if self._geometry.shape_functions.discontinuous:
             return self.global_index[:0]
-        radii = self._corners()[:, :, 0]
-        lowest = radii.min(axis=1, initial=np.inf)
-        behind = lowest < -AXIS * (radii.max(axis=1, initial=-np.inf) - lowest)
+        behind = _reach_behind(self._corners()[:, :, 0])
         return np.asarray(self.global_index[behind & ~self.deleted])
 
     def folded(self) -> NDArray[np.int64]:
@@ -503,6 +501,12 @@ class Domains:
             Shape ``(n, corners)``.
         """
         return self._geometry.corner_jacobians(self._corners())
+
+
+def _reach_behind(radii: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return whether domains reach behind the axis, by the radii of their nodes ``(n, k)``."""
+    lowest = radii.min(axis=1, initial=np.inf)
+    return np.asarray(lowest < -AXIS * (radii.max(axis=1, initial=-np.inf) - lowest))
 
 
 def separate_nodes(W: fem.FunctionSpace) -> fem.FunctionSpace:
