@@ -194,7 +194,7 @@ class NewtonSolver:
         """The reduced tangent."""
         return self._factor.K
 
-    def solve(self, problem: ReducedProblem, sizes: tuple[int, int], shorten: bool = False) -> None:
+    def solve(self, problem: ReducedProblem, sizes: tuple[int, int], shorten: bool) -> None:
         """Find a root of the residual, starting from zero or from the prediction.
 
         The prediction is kept only where its residual is small beside that of a start from zero.

@@ -188,3 +188,12 @@ def test_no_points_are_fine():
     for dim in (2, 3):
         answer = material.update(np.zeros((0, dim, dim)), material.initial_state(0, dim))
         assert answer.tangent.shape == (0, dim, dim, dim, dim)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_plastic_work_is_the_area_under_the_uniaxial_curve(law):
+    material = law(YOUNG, POISSON, rho_y=RHO, hardening=30.0)
+    kappa = np.linspace(0.0, 0.2, 41)
+    uniaxial = np.sqrt(1.5) * material.strength(kappa)
+    area = np.concatenate([[0.0], np.cumsum((uniaxial[1:] + uniaxial[:-1]) / 2 * np.diff(kappa))])
+    np.testing.assert_allclose(material.plastic_work({"plastic_strain": kappa}), area, rtol=1e-12)

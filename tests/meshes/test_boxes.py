@@ -40,6 +40,19 @@ def test_boxes_in_one_place():
     assert error.particles == [1, last]
 
 
+@pytest.mark.parametrize("unit", [1e-8, 1.0, 1e8])
+def test_boxes_in_one_place_in_any_unit(unit):
+    V = scenes.vectors(scenes.box([0.0, 0.0], [4.0 * unit] * 2, [8, 8], QUADRILATERAL))
+    x = unit * np.array([[0.5 + WORLD.rank, 0.5], [0.5 + WORLD.rank, 0.75]])
+    mpm.Particles.from_points(x, 0.25 * unit, V)
+    near = np.concatenate([x, x[:1] + 1e-12 * unit])
+    raises(
+        lambda: mpm.Particles.from_points(near, 0.25 * unit, V),
+        mpm.MPMError,
+        "others in the same place",
+    )
+
+
 def test_boxes_without_a_mesh_are_those_of_a_mesh():
     V = vectors(box([0.0, -0.25], [2.0, 1.25], [8, 6], QUADRILATERAL))
     held = scenes.fix(V, scenes.at(0, 0.0))

@@ -20,7 +20,7 @@ def test_a_step_uphill_is_redirected():
     # and leads uphill, where the residual grows.
     problem = DoubleWell([1.0, 5.0, 0.3], 0.1)
     solver = newton()
-    solver.solve(problem, (3, 3))
+    solver.solve(problem, (3, 3), shorten=False)
     assert solver.statistics["redirections"] >= 1
     x = solver.x.array_r + problem.start
     assert np.all(3.0 * x**2 > 1.0)  # a minimum of the potential, not its maximum
@@ -34,7 +34,7 @@ def test_a_step_uphill_is_redirected():
 def test_no_redirection_without_its_conditions(options):
     solver = newton(**options)
     try:
-        solver.solve(DoubleWell([1.0, 5.0, 0.3], 0.1), (3, 3))
+        solver.solve(DoubleWell([1.0, 5.0, 0.3], 0.1), (3, 3), shorten=False)
     except mpm.ConvergenceError:
         assert solver.no_equilibrium
     assert solver.statistics["redirections"] == 0
@@ -70,7 +70,7 @@ class Rod(DoubleWell):
 def test_a_step_that_turns_a_stiff_rod_is_trusted():
     # The first Newton step stretches the rod by 1.4: its force is 10^6 times the load then.
     solver, problem = newton(), Rod(1e6, has_history=False)
-    solver.solve(problem, (2, 2))
+    solver.solve(problem, (2, 2), shorten=False)
     assert solver.statistics["trusted_steps"] == 1 and solver.statistics["halvings"] == 0
     assert solver.iterations < 10 and max(solver.residuals) > 1e5
     # A rod that hardly stretches stands at 45 degrees: spring and load pull along it.
@@ -81,7 +81,7 @@ def test_a_response_with_a_history_is_not_trusted():
     ends, solves = [], []
     for has_history in (False, True):
         solver, problem = newton(), Rod(1e3, has_history)
-        solver.solve(problem, (2, 2))
+        solver.solve(problem, (2, 2), shorten=False)
         assert (solver.statistics["trusted_steps"] > 0) != has_history
         assert (solver.statistics["halvings"] > 0) == has_history
         ends.append(solver.x.array_r + problem.start)
@@ -108,7 +108,7 @@ class Flat(DoubleWell):
 def test_trust_that_is_abused_ends():
     solver = newton()
     problem = Flat([1.0, 1.0], 0.0, start=np.array([1.5, -3.0]))
-    solver.solve(problem, (2, 2))
+    solver.solve(problem, (2, 2), shorten=False)
     assert solver.statistics["trusted_steps"] == solver.statistics["withdrawn_steps"] == 1
     assert solver.statistics["halvings"] > 0 and solver.iterations < 20
     np.testing.assert_allclose(solver.x.array_r + problem.start, 0.0, atol=1e-9)
@@ -117,7 +117,7 @@ def test_trust_that_is_abused_ends():
 def test_trust_ends_where_a_linear_solve_breaks_down():
     solver = newton()
     problem = Flat([1.0, 1.0], 0.0, start=np.array([1.5, -10.0]))  # a tangent of 1e-300 soon
-    solver.solve(problem, (2, 2))
+    solver.solve(problem, (2, 2), shorten=False)
     assert solver.statistics["withdrawn_steps"] == 1
     np.testing.assert_allclose(solver.x.array_r + problem.start, 0.0, atol=1e-9)
 

@@ -12,6 +12,8 @@ import scenes
 from scenes import HEXAHEDRON, PLANE, QUADRILATERAL, TETRAHEDRON
 from transfer.reference import PAIRS, SOLID, basis_by_loop, local_positions, scene
 
+import mpm_dolfinx as mpm
+
 
 def dense_weights(particles):
     """Return particles' weights as dense arrays (n, nodes) and (n, nodes, gdim)."""
@@ -143,3 +145,12 @@ def test_increment_of_F_by_published_gradients(background, cell, same):
     published = (np.eye(dim) + np.einsum("ix,piy->pxy", u, grad_S)) @ F_n
     gap = scenes.largest(F - published)
     assert gap < 1e-12 if same else 1e-6 < gap < 0.1
+
+
+def test_weights_of_domains_on_nodes_of_the_background():
+    V = scenes.vectors(scenes.unit(4, QUADRILATERAL))
+    particles = mpm.Particles(scenes.unit(4, QUADRILATERAL), V)
+    offsets, _, S, grad_S = particles.weights()
+    assert (np.diff(offsets) == 4).all()  # its own corners, nothing that is zero
+    np.testing.assert_allclose(S, 0.25, atol=1e-14)
+    np.testing.assert_allclose(np.abs(grad_S), 2.0, atol=1e-12)
