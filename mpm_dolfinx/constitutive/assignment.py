@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +22,7 @@ from ..materials.base import Material, Refused, check_parameter
 from ..particles.particles import Particles
 from .governed import Governed
 from .pressure import MeanStress, is_split, without_bulk
+from .succession import equals
 
 __all__ = ["Assignment", "Materials"]
 
@@ -86,6 +89,13 @@ class Assignment:
             chosen = self._chosen(materials, cell_tags)
             self._given = [_Given(material, dict(material.parameters)) for material, _ in chosen]
             self.governed = [self._governing(material, points) for material, points in chosen]
+
+    def kinds(self) -> NDArray[np.int64]:
+        """Return for each material the number of the first that equals it (collective)."""
+        given = self.given
+        equal = np.array([[equals(one, other) for other in given] for one in given])
+        self._particles.mesh.comm.Allreduce(MPI.IN_PLACE, equal, MPI.LAND)
+        return np.asarray(equal.argmax(axis=1))
 
     @property
     def given(self) -> list[Material]:

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from ..errors import ConvergenceError, MPMError, as_ours
 from ..materials.base import Material, State, StrainMaterial, Update
+from ..materials.kinematics import KINEMATICS
 from ..materials.mandel import num_components
 from ..particles.particles import Particles
 from .pressure import VolumeStrain
 
-__all__ = ["Answer", "Governed"]
+__all__ = ["Answer", "Carried", "Governed"]
 
 FLOAT = np.dtype(np.float64)
 #: What a law answers first of all.
@@ -31,6 +32,21 @@ class Answer(NamedTuple):
     first_piola: NDArray[np.float64]
     tangent: NDArray[np.float64]
     state: State
+
+
+class Carried(NamedTuple):
+    """What points carry that begin with a stress, or go on with it under another law.
+
+    Attributes:
+        stress: Cauchy stress, shape ``(n, 3, 3)``.
+        gradient: ``F - I`` that laws see, shape ``(n, dim, dim)``.
+        gap: Volume strain beyond that of the stress, shape ``(n,)``, where a pressure of its own
+            stands for the mean stress, which is the law's on average alone; ``None`` for none.
+    """
+
+    stress: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    gap: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -141,24 +157,34 @@ class Governed:
         volume = found.gap + found.compliance * pressure
         return answer, VolumeStrain(volume, found.slope, found.compliance, found.by_pressure)
 
-    def stressed_state(self, rows: NDArray[np.integer[Any]], stress: NDArray[np.float64]) -> State:
+    def stressed_state(
+        self, rows: NDArray[np.integer[Any]], carried: Carried, variables: State
+    ) -> State:
         """Return the state of some of the points under a stress.
 
         Args:
             rows: Which of them.
-            stress: Of all points of this rank, shape ``(n nq, 3, 3)``.
+            carried: What all points of this rank carry.
+            variables: Internal variables that those have already, by name.
 
         Raises:
             MPMError: The law fails, or cannot bear the stress.
         """
         points = self.points[rows]
+        law, gradient = self.material.at(rows), carried.gradient[points]
         try:
-            return self.material.at(rows).stressed_state(stress[points], self.dim)
+            state = law.stressed_state(carried.stress[points], gradient, variables)
         except MPMError as error:
             raise self._named(error, points) from None
         except Exception as error:
             what = f"stressed_state of {type(self.material).__name__}"
             raise as_ours(error, what) from error
+        if carried.gap is not None:
+            assert isinstance(law, StrainMaterial)
+            strain = law.elastic_strain(state["stress"])
+            strain[:, :3] += carried.gap[points, None] / 3.0
+            state |= KINEMATICS[law.kinematics].history_of(strain, gradient)
+        return state
 
     def cauchy_stress(self, gradient: NDArray[np.float64], state: State) -> NDArray[np.float64]:
         """Return the Cauchy stress of a state, shape ``(n, 3, 3)``.

@@ -94,6 +94,18 @@ class Groups:
             sums[self._cut] = travel[self._place]
         return np.asarray(sums[self._local])
 
+    def same(self, other: Groups) -> NDArray[np.bool_]:
+        """Return which owned domains have the same group in both, shape ``(n,)`` (collective).
+
+        Args:
+            other: Another partition of the same domains.
+        """
+        one, number = np.ones(len(self.number)), other.number.astype(np.float64)
+        size = self.sum(one)
+        other_size = other.sum(one)
+        strange = (size != other_size) | (self.sum(number) != number * size)
+        return np.asarray(self.sum(strange.astype(np.float64)) == 0.0)
+
     def totals(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums over all groups of all ranks, shape ``(count, ...)`` (collective)."""
         sums = np.zeros((self.count, *values.shape[1:]))

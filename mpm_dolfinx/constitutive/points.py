@@ -8,8 +8,6 @@ from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from typing import Any, NamedTuple
 
-from mpi4py import MPI
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,9 +19,10 @@ from ..meshes.remesh import Column
 from ..particles.field import ParticleField
 from .assignment import Assignment, Materials
 from .averaging import VolumeAveraging
-from .governed import Answer, Governed
+from .governed import Answer, Carried, Governed
 from .pressure import MeanStress, VolumeStrain
 from .strain import Strain
+from .succession import Episode, states_after
 
 __all__ = ["MaterialPoints"]
 
@@ -101,8 +100,8 @@ class MaterialPoints:
         self.averaging: VolumeAveraging | None = None
         if f_bar != "none":
             material = np.zeros(particles.num_local, dtype=np.int64)
-            for number, part in enumerate(self._governed):
-                material[part.points // particles.num_points] = number
+            for kind, part in zip(self._assignment.kinds(), self._governed, strict=True):
+                material[part.points // particles.num_points] = kind
             self.averaging = VolumeAveraging(
                 strain, f_bar, material, self._resistance(), self.symmetric
             )
@@ -164,17 +163,19 @@ class MaterialPoints:
             MPMError: A material cannot bear it; ``particles`` are global indices.
         """
         stress = cauchy_stress.reshape(self._points, 3, 3)
+        carried = Carried(stress, np.zeros((self._points, self.dim, self.dim)))
         if self.mean_stress is not None:
             self.mean_stress.begin_with(np.trace(stress, axis1=1, axis2=2) / 3.0)
         with agree(self._particles.mesh.comm):
-            states = [p.stressed_state(np.arange(len(p.points)), stress) for p in self._governed]
+            states = [
+                p.stressed_state(np.arange(len(p.points)), carried, {}) for p in self._governed
+            ]
         self._settle(states)
 
     def take_over(self, before: MaterialPoints) -> None:
         """Go on from the last converged step of the same points with other materials (collective).
 
-        Points whose material is the same object go on with its history; the others carry the
-        stress that they had, and no other history. Strength is divided by what it was divided by.
+        See :func:`states_after`. Strength is divided by what it was divided by.
 
         Args:
             before: The points, on the same mesh.
@@ -184,72 +185,29 @@ class MaterialPoints:
         """
         if before.weakening != self.weakening:
             self.weaken(before.weakening)
-        gradient = before.strain.gradient().reshape(-1, self.dim, self.dim)
-        kirchhoff = before.cauchy_stress().reshape(self._points, 3, 3)
-        kirchhoff *= np.linalg.det(np.eye(self.dim) + gradient)[:, None, None]
-        comm, histories = self._particles.mesh.comm, before.histories()
-        known = []
-        for material, part in zip(self._assignment.given, self._governed, strict=True):
-            state, kept = self._remembered(material, part.points, histories)
-            whole = bool(state) and bool(comm.allreduce(bool(kept.all()), MPI.LAND))
-            if not whole:
-                # a law without memory has none that could be mixed with that of other points
-                kept &= "displacement_gradient" in state
-            known.append((whole, kept, state))
-        with agree(comm):
-            states = [
-                state if whole else self._mixed(part, kept, state, kirchhoff, gradient)
-                for part, (whole, kept, state) in zip(self._governed, known, strict=True)
-            ]
+        gradient, unchanged = self.strain.gradient(), np.ones(self._points, dtype=bool)
+        if self.averaging is not None and before.averaging is not None:
+            gradient = self.averaging.average(gradient)
+            same = self.averaging.groups.same(before.averaging.groups)
+            unchanged = np.repeat(same, self._particles.num_points)
+        gap = None
         if self.mean_stress is not None and before.mean_stress is not None:
-            self.mean_stress.begin_with(before.mean_stress.values)
-        self._settle(states)
+            pressure, seen = before.mean_stress.values, before.volume_strain
+            self.mean_stress.begin_with(pressure)
+            gap = seen.volume - seen.compliance * pressure
+        gradient = gradient.reshape(-1, self.dim, self.dim)
+        stress = before.cauchy_stress(gradient).reshape(self._points, 3, 3)
+        carried = Carried(stress, gradient, gap)
+        episodes = before.episodes()
+        laws = list(zip(self._assignment.given, self._governed, strict=True))
+        self._settle(states_after(episodes, laws, carried, unchanged, self._particles.mesh.comm))
 
-    def histories(self) -> list[tuple[Material, NDArray[np.int64], State]]:
-        """Return each material as given, its points and their last converged state."""
+    def episodes(self) -> list[Episode]:
+        """Return each material as given, with its points and their last converged state."""
         return [
-            (material, part.points, state)
-            for material, part, state in zip(
-                self._assignment.given, self._governed, self._last.states, strict=True
-            )
+            Episode(*known)
+            for known in zip(self._assignment.given, self._governed, self._last.states, strict=True)
         ]
-
-    def _remembered(
-        self,
-        material: Material,
-        points: NDArray[np.int64],
-        histories: list[tuple[Material, NDArray[np.int64], State]],
-    ) -> tuple[State, NDArray[np.bool_]]:
-        """Return what histories have of a material at points, and at which of them."""
-        there = np.zeros(self._points, dtype=bool)
-        state: State = {}
-        for its_material, its_points, its in histories:
-            if its_material is material and (not state or state.keys() == its.keys()):
-                there[its_points] = True
-                for name, values in its.items():
-                    shape = (self._points, *values.shape[1:])
-                    state.setdefault(name, np.zeros(shape, values.dtype))[its_points] = values
-        return {name: values[points] for name, values in state.items()}, there[points]
-
-    def _mixed(
-        self,
-        part: Governed,
-        kept: NDArray[np.bool_],
-        known: State,
-        kirchhoff: NDArray[np.float64],
-        gradient: NDArray[np.float64],
-    ) -> State:
-        """Return the state of points, which is known where it is kept, elsewhere of a stress."""
-        new = np.flatnonzero(~kept)
-        state = {}
-        for name, values in part.stressed_state(new, kirchhoff).items():
-            state[name] = np.empty((len(kept), *values.shape[1:]), values.dtype)
-            state[name][new] = values
-            if name == "displacement_gradient":
-                state[name][new] = gradient[part.points[new]]
-            if kept.any():
-                state[name][kept] = known[name][kept]
-        return state
 
     def _settle(self, states: list[State]) -> None:
         """Take states for those of the last converged step, at the present displacement.
@@ -367,6 +325,16 @@ class MaterialPoints:
                 result[part.points] = np.einsum("niiii->ni", tangent).max(axis=1, initial=0.0)
         shape = (self._particles.num_local, self._particles.num_points)
         return result.reshape(shape).mean(axis=1)
+
+    def shear_modulus(self) -> float:
+        """Return the mean shear modulus of the unstrained body (collective)."""
+        volumes = self.strain.volumes().ravel()
+        with agree(self._particles.mesh.comm):
+            shear = self.undeformed_tangent()[:, 0, 1, 0, 1]
+        whole, volume = self._particles.mesh.comm.allreduce(
+            np.array([volumes @ shear, volumes.sum()])
+        )
+        return float(whole / volume)
 
     def undeformed_tangent(self) -> NDArray[np.float64]:
         """Return dP/dF of all points where nothing is strained, ``(n nq, dim, dim, dim, dim)``."""
@@ -621,11 +589,16 @@ class MaterialPoints:
             laws.append((type(material).__name__, parameters))
         return laws
 
-    def cauchy_stress(self) -> NDArray[np.float64]:
-        """Cauchy stress of the last converged step, shape ``(n, nq, 3, 3)``."""
+    def cauchy_stress(self, gradient: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """Return the Cauchy stress of the last converged step, shape ``(n, nq, 3, 3)``.
+
+        Args:
+            gradient: ``F - I`` to take it at, ``(n nq, dim, dim)``; ``None``: that which laws saw.
+        """
+        seen = self._last.gradient if gradient is None else gradient
 
         def value(part: Governed, state: State) -> Any:
-            return part.cauchy_stress(self._last.gradient[part.points], state)
+            return part.cauchy_stress(seen[part.points], state)
 
         return self._collect((3, 3), value, "cauchy_stress")
 

@@ -223,14 +223,22 @@ class Material(ABC):
         """
         return None
 
-    def stressed_state(self, cauchy_stress: NDArray[np.float64], dim: int) -> State:
-        """Return the state of points that carry a stress where their body is undeformed.
+    def stressed_state(
+        self,
+        cauchy_stress: NDArray[np.float64],
+        displacement_gradient: NDArray[np.float64],
+        variables: Mapping[str, NDArray[np.float64]] = MappingProxyType({}),
+    ) -> State:
+        """Return the state of points that carry a stress at a displacement gradient.
 
-        The state belongs to a displacement gradient of zero; an update of it gives this stress.
+        An update of it at that gradient, which is zero where a body has not moved, gives this
+        stress.
 
         Args:
             cauchy_stress: Shape ``(n, 3, 3)``, symmetric; in plane strain xz and yz are zero.
-            dim: Dimension of the body.
+            displacement_gradient: Shape ``(n, dim, dim)``.
+            variables: Internal variables that the points have already, by name; others are those
+                of unstrained points.
 
         Raises:
             MPMError: The material cannot carry it; ``particles`` are the numbers of the points.
@@ -374,20 +382,28 @@ class StrainMaterial(Material):
             "which returns the elastic strain of stresses (n, m)."
         )
 
-    def stressed_state(self, cauchy_stress: NDArray[np.float64], dim: int) -> State:
+    def stressed_state(
+        self,
+        cauchy_stress: NDArray[np.float64],
+        displacement_gradient: NDArray[np.float64],
+        variables: Mapping[str, NDArray[np.float64]] = MappingProxyType({}),
+    ) -> State:
         """See :meth:`Material.stressed_state`.
 
         The points carry the elastic strain of this stress, which must not be beyond yield.
         """
-        stress = to_vector(cauchy_stress, dim)
-        state = self.initial_state(len(stress), dim)
+        dim = displacement_gradient.shape[-1]
+        ratio = self._kinematics.volume_ratio(displacement_gradient)[:, None, None]
+        own = ratio * cauchy_stress
+        stress = to_vector(own, dim)
+        state = self.initial_state(len(stress), dim) | dict(variables)
+        known = {name: state[name] for name in self.internal_variables}
         strain = self.elastic_strain(stress)
         size = norm(stress)
-        lost = np.abs(cauchy_stress - to_tensor(stress)).max(axis=(1, 2), initial=0.0)
+        lost = np.abs(own - to_tensor(stress)).max(axis=(1, 2), initial=0.0)
         possible = (lost <= 1e-12 * size) & np.isfinite(strain).all(axis=1)
-        variables = {name: state[name] for name in self.internal_variables}
         with np.errstate(invalid="ignore"):
-            answer = self.integrate(np.where(possible[:, None], strain, 0.0), variables, False)
+            answer = self.integrate(np.where(possible[:, None], strain, 0.0), known, False)
         possible &= norm(answer.stress - stress) <= 1e-9 * size
         if not possible.all():
             points = np.flatnonzero(~possible)
@@ -397,7 +413,8 @@ class StrainMaterial(Material):
                 "out of the plane; give a stress that the material can bear.",
                 points,
             )
-        return state | {"stress": stress} | self._kinematics.history_of(strain, dim)
+        history = self._kinematics.history_of(strain, displacement_gradient)
+        return state | {"stress": stress} | history
 
     def update(
         self, displacement_gradient: NDArray[np.float64], state: State, tangent: bool = True

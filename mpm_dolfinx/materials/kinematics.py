@@ -81,8 +81,8 @@ class Kinematics(ABC):
 
     @staticmethod
     @abstractmethod
-    def history_of(elastic_strain: Array, dim: int) -> dict[str, Array]:
-        """Return the history of points that have not moved, of elastic strain ``(n, m)``."""
+    def history_of(elastic_strain: Array, displacement_gradient: Array) -> dict[str, Array]:
+        """Return the history of points of an elastic strain ``(n, m)`` at ``(n, dim, dim)``."""
 
     @abstractmethod
     def history(self, elastic_strain: Array) -> dict[str, Array]:
@@ -132,11 +132,10 @@ class SmallStrain(Kinematics):
         }
 
     @staticmethod
-    def history_of(elastic_strain: Array, dim: int) -> dict[str, Array]:
+    def history_of(elastic_strain: Array, displacement_gradient: Array) -> dict[str, Array]:
         """Return displacement gradient and elastic strain."""
-        n = len(elastic_strain)
         return {
-            "displacement_gradient": np.zeros((n, dim, dim)),
+            "displacement_gradient": displacement_gradient.copy(),
             "elastic_strain": elastic_strain.copy(),
         }
 
@@ -207,11 +206,11 @@ class LogarithmicStrain(Kinematics):
         }
 
     @staticmethod
-    def history_of(elastic_strain: Array, dim: int) -> dict[str, Array]:
+    def history_of(elastic_strain: Array, displacement_gradient: Array) -> dict[str, Array]:
         """Return displacement gradient and b - I."""
-        n = len(elastic_strain)
+        dim = displacement_gradient.shape[-1]
         return {
-            "displacement_gradient": np.zeros((n, dim, dim)),
+            "displacement_gradient": displacement_gradient.copy(),
             "elastic_b_minus_identity": _exponential(elastic_strain.T, dim).T,
         }
 

@@ -59,8 +59,8 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
             stiffness of the undeformed bodies (a time); not negative.
         after: A quasi-static problem of the same particles, from the state of which the motion
             begins: equilibrium under loads, supports and terms that should be given here too, the
-            same contacts, which know where points stick. Points whose material is the same object
-            go on with its history, others carry their stress. That problem cannot go on then.
+            same contacts, which know where points stick. Materials come in place of those of before
+            as in :meth:`stage`. That problem cannot go on then.
         quasi_static: Bodies among these that have no inertia, beside others that move: they are in
             equilibrium at the end of each step, whatever the scheme, and have no velocity given.
         terms: As in :class:`QuasiStaticProblem`.

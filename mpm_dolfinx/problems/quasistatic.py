@@ -279,7 +279,8 @@ class QuasiStaticProblem(ParticleProblem):
         """Begin a stage: change what is given, and keep the rest, in the same state (collective).
 
         What is taken away is unloaded over the next run, and what is new is loaded over it. Points
-        whose material is another object than before carry their stress on, and no other history.
+        whose law equals that of before go on as they were; others carry their stress on, and where
+        the law is of the same class the internal variables that both begin with the same value.
         All arguments but these are as in the constructor; ``...`` keeps what there is.
 
         Args:
@@ -585,7 +586,7 @@ class QuasiStaticProblem(ParticleProblem):
             carried = CarriedField(field)
             found.append(PressureTerm(body, carried, acting))
             if self.setup.mixed == "stabilised pressure":
-                found.append(PressureSmoothing(carried, points))
+                found.append(PressureSmoothing(carried, points, self._force_share(body) or 1.0))
         return found
 
     def begin_step(self) -> None:

@@ -20,12 +20,16 @@ from dolfinx import fem
 from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree, as_ours
 from ..particles.particles import Particles
+from ..system.reduced import ReducedSystem
 from ..system.term import Term
 from .arguments import as_bodies, as_conditions, as_terms, by_space
 from .initial_stress import initial_stress_at_points
 from .setup import BodySetup, Setup
 
 __all__ = ["Addition", "Given", "Removal", "Staged", "chosen_cells", "join"]
+
+#: What says which law governs which points.
+OF_LAWS = {"material", "cell_tags"}
 
 
 class Staged(Protocol):
@@ -38,6 +42,7 @@ class Staged(Protocol):
         terms: What else acts on the bodies.
         setup: What the user has given for them.
         points: The materials at the points of each body.
+        reduced: The system.
     """
 
     particles: Particles | Sequence[Particles]
@@ -49,6 +54,10 @@ class Staged(Protocol):
     @property
     def points(self) -> list[MaterialPoints]:
         """The materials at the points of each body."""
+
+    @property
+    def reduced(self) -> ReducedSystem:
+        """The system."""
 
 
 class _Change:
@@ -105,7 +114,7 @@ class Given(_Change):
         spaces = [group[0].V for group in by_space(problem.bodies)]
         self._bodies, self._bcs = list(bodies), as_conditions(bcs, spaces)
         self._terms = [*own, *as_terms(terms, problem.bodies)]
-        self._points = list(problem.points)
+        self._points, self._moduli = list(problem.points), problem.reduced.moduli
 
     def make(self) -> None:
         """See :class:`~mpm_dolfinx.problems.staging.Change`."""
@@ -120,17 +129,24 @@ class Given(_Change):
 
     def settle(self) -> None:
         """See :class:`~mpm_dolfinx.problems.staging.Change`."""
-        for changes, points, before in zip(
-            self._bodies, self.problem.points, self._points, strict=True
+        problem, factors = self.problem, {}
+        for body, changes, points, before in zip(
+            problem.bodies, self._bodies, problem.points, self._points, strict=True
         ):
-            if changes.keys() & {"material", "cell_tags"}:
+            if changes.keys() & OF_LAWS:
                 points.take_over(before)
+                factors[id(body)] = points.shear_modulus() / before.shear_modulus()
+        if self._moduli is not None:
+            problem.reduced.moduli = [
+                None if modulus is None else modulus * factors.get(id(moved), 1.0)
+                for moved, modulus in zip(problem.reduced.bodies, self._moduli, strict=True)
+            ]
 
     def renews(self, body: int | None, name: str) -> bool:
         """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         if body is None:
-            return name == "moduli" and any("material" in changes for changes in self._bodies)
-        other = self._bodies[body].keys() & {"material", "cell_tags"}
+            return name == "moduli"
+        other = self._bodies[body].keys() & OF_LAWS
         return bool(other) and name.startswith("history ")
 
 

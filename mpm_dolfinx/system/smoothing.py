@@ -43,12 +43,15 @@ class PressureSmoothing(FieldTerm):
     Args:
         pressure: The pressure, at a body's points.
         material: The material at the points.
+        share: What of a body's forces at a step's end is force (see :meth:`Term.pace`); it counts
+            ``1 / share`` times, as the constraint does.
     """
 
-    def __init__(self, pressure: CarriedField, material: ShearPoints) -> None:
+    def __init__(self, pressure: CarriedField, material: ShearPoints, share: float = 1.0) -> None:
         super().__init__(None, [pressure])
         self.fields = []  # committed by the constraint's own term
         self._pressure, self._material = pressure, material
+        self._weight = WEIGHT / share
         self._matrix: PETSc.Mat | None = None
         self._force = pressure.T.createVecLeft()
 
@@ -104,7 +107,7 @@ class PressureSmoothing(FieldTerm):
         # volume / weight is one over the mean shear modulus of a cell
         filled = weight.array_r > 0.0
         share = np.zeros(len(filled))
-        share[filled] = WEIGHT / 2.0 / weight.array_r[filled]
+        share[filled] = self._weight / 2.0 / weight.array_r[filled]
         weight.array_w[:] = np.sqrt(share)
         volume.array_w[:] = share * volume.array_r
         factors = ones.duplicate()

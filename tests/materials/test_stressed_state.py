@@ -45,12 +45,17 @@ def pressures(n, dim, K0=0.6, largest=20.0):
     return Q @ stress @ Q.T
 
 
+def unmoved(stress, dim):
+    """Return the displacement gradients of points that have a stress and have not moved."""
+    return np.zeros((len(stress), dim, dim))
+
+
 @pytest.mark.parametrize(
     ("law", "dim", "route"), thinned(3, product(LAWS, [2, 3], [copy.copy, in_python]))
 )
 def test_the_stress_is_that_which_was_asked_for(law, dim, route):
     material, stress = route(LAWS[law]), pressures(9, dim)
-    state = material.stressed_state(stress, dim)
+    state = material.stressed_state(stress, unmoved(stress, dim))
     H = np.zeros((9, dim, dim))
     answer = material.update(H, state)
     np.testing.assert_allclose(answer.first_piola, stress[:, :dim, :dim], atol=1e-11)
@@ -79,7 +84,7 @@ def test_tangents_with_an_initial_stress(law, dim):
             if self.begun:
                 return super().initial_state(n, dim)
             self.begun = True
-            return self.stressed_state(pressures(n, dim), dim)
+            return self.stressed_state(pressures(n, dim), np.zeros((n, dim, dim)))
 
     material = copy.copy(LAWS[law])
     material.__class__ = Stressed
@@ -91,7 +96,7 @@ def test_a_stress_beyond_yield_is_refused(law):
     stress = pressures(5, 2)
     stress[[1, 4]] = np.diag([900.0, -900.0, 0.0])
     with pytest.raises(MPMError, match="cannot bear the initial stress of 2 of 5") as caught:
-        LAWS[law].stressed_state(stress, 2)
+        LAWS[law].stressed_state(stress, unmoved(stress, 2))
     assert list(caught.value.particles) == [1, 4]
 
 
@@ -99,7 +104,7 @@ def test_clay_bears_no_tension_and_sand_none_without_cohesion():
     stress = np.broadcast_to(np.eye(3), (2, 3, 3))
     for material in (clay(), FRICTIONAL["no cohesion"], FRICTIONAL["no tension"]):
         with pytest.raises(MPMError, match="cannot bear the initial stress of 2 of 2"):
-            material.stressed_state(stress, 3)
+            material.stressed_state(stress, unmoved(stress, 3))
 
 
 def test_stresses_of_another_kind_are_refused():
@@ -107,24 +112,24 @@ def test_stresses_of_another_kind_are_refused():
     out_of_plane, skew = np.zeros((1, 3, 3)), np.zeros((1, 3, 3))
     out_of_plane[0, 0, 2] = out_of_plane[0, 2, 0] = 1.0
     with pytest.raises(MPMError, match="out of the plane"):
-        material.stressed_state(out_of_plane, 2)
-    material.stressed_state(out_of_plane, 3)
+        material.stressed_state(out_of_plane, unmoved(out_of_plane, 2))
+    material.stressed_state(out_of_plane, unmoved(out_of_plane, 3))
     skew[0, 0, 1] = 1.0
     with pytest.raises(MPMError, match="cannot bear"):
-        material.stressed_state(skew, 3)
+        material.stressed_state(skew, unmoved(skew, 3))
     with pytest.raises(MPMError, match="cannot bear"):
-        material.stressed_state(np.full((1, 3, 3), np.nan), 3)
+        material.stressed_state(np.full((1, 3, 3), np.nan), np.zeros((1, 3, 3)))
 
     class Own(Material):
         symmetric = True
         initial_state = update = cauchy_stress = None
 
     with pytest.raises(MPMError, match="Own cannot begin with a stress"):
-        Own().stressed_state(skew, 3)
+        Own().stressed_state(skew, unmoved(skew, 3))
 
 
 def test_the_state_of_no_points_and_of_the_stress_itself():
-    state = LAWS["clay"].stressed_state(np.zeros((0, 3, 3)), 2)
+    state = LAWS["clay"].stressed_state(np.zeros((0, 3, 3)), np.zeros((0, 2, 2)))
     assert state["stress"].shape == (0, mandel.num_components(2))
-    state = clay().stressed_state(-100.0 * np.eye(3)[None], 3)
+    state = clay().stressed_state(-100.0 * np.eye(3)[None], np.zeros((1, 3, 3)))
     np.testing.assert_allclose(state["elastic_b_minus_identity"], 0.0, atol=1e-15)
