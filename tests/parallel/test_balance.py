@@ -28,3 +28,7 @@ def test_imbalance():
     assert imbalance(WORLD, 3) == 1.0
     assert imbalance(WORLD, 4 if WORLD.rank == 0 else 0) == WORLD.size
     assert imbalance(WORLD, 0) == 0.0
+
+
+def test_one_item_is_as_uneven_as_there_are_ranks():
+    assert imbalance(WORLD, int(WORLD.rank == 0)) == WORLD.size
