@@ -28,6 +28,7 @@ COUNTERS = (
     "residuals",
     "predictions",
     "rejected_predictions",
+    "second_attempts",
     "rejected_steps",
     "factorisations",
     "krylov_iterations",
@@ -65,7 +66,8 @@ class Statistics(dict[str, float]):
     ``factorisations`` (or levels of multigrid made for a tangent), ``krylov_iterations`` (of solves
     with multigrid), ``multigrid_failures`` (how often a factorisation took over),
     ``predictions`` (steps that began at the extrapolated increment) and
-    ``rejected_predictions``, ``rejected_steps`` (which converged, and were taken back for their
+    ``rejected_predictions``, ``second_attempts`` (at steps whose first one failed, from their
+    beginning), ``rejected_steps`` (which converged, and were taken back for their
     error), ``halvings`` (of Newton steps by the line search), ``trusted_steps``
     (series of them taken although the residual grew) and ``withdrawn_steps`` (where that came to
     nothing),

@@ -461,6 +461,10 @@ class StepStress:
         """Return whether the history stays as it is in the last update."""
         return self._points.elastic()
 
+    def yielding(self) -> NDArray[np.bool_]:
+        """Return :meth:`MaterialPoints.yielding`."""
+        return self._points.yielding()
+
     def commit(self) -> Callable[[], None]:
         """Make the last update the history, and take note of the work done in the step.
 

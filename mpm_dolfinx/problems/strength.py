@@ -5,11 +5,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ConvergenceError, DomainDistortionError, MPMError, ParticleOutsideError
+from ..errors import TRIAL_ERRORS, MPMError, ParticleOutsideError
 from ..parallel.given import require_same
 from ..parallel.interruption import held, interrupted, settle
 from .quasistatic import QuasiStaticProblem
@@ -23,6 +24,11 @@ type Array = NDArray[np.float64]
 DIGITS = 12
 #: Least step and tolerance of a factor.
 FINEST = 1e-9
+#: Share of the limit of the displacement up to which a body that Newton's method fails for does not
+#: look as if it slid.
+FAR = 0.25
+#: What says that there is no equilibrium, or none was found.
+FAILURES = (*TRIAL_ERRORS, ParticleOutsideError)
 
 
 @dataclass(frozen=True)
@@ -31,10 +37,16 @@ class StrengthReduction:
 
     Attributes:
         factor: Factor of safety: what the strength was last divided by with equilibrium.
-        above: The least factor for which there was none; infinite where none was tried.
+        above: The least factor for which none was found; infinite where none was tried.
         factors: The factors with equilibrium, in order.
         displacements: Largest displacement of a node since the reduction began, for each.
         limit: Largest displacement that counted as equilibrium.
+        reason: Why there is none for ``above``: ``"displacement"``, there is one but beyond the
+            limit; ``"no convergence"``, where Newton's method failed, which says nothing of the
+            ground unless the curve is steep there; ``"most"``, the body bears the largest factor.
+        failure: What Newton's method failed with at ``above`` and where, if that is the reason.
+        curve: Factors with any equilibrium, in order, and the displacements there, those beyond
+            the limit too, shape ``(n, 2)``.
     """
 
     factor: float
@@ -42,6 +54,9 @@ class StrengthReduction:
     factors: list[float] = field(default_factory=list)
     displacements: list[float] = field(default_factory=list)
     limit: float = np.inf
+    reason: Literal["displacement", "no convergence", "most"] = "most"
+    failure: MPMError | None = None
+    curve: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 class _Search:
@@ -99,7 +114,8 @@ def strength_reduction(
     about ``density gravity H^2 / young`` (Griffiths & Lane's diagrams have that unit). Newton's
     method may also fail where there is equilibrium, most where soils do not dilate. So a factor
     at which it has failed is tried again in smaller increments. One that moves the body too far is
-    not.
+    not. The result tells which of the two ended the search, ``found.reason``, and there is a
+    warning where it was Newton's method, far below the limit.
 
     Where something else ends it, Ctrl-C or an error in a function of yours, the body is left in the
     last state of equilibrium too, with the strength that it was given.
@@ -122,30 +138,102 @@ def strength_reduction(
         The factor of safety and how it was found.
 
     Raises:
-        MPMError: The problem is not at its whole load, its steps have a duration (PorousProblem,
-            DynamicProblem), a material has no strength, or domains may be split.
+        MPMError: The problem is not at its whole load, a step there with the strength that it has
+            fails, its steps have a duration (PorousProblem, DynamicProblem), a material has no
+            strength, or domains may be split.
     """
     _require(problem, step, tolerance, most, displacement)
     start = [body.converged_displacement.copy() for body in problem.bodies]
     limit = _elastic_displacement(problem) if displacement is None else float(displacement)
     search = _Search(float(step), float(most))
-    factors, displacements = [1.0], [0.0]
+    ways: dict[float, float] = {}
+    failures: dict[float, MPMError] = {}
+    factor = 1.0
     try:
-        while search.bad - search.good > tolerance and search.good < most:
-            factor = search.next()
+        for points in problem.points:
+            points.weaken(search.next())  # laws without a strength refuse that
+        while True:
             for points in problem.points:
                 points.weaken(factor)
-            way = _equilibrium(problem, start, limit)
-            if way is not None and way <= limit:
-                search.stood(factor)
-                factors.append(factor)
-                displacements.append(way)
+            found = _equilibrium(problem, start, limit)
+            if isinstance(found, MPMError):
+                failures[factor] = found
             else:
-                search.fell(factor, too_far=way is not None)
+                ways[factor] = found
+            if factor == 1.0:
+                _require_rest(found, limit)
+            if factor in ways and ways[factor] <= limit:
+                search.stood(factor)
+            else:
+                search.fell(factor, too_far=factor in ways)
+            if search.bad - search.good <= tolerance or search.good >= most:
+                break
+            factor = search.next()
     finally:
         for points in problem.points:
             points.weaken(1.0)
-    return StrengthReduction(search.good, float(search.bad), factors, displacements, limit)
+    result = _result(search, ways, failures, limit)
+    if result.failure is not None:
+        _warn_if_far(problem, result)
+    return result
+
+
+def _require_rest(found: float | MPMError, limit: float) -> None:
+    """Raise an error where a step at the present strength is not one of a body at rest."""
+    if isinstance(found, MPMError):
+        raise MPMError(
+            "strength_reduction() begins with a step at the present loads and strength, which "
+            f"failed, so that a factor would mean nothing: {found!s}",
+            found.particles,
+        ) from found
+    if found > limit:
+        raise MPMError(
+            "strength_reduction() begins with a step at the present loads and strength, in which "
+            f"the body moves by {found:.3g}, beyond the limit {limit:.3g} of the displacement; let "
+            "it come to rest by problem.step(), or give displacement=."
+        )
+
+
+def _result(
+    search: _Search, ways: dict[float, float], failures: dict[float, MPMError], limit: float
+) -> StrengthReduction:
+    """Return what was found, and why the search ended.
+
+    Args:
+        search: It.
+        ways: How far the body has moved where there was equilibrium.
+        failures: What there was in its place.
+        limit: Largest displacement that counts.
+    """
+    reason: Literal["displacement", "no convergence", "most"] = "most"
+    failure = None
+    if search.bad < np.inf:
+        # (a factor that failed may have moved the body too far when it was tried again)
+        failure = None if search.bad in ways else failures[search.bad]
+        reason = "displacement" if failure is None else "no convergence"
+    curve = np.array(sorted(ways.items())).reshape(-1, 2)
+    factors, displacements = curve[curve[:, 1] <= limit].T.tolist()
+    return StrengthReduction(
+        search.good,
+        float(search.bad),
+        factors,
+        displacements,
+        limit,
+        reason,
+        failure,
+        curve,
+    )
+
+
+def _warn_if_far(problem: QuasiStaticProblem, result: StrengthReduction) -> None:
+    """Warn where Newton's method failed for a body that has hardly moved (collective)."""
+    limit = result.limit if result.limit < np.inf else _elastic_displacement(problem)
+    if result.displacements[-1] < FAR * limit:
+        problem.warn(
+            f"The factor of safety of {result.factor:g} may be too low: at {result.above:g} "
+            f"Newton's method failed, for a body that has moved by {result.displacements[-1]:.3g} "
+            f"(limit {limit:.3g}). {result.failure!s}"
+        )
 
 
 def _require(
@@ -215,30 +303,31 @@ def _elastic_displacement(problem: QuasiStaticProblem) -> float:
     return way if way > 0.0 else np.inf
 
 
-def _equilibrium(problem: QuasiStaticProblem, start: list[Array], limit: float) -> float | None:
+def _equilibrium(problem: QuasiStaticProblem, start: list[Array], limit: float) -> float | MPMError:
     """Look for equilibrium with the present strength, and stay there if it is within a limit.
 
     Whatever else ends it, Ctrl-C or an error in a user's function, leaves the body where it was.
 
     Returns:
-        How far the body has moved, ``None`` where there was no equilibrium.
+        How far the body has moved, or why no equilibrium was found.
     """
-    comm, way = problem.bodies[0].V.mesh.comm, None
+    comm = problem.bodies[0].V.mesh.comm
+    found: float | MPMError
     with held() as hold:
         before = problem.capture()
         try:
             problem.step()
-            way = _moved(problem, start)
+            found = _moved(problem, start)
             if interrupted(comm):
                 settle(comm)
                 raise KeyboardInterrupt
-        except (ConvergenceError, DomainDistortionError, ParticleOutsideError):
-            pass
+        except FAILURES as error:
+            found = error
         except BaseException:
             problem.return_to(before)
             raise
-        if way is not None and way > limit:
+        if not isinstance(found, MPMError) and found > limit:
             problem.return_to(before)
     if interrupted(comm, hold.left):
         raise KeyboardInterrupt
-    return way
+    return found

@@ -20,6 +20,8 @@ __all__ = ["LineSearch", "stalled"]
 #: Most halvings of a Newton step, and the drop in work that needs none.
 HALVINGS = 8
 SUFFICIENT = 0.8
+#: Least share by which the norm falls where it alone is searched on.
+LEAST = 1e-4
 #: Halvings after which a step is taken if its end can be evaluated, in a solve that hurries.
 FEW_HALVINGS = 3
 #: Share of its start that the work may keep where a potential is followed, and most evaluations
@@ -110,14 +112,17 @@ class LineSearch:
         self._statistics = statistics
         self.begin()
 
-    def begin(self, potential: bool = False, hurries: bool = False) -> None:
+    def begin(self, potential: bool = False, hurries: bool = False, by_norm: bool = False) -> None:
         """Begin a solve.
 
         Args:
             potential: Whether the residual is the gradient of a potential.
             hurries: Whether a solve that is hard is better given up: see :func:`stalled`.
+            by_norm: Whether steps are judged by the residual's norm alone where there is no
+                potential, so that its work on them means nothing.
         """
         self._potential, self._hurries = potential, hurries
+        self._by_norm = by_norm and not potential
         self._trusted: _Step | None = None
         self._since = 0  # iterations
         self._may_trust = True
@@ -191,6 +196,8 @@ class LineSearch:
         trial.waxpy(-1.0, step.y, step.x)
         if self._evaluate(trial) is not None:
             return False
+        if self._by_norm:
+            return norm(F) <= (1.0 - LEAST) * step.norm
         work = abs(F.dot(step.direction))
         return bool(work <= SUFFICIENT * abs(step.work) or norm(F) <= step.norm)
 

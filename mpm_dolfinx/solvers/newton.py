@@ -11,6 +11,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import _compat
 from ..errors import ConvergenceError, MPMError
@@ -41,6 +42,8 @@ LOOSE = 1e-3
 SETTLED = 1e-9
 #: What the norm of ``F - K y`` falls to, relative to F, where a step is refined.
 REFINED = 1e-6
+#: Iterations after which it is noted which particles yield, should a solve fail.
+LATE = 5
 #: Relative diagonal shifts tried in turn until a tangent is positive definite.
 DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 
@@ -69,6 +72,9 @@ class ReducedProblem(Levels, Resisting, Protocol):
 
     def smooth(self) -> bool:
         """Return whether no history changes in the last residual, nor contact."""
+
+    def yielding(self) -> list[NDArray[np.bool_]]:
+        """Return whether each particle yields in the last residual, for each body."""
 
     def prediction(self) -> PETSc.Vec | None:
         """Return unknowns to expect at the step's end, if the past says any."""
@@ -135,9 +141,11 @@ class NewtonSolver:
         iterations: Linear solves of the last attempt.
         x: The solution of the last attempt.
         F: Its residual, without the proximal term.
-        no_equilibrium: Whether the last attempt's iterations came to nothing.
+        gave_up: Whether the last attempt's iterations came to nothing.
         lets_go: Whether what the proximal term holds back is let go once however little it is: in
             a motion it is a viscosity, and the same in each step.
+        has_another_way: Whether an attempt that fails may be made in another way at once: there is
+            no potential, or it began at a prediction and no smaller step is tried.
         gives_up_early: Whether a solve whose residual is not the gradient of a potential is given
             up soon where it makes no headway: in a motion half of the step is much easier.
     """
@@ -170,10 +178,11 @@ class NewtonSolver:
         self.statistics = statistics
         self.residuals: list[float] = []
         self.iterations = 0
-        self.no_equilibrium = False
+        self.gave_up = self.has_another_way = False
+        self._yielding: list[list[NDArray[np.bool_]]] = []
         self.x: PETSc.Vec | None = None
         self.F: PETSc.Vec | None = None
-        self.lets_go = self.gives_up_early = self._hurries = False
+        self.lets_go = self.gives_up_early = self._hurries = self._misled = False
         self._centre: PETSc.Vec | None = None
         self._failure: MPMError | None = None
         self._raised: BaseException | None = None
@@ -194,7 +203,25 @@ class NewtonSolver:
         """The reduced tangent."""
         return self._factor.K
 
-    def solve(self, problem: ReducedProblem, sizes: tuple[int, int], shorten: bool) -> None:
+    @property
+    def flips(self) -> list[NDArray[np.int64]]:
+        """How often each particle began or ceased to yield, late in the last attempt, by body."""
+        return [
+            np.count_nonzero(np.diff(np.array(each), axis=0), axis=0)
+            for each in zip(*self._yielding, strict=True)
+        ]
+
+    def forget(self) -> None:
+        """Forget how the last attempt failed: what comes before the next one may fail too."""
+        self.gave_up, self._yielding = False, []
+
+    def solve(
+        self,
+        problem: ReducedProblem,
+        sizes: tuple[int, int],
+        shorten: bool,
+        again: bool = False,
+    ) -> None:
         """Find a root of the residual, starting from zero or from the prediction.
 
         The prediction is kept only where its residual is small beside that of a start from zero.
@@ -205,6 +232,8 @@ class NewtonSolver:
             problem: Residual and tangent.
             sizes: Local and global number of unknowns.
             shorten: Whether a step that fails is tried again with less load.
+            again: Whether an attempt has failed before: this one begins at zero, and without a
+                potential it searches on the norm of the residual alone.
 
         Raises:
             MPMError: Why there is none; ``x`` and ``F`` are the last evaluated then.
@@ -220,11 +249,14 @@ class NewtonSolver:
         self._norm = self._internal = np.inf  # the size of internal forces, once it is known
         self._first = 0.0
         self._norms: list[float] = []
-        self.no_equilibrium = False
+        self.forget()
+        self.has_another_way = False
+        self._predicts = not (again or self._misled)
         if self._search is not None:
             potential = self._symmetric and problem.has_potential()
+            self.has_another_way = not potential
             self._hurries = self.gives_up_early and shorten and not potential
-            self._search.begin(potential, self._hurries)
+            self._search.begin(potential, self._hurries, again)
         self._factor.begin(sizes[1], problem, self.lets_go)
         # What an iterative solve that fails means is for _pre_check to say.
         self.snes.setMaxLinearSolveFailures(1000 if self._factor.iterates else 1)
@@ -238,6 +270,7 @@ class NewtonSolver:
             self._iterate(x)
         if self._failure is not None:
             raise self._failure
+        self._misled = False
         self._factor.end()
 
     def _start(self, sizes: tuple[int, int]) -> PETSc.Vec:
@@ -267,7 +300,9 @@ class NewtonSolver:
             forces.axpy(1.0, self.F)
         start = self.F if forces is None else forces
         self._first = norm(start)
-        predicted = self._predict(x, start)
+        predicted = self._predicts and self._predict(x, start)
+        self.has_another_way = self.has_another_way or (predicted and not self._shorten)
+        self._misled = predicted
         self._centre = x.copy()
         self._set_tangent(self._problem.tangent() if predicted or K is None else K)
         self._fresh = forces is None or predicted
@@ -305,7 +340,7 @@ class NewtonSolver:
                     why = "as the factorisation of the tangent failed"
             else:
                 why = _reason(reason)
-                self.no_equilibrium = True
+                self.gave_up = True
             self._failure = ConvergenceError(
                 f"Newton's method stopped after {self.iterations} linear solves at a relative "
                 f"residual of {residual:.1e} ({why})"
@@ -425,6 +460,8 @@ class NewtonSolver:
         self._norms.append(size)
         self.residuals.append(size / scale if scale > 0 else size)
         tell(self._comm, NEWTON, "  iteration %d: residual %.2e", iteration, self.residuals[-1])
+        if iteration > LATE:
+            self._yielding.append(self._problem.yielding())
         self._tolerance = tolerance = max(rtol * scale, atol)
         small = size <= tolerance
         if small or (
@@ -449,7 +486,7 @@ class NewtonSolver:
         if self._search is not None and stalled(
             self._norms, self._hurries and not self._search.trusts
         ):
-            self.no_equilibrium = True
+            self.gave_up = True
             lowest = min(self.residuals)
             self._failure = ConvergenceError(
                 f"Newton's method makes no headway: in {self.iterations} linear solves the "

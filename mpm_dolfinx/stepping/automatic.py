@@ -277,15 +277,15 @@ class ErrorControl:
         """Try a step as at the beginning, after what made smaller ones fail has changed."""
         self._size, self._before, self._holds = self._first, None, False
 
-    def cut_back(self, no_equilibrium: bool = False) -> bool:
+    def cut_back(self, gave_up: bool = False) -> bool:
         """Halve the step; return False where it is at its smallest, or a limit is found.
 
         Args:
-            no_equilibrium: As in :meth:`StepControl.cut_back`.
+            gave_up: As in :meth:`StepControl.cut_back`.
         """
         tried = self.target - self._now
         limit = tried <= self._first / 2**LIMIT_HALVINGS and tried <= LIMIT_WIDTH * self._now
-        if self._smallest or (no_equilibrium and limit):
+        if self._smallest or (gave_up and limit):
             return False
         self._size, self._holds = max(0.5 * tried, self._least), True
         return True

@@ -62,7 +62,7 @@ class Control(Protocol):
     def begin_anew(self) -> None:
         """Begin anew, after what made steps fail has changed."""
 
-    def cut_back(self, no_equilibrium: bool = False) -> bool:
+    def cut_back(self, gave_up: bool = False) -> bool:
         """Make the step smaller; return False where it is at its smallest, or a limit is found."""
 
 
@@ -144,12 +144,12 @@ class StepControl:
         self._moved = self._wary = self._trying = False
         self._taken, self._patience = 0, PATIENCE
 
-    def cut_back(self, no_equilibrium: bool = False) -> bool:
+    def cut_back(self, gave_up: bool = False) -> bool:
         """Halve the step; return False where it is at its smallest, or a limit is found.
 
         Args:
-            no_equilibrium: Whether Newton's method found none. Then a step of 1/64 of a full one
-                and of 1/1000 of the load reached is the smallest.
+            gave_up: Whether Newton's iterations came to nothing. Then a step of 1/64 of a full
+                one and of 1/1000 of the load reached is the smallest.
         """
         limit = self._size <= max(1, self._largest >> LIMIT_HALVINGS) and (
             self._size <= LIMIT_WIDTH * self._now
@@ -161,7 +161,7 @@ class StepControl:
         if self._trying:
             self._patience *= 2
         self._taken, self._trying = 0, False
-        if self._size == 1 or (no_equilibrium and limit):
+        if self._size == 1 or (gave_up and limit):
             return False
         self._size //= 2
         return True
@@ -258,18 +258,18 @@ class Run:
 
     @property
     def limit(self) -> str:
-        """What it means, and what to do, if there is no equilibrium up to the end of this step."""
-        found = "no equilibrium was found up to"
+        """Where Newton's method gets no further, and what to do, if this step is the smallest."""
+        found = "no step, however small, gets to"
         if self.end is not None:
-            return f"no motion was found up to the time {self.time:.6g}, however short the steps"
+            return f"{found} the time {self.time:.6g}"
         if self.goal is not None:
             return (
                 f"{found} a controlled displacement of {self.parameter:.6g}, where it may turn "
                 "back; control another one, or take more steps"
             )
         return (
-            f"{found} {self.control.target:.6g}, which is a limit load unless more steps get over "
-            "it; displacement control (control=...) goes on beyond it"
+            f"{found} {self.control.target:.6g}; if that is a limit load, displacement control "
+            "(control=...) goes on beyond it"
         )
 
     def dirichlet_values(self, totals: list[NDArray[np.float64]]) -> list[NDArray[np.float64]]:

@@ -5,19 +5,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from mpi4py import MPI
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..errors import ConvergenceError, DomainDistortionError, MPMError, agreed
+from ..errors import TRIAL_ERRORS, ConvergenceError, DomainDistortionError, MPMError, agreed
 from ..history import Statistics
 from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
-from ..system.field import Field
+from ..system.field import Field, ValueField
 from ..system.reduced import ReducedSystem
 
 __all__ = ["count_folded", "crossed", "placed"]
+
+#: Share of the bodies' largest motion from which on it is that of a node of the background which is
+#: held by next to nothing, and the largest weight of such a node.
+ASTRAY, HARDLY = 0.5, 1e-2
+#: How often a particle begins or ceases to yield, late in a solve, that flips to and fro.
+FLIPS = 2
 
 
 def crossed(bodies: Sequence[Particles]) -> MPMError | None:
@@ -37,7 +45,11 @@ def count_folded(bodies: Sequence[Particles], statistics: Statistics) -> None:
 
 
 def placed(
-    error: MPMError, reduced: ReducedSystem, load: float, limit: str | None = None
+    error: MPMError,
+    reduced: ReducedSystem,
+    load: float,
+    limit: str | None = None,
+    flips: Sequence[NDArray[np.int64]] = (),
 ) -> MPMError:
     """Return an error that says at what load it happened, and what to do (collective).
 
@@ -45,7 +57,8 @@ def placed(
         error: It.
         reduced: The system whose residual did not vanish.
         load: Load, or parameter of the path, at the last converged step.
-        limit: Up to what no equilibrium was found, if that may be a limit, and what to do.
+        limit: Beyond what no step gets, if that may be a limit, and what to do.
+        flips: How often each particle began or ceased to yield, by body.
     """
     advice = {
         DomainDistortionError: "; take more steps, smaller loads or finer domains",
@@ -61,9 +74,70 @@ def placed(
         if particles and dofs:
             text += f"; the residual is largest at dof {dofs[0]} of {space} near {where}"
             text += ", and at {particles}"
+    if isinstance(error, TRIAL_ERRORS):
+        astray = max(map(_astray, reduced.fields), default=None)
+        if astray is not None and astray.moves > 0.0:
+            text += (
+                f"; the background's node near {astray.where} is held by next to nothing (a "
+                f"weight of {astray.weight:.1e})"
+            )
+            advice = "; move the background or the bodies a little, or use stabilisation='ghost'"
+        else:
+            text += _flipping(reduced, flips)
     told = type(error)(f"{text}, in the step after load {load:.6g}{advice}.", particles, load)
     told.dofs = dofs
     return told
+
+
+class _Astray(NamedTuple):
+    """A node of the background that the bodies' largest motion hangs on, though hardly held.
+
+    Attributes:
+        moves: How far it moves the bodies, 0 where there is none.
+        weight: The largest weight that a node of the bodies has for it.
+        where: Its place.
+    """
+
+    moves: float
+    weight: float
+    where: tuple[float, ...]
+
+
+def _astray(field: Field) -> _Astray:
+    """Return the node of a field that is hardly held and moves the bodies most (collective)."""
+    comm: MPI.Comm = field.V.mesh.comm
+    found = _Astray(0.0, 0.0, ())
+    if isinstance(field, ValueField) or over_ranks(comm, field.free is None, MPI.LOR):
+        return found
+    bs, gdim = field.V.dofmap.index_map_bs, field.V.mesh.geometry.dim
+    u = np.linalg.norm(np.nan_to_num(field.u.array_r).reshape(-1, bs), axis=1)
+    bodies = [np.nan_to_num(motion.of(field.u).array_r) for motion in field.motions]
+    least = ASTRAY * over_ranks(
+        comm, max(float(np.abs(moved).max(initial=0.0)) for moved in bodies), MPI.MAX
+    )
+    hold = field.touched.hold()
+    moves = np.where(hold <= HARDLY, hold * u, 0.0)
+    node = int(moves.argmax()) if len(moves) else -1
+    if node >= 0 and moves[node] > least:
+        x = field.V.tabulate_dof_coordinates()[node, :gdim]
+        where = tuple(float(round(c, 6)) for c in x)
+        found = _Astray(float(moves[node]), float(hold[node]), where)
+    every: list[_Astray] = comm.allgather(found)
+    return max(every)
+
+
+def _flipping(reduced: ReducedSystem, flips: Sequence[NDArray[np.int64]]) -> str:
+    """Say how many particles begin and cease to yield by turns, and where (collective)."""
+    comm: MPI.Comm = reduced.bodies[0].V.mesh.comm
+    which = comm.allgather([np.flatnonzero(each >= FLIPS) for each in flips])
+    count = sum(len(each) for rank in which for each in rank)
+    if count == 0:
+        return ""
+    bodies = [body for body in reduced.bodies if isinstance(body, Particles)]
+    places = [body.centroid[each >= FLIPS] for body, each in zip(bodies, flips, strict=False)]
+    x = np.concatenate([p for rank in comm.allgather(places) for p in rank])
+    where = tuple(float(f"{c:.4g}") for c in np.median(x, axis=0))
+    return f"; {count} particles around {where} flip between elastic and plastic"
 
 
 def _worst_dof(reduced: ReducedSystem) -> tuple[list[int], tuple[float, ...], str]:

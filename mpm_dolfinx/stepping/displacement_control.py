@@ -352,6 +352,10 @@ class ControlledSystem:
         """Return whether no history changes in the last residual, nor contact."""
         return self._reduced.smooth()
 
+    def yielding(self) -> list[NDArray[np.bool_]]:
+        """Return whether each particle yields in the last residual, for each body."""
+        return self._reduced.yielding()
+
     def prediction(self) -> PETSc.Vec | None:
         """Return unknowns to expect, with the prescribed displacement, if the past says any."""
         x = self._reduced.prediction()

@@ -288,8 +288,8 @@ class Stepper:
             self._leave(update)
         except TRIAL_ERRORS as error:
             self._take_back(run.size, end, str(error))
-            no_equilibrium = self.newton.no_equilibrium
-            if run.control.cut_back(no_equilibrium):
+            gave_up = self.newton.gave_up
+            if run.control.cut_back(gave_up):
                 owner.history.cutbacks += 1
                 tell(
                     self._comm,
@@ -300,8 +300,8 @@ class Stepper:
                     self.newton.iterations,
                 )
                 return None
-            limit = run.limit if no_equilibrium else None
-            told = placed(error, self._reduced, self.converged.parameter, limit)
+            limit = run.limit if gave_up else None
+            told = self._placed(error, self.converged.parameter, limit)
             if owner.mend(told) or (self._mender is not None and self._mender.mend(told)):
                 run.control.begin_anew()
                 return None
@@ -309,7 +309,7 @@ class Stepper:
             raise told from error.__cause__
         except MPMError as error:
             self.go_back(update)
-            told = placed(error, self._reduced, self.converged.parameter)
+            told = self._placed(error, self.converged.parameter)
             raise told from error.__cause__
         except BaseException:
             self.go_back()
@@ -317,6 +317,10 @@ class Stepper:
         if step is not None:
             run.control.accept(step.iterations)
         return step
+
+    def _placed(self, error: MPMError, reached: float, limit: str | None = None) -> MPMError:
+        """Return an error that says where and why its step failed (collective)."""
+        return placed(error, self._reduced, reached, limit, self.newton.flips)
 
     def _take_back(self, size: float, end: float, reason: str) -> None:
         """Return to the last converged step, and take note of what is lost (collective)."""
@@ -368,6 +372,7 @@ class Stepper:
             self.run, self.converged.parameter = None, self.converged.load
             try:
                 load = float(owner.bodies[0].load.value)
+                self._release.aim(self._release.remaining)
                 self._set_load(load, self.converged.proportional)
                 step = self._advance(load, self._totals())
                 assert step is not None
@@ -380,7 +385,7 @@ class Stepper:
                 if not isinstance(error, MPMError):
                     raise
                 owner.history.failed_iterations += self.newton.iterations
-                raise placed(error, self._reduced, reached) from error.__cause__
+                raise self._placed(error, reached) from error.__cause__
             self._end_step(owner)
             if interrupted(self._comm):
                 self._leave()
@@ -469,15 +474,9 @@ class Stepper:
         size = parameter - self.converged.parameter
         if control is not None:
             size = abs(parameter - control.present())
-        before = self.converged.prescribed
-        reduced.begin([new - old for new, old in zip(values, before, strict=True)], size, before)
-        system: ReducedProblem = reduced
-        displacement = None
-        if control is not None:
-            system = ControlledSystem(reduced, control, parameter, owner.bodies)
-            displacement = parameter
+        displacement = None if control is None else parameter
         experience = self.newton.experience
-        self.newton.solve(system, reduced.sizes, shorten=self.run is not None)
+        self._find_equilibrium(values, size, control, parameter)
         if (failure := owner.improper()) is not None:
             raise failure
         if run is not None and self._reject(run, size, parameter):
@@ -520,6 +519,43 @@ class Stepper:
             step.residuals[-1] if step.residuals else 0.0,
         )
         return step
+
+    def _find_equilibrium(
+        self,
+        values: list[NDArray[np.float64]],
+        size: float,
+        control: DisplacementControl | None,
+        goal: float,
+    ) -> None:
+        """Solve one step from where it is expected to end, or else from where it begins.
+
+        A prediction from which Newton's method fails is not the start of a second attempt, nor is
+        the step made smaller for it: most of what fails is near a solution that the prediction is
+        far from.
+        """
+        reduced, newton, again = self._reduced, self.newton, False
+        before = self.converged.prescribed
+        changes = [new - old for new, old in zip(values, before, strict=True)]
+        while True:
+            newton.forget()
+            reduced.begin(changes, size, before)
+            system: ReducedProblem = reduced
+            if control is not None:
+                system = ControlledSystem(reduced, control, goal, self.owner.bodies)
+            try:
+                newton.solve(system, reduced.sizes, self.run is not None, again)
+                return
+            except TRIAL_ERRORS:
+                if again or not newton.has_another_way:
+                    raise
+            again = True
+            self.owner.history.failed_iterations += newton.iterations
+            self.owner.history.statistics.count("second_attempts")
+            for body in self.owner.bodies:
+                body.roll_back()
+            if control is not None:
+                self._set_load(self.converged.load, self.converged.proportional)
+            reduced.roll_back()
 
     def _end_step(self, owner: Owner) -> None:
         with agree(self._comm, "end_step()"):

@@ -40,6 +40,9 @@ class PointHistory(PointMaterial, Protocol):
     def elastic(self) -> bool:
         """Return whether the history stays as it is in the last update."""
 
+    def yielding(self) -> NDArray[np.bool_]:
+        """Whether the history of each particle changes in the last update."""
+
     def commit(self) -> Callable[[], None]:
         """Make the last update the history; return what takes that back."""
 
@@ -163,6 +166,10 @@ class BodyTerm(Term):
     def smooth(self) -> bool:
         """See :meth:`Term.smooth`. It may differ between ranks."""
         return not self._contact and (self._material is None or self._material.elastic())
+
+    def yielding(self) -> NDArray[np.bool_] | None:
+        """See :meth:`Term.yielding`."""
+        return None if self._material is None else self._material.yielding()
 
     def residuals(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.residuals`."""

@@ -475,6 +475,19 @@ class ReducedSystem:
         smooth = [term.smooth() for term in self._terms]
         return over_ranks(self._comm, all(smooth), MPI.LAND)
 
+    def yielding(self) -> list[NDArray[np.bool_]]:
+        """Return whether each particle yields in the last residual, for each body (not collective).
+
+        In the order of those among :attr:`bodies` that are displaced.
+        """
+        displaced = [body for body in self.bodies if isinstance(body, Particles)]
+        found = {id(body): np.zeros(body.num_local, dtype=bool) for body in displaced}
+        for term in self._terms:
+            yields = term.yielding()
+            if yields is not None:
+                found[id(term.bodies[0])] |= yields
+        return list(found.values())
+
     def is_driven(self) -> bool:
         """Return whether something moves on its own path against bodies whose history changes."""
         drives = [term.drives() for term in self._terms]

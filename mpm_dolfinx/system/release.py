@@ -40,7 +40,7 @@ class Release(Term):
     def __init__(self) -> None:
         super().__init__()
         self.remaining = 0.0
-        self._factor = 0.0
+        self._aim = self._factor = 0.0
         self._nodal: list[fem.Function] = []
         self._reactions: list[fem.Function] = []
 
@@ -78,7 +78,7 @@ class Release(Term):
         return found
 
     def _let_go(self) -> None:
-        self.remaining = self._factor = 0.0
+        self.remaining = self._aim = self._factor = 0.0
         self._nodal, self._reactions = [], []
 
     def hold(self, nodal: Sequence[Array], reactions: Sequence[Array]) -> None:
@@ -92,18 +92,19 @@ class Release(Term):
         self._reactions = [_function(V, f) for V, f in zip(self._spaces, reactions, strict=True)]
         some = any(np.any(f) for f in (*nodal, *reactions))
         if self.bodies[0].mesh.comm.allreduce(some):
-            self.remaining = self._factor = 1.0
+            self.remaining = self._aim = self._factor = 1.0
         else:
             self._let_go()
 
     def aim(self, remaining: float) -> None:
-        """Take a value of s for the end of the step to try."""
-        self._factor = remaining if self._nodal else 0.0
+        """Take a value of s for the end of the steps that begin from now on."""
+        self._aim = remaining if self._nodal else 0.0
 
     # -- A step ---------------------------------------------------------------------------
 
     def begin(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.begin`."""
+        self._factor = self._aim
         return self.residuals()
 
     def residuals(self) -> Sequence[PETSc.Vec]:
@@ -188,7 +189,7 @@ class Release(Term):
         for V, columns in zip(self._spaces, taken.backgrounds, strict=True):
             self._reactions.append(fem.Function(V))
             fill(self._reactions[-1], columns["reaction"])
-        self.remaining = self._factor = remaining
+        self.remaining = self._aim = self._factor = remaining
 
 
 class _Held(Kept):

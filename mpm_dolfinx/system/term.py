@@ -212,6 +212,10 @@ class Term:
         """Return whether no history changes in the last residual, nor contact."""
         return True
 
+    def yielding(self) -> NDArray[np.bool_] | None:
+        """Whether the history of each particle of its first body changes in the last residual."""
+        return None
+
     def drives(self) -> bool:
         """Return whether it touches bodies and moves on its own path in this step, on this rank."""
         return False

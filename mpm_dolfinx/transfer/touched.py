@@ -83,6 +83,19 @@ class TouchedNodes:
         result[self.active] = True
         return result
 
+    def hold(self) -> NDArray[np.float64]:
+        """Return the largest weight of each of this rank's own nodes of V, 0 without (collective).
+
+        It is how well the bodies hold the node: 1 where one of their nodes lies on it.
+        """
+        largest = np.zeros(len(self.nodes))
+        for row in self.rows:
+            np.maximum.at(largest, row.nodes, np.abs(row.values))
+        result = np.zeros(self.num_own)
+        for own, part in zip(self._own, swap(self._comm, self._by_owner(largest)), strict=True):
+            result[own] = np.maximum(result[own], part)
+        return result
+
     def on_dofs(self, nodes: NDArray[Any]) -> NDArray[Any]:
         """Return values of this rank's own nodes of V at its own dofs."""
         return np.repeat(nodes, self.block_size)

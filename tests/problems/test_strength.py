@@ -3,6 +3,7 @@
 """Factors of safety by one call, against a published slope and a bound of limit analysis."""
 
 import signal
+import warnings
 
 from mpi4py.MPI import MAX
 
@@ -242,6 +243,7 @@ class Watched(mpm.QuasiStaticProblem):
         """Do something after it."""
 
 
+@pytest.mark.filterwarnings("ignore:The factor of safety")
 @pytest.mark.parametrize("step", [0.02, 0.05, 0.1, 0.2])
 def test_what_fails_from_afar_is_tried_again_from_nearer(step):
     """Where increments of more than 0.04 fail from 1.3 on, and all beyond 1.42."""
@@ -260,12 +262,53 @@ def test_what_fails_from_afar_is_tried_again_from_nearer(step):
     assert 1.41 <= found.factor <= 1.42 < found.above <= found.factor + 0.01
 
 
+@pytest.mark.parametrize("limit", [None, np.inf])
+def test_failures_far_from_a_slide_are_told(limit):
+    problem = block(kind=Watched)
+    problem.solve(2)
+
+    def newton(factor):
+        if factor > 1.21:
+            raise mpm.ConvergenceError("It does not converge.", [3])
+
+    problem.before = newton
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = mpm.strength_reduction(problem, displacement=limit)
+    if WORLD.rank == 0:
+        told = "may be too low: at 1.2125 Newton's method failed"
+        assert told in str(caught[-1].message) and "It does not converge" in str(caught[-1].message)
+    assert found.reason == "no convergence" and found.failure.particles == [3]
+    np.testing.assert_array_equal(found.curve, np.transpose([found.factors, found.displacements]))
+
+
+def test_states_that_cannot_repeat_their_step_are_refused():
+    problem = block(kind=Watched)
+    problem.solve(2)
+
+    def newton(factor):
+        raise mpm.ConvergenceError("It does not converge.", [3])
+
+    problem.before = newton
+    with pytest.raises(mpm.MPMError, match="a factor would mean nothing: It does not") as caught:
+        mpm.strength_reduction(problem)
+    assert caught.value.particles == [3] and problem.points[0].weakening == 1.0
+    problem.before = lambda factor: None
+    with pytest.raises(mpm.MPMError, match="beyond the limit 1e-30"):
+        problem.particles.load.value = 1.01
+        mpm.strength_reduction(problem, displacement=1e-30)
+
+
 def test_what_moves_too_far_is_not_tried_again():
     problem = block(kind=Watched)
     problem.solve(2)
     found = mpm.strength_reduction(problem, step=0.5, displacement=0.2)
     fell = [f for f in problem.tried if f not in found.factors]
     assert fell == sorted(set(fell), reverse=True) and found.above == fell[-1]
+    assert found.reason == "displacement" and found.failure is None
+    last = len(found.factors)
+    np.testing.assert_array_equal(found.curve[:last].T, [found.factors, found.displacements])
+    assert found.curve[last, 0] == found.above and found.curve[last, 1] > 0.2
     assert found.displacements[-1] <= 0.2 and len(fell) >= 3
     other = block()
     other.solve(2)
@@ -291,16 +334,16 @@ def test_interrupted_reduction_leaves_the_last_state_that_counts(ends, limit):
     law, here = problem.points[0], {}
 
     def after(factor):
-        if len(problem.tried) == 2:
+        if len(problem.tried) == 3:
             here["d"] = problem.particles.converged_displacement.copy()
             here["steps"] = len(problem.history.steps)
-        elif len(problem.tried) == 3:
+        elif len(problem.tried) == 4:
             ends()
 
     problem.after = after
     with pytest.raises(KeyboardInterrupt if ends is ctrl_c else ZeroDivisionError):
         mpm.strength_reduction(problem, displacement=limit)
-    assert problem.tried == [1.1, 1.2, 1.3] and problem.points[0].weakening == 1.0
+    assert problem.tried == [1.0, 1.1, 1.2, 1.3] and problem.points[0].weakening == 1.0
     np.testing.assert_array_equal(problem.particles.converged_displacement, here["d"])
     assert problem.points[0] is law and len(problem.history.steps) == here["steps"]
     problem.step()  # and with the strength that was given it stands there
@@ -315,6 +358,7 @@ def test_domains_that_may_be_split_are_refused():
     problem.particles.on_distortion = "error"
     found = mpm.strength_reduction(problem, tolerance=0.1, most=1.2, displacement=np.inf)
     assert found.factor == 1.2 and found.above == found.limit == np.inf
+    assert found.reason == "most"
 
 
 def test_a_law_without_strength_is_refused():

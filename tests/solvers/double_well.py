@@ -39,6 +39,9 @@ class DoubleWell:
     def smooth(self):
         return True
 
+    def yielding(self):
+        return []
+
     def diagonal(self, K):
         sizes = K.getDiagonal()
         sizes.abs()

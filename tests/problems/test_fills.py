@@ -1,0 +1,64 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Fills of soil without dilation on soft clay: they stand, and what fails is told by its cause."""
+
+import warnings
+
+import pytest
+from scenes import QUADRILATERAL, WORLD, at, box, fix, vectors
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx import materials
+
+GRAVITY = (0.0, -10.0)
+
+
+def fill(lifts, rows, cutoff=None, **options):
+    """Return an embankment of height 2 and slope 1:2 (kPa, m, t), built in lifts."""
+    V = vectors(box([0, 0], [26, 9], [26, 9], QUADRILATERAL))
+    problem = mpm.QuasiStaticProblem(
+        mpm.Particles(box([0, 0], [26, 6], [52, 12], QUADRILATERAL), V),
+        materials.Tresca(4500.0, 0.49, cohesion=15.0),
+        density=1.6,
+        body_force=GRAVITY,
+        bcs=[fix(V, at(0, 0, 26), component=0), *(fix(V, at(1, 0), component=i) for i in (0, 1))],
+        f_bar="patch",
+        initial_stress=mpm.geostatic(6.0, 1.6, 0.8, GRAVITY),
+        **options,
+    )
+    problem.solve()
+    given = {} if cutoff is None else {"tension_cutoff": cutoff}
+    soil = materials.MohrCoulomb(2e4, 0.3, cohesion=2.0, friction_angle=32.0, **given)
+    height = 2.0 / lifts
+    for k in range(lifts):
+        lift = box([0, 0], [1, 1], [16, rows], QUADRILATERAL)
+        x = lift.geometry.x
+        x[:, 1] = 6.0 + height * (k + x[:, 1])
+        x[:, 0] *= 4.0 + 2.0 * (8.0 - x[:, 1])
+        problem.add(mpm.Particles(lift, V), soil, density=1.9, body_force=GRAVITY)
+        problem.solve(3)
+    return problem
+
+
+@pytest.mark.parametrize("lifts", [1, 2])
+def test_what_a_prediction_is_too_far_from_is_found_from_zero(lifts):
+    """Newton's method goes round from the prediction, and takes few solves from zero."""
+    problem = fill(lifts, 4 // lifts)
+    assert problem.history.cutbacks == 0
+    assert problem.history.statistics["second_attempts"] > 0
+    assert problem.history.total_iterations <= 75
+
+
+def test_a_node_that_is_hardly_held_is_named():
+    """The toe of a lift hangs on a node of weight 2e-7, as it is a row of cells too high."""
+    problem = fill(4, 1, stabilisation=None)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = mpm.strength_reduction(problem, tolerance=0.05, displacement=0.3)
+    assert found.reason == "no convergence" and found.factor < 1.5
+    assert found.displacements[-1] < 0.01 * found.limit
+    cause = "the background's node near (7.0, 8.0) is held by next to nothing (a weight of 1.9e-07)"
+    assert cause in str(found.failure)
+    if WORLD.rank == 0:
+        assert "may be too low" in str(caught[-1].message) and cause in str(caught[-1].message)
+    assert "limit load" not in str(found.failure)
