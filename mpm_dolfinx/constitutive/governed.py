@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .._core import is_as_inherited
 from ..errors import ConvergenceError, MPMError, as_ours
 from ..materials.base import Material, State, StrainMaterial, Update
 from ..materials.kinematics import KINEMATICS
@@ -221,7 +222,7 @@ class Governed:
         Raises:
             MPMError: The law gives something else.
         """
-        if not _is_as_inherited(type(self.material), "plastic_work"):
+        if not is_as_inherited(self.material, "plastic_work"):
             return None
         return self._known("plastic work", self.material.plastic_work(state))
 
@@ -293,17 +294,6 @@ class Governed:
         particles = np.unique(self.particles.global_index[domains])
         where = " (at {particles})" if len(particles) else ""
         return type(error)(error.message.rstrip(".") + where, particles)
-
-
-def _is_as_inherited(law: type, name: str) -> bool:
-    """Return whether heirs of the class that a function is of change nothing else of that class."""
-    heirs: list[type] = []
-    for its in law.__mro__:
-        if name in vars(its):
-            changed = {other for heir in heirs for other in vars(heir) if hasattr(its, other)}
-            return all(other.startswith("__") or other == "_abc_impl" for other in changed)
-        heirs.append(its)
-    raise AttributeError(name)
 
 
 def _read_only(values: NDArray[Any]) -> NDArray[Any]:

@@ -12,11 +12,12 @@ and has that size (the return mapping of Wriggers 2006, Computational Contact Me
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .._core import is_as_inherited
 from ..errors import MPMError
 
 __all__ = [
@@ -38,6 +39,8 @@ __all__ = [
 class Coulomb:
     """Friction that does not depend on the velocity: at most ``min(friction p + cohesion, limit)``.
 
+    An heir has another bound by :meth:`bound`, of which derivatives are taken by complex steps.
+
     Args:
         friction: Coefficient of friction.
         cohesion: Shear traction that is borne without pressure, where bodies touch, per area of
@@ -51,6 +54,7 @@ class Coulomb:
     friction: float = 0.0
     cohesion: float = 0.0
     limit: float = np.inf
+    _loop: ClassVar[str] = "coulomb"
 
     def __post_init__(self) -> None:
         """Say so where a number makes no sense."""
@@ -63,12 +67,14 @@ class Coulomb:
     @property
     def smooth(self) -> bool:
         """Whether there is no friction at all."""
-        return self.limit == 0.0 or (self.friction == 0.0 and self.cohesion == 0.0)
+        none = self.limit == 0.0 or (self.friction == 0.0 and self.cohesion == 0.0)
+        return none and type(self).bound is Coulomb.bound
 
     @property
     def by_area(self) -> bool:
         """Whether a part of it does not grow with the pressure, but with the area."""
-        return self.cohesion > 0.0 or np.isfinite(self.limit)
+        known = type(self).bound is Coulomb.bound
+        return not known or self.cohesion > 0.0 or bool(np.isfinite(self.limit))
 
     def bound(
         self, p: NDArray[Any], stretch: NDArray[np.float64]
@@ -83,6 +89,42 @@ class Coulomb:
         limit = self.limit * stretch
         free = (bound.real < limit) & (p.real > 0.0)
         return np.where(bound.real < limit, bound, limit), self.friction * free
+
+    def shared(self, share: float) -> Coulomb:
+        """Return the friction of points that bear a share of the pressure, and of its bound."""
+        if is_as_inherited(self, "_loop"):
+            return Coulomb(self.friction, share * self.cohesion, share * self.limit)
+        return _Shared(self.friction, self.cohesion, self.limit, self, share)
+
+
+@dataclass(frozen=True)
+class _Shared(Coulomb):
+    """Friction by an heir's law, of points that bear a share of the pressure.
+
+    Attributes:
+        whole: The law of points that bear all of it.
+        share: The share.
+    """
+
+    whole: Coulomb = Coulomb()
+    share: float = 1.0
+
+    @property
+    def smooth(self) -> bool:
+        """See :class:`Coulomb`."""
+        return self.whole.smooth
+
+    @property
+    def by_area(self) -> bool:
+        """See :class:`Coulomb`."""
+        return self.whole.by_area
+
+    def bound(
+        self, p: NDArray[Any], stretch: NDArray[np.float64]
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """See :class:`Coulomb`."""
+        bound, slope = self.whole.bound(p / self.share, stretch)
+        return self.share * bound, slope
 
 
 def as_friction(value: Any) -> Coulomb:

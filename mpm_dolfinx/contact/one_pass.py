@@ -126,7 +126,7 @@ class Pass:
         """
         # (pressure has its share by stiffness)
         law, self.share = self._whole, share
-        self.law = replace(law, cohesion=share * law.cohesion, limit=share * law.limit)
+        self.law = law.shared(share)
         facing = float(np.median(np.concatenate(self._comm.allgather(target))))
         k = share / (1.0 / source + 1.0 / facing) if len(source) else source
         self._stiffness = k

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .._core import loops
+from .._core import is_as_inherited, loops
 from .facets import Table, solved
 from .law import Coulomb, Points, Traction, nitsche, push_derivative, traction
 from .surface import normals
@@ -240,6 +240,11 @@ def by_stress(law: Coulomb, stencil: Stencil, touch: float) -> tuple[Array, Arra
     return foot.n, by * push.acts[:, None, None]
 
 
+def _is_compiled(law: Coulomb, stencil: Stencil) -> bool:
+    """Return whether there are compiled loops for a law and points."""
+    return stencil.start is None and is_as_inherited(law, "_loop")
+
+
 def _compiled_arguments(law: Coulomb, stencil: Stencil, touch: float) -> tuple[Any, ...]:
     """Return what the compiled loops take."""
     points = stencil.points
@@ -264,7 +269,7 @@ def acting_now(law: Coulomb, stencil: Stencil, touch: float, extent: float) -> A
         touch: As there.
         extent: As there.
     """
-    if stencil.start is not None:
+    if not _is_compiled(law, stencil):
         return acting(law, stencil, stencil.x, touch, extent)
     n, _, gdim = stencil.x.shape
     pushes, rubs = (np.zeros((n, 1 + stencil.anchored.shape[1], gdim)) for _ in range(2))
@@ -294,7 +299,7 @@ def add_tangents(law: Coulomb, stencil: Stencil, touch: float, extent: float, su
     if len(stencil.x) == 0:
         return
     where = [np.ascontiguousarray(part) for part in sums[:4]]
-    if stencil.start is None:
+    if _is_compiled(law, stencil):
         arguments = _compiled_arguments(law, stencil, touch)
         loops.add_tangents(*arguments, *where, sums.values)
         return

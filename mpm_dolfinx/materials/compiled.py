@@ -4,10 +4,12 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 
-from .._core import loops
+from .._core import is_as_inherited, loops
 from ..errors import ConvergenceError
 from .base import Parameter, State, StrainMaterial, Update
 from .given_pressure import ALPHA, AtPressure
@@ -22,8 +24,14 @@ type Array = NDArray[np.float64]
 class CompiledMaterial(StrainMaterial):
     """A law that may have a compiled update: its class names it in ``_loop``.
 
-    A law derived from it, which may integrate otherwise, is updated in Python.
+    A law derived from it that overrides anything of it is updated in Python.
     """
+
+    _loop: ClassVar[str] = ""
+
+    def _known_loop(self) -> str:
+        """Return the name of the compiled update that may be used, or nothing."""
+        return self._loop if is_as_inherited(self, "_loop") else ""
 
     def _constants(self) -> tuple[Parameter, ...]:
         """Return what the compiled law has for parameters, as ``material.h`` lists them."""
@@ -31,8 +39,8 @@ class CompiledMaterial(StrainMaterial):
 
     def update(self, displacement_gradient: Array, state: State, tangent: bool = True) -> Update:
         """See :meth:`Material.update`."""
-        loop = vars(type(self)).get("_loop")
-        if loop is None:
+        loop = self._known_loop()
+        if not loop:
             return super().update(displacement_gradient, state, tangent)
         H = np.ascontiguousarray(displacement_gradient)
         n, dim, _ = H.shape
@@ -52,9 +60,8 @@ class CompiledMaterial(StrainMaterial):
         self, displacement_gradient: Array, state: State, pressure: Array, shear: Array
     ) -> AtPressure:
         """See :meth:`StrainMaterial.at_pressure`."""
-        loop = vars(type(self)).get("_loop")
-        remembers = "displacement_gradient" in state
-        if loop is None or not remembers:
+        loop = self._known_loop()
+        if not loop or "displacement_gradient" not in state:
             return super().at_pressure(displacement_gradient, state, pressure, shear)
         H = np.ascontiguousarray(displacement_gradient)
         n, dim, _ = H.shape

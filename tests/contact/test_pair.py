@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import error_of_a_term, outcome, same_run
+from obstacles import on_plane
 from pairs import POISSON, YOUNG, balance, fail_after, go_on_other_meshes, hertz, patch, spaces, two
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 
@@ -422,3 +423,47 @@ def test_a_slit_in_one_body_does_not_close():
     gap = (high - low) / 0.05
     assert 0.5 < gap.min() and gap.max() < 1.0  # 0.2 cells at first, and as a material since then
     assert forces[0] == pytest.approx(forces[1], rel=0.05)
+
+
+class Half(contact.Coulomb):
+    """An heir of Coulomb's law with half the bound, which knows no other part of it."""
+
+    def bound(self, p, stretch):
+        bound, slope = super().bound(p, stretch)
+        return 0.5 * bound, 0.5 * slope
+
+
+class Flat(contact.Coulomb):
+    """A law of a bound that is its own."""
+
+    def bound(self, p, stretch):
+        pressed = p.real > 0.0
+        return np.where(pressed, 0.2 * p + 0.5 * stretch, 0.5 * stretch), 0.2 * pressed
+
+
+@pytest.mark.parametrize(
+    ("heir", "law", "passes"),
+    [
+        (Half(0.4), contact.Coulomb(0.2), 2),
+        (Half(0.4, 2.0, 12.0), contact.Coulomb(0.2, 1.0, 6.0), 2),
+        (Flat(), contact.Coulomb(0.2, 0.5), 2),
+        (Flat(), contact.Coulomb(0.2, 0.5), 1),
+    ],
+)
+def test_an_heir_of_coulombs_law_has_its_own_bound(heir, law, passes):
+    found = []
+    for friction in (heir, law):
+        problem, touch, path = two(friction=friction, passes=passes)
+        problem.solver.setTolerances(rtol=1e-12)
+        problem.solve(3, update=path)
+        assert WORLD.allreduce(int((touch.touches & ~touch.sticks).sum())) > 0
+        found.append(touch.reaction)
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-9)
+
+
+def test_an_heir_of_coulombs_law_holds_a_block_on_an_obstacle():
+    # (its coefficient is that of no friction)
+    problem, ground, force = on_plane(Flat())
+    force.value[:] = (1.0, -10.0)
+    problem.solve(2)
+    np.testing.assert_allclose(problem.reaction(ground), (-0.5, 5.0), rtol=1e-6)

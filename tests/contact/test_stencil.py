@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """What acts between points and facets: compiled loops against NumPy and the complex step."""
 
+import inspect
+
 import numpy as np
 import pytest
 
@@ -180,3 +182,17 @@ def test_blocks_that_are_not_there_are_refused():
     ):
         with pytest.raises(ValueError, match="shapes do not go together"):
             stencil.add_tangents(law, points, TOUCH, EXTENT, wrong)
+
+
+def test_an_heir_that_overrides_anything_has_no_compiled_loops(monkeypatch):
+    monkeypatch.setattr(stencil, "loops", object())  # any use of which is an error
+    points = meeting("line", Coulomb(0.3))
+    new = type("New", (Coulomb,), {"colour": "red"})
+    for law in (Coulomb(0.3), new(0.3)):
+        with pytest.raises(AttributeError, match="act"):
+            stencil.acting_now(law, points, TOUCH, EXTENT)
+    names = [name for name in vars(Coulomb) if not name.startswith("__") and name != "_loop"]
+    assert {"bound", "smooth", "friction", "limit"} <= set(names)
+    for name in names:
+        heir = type("Heir", (Coulomb,), {name: inspect.getattr_static(Coulomb, name)})
+        stencil.acting_now(heir(0.3), points, TOUCH, EXTENT)

@@ -2,12 +2,17 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """The compiled updates against NumPy's."""
 
+import copy
+import functools
+import inspect
+
 import numpy as np
 import pytest
 from laws import in_python
 from marks import slow
 from materials.test_von_mises import random_path
 
+import mpm_dolfinx.materials
 from mpm_dolfinx import DomainDistortionError
 from mpm_dolfinx._core import loops
 from mpm_dolfinx.materials import (
@@ -130,3 +135,35 @@ def test_a_gradient_that_may_be_written_to_is_copied():
     H.flags.writeable = False
     given = law.update(H, law.initial_state(3, 2)).state["displacement_gradient"]
     assert np.shares_memory(given, H)
+
+
+def test_an_heir_that_overrides_anything_has_no_compiled_update(monkeypatch):
+    # Any use of loops that are none is an error.
+    monkeypatch.setattr(mpm_dolfinx.materials.compiled, "loops", object())
+    H = 1e-3 * np.random.default_rng(1).normal(size=(COUNT, 2, 2))
+    every = {type(law): law for law in LAWS.values()}
+    known = {law for law in vars(mpm_dolfinx.materials).values() if "_loop" in vars_of(law)}
+    assert known == set(every)
+    for law, made in every.items():
+        state, new = made.initial_state(COUNT, 2), type("New", (law,), {"colour": "red"})
+        for its in (law, new):
+            with pytest.raises(AttributeError, match=r"update_(hencky|plastic)"):
+                as_a(its, made).update(H, state)
+        for name in dir(law):
+            if not name.startswith("__") and name not in ("_abc_impl", "_loop"):
+                heir = type("Heir", (law,), {name: inspect.getattr_static(law, name)})
+                as_a(heir, made).update(H, state)
+    own = as_a(VonMises, LAWS["perfect"])
+    own.integrate = functools.partial(VonMises.integrate, own)
+    own.update(H, own.initial_state(COUNT, 2))
+
+
+def vars_of(one):
+    return vars(one) if isinstance(one, type) else ()
+
+
+def as_a(law, made):
+    """Return a law as one of another class."""
+    other = copy.copy(made)
+    other.__class__ = law
+    return other
