@@ -97,6 +97,10 @@ class BodyContact(Rigid):
         """
         raise MPMError("A contact of a RigidBody is moved by it; use move() of the RigidBody.")
 
+    def _turn(self, last: Pose, pose: Pose) -> float:
+        """See :class:`Rigid`; its vector of rotation in space tells no whole turns."""
+        return pose.least_turn_from(last)
+
     def begin(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.begin`; where the rigid body goes is found out later."""
         self._settle()

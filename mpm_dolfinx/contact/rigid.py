@@ -40,6 +40,9 @@ __all__ = ["Rigid"]
 
 #: Penetration, over the thickness of the domain behind, of a body that is given in an obstacle.
 OVERLAP = 0.1
+#: Most that an obstacle turns in a step at whose end points rub against it: friction is along the
+#: chord of their way in its frame.
+MOST_TURN = 0.5 * np.pi
 #: Difference of normals, and of gaps over the body's coordinates, of obstacles in the same place.
 SAME = 1e-10
 #: Most points of each rank at which the shapes of ranks are compared.
@@ -446,6 +449,14 @@ class Rigid(Contact):
                 failure = ConvergenceError(
                     "A body goes through the obstacle of a Rigid in one step; take smaller steps"
                 )
+            turn = self._turn(before.pose, trial.pose)
+            rubs = not self.friction.smooth and bool(trial.touched.any())
+            if rubs and turn > MOST_TURN * (1.0 + SAME):
+                failure = ConvergenceError(
+                    f"An obstacle turns by {turn:.3g} rad in one step, and friction follows a "
+                    "quarter of a turn at most; turn it in smaller steps, by a path (update=), and "
+                    "count whole turns on"
+                )
         except MPMError as error:
             failure = error
         if (failure := agreed(self._comm, failure)) is not None:
@@ -457,6 +468,10 @@ class Rigid(Contact):
             self._memory = before
 
         return undo
+
+    def _turn(self, last: Pose, pose: Pose) -> float:
+        """Return the angle by which the obstacle has turned in a step."""
+        return pose.turn_from(last)
 
     def _exact(self, memory: Memory, which: NDArray[np.int64] | None = None) -> Memory:
         """Return what is known with the gaps of all points of some facets, or of all facets."""

@@ -54,6 +54,8 @@ LOOSE = 1e-11
 NEAR, LEAST = 1e-7, 8.0
 #: Most that a body turns in one iteration.
 MOST_TURN = 0.5
+#: Largest Cayley vector of a free body in a step of a motion: its angle lags by 2 % then.
+MOST_SPIN = 0.5
 #: Drag on a body that creeps to its balance, over the largest stiffness, to begin with; by how much
 #: it changes in an iteration at most, down and up; and how much larger the residual may become.
 DRAG, FADES, RISES, GROWS = 0.1, 0.25, 4.0, 2.0
@@ -634,7 +636,17 @@ class RigidBody(Term):
         return forces
 
     def commit(self) -> Callable[[], None]:
-        """See :meth:`Term.commit`."""
+        """See :meth:`Term.commit`.
+
+        Raises:
+            ConvergenceError: It turns too far for the scheme, or a contact is refused.
+        """
+        turn = float(np.linalg.norm(self._found[self.shape.dim :]))
+        if self._motion.dt is not None and not self._held[-1] and turn > MOST_SPIN:
+            raise ConvergenceError(
+                f"A RigidBody spins by {turn:.3g} rad in one step, of which the scheme follows "
+                f"{MOST_SPIN:g}; take smaller steps"
+            )
         before = self._memory
         done: list[Callable[[], None]] = []
 

@@ -82,6 +82,15 @@ class Pose:
         same = np.array_equal(self.offset, other.offset)
         return same and np.array_equal(self.angle, other.angle)
 
+    def turn_from(self, other: Pose) -> float:
+        """Return the angle of the turn from another pose; whole turns count."""
+        return float(np.linalg.norm(self.angle - other.angle))
+
+    def least_turn_from(self, other: Pose) -> float:
+        """Return the angle of the least turn from another pose, at most half a turn."""
+        Q = self.Q @ other.Q.T
+        return 2.0 * float(np.arcsin(min(1.0, np.linalg.norm(Q - np.eye(len(Q))) / np.sqrt(8.0))))
+
     def mean(self, other: Pose) -> NDArray[np.float64]:
         """Return the mean of the rotations of two poses, which is none itself."""
         return np.asarray(0.5 * (self.Q + other.Q))
