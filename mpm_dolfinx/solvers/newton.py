@@ -185,6 +185,7 @@ class NewtonSolver:
         self.lets_go = self.gives_up_early = self._hurries = self._misled = False
         self._centre: PETSc.Vec | None = None
         self._failure: MPMError | None = None
+        self._asked: tuple[PETSc.Mat, ...] = ()
         self._raised: BaseException | None = None
         self._known = self._fresh = False
         self._kept = KEPT
@@ -598,6 +599,8 @@ class NewtonSolver:
             self.snes.setJacobian(self._callback(self._jacobian), K, self._factor.P)
 
     def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
+        # SNES notes x at these when this returns, also where it has been given others by then.
+        self._asked = A, P
         if not self._fresh:
             self._set_tangent(self._problem.tangent())
         self._fresh = False

@@ -4,6 +4,7 @@
 
 import gc
 import weakref
+from functools import partial
 
 from mpi4py import MPI
 
@@ -15,6 +16,7 @@ from routes import on_route
 from dolfinx import fem
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx import contact
 
 
 def test_a_problem_ends_with_its_last_reference():
@@ -104,16 +106,90 @@ def with_a_pressure():
     problem.solve(1)
 
 
-@pytest.mark.mpi
-@pytest.mark.filterwarnings("ignore:The domains have")
-def test_problems_leave_no_communicator():
-    kinds = [loaded, repartitioned, split, on_reference_route, moving, with_a_pressure]
+def with_water():
+    V = scenes.vectors(scenes.box([-0.5] * 2, [1.5] * 2, [4, 4], scenes.QUADRILATERAL), 2)
+    body = mpm.Particles(scenes.unit(2, scenes.QUADRILATERAL), V, degree=2)
+    law = mpm.materials.Hencky(1e3, 0.3)
+    mpm.PorousProblem(body, law, 0.02, body_force=(0.0, -1.0), bcs=on_the_ground(V)).step(0.05)
 
+
+def on_the_ground(V):
+    return [fem.dirichletbc(np.zeros(2), fem.locate_dofs_geometrical(V, lambda x: x[1] < 0.1), V)]
+
+
+def ground():
+    V = scenes.vectors(scenes.box([-0.5] * 2, [1.5] * 2, [4, 4], scenes.QUADRILATERAL))
+    return mpm.Particles(scenes.unit(2, scenes.QUADRILATERAL), V, quadrature_degree=2)
+
+
+def pressed(law):
+    body = ground()
+    die = contact.Rigid(body, contact.disc((0.5, 1.51), 0.5), 0.4, law=law)
+    law = mpm.materials.Hencky(1e3, 0.3)
+    problem = mpm.QuasiStaticProblem(body, law, bcs=on_the_ground(body.V), terms=[die])
+    die.move((0.0, -0.03))
+    problem.step()
+
+
+def under_a_footing():
+    body = ground()
+    shape = contact.box((0.2, 1.0), (0.8, 1.5), radius=0.1)
+    footing = contact.RigidBody(body, shape, centre=(0.5, 1.0), friction=0.5)
+    law = mpm.materials.Hencky(1e3, 0.3)
+    problem = mpm.QuasiStaticProblem(body, law, bcs=on_the_ground(body.V), terms=[footing])
+    footing.push((0.0, -10.0))
+    problem.step()
+
+
+def two_bodies(term):
+    background = scenes.box([-0.5] * 2, [1.5] * 2, [4, 4], scenes.QUADRILATERAL)
+    upper, lower = (
+        mpm.Particles(
+            scenes.box(*corners, [3, 2], scenes.QUADRILATERAL),
+            scenes.vectors(background),
+            quadrature_degree=2,
+        )
+        for corners in (([0.1, 0.5], [0.9, 1.0]), ([0.0, 0.0], [1.0, 0.5]))
+    )
+    law = mpm.materials.Hencky(1e3, 0.3)
+    bcs = [
+        fem.dirichletbc(fem.Constant(background, (0.0, value)), dofs, V)
+        for V, value, inside in (
+            (upper.V, -0.02, lambda x: x[1] > 0.9),
+            (lower.V, 0.0, lambda x: x[1] < 0.1),
+        )
+        for dofs in [fem.locate_dofs_geometrical(V, inside)]
+    ]
+    mpm.QuasiStaticProblem([upper, lower], law, bcs=bcs, terms=[term(upper, lower)]).step()
+
+
+def tied(a, b):
+    return mpm.Tie(a, b, scenes.facet_tags(a.mesh, scenes.at(1, 0.5)), 1, 1e4)
+
+
+def staged():
+    problem = scenes.block()
+    problem.solve(1)
+    problem.stage(density=2.0)
+    problem.solve(1)
+
+
+KINDS = {
+    **{f.__name__: f for f in (loaded, repartitioned, split, on_reference_route, moving, staged)},
+    **{f.__name__: f for f in (with_a_pressure, with_water, under_a_footing)},
+    **{f"pressed, {law}": partial(pressed, law) for law in ("penalty", "nitsche")},
+    "a pair": partial(two_bodies, contact.Pair),
+    "tied": partial(two_bodies, tied),
+}
+
+
+@pytest.mark.filterwarnings("ignore:The domains have")
+@pytest.mark.parametrize("kind", KINDS)
+def test_problems_leave_no_communicator(kind):
     def run(times):
         for _ in range(times):
-            for kind in kinds:
-                kind()
-                gc.collect()
+            KINDS[kind]()
+            gc.collect()
 
     run(1)
     before = free_communicators()
