@@ -64,6 +64,22 @@ def held(kind, **options):
     return build
 
 
+def tie(**options):
+    """Return a function that makes a tie of two bodies of which one lies on the other."""
+
+    def build():
+        a, b = (
+            mpm.Particles(
+                scenes.box(low, high, (2, 1), QUADRILATERAL), scenes.vectors(background())
+            )
+            for low, high in (([0.0, 0.0], [1.0, 0.5]), ([0.0, 0.5], [1.0, 1.0]))
+        )
+        tags = scenes.facet_tags(a.mesh, scenes.at(1, 0.5))
+        return mpm.Tie(a, b, tags, 1, **{"stiffness": 1e5} | options)
+
+    return build
+
+
 def touching(domain, where):
     """Return the input indices of all cells with a vertex where a marker holds."""
     vertices = domain.geometry.x[_compat.geometry_dofmap(domain)]

@@ -8,11 +8,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import ufl
+from dolfinx import fem
 
 from ..constitutive.strain import Strain
+from ..particles.particles import Particles
 from .inputs import as_expression, facet_measure
 
-__all__ = ["VirtualWork"]
+__all__ = ["VirtualWork", "changeable"]
 
 
 class VirtualWork:
@@ -67,3 +69,9 @@ class VirtualWork:
             for p, tag in loads
         ]
         return self._at_load(terms)
+
+
+def changeable(load: ufl.Form, particles: Particles) -> list[fem.Constant | fem.Function]:
+    """Return the Constants and Functions of a load that a user may change, none of the body's."""
+    own = (particles.load, particles.displacement)
+    return [f for f in (*load.constants(), *load.coefficients()) if all(f is not o for o in own)]

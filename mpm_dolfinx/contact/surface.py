@@ -20,6 +20,7 @@ from .. import _compat
 from ..assembly.inputs import is_tag, known_tags
 from ..errors import MPMError
 from ..meshes.remesh import Column
+from ..parallel.given import require_degree
 from ..particles.particles import Particles
 
 __all__ = [
@@ -154,12 +155,7 @@ class Surface:
     ) -> None:
         if degree is None:
             degree = 2 * int(particles.W.ufl_element().degree) + 1
-        whole = isinstance(degree, int | np.integer) and not isinstance(degree, bool)
-        if not whole or not 0 <= degree <= MOST:
-            raise MPMError(
-                f"quadrature_degree of {what} must be a whole number from 0 to {MOST}, not "
-                f"{degree!r}."
-            )
+        require_degree(f"quadrature_degree of {what}", degree, MOST)
         self.particles = particles
         self.axisymmetric = axisymmetric
         self._where = Facets(particles, facet_tags, tag, what)

@@ -10,15 +10,26 @@ import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from mpi4py import MPI
 
 from ..errors import MPMError, agree
 
-__all__ = ["complaint", "kind_of", "replace", "require_ordinary"]
+__all__ = ["as_path", "complaint", "kind_of", "replace", "require_ordinary"]
 
 PIECE = 1 << 28
+
+
+def as_path(path: Any) -> Path:
+    """Return a name of a file that a user gives.
+
+    Raises:
+        MPMError: It is none.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise MPMError(f"path must be the name of a file, such as 'run.pvd', not {path!r}.")
+    return Path(path)
 
 
 def replace(comm: MPI.Comm, path: Path, size: int, pieces: Iterable[tuple[int, bytes]]) -> None:

@@ -248,9 +248,24 @@ class Material(ABC):
         )
 
     def with_parameters(self, **parameters: Parameter) -> Self:
-        """Return a copy of this material with other values of some parameters."""
+        """Return a copy of this material with other values of some parameters.
+
+        Raises:
+            MPMError: It has no such parameter, or a value is not allowed.
+        """
+        known = {*self.parameters, *self.limits}
+        for name in parameters:
+            if name not in known:
+                raise MPMError(
+                    f"A {type(self).__name__} has no parameter {name!r}; there are "
+                    f"{', '.join(sorted(known))}."
+                )
+        checked = {
+            name: check_parameter(name, value, **self.limits.get(name, {}))
+            for name, value in parameters.items()
+        }
         other = copy.copy(self)
-        other.parameters = {**self.parameters, **parameters}
+        other.parameters = {**self.parameters, **checked}
         return other
 
     def weakened(self, factor: float) -> Self:
@@ -504,6 +519,8 @@ def check_parameter(
     held = isinstance(getattr(value, "value", None), np.ndarray)  # a Constant
     given: Any = value.x.array if hasattr(value, "x") else getattr(value, "value", value)
     try:
+        if isinstance(given, bool):
+            raise TypeError("a truth is no number")
         values = as_reals(given)
     except (TypeError, ValueError):
         raise MPMError(f"{name} must be a number or one number per point, not {value!r}") from None

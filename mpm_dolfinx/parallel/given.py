@@ -22,7 +22,7 @@ from ufl.corealg.traversal import traverse_unique_terminals
 
 from ..errors import MPMError
 
-__all__ = ["require_same"]
+__all__ = ["require_degree", "require_same", "require_truth"]
 
 #: What describes a law besides its parameters.
 KINDS = ("symmetric", "kinematics", "inelastic")
@@ -59,6 +59,30 @@ def require_same(comm: MPI.Comm, **given: Any) -> None:
                 f"{name} differs between the ranks: {values[0]} on rank 0, {values[rank]} on rank "
                 f"{rank}; give the same on all."
             )
+
+
+def require_truth(name: str, value: Any) -> None:
+    """Raise an error unless an option is a truth.
+
+    Args:
+        name: What it is called in a message.
+        value: What is given.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise MPMError(f"{name} must be True or False, not {value!r}.")
+
+
+def require_degree(name: str, value: Any, most: int) -> None:
+    """Raise an error unless a value is a degree of a rule.
+
+    Args:
+        name: What it is called in a message.
+        value: What is given.
+        most: The highest.
+    """
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or not 0 <= value <= most:
+        raise MPMError(f"{name} must be a whole number from 0 to {most}, not {value!r}.")
 
 
 def _parts(name: str, value: Any) -> Iterator[tuple[str, str]]:

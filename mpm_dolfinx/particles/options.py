@@ -22,6 +22,7 @@ from ..meshes.boxes import BOX_CELLS
 from ..meshes.jacobian_bound import JacobianBound
 from ..meshes.quadrature import default_degree
 from ..parallel.exchange import swap
+from ..parallel.given import require_degree
 from ..reals import is_one_of
 from ..transfer.methods import METHODS
 
@@ -34,6 +35,8 @@ __all__ = [
 ]
 
 DEGREES = (1, 2, 3)
+#: Highest degree of the rule that carries the history: 16 points each way.
+HIGHEST = 30
 #: Curved cells looked at together.
 BLOCK = 1 << 14
 
@@ -138,7 +141,7 @@ def _validate_degrees(body: mesh.Mesh, background: int, domains: Any) -> None:
             f"The background has degree {background}; use "
             f"{'1' if background < 1 else '3, the highest that is supported'}."
         )
-    if not isinstance(domains, int) or domains not in DEGREES:
+    if isinstance(domains, bool) or not isinstance(domains, int) or domains not in DEGREES:
         raise MPMError(f"The domains' degree must be 1, 2 or 3, not {domains!r}.")
     if domains < background:
         hourglass = domains == 1 and body.basix_cell() in BOX_CELLS
@@ -168,12 +171,8 @@ def validate_options(
             f"Method {method!r} has one quadrature point per domain of degree 1, on a background "
             "of degree 1; use 'cpdi2' for others."
         )
-    if quadrature_degree is not None and (
-        not isinstance(quadrature_degree, int) or quadrature_degree < 0
-    ):
-        raise MPMError(
-            f"quadrature_degree must be a whole number from 0 on, not {quadrature_degree!r}."
-        )
+    if quadrature_degree is not None:
+        require_degree("quadrature_degree", quadrature_degree, HIGHEST)
     if quadrature_degree is not None and degree > 1 and quadrature_degree < 2 * degree - 2:
         raise MPMError(
             f"A rule of degree {quadrature_degree} does not see all strains of a domain of degree "

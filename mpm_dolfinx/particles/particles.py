@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 from petsc4py import PETSc
 
@@ -163,6 +163,14 @@ class Particles(MaterialDomains):
         self._method.require(body, self.initial_domains, self.global_index)
         self._geometry.require_volume(self.quadrature)
         self.locate()
+
+    def __copy__(self) -> NoReturn:
+        """Raise an error: a copy would have the mesh, the load and the displacement in common."""
+        raise MPMError("Particles cannot be copied; make others: mpm.Particles(body, V, ...).")
+
+    def __deepcopy__(self, memo: Any) -> NoReturn:
+        """See :meth:`__copy__`."""
+        self.__copy__()
 
     def __del__(self) -> None:
         """Let go of the meshes here, where no exception is on its way.

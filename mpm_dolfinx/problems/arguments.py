@@ -39,7 +39,6 @@ __all__ = [
     "require_background_fields",
     "require_entity_maps",
     "require_own_fields",
-    "require_truth",
     "residuals_of",
 ]
 
@@ -78,17 +77,6 @@ def as_bodies(particles: Particles | Sequence[Particles]) -> list[Particles]:
             "ranks."
         )
     return list(bodies)
-
-
-def require_truth(name: str, value: Any) -> None:
-    """Raise an error unless an option is a truth.
-
-    Args:
-        name: What it is called in a message.
-        value: What is given.
-    """
-    if not isinstance(value, bool | np.bool_):
-        raise MPMError(f"{name} must be True or False, not {value!r}.")
 
 
 def as_loads(name: str, loads: Any) -> Sequence[Any]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -25,10 +25,11 @@ from ..contact.rigid_body import RigidBody
 from ..errors import MPMError, agree, warn
 from ..history import History, Step
 from ..io import checkpoint
+from ..io.files import as_path
 from ..io.series import Output
 from ..io.snapshot import Kept, spaces_of
 from ..parallel.garbage import Cleaner
-from ..parallel.given import require_same
+from ..parallel.given import require_same, require_truth
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
 from ..solvers.linear import chosen
@@ -53,7 +54,6 @@ from .arguments import (
     by_space,
     one_for_each,
     require_entity_maps,
-    require_truth,
     residuals_of,
 )
 from .parts import Contribution, Parts
@@ -332,6 +332,14 @@ class ParticleProblem:
             parts: What the system is put together from.
         """
         return parts.field_terms()
+
+    def __copy__(self) -> NoReturn:
+        """Raise an error: a copy would have the bodies and their state in common."""
+        raise MPMError("A problem cannot be copied; make another one, of particles of its own.")
+
+    def __deepcopy__(self, memo: Any) -> NoReturn:
+        """See :meth:`__copy__`."""
+        self.__copy__()
 
     def __del__(self) -> None:
         """Leave PETSc's objects to the next clean-up; at the program's end PETSc drops them.
@@ -673,7 +681,7 @@ class ParticleProblem:
         with agree(self._comm):
             if not isinstance(moment, float | int | np.number) or not np.isfinite(moment):
                 raise MPMError(f"time must be a finite number, not {time!r}.")
-        self._output.write(Path(path), self.bodies, float(moment), len(self.history.steps))
+        self._output.write(as_path(path), self.bodies, float(moment), len(self.history.steps))
 
     def keep_identity(self) -> None:
         """Note what this problem is known by, before its body meshes change (collective)."""
@@ -717,7 +725,7 @@ class ParticleProblem:
             MPMError: The file cannot be written, or functions that cannot be kept.
         """
         self._require_governing()
-        self._state.save(Path(path), functions)
+        self._state.save(as_path(path), functions)
 
     def capture(self) -> checkpoint.Snapshot:
         """Return the state at the last converged step, for :meth:`return_to` (collective)."""
@@ -767,7 +775,7 @@ class ParticleProblem:
                 be read; the state is what it was.
         """
         self._require_governing()
-        self._state.restore(Path(path), functions, resume)
+        self._state.restore(as_path(path), functions, resume)
 
     def cut_as(self, snapshot: checkpoint.Snapshot, functions: bool, source: str) -> None:
         """Split the domains that were split in a state (collective).
@@ -801,6 +809,13 @@ class ParticleProblem:
         ranks.
         """
         return None
+
+    def loads(self) -> Sequence[fem.Constant | fem.Function]:
+        """Return what the load factor multiplies and the user may change, where that is known.
+
+        A residual in UFL says itself what it multiplies by ``particles.load``.
+        """
+        return ()
 
     def masses(self, number: int) -> NDArray[np.float64] | None:
         """Return the mass of each particle of a body that this rank owns, if it is known."""

@@ -15,7 +15,7 @@ import ufl
 from dolfinx import fem
 
 from ..assembly.inputs import Density, functions_of
-from ..assembly.loads import VirtualWork
+from ..assembly.loads import VirtualWork, changeable
 from ..assembly.rules import depends_on
 from ..boundary.supports import Support
 from ..constitutive.groups import background_cells
@@ -25,7 +25,7 @@ from ..constitutive.strain import Strain, strain_of
 from ..errors import DomainDistortionError, MPMError, agree, agreed, warn
 from ..io.checkpoint import Snapshot
 from ..parallel.compilation import compiled_form
-from ..parallel.given import require_same
+from ..parallel.given import require_same, require_truth
 from ..particles.domains import separate_nodes
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
@@ -371,7 +371,7 @@ class QuasiStaticProblem(ParticleProblem):
         Raises:
             MPMError: There are none of them, or nothing would be left. Nothing is changed then.
         """
-        if body not in range(len(self.bodies)):
+        if not isinstance(body, int | np.integer) or body not in range(len(self.bodies)):
             raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
         require_same(self._comm, tags=tags, body=body, name=name, sudden=sudden)
         own = self.setup.bodies[body]
@@ -460,9 +460,12 @@ class QuasiStaticProblem(ParticleProblem):
 
     def _go_on(self, name: str | None, change: Any, sudden: bool) -> None:
         """Begin a stage."""
+        require_truth("sudden", sudden)
         known = self._parameters
         number = len(self.history.stages) + 1
-        self.begin_stage(name or f"stage {number}", change, sudden or not self._gradual)
+        self.begin_stage(
+            f"stage {number}" if name is None else name, change, sudden or not self._gradual
+        )
         present = self._functions()
         for function in known:
             if all(function is not f for f in present):
@@ -474,6 +477,10 @@ class QuasiStaticProblem(ParticleProblem):
         """The materials at the points of each body."""
         return self._stresses
 
+    def loads(self) -> list[fem.Constant | fem.Function]:
+        """See :meth:`ParticleProblem.loads`."""
+        return self._loads
+
     def _functions(self) -> list[fem.Function]:
         """Return the parameters of materials that are Functions."""
         return [f for body in self.setup.bodies for f in functions_of(body.material)]
@@ -483,6 +490,7 @@ class QuasiStaticProblem(ParticleProblem):
         self._stresses: list[MaterialPoints] = []
         self._acting: list[MaterialPoints | StepStress] = []
         self._density: list[tuple[VirtualWork, Density]] = []
+        self._loads: list[fem.Constant | fem.Function] = []
         bodies = [given.particles for given in self.setup.bodies]
         known = self.pressure
         self.pressure = [self._pressure_of(body) for body in bodies if self.setup.mixed]
@@ -530,10 +538,13 @@ class QuasiStaticProblem(ParticleProblem):
         if given.tractions:
             loads.append(-work.tractions(given.tractions, given.facet_tags))
             symmetric = symmetric and not depends_on(loads[-1], body.displacement)
+        for load in loads:
+            self._loads += changeable(load, body)
         share = self._force_share(body)
         loads += [s.at_body(history.initial_modulus, strain.turn, share) for s in given.supports]
         if given.pressures:
             loads.append(work.pressures(given.pressures, given.facet_tags))
+            self._loads += changeable(loads[-1], body)
         further, plain = self._further_work(given, strain)
         loads += further
         symmetric = symmetric and plain

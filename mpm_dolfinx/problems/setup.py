@@ -23,18 +23,25 @@ from dolfinx import mesh
 from ..boundary.supports import Support
 from ..constitutive.averaging import F_BARS
 from ..errors import MPMError
-from ..parallel.given import require_same
+from ..parallel.given import require_same, require_truth
 from ..particles.particles import Particles
 from ..reals import is_one_of
 from ..solvers.linear import LINEAR_SOLVERS
 from ..system.term import Term
-from .arguments import carried, holds, require_truth
+from .arguments import carried, holds
 from .summary import counted
 
 __all__ = ["MIXED", "BodySetup", "Numerics", "Setup"]
 
 #: What may be an unknown beside displacements.
 MIXED = ("pressure", "discontinuous pressure", "stabilised pressure")
+#: Least values of PETSc's tolerances and numbers of iterations, and what they are below.
+TOLERANCES = {
+    "rtol": (0.0, 1.0),
+    "atol": (0.0, np.inf),
+    "stol": (0.0, np.inf),
+    "max_it": (1.0, np.inf),
+}
 #: Cells of the background in which a pressure may be linear by itself.
 WHOLE = ("quadrilateral", "hexahedron")
 
@@ -92,6 +99,8 @@ class Numerics:
             ):
                 continue
             raise MPMError(f"{name} must be a dictionary of options by their names, not {given!r}.")
+        for name, value in self.petsc_options.items():
+            _require_tolerance(name, value)
         if not is_one_of(self.dependent_dofs, ("shift", "remove")):
             raise MPMError(
                 f"Unknown dependent_dofs={self.dependent_dofs!r}; choose 'shift' or 'remove'."
@@ -129,6 +138,27 @@ class Numerics:
             "jit_options": self.jit_options,
         }
         return options if self.entity_maps is None else {**options, "entity_maps": self.entity_maps}
+
+
+def _require_tolerance(name: str, value: Any) -> None:
+    """Raise an error where PETSc would take a tolerance, or a number of iterations, for another.
+
+    It takes some negative values for "as it was", and reads none where nothing iterates.
+    """
+    solver, _, what = name.rpartition("snes_" if "snes_" in name else "ksp_")
+    bounds = TOLERANCES.get(what)
+    if not name.startswith(("snes_", "ksp_")) or solver or bounds is None or value is None:
+        return
+    least, below = bounds
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = np.nan
+    if not least <= number < below:
+        most = f" and below {below:g}" if np.isfinite(below) else ""
+        raise MPMError(
+            f"{name} of petsc_options= must be a number of at least {least:g}{most}, not {value!r}."
+        )
 
 
 @dataclass(frozen=True)

@@ -200,6 +200,7 @@ class Run:
         began: Time at its beginning: the number of the stages before it, unless it is through time.
         end: Time at its end, ``None`` unless it is through time.
         held: How much of what a stage changes was held back at its beginning.
+        warned: Whether it has warned of loads that its path sets.
     """
 
     control: Control
@@ -210,6 +211,7 @@ class Run:
     began: float = 0.0
     end: float | None = None
     held: float = 0.0
+    warned: bool = False
 
     @property
     def remaining(self) -> float:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from typing import NoReturn, Protocol
 
@@ -13,6 +13,8 @@ from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dolfinx import fem
 
 from ..errors import (
     TRIAL_ERRORS,
@@ -25,6 +27,7 @@ from ..history import Attempt, History, Step
 from ..log import STEPS, tell
 from ..parallel.garbage import Cleaner
 from ..parallel.interruption import Hold, Interrupted, held, interrupted, settle
+from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
 from ..solvers.newton import NewtonSolver, ReducedProblem
 from ..system.conditions import dirichlet_values
@@ -68,6 +71,9 @@ class Owner(Protocol):
 
     def warn(self, sentence: str) -> None:
         """Warn the user, on one rank."""
+
+    def loads(self) -> Sequence[fem.Constant | fem.Function]:
+        """Return what the load factor multiplies and the user may change."""
 
 
 class Mender(Protocol):
@@ -280,7 +286,11 @@ class Stepper:
             if control is None:
                 self._set_load(run.aim, update is None and self.converged.proportional)
             if update is not None:
+                grows = run.end is None and run.aim < 1.0
+                before = _values(owner.loads()) if grows else []
                 update(t if run.end is None else run.time)
+                if grows:
+                    self._look_at_loads(owner, run, before)
             values = run.dirichlet_values(self._totals())
             step = self._advance(end, values, run, control)
         except Interrupted:
@@ -557,6 +567,27 @@ class Stepper:
                 self._set_load(self.converged.load, self.converged.proportional)
             reduced.roll_back()
 
+    def _look_at_loads(self, owner: Owner, run: Run, before: Sequence[NDArray[np.float64]]) -> None:
+        """Warn where a path has set loads that the load factor multiplies besides (collective).
+
+        Args:
+            owner: The problem.
+            run: The run, which warns once.
+            before: Values of loads before the path was asked.
+        """
+        factor = float(owner.bodies[0].load.value)
+        pairs = zip(before, _values(owner.loads()), strict=True)
+        mine = factor == run.aim and any(not np.array_equal(*pair) for pair in pairs)
+        if run.warned or not over_ranks(self._comm, mine, MPI.LOR):
+            return
+        run.warned = True
+        owner.warn(
+            f"update= sets loads, and the load factor multiplies them besides: it is {factor:.3g} "
+            "in this step and goes to 1 by itself, as the loads had not been applied in full "
+            "before this run. Set particles.load.value = 1 in update= if it says all of the loads, "
+            "or apply the others by solve() first."
+        )
+
     def _end_step(self, owner: Owner) -> None:
         with agree(self._comm, "end_step()"):
             owner.end_step()
@@ -582,3 +613,8 @@ class Stepper:
         except ParticleOutsideError as error:
             told = str(error)
             self.owner.warn(f"The run is complete, but {told[0].lower()}{told[1:]}")
+
+
+def _values(loads: Sequence[fem.Constant | fem.Function]) -> list[NDArray[np.float64]]:
+    """Return copies of the values of loads on this rank."""
+    return [np.array(f.x.array if isinstance(f, fem.Function) else f.value) for f in loads]

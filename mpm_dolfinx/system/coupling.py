@@ -20,11 +20,14 @@ from .. import _compat
 from ..assembly.inputs import is_tag, known_tags
 from ..background.basis import BackgroundBasis
 from ..errors import MPMError, agree
+from ..parallel.given import require_degree, require_truth
 from ..particles.particles import Particles
 from .term import Term
 
 __all__ = ["Tie"]
 
+#: Highest degree of a rule on a facet.
+MOST = 100
 #: Share of a point's displacement from nodes of deleted domains, from which it is gone with them.
 GONE = 1e-9
 
@@ -83,7 +86,9 @@ class Tie(Term):
         self.stiffness = float(stiffness)
         self._tags, self._tag = facet_tags, tag
         degree = 2 * a.W.ufl_element().degree if quadrature_degree is None else quadrature_degree
-        self._degree, self.axisymmetric = degree, axisymmetric
+        require_degree("quadrature_degree of a Tie", degree, MOST)
+        require_truth("axisymmetric", axisymmetric)
+        self._degree, self.axisymmetric = int(degree), axisymmetric
         self._spaces: tuple[fem.FunctionSpace, ...] = ()
         self._held: NDArray[np.bool_] = np.zeros(0, dtype=bool)
         self._settle()

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Bad input: one clear sentence of ours, the same on every rank."""
 
+import copy
+
 import numpy as np
 import pytest
 import scenes
@@ -13,6 +15,7 @@ from bad_input import (
     particles,
     problem,
     tags_of_facets,
+    tie,
     values,
 )
 from compare import raises
@@ -244,7 +247,42 @@ PROBLEMS = {
         problem(petsc_options={"pc_factor_mat_solver_type": "foo"}),
         r"Could not locate solver type foo for factorization type CHOLESKY",
     ),
-    "tolerance in words": (problem(petsc_options={"snes_rtol": "small"}), r"small has no numeric"),
+    "tolerance in words": (
+        problem(petsc_options={"snes_rtol": "small"}),
+        r"snes_rtol of petsc_options= must be a number of at least 0 and below 1, not 'small'",
+    ),
+    "negative tolerance": (problem(petsc_options={"snes_rtol": -1}), r"below 1, not -1"),
+    "negative size": (problem(petsc_options={"snes_atol": -1.0}), r"at least 0, not -1\.0"),
+    "no iterations": (problem(petsc_options={"snes_max_it": 0}), r"at least 1, not 0"),
+    "tolerance that nobody reads": (problem(petsc_options={"ksp_rtol": "x"}), r"ksp_rtol.* 'x'"),
+    "path that is a number": (lambda: scenes.block().write(3), r"path must be the name of a file"),
+    "checkpoint without name": (lambda: scenes.block().save(None), r"path must be .* not None"),
+    "checkpoint of a number": (lambda: scenes.block().restore(1.0), r"path must be .* not 1\.0"),
+    "stage of no name": (lambda: scenes.block().stage([]), r"name of a stage must be a string"),
+    "half sudden": (lambda: scenes.block().stage(sudden=0), r"sudden must be True or False, not 0"),
+    "body of many": (
+        lambda: scenes.block().remove([0], body=np.ones(2)),
+        r"There is no body array",
+    ),
+    # bodies
+    "particles twice by a copy": (lambda: copy.copy(particles()), r"Particles cannot be copied"),
+    "particles twice by a deep one": (
+        lambda: copy.deepcopy(particles()),
+        r"Particles cannot be copied",
+    ),
+    "a problem twice": (lambda: copy.copy(scenes.block()), r"A problem cannot be copied"),
+    "a rule of too many points": (
+        lambda: particles(quadrature_degree=99),
+        r"quadrature_degree must be a whole number from 0 to 30, not 99",
+    ),
+    "a rule that is true": (lambda: particles(quadrature_degree=True), r"from 0 to 30, not True"),
+    "a degree that is true": (lambda: particles(degree=True), r"degree must be 1, 2 or 3, not T"),
+    "a tie of negative degree": (
+        tie(quadrature_degree=-2),
+        r"of a Tie must be .* not -2",
+    ),
+    "a tie of half a degree": (tie(quadrature_degree=1.5), r"of a Tie must be .* not 1\.5"),
+    "a tie around a word": (tie(axisymmetric="r"), r"axisymmetric must be True or False, not 'r'"),
     "ordering of no kind": (
         lambda: scenes.block(
             petsc_options={
@@ -256,6 +294,19 @@ PROBLEMS = {
         r"PETSc refuses an option of the problem: .*foo.*; correct petsc_options=",
     ),
     # materials
+    "negative modulus put in place": (
+        lambda: Hencky(1e3, 0.3).with_parameters(young=-1),
+        r"young is -1 but must be finite, greater than 0",
+    ),
+    "modulus in words put in place": (
+        lambda: Hencky(1e3, 0.3).with_parameters(young="stiff"),
+        r"young must be a number",
+    ),
+    "misspelt parameter": (
+        lambda: Hencky(1e3, 0.3).with_parameters(yuong=1.0),
+        r"A Hencky has no parameter 'yuong'; there are poisson, young",
+    ),
+    "modulus that is true": (lambda: Hencky(True, 0.3), r"young must be a number"),
     "material of no particles": (
         lambda: mpm.QuasiStaticProblem(body(), Hencky(1.0, 0.0)),
         r"mpm\.Particles.* not Mesh",

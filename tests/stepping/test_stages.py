@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Runs one after the other: what was applied stays, and what a path says is what happens."""
 
+import warnings
+
 import numpy as np
 import pytest
 import scenes
@@ -52,6 +54,37 @@ def test_a_strip_load_after_the_weight():
     strip.value[1] = 0.0
     problem.step()
     assert abs(problem.reaction(problem.bcs[0])[1] / weight - 1.0) < 1e-9
+
+
+def sets_loads(problem, update):
+    """Return whether a path in two steps is warned of, on rank 0."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        problem.solve(2, update=update)
+    return sum("update= sets loads" in str(one.message) for one in told)
+
+
+def test_a_path_that_sets_loads_which_grow_besides():
+    """It is warned of once; not where the path sets the factor, or loads were applied before."""
+
+    def load(strip):
+        return lambda t: np.put(strip.value, 1, -8e4 * t)
+
+    problem, strip, _ = slope()
+    assert sets_loads(problem, load(strip)) == (WORLD.rank == 0)
+    assert sets_loads(problem, lambda t: np.put(strip.value, 1, -8e4 * (1.0 - 0.5 * t))) == 0
+
+    problem, strip, weight = slope()
+
+    def all_of_it(t):
+        problem.particles.load.value = 1.0
+        load(strip)(t)
+
+    assert sets_loads(problem, all_of_it) == 0
+    assert abs(problem.reaction(problem.bcs[0])[1] / (weight + 2.0 * 8e4) - 1.0) < 1e-9
+
+    problem, strip, _ = slope()
+    assert sets_loads(problem, lambda t: None) == 0
 
 
 def test_the_load_factor_goes_on_from_where_it_is(mpi_tmp_path):
