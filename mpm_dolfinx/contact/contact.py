@@ -77,6 +77,7 @@ class Contact(Term):
         self._number = 0
         self._share = 1.0
         self._places: list[int] = []
+        self._masses: Sequence[NDArray[np.float64]] = ()
         self._joins, self._gone = True, list[Contact]()
 
     @property
@@ -100,7 +101,7 @@ class Contact(Term):
         materials: Sequence[PointMaterial | None],
     ) -> None:
         """See :meth:`Term.take_part`."""
-        self._number, self._share = number, 1.0
+        self._number, self._share, self._masses = number, 1.0, ()
         self._places = [
             next(i for i, body in enumerate(bodies) if body is mine) for mine in self.bodies
         ]
@@ -141,6 +142,25 @@ class Contact(Term):
                 "add energy with each impact in this scheme; use scheme='euler', or law='penalty'."
             )
         self._share = share
+
+    def weigh(self, masses: Sequence[NDArray[np.float64]]) -> None:
+        """See :meth:`Term.weigh`."""
+        self._masses = masses
+
+    def _inertial(self, body: int, surface: Surface, dt: float) -> NDArray[np.float64]:
+        """Return what the mass behind facets adds to the stiffness in a step, shape ``(m,)``.
+
+        That is the density times the height over the square of the step, as the modulus is over the
+        height. The stress behind a facet is not on it by as much as that mass is accelerated: held
+        by the modulus alone, a gap would be left there, and closed under another pressure.
+        """
+        if not (self._nitsche and self._masses and dt > 0.0):
+            return np.zeros(len(surface.cells))
+        area = surface.weights.sum(axis=1)
+        mass = surface.narrowing * self._masses[body][surface.cells]
+        degree = surface.particles.W.ufl_element().degree
+        behind = np.where(area > 0.0, mass / np.where(area > 0.0, area, 1.0), 0.0)
+        return np.asarray(behind / (degree * dt) ** 2)
 
     def end_forces(self) -> Sequence[PETSc.Vec]:
         """See :meth:`Term.end_forces`."""

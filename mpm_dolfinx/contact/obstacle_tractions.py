@@ -65,6 +65,7 @@ class ObstacleTractions:
     Attributes:
         of_step: Whether forces are those of whole steps of a motion.
         nitsche: The stress behind the facets, where the pressure is that.
+        inertial: What their mass adds to the stiffness in a step of a motion, shape ``(m,)``, or 0.
         slip_changes: Which points have changed their slip.
     """
 
@@ -75,6 +76,7 @@ class ObstacleTractions:
         self._penalty, self._tangential = penalty, tangential
         self.of_step = False
         self.nitsche: Nitsche | None = None
+        self.inertial: NDArray[np.float64] = np.zeros(0)
         self.slip_changes = SlipChanges()
         self._stretch: NDArray[np.float64] | None = None
 
@@ -87,6 +89,7 @@ class ObstacleTractions:
             stiffness: Modulus over thickness of each, shape ``(m,)``.
         """
         self._stiffness = np.repeat(stiffness[:, None], self._surface.nq, axis=1)
+        self.inertial = np.zeros(len(stiffness))
 
     def hold_stretch(self) -> None:
         """Note the stretch of facets that counts for friction, once in a step.
@@ -108,8 +111,11 @@ class ObstacleTractions:
         Args:
             which: Numbers of facets; ``None``: all.
         """
-        k = self._stiffness if which is None else self._stiffness[which]
-        return self._penalty * k, self._tangential * k
+        some = slice(None) if which is None else which
+        k = self._stiffness[some]
+        return self._penalty * (self._stiffness + self.inertial[:, None])[
+            some
+        ], self._tangential * k
 
     def points(self, memory: Memory) -> Points:
         """Return the points of facets of which something is known."""

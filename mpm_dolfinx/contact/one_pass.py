@@ -127,9 +127,7 @@ class Pass:
         # (pressure has its share by stiffness)
         law, self.share = self._whole, share
         self.law = law.shared(share)
-        facing = float(np.median(np.concatenate(self._comm.allgather(target))))
-        k = share / (1.0 / source + 1.0 / facing) if len(source) else source
-        self._stiffness = k
+        self._stiffness = self._normal = self._in_series(source, target)
         self.reach = REACH * max(
             float(np.median(np.concatenate(self._comm.allgather(surface.sizes))))
             for surface in (self.source, self.target)
@@ -137,6 +135,17 @@ class Pass:
         body = self.target.particles
         sides = len(basix.topology(body.mesh.basix_cell())[self.target.gdim - 1])
         self._number = body.global_index[self.target.cells] * sides + self.target.facets
+
+    def stiffen(self, source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
+        """Take other stiffnesses than those of :meth:`settle` for what presses (collective)."""
+        self._normal = self._in_series(source, target)
+
+    def _in_series(
+        self, source: NDArray[np.float64], target: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the share of both bodies' stiffnesses one behind the other (collective)."""
+        facing = float(np.median(np.concatenate(self._comm.allgather(target))))
+        return self.share / (1.0 / source + 1.0 / facing) if len(source) else source
 
     @property
     def touch(self) -> float:
@@ -314,7 +323,7 @@ class Pass:
         if self.stress is not None:
             self._behind = self.share * self._flat(self.stress.tractions(self._facets))
             # as far as it may press
-            k = self._penalties[0] * np.repeat(self._stiffness[self._facets], self.source.nq)
+            k = self._penalties[0] * np.repeat(self._normal[self._facets], self.source.nq)
             reach = self.touch + np.linalg.norm(self._behind, axis=1) / k
             pressed = found.near & (found.gap <= reach) & borne
         if self.of_step:
@@ -463,10 +472,10 @@ class Pass:
             parts.append(nodes[anchor])
         if self._stretch is None:
             self._stretch = self.source.stretch(self.law.by_area, self._facets).ravel()
-        k = self._stiffness[self._facets[which // self.source.nq]]
+        own = self._facets[which // self.source.nq]
         points = Points(
-            self._penalties[0] * k,
-            np.where(lost, 0.0, self._penalties[1] * k),
+            self._penalties[0] * self._normal[own],
+            np.where(lost, 0.0, self._penalties[1] * self._stiffness[own]),
             memory.touched[which] | lost,
             np.zeros((len(which), 0)),
             np.where(lost, 0.0, memory.gap[which]),

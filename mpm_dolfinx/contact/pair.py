@@ -197,7 +197,7 @@ class Pair(Contact):
         new = [surface.settle() for surface in self._surfaces]
         if not any(new) and not again:
             return
-        k = [
+        k = self._stiffnesses = [
             stiffness(surface, modulus, material, "A Pair")
             for surface, modulus, material in zip(
                 self._surfaces, self._moduli, self._materials, strict=True
@@ -210,6 +210,19 @@ class Pair(Contact):
         self._made = True
         self._take_stress()
         self._new_pattern()
+
+    def pace(self, dt: float, share: float) -> None:
+        """See :meth:`Contact.pace`."""
+        super().pace(dt, share)
+        if self._nitsche:
+            k = [
+                own + self._inertial(i, surface, dt)
+                for i, (own, surface) in enumerate(
+                    zip(self._stiffnesses, self._surfaces, strict=True)
+                )
+            ]
+            for i, each in enumerate(self._passes):
+                each.stiffen(k[i], k[1 - i])
 
     def _take_stress(self) -> None:
         """Take the stress behind the points of each pass, where the pressure is that."""

@@ -230,6 +230,7 @@ class Rigid(Contact):
         """See :meth:`Contact.pace`."""
         super().pace(dt, share)
         self._tractions.of_step = self._of_step
+        self._tractions.inertial = self._inertial(0, self._surface, dt)
 
     def _require_same_shape(self) -> None:
         """Raise an error where ranks have different shapes, by some distances (collective)."""

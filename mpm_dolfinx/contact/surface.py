@@ -208,8 +208,10 @@ class Surface:
         centre = (self.shapes @ x[self.nodes]).mean(axis=1)
         n = normals(edges).mean(axis=1)
         self.outward = np.where(((centre - middle) * n).sum(axis=1) < 0.0, -1.0, 1.0)
-        narrowing = self.gdim if cell in SIMPLICES else 1
-        self.thickness = narrowing * self.particles.initial_volume[self.cells] / area.sum(axis=1)
+        self.narrowing = self.gdim if cell in SIMPLICES else 1
+        self.thickness = (
+            self.narrowing * self.particles.initial_volume[self.cells] / area.sum(axis=1)
+        )
         extent = float(np.abs(self.particles.initial_domains).max(initial=0.0))
         self.extent = float(body.comm.allreduce(extent, MPI.MAX))
         self._around = np.ones_like(area)

@@ -234,6 +234,9 @@ class Inertia(Term):
         for body, M in zip(self.bodies, self.masses, strict=True):
             if not self.is_static(body):
                 _require_mass(body, M)
+        owned = [own.sum(axis=(1, 2)) for own in self._domain_masses]
+        for term in self._others:
+            term.weigh([owned[self._number(body)] for body in term.bodies])
         kinetic = self.kinetic()
         if self._energies:
             self._totals[TOTALS.index("lost")] += self._kinetic - kinetic

@@ -182,6 +182,16 @@ class Term:
             share: 0.5, or 1 where the scheme takes forces at the step's end alone.
         """
 
+    def weigh(self, masses: Sequence[NDArray[np.float64]]) -> None:
+        """Take the masses of the domains of its bodies in a motion, before its first :meth:`pace`.
+
+        They are told again where domains are deleted.
+
+        Args:
+            masses: Of the domains of each body that this rank owns, shape ``(n,)``; zero for a
+                body without inertia.
+        """
+
     def end_forces(self) -> Sequence[PETSc.Vec]:
         """Return the residuals at the last converged step, but for what is of a whole step.
 

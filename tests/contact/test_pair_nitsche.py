@@ -338,3 +338,25 @@ def test_it_goes_with_implicit_euler():
     )
     problem.solve(0.5, 0.05)
     assert problem.reaction(touch)[1] == pytest.approx(4.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("passes", [1, pytest.param(2, marks=SLOW)])
+@pytest.mark.parametrize("steps", [20, pytest.param(60, marks=SLOW)])
+def test_an_impact_wins_no_energy(passes, steps):
+    # (see the test of the same name of a Rigid)
+    Va, Vb = spaces([-0.5, -1.3], [1.5, 1.3], [8, 10])
+    a = mpm.Particles(scenes.box([0.0, 0.03], [1.0, 0.5], [8, 5], QUADRILATERAL), Va)
+    b = mpm.Particles(scenes.box([0.05, -0.5], [0.95, 0.0], [6, 5], TRIANGLE), Vb)
+    problem = mpm.DynamicProblem(
+        [a, b],
+        Hencky(1.0, 0.0),
+        1.0,
+        scheme="euler",
+        velocity=[(0.1, -0.8), (0.0, 0.8)],
+        terms=[contact.Pair(a, b, 0.6, law="nitsche", passes=passes)],
+    )
+    problem.solve(0.75, 0.75 / steps)
+    energies = problem.history.energies
+    whole = np.array([energy.kinetic + energy.strain for energy in energies])
+    assert np.diff([energy.kinetic for energy in energies]).max() > 0.005 * whole[0]  # they bounce
+    assert whole.max() <= whole[0] * (1.0 + 1e-9)

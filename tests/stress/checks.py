@@ -712,7 +712,9 @@ class Observer:
         So the force on one body is found from its own stresses, and is minus that on the other.
         """
         force = np.asarray(self.run.problem.reaction(self.run.contact))
-        points = np.concatenate(self.comm.allgather(self.run.touch.points[self.run.touch.touches]))
+        # (of both passes: points of one may press where none of the other does)
+        acting = [x[np.abs(f).max(axis=1) > 0.0] for x, f in self.run.touch._forces()]
+        points = np.concatenate(self.comm.allgather(np.concatenate(acting)))
         forces, bounds = [], []
         for i, domains in enumerate(self.domains):
             (internal, outer, floor, absolute, _), active = self._carried(i)
