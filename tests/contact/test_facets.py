@@ -74,9 +74,8 @@ def test_no_place_on_any_facet_is_nearer(kind):
 
 
 @pytest.mark.skip_in_parallel
-@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("kind", [TRIANGLE, TETRAHEDRON, HEXAHEDRON])
-def test_points_beside_the_end_of_a_surface_touch_nothing(kind, compiled):
+def test_points_beside_the_end_of_a_surface_touch_nothing(kind):
     # above its plane as below it, where a pressure by stress may act at a gap
     dim = 2 if kind == TRIANGLE else 3
     V = scenes.vectors(box([-1.0] * dim, [2.0] * dim, [3] * dim, GRID[dim], WORLD))
@@ -89,14 +88,13 @@ def test_points_beside_the_end_of_a_surface_touch_nothing(kind, compiled):
     x[:, 0] = np.linspace(-0.1, 1.1, len(x))
     x[:, -1] = 1.0 + 2e-4 * np.array([1.0, -1.0, 1e-12, -1e-12])[np.arange(len(x)) % 4]
     known = facets.NearFacets(surface, np.arange(len(surface.cells)), x, 3.0 * REACH, nodes)
-    found = known.closest(x, None, known.positions(nodes), REACH, compiled=compiled)
+    found = known.closest(x, None, known.positions(nodes), REACH)
     assert (found.facet >= 0).all()
     assert np.array_equal(found.near, (x[:, 0] >= 0.0) & (x[:, 0] <= 1.0))
 
 
 @pytest.mark.skip_in_parallel
-@pytest.mark.parametrize("compiled", [True, False])
-def test_points_over_the_edges_of_a_bent_surface_face_it(compiled):
+def test_points_over_the_edges_of_a_bent_surface_face_it():
     V = scenes.vectors(box([-2.0, -2.0], [2.0, 2.0], [3, 3], QUADRILATERAL, WORLD))
     mesh = box([-1.0, 0.0], [1.0, 1.0], [8, 4], QUADRILATERAL, WORLD)
     # the arc of a circle: corners of 9.6 degrees
@@ -116,5 +114,5 @@ def test_points_over_the_edges_of_a_bent_surface_face_it(compiled):
     radius = 1.0 + np.array([0.05, 1e-3, 1e-6])[np.arange(len(angle)) % 3]
     x = radius[:, None] * np.column_stack([np.sin(angle), np.cos(angle)])
     known = facets.NearFacets(surface, np.arange(len(surface.cells)), x, 3.0 * REACH, nodes)
-    found = known.closest(x, None, known.positions(nodes), REACH, compiled=compiled)
+    found = known.closest(x, None, known.positions(nodes), REACH)
     assert found.near.all() and (found.beside > 0.0).any()
