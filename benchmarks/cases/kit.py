@@ -44,7 +44,7 @@ class Parser(argparse.ArgumentParser):
         """Add the unknowns besides displacements."""
         self.add_argument(
             "--mixed",
-            choices=("none", "pressure", "discontinuous pressure", "stabilised pressure"),
+            choices=("none", "pressure", "stabilised pressure"),
             default="none",
             help="the pressure as an unknown, of one degree less",
         )

@@ -51,7 +51,6 @@ TUBE = {
     '`mixed="pressure"`': "",
     "shifted by 0.37 cells": "--offset 0.37",
     "cells of half the wall, shifted": "--offset 0.37 --cells 2",
-    '`"discontinuous pressure"`, shifted': "--offset 0.37 --mixed discontinuous",
     "displacements alone": "--mixed none",
     "displacements alone, shifted": "--mixed none --offset 0.37",
     'degree 1, `"patch"`, shifted': "--mixed none --degree 1 --f-bar patch --offset 0.37",
@@ -72,8 +71,7 @@ BLOCK = {
 
 def words(options: str) -> list[str]:
     """Return options one by one, of which some are two words."""
-    two = ("discontinuous", "stabilised")
-    return [f"{word} pressure" if word in two else word for word in options.split()]
+    return ["stabilised pressure" if word == "stabilised" else word for word in options.split()]
 
 
 def footing(options: str) -> list[Any]:

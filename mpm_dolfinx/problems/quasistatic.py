@@ -100,11 +100,9 @@ class QuasiStaticProblem(ParticleProblem):
             of one degree less on the same background mesh (the pair of Taylor & Hood 1973), so that
             nothing locks however little volume changes; for laws in strain space (Hencky,
             von Mises, Mohr-Coulomb, Drucker-Prager, your own), backgrounds and particles of degree
-            2 or 3, instead of ``f_bar``. ``"discontinuous pressure"``: a polynomial of that degree
-            in each quadrilateral or hexahedron of the background, so that it may jump.
-            ``"stabilised pressure"``: displacement and pressure are both of degree 1, and what the
-            pressure deviates by from its mean in each cell counts as compliance (Bochev, Dohrmann &
-            Gunzburger 2006).
+            2 or 3, instead of ``f_bar``. ``"stabilised pressure"``: displacement and pressure are
+            both of degree 1, and what the pressure deviates by from its mean in each cell counts as
+            compliance (Bochev, Dohrmann & Gunzburger 2006).
 
     Attributes:
         pressure: With ``mixed``, the pressure of each body: a :class:`mpm_dolfinx.ParticleField` at
@@ -504,9 +502,8 @@ class QuasiStaticProblem(ParticleProblem):
                 return known
         V = next((V for its, V in self._spaces_of_pressure if its is body), None)
         if V is None:
-            family = "DPC" if self.setup.mixed == "discontinuous pressure" else "Lagrange"
             degree = max(body.V.ufl_element().degree - 1, 1)
-            V = fem.functionspace(body.V.mesh, (family, degree))
+            V = fem.functionspace(body.V.mesh, ("Lagrange", degree))
             self._spaces_of_pressure.append((body, V))
         return body.field(V, at="points", name="pressure")
 

@@ -34,7 +34,7 @@ from .summary import counted
 __all__ = ["MIXED", "BodySetup", "Numerics", "Setup"]
 
 #: What may be an unknown beside displacements.
-MIXED = ("pressure", "discontinuous pressure", "stabilised pressure")
+MIXED = ("pressure", "stabilised pressure")
 #: Least values of PETSc's tolerances and numbers of iterations, and what they are below.
 TOLERANCES = {
     "rtol": (0.0, 1.0),
@@ -42,8 +42,6 @@ TOLERANCES = {
     "stol": (0.0, np.inf),
     "max_it": (1.0, np.inf),
 }
-#: Cells of the background in which a pressure may be linear by itself.
-WHOLE = ("quadrilateral", "hexahedron")
 
 
 @dataclass(frozen=True)
@@ -306,18 +304,18 @@ class Setup:
                         "mixed='stabilised pressure' is for a background and particles of degree "
                         f"1, not {degrees[0]} and {degrees[1]}; use mixed='pressure' there."
                     )
+                if body.V.mesh.topology.cell_name() not in ("quadrilateral", "hexahedron"):
+                    raise MPMError(
+                        "mixed='stabilised pressure' needs a background of quadrilaterals or "
+                        "hexahedra: on triangles or tetrahedra it would oscillate, or nearly so; "
+                        "use degree 2 with mixed='pressure' there."
+                    )
             elif min(degrees) < 2:
                 raise MPMError(
-                    f"mixed={self.mixed!r} needs a background and particles of degree 2 or 3 "
+                    "mixed='pressure' needs a background and particles of degree 2 or 3 "
                     f"(degree=2), not {degrees[0]} and {degrees[1]}: with displacements of degree "
                     "1 the pressure would oscillate; use mixed='stabilised pressure' or "
                     "f_bar='patch' there."
-                )
-            if self.mixed != "pressure" and body.V.mesh.topology.cell_name() not in WHOLE:
-                raise MPMError(
-                    f"mixed={self.mixed!r} needs a background of quadrilaterals or hexahedra: on "
-                    "triangles or tetrahedra it would oscillate, or nearly so; use degree 2 with "
-                    "mixed='pressure' there."
                 )
 
     def carried(self) -> Setup:

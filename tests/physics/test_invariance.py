@@ -454,7 +454,6 @@ SCENES = {
     "f_bar patch": kept(f_bar="patch"),
     "stabilised pressure": kept(mixed="stabilised pressure"),
     "pressure": kept(scene={"degree": 2}, mixed="pressure"),
-    "discontinuous pressure": kept(scene={"degree": 2}, mixed="discontinuous pressure"),
     **{law: kept(scene={"law": law}) for law in list(LAWS)[1:]},
     "space": kept(scene={"dim": 3}),
     "tetrahedra": kept(scene={"dim": 3, "cell": TETRAHEDRON}, f_bar="patch"),

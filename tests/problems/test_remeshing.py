@@ -242,13 +242,6 @@ def test_checkpoint_after_a_split(tmp_path):
 REBASED = [
     *(pytest.param(cell, 1, {}, id=scenes.name(cell)) for cell in ALL),
     pytest.param(QUADRILATERAL, 2, {"mixed": "pressure"}, id="degree 2 with a pressure"),
-    pytest.param(
-        QUADRILATERAL,
-        2,
-        {"mixed": "discontinuous pressure"},
-        id="discontinuous",
-        marks=pytest.mark.slow,
-    ),
     pytest.param(TRIANGLE, 3, {"mixed": "pressure"}, id="degree 3 with a pressure"),
     pytest.param(
         TETRAHEDRON, 2, {"mixed": "pressure"}, id="tetrahedra of degree 2", marks=pytest.mark.slow
