@@ -25,6 +25,7 @@ from .problems.quasistatic import QuasiStaticProblem  # noqa: E402
 from .problems.strength import StrengthReduction, strength_reduction  # noqa: E402
 from .stepping.displacement_control import DisplacementControl  # noqa: E402
 from .system.coupling import Tie  # noqa: E402
+from .system.schemes import Kinematics, Rates, Scheme  # noqa: E402
 from .system.term import Term  # noqa: E402
 from .transfer.weights import Weights  # noqa: E402
 
@@ -39,6 +40,7 @@ __all__ = [
     "DynamicProblem",
     "Energy",
     "History",
+    "Kinematics",
     "Loss",
     "MPMError",
     "ParticleField",
@@ -47,6 +49,8 @@ __all__ = [
     "Particles",
     "PorousProblem",
     "QuasiStaticProblem",
+    "Rates",
+    "Scheme",
     "Stage",
     "Statistics",
     "Step",

@@ -301,9 +301,13 @@ class StepStress:
             kind = np.where(self._small, 0, 2).astype(np.uint8)
             mean, tangent = self._mean(_Ends(slope, before, turning, volumes, kind))
         else:
-            mean, tangent = 0.5 * (slope + before) / self._share, 0.5 * turning / self._share
+            mean, tangent = self._between(before, slope) / self._share, turning
         self._mean_slope, self._of_pressure = mean, mean + self._own_by_pressure(slope)
         return p[:, None, None] * mean, p[:, None, None, None, None] * tangent
+
+    def _between(self, before: Array, after: Array) -> Array:
+        """Return what the ends of a step have as its mean, by their weights."""
+        return (1.0 - self._share) * before + self._share * after
 
     def _own_by_pressure(self, slope: Array) -> Array:
         """Return the derivative by the pressure of the stress that is not of it, over the share."""
@@ -484,11 +488,9 @@ class StepStress:
         elif self._splits:
             p = self._pressure.values
             whole = self._share * p[:, None, None] * self._mean_slope
-            stress = 0.5 * (self._P + self._own) + whole
-        elif self._share < 1.0:
-            stress = 0.5 * (self._P + points.first_piola)
+            stress = self._between(self._P, self._own) + whole
         else:
-            stress = points.first_piola
+            stress = self._between(self._P, points.first_piola)
         weights = points.weights.ravel()
         done, in_step, damped = (
             float(weights @ np.einsum("niJ,niJ->n", np.broadcast_to(one, H.shape), H))

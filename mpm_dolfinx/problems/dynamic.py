@@ -21,6 +21,7 @@ from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..system.body import StepForce
 from ..system.inertia import Inertia
+from ..system.schemes import Scheme, as_scheme
 from ..system.term import Term
 from .arguments import as_bodies, as_supports, as_terms
 from .motion import MovingProblem, initial_velocities, rayleigh_of, require_motion
@@ -53,7 +54,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
             ends. ``"conserving"``: second order; stress is one of the whole step, by which angular
             momentum is kept to round-off, and the energy of elastic materials too; for what
             spins fast or long. ``"euler"``: first order, with much loss of energy, for motions
-            that shall come to rest.
+            that shall come to rest. Or a :class:`Scheme` of your own.
         out_of_range: ``"project"`` or ``"reflect"``; no matter with ``scheme="euler"``.
         rayleigh: Damping ``(alpha, beta)`` in proportion to mass (one over a time) and to the
             stiffness of the undeformed bodies (a time); not negative.
@@ -81,7 +82,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         density: Any,
         *,
         velocity: Any = None,
-        scheme: str = "midpoint",
+        scheme: str | Scheme = "midpoint",
         out_of_range: str = "project",
         rayleigh: tuple[float, float] = (0.0, 0.0),
         after: QuasiStaticProblem | None = None,
@@ -105,8 +106,8 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         damping = rayleigh_of(rayleigh)
         self._viscosity = damping[1]
         require_motion("DynamicProblem", options)
-        kept = out_of_range == "reflect" and scheme != "euler"
-        if kept and options.get("mixed") == "stabilised pressure":
+        rule = as_scheme(scheme, out_of_range)
+        if rule.reflects and options.get("mixed") == "stabilised pressure":
             warn(
                 bodies[0].V.mesh.comm,
                 "With mixed='stabilised pressure' a motion with out_of_range='reflect' may win "
@@ -117,7 +118,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         for body, its in zip(bodies, start, strict=True):
             if body in static:
                 its.x.array[:] = 0.0
-        self.inertia = Inertia(bodies, start, scheme, out_of_range, damping, self._energies, static)
+        self.inertia = Inertia(bodies, start, rule, damping, self._energies, static)
         given = as_terms(terms, bodies)
         if after is not None:
             join(given, after.terms)
@@ -132,7 +133,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
                 **options,
             )
             self.history.energies = self._energies
-            self.inertia.settle()
+            self.inertia.mass()
             if after is not None:
                 for points, before in zip(self.points, after.points, strict=True):
                     points.take_over(before)
@@ -194,7 +195,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
     ) -> tuple[StepStress, Sequence[StepForce]]:
         """See :meth:`QuasiStaticProblem._in_time`."""
         body = history.strain.particles
-        whole = self.inertia.scheme == "conserving" and not self.inertia.is_static(body)
+        whole = self.inertia.scheme.stress_of_step and not self.inertia.is_static(body)
         stress = StepStress(history, whole, self._viscosity, self._force_share(body))
         self._step_stresses.append(stress)
         return stress, (stress, *supports)
@@ -206,7 +207,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
 
     def _force_share(self, body: Particles) -> float:
         """See :meth:`QuasiStaticProblem._force_share`."""
-        return 1.0 if self.inertia.is_static(body) else self.inertia.share
+        return 1.0 if self.inertia.is_static(body) else self.inertia.scheme.share
 
     def _contribution(self, given: BodySetup) -> Contribution:
         """See :meth:`QuasiStaticProblem._contribution`."""
@@ -240,8 +241,8 @@ class DynamicParticleProblem(MovingProblem):
             list has one for each body.
         J: As in :class:`ParticleProblem`.
         velocity: As in :class:`DynamicProblem`.
-        scheme: ``"midpoint"`` or ``"euler"``. Stress of a whole step (``"conserving"``) is for
-            materials: write the law as one.
+        scheme: ``"midpoint"``, ``"euler"`` or a :class:`Scheme`. Stress of a whole step
+            (``"conserving"``) is for materials: write the law as one.
         out_of_range: As in :class:`DynamicProblem`.
         damping: Damping in proportion to the mass, one over a time; not negative.
         supports: Supports with a modulus, of :mod:`mpm_dolfinx.boundary`. One-sided ones and
@@ -262,7 +263,7 @@ class DynamicParticleProblem(MovingProblem):
         J: ufl.Form | Sequence[ufl.Form | None] | None = None,
         *,
         velocity: Any = None,
-        scheme: str = "midpoint",
+        scheme: str | Scheme = "midpoint",
         out_of_range: str = "project",
         damping: float = 0.0,
         supports: Sequence[Support] = (),
@@ -281,10 +282,11 @@ class DynamicParticleProblem(MovingProblem):
         )
         rayleigh = rayleigh_of((damping, 0.0))
         require_motion("DynamicParticleProblem", options)
-        if scheme == "conserving":
+        rule = as_scheme(scheme, out_of_range)
+        if rule.stress_of_step:
             raise MPMError(
-                "scheme='conserving' needs the stress at points, which a residual in UFL does not "
-                "tell; write the law as a material, and make a DynamicProblem."
+                f"scheme={rule.name!r} needs the stress at points, which a residual in UFL does "
+                "not tell; write the law as a material, and make a DynamicProblem."
             )
         residuals = R if isinstance(R, list | tuple) else [R]
         if any(is_one_sided(form) for form in residuals):
@@ -299,11 +301,11 @@ class DynamicParticleProblem(MovingProblem):
             raise MPMError(f"There are {len(bodies)} bodies, but a list of {len(given)} densities.")
         self._densities = [Density(rho, body) for rho, body in zip(given, bodies, strict=True)]
         self._energies = []
-        self.inertia = Inertia(bodies, start, scheme, out_of_range, rayleigh, self._energies)
+        self.inertia = Inertia(bodies, start, rule, rayleigh, self._energies)
         every = [self.inertia, *as_terms(terms, bodies)]
         super().__init__(R, particles, J, predictor=False, terms=every, **options)
         self.history.energies = self._energies
-        self.inertia.settle()
+        self.inertia.mass()
 
     def _contributions(self) -> list[Contribution]:
         """See :meth:`ParticleProblem._contributions`."""
@@ -316,7 +318,7 @@ class DynamicParticleProblem(MovingProblem):
         """Return a body's contribution with those of its supports (collective)."""
         if not supports:
             return given
-        forms = [s.at_body(_no_moduli, 1.0, self.inertia.share) for s in supports]
+        forms = [s.at_body(_no_moduli, 1.0, self.inertia.scheme.share) for s in supports]
         form, d = sum(forms[1:], forms[0]), supports[0].particles.displacement
         return given._replace(
             residual=form if given.residual is None else given.residual + form,

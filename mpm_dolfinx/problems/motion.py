@@ -71,7 +71,7 @@ class MovingProblem(TimeProblem):
         super()._let_take_part(materials)
         for term in self.terms:
             if term is not self.inertia:
-                term.pace(self.inertia.dt, self.inertia.share)
+                term.pace(self.inertia.dt, self.inertia.scheme.share)
 
     def _reduced_masses(self, masses: Masses) -> tuple[list[PETSc.Mat], list[Particles]]:
         """Return :meth:`ReducedSystem.masses` (collective)."""
@@ -134,12 +134,12 @@ class MovingProblem(TimeProblem):
     @property
     def kinetic_energy(self) -> float:
         """Kinetic energy at the last converged step (collective)."""
-        return self.inertia.kinetic()
+        return self.inertia.mass().kinetic(self.inertia.velocities)
 
     @property
     def momentum(self) -> NDArray[np.float64]:
         """Momentum of all bodies at the last converged step, shape ``(gdim,)`` (collective)."""
-        return self.inertia.momentum()
+        return self.inertia.mass().momentum(self.inertia.velocities)
 
     @property
     def angular_momentum(self) -> NDArray[np.float64]:
@@ -147,7 +147,7 @@ class MovingProblem(TimeProblem):
 
         Shape ``(1,)`` in the plane, about the axis normal to it, or ``(3,)``.
         """
-        return self.inertia.angular_momentum()
+        return self.inertia.mass().angular_momentum(self.inertia.velocities)
 
     # -- Through time -------------------------------------------------------------------------
 
@@ -171,9 +171,9 @@ class MovingProblem(TimeProblem):
         :meth:`ParticleProblem.reaction`.
         """
         force = super().reaction(bc)
-        return (
-            force if isinstance(bc, Support | Contact | RigidBody) else self.inertia.share * force
-        )
+        if isinstance(bc, Support | Contact | RigidBody):
+            return force
+        return self.inertia.scheme.share * force
 
 
 def initial_velocities(

@@ -1,0 +1,236 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Time schemes: how a step's increment makes velocities, and which forces it balances.
+
+The increment w of displacement is the unknown of a step. With f the forces at its ends, M the mass
+and C the damping in proportion to it, a scheme has
+
+    T^T [ M a + C s + (1 - share) f_n + share f_1 ] = 0,
+
+where the acceleration a, the velocity s that damping resists, the velocity v_1 at the end and what
+is kept for the next step are linear combinations of w, of the velocity v_n at the beginning and of
+what was kept. No acceleration needs to be kept: what the cells cannot follow would add up in it.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import MPMError
+from ..reals import is_one_of
+from .mass import NodalMass
+
+__all__ = ["OUT_OF_RANGE", "SCHEMES", "Conserving", "Euler", "Kinematics", "Midpoint", "Rates"]
+__all__ += ["Scheme", "as_scheme", "rates_of"]
+
+OUT_OF_RANGE = ("project", "reflect")
+
+type Factors = NDArray[np.float64]
+"""Factors of the increment, of the velocity at the beginning, and of all that a scheme keeps."""
+
+
+class Rates(NamedTuple):
+    """Linear combinations of the increment, the velocity at the beginning, and what is kept.
+
+    Attributes:
+        acceleration: The force of inertia, over the mass.
+        damped: Velocity that damping in proportion to the mass resists.
+        velocity: At the step's end.
+        kept: What is kept of the step, in the order of :attr:`Scheme.keeps`.
+    """
+
+    acceleration: Factors
+    damped: Factors
+    velocity: Factors
+    kept: Sequence[Factors] = ()
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """Motion in a step that has converged: vectors on W of each body.
+
+    Attributes:
+        mass: The mass of the bodies.
+        increment: Of displacement.
+        acceleration: Of which the mass times it is the force of inertia.
+        before: Velocity at the beginning.
+        taken: The part of it that has come into that at the end.
+        after: Velocity at the end.
+    """
+
+    mass: NodalMass
+    increment: Sequence[PETSc.Vec]
+    acceleration: Sequence[PETSc.Vec]
+    before: Sequence[PETSc.Vec]
+    taken: Sequence[PETSc.Vec]
+    after: Sequence[PETSc.Vec]
+
+    @property
+    def left(self) -> list[PETSc.Vec]:
+        """Velocity at the beginning that has not come into that at the end."""
+        return _difference(self.before, self.taken)
+
+    @property
+    def change(self) -> list[PETSc.Vec]:
+        """Change of the velocity."""
+        return _difference(self.after, self.before)
+
+
+class Scheme(ABC):
+    """A rule by which bodies move through a step in time; a subclass is a new one.
+
+    Give an instance as ``scheme=`` to a :class:`DynamicProblem`.
+
+    Args:
+        reflects: Whether the velocity at a step's end has in it all of that at the beginning;
+            otherwise the part of it alone that the step's background can follow.
+
+    Attributes:
+        name: A word by which a checkpoint knows it.
+        share: Weight of the forces at a step's end, from 0.5 to 1; those at its beginning have the
+            rest.
+        stress_of_step: Whether the stress of a material is one of the whole step, by which angular
+            momentum and the energy of elastic bodies are kept; with ``share`` 0.5.
+        keeps: Names of the fields that it keeps from step to step, besides the velocity. They are
+            zero before the first step, are saved in checkpoints, and go with the bodies.
+        reflects: As given.
+    """
+
+    name: str
+    share: float = 1.0
+    stress_of_step: bool = False
+    keeps: tuple[str, ...] = ()
+
+    def __init__(self, reflects: bool = False) -> None:
+        self.reflects = reflects
+
+    @abstractmethod
+    def rates(self, dt: float, last: float) -> Rates:
+        """Return how a step makes velocities.
+
+        Args:
+            dt: Duration of the step.
+            last: Duration of the step before; 0 where there is none.
+        """
+
+    def lost(self, step: Kinematics) -> float:
+        """Return the kinetic energy that a step has lost by the scheme alone (collective).
+
+        That is the work of the acceleration less the change of kinetic energy; a scheme whose loss
+        is known as a square can tell it without a difference.
+        """
+        product = step.mass.product
+        change = 0.5 * (product(step.after, step.after) - product(step.before, step.before))
+        return product(step.acceleration, step.increment) - change
+
+
+class Midpoint(Scheme):
+    """Second order; the force of a step is the mean of those at its ends."""
+
+    name = "midpoint"
+    share = 0.5
+
+    def rates(self, dt: float, last: float) -> Rates:
+        """See :meth:`Scheme.rates`."""
+        mean = np.array([1.0 / dt, 0.0])
+        velocity = np.array([2.0 / dt, -1.0])
+        return Rates(np.array([2.0 / dt**2, -2.0 / dt]), mean, velocity)
+
+    def lost(self, step: Kinematics) -> float:
+        """See :meth:`Scheme.lost`: what the background could not follow."""
+        product, left = step.mass.product, step.left
+        return 0.5 * product(left, left) - product(step.after, left)
+
+
+class Conserving(Midpoint):
+    """The midpoint rule with a stress of the whole step."""
+
+    name = "conserving"
+    stress_of_step = True
+
+
+class Euler(Scheme):
+    """Backward Euler: first order, with forces at the step's end."""
+
+    name = "euler"
+
+    def __init__(self, reflects: bool = False) -> None:
+        super().__init__()  # its velocities have nothing of those before
+
+    def rates(self, dt: float, last: float) -> Rates:
+        """See :meth:`Scheme.rates`."""
+        velocity = np.array([1.0 / dt, 0.0])
+        return Rates(np.array([1.0 / dt**2, -1.0 / dt]), velocity, velocity)
+
+    def lost(self, step: Kinematics) -> float:
+        """See :meth:`Scheme.lost`."""
+        change = step.change
+        return 0.5 * step.mass.product(change, change)
+
+
+#: The schemes that a problem knows by name.
+SCHEMES: dict[str, type[Scheme]] = {one.name: one for one in (Midpoint, Conserving, Euler)}
+
+
+def as_scheme(value: Any, out_of_range: Any) -> Scheme:
+    """Return a scheme by its name, or one that is given.
+
+    Args:
+        value: One of :data:`SCHEMES`, or a :class:`Scheme`.
+        out_of_range: One of :data:`OUT_OF_RANGE`, for those with a name.
+
+    Raises:
+        MPMError: There is none of this name, or one that is given cannot do as asked.
+    """
+    if not is_one_of(out_of_range, OUT_OF_RANGE):
+        raise MPMError(
+            f"Unknown out_of_range={out_of_range!r}; choose one of {', '.join(OUT_OF_RANGE)}."
+        )
+    reflects = out_of_range == "reflect"
+    if isinstance(value, Scheme):
+        if reflects and not value.reflects:
+            raise MPMError("out_of_range='reflect' is for schemes by name; make this one reflect.")
+        if not 0.5 <= value.share <= 1.0 or (value.stress_of_step and value.share != 0.5):
+            raise MPMError(
+                f"{type(value).__name__}.share must be from 0.5 to 1, and 0.5 with a stress of the "
+                f"whole step, not {value.share!r}."
+            )
+        return value
+    if not is_one_of(value, SCHEMES):
+        raise MPMError(
+            f"Unknown scheme={value!r}; choose one of {', '.join(SCHEMES)}, or give an mpm.Scheme."
+        )
+    return SCHEMES[value](reflects)
+
+
+def rates_of(scheme: Scheme, dt: float, last: float) -> Rates:
+    """Return the rates of a scheme, all with a factor for each field.
+
+    Raises:
+        MPMError: Some have not, or are not finite.
+    """
+    found, count = scheme.rates(dt, last), 2 + len(scheme.keeps)
+    rows = [found.acceleration, found.damped, found.velocity, *found.kept]
+    shapes = {np.shape(row) for row in rows}
+    if len(found.kept) != len(scheme.keeps) or shapes != {(count,)} or not np.isfinite(rows).all():
+        raise MPMError(
+            f"{type(scheme).__name__}.rates must return {3 + len(scheme.keeps)} rows of {count} "
+            "finite numbers: factors of the increment, of the velocity, and of each field in keeps."
+        )
+    return found
+
+
+def _difference(some: Sequence[PETSc.Vec], others: Sequence[PETSc.Vec]) -> list[PETSc.Vec]:
+    """Return the differences of vectors."""
+    found = [vector.copy() for vector in some]
+    for vector, other in zip(found, others, strict=True):
+        vector.axpy(-1.0, other)
+    return found

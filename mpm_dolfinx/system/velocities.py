@@ -1,0 +1,240 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What a motion has at the nodes of its bodies from step to step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from ..errors import MPMError
+from ..io.snapshot import Kept, Taken, fill, of_cells, spaces_of
+from ..meshes.remesh import Column, Place
+from ..particles.particles import Particles
+from .account import Account
+from .schemes import Scheme
+from .term import Term
+
+__all__ = ["Velocities"]
+
+FORCES = ("force", "external")
+
+
+class Velocities(Kept):
+    """Velocities, the forces that were there with them, and the account of energies.
+
+    Args:
+        bodies: The bodies.
+        velocities: At the beginning, on W of each body.
+        scheme: The time scheme.
+        rayleigh: Damping in proportion to mass and stiffness.
+        static: The bodies that have no inertia.
+        account: The account of energies.
+
+    Attributes:
+        velocities: At the last converged step, on W of each body.
+        forces: Of all terms, at the same time.
+        external: Those of them that are loads.
+        kept: What the scheme keeps.
+        time: Time of the last converged step.
+        last: Its duration; 0 before the first.
+    """
+
+    key = "inertia"
+
+    def __init__(
+        self,
+        bodies: Sequence[Particles],
+        velocities: Sequence[fem.Function],
+        scheme: Scheme,
+        rayleigh: tuple[float, float],
+        static: Sequence[Particles],
+        account: Account,
+    ) -> None:
+        self._bodies = tuple(bodies)
+        self._scheme, self._rayleigh, self._static = scheme, rayleigh, static
+        self._account = account
+        self.velocities = list(velocities)
+        self.forces = [fem.Function(body.W) for body in bodies]
+        self.external = [fem.Function(body.W) for body in bodies]
+        self.kept = [[fem.Function(body.W) for body in bodies] for _ in scheme.keeps]
+        self.time, self.last = 0.0, 0.0
+        self._rates: list[NDArray[np.float64]] = []  # of Dirichlet values, in the last step
+
+    def is_static(self, body: Particles) -> bool:
+        """Return whether a body has no inertia."""
+        return any(body is one for one in self._static)
+
+    def number(self, body: Particles) -> int:
+        """Return the number of a body."""
+        return next(i for i, one in enumerate(self._bodies) if one is body)
+
+    def join(self, bodies: Sequence[Particles]) -> None:
+        """Hold some more bodies, which are at rest, or fewer of the last (collective).
+
+        Args:
+            bodies: All bodies, in the problem's order.
+        """
+        self._bodies = tuple(bodies)
+        for functions in self._fields().values():
+            del functions[len(bodies) :]
+            for body in bodies[len(functions) :]:
+                functions.append(fem.Function(body.W, name="velocity"))
+
+    def _fields(self) -> dict[str, list[fem.Function]]:
+        """Return all fields by their names in a checkpoint."""
+        own = {"velocity": self.velocities, "force": self.forces, "external": self.external}
+        kept = zip(self._scheme.keeps, self.kept, strict=True)
+        return own | {f"{self._scheme.name} {name}": functions for name, functions in kept}
+
+    # -- Steps ------------------------------------------------------------------------------------
+
+    def note_forces(self, terms: Sequence[Term], balanced: bool = False) -> None:
+        """Keep the forces of all other terms, as they are now (collective).
+
+        Args:
+            terms: The terms.
+            balanced: Whether they are those of a step that has converged, which a term that begins
+                anew may find otherwise, as where points of contact have stayed with their facets.
+        """
+        for function in (*self.forces, *self.external):
+            function.x.array[:] = 0.0
+        for term in terms:
+            if balanced:
+                self._gather(term, term.end_forces(), self.forces)
+            self._gather(term, term.begin(), self.external)
+            if not balanced:
+                self._gather(term, term.end_forces(), self.forces)
+        for function in (*self.forces, *self.external):
+            function.x.scatter_forward()
+
+    def _gather(self, term: Term, vectors: Sequence[Any], to: Sequence[fem.Function]) -> None:
+        """Add a term's forces to those of its bodies."""
+        for body, vector in zip(term.bodies if vectors else (), vectors, strict=True):
+            to[self.number(body)].x.array[: vector.getLocalSize()] += vector.array_r
+
+    def driven(self, changes: Sequence[NDArray[np.float64]], dt: float) -> list[Any]:
+        """Return the rates of Dirichlet values at a step's beginning.
+
+        They are those of a parabola through the last three values.
+
+        Args:
+            changes: Of the values in the step, on own dofs of each background.
+            dt: Its duration.
+        """
+        rates = [change / dt for change in changes]
+        if self.last > 0.0 and len(self._rates) == len(rates):
+            part = dt / (dt + self.last)
+            before = zip(self._rates, rates, strict=True)
+            rates = [part * last + (1.0 - part) * now for last, now in before]
+        return rates
+
+    def commit(
+        self, fields: Sequence[Sequence[Any]], changes: Sequence[NDArray[np.float64]], time: float
+    ) -> None:
+        """Take over a step that has converged (collective).
+
+        Args:
+            fields: Velocities at its end, and what the scheme keeps of it; vectors for each body.
+            changes: Of Dirichlet values in it.
+            time: Time of its end.
+        """
+        for functions, vectors in zip((self.velocities, *self.kept), fields, strict=True):
+            for function, vector in zip(functions, vectors, strict=True):
+                function.x.array[: vector.getLocalSize()] = vector.array_r
+                function.x.scatter_forward()
+        dt = time - self.time
+        self._rates = [change / dt for change in changes]
+        self.time, self.last = time, dt
+
+    def undo(self) -> Callable[[], None]:
+        """Return what takes back all that changes from now on, also in the account."""
+        functions = [one for fields in self._fields().values() for one in fields]
+        values = [function.x.array.copy() for function in functions]
+        before, account = (self.time, self.last, self._rates), self._account.undo()
+
+        def undo() -> None:
+            for function, its in zip(functions, values, strict=True):
+                function.x.array[:] = its
+            self.time, self.last, self._rates = before
+            account()
+
+        return undo
+
+    # -- Checkpoints ------------------------------------------------------------------------------
+
+    def numbers(self) -> dict[str, Any]:
+        """See :class:`Kept`."""
+        return {
+            "scheme": [self._scheme.name, "reflect" if self._scheme.reflects else "project"],
+            "rayleigh": list(self._rayleigh),
+            "static": [number for number, body in enumerate(self._bodies) if self.is_static(body)],
+            "time": self.time,
+            "rates": self.last,
+            **self._account.numbers(),
+        }
+
+    def columns(self, body: int | None) -> dict[str, Column]:
+        """See :class:`Kept`."""
+        if body is None:
+            return self.on_background(0)
+        return {name: _column(name, its[body]) for name, its in self._fields().items()}
+
+    def on_background(self, number: int) -> dict[str, Column]:
+        """See :class:`Kept`: the rates of Dirichlet values in the last step."""
+        spaces = spaces_of(self._bodies)
+        if number >= len(spaces):  # that of a pressure, which has no rates
+            return {}
+        function = fem.Function(spaces[number])
+        if self.last > 0.0 and number < len(self._rates):
+            function.x.array[: len(self._rates[number])] = self._rates[number]
+            function.x.scatter_forward()
+        return {"rates": Column(of_cells(function), "nodes")}
+
+    def require(self, source: str, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        if "scheme" not in taken.numbers:
+            raise MPMError(f"{source} holds no velocities; it is not that of a DynamicProblem.")
+        present = self.numbers()
+        mine, its = present["scheme"], taken.numbers["scheme"]
+        if list(its) != mine:
+            raise MPMError(
+                f"{source} was made with scheme={its[0]!r}, out_of_range={its[1]!r}, and this "
+                f"problem with {mine[0]!r}, {mine[1]!r}."
+            )
+        damping = taken.numbers.get("rayleigh")  # which older files do not tell
+        if damping is not None and damping != present["rayleigh"]:
+            raise MPMError(
+                f"{source} was made with rayleigh={tuple(damping)}, and this problem with "
+                f"{tuple(present['rayleigh'])}."
+            )
+        if taken.numbers.get("static", []) != present["static"]:
+            raise MPMError(f"{source} has other bodies without inertia than quasi_static= says.")
+        super().require(source, taken)
+
+    def restore(self, taken: Taken) -> None:
+        """See :class:`Kept`."""
+        for name, functions in self._fields().items():
+            for number, body in enumerate(self._bodies):
+                if functions[number].function_space is not body.W:
+                    functions[number] = fem.Function(body.W, name=functions[number].name)
+                fill(functions[number], taken.columns[number][name])
+        self.time, self.last = taken.numbers["time"], taken.numbers["rates"]
+        self._account.restore(taken.numbers)
+        self._rates = []
+        for V, columns in zip(spaces_of(self._bodies), taken.backgrounds, strict=False):
+            function = fem.Function(V)
+            fill(function, columns["rates"])
+            owned = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
+            self._rates.append(np.array(function.x.array[:owned]))
+
+
+def _column(name: str, function: fem.Function) -> Column:
+    """Return what a checkpoint has of a field."""
+    place: Place = "forces" if name in FORCES else "nodes"
+    return Column(of_cells(function), place)
