@@ -14,7 +14,7 @@ error, a gap of ``strain h / penalty``, is far below that of the domains' displa
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, override
 
 from mpi4py import MPI
 
@@ -214,7 +214,7 @@ class Support:
         raise NotImplementedError
 
     def pace(self, dt: float, share: float) -> None:
-        """See :meth:`mpm_dolfinx.Term.pace`."""
+        """Set the share of a step's end in its force (:meth:`mpm_dolfinx.Term.pace`)."""
         self._share = share
         np.copyto(self._scale.value, 1.0 / share)
 
@@ -307,12 +307,12 @@ class Plane(Support):
         some = ufl.conditional(ufl.Or(*touched), 0.5 * (ends[0] + ends[1]) * change, 0.0)
         return -self._stiffness * some * self._normal
 
+    @override
     def settle(self) -> None:
-        """See :meth:`Support.settle`."""
         self._start.settle()
 
+    @override
     def step_work(self) -> tuple[float, float]:
-        """See :meth:`Support.step_work`."""
         if not self._whole_step:
             return 0.0, 0.0
         d = self.particles.displacement
@@ -355,8 +355,8 @@ class Dashpot(Support):
         return True
 
     @property
+    @override
     def residual(self) -> ufl.Form:
-        """See :attr:`Support.residual`."""
         if not self._whole_step:
             self._has_whole_step(None)
         return super().residual
@@ -364,17 +364,17 @@ class Dashpot(Support):
     def _of_step(self) -> Any:
         return self._damping
 
+    @override
     def pace(self, dt: float, share: float) -> None:
-        """See :meth:`Support.pace`."""
         super().pace(dt, share)
         np.copyto(self._dt.value, dt)
 
+    @override
     def settle(self) -> None:
-        """See :meth:`Support.settle`."""
         self._start.settle()
 
+    @override
     def step_work(self) -> tuple[float, float]:
-        """See :meth:`Support.step_work`."""
         d = self.particles.displacement
         self._last = super().reaction
         return 0.0, self._step_power(d - self._start.of(d))

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,54 +133,56 @@ class Revolution(Strain):
         self._radius = self._mesh_radius if particles.origin is None else particles.origin[0]
 
     @property
+    @override
     def hoop(self) -> Array | None:
-        """See :class:`Strain`."""
         return self.particles.hoop
 
+    @override
     def gradient(self) -> Array:
-        """See :meth:`Strain.gradient`."""
         return self.particles.displacement_gradient(axisymmetric=True)
 
+    @override
     def volumes(self) -> Array:
-        """See :meth:`Strain.volumes`: all around."""
+        """Volumes all around the axis."""
         return self.particles.point_volumes(axisymmetric=True)
 
+    @override
     def beyond(self) -> tuple[str, NDArray[np.int64]]:
-        """See :meth:`Strain.beyond`: the axis stays where it is."""
+        """Displacements beyond the mesh; the axis stays where it is."""
         words = "reach across the axis x[0] = 0 (nodes on it must be held against the radius)"
         return words, self.particles.behind_axis()
 
+    @override
     def before_mesh(self) -> Array | None:
-        """See :meth:`Strain.before_mesh`."""
         return super().before_mesh() if self.particles.means is None else None
 
+    @override
     def integral(self, work: Any) -> ufl.Form:
-        """See :meth:`Strain.integral`."""
         means = self.particles.means
         if means is None:
             return super().integral(work)
         form: ufl.Form = means.share * work * self.particles.dx
         return form
 
+    @override
     def ufl_gradient(self, w: Any) -> Any:
-        """See :meth:`Strain.ufl_gradient`."""
         means = self.particles.means
         if means is None:
             return super().ufl_gradient(w)
         return _in_space(means.gradient(w), means.hoop(w))
 
     @property
+    @override
     def turn(self) -> Any:
-        """See :class:`Strain`."""
         return 2.0 * np.pi * self._radius
 
     @property
+    @override
     def present_turn(self) -> Any:
-        """See :class:`Strain`."""
         return 2.0 * np.pi * (self._mesh_radius + self.particles.displacement[0])
 
+    @override
     def with_turn(self, gradient: Any, w: Any) -> Any:
-        """See :meth:`Strain.with_turn`."""
         return _in_space(gradient, w[0] / self._radius)
 
 

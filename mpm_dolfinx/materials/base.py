@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, cast
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, cast, override
 
 from mpi4py import MPI
 
@@ -371,8 +371,8 @@ class StrainMaterial(Material):
         """The strain measure at work."""
         return KINEMATICS[self.kinematics]
 
+    @override
     def initial_state(self, n: int, dim: int) -> State:
-        """See :meth:`Material.initial_state`."""
         for value in self.parameters.values():
             if isinstance(value, Refused):
                 raise MPMError(value.message)
@@ -397,16 +397,14 @@ class StrainMaterial(Material):
             "which returns the elastic strain of stresses (n, m)."
         )
 
+    @override
     def stressed_state(
         self,
         cauchy_stress: NDArray[np.float64],
         displacement_gradient: NDArray[np.float64],
         variables: Mapping[str, NDArray[np.float64]] = MappingProxyType({}),
     ) -> State:
-        """See :meth:`Material.stressed_state`.
-
-        The points carry the elastic strain of this stress, which must not be beyond yield.
-        """
+        """State with the elastic strain of this stress, which must not be beyond yield."""
         dim = displacement_gradient.shape[-1]
         ratio = self._kinematics.volume_ratio(displacement_gradient)[:, None, None]
         own = ratio * cauchy_stress
@@ -431,10 +429,10 @@ class StrainMaterial(Material):
         history = self._kinematics.history_of(strain, displacement_gradient)
         return state | {"stress": stress} | history
 
+    @override
     def update(
         self, displacement_gradient: NDArray[np.float64], state: State, tangent: bool = True
     ) -> Update:
-        """See :meth:`Material.update`."""
         remembers = "displacement_gradient" in state  # elastic points that began with a stress too
         frame = self._kinematics(displacement_gradient, state if remembers else None)
         variables = {name: state[name] for name in self.internal_variables}
@@ -467,10 +465,10 @@ class StrainMaterial(Material):
         """
         return at_pressure(self, displacement_gradient, state, pressure, shear)
 
+    @override
     def cauchy_stress(
         self, displacement_gradient: NDArray[np.float64], state: State
     ) -> NDArray[np.float64]:
-        """See :meth:`Material.cauchy_stress`."""
         ratio = self._kinematics.volume_ratio(displacement_gradient)
         return to_tensor(state["stress"]) / ratio[:, None, None]
 

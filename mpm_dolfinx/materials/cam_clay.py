@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self, override
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -134,8 +134,9 @@ class ModifiedCamClay(CompiledMaterial):
                 order = "less than" if less == "swelling" else "at most"
                 raise MPMError(f"{less} must be {order} {more}, at each point.")
 
+    @override
     def initial_state(self, n: int, dim: int) -> State:
-        """See :meth:`Material.initial_state`; the points are under the reference pressure."""
+        """State of points under the reference pressure."""
         state = super().initial_state(n, dim)
         self._require_order()
         state["stress"][:, :3] = -per_row(self.parameters["reference_pressure"])
@@ -178,8 +179,8 @@ class ModifiedCamClay(CompiledMaterial):
         q = np.sqrt(1.5) * norm(deviator(stress)) / self.parameters["critical_ratio"]
         return np.asarray((q / p_c) ** 2 + p / p_c * (p / p_c - 1.0))
 
+    @override
     def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
-        """See :meth:`StrainMaterial.integrate`."""
         n, m = trial_strain.shape
         p_c = variables["preconsolidation"]
         law = _Law.of(self.parameters, p_c)

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +37,8 @@ class CompiledMaterial(StrainMaterial):
         """Return what the compiled law has for parameters, as ``material.h`` lists them."""
         raise NotImplementedError
 
+    @override
     def update(self, displacement_gradient: Array, state: State, tangent: bool = True) -> Update:
-        """See :meth:`Material.update`."""
         loop = self._known_loop()
         if not loop:
             return super().update(displacement_gradient, state, tangent)
@@ -56,10 +56,10 @@ class CompiledMaterial(StrainMaterial):
         require_valid(valid)
         return Update(P, A if tangent else None, new)
 
+    @override
     def at_pressure(
         self, displacement_gradient: Array, state: State, pressure: Array, shear: Array
     ) -> AtPressure:
-        """See :meth:`StrainMaterial.at_pressure`."""
         loop = self._known_loop()
         if not loop or "displacement_gradient" not in state:
             return super().at_pressure(displacement_gradient, state, pressure, shear)

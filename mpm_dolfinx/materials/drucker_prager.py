@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, NamedTuple, get_args
+from typing import ClassVar, Literal, NamedTuple, get_args, override
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -129,8 +129,8 @@ class DruckerPrager(FrictionalMaterial):
         cone = np.sqrt(0.5) * norm(deviator(stress)) + eta * mean - strength
         return np.asarray(np.maximum(cone, mean - self._tension()))
 
+    @override
     def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
-        """See :meth:`StrainMaterial.integrate`."""
         if "decay" in self.parameters:
             law = self.softened(variables["plastic_strain"])
             return law.integrate(trial_strain, variables, tangent)

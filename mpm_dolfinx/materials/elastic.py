@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, override
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -84,10 +84,10 @@ class IsotropicElastic(CompiledMaterial):
         D = bulk * np.outer(one, one) + 2.0 * shear * deviatoric_projector(m)
         return np.broadcast_to(D, (n, m, m))
 
+    @override
     def integrate(
         self, trial_strain: NDArray[np.float64], variables: State, tangent: bool
     ) -> Integration:
-        """See :meth:`StrainMaterial.integrate`."""
         D = self.elastic_tangent(*trial_strain.shape) if tangent else None
         return Integration(self.elastic_stress(trial_strain), D, trial_strain, variables)
 

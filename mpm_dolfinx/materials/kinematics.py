@@ -114,7 +114,6 @@ class SmallStrain(Kinematics):
     """Infinitesimal strain: one stress, no difference of configurations."""
 
     def __init__(self, displacement_gradient: Array, history: Mapping[str, Array] | None) -> None:
-        """See :class:`Kinematics`."""
         self._gradient = points_last(displacement_gradient)
         self._dim = len(self._gradient)
         if history is None:
@@ -169,7 +168,7 @@ class LogarithmicStrain(Kinematics):
     """
 
     def __init__(self, displacement_gradient: Array, history: Mapping[str, Array] | None) -> None:
-        """See :class:`Kinematics`.
+        """Take the displacement gradients of points.
 
         Raises:
             DomainDistortionError: det F or an eigenvalue of b is not positive and finite; its

@@ -7,7 +7,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self, override
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -139,24 +139,24 @@ class FrictionalMaterial(IsotropicElastic):
         other.parameters = values
         return other
 
+    @override
     def update(self, displacement_gradient: Array, state: State, tangent: bool = True) -> Update:
-        """See :meth:`Material.update`."""
         if "decay" in self.parameters:
             law = self.softened(state["plastic_strain"])
             return law.update(displacement_gradient, state, tangent)
         return super().update(displacement_gradient, state, tangent)
 
+    @override
     def at_pressure(
         self, displacement_gradient: Array, state: State, pressure: Array, shear: Array
     ) -> AtPressure:
-        """See :meth:`StrainMaterial.at_pressure`."""
         if "decay" in self.parameters:
             law = self.softened(state["plastic_strain"])
             return law.at_pressure(displacement_gradient, state, pressure, shear)
         return super().at_pressure(displacement_gradient, state, pressure, shear)
 
+    @override
     def with_parameters(self, **parameters: Parameter) -> Self:
-        """See :meth:`Material.with_parameters`."""
         other = super().with_parameters(**parameters)
         replaced = [angle for angle in _ANGLES if angle in parameters]
         angles = [law.parameters[angle] for law in (self, other) for angle in _ANGLES]
@@ -166,12 +166,9 @@ class FrictionalMaterial(IsotropicElastic):
             other.symmetric = False
         return other
 
+    @override
     def weakened(self, factor: float) -> Self:
-        """See :meth:`Material.weakened`.
-
-        c, tan(phi), their residual values and a cut-off are divided; psi stays what it is, up to
-        phi.
-        """
+        """Divide c, tan(phi), their residual values and a cut-off; psi stays, up to phi."""
         values: dict[str, Any] = {}
         for name in ("cohesion", "cohesion_residual", "tension_cutoff"):
             if name in self.parameters:
@@ -186,8 +183,8 @@ class FrictionalMaterial(IsotropicElastic):
         known = {n: v if isinstance(v, np.ndarray) else float(v) for n, v in values.items()}
         return self.with_parameters(**known)
 
+    @override
     def initial_state(self, n: int, dim: int) -> State:
-        """See :meth:`Material.initial_state`."""
         _require_less_dilation(*(self.parameters[angle] for angle in _ANGLES))
         _require_softening(self.parameters)
         return super().initial_state(n, dim)
@@ -274,8 +271,8 @@ class MohrCoulomb(FrictionalMaterial):
         corrects = float(self.volume_correction)
         return self.bulk, self.shear, friction, dilation, strength, self._tension(), corrects
 
+    @override
     def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
-        """See :meth:`StrainMaterial.integrate`."""
         if "decay" in self.parameters:
             softer = self.softened(variables["plastic_strain"])
             return softer.integrate(trial_strain, variables, tangent)

@@ -8,7 +8,7 @@ import copy
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self, override
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -106,22 +106,23 @@ class MuIRheology(IsotropicElastic):
         self.duration = math.inf
         _require_rising(self.parameters)
 
+    @override
     def in_time(self, duration: float) -> Self:
-        """See :meth:`Material.in_time`."""
         if duration == self.duration:
             return self
         other = copy.copy(self)
         other.duration = duration
         return other
 
+    @override
     def weakened(self, factor: float) -> Self:
-        """See :meth:`Material.weakened`; both coefficients are divided."""
+        """Divide both coefficients."""
         values = {n: self.parameters[n] / factor for n in ("static_friction", "limit_friction")}
         known = {n: v if isinstance(v, np.ndarray) else float(v) for n, v in values.items()}
         return self.with_parameters(**known)
 
+    @override
     def initial_state(self, n: int, dim: int) -> State:
-        """See :meth:`Material.initial_state`."""
         _require_rising(self.parameters)
         return super().initial_state(n, dim)
 
@@ -144,8 +145,8 @@ class MuIRheology(IsotropicElastic):
         time = np.where(np.equal(lag, 0.0), 1.0, self.duration)
         return self.bulk, self.shear, friction, span, lag, time
 
+    @override
     def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
-        """See :meth:`StrainMaterial.integrate`."""
         n, m = trial_strain.shape
         stress = self.elastic_stress(trial_strain)
         D = self.elastic_tangent(n, m) if tangent else None

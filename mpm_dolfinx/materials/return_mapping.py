@@ -7,7 +7,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,10 +104,11 @@ class ReturnMapping(IsotropicElastic):
         slope = slope_by_stress if _has_analytic_gradient(self) else difference_by_stress
         return slope(self.potential_gradient, stress, plastic_strain)
 
+    @override
     def integrate(
         self, trial_strain: NDArray[np.float64], variables: State, tangent: bool
     ) -> Integration:
-        """See :meth:`StrainMaterial.integrate`.
+        """Integrate by a return map.
 
         Raises:
             ConvergenceError: Newton's method fails; ``particles`` are the numbers of the points.

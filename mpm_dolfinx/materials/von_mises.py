@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self, override
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -81,8 +81,8 @@ class VonMises(IsotropicElastic):
             "hardening": check_parameter("hardening", hardening, **self.limits["hardening"]),
         }
 
+    @override
     def weakened(self, factor: float) -> Self:
-        """See :meth:`Material.weakened`."""
         names = [name for name in ("rho_y", "yield_stress", "hardening") if name in self.parameters]
         return self.with_parameters(**{name: self.parameters[name] / factor for name in names})
 
@@ -104,16 +104,17 @@ class VonMises(IsotropicElastic):
         """Return f, shape ``(n,)``, of a state's stress ``(n, m)`` and plastic strain ``(n,)``."""
         return np.asarray(norm(deviator(stress)) / self.strength(plastic_strain) - 1.0)
 
+    @override
     def plastic_work(self, state: State) -> NDArray[np.float64]:
-        """See :meth:`Material.plastic_work`: the uniaxial stress, along the plastic strain."""
+        """Work of the uniaxial stress along the plastic strain."""
         kappa = state["plastic_strain"]
         yields = np.sqrt(1.5) * self.rho_y + 0.5 * self.parameters["hardening"] * kappa
         return np.asarray(yields * kappa)
 
+    @override
     def integrate(
         self, trial_strain: NDArray[np.float64], variables: State, tangent: bool
     ) -> Integration:
-        """See :meth:`StrainMaterial.integrate`."""
         n, m = trial_strain.shape
         stress = self.elastic_stress(trial_strain)
         f = self.yield_function(stress, variables["plastic_strain"])

@@ -169,7 +169,7 @@ class Particles(MaterialDomains):
         raise MPMError("Particles cannot be copied; make others: mpm.Particles(body, V, ...).")
 
     def __deepcopy__(self, memo: Any) -> NoReturn:
-        """See :meth:`__copy__`."""
+        """Raise an error: a body cannot be copied."""
         self.__copy__()
 
     def __del__(self) -> None:

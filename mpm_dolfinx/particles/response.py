@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,8 +63,9 @@ class MaterialDomains(Domains):
 
     governed_by: object | None = None
 
+    @override
     def _live_on(self, geometry: Geometry, deletable: bool) -> None:
-        """See :class:`Domains`; no response answers for the domains of another mesh yet."""
+        """Live on another mesh, for whose domains no response answers yet."""
         super()._live_on(geometry, deletable)
         self._response: Response | None = None
         self._unknowns: Sequence[Unknown] = ()

@@ -408,11 +408,11 @@ class ControlledSystem:
         return self._reduced.splits()
 
     def interpolations(self, coarsest: int, values: bool = False) -> Sequence[PETSc.Mat]:
-        """See :class:`Levels`."""
+        """Return the interpolations between levels of the unknowns without the load factor."""
         return self._reduced.interpolations(coarsest, values)
 
     def mass(self) -> PETSc.Mat:
-        """See :class:`Levels`."""
+        """Return the mass matrix of the unknowns without the load factor."""
         return self._reduced.mass()
 
     def extent(self) -> float:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, override
 
 from petsc4py import PETSc
 
@@ -110,30 +110,30 @@ class BodyTerm(Term):
         return self._contact
 
     @property
+    @override
     def fused(self) -> Sequence[tuple[Particles, BodyForms]]:
-        """See :attr:`Term.fused`."""
         forms = self.forms
         return [(self.particles, forms)] if forms.internal is not None or forms.fused else []
 
     @property
+    @override
     def follows_load(self) -> bool:
-        """See :attr:`Term.follows_load`."""
         return self.forms.follows_load
 
+    @override
     def begin(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.begin`."""
         self.forms.assemble_external()
         return [self.forms.external]
 
+    @override
     def pace(self, dt: float, share: float) -> None:
-        """See :meth:`Term.pace`."""
         if self._static:
             self.forms.factor, share = 1.0 / share, 1.0
         for part in self._of_step:
             part.pace(dt, share)
 
+    @override
     def end_forces(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.end_forces`."""
         if self._static:
             for part in self._of_step:
                 part.settle()
@@ -146,15 +146,15 @@ class BodyTerm(Term):
             part.settle()
         return [force]
 
+    @override
     def step_work(self) -> tuple[float, float]:
-        """See :meth:`Term.step_work`."""
         works = np.array([part.step_work() for part in self._of_step]).reshape(-1, 2)
         total = self.particles.mesh.comm.allreduce(works.sum(axis=0))
         done = self._work - total[1] if self._static else total[0]
         return float(done), float(total[1])
 
+    @override
     def update(self) -> MPMError | None:
-        """See :meth:`Term.update`."""
         if self._material is None:
             return None
         try:
@@ -163,16 +163,17 @@ class BodyTerm(Term):
             return error
         return None
 
+    @override
     def smooth(self) -> bool:
-        """See :meth:`Term.smooth`. It may differ between ranks."""
+        """Whether all points are smooth; it may differ between ranks."""
         return not self._contact and (self._material is None or self._material.elastic())
 
+    @override
     def yielding(self) -> NDArray[np.bool_] | None:
-        """See :meth:`Term.yielding`."""
         return None if self._material is None else self._material.yielding()
 
+    @override
     def residuals(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.residuals`."""
         force = self.forms.assemble_residual()
         if self._static:
             motion = force.duplicate()
@@ -188,12 +189,13 @@ class BodyTerm(Term):
             result.scale(self.forms.factor)
         return result
 
+    @override
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        """See :meth:`Term.tangents`."""
         return {(0, 0): self._counted(self.forms.assemble_tangent())} if self.forms.stock else {}
 
+    @override
     def reduced_tangents(self, transfer: Transfer) -> Sequence[PETSc.Mat]:
-        """See :meth:`Term.reduced_tangents`: low-rank parts apart from others."""
+        """Tangents at the unknowns, low-rank parts apart from others."""
         if self.forms.low_rank is None:
             return []
         T = transfer(self.particles)
@@ -202,23 +204,23 @@ class BodyTerm(Term):
         self._low_rank = self.forms.low_rank.reduced(T, self._low_rank)
         return [self._counted(part) for part in self._low_rank.parts]
 
+    @override
     def reduced_product(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.reduced_product`."""
         if self.forms.low_rank is None:
             return []
         return [self._counted(self.forms.low_rank_force(motions[0]))]
 
+    @override
     def absolute_contributions(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.absolute_contributions`."""
         return [self._counted(self.forms.absolute_contributions(self.particles.domain_nodes))]
 
+    @override
     def load_derivative(self, order: int) -> tuple[Sequence[PETSc.Vec], float]:
-        """See :meth:`Term.load_derivative`."""
         part, size = self.forms.load_derivative(order)
         return [part], size
 
+    @override
     def stiffness_force(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.stiffness_force`."""
         return [self._counted(self.forms.stiffness_force(motions[0]))]
 
     def shear_modulus(self) -> float:
@@ -242,12 +244,12 @@ class BodyTerm(Term):
         positive = [float(energy / volume) for energy in energies if energy > 0.0]
         return self.forms.factor * min(positive, default=0.0)
 
+    @override
     def commit(self) -> Callable[[], None] | None:
-        """See :meth:`Term.commit`."""
         return None if self._material is None else self._material.commit()
 
+    @override
     def roll_back(self) -> None:
-        """See :meth:`Term.roll_back`."""
         self.forms.update_average()
         if self._material is not None:
             self._material.roll_back()

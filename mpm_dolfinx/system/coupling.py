@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, override
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -99,15 +99,16 @@ class Tie(Term):
         return False
 
     @property
+    @override
     def symmetric(self) -> bool:
-        """See :attr:`Term.symmetric`."""
         return True
 
     def require_movable(self, consequence: str) -> None:
         """Raise nothing: the tie finds its points on other ranks."""
 
+    @override
     def begin(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.begin`: look for the points again where bodies have other meshes."""
+        """Look for the points again where bodies have other meshes."""
         self._settle()
         return ()
 
@@ -202,8 +203,8 @@ class Tie(Term):
         pull = np.where(self._held, self.stiffness * (gaps[0] - gaps[1]), 0.0)
         return pull.reshape(-1, gdim)
 
+    @override
     def residuals(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.residuals`."""
         pull = self._weights * self.tractions().ravel()
         forces = []
         for sign, (rows, _) in zip((1.0, -1.0), self._at, strict=True):
@@ -213,8 +214,8 @@ class Tie(Term):
             forces.append(force)
         return forces
 
+    @override
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        """See :meth:`Term.tangents`."""
         for pair, block in self._blocks.items():
             block.copy(self._tangents[pair], structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
             self._tangents[pair].scale(self.stiffness)

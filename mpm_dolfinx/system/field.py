@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from itertools import combinations
+from typing import override
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -504,8 +505,9 @@ class ValueField(Field):
         """Value on V of an unknown of size 1."""
         return 1.0 if self.unit is None else self.unit
 
+    @override
     def find(self) -> FreeDofs:
-        """See :meth:`Field.find`; look for the values that the step starts from."""
+        """Look for the values that the step starts from."""
         found = super().find()
         for carried in self.carried:
             carried.converged_displacement = carried.field.previous.x.array.copy()

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import override
 
 from petsc4py import PETSc
 
@@ -57,22 +58,23 @@ class PressureTerm(FieldTerm):
         self._mats: tuple[PETSc.Mat, PETSc.Mat, PETSc.Mat, PETSc.Mat] | None = None
 
     @property
+    @override
     def symmetric(self) -> bool:
-        """See :attr:`Term.symmetric`."""
         return self._material.symmetric
 
     @property
+    @override
     def coupling(self) -> Coupling:
-        """See :attr:`Term.coupling`."""
         return self._coupling
 
+    @override
     def absolute_product(self, changes: Sequence[NDArray[np.float64]]) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.absolute_product`; forces on the body's nodes are left out."""
+        """The product with absolute values, without forces on the body's nodes."""
         self._force.array_w[:] = self._coupling.sizes(*changes)
         return [self._none, self._force]
 
+    @override
     def residuals(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.residuals`."""
         found = self._material.volume_strain
         p = self._pressure.displacement.x.array[: len(found.volume)]
         weights = self._material.weights.ravel()
@@ -80,8 +82,8 @@ class PressureTerm(FieldTerm):
         self._force.array_w[:] = weights * gap
         return [self._none, self._force]
 
+    @override
     def absolute_contributions(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.absolute_contributions`."""
         size = self.residuals()[1].copy()
         size.abs()
         return [self._none, size]
@@ -102,8 +104,8 @@ class PressureTerm(FieldTerm):
             strains[weights == 0.0] = 0.0
         return np.take_along_axis(strains, self._order[:, None, :, None], axis=2).ravel()
 
+    @override
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        """See :meth:`Term.tangents`."""
         found = self._material.volume_strain
         diagonal = self._force.duplicate()
         diagonal.array_w[:] = -self._material.weights.ravel() * found.compliance

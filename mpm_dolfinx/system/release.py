@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any, cast, override
 
 from petsc4py import PETSc
 
@@ -45,8 +45,8 @@ class Release(Term):
         self._reactions: list[fem.Function] = []
 
     @property
+    @override
     def symmetric(self) -> bool:
-        """See :attr:`Term.symmetric`."""
         return True
 
     @property
@@ -102,13 +102,13 @@ class Release(Term):
 
     # -- A step ---------------------------------------------------------------------------
 
+    @override
     def begin(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.begin`."""
         self._factor = self._aim
         return self.residuals()
 
+    @override
     def residuals(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.residuals`."""
         if self._factor == 0.0:
             return ()
         forces = []
@@ -122,16 +122,16 @@ class Release(Term):
             forces.append(vector)
         return forces
 
+    @override
     def background_forces(self, V: fem.FunctionSpace) -> Array | None:
-        """See :meth:`Term.background_forces`."""
         if self._factor == 0.0:
             return None
         function = next(f for f in self._reactions if f.function_space is V)
         count = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
         return np.asarray(-self._factor * function.x.array[:count])
 
+    @override
     def commit(self) -> Callable[[], None]:
-        """See :meth:`Term.commit`."""
         before = self.remaining, self._nodal, self._reactions
 
         def undo() -> None:
@@ -142,14 +142,14 @@ class Release(Term):
             self._let_go()
         return undo
 
+    @override
     def roll_back(self) -> None:
-        """See :meth:`Term.roll_back`."""
         self._factor = self.remaining
 
     # -- What goes with the problem -------------------------------------------------------
 
+    @override
     def kept(self) -> Sequence[Kept]:
-        """See :meth:`Term.kept`."""
         return [_Held(self)]
 
     def columns(self, body: int) -> dict[str, Column]:
@@ -204,23 +204,24 @@ class _Held(Kept):
     def __init__(self, release: Release) -> None:
         self._release = release
 
+    @override
     def numbers(self) -> dict[str, Any]:
-        """See :class:`Kept`."""
         return {"remaining": self._release.remaining}
 
+    @override
     def columns(self, body: int | None) -> dict[str, Column]:
-        """See :class:`Kept`."""
         return {} if body is None else self._release.columns(body)
 
+    @override
     def on_background(self, number: int) -> dict[str, Column]:
-        """See :class:`Kept`."""
         return self._release.on_cells(number)
 
+    @override
     def require(self, source: str, taken: Taken) -> None:
-        """See :class:`Kept`; any state will do, one of before there were stages too."""
+        """Take any state, one from before there were stages too."""
 
+    @override
     def restore(self, taken: Taken) -> None:
-        """See :class:`Kept`."""
         self._release.take(taken)
 
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import Protocol, override
 
 from petsc4py import PETSc
 
@@ -56,25 +56,26 @@ class PressureSmoothing(FieldTerm):
         self._force = pressure.T.createVecLeft()
 
     @property
+    @override
     def symmetric(self) -> bool:
-        """See :attr:`Term.symmetric`."""
         return True
 
+    @override
     def begin(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.begin`; the points are in other cells, or have other volumes."""
+        """Begin a step, with points in other cells, or of other volumes."""
         self._matrix = None
         return ()
 
+    @override
     def residuals(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.residuals`."""
         values = self._force.duplicate()
         count = values.getLocalSize()
         values.array_w[:] = self._pressure.displacement.x.array[:count]
         self._present().mult(values, self._force)
         return [self._force]
 
+    @override
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        """See :meth:`Term.tangents`."""
         return {(0, 0): self._present()}
 
     def _present(self) -> PETSc.Mat:

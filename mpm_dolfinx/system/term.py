@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, override
 
 from petsc4py import PETSc
 
@@ -389,18 +389,18 @@ class UserTerm(Term):
         assert hooks is not None
         return hooks
 
+    @override
     def update(self) -> MPMError | None:
-        """See :meth:`Term.update`."""
         return self._hooks.evaluate()
 
+    @override
     def smooth(self) -> bool:
-        """See :meth:`Term.smooth`."""
         return self._hooks.smooth()
 
+    @override
     def commit(self) -> None:
-        """See :meth:`Term.commit`."""
         self._hooks.commit()
 
+    @override
     def roll_back(self) -> None:
-        """See :meth:`Term.roll_back`."""
         self._hooks.roll_back()

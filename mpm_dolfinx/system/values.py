@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import cast
+from typing import cast, override
 
 from petsc4py import PETSc
 
@@ -43,8 +43,8 @@ class FieldTerm(Term):
         """Whether it may let its bodies go: see :attr:`Term.one_sided`."""
         return False
 
+    @override
     def commit(self) -> Callable[[], None]:
-        """See :meth:`Term.commit`."""
         before = [field.commit() for field in self.fields]
 
         def undo() -> None:
@@ -53,8 +53,8 @@ class FieldTerm(Term):
 
         return undo
 
+    @override
     def roll_back(self) -> None:
-        """See :meth:`Term.roll_back`."""
         for field in self.fields:
             field.roll_back()
 
@@ -88,35 +88,35 @@ class FormsTerm(FieldTerm):
             self._none[0].set(0.0)
 
     @property
+    @override
     def symmetric(self) -> bool:
-        """See :attr:`Term.symmetric`."""
         return self._symmetric
 
     @property
+    @override
     def follows_load(self) -> bool:
-        """See :attr:`Term.follows_load`."""
         return self._forms.follows_load
 
+    @override
     def begin(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.begin`."""
         self._forms.assemble_external()
         return [*self._none, *self._forms.external]
 
+    @override
     def residuals(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.residuals`."""
         return [*self._none, *self._forms.assemble_residuals()]
 
+    @override
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        """See :meth:`Term.tangents`."""
         first = self._first
         blocks = self._forms.assemble_tangents()
         return {(i - first, j - first): block for (i, j), block in blocks.items()}
 
+    @override
     def absolute_contributions(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.absolute_contributions`."""
         return [*self._none, *self._forms.absolute_contributions()]
 
+    @override
     def load_derivative(self, order: int) -> tuple[Sequence[PETSc.Vec], float]:
-        """See :meth:`Term.load_derivative`."""
         parts, size = self._forms.load_derivative(order)
         return [*self._none, *parts], size

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from typing import override
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,12 +23,12 @@ class CPDI2(Method):
     at_nodes = True
     one_point = False
 
+    @override
     def rows(self, state: DomainState, background: BackgroundBasis) -> CornerBasis:
-        """See :meth:`Method.rows`."""
         return CornerBasis(None, background.at(state.positions))
 
+    @override
     def domains(self, state: DomainState) -> NDArray[np.float64]:
-        """See :meth:`Method.domains`."""
         return state.corners
 
 
@@ -36,8 +38,8 @@ class CPDI(Method):
     name = "cpdi"
     at_nodes = True
 
+    @override
     def rows(self, state: DomainState, background: BackgroundBasis) -> CornerBasis:
-        """See :meth:`Method.rows`."""
         corners = state.parallelograms()
         positions = state.nodes.copy()
         positions[state.domains] = corners

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from typing import override
+
 from mpi4py import MPI
 
 import numpy as np
@@ -44,10 +46,11 @@ class GIMP(Method):
         self._grid = BoxGrid(V.mesh)
         self._stretch = domain_update == "stretch"
 
+    @override
     def require(
         self, body: mesh.Mesh, corners: NDArray[np.float64], index: NDArray[np.int64]
     ) -> None:
-        """See :meth:`Method.require`: all domains are axis-aligned boxes."""
+        """Raise an error unless all domains are axis-aligned boxes."""
         low, high = corners.min(axis=1, keepdims=True), corners.max(axis=1, keepdims=True)
         off = np.minimum(corners - low, high - corners).max(axis=(1, 2), initial=0.0)
         skew = index[off > 1e-9 * (high - low).max(axis=(1, 2), initial=0.0)]
@@ -59,8 +62,8 @@ class GIMP(Method):
                     skew,
                 )
 
+    @override
     def rows(self, state: DomainState, background: BackgroundBasis) -> CornerBasis:
-        """See :meth:`Method.rows`."""
         centroid = state.particles.centroid
         half = 0.5 * np.ptp(self.domains(state), axis=1)
         middles, shares = self._grid.cut(centroid, half)
@@ -81,8 +84,9 @@ class GIMP(Method):
         )
         return CornerBasis(state.parallelograms(), affine(state, state.arms(), average))
 
+    @override
     def domains(self, state: DomainState) -> NDArray[np.float64]:
-        """See :meth:`Method.domains`: the corners of the boxes."""
+        """Corners of the boxes."""
         original = state.nodes[state.domains]
         centre, centroid, F = state.particles
         half = 0.5 * np.ptp(original, axis=1)

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from typing import override
+
 from ..background.basis import BackgroundBasis
 from .method import CornerBasis, DomainState, Method, affine
 
@@ -19,7 +21,7 @@ class Points(Method):
 
     name = "mpm"
 
+    @override
     def rows(self, state: DomainState, background: BackgroundBasis) -> CornerBasis:
-        """See :meth:`Method.rows`."""
         basis = background.at(state.particles.centroid, gradients=True)
         return CornerBasis(state.parallelograms(), affine(state, state.arms(), basis))
