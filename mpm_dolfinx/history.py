@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What a run did: steps, counters and seconds per phase."""
+"""Record of a run: steps, counters and seconds per phase."""
 
 from __future__ import annotations
 
@@ -242,7 +242,7 @@ class Energy:
 
     @property
     def balance(self) -> float:
-        """What stays: kinetic energy, less work of loads, plus what was stored, used and lost."""
+        """Conserved sum: kinetic energy, less work of loads, plus energy stored and lost."""
         used = self.internal + self.damping + self.stabilisation + self.residual + self.lost
         return self.kinetic + used - self.external - self.prescribed
 

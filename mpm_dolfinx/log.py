@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What a run does, told by rank 0 through Python's ``logging`` under ``mpm_dolfinx``.
+"""Messages of a run, from rank 0 through Python's ``logging`` under ``mpm_dolfinx``.
 
 Steps and cutbacks are those of ``mpm_dolfinx.steps``, iterations of Newton's method those of
 ``mpm_dolfinx.newton``, all at the level ``INFO``. Nothing is shown unless the user asks for it,

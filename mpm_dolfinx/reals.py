@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What a user has given, taken for real numbers."""
+"""Input of users, taken for real numbers."""
 
 from __future__ import annotations
 

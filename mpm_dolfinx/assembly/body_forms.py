@@ -164,11 +164,11 @@ class BodyForms:
 
     @property
     def low_rank(self) -> LowRankTangent | None:
-        """What the tangent has besides stock, fused and internal parts, if anything."""
+        """Low-rank part of the tangent, besides its stock, fused and internal parts, if any."""
         return None if self._by_domains else self._low_rank
 
     def low_rank_of_domains(self) -> LowRankTerm | None:
-        """Return what the internal tangent has besides, each domain for itself, if anything."""
+        """Return the low-rank part of the internal tangent, domain by domain, if any."""
         if not self._by_domains or self._source is None:
             return None
         return self._source.linearise()

@@ -162,7 +162,7 @@ class _Loops:
 
 
 class Coupling(Protocol):
-    """What a body's displacement and a field on it do to each other, for the compiled loops."""
+    """Coupling of a body's displacement and a field on it, for the compiled loops."""
 
     @property
     def places(self) -> tuple[Particles, CarriedField]:
@@ -434,7 +434,7 @@ class _Pattern:
 
     @property
     def part(self) -> tuple[Any, ...]:
-        """What the compiled loops must know of it."""
+        """Arguments of the compiled loops."""
         return self.offsets, self.nodes, self.columns.bs, self.columns.numbers
 
 
@@ -447,7 +447,7 @@ def _joined(supports: Sequence[Support]) -> tuple[NDArray[np.int64], NDArray[np.
 
 
 class _Coupled:
-    """What couples a displacement and another field, and its places in the rows of both."""
+    """Coupling of a displacement and another field, and its places in the rows of both."""
 
     def __init__(self, moving: _Block, other: _Block, coupling: Coupling) -> None:
         self._coupling = coupling

@@ -49,7 +49,7 @@ class PressurePoints(Protocol):
 
 
 class PressureBlocks:
-    """What a pressure and the displacement of its body do to each other.
+    """Blocks of the tangent that couple a pressure and the displacement of its body.
 
     Args:
         particles: The body.
@@ -70,7 +70,7 @@ class PressureBlocks:
 
     @property
     def _domains(self) -> tuple[NDArray[np.int32], *tuple[NDArray[np.float64], ...]]:
-        """What the loops must know of the domains."""
+        """Data of the domains for the compiled loops."""
         hoop = self._material.hoop
         return (
             self._particles.domain_nodes,
@@ -94,7 +94,7 @@ class PressureBlocks:
     def sizes(
         self, moved: NDArray[np.float64], pressed: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return what changes add to the constraint at each point, in sizes (collective).
+        """Return the sizes of changes of the constraint at each point (collective).
 
         Args:
             moved: Sizes of changes of displacement, on own dofs of W.

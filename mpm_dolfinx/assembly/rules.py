@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What the integrals of a form depend on, and the rule that each one needs."""
+"""Dependencies of the integrals of a form, and the quadrature rule that each one needs."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def _require_radius_seen(integral: Any, degree: int, *unknowns: fem.Function) ->
 
 
 def _name_of(terminal: Any, integral: Any) -> str:
-    """Return what a Function or an argument is called, by its number in the integral."""
+    """Return the name of a Function, or of an argument by its number in the integral."""
     if isinstance(terminal, ufl.Argument):
         return "a test or trial function"
     known = traverse_unique_terminals(integral.integrand())

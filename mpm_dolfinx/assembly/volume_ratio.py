@@ -131,7 +131,7 @@ class AveragedVolumeRatio(fem.Function):
         return [compiled_form(part) for part in split_by_rule(form, self.particles.displacement)]
 
     def _of_domains(self, forms: list[fem.Form], shape: tuple[int, ...] = ()) -> Array:
-        """Return what the owned domains have of forms, shape ``(n, *shape)``."""
+        """Return the integrals of forms over the owned domains, shape ``(n, *shape)``."""
         n = self.particles.num_local
         total = np.zeros((n, *shape))
         for form in forms:
@@ -156,7 +156,7 @@ class AveragedVolumeRatio(fem.Function):
         self.pressure.x.scatter_forward()
 
     def linearise(self) -> LowRankTerm:
-        """Return what the tangent has at present besides that of UFL (collective)."""
+        """Return the part of the present tangent that UFL's derivative lacks (collective)."""
         _, twice, mixed, slope = self._forms
         shape = (self.particles.domain_nodes.shape[1], self.particles.mesh.geometry.dim)
         groups = self._averaging.groups

@@ -39,7 +39,7 @@ class PointBasis(NamedTuple):
     rank: NDArray[np.integer[Any]] | None = None
 
     def part(self, count: int) -> PointBasis:
-        """Return what is known of the first points."""
+        """Return the basis at the first points."""
         return PointBasis._make(None if a is None else a[:count] for a in self)
 
 

@@ -188,7 +188,7 @@ class Support:
 
     @property
     def residual(self) -> ufl.Form:
-        """What the support adds to a residual: minus the virtual work of its traction.
+        """Residual of the support: minus the virtual work of its traction.
 
         Raises:
             MPMError: No modulus was given.
@@ -386,7 +386,7 @@ class Dashpot(Support):
 
 
 class _Start:
-    """What Functions and Constants were at the beginning of a step."""
+    """Values of Functions and Constants at the beginning of a step."""
 
     def __init__(self) -> None:
         self._copies: list[tuple[Any, Any]] = []

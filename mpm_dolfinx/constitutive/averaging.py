@@ -41,7 +41,7 @@ type Array = NDArray[np.float64]
 
 
 def deviation(d: Array, free: float, whole: float) -> tuple[Array, Array]:
-    """Return what a deviation of ln J from its average costs: Phi' and Phi''.
+    """Return first and second derivatives, Phi' and Phi'', of the energy of deviations of ln J.
 
     Phi' is odd, 0 up to ``free``, then a parabola up to ``whole``, and has slope 1 beyond.
 
@@ -95,7 +95,7 @@ class LowRankTerm(NamedTuple):
         return cls(groups, (first, g), (g, first if right is left else half + right))
 
     def times(self, nodal: Array) -> Array:
-        """Return what the owned domains contribute to the term times a vector (collective).
+        """Return the owned domains' contributions to the term times a vector (collective).
 
         Args:
             nodal: The vector at the domains' nodes, shape ``(n, k, gdim)``.
@@ -106,7 +106,7 @@ class LowRankTerm(NamedTuple):
 
 
 class GroupedTangent(NamedTuple):
-    """What an effective stress at the points of a group has from the group's other points.
+    """Part of the tangent at a point that comes from the other points of its group.
 
     That is ``(h gamma + left) (gamma : dF) + gamma (right : dF)``, where ``a : dF`` is the integral
     over the group.
@@ -125,7 +125,7 @@ class GroupedTangent(NamedTuple):
 
 
 class Linearised(Protocol):
-    """What knows the low-rank part of a body's tangent."""
+    """Source of the low-rank part of a body's tangent."""
 
     @property
     def groups(self) -> Groups:
@@ -280,12 +280,12 @@ class VolumeAveraging:
         return stress, tangent
 
     def grouped_tangent(self) -> GroupedTangent:
-        """Return what the pointwise tangent of the last evaluation lacks, at the points."""
+        """Return the part that the last pointwise tangent lacks, at the points."""
         assert self._grouped_tangent is not None
         return self._grouped_tangent
 
     def linearise(self) -> LowRankTerm:
-        """Return what the pointwise tangent of the last evaluation lacks, on the nodes."""
+        """Return the part that the last pointwise tangent lacks, on the nodes."""
         if self._low_rank is None:
             h, gamma, left, right = self.grouped_tangent()
             before = self.nodal(left)

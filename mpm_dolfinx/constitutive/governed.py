@@ -28,7 +28,7 @@ STRESS = "stress P"
 
 
 class Answer(NamedTuple):
-    """What a material answers, with a tangent."""
+    """Answer of a material, with a tangent."""
 
     first_piola: NDArray[np.float64]
     tangent: NDArray[np.float64]
@@ -36,7 +36,7 @@ class Answer(NamedTuple):
 
 
 class Carried(NamedTuple):
-    """What points carry that begin with a stress, or go on with it under another law.
+    """State of points that begin with a stress, or go on with it under another law.
 
     Attributes:
         stress: Cauchy stress, shape ``(n, 3, 3)``.
@@ -113,7 +113,7 @@ class Governed:
         return self.answer(undeformed, self.initial_state()).tangent
 
     def answer(self, gradient: NDArray[np.float64], state: State) -> Answer:
-        """Return what the law answers, which is as it must be; it cannot write into its input.
+        """Return the answer of the law, checked; the law cannot write into its input.
 
         Args:
             gradient: ``F - I``, shape ``(n, dim, dim)``.
@@ -138,7 +138,7 @@ class Governed:
         gradient: NDArray[np.float64],
         state: State,
     ) -> tuple[Answer, VolumeStrain]:
-        """Return what the law answers at a pressure, and its volume strain.
+        """Return the answer of the law at a pressure, and its volume strain.
 
         Args:
             pressure: Shape ``(n,)``.
@@ -233,7 +233,7 @@ class Governed:
         return values
 
     def _asked[T](self, law: Callable[[], T]) -> T:
-        """Return what a law answers, with an error of its own told as one of ours."""
+        """Return the answer of a law, with an error of its own raised as one of ours."""
         name = type(self.material).__name__
         try:
             return law()
@@ -248,7 +248,7 @@ class Governed:
             raise ours from error
 
     def _checked(self, state: State, answer: Update) -> Answer:
-        """Return what a law answered to a state, if it is finite and of the right shape and type.
+        """Return the answer of a law if it is finite, of the right shape and of the right type.
 
         Raises:
             MPMError: It is not.
@@ -318,7 +318,7 @@ def _all_finite(values: NDArray[np.float64]) -> bool:
 
 
 def _told(values: Any) -> str:
-    """Return what a value is, for an error."""
+    """Return a description of a value, for an error."""
     if not isinstance(values, np.ndarray):
         return "None" if values is None else f"a {type(values).__name__}"
     return f"an array of shape {values.shape} and type {values.dtype}"

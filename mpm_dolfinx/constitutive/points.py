@@ -28,7 +28,7 @@ __all__ = ["MaterialPoints"]
 
 
 class _Converged(NamedTuple):
-    """What is known of the points at the last converged step.
+    """Points at the last converged step.
 
     Attributes:
         states: What the material of each group keeps.
@@ -131,7 +131,7 @@ class MaterialPoints:
 
     @property
     def weakening(self) -> float:
-        """What the strength of all materials is divided by."""
+        """Factor that divides the strength of all materials."""
         return self._assignment.weakening
 
     def weaken(self, factor: float) -> None:
@@ -254,7 +254,7 @@ class MaterialPoints:
 
     @property
     def recovery(self) -> NDArray[np.float64] | float:
-        """What the recovery of averaged stresses adds to the particles' Cauchy stress.
+        """Correction of the particles' Cauchy stress by the recovery of averaged stresses.
 
         Shape ``(n, 3, 3)``, or 0.
         """
@@ -275,7 +275,7 @@ class MaterialPoints:
 
     @property
     def grouped(self) -> VolumeAveraging | None:
-        """What knows what the tangent has from other points of a group; ``None`` without F-bar."""
+        """Part of the tangent from other points of a group; ``None`` without F-bar."""
         return self.averaging
 
     @property
@@ -295,7 +295,7 @@ class MaterialPoints:
 
     @property
     def volume_strain(self) -> VolumeStrain:
-        """What a pressure of its own is the multiplier of, in the last update."""
+        """Constraint whose multiplier is the pressure, in the last update."""
         assert self.mean_stress is not None
         return self.mean_stress.strain
 
@@ -460,7 +460,7 @@ class MaterialPoints:
     def _at_pressure(
         mean_stress: MeanStress, part: Governed, gradient: NDArray[np.float64], state: State
     ) -> tuple[Answer, VolumeStrain]:
-        """Return what a material answers at the pressure of its points, and its volume strain."""
+        """Return a material's answer at the pressure of its points, and its volume strain."""
         points = part.points
         if part.at_pressure:
             return part.answer_at(

@@ -37,7 +37,7 @@ __all__ = [
 
 
 class VolumeStrain(NamedTuple):
-    """What a pressure is the multiplier of: ``volume - compliance p = 0``.
+    """Constraint whose multiplier is a pressure: ``volume - compliance p = 0``.
 
     Attributes:
         volume: Elastic volumetric strain theta, shape ``(n,)``.

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What the points of a body are strained in: the plane, space, or all around an axis."""
+"""Strain of the points of a body: in the plane, in space, or around an axis."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Strain:
         return nodal_forces(stress, volumes, gradients, self.hoop)
 
     def beyond(self) -> tuple[str, NDArray[np.int64]]:
-        """Return what no domain may do in a converged step besides crossing itself, and which do.
+        """Return a bound on converged steps besides folding, and the domains that break it.
 
         Returns:
             The words for an error, and global indices.
@@ -192,7 +192,7 @@ def _in_space(g: Any, hoop: Any) -> Any:
 
 
 def strain_of(particles: Particles, axisymmetric: bool) -> Strain:
-    """Return what a body is strained in (collective).
+    """Return the kind of strain of a body (collective).
 
     Args:
         particles: The body.

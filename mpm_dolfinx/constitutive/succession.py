@@ -34,7 +34,7 @@ class Episode(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """What is known of the points of a law.
+    """State of the points of a law.
 
     Attributes:
         state: Of an equal law, of all of them.
@@ -85,7 +85,7 @@ def states_after(
     unchanged: NDArray[np.bool_],
     comm: MPI.Comm,
 ) -> list[State]:
-    """Return what laws go on with at their points, in place of those of before (collective).
+    """Return the states that laws go on with at their points (collective).
 
     An equal law goes on with the history. Another carries the stress, and those internal variables
     that the law of before, one of its class, had begun with the same value.
@@ -116,7 +116,7 @@ def _known(
     unchanged: NDArray[np.bool_],
     comm: MPI.Comm,
 ) -> _Known:
-    """Return what equal laws have known of the points of a law (collective)."""
+    """Return the state that equal laws have kept of the points of a law (collective)."""
     count = len(part.points)
     state: State = {}
     where = np.zeros(count, dtype=bool)

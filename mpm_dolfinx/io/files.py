@@ -98,7 +98,7 @@ def require_ordinary(comm: MPI.Comm, path: Path) -> None:
 
 
 def kind_of(path: Path) -> str | None:
-    """Return what has a name: ``"a file"``, something else, or ``None`` where nothing has."""
+    """Return the kind of a path: ``"a file"``, something else, or ``None`` if it is free."""
     try:
         mode = path.stat().st_mode
     except OSError:

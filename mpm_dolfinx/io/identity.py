@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What a problem must have in common with the one that made a checkpoint."""
+"""Identity of a problem, which it shares with the one that made a checkpoint."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def require_same(present: dict[str, Any], snapshot: Snapshot, source: str, comm:
 
 
 class Identifiable(Protocol):
-    """What tells a problem from others."""
+    """Something that has an identity among problems."""
 
     bodies: list[Particles]
 
@@ -50,7 +50,7 @@ class Identifiable(Protocol):
 
 
 def identity(problem: Identifiable) -> dict[str, Any]:
-    """Return what two problems must share for a state of one to be one of the other (collective).
+    """Return the properties that two problems must share to exchange states (collective).
 
     It is that of the problem as it is now: see :class:`ProblemState` for what it was made as.
     """

@@ -251,7 +251,7 @@ class Output:
 
 
 def read_series(comm: MPI.Comm, names: Iterable[str]) -> dict[str, list[Entry]]:
-    """Return what is in time series (collective).
+    """Return the entries of time series (collective).
 
     Args:
         comm: The ranks.

@@ -48,11 +48,11 @@ class Kept:
     key: str = ""
 
     def numbers(self) -> dict[str, Any]:
-        """Return what is the same on all ranks, in types that JSON has, by name."""
+        """Return values that are the same on all ranks, in types that JSON has, by name."""
         return {}
 
     def columns(self, body: int | None) -> dict[str, Column]:
-        """Return what is spread over the ranks at the last converged step, by name.
+        """Return arrays that are spread over the ranks, at the last converged step, by name.
 
         Args:
             body: Number of the body, or ``None``: on the cells of the background.
@@ -60,7 +60,7 @@ class Kept:
         return {}
 
     def on_background(self, number: int) -> dict[str, Column]:
-        """Return what is spread over the cells of one of several backgrounds, by name.
+        """Return arrays over the cells of one of several backgrounds, by name.
 
         Args:
             number: Its number, 0 for that of the first body: what :meth:`columns` returns for
@@ -99,7 +99,7 @@ class Kept:
 
 
 class Taken(NamedTuple):
-    """What a state holds for something that is kept.
+    """Part of a state that belongs to one kept object.
 
     Attributes:
         numbers: Numbers by name.
@@ -287,12 +287,12 @@ def belongs(name: str, keys: Sequence[str]) -> bool:
 
 
 def _name(key: str, name: str) -> str:
-    """Return what something that is kept is called in a state."""
+    """Return the name of a kept value in a state."""
     return f"{key} {name}".strip()
 
 
 def _of_key[Value](key: str, keys: Sequence[str], state: Mapping[str, Value]) -> dict[str, Value]:
-    """Return what a state holds under a key, by its own names; under none, what no other has."""
+    """Return the values of a state under a key, by their own names; under none, those of no key."""
     if not key:
         return {name: value for name, value in state.items() if not belongs(name, keys)}
     whole = len(key) + 1

@@ -84,7 +84,7 @@ class Parameters(Mapping[str, Parameter]):
 
 
 class Update(NamedTuple):
-    """What a material answers.
+    """Answer of a material.
 
     Attributes:
         first_piola: First Piola stress P, shape ``(n, dim, dim)``, C order.
@@ -207,7 +207,7 @@ class Material(ABC):
         return None
 
     def plastic_work(self, state: State) -> NDArray[np.float64] | None:
-        """Return what yielding has taken up, per undeformed volume of points, shape ``(n,)``.
+        """Return the energy used by yielding, per undeformed volume of points, shape ``(n,)``.
 
         It is for laws whose stress after an update is the derivative of it and of the strain energy
         together, the history being as it was: those of associated flow and isotropic hardening,
@@ -316,7 +316,7 @@ def _in_words(value: Any) -> str:
 
 
 class Integration(NamedTuple):
-    """What a law in strain space answers.
+    """Answer of a law in strain space.
 
     Attributes:
         stress: Stress, shape ``(n, m)``.
@@ -452,7 +452,7 @@ class StrainMaterial(Material):
         pressure: NDArray[np.float64],
         shear: NDArray[np.float64],
     ) -> AtPressure:
-        """Return what the law answers where its mean stress is given, for ``mixed="pressure"``.
+        """Return the answer of the law at a given mean stress, for ``mixed="pressure"``.
 
         Args:
             displacement_gradient: As in :meth:`update`.

@@ -34,7 +34,7 @@ class CompiledMaterial(StrainMaterial):
         return self._loop if is_as_inherited(self, "_loop") else ""
 
     def _constants(self) -> tuple[Parameter, ...]:
-        """Return what the compiled law has for parameters, as ``material.h`` lists them."""
+        """Return the parameters of the compiled law, in the order of ``material.h``."""
         raise NotImplementedError
 
     @override

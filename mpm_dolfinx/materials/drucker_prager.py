@@ -209,7 +209,7 @@ def _give_back(
 
 
 class Returned(NamedTuple):
-    """What a law of p and q, the root of J2, returns to, with derivatives, shape ``(n,)`` each.
+    """Result of a return in p and q, the root of J2, with derivatives, shape ``(n,)`` each.
 
     Derivatives are those by the trace and by the size of the deviator of the trial strain.
     """

@@ -48,7 +48,7 @@ STRIDE = 0.05
 
 
 class AtPressure(NamedTuple):
-    """What a law answers at a given pressure.
+    """Answer of a law at a given pressure.
 
     Attributes:
         first_piola: First Piola stress, shape ``(n, dim, dim)``.
@@ -70,7 +70,7 @@ class AtPressure(NamedTuple):
 
 
 class StrainLaw(Protocol):
-    """What is asked of a law in strain space."""
+    """Law in strain space, as far as a given pressure needs it."""
 
     @property
     def kinematics(self) -> str:
@@ -90,7 +90,7 @@ class StrainLaw(Protocol):
 def at_pressure(
     material: StrainLaw, gradient: Array, state: Mapping[str, Array], pressure: Array, shear: Array
 ) -> AtPressure:
-    """Return what a law answers at a given pressure.
+    """Return the answer of a law at a given pressure.
 
     Args:
         material: The law.

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 
 class FrictionalMaterial(IsotropicElastic):
-    """What laws with cohesion and angles of friction and dilation have in common.
+    """Base of laws with a cohesion and angles of friction and dilation.
 
     Hencky elasticity at finite strain; the state holds the accumulated plastic strain kappa, the
     sum of sqrt(2/3) |d eps_p|, as ``"plastic_strain"``, shape ``(n,)``. Plasticity is perfect, or

@@ -178,7 +178,7 @@ class MuIRheology(IsotropicElastic):
 
 
 def _give_back(constants: list[Array], pressure: Array, root: Array) -> Returned:
-    """Return what trial states that yield return to.
+    """Return the stresses that yielding trial states return to.
 
     The plastic shear of a step is the positive root of G k x^2 + b x = f w, with w = dt sqrt(P),
     k = d sqrt(rho_s)/I_0, f the excess over mu_s P, and b = G w + k ((mu_2 - mu_s) P - f).

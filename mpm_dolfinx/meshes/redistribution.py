@@ -52,7 +52,7 @@ class Carrier:
         self.origin, self.numbers = origin, numbers
 
     def then(self, move: Carrier) -> Carrier:
-        """Return what takes things of this source to where another carrier goes on (collective).
+        """Return the carrier that does this one's move and then another's (collective).
 
         Args:
             move: Its source is the mesh of this one.

@@ -88,7 +88,7 @@ def diagonals(
 
 
 class _Nodes(NamedTuple):
-    """What the cells of a mesh are made of.
+    """Nodes of the cells of a mesh.
 
     Attributes:
         of_cells: Local nodes of each local cell, shape ``(n, k)``.

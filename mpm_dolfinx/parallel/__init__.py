@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What ranks owe each other: rows sent by global index, even shares, shared garbage.
+"""Exchange between ranks: rows sent by global index, even shares, shared garbage.
 
 Nothing here knows a mesh or a particle. :mod:`~mpm_dolfinx.parallel.exchange` sends rows of arrays
 to the ranks that ask for their global indices; :mod:`~mpm_dolfinx.parallel.bisection` parts points

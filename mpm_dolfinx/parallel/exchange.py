@@ -17,7 +17,7 @@ __all__ = ["RowExchange", "swap"]
 
 
 def swap(comm: MPI.Comm, parts: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
-    """Return what each rank has sent to this one (collective).
+    """Return the parts that each rank has sent to this one (collective).
 
     Args:
         comm: The ranks.

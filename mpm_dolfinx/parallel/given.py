@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What is given to a constructor or a run, compared over the ranks by a hash.
+"""Input of a constructor or a run, compared over the ranks by a hash.
 
 Each rank runs the user's program, and what differs between them (a number of steps, a modulus, one
 condition more) would let one wait for ever in a call that another never reaches.

@@ -97,7 +97,7 @@ _SIGINT = _Signal()
 
 
 class Hold:
-    """What a block is told that holds SIGINT.
+    """State of a block that holds SIGINT.
 
     Attributes:
         left: After the block: whether a signal was noted in it that nobody is left to obey.

@@ -30,7 +30,7 @@ PLACES = ("nodes", "points")
 
 
 class Body(Protocol):
-    """What a field asks of its body."""
+    """Body, as a field on it knows it."""
 
     @property
     def mesh(self) -> mesh.Mesh:

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What follows from one body mesh: spaces, measures, volumes, how its cells can fold."""
+"""Geometry of one body mesh: spaces, measures, volumes, how its cells can fold."""
 
 from __future__ import annotations
 

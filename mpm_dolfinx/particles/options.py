@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What particles can be made of, and the sentences for what they cannot."""
+"""Options of particles, and the errors for those that are not valid."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ BLOCK = 1 << 14
 
 
 class Coordinates:
-    """What the coordinates of a mesh were.
+    """Coordinates of a mesh at an earlier time.
 
     Args:
         domain: The mesh.

@@ -186,7 +186,7 @@ class Particles(MaterialDomains):
         return f"<Particles: {self.in_words()}>"
 
     def in_words(self) -> str:
-        """Return what they are and what carries them, in a few words."""
+        """Return a short description of the particles and the method that carries them."""
         cells, degree = self.V.mesh.topology, self.W.ufl_element().degree
         kind = self.V.mesh.basix_cell().name
         kinds = kind.removesuffix("on") + "a" if kind.endswith("hedron") else kind + "s"
@@ -609,7 +609,7 @@ class Particles(MaterialDomains):
 
     @property
     def background_basis(self) -> BackgroundBasis:
-        """What evaluates the basis of V at points."""
+        """Evaluator of the basis of V at points."""
         return self._background
 
     def quadrature_points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -18,7 +18,7 @@ __all__ = ["MaterialDomains", "Response"]
 
 
 class Kinematics(Protocol):
-    """What the points of a body are strained in."""
+    """Kinematics of the points of a body."""
 
     def gradient(self) -> NDArray[np.float64]:
         """Return ``F - I`` at the points, shape ``(n, nq, dim, dim)``."""
@@ -28,15 +28,15 @@ class Kinematics(Protocol):
 
 
 class Response(Protocol):
-    """What answers for the stress and internal variables of a body, at its points."""
+    """Source of stress and internal variables of a body, at its points."""
 
     @property
     def recovery(self) -> NDArray[np.float64] | float:
-        """What is added to the mean stress of each domain, shape ``(n, 3, 3)``, or 0."""
+        """Correction of the mean stress of each domain, shape ``(n, 3, 3)``, or 0."""
 
     @property
     def strain(self) -> Kinematics:
-        """What the points are strained in."""
+        """Kinematics of the points."""
 
     def cauchy_stress(self) -> NDArray[np.float64]:
         """Return the Cauchy stress, shape ``(n, nq, 3, 3)``."""
@@ -145,7 +145,7 @@ class MaterialDomains(Domains):
         return _in_space(self._strained())
 
     def fields(self) -> dict[str, NDArray[np.float64]]:
-        """Return what is known of each particle, for output: arrays ``(n, ...)`` by name.
+        """Return all fields of the particles for output: arrays ``(n, ...)`` by name.
 
         ``volume_ratio`` and, where there is a material, ``stress`` (Cauchy), ``pressure``
         (mean of the normal stresses, compression positive) and ``plastic_strain``; with

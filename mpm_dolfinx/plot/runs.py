@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What a run did, as curves."""
+"""Curves of a run."""
 
 from __future__ import annotations
 

@@ -359,7 +359,7 @@ def _filled(
 
 
 def _colours(look: Look, limits: tuple[float, float]) -> Any:
-    """Return what gives values their colours."""
+    """Return the colour map of values."""
     normalise = import_module("matplotlib.colors").Normalize(*limits)
     colours = import_module("matplotlib.cm").ScalarMappable(normalise, look.cmap)
     colours.set_cmap(colours.cmap.with_extremes(bad=NO_FIELD))

@@ -114,7 +114,7 @@ class Indefinite(Exception):
 
 
 class Levels(Fields, Protocol):
-    """What a linear solver must know of the unknowns. All calls are collective."""
+    """Unknowns, as a linear solver must know them. All calls are collective."""
 
     @property
     def constrained(self) -> bool:

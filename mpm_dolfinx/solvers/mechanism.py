@@ -24,7 +24,7 @@ INVERSE_ITERATIONS = 100
 
 
 class Resisting(Protocol):
-    """What must be known of a system. All calls are collective."""
+    """System, as the search for mechanisms must know it. All calls are collective."""
 
     def rigid_motions(self) -> PETSc.NullSpace:
         """Return the rigid motions in the unknowns."""

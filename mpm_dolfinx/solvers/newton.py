@@ -49,7 +49,7 @@ DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 
 
 class ReducedProblem(Levels, Resisting, Protocol):
-    """What the solver asks of a problem. All calls are collective."""
+    """Problem, as the solver asks for it. All calls are collective."""
 
     @property
     def softens(self) -> bool:
@@ -397,7 +397,7 @@ class NewtonSolver:
 
     @property
     def experience(self) -> tuple[float, int]:
-        """What earlier steps have taught about predictions, for a checkpoint."""
+        """Success of predictions in earlier steps, for a checkpoint."""
         return self._kept, self._from_zero
 
     @experience.setter

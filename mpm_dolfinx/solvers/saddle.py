@@ -21,7 +21,7 @@ SOFT = 0.3
 
 
 class Fields(Protocol):
-    """What multigrid must know of the unknowns. All calls are collective."""
+    """Unknowns of several fields, as multigrid must know them. All calls are collective."""
 
     def diagonal(self, K: PETSc.Mat) -> PETSc.Vec:
         """Return sizes of a tangent's diagonal; for values that of their Schur complement."""
@@ -33,7 +33,7 @@ class Fields(Protocol):
         """Return the mass matrix of the unknowns that are no displacements, numbered alone."""
 
     def interpolations(self, coarsest: int, values: bool = False) -> Sequence[PETSc.Mat]:
-        """Return what gives the unknowns of each level from those of the next coarser one.
+        """Return the interpolations to the unknowns of each level from the next coarser one.
 
         Args:
             coarsest: Number of unknowns below which no coarser level is made.

@@ -46,7 +46,7 @@ HALF = 0.5
 
 @dataclass(frozen=True)
 class StepError:
-    """What is estimated of a step that has converged and is not committed yet.
+    """Estimated error of a step that has converged and is not committed yet.
 
     Attributes:
         error: Its error, the root mean square over the nodes of all bodies.
@@ -158,7 +158,7 @@ class ErrorControl:
 
     @property
     def asked(self) -> list[Any]:
-        """What a run that goes on from a checkpoint must have in common with it."""
+        """Options that a run from a checkpoint must share with the one before."""
         return [self.steps, self._tolerance, self._first, self._length, self._levels]
 
     def __str__(self) -> str:
@@ -243,7 +243,7 @@ class ErrorControl:
 
     @property
     def complaint(self) -> str | None:
-        """What to say of the step that was judged last: that the tolerance is not kept, once."""
+        """Warning that the step judged last misses the tolerance, given once."""
         if self._unkept != MANY or self._ratio <= REJECTED or not self._smallest:
             return None
         length = "" if self._length is None else f" and length={self._length:g}"

@@ -38,7 +38,7 @@ class Control(Protocol):
 
     @property
     def asked(self) -> list[Any]:
-        """What a run that goes on from a checkpoint must have in common with it."""
+        """Options that a run from a checkpoint must share with the one before."""
 
     @property
     def finished(self) -> bool:
@@ -91,7 +91,7 @@ class StepControl:
 
     @property
     def asked(self) -> list[Any]:
-        """What a run that goes on from a checkpoint must have in common with it."""
+        """Options that a run from a checkpoint must share with the one before."""
         return [self.steps]
 
     def __str__(self) -> str:
@@ -169,7 +169,7 @@ class StepControl:
 
 @dataclass
 class Converged:
-    """What a problem knows of the last converged step besides its bodies and their histories.
+    """Last converged step of a problem, besides its bodies and their histories.
 
     Attributes:
         load: Load factor.

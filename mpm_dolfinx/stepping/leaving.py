@@ -69,7 +69,7 @@ def _loss(
     which: NDArray[np.int64],
     load: float,
 ) -> Loss:
-    """Return what the deletion of particles of a body loses (collective)."""
+    """Return the loss by the deletion of particles of a body (collective)."""
     comm = body.V.mesh.comm
     mass = None if masses is None else float(comm.allreduce(masses[which].sum()))
     indices = {p for ps in comm.allgather(body.global_index[which].tolist()) for p in ps}

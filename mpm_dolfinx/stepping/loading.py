@@ -46,7 +46,7 @@ type Path = Callable[[float], None]
 
 
 class Owner(Protocol):
-    """What load steps ask of the problem that they are steps of. All calls are collective."""
+    """Problem, as its load steps need it. All calls are collective."""
 
     bodies: list[Particles]
     history: History
@@ -73,11 +73,11 @@ class Owner(Protocol):
         """Warn the user, on one rank."""
 
     def loads(self) -> Sequence[fem.Constant | fem.Function]:
-        """Return what the load factor multiplies and the user may change."""
+        """Return the loads that the load factor multiplies and the user may change."""
 
 
 class Mender(Protocol):
-    """What changes the meshes of bodies between steps. All calls are collective."""
+    """Changes of the bodies' meshes between steps. All calls are collective."""
 
     def after_step(self) -> None:
         """Look at what a converged step has made of the domains."""

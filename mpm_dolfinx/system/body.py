@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What one body is made of and loaded by, as a term of the reduced system."""
+"""Material and loads of one body, as a term of the reduced system."""
 
 from __future__ import annotations
 

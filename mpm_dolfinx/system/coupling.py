@@ -192,7 +192,7 @@ class Tie(Term):
         return points.reshape(-1, dim + 1), (weights * area).ravel()
 
     def tractions(self) -> NDArray[np.float64]:
-        """Return what the springs pull b with, at this rank's points, shape ``(n, gdim)``."""
+        """Return the pull of the springs on b at this rank's points, shape ``(n, gdim)``."""
         gaps = []
         for body, (rows, _) in zip(self.bodies, self._at, strict=True):
             d, gap = rows.createVecs()
@@ -225,7 +225,7 @@ class Tie(Term):
 def _interpolation(
     W: fem.FunctionSpace, points: NDArray[np.float64], comm: Any
 ) -> tuple[PETSc.Mat, NDArray[np.bool_]]:
-    """Return what gives values at points from dofs of W, and which points are in its mesh.
+    """Return the matrix from dofs of W to values at points, and which points are in its mesh.
 
     Args:
         W: Space of a body (collective).

@@ -180,7 +180,7 @@ class Field:
 
     @property
     def counts(self) -> dict[str, int]:
-        """What was found about badly supported dofs, by the names of the statistics."""
+        """Numbers of badly supported dofs, by the names of the statistics."""
         return self._cure.counts
 
     def begin(self, change: NDArray[np.float64], before: NDArray[np.float64] | None = None) -> None:
@@ -261,7 +261,7 @@ class Field:
 
     @property
     def prolongation(self) -> PETSc.Mat:
-        """What gives the increment of all dofs of V, zero at the fixed ones, from all unknowns."""
+        """Matrix from all unknowns to the increment of all dofs of V, zero at the fixed ones."""
         if self._prolongation is None:
             offsets = np.zeros(self._owned + 1, dtype=PETSc.IntType)
             offsets[1 + self.dofs] = 1
@@ -400,7 +400,7 @@ class Field:
         return joint_norm(forces, self._comm)
 
     def works(self, stiffness: Callable[[], list[float]]) -> NDArray[np.float64]:
-        """Return what acts on the background does over the last increment (collective).
+        """Return the work of forces on the background over the last increment (collective).
 
         Args:
             stiffness: Returns the shear modulus of each body.

@@ -89,7 +89,7 @@ class _Entries(NamedTuple):
 def interpolations(
     comm: MPI.Comm, count: int, fields: Sequence[FieldDofs], coarsest: int
 ) -> list[PETSc.Mat]:
-    """Return what gives the dofs of each level from those of the next coarser one (collective).
+    """Return the interpolations to the dofs of each level from the next coarser one (collective).
 
     Args:
         comm: The ranks.
@@ -152,7 +152,7 @@ def _summed(
 
 
 def _offered(comm: MPI.Comm, entries: _Entries) -> _Sums:
-    """Return what :func:`_summed` does, of all ranks' rows (collective)."""
+    """Return the sums of :func:`_summed` over all ranks' rows (collective)."""
     dofs, ranks, sums = _summed(entries.dofs, 0, entries.values)
     parts = comm.allgather((dofs, np.full_like(ranks, comm.rank), sums))
     dofs, ranks, sums = (np.concatenate(part) for part in zip(*parts, strict=True))

@@ -120,7 +120,7 @@ class ReducedSystem:
         return reduced and not moving.extends and not other.extends
 
     def _couplings_in(self, group: Sequence[Field]) -> list[tuple[int, int, Coupling]]:
-        """Return what the compiled loops reduce between fields of a group, with their numbers."""
+        """Return the couplings of fields in a group that compiled loops reduce, with numbers."""
         found = []
         for term, coupled in zip(self._terms, self._coupled, strict=True):
             if coupled and term.coupling is not None:
@@ -606,7 +606,7 @@ class ReducedSystem:
         return found
 
     def _schur(self, K: PETSc.Mat, sizes: PETSc.Vec, part: slice) -> NDArray[np.float64]:
-        """Return what unknowns of the fields before take from the diagonal of some (collective)."""
+        """Return the part of a diagonal that earlier fields' unknowns take away (collective)."""
         first = K.getOwnershipRange()[0]
         stop = part.start
         before, own = (
@@ -707,7 +707,7 @@ class ReducedSystem:
         return found
 
     def interpolations(self, coarsest: int, values: bool = False) -> Sequence[PETSc.Mat]:
-        """Return what gives the unknowns of each level of multigrid from the next coarser one.
+        """Return the interpolations to the unknowns of each level from the next coarser one.
 
         See :func:`.hierarchy.interpolations` (collective).
 
@@ -806,7 +806,7 @@ class ReducedSystem:
         return norm(F) / max(ratios) if ratios else joint_norm(scales)
 
     def _changed(self, field: Field) -> float:
-        """Return what the step's changes of all unknowns add to a field's residual, in sizes.
+        """Return the sizes of changes of a field's residual by those of all unknowns (collective).
 
         The residual of a constraint has no forces to be compared with: what is to vanish, as the
         change of volume at each point, is a sum of terms that do not.

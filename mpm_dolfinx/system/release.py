@@ -26,7 +26,7 @@ type Array = NDArray[np.float64]
 
 
 class Release(Term):
-    """What a stage takes away or adds at once, held back at its beginning and let go over it.
+    """Forces of what a stage takes away or adds at once, held back and let go over the stage.
 
     Let r be the residual with the loads and bodies of the stage, and q what it differs by from that
     of before, both in the state of before. The stage solves ``r - s q = 0``, where s goes from 1
@@ -69,7 +69,7 @@ class Release(Term):
         self._let_go()
 
     def left(self) -> list[Array]:
-        """Return what is held back now on this rank's own dofs of each background."""
+        """Return the forces held back now on this rank's own dofs of each background."""
         found = []
         for i, V in enumerate(self._spaces):
             count = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
@@ -153,7 +153,7 @@ class Release(Term):
         return [_Held(self)]
 
     def columns(self, body: int) -> dict[str, Column]:
-        """Return what is held back at the nodes of a body, and for its fields."""
+        """Return the forces held back at the nodes of a body, and for its fields."""
         if not self._nodal:
             return {}
         return {
@@ -171,7 +171,7 @@ class Release(Term):
         return found
 
     def on_cells(self, number: int) -> dict[str, Column]:
-        """Return what is held back on a background."""
+        """Return the forces held back on a background."""
         if not self._reactions:
             return {}
         return {"reaction": Column(of_cells(self._reactions[number]), "nodes")}
@@ -193,7 +193,7 @@ class Release(Term):
 
 
 class _Held(Kept):
-    """What is held back, and how much of it.
+    """Forces held back, and their share.
 
     Args:
         release: Has it.

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What keeps a pressure of the displacement's own degree from oscillating."""
+"""Stabilisation of a pressure of the displacement's own degree."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What acts on the nodes of bodies: its forces, their tangent, and what it remembers."""
+"""Terms act on the nodes of bodies: forces, their tangents, and their histories."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ type Motion = Callable[[Particles], PETSc.Vec | None]
 
 
 class PointMaterial(Protocol):
-    """What a term may ask of the material at the points of a body."""
+    """Material at the points of a body, as a term may ask for it."""
 
     def initial_modulus(self) -> NDArray[np.float64]:
         """Return the modulus of each undeformed domain in one direction, ``(n,)`` (collective)."""
@@ -113,7 +113,7 @@ class Term:
 
     @property
     def coupling(self) -> Coupling | None:
-        """What the compiled loops make of all of :meth:`tangents`; ``None``: nothing."""
+        """All of :meth:`tangents` by the compiled loops; ``None``: nothing."""
         return None
 
     @property
@@ -252,7 +252,7 @@ class Term:
         return {}
 
     def reduced_tangents(self, transfer: Transfer) -> Sequence[PETSc.Mat]:
-        """Return what the term reduces by T itself, as matrices ``T_a^T K_ab T_b`` of all unknowns.
+        """Return tangents that the term reduces by T itself, ``T_a^T K_ab T_b`` of all unknowns.
 
         Args:
             transfer: Returns T of a body in all unknowns, the same object through a step.
@@ -286,7 +286,7 @@ class Term:
         return [forces[a] for a in range(len(self.bodies))] if forces else ()
 
     def absolute_product(self, changes: Sequence[NDArray[np.float64]]) -> Sequence[PETSc.Vec]:
-        """Return what :attr:`coupling` is with absolute values, times changes of each body.
+        """Return the product of the absolute values of :attr:`coupling` and changes of each body.
 
         Args:
             changes: Sizes of changes on this rank's own dofs of W of each body.
@@ -330,7 +330,7 @@ class Term:
         """Return to the last converged evaluation."""
 
     def kept(self) -> Sequence[Kept]:
-        """Return what is to be saved and restored with it, and to move with the bodies."""
+        """Return the objects that are saved with the term and move with the bodies."""
         return ()
 
     def require_movable(self, consequence: str) -> None:
@@ -350,7 +350,7 @@ class Term:
 
 
 class Hooks(Protocol):
-    """What an heir of a problem class may override."""
+    """Methods that a subclass of a problem class may override."""
 
     def evaluate(self) -> MPMError | None:
         """Update what the forms hold besides the displacement."""
@@ -366,7 +366,7 @@ class Hooks(Protocol):
 
 
 class UserTerm(Term):
-    """What the heir of a problem class does in its hooks.
+    """Contribution of the hooks that a subclass of a problem class overrides.
 
     Args:
         hooks: The problem, which is not kept alive.

@@ -18,7 +18,7 @@ __all__ = ["FieldTerm", "FormsTerm"]
 
 
 class FieldTerm(Term):
-    """What couples the displacement of a body and fields on it, which it commits and takes back.
+    """Term that couples a body's displacement and fields on it, which it commits and rolls back.
 
     In :attr:`bodies` the body comes first, where its displacement is an unknown, then the fields.
 

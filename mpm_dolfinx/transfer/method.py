@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What a material point method is: where the corners of the domains are, and what moves them.
+"""Material point methods: corners of the domains, and how they are moved.
 
 Each method is a class in a file of its own, registered in :mod:`~mpm_dolfinx.transfer.methods`. All
 give rows of T, one for each corner of a domain; they differ in nothing else.
@@ -94,7 +94,7 @@ class DomainState:
 
 
 class CornerBasis(NamedTuple):
-    """What the background does to the domains' corners: the rows of T.
+    """Background basis at the domains' corners: the rows of T.
 
     Attributes:
         corners: Where the rows move the corners from, shape ``(n, k, gdim)``; ``None`` where
