@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +17,9 @@ from .cells import BLOCK, DROP, TOLERANCE, Cells, CellTable
 from .tiles import Tiles
 
 __all__ = ["BackgroundBasis", "PointBasis"]
+
+#: Distance in cells over which the cells beside a point are looked for.
+BESIDE = 0.1
 
 
 class PointBasis(NamedTuple):
@@ -74,9 +78,7 @@ class BackgroundBasis:
         Returns:
             Nodes, values and whether a cell was found.
         """
-        if self._tiles is not None and self._tiles.know(points):
-            self._cells = Cells(self._mesh, self._tiles.cells)
-        cells = self._cells
+        cells = self._around(points)
         n, k = len(points), cells.nodes.shape[1]
         if n == 0 or len(cells.index) == 0:
             slopes = np.zeros((n, k, points.shape[1])) if gradients else None
@@ -105,3 +107,41 @@ class BackgroundBasis:
                 cells.rank[cell],
             )
         return PointBasis(nodes, values, found, slopes, home, rank)
+
+    def beside(self, points: NDArray[np.float64]) -> tuple[PointBasis, NDArray[np.float64]]:
+        """Evaluate at points the basis of the cells beside theirs, continued (collective).
+
+        Args:
+            points: This rank's points, shape ``(n, gdim)``, on which :meth:`at` has been.
+
+        Returns:
+            The basis of the cells in each of m directions, of which several may be one, shapes
+            ``(n, m, ...)``; how far the point lies outside each, in reference coordinates, shape
+            ``(n, m)``, infinite where there is none.
+        """
+        n, gdim = points.shape
+        ways = np.array([way for way in product((-1, 0, 1), repeat=gdim) if any(way)])
+        size = np.zeros((n, gdim))
+        if n > 0:
+            size = np.ptp(self._cells.vertices[self._cells.locate(points)[0]], axis=1)
+        probes = (points[:, None] + BESIDE * size[:, None] * ways).reshape(-1, gdim)
+        basis = self.at(probes)
+        cells, shape = self._cells, (n, len(ways))
+        outside = np.full(n * len(ways), np.inf)
+        if n > 0:
+            cell, _, _ = cells.locate(probes)
+            reference = cells.pull_back(cell, np.repeat(points, len(ways), axis=0))
+            far = cells.violation(cell, reference)
+            known = basis.found & np.isfinite(far)
+            outside[known] = far[known]
+            basis.values[known] = _compat.tabulated(self._basis, 0, reference[known])[0]
+        basis = PointBasis._make(
+            None if part is None else part.reshape(*shape, *part.shape[1:]) for part in basis
+        )
+        return basis, outside.reshape(shape)
+
+    def _around(self, points: NDArray[np.float64]) -> Cells:
+        """Return cells with those that hold points among them (collective)."""
+        if self._tiles is not None and self._tiles.know(points):
+            self._cells = Cells(self._mesh, self._tiles.cells)
+        return self._cells

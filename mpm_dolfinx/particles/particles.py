@@ -607,6 +607,30 @@ class Particles(MaterialDomains):
         """The background basis at the local nodes of W, at the last converged positions."""
         return self.transfer.rows.basis
 
+    def beside(self, nodes: NDArray[np.int64]) -> tuple[PointBasis, NDArray[np.float64]]:
+        """Return the basis at nodes of W of the cells beside theirs, continued (collective).
+
+        Args:
+            nodes: Local nodes of W.
+
+        Returns:
+            See :meth:`BackgroundBasis.beside`.
+        """
+        return self._background.beside(self._at_converged().positions[nodes])
+
+    def carry_by(self, nodes: NDArray[np.int64], rows: PointBasis) -> None:
+        """Let nodes of W have other rows of T, until the body has moved (collective).
+
+        Args:
+            nodes: Local nodes of W.
+            rows: Their rows.
+        """
+        whole = self.transfer.rows
+        for known, other in zip(whole.basis, rows, strict=True):
+            if known is not None and other is not None:
+                known[nodes] = other
+        self._transfer = self._transfer_by(whole)
+
     @property
     def background_basis(self) -> BackgroundBasis:
         """Evaluator of the basis of V at points."""

@@ -114,7 +114,8 @@ class ParticleProblem:
             ``"ghost"`` penalty, ``"aggregate"``, ``None``, or ``"auto"``, a ghost penalty where a
             cut is small, on backgrounds of degree 2 or more and, on those of degree 1, while
             the bodies have hardly more nodes than the background (not beside ``background=``
-            or ``dependent_dofs="remove"``).
+            or ``dependent_dofs="remove"``); with degree 1 ``"auto"`` also keeps joints between
+            bodies shut (:class:`~mpm_dolfinx.stabilisation.joints.Joints`).
         linear_solver: ``"direct"``: a factorisation by MUMPS; ``"multigrid"``: conjugate gradients
             (generalised minimal residuals where the tangent is not symmetric or there are
             ``fields``) with multigrid on boxes of the background; ``"auto"``: multigrid from as

@@ -19,7 +19,7 @@ from ..constitutive.averaging import Linearised
 from ..errors import MPMError
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
-from ..stabilisation.choice import stabilisation_of
+from ..stabilisation.choice import joints_of, stabilisation_of
 from ..system.body import BodyTerm, PointHistory, StepForce
 from ..system.field import Field
 from ..system.values import FormsTerm
@@ -150,13 +150,14 @@ class Parts:
             bcs: Dirichlet conditions.
         """
         groups = by_space(self.moving)
-        remove = self.numerics.dependent_dofs == "remove"
+        kind, remove = self.numerics.stabilisation, self.numerics.dependent_dofs == "remove"
         return [
             Field(
                 group,
                 bcs,
                 forms,
-                stabilisation_of(self.numerics.stabilisation, group, remove, forms is not None),
+                stabilisation_of(kind, group, remove, forms is not None),
+                joints_of(kind, group),
             )
             for group, forms in zip(groups, self._on_backgrounds(groups), strict=True)
         ]

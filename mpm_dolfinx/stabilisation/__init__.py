@@ -6,11 +6,12 @@ Background dofs that hardly anything of a body supports make a tangent singular 
 are held by a penalty on facets (:mod:`~mpm_dolfinx.stabilisation.ghost_penalty`), follow the
 polynomial of a well filled cell (:mod:`~mpm_dolfinx.stabilisation.aggregation`), or stand in for
 each other (:mod:`~mpm_dolfinx.stabilisation.dependent_dofs`);
-:mod:`~mpm_dolfinx.stabilisation.choice` chooses.
+:mod:`~mpm_dolfinx.stabilisation.choice` chooses. Bodies that bear on each other are kept together
+where the background would let them part (:mod:`~mpm_dolfinx.stabilisation.joints`).
 """
 
 from .aggregation import Aggregation
-from .choice import stabilisation_of
+from .choice import joints_of, stabilisation_of
 from .ghost_penalty import PENALTY, GhostPenalty
 
-__all__ = ["PENALTY", "Aggregation", "GhostPenalty", "stabilisation_of"]
+__all__ = ["PENALTY", "Aggregation", "GhostPenalty", "joints_of", "stabilisation_of"]

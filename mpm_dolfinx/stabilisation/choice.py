@@ -13,8 +13,9 @@ from .aggregation import Aggregation
 from .cure import Cure
 from .dependent_dofs import DependentDofs
 from .ghost_penalty import GhostPenalty
+from .joints import Joints
 
-__all__ = ["stabilisation_of"]
+__all__ = ["joints_of", "stabilisation_of"]
 
 #: Background nodes with weight over nodes of the bodies, from which on a background of degree 1
 #: needs a penalty.
@@ -59,6 +60,18 @@ def stabilisation_of(
             "use dependent_dofs='shift'."
         )
     return DependentDofs(bodies)
+
+
+def joints_of(kind: str | None, bodies: Sequence[Particles]) -> Joints | None:
+    """Return what keeps the joints between bodies shut, by default with degree 1.
+
+    Args:
+        kind: As for :func:`stabilisation_of`.
+        bodies: The bodies on one background space.
+    """
+    simple = bodies[0].V.ufl_element().degree == 1
+    acts = kind == "auto" and simple and len(bodies) > 1
+    return Joints(bodies) if acts and all(body.shares_nodes for body in bodies) else None
 
 
 def _stabilisation(kind: str | None, bodies: Sequence[Particles]) -> Cure | None:

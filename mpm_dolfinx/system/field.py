@@ -28,6 +28,7 @@ from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..solvers.linear import Coarsening
 from ..stabilisation.cure import Cure
+from ..stabilisation.joints import Joints
 from ..transfer.touched import TouchedNodes, TransferRows
 from .conditions import fixed_dofs
 from .hierarchy import FieldDofs
@@ -134,6 +135,7 @@ class Field:
         conditions: Dirichlet conditions, of which those on this space count.
         background: Terms on it.
         cure: What is done about dofs that the bodies support badly; ``None``: nothing.
+        joints: What keeps the joints between bodies shut; ``None``: nothing.
 
     Attributes:
         V: The space.
@@ -158,6 +160,7 @@ class Field:
         conditions: Sequence[fem.DirichletBC] = (),
         background: BackgroundForms | None = None,
         cure: Cure | None = None,
+        joints: Joints | None = None,
     ) -> None:
         self.bodies = list(bodies)
         self.V = V = bodies[0].V
@@ -169,6 +172,7 @@ class Field:
         self._lines: list[NDArray[np.float64]] | None = None
         self._background = background
         self._cure = Cure() if cure is None else cure
+        self._joints = joints
         self._comm: MPI.Comm = V.mesh.comm
         self._bs = V.dofmap.index_map_bs
         self._owned = V.dofmap.index_map.size_local * self._bs
@@ -180,8 +184,9 @@ class Field:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Numbers of badly supported dofs, by the names of the statistics."""
-        return self._cure.counts
+        """Numbers of badly supported dofs and of joints, by the names of the statistics."""
+        joints = {} if self._joints is None else {"joint_nodes": self._joints.count}
+        return self._cure.counts | joints
 
     def begin(self, change: NDArray[np.float64], before: NDArray[np.float64] | None = None) -> None:
         """Take over the Dirichlet values of a step, on the local dofs of V.
@@ -199,8 +204,7 @@ class Field:
 
     def find(self) -> FreeDofs:
         """Find the unknowns: dofs with weight or a background term, and without a condition."""
-        owned = [body.W.dofmap.index_map.size_local for body in self.bodies]
-        self.touched = TouchedNodes(self.V, [body.node_basis for body in self.bodies], owned)
+        self.touched = self._look() if self._joints is None else self._joints.touched()
         supported = np.zeros(self._owned, dtype=bool)
         if self._background is not None:
             supported[self._background.support()] = True
@@ -217,6 +221,11 @@ class Field:
         self._penalty: tuple[PETSc.Mat, PETSc.Mat] | None = None
         self._product: PETSc.Mat | None = None
         return self.free
+
+    def _look(self) -> TouchedNodes:
+        """Return the nodes of V that bodies touch."""
+        owned = [body.W.dofmap.index_map.size_local for body in self.bodies]
+        return TouchedNodes(self.V, [body.node_basis for body in self.bodies], owned)
 
     def _held(self) -> NDArray[np.bool_]:
         """Return which of this rank's own dofs of V have a condition, looked up once for each."""

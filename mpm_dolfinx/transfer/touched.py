@@ -64,6 +64,7 @@ class TouchedNodes:
             values = basis.values.ravel() if keep.all() else basis.values[keep]  # no copy if all
             self.rows.append(TransferRows(offsets, mine, values))
         firsts = self._comm.allgather(first)
+        self._firsts = np.asarray(firsts)
         self._ends = np.searchsorted(self.nodes, firsts[1:])
         told = swap(self._comm, self._by_owner(np.column_stack([self.nodes, counts])))
         self._own = [part[:, 0] - first for part in told]
@@ -95,6 +96,47 @@ class TouchedNodes:
         for own, part in zip(self._own, swap(self._comm, self._by_owner(largest)), strict=True):
             result[own] = np.maximum(result[own], part)
         return result
+
+    def shared(self) -> NDArray[np.bool_]:
+        """Return whether several bodies touch each of this rank's own nodes of V (collective)."""
+        first = np.full(len(self.nodes), len(self.rows))
+        last = np.full(len(self.nodes), -1)
+        for number, row in enumerate(self.rows):
+            first[row.nodes] = np.minimum(first[row.nodes], number)
+            last[row.nodes] = number
+        low, high = np.full(self.num_own, len(self.rows)), np.full(self.num_own, -1)
+        told = swap(self._comm, self._by_owner(np.column_stack([first, last])))
+        for own, part in zip(self._own, told, strict=True):
+            low[own] = np.minimum(low[own], part[:, 0])
+            high[own] = np.maximum(high[own], part[:, 1])
+        return high > low
+
+    def rows_on(self, nodes: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+        """Return whether each row of T has a weight on chosen nodes, for each body (collective).
+
+        Args:
+            nodes: Whether each of this rank's own nodes of V is chosen.
+        """
+        chosen, found = self.spread(nodes), []
+        for row in self.rows:
+            result = np.zeros(len(row.offsets) - 1, dtype=bool)
+            number = np.repeat(np.arange(len(result)), np.diff(row.offsets))
+            result[number[chosen[row.nodes]]] = True
+            found.append(result)
+        return found
+
+    def at_nodes(self, values: NDArray[Any], nodes: NDArray[np.int64]) -> NDArray[Any]:
+        """Return at any nodes of V what their owners have (collective).
+
+        Args:
+            values: One number for each own node of V.
+            nodes: Global nodes, touched or not, of any shape.
+        """
+        wanted, number = np.unique(nodes, return_inverse=True)
+        asked = np.split(wanted, np.searchsorted(wanted, self._firsts[1:]))
+        first = self._firsts[self._comm.rank]
+        answers = swap(self._comm, [values[own - first] for own in swap(self._comm, asked)])
+        return np.concatenate(answers)[number].reshape(nodes.shape)
 
     def on_dofs(self, nodes: NDArray[Any]) -> NDArray[Any]:
         """Return values of this rank's own nodes of V at its own dofs."""

@@ -43,7 +43,7 @@ def fill(lifts, rows, cutoff=None, **options):
 @pytest.mark.parametrize("lifts", [1, 2])
 def test_what_a_prediction_is_too_far_from_is_found_from_zero(lifts):
     """Newton's method goes round from the prediction, and takes few solves from zero."""
-    problem = fill(lifts, 4 // lifts)
+    problem = fill(lifts, 4 // lifts, stabilisation=None)
     assert problem.history.cutbacks == 0
     assert problem.history.statistics["second_attempts"] > 0
     assert problem.history.total_iterations <= 75
@@ -62,3 +62,13 @@ def test_a_node_that_is_hardly_held_is_named():
     if WORLD.rank == 0:
         assert "may be too low" in str(caught[-1].message) and cause in str(caught[-1].message)
     assert "limit load" not in str(found.failure)
+
+
+@pytest.mark.parametrize(
+    ("lifts", "rows", "cutoff"), [(4, 1, None), (4, 1, 0.0), (4, 2, None), (3, 1, None)]
+)
+def test_lifts_are_built_by_default(lifts, rows, cutoff):
+    """What next to nothing holds follows the cell below: none stops at a toe that is let loose."""
+    problem = fill(lifts, rows, cutoff)
+    assert problem.history.cutbacks == 0
+    assert problem.history.total_iterations < 60
