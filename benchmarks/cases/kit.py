@@ -144,7 +144,7 @@ DOMAINS = {
     "hex": mesh.CellType.hexahedron,
     "tet": mesh.CellType.tetrahedron,
 }
-F_BARS = ("none", "domain", "pair", "patch")
+F_BARS = ("none", "domain", "patch")
 METHODS = ("cpdi2", "cpdi", "gimp", "mpm")
 
 

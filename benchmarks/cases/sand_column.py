@@ -40,7 +40,7 @@ parser.add_argument("--cohesion", type=float, default=0.0, help="Pa")
 parser.add_argument("--young", type=kit.positive, default=1e6, help="Pa")
 parser.add_argument("--no-volume-correction", action="store_true", help="what opens stays open")
 parser.add_argument("--rayleigh", type=float, default=3e-6, help="damping by stiffness, beta in s")
-parser.add_argument("--f-bar", choices=("none", "pair", "patch"), default="none")
+parser.add_argument("--f-bar", choices=("none", "patch"), default="none")
 parser.add_argument(
     "--outside", choices=("error", "delete"), default="error", help="if grains leave the background"
 )

@@ -14,7 +14,6 @@ FOOTING = {
     "2 by 2 points": "--f-bar none",
     '2 by 2 points, `"domain"`': "--f-bar domain",
     "triangles": "--f-bar none --domain tri",
-    'triangles, `"pair"`': "--f-bar pair --domain tri",
     'one point, `"patch"`': "--f-bar patch --quadrature-degree 1",
     '2 by 2 points, `"patch"`': "--f-bar patch",
     'triangles, `"patch"`': "--f-bar patch --domain tri",
@@ -58,7 +57,6 @@ TUBE = {
 COLUMNS = {
     'quadrilaterals, `"domain"`': "--f-bar domain",
     'quadrilaterals, `"patch"`': "--f-bar patch",
-    'triangles, `"pair"`': "--f-bar pair --domain tri",
     'triangles, `"patch"`': "--f-bar patch --domain tri",
 }
 BLOCK = {

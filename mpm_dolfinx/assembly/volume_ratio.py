@@ -38,7 +38,7 @@ class AveragedVolumeRatio(fem.Function):
 
     Args:
         particles: The body.
-        over: What a group is: ``"domain"``, ``"pair"`` or ``"patch"``, as in
+        over: What a group is: ``"domain"`` or ``"patch"``, as in
             ``QuasiStaticProblem(..., f_bar=...)``. J is that at the points of ``particles.dx``.
 
     Attributes:
@@ -52,8 +52,8 @@ class AveragedVolumeRatio(fem.Function):
     """
 
     def __init__(self, particles: Particles, over: str = "domain") -> None:
-        if over not in ("domain", "pair", "patch"):
-            raise MPMError(f"Unknown over={over!r}; choose 'domain', 'pair' or 'patch'.")
+        if over not in ("domain", "patch"):
+            raise MPMError(f"Unknown over={over!r}; choose 'domain' or 'patch'.")
         space = fem.functionspace(particles.mesh, ("Discontinuous Lagrange", 0))
         super().__init__(space, name="averaged_volume_ratio")
         self.x.array[:] = 1.0

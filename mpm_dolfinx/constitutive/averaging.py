@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""F-bar: volume ratios averaged over domains, pairs or patches, against locking.
+"""F-bar: volume ratios averaged over domains or patches, against locking.
 
 A material sees ``Fbar = (Jbar / J)^(1/dim) F`` (de Souza Neto, Peric, Dutko & Owen 1996), in
 plane strain with the power 1/2, which leaves the third direction alone; Jbar is the mean of J over
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
-from .groups import Groups, pairs, patches, singles
+from .groups import Groups, patches, singles
 from .strain import Strain
 
 __all__ = [
@@ -34,9 +34,9 @@ __all__ = [
     "deviation_energy",
 ]
 
-F_BARS = ("none", "domain", "pair", "patch")
+F_BARS = ("none", "domain", "patch")
 #: Deviation of ln J from its average that costs nothing, and that from which all is resisted.
-FREE = {"domain": (0.2, 0.6), "pair": (0.2, 0.6), "patch": (0.1, 0.5)}
+FREE = {"domain": (0.2, 0.6), "patch": (0.1, 0.5)}
 type Array = NDArray[np.float64]
 
 
@@ -143,7 +143,7 @@ class VolumeAveraging:
 
     Args:
         strain: What the points of the body are strained in.
-        kind: ``"domain"``, ``"pair"`` or ``"patch"``.
+        kind: ``"domain"`` or ``"patch"``.
         material: Number of each owned domain's material; groups have one material.
         modulus: Modulus that resists deviations from an average, for each owned domain, ``(n,)``.
         symmetric: Whether the material's tangent is symmetric.
@@ -188,13 +188,6 @@ class VolumeAveraging:
                     "each; make the particles with quadrature_degree=2, or use f_bar='patch'."
                 )
             return singles(body)
-        if kind == "pair":
-            if body.mesh.topology.cell_name() != "triangle":
-                raise MPMError(
-                    "f_bar='pair' averages over the two triangles of a quadrilateral, but the "
-                    f"body has {body.mesh.topology.cell_name()} cells; use 'domain' or 'patch'."
-                )
-            return pairs(body, material)
         return patches(body, material)
 
     def average(self, gradient: Array) -> Array:

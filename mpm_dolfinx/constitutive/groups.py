@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Fixed groups of domains: pairs of triangles, patches of about one background cell.
+"""Fixed groups of domains: patches of about one background cell.
 
 Groups are found once, on the undeformed body, and are the same on any number of ranks: all ranks
 look at the whole body. A group may lie on several ranks, whose sums travel.
@@ -23,7 +23,7 @@ from ..background.basis import BackgroundBasis
 from ..background.cells import cell_volumes
 from ..particles.particles import Particles
 
-__all__ = ["Groups", "background_cells", "pairs", "patches", "singles"]
+__all__ = ["Groups", "background_cells", "patches", "singles"]
 
 #: Share of a background cell below which a patch joins a neighbour.
 LEAST_FILL = 0.4
@@ -328,33 +328,6 @@ def singles(particles: Particles) -> Groups:
         none,
         none.reshape(0, 2),
     )
-
-
-def pairs(particles: Particles, material: NDArray[np.int64]) -> Groups:
-    """Pair triangles with a neighbour, by edges that are long for both first (collective).
-
-    Triangles that are halves of quadrilaterals find each other over the diagonal. One that is
-    left over stays alone.
-
-    Args:
-        particles: Triangles.
-        material: Number of each owned domain's material; pairs have one.
-    """
-    whole = _whole_body(particles, material)
-    edges = np.linalg.norm(whole.corners - np.roll(whole.corners, 1, axis=1), axis=2)
-    longest = edges.max(axis=1)
-    a, b = whole.facets[_same(whole.material, whole.facets)].T
-    common = (whole.vertices[a][:, :, None] == whole.vertices[b][:, None]).any(axis=2)
-    ends = whole.corners[a][common].reshape(len(a), 2, -1)
-    length = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-    share = np.minimum(length / longest[a], length / longest[b])
-    label = np.arange(len(whole.volume))
-    alone = np.ones(len(label), dtype=bool)
-    for i in np.lexsort((b, a, -np.round(share, 6))).tolist():
-        if alone[a[i]] and alone[b[i]]:
-            alone[a[i]] = alone[b[i]] = False
-            label[b[i]] = a[i]
-    return _numbered(particles, whole, label)
 
 
 def patches(particles: Particles, material: NDArray[np.int64]) -> Groups:

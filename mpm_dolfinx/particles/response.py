@@ -111,7 +111,7 @@ class MaterialDomains(Domains):
     def stress(self) -> NDArray[np.float64]:
         """Cauchy stress, shape ``(n, 3, 3)`` (volume averages).
 
-        With ``f_bar="pair"`` or ``"patch"`` the part of it that is constant on a patch is
+        With ``f_bar="patch"`` the part of it that is constant on a patch is
         recovered linearly from the patches around.
 
         Raises:

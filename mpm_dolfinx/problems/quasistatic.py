@@ -76,9 +76,8 @@ class QuasiStaticProblem(ParticleProblem):
         supports: Supports on the bodies' own boundaries, of :mod:`mpm_dolfinx.boundary`.
         background: Form on the background, as in :class:`ParticleProblem`.
         f_bar: Average of the volume ratio that the material sees, against hourglass modes and
-            locking: ``"none"``, ``"domain"`` (over a domain's points), ``"pair"`` (over the two
-            triangles of a quadrilateral) or ``"patch"`` (over the domains of about one
-            background cell).
+            locking: ``"none"``, ``"domain"`` (over a domain's points) or ``"patch"`` (over the
+            domains of about one background cell).
         petsc_options_prefix: Prefix of the PETSc options.
         petsc_options: PETSc options, without prefix.
         shift: As in :class:`ParticleProblem`.

@@ -149,7 +149,7 @@ def boundary_tags(body):
         5,
         product(
             ["plane", "axisymmetric", "space"],
-            ["none", "domain", "pair", "patch"],
+            ["none", "domain", "patch"],
             [1, 2],
             [False, True],
             [1, 2],
@@ -158,7 +158,7 @@ def boundary_tags(body):
 )
 def test_every_combination(kind, f_bar, degree, follower, bodies):
     plane = kind != "space"
-    cell = HEXAHEDRON if not plane else TRIANGLE if f_bar == "pair" else QUADRILATERAL
+    cell = QUADRILATERAL if plane else HEXAHEDRON
     V = space(2 if plane else 3, degree)
     corners = [[0.1, 0.1, 0.1], [0.1, -0.9, -0.9]][:bodies]
     meshes = [bent(cell, corner[: 2 if plane else 3]) for corner in corners]
@@ -174,10 +174,6 @@ def test_every_combination(kind, f_bar, degree, follower, bodies):
     def make():
         return quasi_static(particles, f_bar=f_bar, axisymmetric=kind == "axisymmetric", **loads)
 
-    if f_bar == "pair" and not plane:
-        with pytest.raises(mpm.MPMError, match="use 'domain' or 'patch'"):
-            make()
-        return
     compare(make, symmetric=not follower)
 
 

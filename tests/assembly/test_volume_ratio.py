@@ -62,7 +62,6 @@ CASES = [
     (QUADRILATERAL, "domain", 2),
     (QUADRILATERAL, "patch", 1),
     (QUADRILATERAL, "patch", 2),
-    (TRIANGLE, "pair", 1),
     (TRIANGLE, "patch", 1),
 ]
 
@@ -199,7 +198,7 @@ def test_a_failed_step_leaves_the_averages():
 def test_bad_input():
     particles, bcs = block(QUADRILATERAL, None)
     d, v = particles.displacement, ufl.TestFunction(particles.W)
-    with pytest.raises(mpm.MPMError, match="choose 'domain', 'pair' or 'patch'"):
+    with pytest.raises(mpm.MPMError, match="choose 'domain' or 'patch'"):
         mpm.AveragedVolumeRatio(particles, "cell")
     with pytest.raises(mpm.MPMError, match="one each"):
         mpm.AveragedVolumeRatio(particles, "domain")

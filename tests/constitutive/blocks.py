@@ -22,8 +22,6 @@ CASES = [
     (QUADRILATERAL, "domain", 2, True),
     (QUADRILATERAL, "patch", 2, False),
     (QUADRILATERAL, "patch", 1, False),
-    (TRIANGLE, "pair", 1, False),
-    (TRIANGLE, "pair", 1, True),
     (TRIANGLE, "patch", 1, False),
     (TRIANGLE, "patch", 1, True),
     (HEXAHEDRON, "domain", 2, False),

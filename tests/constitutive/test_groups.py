@@ -1,12 +1,12 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Groups of domains: pairs and patches."""
+"""Groups of domains: patches."""
 
 import numpy as np
 import pytest
 import scenes
 from constitutive.blocks import CASES, ELASTIC, PLASTIC, block, label
-from scenes import QUADRILATERAL, TRIANGLE, box, vectors
+from scenes import QUADRILATERAL, box, vectors
 
 import mpm_dolfinx as mpm
 
@@ -30,18 +30,6 @@ def test_groups_do_not_depend_on_the_ranks(cell, f_bar, rule, axisymmetric):
     first = np.full(number.max() + 1, len(number))
     np.minimum.at(first, number[order], np.arange(len(number)))
     np.testing.assert_array_equal(members(problem), first[number[order]])
-
-
-@pytest.mark.parametrize("diagonal", ["left", "right", "left_right", "right_left"])
-def test_pairs_are_the_quadrilaterals(diagonal):
-    V = vectors(box([0.0, 0.0], [1.0, 1.0], [2, 2], QUADRILATERAL))
-    body = box([0.0, 0.0], [1.0, 1.0], [4, 4], TRIANGLE, diagonal=diagonal)
-    problem = mpm.QuasiStaticProblem(mpm.Particles(body, V), ELASTIC, f_bar="pair")
-    centre = scenes.in_order(problem.particles, problem.particles.initial_centroid)
-    square = np.floor(centre * 4.0) @ [1.0, 4.0]
-    group = members(problem)
-    assert len(np.unique(group)) == 16
-    assert (square == square[group]).all()
 
 
 @pytest.mark.parametrize("cell", scenes.PLANE, ids=label)

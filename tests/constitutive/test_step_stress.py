@@ -196,11 +196,10 @@ def test_the_work_of_metal_is_its_energy_and_what_yielding_takes(cell):
 GROUPED = [
     (QUADRILATERAL, "Hencky", "domain", False),
     (QUADRILATERAL, "Hencky", "domain", True),
-    (TRIANGLE, "Hencky", "pair", False),
     (TRIANGLE, "Hencky", "patch", False),
     (HEXAHEDRON, "Hencky", "domain", False),
     (QUADRILATERAL, "von Mises", "domain", False),
-    (TRIANGLE, "linear", "pair", False),
+    (TRIANGLE, "linear", "patch", False),
 ]
 
 

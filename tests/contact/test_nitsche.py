@@ -105,7 +105,7 @@ TANGENTS = {
     "domain": {"quadrature_degree": 2, "f_bar": "domain"},
     "patch": {"quadrature_degree": 2, "f_bar": "patch"},
     "reference": {"quadrature_degree": 2, "f_bar": "patch", "route": "reference"},
-    "pair": {"cell": TRIANGLE, "f_bar": "pair"},
+    "patches of triangles": {"cell": TRIANGLE, "f_bar": "patch"},
     "degree 2": {"degree": 2, "n": 4},
 }
 

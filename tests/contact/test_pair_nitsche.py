@@ -197,7 +197,7 @@ WALK = {
     "one pass": {"passes": 1},
     "one field of the rule": {"rule": 2, "f_bar": "domain"},
     "patches": {"rule": 2, "f_bar": "patch"},
-    "pairs of triangles": {"cells": (TRIANGLE, TRIANGLE), "f_bar": "pair"},
+    "patches of triangles": {"cells": (TRIANGLE, TRIANGLE), "f_bar": "patch"},
     "degree 2": {"degree": 2},
     "degree 3": {"degree": 3, "cells": (QUADRILATERAL, QUADRILATERAL)},
     "yields": {"material": SOFT, "rule": 2, "f_bar": "patch"},

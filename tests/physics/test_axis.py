@@ -79,7 +79,6 @@ CASES = {
     "bent, patches": {"bent": True, "f_bar": "patch"},
     "patches": {"f_bar": "patch"},
     "domains": {"f_bar": "domain", "quadrature_degree": 2},
-    "pairs": {"f_bar": "pair", "cell": TRIANGLE},
     "pressure": {"mixed": "pressure", "degree": 2},
     "stabilised pressure": {"mixed": "stabilised pressure"},
     "2 x 2": {"quadrature_degree": 2},

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import scenes
 from marks import all_but, slow
-from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
+from scenes import HEXAHEDRON, QUADRILATERAL, WORLD
 
 import ufl
 from dolfinx import fem, la
@@ -40,7 +40,6 @@ FEATURES = {
     "degree 2": {"degree": 2},
     "degree 3": {"degree": 3},
     "f_bar domain": {"f_bar": "domain", "quadrature": 2},
-    "f_bar pair": {"f_bar": "pair", "simplices": True},
     "f_bar patch": {"f_bar": "patch"},
     "axisymmetric": {"axisymmetric": True},
     "3-D": {"dim": 3},
@@ -169,8 +168,7 @@ class Scene:
 
     def body(self, V, bottom, n):
         """Return a unit block."""
-        kinds = (TRIANGLE, TETRAHEDRON) if "simplices" in self.wanted else (None, HEXAHEDRON)
-        cell = kinds[self.dim - 2] or QUADRILATERAL
+        cell = HEXAHEDRON if self.dim == 3 else QUADRILATERAL
         lower, upper = np.zeros(self.dim), np.ones(self.dim)
         lower[-1], upper[-1] = bottom, bottom + 1.0
         return mpm.Particles(

@@ -182,9 +182,7 @@ def test_a_spinning_body_keeps_momentum_and_its_account(scheme, out):
         assert abs(end.dissipated) < 1e-12 * end.kinetic
 
 
-@pytest.mark.parametrize(
-    ("cell", "f_bar"), [(QUADRILATERAL, "domain"), (TRIANGLE, "pair"), (TRIANGLE, "patch")]
-)
+@pytest.mark.parametrize(("cell", "f_bar"), [(QUADRILATERAL, "domain"), (TRIANGLE, "patch")])
 @pytest.mark.parametrize(
     ("law", "route"),
     [

@@ -450,7 +450,6 @@ SCENES = {
     "degree 2": kept(scene={"degree": 2}),
     "degree 3": kept(scene={"degree": 3}),
     "f_bar domain": kept(scene={"particles": {"quadrature_degree": 2}}, f_bar="domain"),
-    "f_bar pair": kept(scene={"cell": TRIANGLE}, f_bar="pair"),
     "f_bar patch": kept(f_bar="patch"),
     "stabilised pressure": kept(mixed="stabilised pressure"),
     "pressure": kept(scene={"degree": 2}, mixed="pressure"),

@@ -134,7 +134,6 @@ def test_a_stage_leaves_the_stress_of_what_flows():
     [
         {"f_bar": "patch"},
         *slow(
-            {"f_bar": "pair"},
             {"mixed": "stabilised pressure"},
             {"scheme": "midpoint", "out_of_range": "reflect"},
             {"scheme": "conserving"},

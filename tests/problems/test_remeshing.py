@@ -248,7 +248,7 @@ REBASED = [
     ),
     pytest.param(HEXAHEDRON, 2, {}, id="hexahedra of degree 2", marks=pytest.mark.slow),
     pytest.param(QUADRILATERAL, 1, {"f_bar": "patch"}, id="patches"),
-    pytest.param(TRIANGLE, 1, {"f_bar": "pair"}, id="pairs"),
+    pytest.param(TRIANGLE, 1, {"f_bar": "patch"}, id="patches of triangles"),
     pytest.param(QUADRILATERAL, 2, {"f_bar": "domain"}, id="F-bar over the domain"),
     pytest.param(QUADRILATERAL, 2, {"axisymmetric": True}, id="around an axis"),
     pytest.param(

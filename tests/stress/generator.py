@@ -324,10 +324,10 @@ def any_background(rng: Random, index: int) -> Scene:
 @scene_class(40, well_posed=True)
 def f_bar(rng: Random, index: int) -> Scene:
     """F-bar of each kind, nearly incompressible or below the limit load."""
-    kind = ("domain", "patch", "pair", "patch")[index % 4]
+    kind = ("domain", "patch")[index % 2]
     plastic = index % 3 == 2
     dim = 3 if index % 10 == 9 and kind == "patch" else 2
-    cell = {"domain": "quadrilateral", "pair": "triangle"}.get(kind) or pick(rng, *CELLS[dim])
+    cell = "quadrilateral" if kind == "domain" else pick(rng, *CELLS[dim])
     return assembled(
         rng,
         dim,
@@ -601,8 +601,8 @@ def many_particles(rng: Random, index: int) -> Scene:
 @scene_class(12, well_posed=True)
 def revolution(rng: Random, index: int) -> Scene:
     """Bodies of revolution, hollow or not, with each F-bar and without."""
-    kind = ("none", "domain", "pair", "patch")[index % 4]
-    cell = {"domain": "quadrilateral", "pair": "triangle"}.get(kind) or pick(rng, *CELLS[2])
+    kind = ("none", "domain", "patch", "patch")[index % 4]
+    cell = "quadrilateral" if kind == "domain" else pick(rng, *CELLS[2])
     hollow = bool(rng.integers(2))
     plastic = index % 3 == 2
     return assembled(
