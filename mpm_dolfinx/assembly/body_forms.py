@@ -35,17 +35,15 @@ no_values: NDArray[np.float64] = np.zeros(0)
 
 
 class PointStress(Protocol):
-    """Stress at a body's quadrature points, of which the compiled loops make forces.
-
-    Attributes:
-        tangent: Pointwise derivative of the stress by F, shape ``(n nq, dim, dim, dim, dim)``.
-    """
-
-    tangent: NDArray[np.float64]
+    """Stress at a body's quadrature points, of which the compiled loops make forces."""
 
     @property
     def first_piola(self) -> NDArray[np.float64]:
         """First Piola stress, shape ``(n nq, dim, dim)``."""
+
+    @property
+    def tangent(self) -> NDArray[np.float64]:
+        """Pointwise derivative of the stress by F, shape ``(n nq, dim, dim, dim, dim)``."""
 
     @property
     def symmetric(self) -> bool:

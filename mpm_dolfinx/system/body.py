@@ -22,13 +22,7 @@ __all__ = ["BodyTerm", "PointHistory", "StepForce"]
 
 
 class PointHistory(PointMaterial, Protocol):
-    """A material at a body's points, with its history. What is here is not collective.
-
-    Attributes:
-        tangent: Pointwise derivative of the stress by F, shape ``(n nq, dim, dim, dim, dim)``.
-    """
-
-    tangent: NDArray[np.float64]
+    """A material at a body's points, with its history. What is here is not collective."""
 
     @property
     def weights(self) -> NDArray[np.float64]:

@@ -229,7 +229,7 @@ def test_with_f_bar_the_tangent_is_the_derivative(cell, law, f_bar, axisymmetric
     stress.update()
     pointwise = np.einsum("niJkL,nkL->niJ", stress.tangent, gradients[1] - gradients[0])
     change = points.strain.nodal(pointwise.reshape(shape), volumes)
-    change += 2.0 * size * stress.linearise().times(direction[nodes])
+    change += 2.0 * size * stress.grouped.linearise().times(direction[nodes])
     found = values[1] - values[0]
     scale = WORLD.allreduce(np.abs(found).max(initial=1e-30), MPI.MAX)
     np.testing.assert_allclose(change, found, atol=4e-6 * scale)
