@@ -35,7 +35,7 @@ FITTED = 1e-6
 
 
 def extrapolation(cell: basix.CellType, points: Array, places: Array, degree: int) -> Array:
-    """Return what takes values at some points to values at others, by a fitted polynomial.
+    """Return the matrix from values at some points to values at others, by a fitted polynomial.
 
     Args:
         cell: The cell, of whose coordinates the points are.

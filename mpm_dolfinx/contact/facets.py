@@ -461,7 +461,7 @@ def separated(
 
 
 def solved(G: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-    """Return what positive matrices ``(n, e, e)`` of one or two rows give as ``b``, ``(n, e)``."""
+    """Return the solutions of positive systems ``(n, e, e)``, e = 1 or 2, for ``b``, ``(n, e)``."""
     if G.shape[1] == 1:
         return np.asarray(b / G[:, 0])
     det = G[:, 0, 0] * G[:, 1, 1] - G[:, 0, 1] * G[:, 1, 0]

@@ -170,7 +170,7 @@ class Nitsche:
 
 
 class ThroughGroups:
-    """What such derivatives have from all points of the groups of F-bar.
+    """Part of such derivatives that comes from all points of the groups of F-bar.
 
     Args:
         behind: The stress behind the facets.

@@ -172,7 +172,7 @@ type Side = tuple[slice, NDArray[np.int32]]
 def _sides(
     number: int, known: Met, names: Sequence[NDArray[np.int64]]
 ) -> tuple[dict[int, Side], dict[int, Side]]:
-    """Return what rows and columns of a pass have of each body.
+    """Return rows and columns of a pass, for each body.
 
     Args:
         number: Of the pass, which is that of the body of its points.

@@ -46,7 +46,7 @@ class Near(NamedTuple):
 
 
 class Reach:
-    """What of a surface an obstacle may reach in a step.
+    """Facets of a surface that an obstacle may reach in a step.
 
     Args:
         surface: The surface.
@@ -80,7 +80,7 @@ class Reach:
             self._change = self._largest_change(self._near)
 
     def of(self, memory: Memory, pose: Pose) -> Memory | None:
-        """Return what is known of facets that may touch at the present positions; ``None``: all.
+        """Return the memory of facets that may touch at the present positions; ``None``: all.
 
         Args:
             memory: What is known of the last converged step.
@@ -97,7 +97,7 @@ class Reach:
         return wider.memory if wider is not None and moved < wider.margin else None
 
     def known(self, trial: Memory, memory: Memory) -> Memory:
-        """Return what was known of the facets that were looked at in a trial.
+        """Return the memory of the facets that were looked at in a trial.
 
         Args:
             trial: The trial.

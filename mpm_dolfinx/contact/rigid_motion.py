@@ -266,7 +266,7 @@ def _finite(count: int) -> str:
 
 
 def _shown(value: Any) -> str:
-    """Return what was given, on one line."""
+    """Return a value in words, on one line."""
     return " ".join(repr(value).split())
 
 

@@ -320,7 +320,7 @@ class Surface:
         sign: float = 1.0,
         which: NDArray[np.int64] | None = None,
     ) -> PETSc.Vec:
-        """Return what tractions at the points do to the nodes of W (collective).
+        """Return the forces of tractions at the points on the nodes of W (collective).
 
         Args:
             tractions: Per undeformed area, shape ``(m, nq, gdim)``.

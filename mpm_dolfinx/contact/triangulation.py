@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, override
 
 from mpi4py import MPI
 
@@ -38,7 +38,7 @@ KEPT = 0.5
 
 
 class _Place(NamedTuple):
-    """What the distance of points to a surface is made of.
+    """Distance of points to a surface, part by part.
 
     Attributes:
         arm: From the nearest corner or edge to the point; from some place of the plane, where that
@@ -59,7 +59,7 @@ class _Place(NamedTuple):
 
 
 class _Faceted(Shape):
-    """What lies behind segments or triangles, which are oriented outwards, with rounded edges.
+    """Solid behind segments or triangles, which are oriented outwards, with rounded edges.
 
     Args:
         points: Corners, shape ``(n, dim)``.
@@ -102,17 +102,17 @@ class _Faceted(Shape):
         self._end_corner[keys[self._end_edge].ravel()] = True
 
     @property
+    @override
     def bounds(self) -> NDArray[np.float64]:
-        """See :attr:`Shape.bounds`."""
         return np.array([self._outline.min(axis=0), self._outline.max(axis=0)])
 
     @property
+    @override
     def outline(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """See :attr:`Shape.outline`."""
         return self._outline, self.facets
 
     def _resolved(self, y: NDArray[Any]) -> _Place:
-        """Return what the distance of points is made of."""
+        """Return the distance of points, part by part."""
         facet, corner, edge = self._tree(y.real)
         vertex = self.facets[facet, np.maximum(corner, 0)]
         arm = y - self.points[vertex]
@@ -142,15 +142,15 @@ class _Faceted(Shape):
         size = np.sqrt(np.where(off, (arm * arm).sum(axis=1), 1.0))
         return _Place(arm, size, sign, n, along, off)
 
+    @override
     def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """See :meth:`Shape.distance`."""
         at = self._resolved(y)
         phi = np.where(at.off, at.sign * at.size, (at.arm * at.normal).sum(axis=1))
         n = np.where(at.off[:, None], at.arm * (at.sign / at.size)[:, None], at.normal)
         return phi - self._radius, n
 
+    @override
     def curvature(self, y: NDArray[Any]) -> NDArray[Any]:
-        """See :meth:`Shape.curvature`."""
         at = self._resolved(y)
         n, t = at.arm / at.size[:, None], at.along
         across = np.eye(self.dim) - n[:, :, None] * n[:, None, :] - t[:, :, None] * t[:, None, :]
@@ -222,7 +222,7 @@ def _corner_normals(
 def triangulated(
     points: Any, triangles: Any, *, outside: Any = None, radius: float = 0.0, pivot: Any = None
 ) -> Shape:
-    """Return what lies behind triangles in space: a closed surface, or an open one.
+    """Return the solid behind triangles in space: a closed surface, or an open one.
 
     Triangles may be given in either sense of rotation, but all in the same; corners at one place
     are one. Beyond the border of an open surface there is no obstacle. Parts that go through each
@@ -248,7 +248,7 @@ def triangulated(
 
 
 def polyline(points: Any, *, outside: Any = None, radius: float = 0.0, pivot: Any = None) -> Shape:
-    """Return what lies behind a line of segments in the plane, such as the profile of a terrain.
+    """Return the solid behind a line of segments in the plane, such as the profile of a terrain.
 
     Beyond its ends there is no obstacle. It is closed where the last point is the first.
 
@@ -271,7 +271,7 @@ def polyline(points: Any, *, outside: Any = None, radius: float = 0.0, pivot: An
 
 
 def terrain(x: Any, y: Any, heights: Any, *, radius: float = 0.0, pivot: Any = None) -> Shape:
-    """Return what lies below a height that is given on a grid, two triangles to each cell.
+    """Return the solid below a height given on a grid, two triangles to each cell.
 
     Beyond the border there is no obstacle; let it reach farther than the body goes.
 
@@ -318,7 +318,7 @@ def read_surface(
     pivot: Any = None,
     comm: MPI.Comm = MPI.COMM_WORLD,
 ) -> Shape:
-    """Return what lies behind a triangulated surface of a file (collective).
+    """Return the solid behind a triangulated surface of a file (collective).
 
     Rank 0 reads it by pyvista: STL, PLY, OBJ, VTK, VTP and more; of volumes the boundary is taken,
     and other polygons are divided.

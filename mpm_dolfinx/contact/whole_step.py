@@ -120,7 +120,7 @@ def corrected_slope(
 
 
 def deformation(middle: NDArray[Any], change: NDArray[Any]) -> NDArray[Any]:
-    """Return what changes of some points have besides a rigid motion.
+    """Return the part of changes of some points that is no rigid motion.
 
     Args:
         middle: Where the points are, shape ``(n, k, gdim)``.

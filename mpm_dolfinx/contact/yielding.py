@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What a rigid body adds to the tangent of what it touches by yielding to it."""
+"""Contribution of a rigid body to the tangent of what it touches, by yielding to it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["Yielding"]
 
 
 class Yielding:
-    """What a rigid body adds to a tangent by yielding, ``sum_ab L_a^T R_b`` on W of the bodies.
+    """Contribution of a yielding rigid body, ``sum_ab L_a^T R_b`` on W of the bodies.
 
     Args:
         bodies: The bodies that it touches.

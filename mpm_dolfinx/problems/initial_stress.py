@@ -129,7 +129,7 @@ def geostatic(
 
 
 def of_all_ranks(value: Any) -> Any:
-    """Return what ranks must have in common of an initial stress, or of a list of them."""
+    """Return the part of an initial stress, or of a list of them, that ranks must share."""
     if isinstance(value, list) and not np.isscalar(value[0] if value else 0.0):
         return [of_all_ranks(entry) for entry in value]
     if isinstance(value, _Geostatic):

@@ -1,13 +1,13 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What every problem keeps: bodies, material points, Functions, increments, and how far it is."""
+"""State that every problem keeps: bodies, points, Functions, increments, and its progress."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, override
 
 from mpi4py import MPI
 
@@ -41,8 +41,8 @@ class Bodies(Kept):
         cuts = [body.cuts.tolist() for body in self._bodies]
         return {"cuts": cuts, "mass share per": "undeformed volume"}
 
+    @override
     def columns(self, body: int | None) -> dict[str, Column]:
-        """See :class:`Kept`."""
         return {} if body is None else self._bodies[body].converged_state()
 
     def require(self, source: str, taken: Taken) -> None:
@@ -55,8 +55,8 @@ class Bodies(Kept):
             if missing:
                 raise MPMError(f"{source} does not hold {missing}, which this problem keeps.")
 
+    @override
     def restore(self, taken: Taken) -> None:
-        """See :class:`Kept`."""
         for body, columns in zip(self._bodies, taken.columns, strict=False):
             body.set_converged_state(columns)
             if "mass share per" not in taken.numbers and body.origin is not None:
@@ -84,13 +84,13 @@ class Material(Kept):
     ) -> None:
         self._get, self._put, self._at, self._points = get, put, at, points
 
+    @override
     def numbers(self) -> dict[str, Any]:
-        """See :class:`Kept`."""
         factors = [points.weakening for points in self._points]
         return {"weakening": factors} if factors else {}
 
+    @override
     def columns(self, body: int | None) -> dict[str, Column]:
-        """See :class:`Kept`."""
         if body is None:
             return {}
         return {
@@ -100,8 +100,8 @@ class Material(Kept):
             for name, value in self._get()[body].items()
         }
 
+    @override
     def require(self, source: str, taken: Taken) -> None:
-        """See :class:`Kept`."""
         for number, history in enumerate(taken.columns[:-1]):
             present = self.columns(number)
             for name, column in present.items():
@@ -115,8 +115,9 @@ class Material(Kept):
                     f"{source} has a history of stress, which this problem has no use for."
                 )
 
+    @override
     def restore(self, taken: Taken) -> None:
-        """See :class:`Kept`; a state that says nothing of strength leaves it as it is."""
+        """Restore; a state that has no strength leaves it as it is."""
         for points, factor in zip(self._points, taken.numbers.get("weakening", ()), strict=False):
             if factor != points.weakening:
                 points.weaken(factor)
@@ -179,13 +180,13 @@ class Functions(Kept):
             )
         self._of = shares
 
+    @override
     def columns(self, body: int | None) -> dict[str, Column]:
-        """See :class:`Kept`."""
         own = [] if body is None else self._of[body]
         return {f.name: Column(of_cells(f), "nodes") for f in own}
 
+    @override
     def require(self, source: str, taken: Taken) -> None:
-        """See :class:`Kept`."""
         for own, columns in zip(self._of, taken.columns, strict=False):
             given = {f.name for f in own}
             if columns.keys() != given:
@@ -199,8 +200,8 @@ class Functions(Kept):
                 if columns[function.name].shape[1:] != shape:
                     raise MPMError(f"{source} holds the function {function.name} in another space.")
 
+    @override
     def restore(self, taken: Taken) -> None:
-        """See :class:`Kept`."""
         for own, columns in zip(self._of, taken.columns, strict=False):
             for function in own:
                 fill(function, columns[function.name])
@@ -219,17 +220,17 @@ class Values(Kept):
     def __init__(self, carried: Sequence[Sequence[CarriedField]], reduced: ReducedSystem) -> None:
         self._carried, self._reduced = carried, reduced
 
+    @override
     def numbers(self) -> dict[str, Any]:
-        """See :class:`Kept`."""
         return {"units": self._reduced.units}
 
+    @override
     def columns(self, body: int | None) -> dict[str, Column]:
-        """See :class:`Kept`."""
         own = [] if body is None else self._carried[body]
         return {one.field.name: Column(of_cells(one.field.previous), one.place) for one in own}
 
+    @override
     def restore(self, taken: Taken) -> None:
-        """See :class:`Kept`."""
         for own, columns in zip(self._carried, taken.columns, strict=False):
             for one in own:
                 fill(one.field.previous, columns[one.field.name])
@@ -269,8 +270,8 @@ class Increments(Kept):
         sizes = [size for size, _ in self._predictor.past]
         return {"": sizes, "measures": moved is not None, "moved": bool(moved)}
 
+    @override
     def columns(self, body: int | None) -> dict[str, Column]:
-        """See :class:`Kept`."""
         if body is None:
             return {}
         past = self._predictor.past
@@ -285,11 +286,12 @@ class Increments(Kept):
             for name, one in self._of[body].items()
         }
 
+    @override
     def require(self, source: str, taken: Taken) -> None:
-        """See :class:`Kept`; those of another run are as good."""
+        """Take any state; those of another run are as good."""
 
+    @override
     def restore(self, taken: Taken) -> None:
-        """See :class:`Kept`."""
         numbers = taken.numbers
 
         def increments(key: str) -> list[NDArray[np.float64]]:
@@ -311,13 +313,13 @@ def _place(one: Particles | CarriedField) -> Literal["points", "nodes"]:
 
 
 class Past(Kept):
-    """What a run did, and the moduli that its ghost penalty began with."""
+    """History of a run, and the moduli that its ghost penalty began with."""
 
     def __init__(self, history: History, reduced: ReducedSystem, comm: MPI.Comm) -> None:
         self._history, self._reduced, self._comm = history, reduced, comm
 
+    @override
     def numbers(self) -> dict[str, Any]:
-        """See :class:`Kept`."""
         history = self._history
         return {
             "moduli": self._reduced.moduli,
@@ -334,11 +336,12 @@ class Past(Kept):
             "statistics": _average(self._comm, history.statistics),
         }
 
+    @override
     def require(self, source: str, taken: Taken) -> None:
-        """See :class:`Kept`."""
+        pass
 
+    @override
     def restore(self, taken: Taken) -> None:
-        """See :class:`Kept`."""
         numbers, history = taken.numbers, self._history
         self._reduced.moduli = numbers["moduli"]
         history.steps[:] = _steps(numbers["steps"])
@@ -369,8 +372,8 @@ class Standing(Kept):
     ) -> None:
         self.progress, self._spaces, self._history = progress, spaces, history
 
+    @override
     def numbers(self) -> dict[str, Any]:
-        """See :class:`Kept`."""
         converged, run = self.progress.converged, self.progress.run
         return {
             "load": converged.load,
@@ -381,8 +384,8 @@ class Standing(Kept):
             "experience": self.progress.experience,
         }
 
+    @override
     def on_background(self, number: int) -> dict[str, Column]:
-        """See :class:`Kept`."""
         converged, run = self.progress.converged, self.progress.run
         totals = {
             "prescribed": converged.prescribed[number],
@@ -394,11 +397,12 @@ class Standing(Kept):
             for name, values in totals.items()
         }
 
+    @override
     def require(self, source: str, taken: Taken) -> None:
-        """See :class:`Kept`."""
+        pass
 
+    @override
     def restore(self, taken: Taken) -> None:
-        """See :class:`Kept`."""
         numbers = taken.numbers
         totals = {
             name: [

@@ -33,7 +33,7 @@ __all__ = ["Change", "Renewable", "Staging"]
 
 
 class Change(Protocol):
-    """What a stage changes of a problem. All calls are collective.
+    """Change of a problem by a stage. All calls are collective.
 
     Attributes:
         kind: What kind of change it is.
@@ -237,7 +237,7 @@ class Staging:
 
 
 def _identity(one: Particles | CarriedField) -> tuple[int, str]:
-    """Return what a body, or a field on it, is known by through stages."""
+    """Return the key of a body, or of a field on it, which stages keep."""
     if isinstance(one, CarriedField):
         return id(one.field.particles), one.field.name
     return id(one), ""

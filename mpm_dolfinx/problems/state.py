@@ -204,7 +204,7 @@ class ProblemState:
     # -- What it is known by --------------------------------------------------------------
 
     def identity(self) -> dict[str, Any]:
-        """Return what the problem is known by, as it was made at first (collective)."""
+        """Return the identity of the problem, as it was made at first (collective)."""
         return identity.identity(self._problem) if self._identity is None else self._identity
 
     def before_remeshing(self) -> None:

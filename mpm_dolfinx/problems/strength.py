@@ -33,7 +33,7 @@ FAILURES = (*TRIAL_ERRORS, ParticleOutsideError)
 
 @dataclass(frozen=True)
 class StrengthReduction:
-    """What a reduction of strength has found.
+    """Result of a reduction of strength.
 
     Attributes:
         factor: Factor of safety: what the strength was last divided by with equilibrium.
@@ -197,7 +197,7 @@ def _require_rest(found: float | MPMError, limit: float) -> None:
 def _result(
     search: _Search, ways: dict[float, float], failures: dict[float, MPMError], limit: float
 ) -> StrengthReduction:
-    """Return what was found, and why the search ended.
+    """Return the result, and why the search ended.
 
     Args:
         search: It.

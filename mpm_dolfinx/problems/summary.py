@@ -34,7 +34,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def in_one_line(problem: Any) -> str:
-    """Return what ``repr`` says of a problem."""
+    """Return the ``repr`` of a problem."""
     count = sum(body.num_global for body in problem.bodies)
     parts = [counted(len(problem.bodies), "body"), counted(count, "particle")]
     if problem.bcs:
@@ -48,7 +48,7 @@ def in_one_line(problem: Any) -> str:
 def on_a_screen(
     problem: Any, comm: MPI.Comm, numerics: Mapping[str, str], laws: Sequence[str]
 ) -> str:
-    """Return what a problem is and what it did, at most a screen of it (collective).
+    """Return a summary of a problem and of its run, at most a screen of it (collective).
 
     Args:
         problem: The problem.

@@ -64,7 +64,7 @@ class Account:
         self.kinetic = kinetic
 
     def missing(self, works: Mapping[str, float], kinetic: float) -> float:
-        """Return what works of a step do not tell of the change of kinetic energy."""
+        """Return the work of a step less what it used and the change of kinetic energy."""
         used = sum(work for name, work in works.items() if name not in GIVEN)
         given = sum(works[name] for name in GIVEN)
         return given - used - (kinetic - self.kinetic)
@@ -78,7 +78,7 @@ class Account:
         )
 
     def undo(self) -> Callable[[], None]:
-        """Return what takes back all that is booked from now on."""
+        """Return a function that takes back all that is booked from now on."""
         before = self.kinetic, self._stress_work, self._totals.copy()
         entries = len(self._entries)
 

@@ -23,7 +23,7 @@ Dirichlet values move.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, override
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -61,7 +61,7 @@ type Stored = Callable[[], tuple[float, float]]
 
 
 class Followed(NamedTuple):
-    """What inertia must know of the rest of a problem, on the present meshes.
+    """Rest of a problem, as inertia must know it, on the present meshes.
 
     Attributes:
         terms: All other terms.
@@ -240,8 +240,8 @@ class Inertia(Term):
 
     # -- A step -----------------------------------------------------------------------------------
 
+    @override
     def begin(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.begin`."""
         mass, share = self.mass(), self.scheme.share
         for term in self._rest.terms:
             term.pace(self.dt, share)
@@ -266,8 +266,9 @@ class Inertia(Term):
         assert self._beginning is not None
         return self._beginning
 
+    @override
     def start(self, transfer: Transfer, prescribed: Motion) -> PETSc.Vec | None:
-        """See :meth:`Term.start`: the M-projection of ``dt v_n``, unless all is at rest.
+        """Return the M-projection of ``dt v_n``, unless all is at rest.
 
         From zero the solver's proximal term takes energy, if any; from elsewhere it may give some.
         Where velocities out of range are reflected, and nothing is lost, steps therefore start from
@@ -303,24 +304,25 @@ class Inertia(Term):
             self._reduced = known = _reduced(self._step.mass, Ts, self._rest.reduced)
         return known
 
+    @override
     def residuals(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.residuals`."""
         self._increments = _increments(self._step.mass)
         forces = self.stiffness_force(self._increments)
         for force, staying in zip(forces, self._step.staying, strict=True):
             force.axpy(1.0, staying)
         return forces
 
+    @override
     def absolute_contributions(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.absolute_contributions`."""
         forces = self.stiffness_force(self._increments)
         for force, size in zip(forces, self._step.sizes, strict=True):
             force.abs()
             force.axpy(1.0, size)
         return forces
 
+    @override
     def reduced_tangents(self, transfer: Transfer) -> Sequence[PETSc.Mat]:
-        """See :meth:`Term.reduced_tangents`: the mass of bodies that fused forms do not have."""
+        """Return the mass of bodies that fused forms do not have."""
         reduced, factor = self._reduce(transfer), self._step.factor
         self._rest.weigh(factor)
         if reduced.mass is None or reduced.scaled is None:
@@ -329,8 +331,8 @@ class Inertia(Term):
         reduced.scaled.scale(factor)
         return [reduced.scaled]
 
+    @override
     def reduced_product(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.reduced_product`."""
         forces = self.stiffness_force(motions)
         assert self._reduced is not None
         for force, own in zip(forces, self._reduced.apart, strict=True):
@@ -338,15 +340,16 @@ class Inertia(Term):
                 force.set(0.0)
         return forces
 
+    @override
     def stiffness_force(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.stiffness_force`."""
         forces = self._step.mass.times(motions)
         for force in forces:
             force.scale(self._step.factor)
         return forces
 
+    @override
     def commit(self) -> Callable[[], None]:
-        """See :meth:`Term.commit`: take the new velocities, forces and energies."""
+        """Commit the new velocities, forces and energies."""
         undo, step, account = self._state.undo(), self._step, self._account
         moved = self._kinematics()
         kinetic = 0.5 * step.mass.product(moved.after, moved.after)
@@ -405,8 +408,8 @@ class Inertia(Term):
 
     # -- What goes with the problem ---------------------------------------------------------------
 
+    @override
     def kept(self) -> Sequence[Kept]:
-        """See :meth:`Term.kept`."""
         return [self._state]
 
     def require_movable(self, consequence: str) -> None:

@@ -90,7 +90,7 @@ class Projection:
         return result
 
     def _rest(self, right: PETSc.Vec, y: PETSc.Vec) -> PETSc.Vec:
-        """Return what y leaves of the right-hand side, without the shift."""
+        """Return the right-hand side that y leaves, without the shift."""
         rest, held = right.duplicate(), right.duplicate()
         self._shifted.mult(y, rest)
         held.pointwiseMult(self._held, y)

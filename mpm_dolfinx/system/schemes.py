@@ -17,7 +17,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, override
 
 from petsc4py import PETSc
 
@@ -138,14 +138,15 @@ class Midpoint(Scheme):
     name = "midpoint"
     share = 0.5
 
+    @override
     def rates(self, dt: float, last: float) -> Rates:
-        """See :meth:`Scheme.rates`."""
         mean = np.array([1.0 / dt, 0.0])
         velocity = np.array([2.0 / dt, -1.0])
         return Rates(np.array([2.0 / dt**2, -2.0 / dt]), mean, velocity)
 
+    @override
     def lost(self, step: Kinematics) -> float:
-        """See :meth:`Scheme.lost`: what the background could not follow."""
+        """Energy of the motion that the background could not follow."""
         product, left = step.mass.product, step.left
         return 0.5 * product(left, left) - product(step.after, left)
 
@@ -165,13 +166,13 @@ class Euler(Scheme):
     def __init__(self, reflects: bool = False) -> None:
         super().__init__()  # its velocities have nothing of those before
 
+    @override
     def rates(self, dt: float, last: float) -> Rates:
-        """See :meth:`Scheme.rates`."""
         velocity = np.array([1.0 / dt, 0.0])
         return Rates(np.array([1.0 / dt**2, -1.0 / dt]), velocity, velocity)
 
+    @override
     def lost(self, step: Kinematics) -> float:
-        """See :meth:`Scheme.lost`."""
         change = step.change
         return 0.5 * step.mass.product(change, change)
 

@@ -1,11 +1,11 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What a motion has at the nodes of its bodies from step to step."""
+"""Velocities and forces at the nodes of bodies, from step to step."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,7 +153,7 @@ class Velocities(Kept):
         self.time, self.last = time, dt
 
     def undo(self) -> Callable[[], None]:
-        """Return what takes back all that changes from now on, also in the account."""
+        """Return a function that takes back all changes from now on, also in the account."""
         functions = [one for fields in self._fields().values() for one in fields]
         values = [function.x.array.copy() for function in functions]
         before, account = (self.time, self.last, self._rates), self._account.undo()
@@ -168,8 +168,8 @@ class Velocities(Kept):
 
     # -- Checkpoints ------------------------------------------------------------------------------
 
+    @override
     def numbers(self) -> dict[str, Any]:
-        """See :class:`Kept`."""
         return {
             "scheme": [self._scheme.name, "reflect" if self._scheme.reflects else "project"],
             "rayleigh": list(self._rayleigh),
@@ -179,14 +179,15 @@ class Velocities(Kept):
             **self._account.numbers(),
         }
 
+    @override
     def columns(self, body: int | None) -> dict[str, Column]:
-        """See :class:`Kept`."""
         if body is None:
             return self.on_background(0)
         return {name: _column(name, its[body]) for name, its in self._fields().items()}
 
+    @override
     def on_background(self, number: int) -> dict[str, Column]:
-        """See :class:`Kept`: the rates of Dirichlet values in the last step."""
+        """Return the rates of Dirichlet values in the last step."""
         spaces = spaces_of(self._bodies)
         if number >= len(spaces):  # that of a pressure, which has no rates
             return {}
@@ -196,8 +197,8 @@ class Velocities(Kept):
             function.x.scatter_forward()
         return {"rates": Column(of_cells(function), "nodes")}
 
+    @override
     def require(self, source: str, taken: Taken) -> None:
-        """See :class:`Kept`."""
         if "scheme" not in taken.numbers:
             raise MPMError(f"{source} holds no velocities; it is not that of a DynamicProblem.")
         present = self.numbers()
@@ -217,8 +218,8 @@ class Velocities(Kept):
             raise MPMError(f"{source} has other bodies without inertia than quasi_static= says.")
         super().require(source, taken)
 
+    @override
     def restore(self, taken: Taken) -> None:
-        """See :class:`Kept`."""
         for name, functions in self._fields().items():
             for number, body in enumerate(self._bodies):
                 if functions[number].function_space is not body.W:
@@ -235,6 +236,6 @@ class Velocities(Kept):
 
 
 def _column(name: str, function: fem.Function) -> Column:
-    """Return what a checkpoint has of a field."""
+    """Return the column of a field in a checkpoint."""
     place: Place = "forces" if name in FORCES else "nodes"
     return Column(of_cells(function), place)
