@@ -42,26 +42,12 @@ struct Ways
 };
 
 template <typename T, int dim>
-struct Foot
+struct Foot : Traction<T, dim>
 {
   std::array<T, dim - 1> moved, lag; // to the foot, and the shear along the slopes there
-  std::array<T, dim> n, shear;
-  T gap, pressure;
-  bool inside, slips;
+  std::array<T, dim> n;
+  T gap;
 };
-
-// That of the gap, or of a traction of the body that presses, but for what gap is left.
-template <typename T, int dim>
-T pressure_of(const Foot<T, dim>& foot, const core::Meeting& m, std::size_t p)
-{
-  const double k = m.stiffness[p];
-  T pressure = T(-k * foot.gap);
-  if (!m.behind)
-    return foot.inside ? pressure : T(0.0);
-  for (int i = 0; i < dim; ++i)
-    pressure = pressure + m.behind[p * dim + i] * foot.n[i];
-  return value_of(pressure) >= -k * m.touch ? pressure : T(0.0);
-}
 
 template <typename T, int dim, int bends>
 Foot<T, dim> foot_of(const Ways<T, dim, bends>& ways, const core::Meeting& m, std::size_t p)
@@ -109,32 +95,10 @@ Foot<T, dim> foot_of(const Ways<T, dim, bends>& ways, const core::Meeting& m, st
   for (int i = 0; i < dim; ++i)
     foot.n[i] = n[i] * unit;
   foot.gap = dot(r, foot.n);
-  const double gap = value_of(foot.gap);
-  foot.inside = gap <= m.touch;
-  foot.slips = false;
-  foot.pressure = pressure_of<T, dim>(foot, m, p);
-  foot.inside = foot.inside || value_of(foot.pressure) != 0.0;
-  if (m.smooth || !foot.inside)
+  static_cast<Traction<T, dim>&>(foot)
+      = traction_of(m.known, p, pressing(m.known, p, foot.gap, foot.n), foot.gap, foot.n, ways.delta);
+  if (m.known.smooth || !foot.inside)
     return foot;
-  // The share of its way that a point has touched, and the shear where all stick.
-  T share(1.0);
-  if (m.touched[p] == 0 && m.gap[p] > 10.0 * m.touch)
-    share = gap < 0.0 ? T(T(-1.0) * foot.gap * inverse(T(m.gap[p]) - foot.gap)) : T(0.0);
-  const T normal = dot(foot.n, ways.delta), factor = -m.tangential[p] * share;
-  for (int i = 0; i < dim; ++i)
-    foot.shear[i] = factor * (ways.delta[i] - foot.n[i] * normal);
-  const T square = dot(foot.shear, foot.shear);
-  const bool pressed = value_of(foot.pressure) > 0.0;
-  T bound = (pressed ? m.friction * foot.pressure : T(0.0)) + T(m.cohesion * m.stretch[p]);
-  if (!(value_of(bound) < m.limit * m.stretch[p]))
-    bound = T(m.limit * m.stretch[p]);
-  foot.slips = std::sqrt(value_of(square)) > value_of(bound) + m.tangential[p] * m.touch;
-  if (foot.slips)
-  {
-    const T less = bound * inverse(root(square));
-    for (T& part : foot.shear)
-      part = part * less;
-  }
   std::array<std::array<T, sides>, sides> metric;
   std::array<T, sides> rubs;
   for (int e = 0; e < sides; ++e)
@@ -197,11 +161,11 @@ Ways<T, dim, bends> ways_of(const core::Meeting& m, std::size_t p)
             if (const int b = bend_of<dim, bends>(e, f); b >= 0)
               B[b] += bend[(e * sides + f) * m.nodes + k] * X;
       }
-      if (!m.smooth)
+      if (!m.known.smooth)
         delta -= m.anchored[p * m.nodes + k] * x[(1 + m.nodes + k) * dim + i];
     }
     ways.r[i] = T(r);
-    ways.delta[i] = m.smooth ? T(0.0) : T(delta);
+    ways.delta[i] = m.known.smooth ? T(0.0) : T(delta);
     for (int e = 0; e < sides; ++e)
       ways.A[e][i] = T(A[e]);
     for (int b = 0; b < bends; ++b)
@@ -360,7 +324,7 @@ void add_tangents_in(const core::Meeting& m, const core::Sums& sums)
   std::vector<double> work(m.nodes * vectors + vectors * dim * m.count * dim);
   for (std::size_t p = 0; p < m.points; ++p)
   {
-    if (m.smooth)
+    if (m.known.smooth)
       differentiate_at<dim, bends, false>(m, p, D.data(), work);
     else
       differentiate_at<dim, bends, true>(m, p, D.data(), work);

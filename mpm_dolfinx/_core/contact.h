@@ -3,6 +3,8 @@
 
 #pragma once
 
+#include "traction.h"
+
 #include <cstddef>
 #include <cstdint>
 
@@ -17,13 +19,8 @@ struct Meeting
   const double* x;                    // (points, count, dim)
   const double *shape, *slope, *bend; // (points, nodes), (., e, nodes), (., e, e, nodes)
   const double* anchored;             // (points, nodes)
-  const double* outward;              // (points,), as all below
-  const double *stiffness, *tangential;
-  const std::uint8_t* touched;
-  const double *gap, *stretch; // at the last converged step; of areas
-  const double* behind;        // tractions (points, dim) that press, or null
-  double friction, cohesion, limit, touch;
-  bool smooth; // whether there is no friction
+  const double* outward;              // (points,)
+  Touching known;
 };
 
 struct Met
@@ -33,7 +30,7 @@ struct Met
   std::uint8_t *inside, *slips;
 };
 
-// Set what acts on points and nodes. The oracle is mpm_dolfinx.contact.stencil.acting.
+// Set what acts on points and nodes.
 void act(const Meeting& meeting, int dim, const Met& result);
 
 // Where derivatives at points add up: in blocks between nodes, those of the point's own facet, over
@@ -47,7 +44,7 @@ struct Sums
   double* values;                  // (blocks, dim, dim)
 };
 
-// Add the derivatives of what acts. The oracle is mpm_dolfinx.contact.stencil.by_complex_step.
+// Add the derivatives of what acts.
 void add_tangents(const Meeting& meeting, int dim, const Sums& sums);
 
 // Add derivatives (points, 1 + nodes, dim, count, dim).

@@ -3,6 +3,7 @@
 //
 // The compiled loops as Python functions: arrays and addresses of kernels, nothing else.
 
+#include <complex>
 #include <string>
 #include <tuple>
 #include <type_traits>
@@ -58,25 +59,79 @@ Numbered numbered(const std::vector<Part>& parts, int dim, const Indices& number
   return result;
 }
 
+// Points that may touch: what is known of them, and the law of friction.
+Touching touching_of(std::size_t n, std::size_t dim, const std::vector<Reals>& points,
+                     const Array<const std::uint8_t>& touched, const std::vector<double>& law,
+                     bool smooth)
+{
+  require(dim == 2 || dim == 3, "two or three dimensions");
+  require(points.size() == 6 && law.size() == 4, "points and law");
+  for (std::size_t i = 0; i < 4; ++i)
+    require(points[i].size() == n, "values (n,)");
+  const Reals &behind = points[4], &bounds = points[5];
+  require(behind.size() == 0 || behind.size() == n * dim, "tractions (n, dim) or none");
+  require(bounds.size() == 0 || bounds.size() == n * 5, "bounds (n, 5) or none");
+  require(touched.size() == n, "touched (n,)");
+  return {points[0].data(),
+          points[1].data(),
+          touched.data(),
+          points[2].data(),
+          points[3].data(),
+          behind.size() == 0 ? nullptr : behind.data(),
+          bounds.size() == 0 ? nullptr : bounds.data(),
+          law[0],
+          law[1],
+          law[2],
+          law[3],
+          smooth};
+}
+
+// Points of which gaps, normals, ways from anchors and, or not, pressures are given.
+template <typename T, typename V>
+Separation<T> separation_of(const std::vector<Array<const V>>& given)
+{
+  static_assert(sizeof(T) == sizeof(V));
+  require(given.size() == 4 && given[1].ndim() == 2, "gaps, normals, ways and pressures");
+  const std::size_t n = given[0].size();
+  require(given[1].shape(0) == n && given[2].size() == given[1].size(), "vectors (n, dim)");
+  require(given[3].size() == 0 || given[3].size() == n, "pressures (n,) or none");
+  const auto data
+      = [&](std::size_t i) { return reinterpret_cast<const T*>(given[i].data()); };
+  return {n, data(0), data(1), data(2), given[3].size() == 0 ? nullptr : data(3)};
+}
+
+// Numbers T of the loops are V in NumPy: those with one derivative are complex there.
+template <typename T, typename V>
+void act_on(const std::vector<Array<const V>>& given, const std::vector<Reals>& points,
+            Array<const std::uint8_t> touched, const std::vector<double>& law, bool smooth,
+            Array<V> pressure, Array<V> shear, Array<std::uint8_t> inside,
+            Array<std::uint8_t> slips)
+{
+  const auto seen = separation_of<T, V>(given);
+  const std::size_t n = seen.points, dim = given[1].shape(1);
+  require(pressure.size() == n && shear.size() == n * dim && inside.size() == n
+              && slips.size() == n,
+          "pressures (n,), shears (n, dim), values (n,)");
+  act(touching_of(n, dim, points, touched, law, smooth), seen, static_cast<int>(dim),
+      reinterpret_cast<T*>(pressure.data()), reinterpret_cast<T*>(shear.data()), inside.data(),
+      slips.data());
+}
+
 // Points that meet facets: places, tables of the facets, and what is known of the points.
 Meeting meeting_of(const Reals& x, const std::vector<Reals>& tables,
                    const std::vector<Reals>& points, const Array<const std::uint8_t>& touched,
                    const std::vector<double>& law, bool smooth)
 {
   require(x.ndim() == 3 && (x.shape(2) == 2 || x.shape(2) == 3), "places (n, count, 2 or 3)");
-  require(tables.size() == 4 && points.size() == 6 && law.size() == 4, "tables, points and law");
+  require(tables.size() == 5, "tables");
   const std::size_t n = x.shape(0), sides = x.shape(2) - 1;
   require(tables[0].ndim() == 2, "shape functions (n, nodes)");
   const std::size_t nodes = tables[0].shape(1);
   require(tables[0].shape(0) == n && tables[1].size() == n * sides * nodes
               && tables[2].size() == n * sides * sides * nodes && tables[3].size() == n * nodes,
           "shape functions with first and second derivatives, and those of anchors");
+  require(tables[4].size() == n, "signs of normals (n,)");
   require(x.shape(1) == 1 + (smooth ? nodes : 2 * nodes), "places of a point, nodes and anchors");
-  for (std::size_t i = 0; i < 5; ++i)
-    require(points[i].size() == n, "values (n,)");
-  const Reals& behind = points[5];
-  require(behind.size() == 0 || behind.size() == n * x.shape(2), "tractions (n, dim) or none");
-  require(touched.size() == n, "touched (n,)");
   return {n,
           static_cast<int>(x.shape(1)),
           static_cast<int>(nodes),
@@ -85,18 +140,8 @@ Meeting meeting_of(const Reals& x, const std::vector<Reals>& tables,
           tables[1].data(),
           tables[2].data(),
           tables[3].data(),
-          points[0].data(),
-          points[1].data(),
-          points[2].data(),
-          touched.data(),
-          points[3].data(),
-          points[4].data(),
-          behind.size() == 0 ? nullptr : behind.data(),
-          law[0],
-          law[1],
-          law[2],
-          law[3],
-          smooth};
+          tables[4].data(),
+          touching_of(n, x.shape(2), points, touched, law, smooth)};
 }
 
 // Where derivatives at points add up.
@@ -641,6 +686,39 @@ NB_MODULE(_loops, m)
   },
         "gradient"_a, "old_gradient"_a, "stiffness"_a, "small"_a, "factor"_a,
         "stress"_a.noconvert(), "tangent"_a.noconvert(), "Set stress and tangent of damping.");
+
+  m.def("traction", &act_on<double, double>, "given"_a, "points"_a, "touched"_a, "law"_a,
+        "smooth"_a, "pressure"_a.noconvert(), "shear"_a.noconvert(), "inside"_a.noconvert(),
+        "slips"_a.noconvert(), "Set tractions of contact at points.");
+
+  m.def("traction", &act_on<Dual<1>, std::complex<double>>, "given"_a, "points"_a, "touched"_a,
+        "law"_a, "smooth"_a, "pressure"_a.noconvert(), "shear"_a.noconvert(),
+        "inside"_a.noconvert(), "slips"_a.noconvert(),
+        "Set tractions with derivatives as small imaginary parts.");
+
+  m.def("traction_slopes",
+        [](const std::vector<Reals>& given, const std::vector<Reals>& points,
+           Array<const std::uint8_t> touched, const std::vector<double>& law, bool smooth,
+           RealsOut slopes) {
+    const auto seen = separation_of<double, double>(given);
+    const std::size_t dim = given[1].shape(1);
+    require(slopes.size() == seen.points * (1 + dim) * (2 + 2 * dim), "slopes (n, 1 + d, 2 + 2 d)");
+    differentiate(touching_of(seen.points, dim, points, touched, law, smooth), seen,
+                  static_cast<int>(dim), slopes.data());
+  },
+        "given"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a, "slopes"_a.noconvert(),
+        "Set derivatives of tractions by pressures on top, gaps, normals and ways.");
+
+  m.def("coulomb",
+        [](Reals pressure, Reals stretch, double friction, double cohesion, double limit) {
+    require(stretch.size() == pressure.size(), "pressures and stretches (n,)");
+    std::vector<double> bounds(pressure.size());
+    for (std::size_t p = 0; p < bounds.size(); ++p)
+      bounds[p] = coulomb(pressure.data()[p], stretch.data()[p], friction, cohesion, limit);
+    return to_numpy(std::move(bounds));
+  },
+        "pressure"_a, "stretch"_a, "friction"_a, "cohesion"_a, "limit"_a,
+        "Return the largest shears by Coulomb's law.");
 
   m.def("act",
         [](Reals x, const std::vector<Reals>& tables, const std::vector<Reals>& points,

@@ -6,7 +6,7 @@ Contact acts at quadrature points on the body's own facets, so there is none bef
 whatever the background's cells. A contact is a term: give it to a problem as ``terms=[contact]``.
 """
 
-from .law import Coulomb
+from .law import Coulomb, Friction, Rubbing
 from .pair import Pair
 from .rigid import Rigid
 from .rigid_body import RigidBody
@@ -25,9 +25,11 @@ from .triangulation import polyline, read_surface, terrain, triangulated
 
 __all__ = [
     "Coulomb",
+    "Friction",
     "Pair",
     "Rigid",
     "RigidBody",
+    "Rubbing",
     "Shape",
     "box",
     "cavity",

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import MPMError
 from ..particles.particles import Particles
-from .law import Coulomb
+from .law import Friction
 from .placed import distance_within, framed
 from .rigid import Rigid
 from .rotation import Pose, cayley_variation, crossing
@@ -79,7 +79,7 @@ class BodyContact(Rigid):
         self,
         particles: Particles,
         shape: Shape,
-        friction: float | Coulomb,
+        friction: float | Friction,
         **options: Any,
     ) -> None:
         super().__init__(particles, shape, friction, **options)

@@ -21,7 +21,7 @@ from ..meshes.remesh import Column
 from ..particles.particles import Particles
 from ..reals import is_one_of
 from ..system.term import PointMaterial, Term
-from .law import Coulomb
+from .law import Friction
 from .surface import Surface
 
 __all__ = ["Contact", "Outcome", "stiffness"]
@@ -65,7 +65,7 @@ class Contact(Term):
     """
 
     def __init__(
-        self, bodies: Sequence[Particles], friction: Coulomb, axisymmetric: bool, law: str
+        self, bodies: Sequence[Particles], friction: Friction, axisymmetric: bool, law: str
     ) -> None:
         if not is_one_of(law, LAWS):
             raise MPMError(f"law must be one of {', '.join(map(repr, LAWS))}, not {law!r}.")
@@ -257,6 +257,11 @@ class Contact(Term):
         """Whether each of this rank's points is in contact and does not slip, shape ``(n,)``."""
         outcome = self._outcome()[1]
         return (outcome.inside & ~outcome.slips).ravel()
+
+    @property
+    def friction_memory(self) -> NDArray[np.float64]:
+        """What the law of friction remembers at this rank's points, shape ``(n, k)``."""
+        raise NotImplementedError
 
     @property
     def reaction(self) -> NDArray[np.float64]:

@@ -6,40 +6,137 @@ The pressure is ``p = <-k g>`` for a gap g, where a point has penetrated (g < 0)
 an anchor a, a place on the other body: the traction along the surface is ``t* = -k_t P (x - a)``
 with ``P = I - n n``, as long as its size stays within ``min(mu p + c, limit)``; beyond it slips,
 and has that size (the return mapping of Wriggers 2006, Computational Contact Mechanics, section
-5.2.3, with the anchor instead of a traction that would have to be turned and transported).
+5.2.3, with the anchor instead of a traction that would have to be turned and transported). Compiled
+loops do so for the points of obstacles and of pairs alike; a law of a user's own gives the bound.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .._core import is_as_inherited
+from .._core import is_as_inherited, loops
 from ..errors import MPMError
 
 __all__ = [
     "Coulomb",
+    "Friction",
     "Points",
-    "Push",
+    "Rubbing",
+    "Separation",
+    "Slopes",
     "Traction",
     "as_friction",
-    "derivative",
-    "nitsche",
-    "push_derivative",
+    "bounds",
+    "known",
+    "remembered",
     "secant_along",
-    "shear_derivative",
+    "slopes",
     "traction",
+    "unworn",
 ]
+
+#: Step of differences of a user's law over the size of what is varied: the third root of eps.
+STEP = 6e-6
+#: Most iterations for the slip of a user's law, and its error over the bound.
+ITERATIONS, ERROR = 60, 1e-12
+#: Least length over which a user's law is varied, over the round-off of positions.
+LENGTH = 1e6
+
+
+type Array = NDArray[np.float64]
+
+
+class Rubbing(NamedTuple):
+    """Points that rub, as a law of friction sees them.
+
+    Attributes:
+        pressure: Per undeformed area, shape ``(n,)``.
+        slip: Way along the surface that each slips in this step, shape ``(n,)``.
+        gap: Negative where a point has penetrated, shape ``(n,)``.
+        stretch: Area at the last converged step over undeformed area, shape ``(n,)``.
+        memory: What the law remembered at the last converged step, shape ``(n, k)``.
+    """
+
+    pressure: Array
+    slip: Array
+    gap: Array
+    stretch: Array
+    memory: Array
+
+
+class Friction:
+    """A law of friction: the largest shear traction of points, and what they remember.
+
+    A subclass has :meth:`bound`, of which derivatives are taken by differences; and, if that
+    depends on what has happened before, the first values of a :attr:`memory` and :meth:`remember`.
+    So a surface that is polished by the way that it has slipped is::
+
+        class Polished(mpm.contact.Friction):
+            memory = (0.0,)
+
+            def bound(self, at):
+                slipped = at.memory[:, 0] + at.slip
+                return (0.2 + 0.3 * np.exp(-slipped / 0.01)) * at.pressure
+
+            def remember(self, at):
+                return at.memory + at.slip[:, None]
+
+    Attributes:
+        memory: What each point remembers before it has touched anything.
+    """
+
+    memory: Sequence[float] = ()
+
+    @property
+    def smooth(self) -> bool:
+        """Whether there is no friction at all."""
+        return False
+
+    @property
+    def by_area(self) -> bool:
+        """Whether a part of it does not grow with the pressure, but with the area."""
+        return True
+
+    @property
+    def compiled(self) -> bool:
+        """Whether compiled loops know it by heart."""
+        return is_as_inherited(self, "_loop")
+
+    def bound(self, at: Rubbing) -> Array:
+        """Return the largest shear traction of points, per undeformed area, shape ``(n,)``.
+
+        Args:
+            at: The points.
+        """
+        raise NotImplementedError
+
+    def remember(self, at: Rubbing) -> Array:
+        """Return what points remember at the end of a step, shape ``(n, k)``.
+
+        Args:
+            at: The points that touch then.
+        """
+        return at.memory
+
+    def shared(self, share: float) -> Friction:
+        """Return the friction of points that bear a share of the pressure, and of its bound."""
+        return _Shared(self, share)
+
+    @property
+    def told(self) -> list[Any]:
+        """What ranks must agree on: the kind of the law, and its numbers."""
+        numbers = {k: v for k, v in vars(self).items() if isinstance(v, float | int)}
+        return [type(self).__name__, *numbers.values()]
 
 
 @dataclass(frozen=True)
-class Coulomb:
+class Coulomb(Friction):
     """Friction that does not depend on the velocity: at most ``min(friction p + cohesion, limit)``.
-
-    An heir has another bound by :meth:`bound`, of which derivatives are taken by complex steps.
 
     Args:
         friction: Coefficient of friction.
@@ -66,74 +163,83 @@ class Coulomb:
 
     @property
     def smooth(self) -> bool:
-        """Whether there is no friction at all."""
+        """See :class:`Friction`."""
         none = self.limit == 0.0 or (self.friction == 0.0 and self.cohesion == 0.0)
         return none and type(self).bound is Coulomb.bound
 
     @property
     def by_area(self) -> bool:
-        """Whether a part of it does not grow with the pressure, but with the area."""
+        """See :class:`Friction`."""
         known = type(self).bound is Coulomb.bound
         return not known or self.cohesion > 0.0 or bool(np.isfinite(self.limit))
 
-    def bound(
-        self, p: NDArray[Any], stretch: NDArray[np.float64]
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the largest shear traction at pressures, and its derivative, ``(n,)`` each.
+    def bound(self, at: Rubbing) -> Array:
+        """See :class:`Friction`."""
+        p, stretch = map(np.ascontiguousarray, (at.pressure, at.stretch))
+        return np.asarray(loops.coulomb(p, stretch, self.friction, self.cohesion, self.limit))
 
-        Args:
-            p: Pressure per undeformed area.
-            stretch: Area over undeformed area.
-        """
-        bound = self.friction * np.where(p.real > 0.0, p, 0.0) + self.cohesion * stretch
-        limit = self.limit * stretch
-        free = (bound.real < limit) & (p.real > 0.0)
-        return np.where(bound.real < limit, bound, limit), self.friction * free
-
-    def shared(self, share: float) -> Coulomb:
-        """Return the friction of points that bear a share of the pressure, and of its bound."""
-        if is_as_inherited(self, "_loop"):
+    def shared(self, share: float) -> Friction:
+        """See :class:`Friction`."""
+        if self.compiled:
             return Coulomb(self.friction, share * self.cohesion, share * self.limit)
-        return _Shared(self.friction, self.cohesion, self.limit, self, share)
+        return super().shared(share)
 
 
-@dataclass(frozen=True)
-class _Shared(Coulomb):
-    """Friction by an heir's law, of points that bear a share of the pressure.
+class _Shared(Friction):
+    """Friction by another law, of points that bear a share of the pressure.
 
-    Attributes:
+    Args:
         whole: The law of points that bear all of it.
         share: The share.
     """
 
-    whole: Coulomb = Coulomb()
-    share: float = 1.0
+    def __init__(self, whole: Friction, share: float) -> None:
+        self._whole, self._share, self.memory = whole, share, whole.memory
 
     @property
     def smooth(self) -> bool:
-        """See :class:`Coulomb`."""
-        return self.whole.smooth
+        """See :class:`Friction`."""
+        return self._whole.smooth
 
     @property
     def by_area(self) -> bool:
-        """See :class:`Coulomb`."""
-        return self.whole.by_area
+        """See :class:`Friction`."""
+        return self._whole.by_area
 
-    def bound(
-        self, p: NDArray[Any], stretch: NDArray[np.float64]
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """See :class:`Coulomb`."""
-        bound, slope = self.whole.bound(p / self.share, stretch)
-        return self.share * bound, slope
+    @property
+    def told(self) -> list[Any]:
+        """See :class:`Friction`."""
+        return self._whole.told
+
+    def _wholly(self, at: Rubbing) -> Rubbing:
+        return at._replace(pressure=at.pressure / self._share)
+
+    def bound(self, at: Rubbing) -> Array:
+        """See :class:`Friction`."""
+        return self._share * self._whole.bound(self._wholly(at))
+
+    def remember(self, at: Rubbing) -> Array:
+        """See :class:`Friction`."""
+        return self._whole.remember(self._wholly(at))
 
 
-def as_friction(value: Any) -> Coulomb:
+def as_friction(value: Any) -> Friction:
     """Return a coefficient of friction, or a law, as a law.
 
     Raises:
         MPMError: It is neither.
     """
-    return value if isinstance(value, Coulomb) else Coulomb(friction=value)
+    return value if isinstance(value, Friction) else Coulomb(friction=value)
+
+
+def unworn(law: Friction, shape: tuple[int, ...]) -> Array:
+    """Return what a law of friction remembers of points that have touched nothing yet.
+
+    Args:
+        law: The law.
+        shape: That of the points.
+    """
+    return np.tile(np.asarray(law.memory, dtype=np.float64), (*shape, 1))
 
 
 class Points(NamedTuple):
@@ -146,6 +252,7 @@ class Points(NamedTuple):
         anchor: The anchor where it was, where it was not its place at that time, ``(n, gdim)``.
         gap: The gap at that time, shape ``(n,)``.
         stretch: Area at that time over undeformed area, shape ``(n,)``.
+        memory: What the law of friction remembers, shape ``(n, k)``.
     """
 
     stiffness: NDArray[np.float64]
@@ -154,10 +261,47 @@ class Points(NamedTuple):
     anchor: NDArray[np.float64]
     gap: NDArray[np.float64]
     stretch: NDArray[np.float64]
+    memory: NDArray[np.float64]
 
     def of(self, which: Any) -> Points:
         """Return some of them."""
         return Points(*(values[which] for values in self))
+
+
+class Separation(NamedTuple):
+    """Where points are with respect to what they touch.
+
+    Attributes:
+        gap: Shape ``(n,)``.
+        normal: Normals, towards the points, shape ``(n, gdim)``.
+        delta: From anchors to points, shape ``(n, gdim)``.
+        touch: Gap at which points touch: round-off of positions.
+        behind: Tractions of the body at its facets that press but for what gaps are left (Nitsche's
+            method), shape ``(n, gdim)``; ``None``: gaps alone do.
+        pressure: That of a whole step, shape ``(n,)``; ``None``: it is by the above.
+    """
+
+    gap: NDArray[Any]
+    normal: NDArray[Any]
+    delta: NDArray[Any]
+    touch: float
+    behind: NDArray[np.float64] | None = None
+    pressure: NDArray[Any] | None = None
+
+    def of(self, which: Any) -> Separation:
+        """Return some of them."""
+        parts = (None if part is None else part[which] for part in (self.behind, self.pressure))
+        return Separation(
+            self.gap[which], self.normal[which], self.delta[which], self.touch, *parts
+        )
+
+    @property
+    def real(self) -> Separation:
+        """All without imaginary parts."""
+        p = None if self.pressure is None else self.pressure.real
+        return Separation(
+            self.gap.real, self.normal.real, self.delta.real, self.touch, self.behind, p
+        )
 
 
 class Traction(NamedTuple):
@@ -176,259 +320,202 @@ class Traction(NamedTuple):
     slips: NDArray[np.bool_]
 
 
-class Push(NamedTuple):
-    """Pressures ``<n . T - k g>`` with a traction T of the body (Nitsche's method).
+class Slopes(NamedTuple):
+    """Derivatives of pressure and of shear at points, the latter by way of the former as well.
 
     Attributes:
-        pressure: Shape ``(n,)``.
-        acts: Whether each is more than nothing, or about to be, shape ``(n,)``.
-        by_position: Derivative by the position, T being as it is, shape ``(n, gdim)``.
+        pressure: By a pressure that comes on top where one acts, gap, normal and way from the
+            anchor, shape ``(n, 2 + 2 gdim)``.
+        shear: By the same, shape ``(n, gdim, 2 + 2 gdim)``.
     """
 
-    pressure: NDArray[Any]
-    acts: NDArray[np.bool_]
-    by_position: NDArray[np.float64]
+    pressure: Array
+    shear: Array
 
-    def of(self, which: Any) -> Push:
-        """Return some of them."""
-        return Push(*(values[which] for values in self))
+    def by_pressure(self, n: Array) -> Array:
+        """Return the derivative of ``p n + t`` by a pressure on top, shape ``(n, gdim)``."""
+        return np.asarray(self.pressure[:, :1] * n + self.shear[:, :, 0])
 
+    def by_position(self, n: Array, H: Array, dp: Array | None = None) -> tuple[Array, Array]:
+        """Return the derivatives of pressure and shear by positions.
 
-def nitsche(
-    points: Points,
-    behind: NDArray[Any],
-    gap: NDArray[Any],
-    n: NDArray[Any],
-    touch: float,
-    H: NDArray[np.float64] | None = None,
-) -> Push:
-    """Return pressures that a traction of the body bears, but for what gaps are left.
+        Args:
+            n: Derivatives of gaps, shape ``(n, gdim)``.
+            H: Those of normals, shape ``(n, gdim, gdim)``.
+            dp: Those of pressures on top, shape ``(n, gdim)``; ``None``: nothing comes on top.
 
-    Args:
-        points: The points.
-        behind: Tractions of the body at its facets, shape ``(n, gdim)``.
-        gap: Shape ``(n,)``.
-        n: Normals, towards the points, shape ``(n, gdim)``.
-        touch: Gap at which points touch.
-        H: Derivatives of the normals, where those of the pressure are asked for.
-    """
-    p = (n * behind).sum(axis=1) - points.stiffness * gap
-    acts = p.real >= -points.stiffness * touch
-    slope = np.zeros(n.shape)
-    if H is not None:
-        slope = np.einsum("nij,ni->nj", H, behind) - points.stiffness[:, None] * n
-        slope = np.where(acts[:, None], slope, 0.0)
-    return Push(np.where(acts, p, 0.0), acts, slope)
+        Returns:
+            Shapes ``(n, gdim)`` and ``(n, gdim, gdim)``.
+        """
+        dim = n.shape[1]
+        eye = np.broadcast_to(np.eye(dim), H.shape)
+        dp = np.zeros_like(n) if dp is None else dp
+        chain = np.concatenate([dp[:, None], n[:, None], H, eye], axis=1)
+        return (self.pressure[:, None] @ chain)[:, 0], self.shear @ chain
 
 
-def _since_touch(
-    points: Points, gap: NDArray[Any], touch: float
-) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return which share of its way a point has been in contact, and the derivative by the gap.
-
-    That is all of it where it was before, and the part behind the surface where it has come from
-    outside, on a straight line: none where it is pressed with a gap left.
-    """
-    came = ~points.touched & (points.gap > 10.0 * touch)
-    behind = came & (gap.real < 0.0)
-    span = np.where(behind, points.gap - gap, 1.0)
-    share = np.where(behind, -gap / span, np.where(came, 0.0, 1.0))
-    return share, np.where(behind, -points.gap / span**2, 0.0)
-
-
-def _trial(
-    points: Points, delta: NDArray[Any], gap: NDArray[Any], n: NDArray[Any], touch: float
-) -> NDArray[Any]:
-    """Return the shear traction ``-k_t s P delta`` of points that would all stick."""
-    share, _ = _since_touch(points, gap, touch)
-    along = delta - n * (n * delta).sum(axis=1)[:, None]
-    return np.asarray(-(points.tangential * share)[:, None] * along)
-
-
-def traction(
-    law: Coulomb,
-    points: Points,
-    delta: NDArray[Any],
-    gap: NDArray[Any],
-    n: NDArray[Any],
-    touch: float,
-    pressure: NDArray[Any] | None = None,
-) -> Traction:
-    """Return what acts on points.
+def traction(law: Friction, points: Points, at: Separation) -> Traction:
+    """Return what acts on points, where positions may have small imaginary parts.
 
     Args:
         law: The friction.
         points: The points.
-        delta: From anchors to points, shape ``(n, gdim)``.
-        gap: Shape ``(n,)``.
-        n: Normals, towards the points, shape ``(n, gdim)``.
-        touch: Gap at which points touch: round-off of positions.
-        pressure: That of a whole step or of Nitsche's method, which may act where there is a gap at
-            the end; ``None`` is that of the gap.
+        at: Where they are.
     """
-    inside = gap.real <= touch
-    if pressure is None:
-        p = np.where(inside, -points.stiffness * gap, 0.0)
-    else:
-        p, inside = pressure, inside | (pressure.real != 0.0)
-    none = np.zeros(len(p), dtype=bool)
-    if law.smooth:
-        return Traction(p, np.zeros_like(n), inside, none)
-    which = np.flatnonzero(inside)
-    some = points.of(which)
-    tried = _trial(some, delta[which], gap[which], n[which], touch)
-    size = np.sqrt((tried * tried).sum(axis=1))
-    bound, _ = law.bound(p[which], some.stretch)
-    slipping = size.real > bound.real + some.tangential * touch
-    factor = np.where(slipping, bound / np.where(slipping, size, 1.0), 1.0)
-    shear, slips = np.zeros(n.shape, dtype=np.result_type(tried, factor)), none
-    shear[which], slips[which] = factor[:, None] * tried, slipping
-    return Traction(p, shear, inside, slips)
+    return _acting(at, known(law, points, at.touch, at.behind, bounds(law, points, at)))
 
 
-def derivative(
-    law: Coulomb,
-    points: Points,
-    delta: NDArray[np.float64],
-    gap: NDArray[np.float64],
-    n: NDArray[np.float64],
-    H: NDArray[np.float64],
-    touch: float,
-    push: Push | None = None,
-) -> NDArray[np.float64]:
-    """Return the derivative of ``p n + t`` by positions of points that are all in contact.
+def slopes(law: Friction, points: Points, at: Separation) -> Slopes:
+    """Return the derivatives of what acts on points: see :func:`traction`."""
+    count, dim = at.normal.shape
+    found = np.zeros((count, 1 + dim, 2 + 2 * dim))
+    acting = known(law, points, at.touch, at.behind, bounds(law, points, at))
+    loops.traction_slopes(_given(at, np.float64), *acting, found)
+    return Slopes(found[:, 0], found[:, 1:])
+
+
+def known(
+    law: Friction, points: Points, touch: float, behind: Array | None, most: Array
+) -> tuple[Any, ...]:
+    """Return what the compiled loops take of points and their friction.
 
     Args:
-        law: As for :func:`traction`, as all that is not said here.
-        points: As there.
-        delta: As there.
-        gap: As there.
-        n: As there.
-        H: Derivatives of the normals, shape ``(n, gdim, gdim)``.
-        touch: As there.
-        push: A pressure that is not of the gap alone.
+        law: The friction.
+        points: The points.
+        touch: As that of :class:`Separation`.
+        behind: As there.
+        most: What :func:`bounds` has returned.
+    """
+    behind = np.zeros(0) if behind is None else behind
+    parts = (points.stiffness, points.tangential, points.gap, points.stretch, behind, most)
+    touched = np.ascontiguousarray(points.touched).view(np.uint8)
+    numbers = [0.0] * 3
+    if isinstance(law, Coulomb):
+        numbers = [law.friction, law.cohesion, law.limit]
+    return [np.ascontiguousarray(part) for part in parts], touched, [*numbers, touch], law.smooth
+
+
+def _given(at: Separation, kind: Any) -> list[NDArray[Any]]:
+    """Return what the compiled loops take of places, as numbers of some kind."""
+    pressure = np.zeros(0) if at.pressure is None else at.pressure
+    parts = (at.gap, at.normal, at.delta, pressure)
+    return [np.ascontiguousarray(part, dtype=kind) for part in parts]
+
+
+def _acting(at: Separation, known: tuple[Any, ...]) -> Traction:
+    """Return what acts on points, by what the compiled loops take of them."""
+    kind: Any = np.complex128 if np.iscomplexobj(at.delta) else np.float64
+    (n, dim) = at.normal.shape
+    acts = Traction(np.zeros(n, kind), np.zeros((n, dim), kind), *np.zeros((2, n), dtype=bool))
+    masks = acts.inside.view(np.uint8), acts.slips.view(np.uint8)
+    loops.traction(_given(at, kind), *known, acts.pressure, acts.shear, *masks)
+    return acts
+
+
+# -- Laws of a user's own -----------------------------------------------------------------------
+
+
+def bounds(law: Friction, points: Points, at: Separation) -> Array:
+    """Return the largest shears by a law that is not compiled, and their derivatives.
 
     Returns:
-        Shape ``(n, gdim, gdim)``.
+        By pressure, gap, way from the anchor and tangential stiffness, shape ``(n, 5)``; or nothing
+        of a law that is compiled.
     """
-    acts = traction(law, points, delta, gap, n, touch, None if push is None else push.pressure)
-    dp = -points.stiffness[:, None] * n if push is None else push.by_position
-    D = n[:, :, None] * dp[:, None, :] + acts.pressure[:, None, None] * H
-    if law.smooth:
-        return D
-    return D + shear_derivative(law, points, delta, gap, n, H, touch, acts, dp, n)
+    if law.smooth or law.compiled:
+        return np.zeros(0)
+    rubs, stiffness, length = _rubbing(law, points, at.real)
+    size = float(rubs.pressure.max(initial=0.0)) or 1.0
+    by_slip = _slope(law, rubs, "slip", length)
+    bound, slips = law.bound(rubs), rubs.slip > 0.0
+    # (slip = way - bound / stiffness)
+    k = np.where(slips, stiffness, np.inf)
+    factor = 1.0 / (1.0 + by_slip / k)
+    pressed = rubs.pressure > 0.0
+    slopes = [pressed * _slope(law, rubs, "pressure", size), _slope(law, rubs, "gap", length)]
+    slopes += [np.where(slips, by_slip, 0.0), by_slip * bound / k**2]
+    return np.column_stack([bound, *(factor * slope for slope in slopes)])
 
 
-def push_derivative(
-    law: Coulomb,
-    points: Points,
-    delta: NDArray[np.float64],
-    gap: NDArray[np.float64],
-    n: NDArray[np.float64],
-    touch: float,
-    push: Push,
-) -> NDArray[np.float64]:
-    """Return the derivative of ``p n + t`` by the traction's part in the pressure.
+def remembered(law: Friction, points: Points, at: Separation) -> Array:
+    """Return what points remember at the end of a step: see :func:`traction`."""
+    if not law.memory:
+        return points.memory
+    inside = traction(law, points, at).inside
+    rubs, *_ = _rubbing(law, points.of(inside), at.of(inside))
+    found = points.memory.copy()
+    found[inside] = law.remember(rubs)
+    return found
 
-    Args:
-        law: As for :func:`derivative`, as all that is not said here.
-        points: As there.
-        delta: As there.
-        gap: As there.
-        n: As there.
-        touch: As there.
-        push: The pressure.
 
-    Returns:
-        Shape ``(n, gdim)``.
+def _rubbing(law: Friction, points: Points, at: Separation) -> tuple[Rubbing, Array, float]:
+    """Return points as a law sees them, their stiffnesses, and a length to vary slips by.
+
+    The slip solves ``bound(slip) + stiffness slip = stiffness way``, by Newton's method in a
+    bracket.
+
+    Raises:
+        MPMError: The law gives no bound for each point.
     """
-    found = n.copy()
-    acts = traction(law, points, delta, gap, n, touch, push.pressure)
-    if acts.slips.any():
-        s = acts.slips
-        trial = _trial(points, delta, gap, n, touch)[s]
-        _, grows = law.bound(acts.pressure[s], points.stretch[s])
-        tau = trial / np.linalg.norm(trial, axis=1)[:, None]
-        found[s] += np.asarray(grows)[:, None] * tau
-    return np.asarray(found * push.acts[:, None])
+    never = np.tile([np.inf, 0.0, 0.0, 0.0, 0.0], (len(at.gap), 1))
+    trial = _acting(at, known(law, points, at.touch, at.behind, never))
+    size, way = (np.linalg.norm(part, axis=1) for part in (trial.shear, _along(at)))
+    stiffness = size / np.where(way > 0.0, way, 1.0)
+    length = max(float(way.max(initial=0.0)), LENGTH * at.touch)
+    # (points may touch at a gap of round-off)
+    pressure = np.maximum(trial.pressure, 0.0)
+    slip, low, high = np.zeros_like(way), np.zeros_like(way), way
+    for _ in range(ITERATIONS):
+        rubs = Rubbing(pressure, slip, at.gap, points.stretch, points.memory)
+        bound = np.asarray(law.bound(rubs))
+        if bound.shape != slip.shape or not (bound >= 0.0).all():
+            raise MPMError(
+                f"{law.told[0]}.bound must return a shear traction from 0 on for each of "
+                f"{len(slip)} points."
+            )
+        left = size - stiffness * slip - bound
+        done = np.abs(left) <= ERROR * size
+        moves = ~done & ((left > 0.0) | (slip > 0.0))
+        if not moves.any():
+            break
+        low, high = np.where(left > 0.0, slip, low), np.where(left < 0.0, slip, high)
+        slope = stiffness + _slope(law, rubs, "slip", length)
+        tried = slip + left / np.where(slope > 0.0, slope, 1.0)
+        inside = (slope > 0.0) & (tried > low) & (tried < high)
+        slip = np.where(moves, np.where(inside, tried, 0.5 * (low + high)), slip)
+    return rubs, stiffness, length
 
 
-def shear_derivative(
-    law: Coulomb,
-    points: Points,
-    delta: NDArray[np.float64],
-    gap: NDArray[np.float64],
-    n: NDArray[np.float64],
-    H: NDArray[np.float64],
-    touch: float,
-    acts: Traction,
-    dp: NDArray[np.float64],
-    dgap: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return the derivative of the shear traction by positions of points that are in contact.
+def _slope(law: Friction, rubs: Rubbing, name: str, size: float) -> Array:
+    """Return the derivative of a law's bound by one of what it depends on, shape ``(n,)``.
 
-    Args:
-        law: As for :func:`derivative`, as all that is not said here.
-        points: As there.
-        delta: As there.
-        gap: As there.
-        n: As there.
-        H: As there.
-        touch: As there.
-        acts: What :func:`traction` returned.
-        dp: Derivative of the pressure, shape ``(n, gdim)``.
-        dgap: Derivative of the gap, shape ``(n, gdim)``.
-
-    Returns:
-        Shape ``(n, gdim, gdim)``.
+    It is of second order in a step forwards: there are no pressures nor slips below zero.
     """
-    share, slope = _since_touch(points, gap, touch)
-    depth = (n * delta).sum(axis=1)
-    along = delta - n * depth[:, None]
-    bent = np.einsum("nij,nj->ni", H, delta)
-    eye = np.eye(n.shape[1])
-    moved = eye - n[:, :, None] * n[:, None, :]
-    moved = moved - depth[:, None, None] * H - n[:, :, None] * bent[:, None, :]
-    dt = share[:, None, None] * moved + along[:, :, None] * (slope[:, None] * dgap)[:, None, :]
-    dt *= -points.tangential[:, None, None]
-    if acts.slips.any():
-        s = acts.slips
-        trial = _trial(points, delta, gap, n, touch)[s]
-        size = np.linalg.norm(trial, axis=1)
-        tau = trial / size[:, None]
-        bound, grows = law.bound(acts.pressure[s], points.stretch[s])
-        turned = (bound / size)[:, None, None] * (eye - tau[:, :, None] * tau[:, None, :])
-        dt[s] = turned @ dt[s] + tau[:, :, None] * (np.asarray(grows)[:, None] * dp[s])[:, None, :]
-    return np.asarray(dt)
+    values, step = getattr(rubs, name), STEP * size
+    first, second, third = (law.bound(rubs._replace(**{name: values + i * step})) for i in range(3))
+    return np.asarray((4.0 * second - 3.0 * first - third) / (2.0 * step))
 
 
-def secant_along(
-    points: Points,
-    delta: NDArray[np.float64],
-    gap: NDArray[np.float64],
-    n: NDArray[np.float64],
-    touch: float,
-    acts: Traction,
-) -> NDArray[np.float64]:
+def _along(at: Separation) -> Array:
+    """Return ways from anchors along surfaces, shape ``(n, gdim)``."""
+    n, delta = at.normal, at.delta
+    return np.asarray(delta - n * (n * delta).sum(axis=1)[:, None])
+
+
+def secant_along(at: Separation, shear: Array) -> Array:
     """Return what the secant of friction has along the shear of points that slip.
 
-    That is the traction over the way from the anchor, of which :func:`shear_derivative` has what is
-    across the shear alone.
+    That is the traction over the way from the anchor, of which :func:`slopes` have what is across
+    the shear alone.
 
     Args:
-        points: As for :func:`traction`, as all that is not said here.
-        delta: As there.
-        gap: As there.
-        n: As there.
-        touch: As there.
-        acts: What :func:`traction` returned.
+        at: Where the points are.
+        shear: Tractions along the surface, shape ``(n, gdim)``.
 
     Returns:
         Shape ``(n, gdim, gdim)``, to be added to derivatives by positions.
     """
-    share, _ = _since_touch(points, gap, touch)
-    size = np.linalg.norm(_trial(points, delta, gap, n, touch), axis=1)
-    bound = np.linalg.norm(acts.shear, axis=1)
-    tau = acts.shear / np.where(bound > 0.0, bound, 1.0)[:, None]
-    stiffness = points.tangential * share * bound / np.where(size > 0.0, size, 1.0)
+    way, size = (np.linalg.norm(part, axis=1) for part in (_along(at), shear))
+    tau = shear / np.where(size > 0.0, size, 1.0)[:, None]
+    stiffness = size / np.where(way > 0.0, way, 1.0)
     return np.asarray(-stiffness[:, None, None] * tau[:, :, None] * tau[:, None, :])

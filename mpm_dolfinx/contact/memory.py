@@ -27,6 +27,7 @@ class Grip(NamedTuple):
         normal: Normals, shape ``(m, nq, gdim)``.
         anchor: Their anchors.
         outcome: What acted.
+        friction: What the law of friction remembers, shape ``(m, nq, k)``.
     """
 
     surface: Surface
@@ -35,6 +36,7 @@ class Grip(NamedTuple):
     normal: NDArray[np.float64]
     anchor: NDArray[np.float64]
     outcome: Outcome
+    friction: NDArray[np.float64]
 
 
 class Step(NamedTuple):
@@ -70,10 +72,10 @@ class Memory:
         gap: Shape ``(m, nq)``.
         normal: Normals, in the frame of the shape.
         outcome: What acted.
+        friction: What the law of friction remembers, shape ``(m, nq, k)``.
         works: What was done against pressure and against friction in the step, if there is motion.
         step: The step of a motion, at all points, by whose middle the forces are.
         behind: Tractions by the stress behind the facets, where these count, ``(m, nq, gdim)``.
-        pressed: Which points that stress presses, or is about to, where it counts, ``(m, nq)``.
         facets: Numbers of the facets that were looked at, as nothing acts on others; ``None``: all.
         exact: Whether all gaps are known, and not only what some are at least.
     """
@@ -84,10 +86,10 @@ class Memory:
     gap: NDArray[np.float64]
     normal: NDArray[np.float64]
     outcome: Outcome
+    friction: NDArray[np.float64]
     works: tuple[float, float] = (0.0, 0.0)
     step: Step | None = None
     behind: NDArray[np.float64] | None = None
-    pressed: NDArray[np.bool_] | None = None
     facets: NDArray[np.int64] | None = None
     exact: bool = True
 
@@ -105,5 +107,6 @@ class Memory:
             self.gap[which],
             self.normal[which],
             outcome,
+            self.friction[which],
             facets=which,
         )

@@ -14,18 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .contact import Outcome
-from .law import (
-    Coulomb,
-    Points,
-    Push,
-    Traction,
-    derivative,
-    nitsche,
-    push_derivative,
-    secant_along,
-    shear_derivative,
-    traction,
-)
+from .law import Friction, Points, Separation, remembered, secant_along, slopes, traction
 from .memory import Memory, Step
 from .nitsche import Nitsche
 from .placed import distance_within, framed
@@ -70,7 +59,7 @@ class ObstacleTractions:
     """
 
     def __init__(
-        self, surface: Surface, shape: Shape, friction: Coulomb, penalty: float, tangential: float
+        self, surface: Surface, shape: Shape, friction: Friction, penalty: float, tangential: float
     ) -> None:
         self._surface, self._shape, self._friction = surface, shape, friction
         self._penalty, self._tangential = penalty, tangential
@@ -129,6 +118,7 @@ class ObstacleTractions:
             memory.anchor.reshape(-1, gdim),
             memory.gap.ravel(),
             self._stretch_of(which).ravel(),
+            memory.friction.reshape(memory.gap.size, memory.friction.shape[2]),
         )
 
     def _stretch_of(self, which: NDArray[np.int64] | None) -> NDArray[np.float64]:
@@ -157,29 +147,19 @@ class ObstacleTractions:
         y = framed(self._shape, pose, x).reshape(-1, gdim)
         points = self.points(memory)
         touch = self._surface.touch
-        behind, reach = None, np.full(len(y), touch)
+        behind, pressing, reach = None, None, np.full(len(y), touch)
         if self.nitsche is not None:
             behind = self.nitsche.tractions()
-            reach = touch + np.linalg.norm(behind, axis=2).ravel() / points.stiffness
+            pressing = (behind @ pose.Q).reshape(-1, gdim)
+            reach = touch + np.linalg.norm(pressing, axis=1) / points.stiffness
         phi, n = self._distance(y, memory, reach)
+        at = Separation(phi, n, y - points.anchor, touch, pressing)
         pushes, step, Q = n, None, pose.Q
-        pressure, pressed = None, None
-        if behind is not None:
-            push = nitsche(points, (behind @ Q).reshape(-1, gdim), phi, n, touch)
-            pressure, pressed = push.pressure, push.acts.reshape(m, nq)
         if self.of_step:
             step = self._step(points, memory, y, phi)
             pushes, Q = step.gradient, memory.pose.mean(pose)
-            pressure = step.pressure
-        acts = traction(
-            self._friction,
-            points,
-            y - points.anchor,
-            phi,
-            n if step is None else step.normal,
-            touch,
-            pressure,
-        )
+            at = at._replace(normal=step.normal, pressure=step.pressure)
+        acts = traction(self._friction, points, at)
         shape = (m, nq)
         normal, shear = (
             (part @ Q.T).reshape(x.shape) for part in (acts.pressure[:, None] * pushes, acts.shear)
@@ -207,10 +187,12 @@ class ObstacleTractions:
             outcome.gap,
             n.reshape(x.shape),
             outcome,
+            memory.friction
+            if which is not None
+            else remembered(self._friction, points, at).reshape(memory.friction.shape),
             works,
             step,
             behind,
-            pressed,
             which,
         )
 
@@ -265,9 +247,6 @@ class ObstacleTractions:
         surface, acting = self._surface, trial.touched
         if self.of_step:
             acting = acting | (memory.gap <= surface.touch)
-        if trial.behind is not None:
-            assert trial.pressed is not None
-            acting = acting | trial.pressed
         here = np.flatnonzero(
             acting.any(axis=1) & (self.weights(trial).max(axis=1, initial=0.0) > 0.0)
         )
@@ -296,28 +275,21 @@ class ObstacleTractions:
         self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
     ) -> NDArray[np.float64]:
         """Return :meth:`derivative` in the frame of the shape."""
-        surface, gdim = self._surface, self._surface.gdim
-        y = framed(self._shape, trial.pose, trial.outcome.positions.reshape(-1, gdim)[flat])
-        n, gap = trial.normal.reshape(-1, gdim)[flat], trial.gap.ravel()[flat]
-        points = self.points(memory).of(flat)
-        delta = y - points.anchor
-        touch, law = surface.touch, self._friction
-        if not self.of_step:
+        points, at, y = self._seen(trial, memory, flat)
+        found = slopes(self._friction, points, at)
+        n = trial.normal.reshape(-1, y.shape[1])[flat]
+        if trial.step is None:
             H = self._shape.curvature(y)
-            push = None if trial.behind is None else self._push(trial, memory, flat, bent=True)
-            return derivative(law, points, delta, gap, n, H, touch, push)
-        assert trial.step is not None
+            dp, dt = found.by_position(n, H)
+            pressure = trial.outcome.pressure.ravel()[flat]
+            return np.asarray(n[:, :, None] * dp[:, None, :] + pressure[:, None, None] * H + dt)
         step = Step(*(part[flat] for part in trial.step))
         H = 0.5 * self._shape.curvature(step.middle)
-        slope = pressure_slope(points.stiffness, step.before, gap, touch)
+        slope = pressure_slope(points.stiffness, step.before, at.gap, at.touch)
         turn = corrected_slope(step.normal, H, step.change, step.factor, n)
-        D = step.gradient[:, :, None] * (slope[:, None] * n)[:, None, :]
-        D = D + step.pressure[:, None, None] * turn
-        if not law.smooth:
-            acts = traction(law, points, delta, gap, step.normal, touch, step.pressure)
-            dp = slope[:, None] * n
-            D = D + shear_derivative(law, points, delta, gap, step.normal, H, touch, acts, dp, n)
-        return np.asarray(D)
+        dp, dt = found.by_position(n, H, slope[:, None] * n)
+        D = step.gradient[:, :, None] * dp[:, None, :]
+        return np.asarray(D + step.pressure[:, None, None] * turn + dt)
 
     def secants(
         self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
@@ -329,7 +301,7 @@ class ObstacleTractions:
         gdim, Q = self._surface.gdim, self.rotation(trial, memory)
         slips = trial.outcome.slips.ravel()
         normal = trial.normal if trial.step is None else trial.step.normal
-        n, pressure = normal.reshape(-1, gdim), trial.outcome.pressure.ravel()
+        n = normal.reshape(-1, gdim)
         force = np.linalg.solve(Q, trial.outcome.traction.reshape(-1, gdim).T).T
         shear = force - n * (n * force).sum(axis=1)[:, None]
         m, nq = self._surface.weights.shape
@@ -338,15 +310,10 @@ class ObstacleTractions:
         slipping[place.ravel()], along[place.ravel()] = slips, shear
         changed = self.slip_changes.note(slipping, along)[place.ravel()][flat]
         found = np.zeros((len(flat), gdim, gdim))
-        if not changed.any():
-            return found
-        some = flat[changed]
-        points = self.points(memory).of(some)
-        y = framed(self._shape, trial.pose, trial.outcome.positions.reshape(-1, gdim)[some])
-        acts = Traction(pressure[some], shear[some], slips[some], slips[some])
-        gap = trial.gap.ravel()[some]
-        secant = secant_along(points, y - points.anchor, gap, n[some], self._surface.touch, acts)
-        found[changed] = Q @ secant @ trial.pose.Q.T
+        if changed.any():
+            some = flat[changed]
+            _, at, _ = self._seen(trial, memory, some)
+            found[changed] = Q @ secant_along(at, shear[some]) @ trial.pose.Q.T
         return found
 
     def by_stress(
@@ -356,45 +323,25 @@ class ObstacleTractions:
 
         Of the latter by its part along the normal, shape ``(n, gdim)``.
         """
-        gdim, pose = self._surface.gdim, trial.pose
+        points, at, _ = self._seen(trial, memory, flat)
+        force = slopes(self._friction, points, at).by_pressure(at.normal)
+        return np.asarray(force @ trial.pose.Q.T)
+
+    def _seen(
+        self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
+    ) -> tuple[Points, Separation, NDArray[np.float64]]:
+        """Return some points, where they are, and their coordinates, in the frame of the shape."""
+        gdim, pose, step, behind = self._surface.gdim, trial.pose, trial.step, None
         points = self.points(memory).of(flat)
         y = framed(self._shape, pose, trial.outcome.positions.reshape(-1, gdim)[flat])
-        force = push_derivative(
-            self._friction,
-            points,
-            y - points.anchor,
-            trial.gap.ravel()[flat],
-            trial.normal.reshape(-1, gdim)[flat],
-            self._surface.touch,
-            self._push(trial, memory, flat),
+        if trial.behind is not None:
+            behind = trial.behind.reshape(-1, gdim)[flat] @ pose.Q
+        n = trial.normal.reshape(-1, gdim)[flat] if step is None else step.normal[flat]
+        pressure = None if step is None else step.pressure[flat]
+        at = Separation(
+            trial.gap.ravel()[flat], n, y - points.anchor, self._surface.touch, behind, pressure
         )
-        return np.asarray(force @ pose.Q.T)
-
-    def _push(
-        self, trial: Memory, memory: Memory, flat: NDArray[np.int64], bent: bool = False
-    ) -> Push:
-        """Return the pressure of Nitsche's method at some points.
-
-        Args:
-            trial: What acts.
-            memory: What is known of the last converged step.
-            flat: Their numbers.
-            bent: Whether the derivative of the pressure is asked for.
-        """
-        gdim, pose = self._surface.gdim, trial.pose
-        assert trial.behind is not None
-        H = None
-        if bent:
-            x = trial.outcome.positions.reshape(-1, gdim)[flat]
-            H = self._shape.curvature(framed(self._shape, pose, x))
-        return nitsche(
-            self.points(memory).of(flat),
-            trial.behind.reshape(-1, gdim)[flat] @ pose.Q,
-            trial.gap.ravel()[flat],
-            trial.normal.reshape(-1, gdim)[flat],
-            self._surface.touch,
-            H,
-        )
+        return points, at, y
 
 
 def _anchors(

@@ -20,10 +20,20 @@ from .. import _compat
 from .behind import At
 from .contact import Outcome
 from .facets import Closest, NearFacets, separated
-from .law import Coulomb, Points
+from .law import Friction, Points, unworn
 from .nitsche import Nitsche, Spread
 from .pair_matrices import Met
-from .stencil import Foot, Start, Stencil, Sums, acting_now, add_tangents, by_stress, projected
+from .stencil import (
+    Foot,
+    Start,
+    Stencil,
+    Sums,
+    acting,
+    add_tangents,
+    by_stress,
+    projected,
+    remembered,
+)
 from .surface import Surface, global_nodes
 
 __all__ = ["Memory", "Pass"]
@@ -55,6 +65,7 @@ class Memory(NamedTuple):
             points that came there from the side and not through a facet, or they would win energy.
         points: Where they were, shape ``(n, gdim)``.
         anchors: Where their anchors were, shape ``(n, gdim)``.
+        friction: What the law of friction remembers, shape ``(n, k)``.
     """
 
     touched: NDArray[np.bool_]
@@ -66,6 +77,7 @@ class Memory(NamedTuple):
     offset: NDArray[np.float64]
     points: NDArray[np.float64]
     anchors: NDArray[np.float64]
+    friction: NDArray[np.float64]
 
     def of(self, points: NDArray[np.int64]) -> Memory:
         """Return what is known of some points."""
@@ -98,7 +110,7 @@ class Pass:
         self,
         source: Surface,
         target: Surface,
-        law: Coulomb,
+        law: Friction,
         penalties: tuple[float, float],
     ) -> None:
         self.source, self.target = source, target
@@ -250,6 +262,7 @@ class Pass:
                 np.zeros(len(which)),
                 x[which],
                 x[which],
+                unworn(self.law, (len(which),)),
             ),
         )
         untouched = self._untouched(x)
@@ -271,7 +284,8 @@ class Pass:
         """
         n = len(x)
         facet, place, gap, near, beside = _nothing(n, self.source.gdim - 1)
-        whole = Memory(near, facet, place, facet, gap, near, beside, x, x)
+        last = unworn(self.law, (n,)) if self.memory is None else self.memory.friction
+        whole = Memory(near, facet, place, facet, gap, near, beside, x, x, last)
         return Memory(
             *(_spread(part, self._which, base) for part, base in zip(known, whole, strict=True))
         )
@@ -334,7 +348,7 @@ class Pass:
         shape = (len(self._facets), self.source.nq)
         force = np.zeros_like(x)
         pressure, slips = np.zeros(len(x)), np.zeros(len(x), dtype=bool)
-        pushes, rubs, acts = acting_now(self.law, self.stencil, self.touch, self.target.extent)
+        pushes, rubs, acts = acting(self.law, self.stencil, self.touch, self.target.extent)
         both = pushes + rubs
         force[which], pressure[which], slips[which] = both[:, 0], acts.pressure, acts.slips
         if self._behind is not None:
@@ -480,6 +494,7 @@ class Pass:
             np.zeros((len(which), 0)),
             np.where(lost, 0.0, memory.gap[which]),
             self._stretch[which],
+            memory.friction[which],
         )
         self._facet, self._anchor = facet, anchor
         start = None
@@ -599,7 +614,12 @@ class Pass:
         N, _, _ = near.tabulate(place[at >= 0])
         anchors[at >= 0] = np.einsum("nk,nki->ni", N, self._nodes[at[at >= 0]])
         closest = _numbers(near, found.facet)
-        own = Memory(inside, numbers, place, closest, found.gap, self._within, offset, x, anchors)
+        rubbed = last.friction.copy()
+        if self.law.memory:
+            rubbed[which] = remembered(self.law, self.stencil, self.touch, self.target.extent)
+        own = Memory(
+            inside, numbers, place, closest, found.gap, self._within, offset, x, anchors, rubbed
+        )
         memory = self._remembered(self._flat(self.source.positions()), own)
         untouched = self._untouched(memory.points)
         outcome = Outcome(
@@ -678,6 +698,7 @@ class Pass:
         touched: NDArray[np.bool_],
         anchors: NDArray[np.float64],
         offset: NDArray[np.float64],
+        friction: NDArray[np.float64] | None = None,
     ) -> None:
         """Take what was remembered, on the meshes of now (collective)."""
         self.begin_anew()
@@ -690,6 +711,9 @@ class Pass:
         there = found.facet >= 0
         numbers[which[there]] = near.number[found.facet[there]]
         place[which[there]] = found.place[there]
+        rubbed = memory.friction
+        if friction is not None and friction.shape[2] == rubbed.shape[1]:
+            rubbed = friction.reshape(rubbed.shape)
         self.memory = memory._replace(
             touched=touched.ravel(),
             facet=numbers,
@@ -697,6 +721,7 @@ class Pass:
             within=touched.ravel() | memory.within,
             offset=offset.ravel(),
             anchors=self._flat(anchors),
+            friction=rubbed,
         )
 
 

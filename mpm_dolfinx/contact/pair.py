@@ -29,7 +29,7 @@ from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..system.term import PointMaterial
 from .contact import Contact, Outcome, stiffness
-from .law import Coulomb, as_friction
+from .law import Friction, as_friction
 from .nitsche import Nitsche, require_stress
 from .one_pass import Pass
 from .pair_matrices import PairMatrices
@@ -43,7 +43,7 @@ ALIKE, LEAST = 1.5, 0.2
 #: Degree of the rule on a facet, by the dimension of space: the other body's facets have kinks.
 DEGREES = {2: 9, 3: 5}
 #: Columns of what points remember, and of what acted, by its names there.
-MEMORY = ("touches", "anchor", "offset")
+MEMORY = ("touches", "anchor", "offset", "friction")
 OUTCOME = {"inside": "touches", "slips": "slips", "pressure": "pressure", "traction": "traction"}
 
 
@@ -62,7 +62,7 @@ class Pair(Contact):
     Args:
         a: A body; what the contact tells is told at its points first.
         b: The other body.
-        friction: Coefficient of friction, or a :class:`Coulomb`.
+        friction: As for :class:`Rigid`.
         facet_tags: Tags of the facets of a and of b, where not all of their boundaries may touch.
         tags: The tags of those that may.
         moduli: Moduli of a and b; those of their materials by default.
@@ -82,7 +82,7 @@ class Pair(Contact):
         self,
         a: Particles,
         b: Particles,
-        friction: float | Coulomb = 0.0,
+        friction: float | Friction = 0.0,
         *,
         facet_tags: Sequence[mesh.MeshTags | None] = (None, None),
         tags: Sequence[int | None] = (None, None),
@@ -116,7 +116,7 @@ class Pair(Contact):
         rubs = as_friction(friction)
         require_same(
             a.mesh.comm,
-            friction=[rubs.friction, rubs.cohesion, rubs.limit],
+            friction=rubs.told,
             tags=list(tags),
             moduli=list(moduli),
             passes=passes,
@@ -190,7 +190,8 @@ class Pair(Contact):
             surface.restore(columns)
         self._settle(again=True)
         for each, surface, columns in zip(self._passes, self._surfaces, every, strict=False):
-            each.restore(*(surface.of_column(columns[name]) for name in MEMORY))
+            known = [name for name in MEMORY if name in columns]
+            each.restore(*(surface.of_column(columns[name]) for name in known))
 
     def _settle(self, again: bool = False) -> None:
         """Take the present meshes of the bodies (collective)."""
@@ -301,6 +302,8 @@ class Pair(Contact):
                 each.evaluate()
         except np.linalg.LinAlgError:
             return ConvergenceError("Facets of a Pair collapse; take smaller steps")
+        except MPMError as error:
+            return error
         return None
 
     def smooth(self) -> bool:
@@ -390,6 +393,14 @@ class Pair(Contact):
         return found
 
     @property
+    def friction_memory(self) -> NDArray[np.float64]:
+        """See :class:`Contact`: at the points of a."""
+        self._outcome()
+        memory = self._passes[0].memory
+        assert memory is not None
+        return memory.friction
+
+    @property
     def reaction(self) -> NDArray[np.float64]:
         """Force on a, shape ``(gdim,)``, on all ranks (collective); that on b is the opposite."""
         mine = np.sum([force.sum(axis=0) for _, force in self._forces()], axis=0)
@@ -414,6 +425,8 @@ class Pair(Contact):
             columns["anchor"] = surface.column(memory.anchors.reshape(*shape, surface.gdim))
             columns["touches"] = surface.column(memory.touched.reshape(shape))
             columns["offset"] = surface.column(memory.offset.reshape(shape))
+            if self.friction.memory:
+                columns["friction"] = surface.column(memory.friction.reshape(*shape, -1))
             columns["slips"] = surface.column(outcome.slips)
             columns["pressure"] = surface.column(outcome.pressure)
             columns["traction"] = surface.column(outcome.traction)

@@ -25,7 +25,7 @@ from ..reals import as_reals
 from ..system.term import PointMaterial
 from .behind import At
 from .contact import Contact, Outcome, stiffness
-from .law import Coulomb, as_friction
+from .law import Friction, as_friction, unworn
 from .memory import Grip, Memory
 from .nitsche import Nitsche, Spread, require_stress
 from .obstacle_tractions import ObstacleTractions
@@ -70,7 +70,8 @@ class Rigid(Contact):
     Args:
         particles: The body.
         shape: The obstacle, of :mod:`mpm_dolfinx.contact`, as it lies at the beginning.
-        friction: Coefficient of friction, or a :class:`Coulomb` with cohesion and a limit.
+        friction: Coefficient of friction, a :class:`Coulomb` with cohesion and a limit, or another
+            law of :class:`Friction`.
         facet_tags: Tags of the body's facets, where not all of its boundary may touch.
         tag: The tag of those that may.
         modulus: Modulus of the body; that of the material by default.
@@ -91,7 +92,7 @@ class Rigid(Contact):
         self,
         particles: Particles,
         shape: Shape,
-        friction: float | Coulomb = 0.0,
+        friction: float | Friction = 0.0,
         *,
         facet_tags: mesh.MeshTags | None = None,
         tag: int | None = None,
@@ -115,7 +116,7 @@ class Rigid(Contact):
         rubs = as_friction(friction)
         require_same(
             particles.mesh.comm,
-            friction=[rubs.friction, rubs.cohesion, rubs.limit],
+            friction=rubs.told,
             tag=tag,
             modulus=modulus,
             penalty=penalty,
@@ -278,7 +279,13 @@ class Rigid(Contact):
         nothing = np.zeros((m, nq))
         still = Outcome(x, phi.reshape(m, nq), nothing, np.zeros_like(x), none, none)
         self._memory = self._trial = Memory(
-            pose, none, y.reshape(x.shape), phi.reshape(m, nq), n.reshape(x.shape), still
+            pose,
+            none,
+            y.reshape(x.shape),
+            phi.reshape(m, nq),
+            n.reshape(x.shape),
+            still,
+            unworn(self.friction, (m, nq)),
         )
 
     def _new_pattern(self) -> None:
@@ -493,6 +500,13 @@ class Rigid(Contact):
             self._memory = self._exact(self._memory)
         return super().gap
 
+    @property
+    def friction_memory(self) -> NDArray[np.float64]:
+        """See :class:`Contact`."""
+        self._outcome()
+        assert self._memory is not None
+        return self._tractions.points(self._memory).memory
+
     def roll_back(self) -> None:
         """See :meth:`Term.roll_back`."""
         assert self._memory is not None
@@ -517,6 +531,8 @@ class Rigid(Contact):
             "touches": surface.column(memory.touched),
             "slips": surface.column(memory.outcome.slips),
         }
+        if self.friction.memory:
+            known["friction"] = surface.column(memory.friction)
         if self._tells_more:
             known["pressure"] = surface.column(memory.outcome.pressure)
             known["traction"] = surface.column(memory.outcome.traction)
@@ -557,7 +573,10 @@ class Rigid(Contact):
             touched[:, :, None], surface.of_column(columns["anchor"]), self._memory.anchor
         )
         found = self._memory
-        self._memory = Memory(pose, touched, anchor, found.gap, found.normal, found.outcome)
+        rubbed = found.friction
+        if "friction" in columns and columns["friction"].shape[3] == rubbed.shape[2]:
+            rubbed = surface.of_column(columns["friction"])
+        self._memory = replace(found, touched=touched, anchor=anchor, friction=rubbed)
         outcome = found.outcome
         if self._tells_more:
             told = {name: surface.of_column(columns[name]) for name in ("pressure", "traction")}
@@ -578,6 +597,7 @@ class Rigid(Contact):
             memory.normal @ pose.Q.T,
             unframed(self.shape, pose, memory.anchor),
             memory.outcome,
+            memory.friction,
         )
 
     def _stand_in(self, before: Grip) -> None:
@@ -602,7 +622,9 @@ class Rigid(Contact):
         )
         same &= np.abs(seen(before.normal) - n).max(axis=2) <= SAME
         anchor = framed(self.shape, memory.pose, seen(before.anchor))
-        acts = before.outcome
+        acts, rubbed = before.outcome, memory.friction
+        if before.friction.shape[2] == rubbed.shape[2]:
+            rubbed = np.where(same[:, :, None], seen(before.friction), rubbed)
         outcome = replace(
             memory.outcome,
             pressure=np.where(same, seen(acts.pressure), 0.0),
@@ -615,6 +637,7 @@ class Rigid(Contact):
             touched=same | memory.touched,
             anchor=np.where(same[:, :, None], anchor, memory.anchor),
             outcome=outcome,
+            friction=rubbed,
         )
 
     @property

@@ -33,7 +33,7 @@ from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..system.term import PointMaterial, Term, Transfer
 from .body_contact import BodyContact
-from .law import Coulomb
+from .law import Friction
 from .placed import Placed
 from .rigid_motion import RigidMotion, State, as_inertia, as_rotation, held_of, names_of
 from .rotation import Pose, Turn, crossing
@@ -102,7 +102,7 @@ class RigidBody(Term):
             one number where it is the same about all axes. Needed in motion unless it cannot turn.
         centre: Centre of mass at the beginning, shape ``(gdim,)``; the pivot of the shape by
             default.
-        friction: Coefficient of friction, or a :class:`Coulomb` with cohesion and a limit.
+        friction: As for :class:`Rigid`.
         gravity: Its acceleration by gravity, shape ``(gdim,)``, which acts in full always.
         velocity: Of its centre at the beginning, shape ``(gdim,)``.
         spin: Its rate of rotation at the beginning: a number, in space a vector ``(3,)``.
@@ -126,7 +126,7 @@ class RigidBody(Term):
         *,
         inertia: Any = None,
         centre: Any = None,
-        friction: float | Coulomb = 0.0,
+        friction: float | Friction = 0.0,
         gravity: Any = None,
         velocity: Any = None,
         spin: Any = None,

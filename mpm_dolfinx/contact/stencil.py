@@ -5,7 +5,7 @@
 A point is projected on the facet; the gap gives the pressure, the way from the anchor the shear.
 What acts on the point acts the other way on the facet's nodes, as if the point were fixed to the
 facet by a rigid arm along its normal. Compiled loops do so point by point and carry derivatives
-along; what they are, and whole steps of a motion, are told here by complex steps.
+along; whole steps of a motion are told here by complex steps.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .._core import is_as_inherited, loops
+from .._core import loops
 from .facets import Table, solved
-from .law import Coulomb, Points, Traction, nitsche, push_derivative, traction
+from .law import Friction, Points, Separation, Traction, bounds, known, slopes, traction
+from .law import remembered as remembered_by
 from .surface import normals
 from .whole_step import corrected, deformation, mean_pressure
 
@@ -28,11 +29,12 @@ __all__ = [
     "Stencil",
     "Sums",
     "acting",
-    "acting_now",
     "add_tangents",
     "by_complex_step",
     "by_stress",
+    "over_step",
     "projected",
+    "remembered",
 ]
 
 #: Step of the complex derivative, and most points of which it is taken at once.
@@ -168,8 +170,10 @@ def _gradient(foot: Foot) -> NDArray[Any]:
     return np.concatenate([n, -foot.N[:, :, None] * n], axis=1)
 
 
-def acting(law: Coulomb, stencil: Stencil, z: NDArray[Any], touch: float, extent: float) -> Acting:
-    """Return what acts on the points and on nodes of their facets.
+def over_step(
+    law: Friction, stencil: Stencil, z: NDArray[Any], touch: float, extent: float
+) -> Acting:
+    """Return what acts on the points and on nodes of their facets in a step of a motion.
 
     Args:
         law: Friction.
@@ -178,30 +182,40 @@ def acting(law: Coulomb, stencil: Stencil, z: NDArray[Any], touch: float, extent
         touch: Gap at which points touch.
         extent: Largest coordinate of the body of the facets.
     """
-    start, count = stencil.start, stencil.anchored.shape[1]
-    both = z[:, : 1 + count]
-    x, X = both[:, 0], both[:, 1:]
-    foot = projected(stencil.table, x, X, stencil.outward)
+    foot, gradient, at = _whole_step(law, stencil, z, touch, extent)
+    acts = traction(law, stencil.points, at)
+    pushes = acts.pressure[:, None, None] * gradient
+    return Acting(pushes, _rubs(foot, acts.shear), acts)
+
+
+def _whole_step(
+    law: Friction, stencil: Stencil, z: NDArray[Any], touch: float, extent: float
+) -> tuple[Foot, NDArray[Any], Separation]:
+    """Return projections in the middle of a step, what acts along with its pressure, and points."""
+    start = stencil.start
+    assert start is not None
+    end, at = _seen(law, stencil, z, touch)
+    both = z[:, : 1 + stencil.anchored.shape[1]]
+    middle, change = 0.5 * (start.x + both), both - start.x
+    foot = projected(start.table, middle[:, 0], middle[:, 1:], stencil.outward)
+    v = deformation(middle, change)
+    gradient, _ = corrected(_gradient(foot), change, v, end.gap - start.gap, extent)
+    gap, before = end.gap - start.offset, start.gap - start.offset
+    p = mean_pressure(stencil.points.stiffness, before, gap, touch)
+    return foot, gradient, at._replace(gap=gap, normal=foot.n, pressure=p)
+
+
+def _seen(
+    law: Friction, stencil: Stencil, z: NDArray[Any], touch: float
+) -> tuple[Foot, Separation]:
+    """Return projections of points, and where they are with respect to what they meet."""
+    count = stencil.anchored.shape[1]
+    x = z[:, 0]
+    foot = projected(stencil.table, x, z[:, 1 : 1 + count], stencil.outward)
     delta = np.zeros_like(x)
     if not law.smooth:
         delta = x - np.einsum("nk,nki->ni", stencil.anchored, z[:, 1 + count :])
-    if start is None:
-        pressure = None
-        if stencil.behind is not None:
-            pressure = nitsche(stencil.points, stencil.behind, foot.gap, foot.n, touch).pressure
-        acts = traction(law, stencil.points, delta, foot.gap, foot.n, touch, pressure)
-        gradient = _gradient(foot)
-    else:
-        gap, middle, change = foot.gap, 0.5 * (start.x + both), both - start.x
-        foot = projected(start.table, middle[:, 0], middle[:, 1:], stencil.outward)
-        gradient = _gradient(foot)
-        v = deformation(middle, change)
-        gradient, _ = corrected(gradient, change, v, gap - start.gap, extent)
-        gap, before = gap - start.offset, start.gap - start.offset
-        p = mean_pressure(stencil.points.stiffness, before, gap, touch)
-        acts = traction(law, stencil.points, delta, gap, foot.n, touch, p)
-    pushes = acts.pressure[:, None, None] * gradient
-    return Acting(pushes, _rubs(foot, acts.shear), acts)
+    return foot, Separation(foot.gap, foot.n, delta, touch, stencil.behind)
 
 
 def _rubs(foot: Foot, shear: NDArray[Any]) -> NDArray[Any]:
@@ -214,7 +228,7 @@ def _rubs(foot: Foot, shear: NDArray[Any]) -> NDArray[Any]:
     return np.concatenate([shear[:, None], on_nodes], axis=1)
 
 
-def by_stress(law: Coulomb, stencil: Stencil, touch: float) -> tuple[Array, Array]:
+def by_stress(law: Friction, stencil: Stencil, touch: float) -> tuple[Array, Array]:
     """Return how forces grow with the traction of the stress behind along the normal.
 
     Args:
@@ -226,51 +240,52 @@ def by_stress(law: Coulomb, stencil: Stencil, touch: float) -> tuple[Array, Arra
         The normals, shape ``(n, gdim)``, and derivatives of forces on points and nodes of their
         facets, shape ``(n, 1 + k, gdim)``.
     """
-    assert stencil.behind is not None
-    x, X = stencil.x[:, 0], stencil.x[:, 1 : 1 + stencil.anchored.shape[1]]
-    foot = projected(stencil.table, x, X, stencil.outward)
-    push = nitsche(stencil.points, stencil.behind, foot.gap, foot.n, touch)
-    by = _gradient(foot)
-    if not law.smooth:
-        delta = x - np.einsum(
-            "nk,nki->ni", stencil.anchored, stencil.x[:, 1 + stencil.anchored.shape[1] :]
-        )
-        along = push_derivative(law, stencil.points, delta, foot.gap, foot.n, touch, push) - foot.n
-        by = by + _rubs(foot, along)
-    return foot.n, by * push.acts[:, None, None]
+    foot, at = _seen(law, stencil, stencil.x, touch)
+    found = slopes(law, stencil.points, at)
+    by = found.pressure[:, :1, None] * _gradient(foot) + _rubs(foot, found.shear[:, :, 0])
+    return foot.n, by
 
 
-def _is_compiled(law: Coulomb, stencil: Stencil) -> bool:
-    """Return whether there are compiled loops for a law and points."""
-    return stencil.start is None and is_as_inherited(law, "_loop")
+def remembered(law: Friction, stencil: Stencil, touch: float, extent: float) -> Array:
+    """Return what the law remembers of points at the end of a step, shape ``(n, k)``.
+
+    Args:
+        law: Friction.
+        stencil: The points.
+        touch: As for :func:`over_step`.
+        extent: As there.
+    """
+    if stencil.start is None:
+        _, at = _seen(law, stencil, stencil.x, touch)
+    else:
+        _, _, at = _whole_step(law, stencil, stencil.x, touch, extent)
+    return remembered_by(law, stencil.points, at)
 
 
-def _compiled_arguments(law: Coulomb, stencil: Stencil, touch: float) -> tuple[Any, ...]:
+def _compiled_arguments(law: Friction, stencil: Stencil, touch: float) -> tuple[Any, ...]:
     """Return what the compiled loops take."""
-    points = stencil.points
-    arrays = [points.stiffness, points.tangential, points.gap, points.stretch]
-    behind = np.zeros(0) if stencil.behind is None else stencil.behind
+    most = np.zeros(0)
+    if not law.compiled:
+        most = bounds(law, stencil.points, _seen(law, stencil, stencil.x, touch)[1])
+    parts = (*stencil.table, stencil.anchored, stencil.outward)
     return (
         np.ascontiguousarray(stencil.x),
-        [np.ascontiguousarray(part) for part in (*stencil.table, stencil.anchored)],
-        [np.ascontiguousarray(part) for part in (stencil.outward, *arrays, behind)],
-        points.touched.view(np.uint8),
-        [law.friction, law.cohesion, law.limit, touch],
-        law.smooth,
+        [np.ascontiguousarray(part) for part in parts],
+        *known(law, stencil.points, touch, stencil.behind, most),
     )
 
 
-def acting_now(law: Coulomb, stencil: Stencil, touch: float, extent: float) -> Acting:
-    """Return what acts at the stencil's own positions: :func:`acting`, compiled where it can be.
+def acting(law: Friction, stencil: Stencil, touch: float, extent: float) -> Acting:
+    """Return what acts on the points and on nodes of their facets, at the stencil's positions.
 
     Args:
-        law: As for :func:`acting`, as all that is not said here.
-        stencil: As there.
-        touch: As there.
-        extent: As there.
+        law: Friction.
+        stencil: The points.
+        touch: Gap at which points touch.
+        extent: Largest coordinate of the body of the facets.
     """
-    if not _is_compiled(law, stencil):
-        return acting(law, stencil, stencil.x, touch, extent)
+    if stencil.start is not None:
+        return over_step(law, stencil, stencil.x, touch, extent)
     n, _, gdim = stencil.x.shape
     pushes, rubs = (np.zeros((n, 1 + stencil.anchored.shape[1], gdim)) for _ in range(2))
     acts = Traction(np.zeros(n), np.zeros((n, gdim)), np.zeros(n, bool), np.zeros(n, bool))
@@ -286,7 +301,7 @@ def acting_now(law: Coulomb, stencil: Stencil, touch: float, extent: float) -> A
     return Acting(pushes, rubs, acts)
 
 
-def add_tangents(law: Coulomb, stencil: Stencil, touch: float, extent: float, sums: Sums) -> None:
+def add_tangents(law: Friction, stencil: Stencil, touch: float, extent: float, sums: Sums) -> None:
     """Add the derivatives of all forces at the points' stencils to blocks.
 
     Args:
@@ -299,7 +314,7 @@ def add_tangents(law: Coulomb, stencil: Stencil, touch: float, extent: float, su
     if len(stencil.x) == 0:
         return
     where = [np.ascontiguousarray(part) for part in sums[:4]]
-    if _is_compiled(law, stencil):
+    if stencil.start is None:
         arguments = _compiled_arguments(law, stencil, touch)
         loops.add_tangents(*arguments, *where, sums.values)
         return
@@ -308,9 +323,9 @@ def add_tangents(law: Coulomb, stencil: Stencil, touch: float, extent: float, su
 
 
 def by_complex_step(
-    law: Coulomb, stencil: Stencil, touch: float, extent: float
+    law: Friction, stencil: Stencil, touch: float, extent: float
 ) -> NDArray[np.float64]:
-    """Return the derivatives of all forces at the points' stencils, by complex steps.
+    """Return the derivatives of all forces of a step of a motion, by complex steps.
 
     Args:
         law: As for :func:`acting`.
@@ -333,7 +348,7 @@ def by_complex_step(
         for copy, (node, j) in zip(copies, some, strict=True):
             copy[:, node, j] += 1j * STEP
         whole = _repeated(stencil, len(some))
-        pushes, rubs, _ = acting(law, whole, copies.reshape(-1, count, gdim), touch, extent)
+        pushes, rubs, _ = over_step(law, whole, copies.reshape(-1, count, gdim), touch, extent)
         slopes = ((pushes + rubs).imag / STEP).reshape(len(some), n, -1, gdim)
         for slope, (node, j) in zip(slopes, some, strict=True):
             D[:, :, :, node, j] = slope

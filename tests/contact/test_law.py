@@ -1,9 +1,10 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Tractions of contact at points: tangents against the complex step, and Coulomb's law."""
+"""Tractions of contact at points: against NumPy and the complex step, and Coulomb's law."""
 
 import numpy as np
 import pytest
+import rubbing
 
 from mpm_dolfinx import contact
 from mpm_dolfinx.contact import law as laws
@@ -33,14 +34,28 @@ def scene(dim, seed=4, count=400):
         y + some.normal(0.0, 0.01, y.shape),
         some.uniform(0.0, 0.05, count),
         some.uniform(0.9, 1.1, count),
+        np.zeros((count, 0)),
     )
     return body, points, y
 
 
-def acting(law, body, points, y):
+def seen(body, points, y, behind=None):
     phi, n = body.distance(y)
-    acts = laws.traction(law, points, y - points.anchor, phi, n, TOUCH)
-    return acts, acts.pressure[:, None] * n + acts.shear
+    return laws.Separation(phi, n, y - points.anchor, TOUCH, behind)
+
+
+def acting(law, body, points, y, behind=None, by=laws.traction):
+    at = seen(body, points, y, behind)
+    acts = laws.Traction(*by(law, points, at))
+    return acts, acts.pressure[:, None] * at.normal + acts.shear
+
+
+def derivative(law, body, points, y, behind=None):
+    """Return the derivative of ``p n + t`` by positions."""
+    at, H = seen(body, points, y, behind), body.curvature(y)
+    dp, dt = laws.slopes(law, points, at).by_position(at.normal, H)
+    p = laws.traction(law, points, at).pressure
+    return at.normal[:, :, None] * dp[:, None, :] + p[:, None, None] * H + dt
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -53,23 +68,18 @@ def acting(law, body, points, y):
         contact.Coulomb(0.5, cohesion=0.1, limit=0.7),
     ],
 )
-def test_tangent_is_that_of_the_complex_step(law, dim):
+def test_tractions_and_tangents_are_those_of_numpy_and_the_complex_step(law, dim):
     body, points, y = scene(dim)
-    phi, n = body.distance(y)
-    D = laws.derivative(law, points, y - points.anchor, phi, n, body.curvature(y), TOUCH)
-    acts, _ = acting(law, body, points, y)
-    if not law.smooth:
-        assert 0.1 < acts.slips.mean() < 0.99
+    D = derivative(law, body, points, y)
+    acts, T = acting(law, body, points, y)
+    known, exact = acting(law, body, points, y, by=rubbing.traction)
+    assert law.smooth or 0.1 < acts.slips.mean() < 0.99
+    assert (acts.slips == known.slips).all() and (acts.inside == known.inside).all()
+    np.testing.assert_allclose(T, exact, atol=1e-14 * np.abs(exact).max())
     for i, e in enumerate(np.eye(dim)):
-        exact = acting(law, body, points, y + 1e-30j * e)[1].imag / 1e-30
-        assert np.abs(D[:, :, i] - exact).max() < 1e-12 * np.abs(D).max()
-
-
-def pushed(law, body, points, y, behind):
-    phi, n = body.distance(y)
-    push = laws.nitsche(points, behind, phi, n, TOUCH)
-    acts = laws.traction(law, points, y - points.anchor, phi, n, TOUCH, push.pressure)
-    return acts, acts.pressure[:, None] * n + acts.shear
+        for by in (rubbing.traction, laws.traction):
+            exact = acting(law, body, points, y + 1e-30j * e, by=by)[1].imag / 1e-30
+            assert np.abs(D[:, :, i] - exact).max() < 1e-12 * np.abs(D).max()
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -81,20 +91,33 @@ def test_nitsches_tangent_is_that_of_the_complex_step(friction, dim):
     y = y + np.random.default_rng(5).uniform(0.0, 0.03, len(y))[:, None] * n  # some have a gap
     phi, n = body.distance(y)
     behind = np.random.default_rng(6).normal(0.0, 2.0, y.shape)
-    acts, _ = pushed(law, body, points, y, behind)
+    acts, _ = acting(law, body, points, y, behind)
     assert (acts.inside & (phi > TOUCH)).any() and (acts.inside & (phi < 0)).any()
     assert (~acts.inside).any() and (acts.pressure[phi < 0] == 0.0).any()
-    push = laws.nitsche(points, behind, phi, n, TOUCH, body.curvature(y))
-    some = acts.inside
-    given = law, points.of(some), (y - points.anchor)[some], phi[some], n[some]
-    D = laws.derivative(*given, body.curvature(y[some]), TOUCH, push.of(some))
-    by_stress = laws.push_derivative(*given, TOUCH, push.of(some))
+    D = derivative(law, body, points, y, behind)
+    by_stress = laws.slopes(law, points, seen(body, points, y, behind)).by_pressure(n)
     for i, e in enumerate(np.eye(dim)):
-        exact = pushed(law, body, points, y + 1e-30j * e, behind)[1].imag[some] / 1e-30
+        exact = acting(law, body, points, y + 1e-30j * e, behind, rubbing.traction)[1].imag / 1e-30
         assert np.abs(D[:, :, i] - exact).max() < 1e-12 * np.abs(D).max()
-        exact = pushed(law, body, points, y, behind + 1e-30j * e)[1].imag[some] / 1e-30
-        found = by_stress * n[some, i : i + 1]
-        assert np.abs(found - exact).max() < 1e-12 * np.abs(by_stress).max()
+        exact = acting(law, body, points, y, behind + 1e-30j * e, rubbing.traction)[1].imag / 1e-30
+        assert np.abs(by_stress * n[:, i : i + 1] - exact).max() < 1e-12 * np.abs(by_stress).max()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_pressure_that_is_given_counts_as_it_is(dim):
+    law = contact.Coulomb(0.5, cohesion=0.1, limit=0.7)
+    body, points, y = scene(dim)
+    at = seen(body, points, y)._replace(pressure=np.random.default_rng(7).uniform(0, 2, len(y)))
+    found, known = laws.traction(law, points, at), rubbing.traction(law, points, at)
+    for mine, other in zip(found, known, strict=True):
+        np.testing.assert_allclose(mine, other, atol=1e-14)
+    D = laws.slopes(law, points, at)
+    tried = at._replace(**{name: getattr(at, name) + 0j for name in ("gap", "normal", "delta")})
+    tried = tried._replace(pressure=at.pressure + 1e-30j)
+    for by in (rubbing.traction, laws.traction):
+        exact = by(law, points, tried)[1].imag / 1e-30
+        np.testing.assert_allclose(D.shear[:, :, 0], exact, atol=1e-13)
+    assert (D.pressure[:, 0] == 1.0).all() and not D.pressure[:, 1:].any()
 
 
 def test_shear_stays_within_coulombs_cone():
@@ -117,11 +140,11 @@ def test_the_secant_takes_the_way_from_the_anchor_to_the_shear(dim):
     _, points, y = scene(dim)
     points = points._replace(touched=np.ones(len(y), dtype=bool))
     y[:, -1] = -0.01 * some.uniform(size=len(y))
-    phi, n = plane.distance(y)
-    delta, H = y - points.anchor, np.zeros((len(y), dim, dim))
-    acts = laws.traction(law, points, delta, phi, n, TOUCH)
-    D = laws.derivative(law, points, delta, phi, n, H, TOUCH)
-    S = D + laws.secant_along(points, delta, phi, n, TOUCH, acts)
+    at = seen(plane, points, y)
+    delta, n = at.delta, at.normal
+    acts = laws.traction(law, points, at)
+    D = derivative(law, plane, points, y)
+    S = D + laws.secant_along(at, acts.shear) * acts.slips[:, None, None]
     along = delta - n * (n * delta).sum(axis=1)[:, None]
     slips = acts.slips
     assert 50 < slips.sum() < len(y)
@@ -145,7 +168,7 @@ def test_points_that_change_their_slip_are_noted():
 def test_nothing_acts_at_a_gap():
     body = contact.plane((0.0, 0.0), (0.0, 1.0))
     one = np.ones(2)
-    points = laws.Points(one, one, one > 0, np.zeros((2, 2)), 0 * one, one)
+    points = laws.Points(one, one, one > 0, np.zeros((2, 2)), 0 * one, one, np.zeros((2, 0)))
     acts, T = acting(contact.Coulomb(0.5), body, points, np.array([[0.3, 1e-9], [0.3, -1e-9]]))
     assert acts.inside.tolist() == [False, True]
     assert np.all(T[0] == 0.0) and T[1, 1] == 1e-9
@@ -154,8 +177,6 @@ def test_nothing_acts_at_a_gap():
 def test_a_point_that_touches_without_pressure_sticks():
     body = contact.plane((0.0, 0.0), (0.0, 1.0))
     one = np.ones(1)
-    points = laws.Points(one, one, one > 0, np.zeros((1, 2)), 0 * one, one)
-    y, H = np.zeros((1, 2)), np.zeros((1, 2, 2))
-    phi, n = body.distance(y)
-    D = laws.derivative(contact.Coulomb(0.5), points, y, phi, n, H, TOUCH)
+    points = laws.Points(one, one, one > 0, np.zeros((1, 2)), 0 * one, one, np.zeros((1, 0)))
+    D = derivative(contact.Coulomb(0.5), body, points, np.zeros((1, 2)))
     assert np.allclose(D[0], -np.eye(2))

@@ -185,7 +185,19 @@ def test_points_that_rub_across_a_kink_end_their_steps_on_the_facet_that_is_ther
     assert energies(history).max() < 1.0 + 1e-9 and account(history) < 1e-10
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.5])
+class Worn(contact.Friction):
+    """Friction that falls with the way that points have slipped."""
+
+    memory = (0.0,)
+
+    def bound(self, at):
+        return (0.3 + 0.2 * np.exp(-(at.memory[:, 0] + at.slip) / 0.01)) * at.pressure
+
+    def remember(self, at):
+        return at.memory + at.slip[:, None]
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5, Worn()])
 @pytest.mark.parametrize("what", ["rigid", "pair"])
 def test_tangent_is_the_derivative_of_the_forces(what, friction):
     if what == "rigid":
@@ -227,7 +239,7 @@ def colliding(friction=0.0, comm=WORLD, cells=(QUADRILATERAL, TRIANGLE), passes=
     return problem, touch
 
 
-@pytest.mark.parametrize(("friction", "passes"), [(0.0, 2), (0.0, 1), (0.3, 2)])
+@pytest.mark.parametrize(("friction", "passes"), [(0.0, 2), (0.0, 1), (0.3, 2), (Worn(), 2)])
 def test_bodies_that_collide_keep_momentum_and_energy(friction, passes):
     problem, touch = colliding(friction, passes=passes)
     momentum, turning = problem.momentum, problem.angular_momentum

@@ -426,23 +426,21 @@ def test_a_slit_in_one_body_does_not_close():
 
 
 class Half(contact.Coulomb):
-    """An heir of Coulomb's law with half the bound, which knows no other part of it."""
+    """Half the bound of Coulomb's law."""
 
-    def bound(self, p, stretch):
-        bound, slope = super().bound(p, stretch)
-        return 0.5 * bound, 0.5 * slope
+    def bound(self, at):
+        return 0.5 * super().bound(at)
 
 
-class Flat(contact.Coulomb):
-    """A law of a bound that is its own."""
+class Flat(contact.Friction):
+    """A law of a user's own that is Coulomb's."""
 
-    def bound(self, p, stretch):
-        pressed = p.real > 0.0
-        return np.where(pressed, 0.2 * p + 0.5 * stretch, 0.5 * stretch), 0.2 * pressed
+    def bound(self, at):
+        return 0.2 * at.pressure + 0.5 * at.stretch
 
 
 @pytest.mark.parametrize(
-    ("heir", "law", "passes"),
+    ("own", "law", "passes"),
     [
         (Half(0.4), contact.Coulomb(0.2), 2),
         (Half(0.4, 2.0, 12.0), contact.Coulomb(0.2, 1.0, 6.0), 2),
@@ -450,9 +448,9 @@ class Flat(contact.Coulomb):
         (Flat(), contact.Coulomb(0.2, 0.5), 1),
     ],
 )
-def test_an_heir_of_coulombs_law_has_its_own_bound(heir, law, passes):
+def test_a_law_of_a_users_own_holds_between_bodies(own, law, passes):
     found = []
-    for friction in (heir, law):
+    for friction in (own, law):
         problem, touch, path = two(friction=friction, passes=passes)
         problem.solver.setTolerances(rtol=1e-12)
         problem.solve(3, update=path)
@@ -461,8 +459,7 @@ def test_an_heir_of_coulombs_law_has_its_own_bound(heir, law, passes):
     np.testing.assert_allclose(found[0], found[1], rtol=1e-9)
 
 
-def test_an_heir_of_coulombs_law_holds_a_block_on_an_obstacle():
-    # (its coefficient is that of no friction)
+def test_a_law_of_a_users_own_holds_a_block_on_an_obstacle():
     problem, ground, force = on_plane(Flat())
     force.value[:] = (1.0, -10.0)
     problem.solve(2)

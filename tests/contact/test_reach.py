@@ -29,7 +29,7 @@ def at_rest(surface, shape, pose):
     gap = placed(shape, pose).distance(x.reshape(-1, shape.dim)).reshape(x.shape[:2])
     none = np.zeros(gap.shape, dtype=bool)
     outcome = Outcome(x, gap, 0.0 * gap, 0.0 * x, none, none)
-    return Memory(pose, none, x, gap, 0.0 * x, outcome)
+    return Memory(pose, none, x, gap, 0.0 * x, outcome, np.zeros((*gap.shape, 0)))
 
 
 @pytest.mark.parametrize("held", [False, True])

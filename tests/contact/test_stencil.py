@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """What acts between points and facets: compiled loops against NumPy and the complex step."""
 
-import inspect
-
 import numpy as np
 import pytest
+import rubbing
 
 import basix
 
 from mpm_dolfinx._core import loops
 from mpm_dolfinx.contact import stencil
-from mpm_dolfinx.contact.law import Coulomb, Points
+from mpm_dolfinx.contact.facets import solved
+from mpm_dolfinx.contact.law import Coulomb, Friction, Points, Separation
 
 TOUCH, EXTENT = 1e-12, 1.0
 SIDES = {
@@ -57,6 +57,7 @@ def meeting(side, law, count=60, pressed=False):
         np.zeros((count, 0)),
         some.uniform(-0.1, 0.1, count),
         some.uniform(0.8, 1.3, count),
+        np.zeros((count, 0)),
     )
     return stencil.Stencil(
         np.arange(count),
@@ -71,20 +72,49 @@ def meeting(side, law, count=60, pressed=False):
     )
 
 
+def by_numpy(law, points, z, behind=None):
+    """Return forces on points and nodes, ``(n, 1 + k, i)``, at real or complex positions."""
+    k = points.anchored.shape[1]
+    x, X = z[:, 0], z[:, 1 : 1 + k]
+    foot = stencil.projected(points.table, x, X, points.outward)
+    delta = np.zeros_like(x)
+    if not law.smooth:
+        delta = x - np.einsum("nk,nki->ni", points.anchored, z[:, 1 + k :])
+    behind = points.behind if behind is None else behind
+    at = Separation(foot.gap, foot.n, delta, TOUCH, behind)
+    acts = rubbing.traction(law, points.points, at)
+    shear, A = acts[1], foot.along
+    # the arm from the facet to the point turns with the facet
+    along = solved(A @ A.swapaxes(1, 2), np.einsum("nei,ni->ne", A, shear))
+    turn = foot.gap[:, None] * np.einsum("nek,ne->nk", foot.dN, along)
+    force = acts[0][:, None] * foot.n + shear
+    on_nodes = turn[:, :, None] * foot.n[:, None] - foot.N[:, :, None] * force[:, None]
+    return np.concatenate([force[:, None], on_nodes], axis=1), acts
+
+
+def by_complex_step(law, points):
+    """Return the derivatives of forces by positions, ``(n, 1 + k, i, z, j)``."""
+    count, dim = points.x.shape[1:]
+    D = np.zeros((len(points.x), 1 + points.anchored.shape[1], dim, count, dim))
+    for node in range(count):
+        for j in range(dim):
+            z = points.x.astype(complex)
+            z[:, node, j] += 1j * stencil.STEP
+            D[:, :, :, node, j] = by_numpy(law, points, z)[0].imag / stencil.STEP
+    return D
+
+
 @pytest.mark.parametrize("pressed", [False, True])
 @pytest.mark.parametrize("friction", FRICTION)
 @pytest.mark.parametrize("side", SIDES)
-def test_compiled_loops_do_what_numpy_and_the_complex_step_do(side, friction, pressed):
+def test_compiled_loops_do_what_numpy_does(side, friction, pressed):
     law = FRICTION[friction]
     points = meeting(side, law, pressed=pressed)
-    told = stencil.acting_now(law, points, TOUCH, EXTENT)
-    known = stencil.acting(law, points, points.x, TOUCH, EXTENT)
-    assert 10 < known.acts.inside.sum() < 50 and (law.smooth or known.acts.slips.any())
-    assert np.array_equal(told.acts.inside, known.acts.inside)
-    assert np.array_equal(told.acts.slips, known.acts.slips)
-    for found, value in zip(
-        (*told[:2], *told.acts[:2]), (*known[:2], *known.acts[:2]), strict=True
-    ):
+    pushes, rubs, told = stencil.acting(law, points, TOUCH, EXTENT)
+    force, known = by_numpy(law, points, points.x)
+    assert 10 < known[2].sum() < 50 and (law.smooth or known[3].any())
+    np.testing.assert_allclose(pushes + rubs, force, atol=1e-14)
+    for found, value in zip(told, known, strict=True):
         np.testing.assert_allclose(found, value, atol=1e-14)
 
 
@@ -119,7 +149,7 @@ def test_compiled_tangents_are_the_complex_steps_summed_up(side, friction, press
     points = meeting(side, law, pressed=pressed)
     found, known = sums(points), sums(points)
     stencil.add_tangents(law, points, TOUCH, EXTENT, found)
-    D = stencil.by_complex_step(law, points, TOUCH, EXTENT)
+    D = by_complex_step(law, points)
     add_by_numpy(D, known)
     scale = np.abs(known.values).max()
     assert scale > 1.0
@@ -137,11 +167,8 @@ def test_forces_grow_with_the_stress_behind_as_a_complex_step_says(side, frictio
     normals, forces = stencil.by_stress(law, points, TOUCH)
     assert 10 < forces.any(axis=(1, 2)).sum() < 50
     for i in range(normals.shape[1]):
-        tried = points._replace(
-            behind=points.behind + 1j * stencil.STEP * np.eye(len(normals[0]))[i]
-        )
-        pushes, rubs, _ = stencil.acting(law, tried, points.x, TOUCH, EXTENT)
-        slopes = (pushes + rubs).imag / stencil.STEP
+        behind = points.behind + 1j * stencil.STEP * np.eye(len(normals[0]))[i]
+        slopes = by_numpy(law, points, points.x, behind)[0].imag / stencil.STEP
         np.testing.assert_allclose(forces * normals[:, i, None, None], slopes, atol=1e-12)
 
 
@@ -153,14 +180,12 @@ def test_directions_of_complex_steps_are_the_same_one_by_one(monkeypatch, side):
     before = shape + 0.01 * np.random.default_rng(3).normal(size=shape.shape)
     gap, offset = points.points.gap, np.minimum(0.1 * points.points.gap, 0.0)
     whole = points._replace(start=stencil.Start(before, points.table, gap, offset))
-    for case in (points, whole):
-        found = stencil.by_complex_step(law, case, TOUCH, EXTENT)
-        with monkeypatch.context() as one_by_one:
-            one_by_one.setattr(stencil, "AT_ONCE", 1)
-            known = stencil.by_complex_step(law, case, TOUCH, EXTENT)
-        scale = np.abs(known).max()
-        assert scale > 0.1
-        np.testing.assert_allclose(found, known, atol=1e-13 * scale)
+    found = stencil.by_complex_step(law, whole, TOUCH, EXTENT)
+    monkeypatch.setattr(stencil, "AT_ONCE", 1)
+    known = stencil.by_complex_step(law, whole, TOUCH, EXTENT)
+    scale = np.abs(known).max()
+    assert scale > 0.1
+    np.testing.assert_allclose(found, known, atol=1e-13 * scale)
 
 
 def test_no_points_add_nothing():
@@ -184,15 +209,45 @@ def test_blocks_that_are_not_there_are_refused():
             stencil.add_tangents(law, points, TOUCH, EXTENT, wrong)
 
 
-def test_an_heir_that_overrides_anything_has_no_compiled_loops(monkeypatch):
-    monkeypatch.setattr(stencil, "loops", object())  # any use of which is an error
+class Own(Friction):
+    """Coulomb's law as a user writes it."""
+
+    def __init__(self, law):
+        self.law = law
+
+    def bound(self, at):
+        return np.minimum(
+            self.law.friction * at.pressure + self.law.cohesion * at.stretch,
+            self.law.limit * at.stretch,
+        )
+
+
+@pytest.mark.parametrize("pressed", [False, True])
+@pytest.mark.parametrize("friction", ["rough", "limited"])
+@pytest.mark.parametrize("side", SIDES)
+def test_a_law_of_a_user_does_what_the_compiled_one_does(side, friction, pressed):
+    law = FRICTION[friction]
+    points = meeting(side, law, pressed=pressed)
+    found, known = sums(points), sums(points)
+    for one, where in ((law, known), (Own(law), found)):
+        stencil.add_tangents(one, points, TOUCH, EXTENT, where)
+    tol = 1e-9 * np.abs(known.values).max()
+    np.testing.assert_allclose(found.values, known.values, atol=tol)
+    for one, other in zip(
+        stencil.acting(Own(law), points, TOUCH, EXTENT)[:2],
+        stencil.acting(law, points, TOUCH, EXTENT)[:2],
+        strict=True,
+    ):
+        np.testing.assert_allclose(one, other, atol=1e-14)
+
+
+def test_a_subclass_that_changes_the_bound_is_asked():
+    class Half(Coulomb):
+        def bound(self, at):
+            return 0.5 * super().bound(at)
+
     points = meeting("line", Coulomb(0.3))
-    new = type("New", (Coulomb,), {"colour": "red"})
-    for law in (Coulomb(0.3), new(0.3)):
-        with pytest.raises(AttributeError, match="act"):
-            stencil.acting_now(law, points, TOUCH, EXTENT)
-    names = [name for name in vars(Coulomb) if not name.startswith("__") and name != "_loop"]
-    assert {"bound", "smooth", "friction", "limit"} <= set(names)
-    for name in names:
-        heir = type("Heir", (Coulomb,), {name: inspect.getattr_static(Coulomb, name)})
-        stencil.acting_now(heir(0.3), points, TOUCH, EXTENT)
+    forces = [stencil.acting(law, points, TOUCH, EXTENT)[1] for law in (Half(0.6), Coulomb(0.3))]
+    assert forces[0].any()
+    np.testing.assert_allclose(*forces, atol=1e-14)
+    assert type("New", (Coulomb,), {"colour": "red"})(0.3).compiled and not Half(0.3).compiled
