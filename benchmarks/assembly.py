@@ -90,7 +90,9 @@ class Scene:
     def ufl(self) -> mpm.ParticleProblem:
         d = self.particles.displacement
         R = ufl.derivative(energy(d) * self.particles.dx, d)
-        return self.prepared(mpm.ParticleProblem(R, self.particles, petsc_options_prefix="ufl_"))
+        return self.prepared(
+            mpm.ParticleProblem(R, self.particles, solver=mpm.Solver(petsc_options_prefix="ufl_"))
+        )
 
     def injected_fem(self) -> Callable[[], None]:
         """Finite elements with a tangent given at the quadrature points."""

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What ``linear_solver="auto"`` chooses, and how long the other choice takes.
+"""What ``Solver(linear="auto")`` chooses, and how long the other choice takes.
 
 Scenes of all kinds, in space with few unknowns more than those from which on multigrid is chosen,
 where it gains least: bodies that weigh on rollers, slump, touch and move. Kinds of which it takes
@@ -101,13 +101,9 @@ def heavy(
         rule = 2 * degree
     particles = mpm.Particles(shape, V, method=method, degree=degree, quadrature_degree=rule)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        law,
-        density=1.0,
-        body_force=(*[0.0] * (dim - 1), -weight),
+        mpm.Body(particles, law, density=1.0, body_force=(*[0.0] * (dim - 1), -weight)),
         bcs=rollers(V, *[(axis, 0.0) for axis in range(dim)]),
-        linear_solver=solver,
-        **options,
+        solver=mpm.Solver(linear=solver, **options),
     )
     return problem, lambda: problem.solve(steps=steps)
 
@@ -141,7 +137,7 @@ def pressed(solver: str, n: int, friction: float) -> Made:
     base = mesh.locate_entities_boundary(V.mesh, 2, lambda x: np.isclose(x[2], 0.0))
     floor = fem.dirichletbc(np.zeros(3), fem.locate_dofs_topological(V, 2, base), V)
     problem = mpm.QuasiStaticProblem(
-        particles, ELASTIC, bcs=[floor], terms=[ball], linear_solver=solver
+        mpm.Body(particles, ELASTIC), bcs=[floor], terms=[ball], solver=mpm.Solver(linear=solver)
     )
 
     def path(t: float) -> None:
@@ -164,13 +160,13 @@ def stacked(solver: str, n: int, friction: float) -> Made:
     )
     walls = [(0, 0.0), (1, 0.0)]
     problem = mpm.QuasiStaticProblem(
-        bodies,
-        ELASTIC,
-        tractions=[[], [((0.0, 0.0, -5e4), 2)]],
-        facet_tags=tags,
+        [
+            mpm.Body(bodies[0], ELASTIC),
+            mpm.Body(bodies[1], ELASTIC, tractions=[((0.0, 0.0, -5e4), 2)], facet_tags=tags[1]),
+        ],
         bcs=[*rollers(lower, *walls, (2, 0.0)), *rollers(upper, *walls)],
         terms=[touch],
-        linear_solver=solver,
+        solver=mpm.Solver(linear=solver),
     )
     return problem, lambda: problem.solve(2)
 
@@ -181,12 +177,11 @@ def squeezed(solver: str, n: int) -> Made:
     V = fem.functionspace(grid, ("Lagrange", 1, (3,)))
     body = box([4.0, 4.0, 3.0], [4 * n // 3, 4 * n // 3, n], HEXAHEDRON)
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V),
-        ELASTIC,
-        pressures=[(2e5, 1)],
-        facet_tags=tagged(body, 2, 3.0),
+        mpm.Body(
+            mpm.Particles(body, V), ELASTIC, pressures=[(2e5, 1)], facet_tags=tagged(body, 2, 3.0)
+        ),
         bcs=rollers(V, (0, 0.0), (1, 0.0), (2, 0.0)),
-        linear_solver=solver,
+        solver=mpm.Solver(linear=solver),
     )
     return problem, lambda: problem.solve(2)
 
@@ -202,12 +197,9 @@ def held(solver: str, n: int) -> Made:
         tags = tagged(body, axis, 0.37)
         supports.append(mpm.boundary.roller(particles, tags, 1, -np.eye(3)[axis]))
     problem = mpm.QuasiStaticProblem(
-        particles,
-        PLASTIC,
-        density=1.0,
-        body_force=(0.0, 0.0, -8e3),
+        mpm.Body(particles, PLASTIC, density=1.0, body_force=(0.0, 0.0, -8e3)),
         supports=supports,
-        linear_solver=solver,
+        solver=mpm.Solver(linear=solver),
     )
     return problem, lambda: problem.solve(2)
 
@@ -216,13 +208,15 @@ def falling(solver: str, n: int) -> Made:
     """A block that hits a floor."""
     V = fem.functionspace(box([8.0] * 3, [2 * n] * 3, HEXAHEDRON), ("Lagrange", 1, (3,)))
     problem = mpm.DynamicProblem(
-        mpm.Particles(box([4.0] * 3, [2 * n] * 3, HEXAHEDRON), V),
-        PLASTIC,
-        2000.0,
-        velocity=lambda x: (0.0 * x[0], 0.0 * x[0], -2.0 * x[2] / 4.0),
-        body_force=(0.0, 0.0, -10.0),
+        mpm.Body(
+            mpm.Particles(box([4.0] * 3, [2 * n] * 3, HEXAHEDRON), V),
+            PLASTIC,
+            density=2000.0,
+            body_force=(0.0, 0.0, -10.0),
+            velocity=lambda x: (0.0 * x[0], 0.0 * x[0], -2.0 * x[2] / 4.0),
+        ),
         bcs=rollers(V, (0, 0.0), (1, 0.0), (2, 0.0)),
-        linear_solver=solver,
+        solver=mpm.Solver(linear=solver),
     )
     return problem, lambda: problem.solve(0.08, 0.02)
 

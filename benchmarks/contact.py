@@ -144,8 +144,7 @@ def obstacle(
             contact.move(tuple(WAY * t * np.eye(dim)[0] - DEPTH * t * up))
 
     problem = mpm.QuasiStaticProblem(
-        block,
-        mpm.materials.Hencky(YOUNG, POISSON),
+        mpm.Body(block, mpm.materials.Hencky(YOUNG, POISSON)),
         bcs=[held(V, np.zeros(dim), lambda x: x[dim - 1] < 1e-9)],
         terms=[contact],
     )
@@ -167,8 +166,7 @@ def pair(
     contact = mpm.contact.Pair(above, below, FRICTION)
     way = fem.Constant(spaces[0].mesh, np.zeros(dim))
     problem = mpm.QuasiStaticProblem(
-        [above, below],
-        mpm.materials.Hencky(YOUNG, POISSON),
+        [mpm.Body(p, mpm.materials.Hencky(YOUNG, POISSON)) for p in (above, below)],
         bcs=[
             held(spaces[0], way, lambda x: x[dim - 1] > 1.4 - 1e-9),
             held(spaces[1], np.zeros(dim), lambda x: x[dim - 1] < 1e-9),

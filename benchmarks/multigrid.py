@@ -41,14 +41,18 @@ def column(n: int, solver: str) -> mpm.QuasiStaticProblem:
     V = fem.functionspace(background, ("Lagrange", 1, (3,)))
     particles = mpm.Particles(box([4.0] * 3, [2 * n] * 3, HEXAHEDRON), V)
     return mpm.QuasiStaticProblem(
-        particles,
-        mpm.materials.VonMises(1e6, 0.3, rho_y=20e3),
-        density=2000.0,
-        body_force=(0.0, 0.0, -10.0),
+        mpm.Body(
+            particles,
+            mpm.materials.VonMises(1e6, 0.3, rho_y=20e3),
+            density=2000.0,
+            body_force=(0.0, 0.0, -10.0),
+        ),
         bcs=rollers(V, *PLANES),
-        stabilisation="ghost",
-        linear_solver="direct" if solver == "full" else solver,
-        petsc_options={"mat_mumps_icntl_35": 0} if solver == "full" else None,
+        solver=mpm.Solver(
+            petsc_options={"mat_mumps_icntl_35": 0} if solver == "full" else None,
+            stabilisation="ghost",
+            linear="direct" if solver == "full" else solver,
+        ),
     )
 
 
@@ -193,13 +197,15 @@ def squeezed(dim: int, n: int, law: mpm.materials.Material, solver: str) -> mpm.
     rule = None if dim == 2 else 4
     body = box([4.0] * dim, [n] * dim, domain)
     return mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, degree=2, quadrature_degree=rule),
-        law,
-        density=1.0,
-        body_force=(*[0.0] * (dim - 1), -8e3),
+        mpm.Body(
+            mpm.Particles(body, V, degree=2, quadrature_degree=rule),
+            law,
+            density=1.0,
+            body_force=(*[0.0] * (dim - 1), -8e3),
+        ),
         bcs=rollers(V, *PLANES[:dim]),
         mixed="pressure",
-        linear_solver=solver,
+        solver=mpm.Solver(linear=solver),
     )
 
 
@@ -216,15 +222,16 @@ def drained(n: int, solver: str) -> mpm.PorousProblem:
     markers = mesh.meshtags(body, 1, facets[order], tags[order])
     particles = mpm.Particles(body, V, degree=2, quadrature_degree=4)
     return mpm.PorousProblem(
-        particles,
-        mpm.materials.LinearElastic(1e3, 0.25),
-        1e-3,
+        mpm.Body(
+            particles,
+            mpm.materials.LinearElastic(1e3, 0.25),
+            tractions=[((0.0, -1.0), 1)],
+            facet_tags=markers,
+            pore_fluid=mpm.PoreFluid(1e-3, drained=[(0.0, 1)]),
+        ),
         bcs=rollers(V, (0, 0.0)),
         supports=[mpm.boundary.roller(particles, markers, 2, (0.0, -1.0))],
-        tractions=[((0.0, -1.0), 1)],
-        facet_tags=markers,
-        drained=[(0.0, 1)],
-        linear_solver=solver,
+        solver=mpm.Solver(linear=solver),
     )
 
 

@@ -87,11 +87,9 @@ def _column(
     body = kit.box(upper, [2, 2 * n], kit.DOMAINS[domain])
     particles = mpm.Particles(body, V, method=method, degree=degree)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        law,
-        body_force=(0.0, -weight),
+        mpm.Body(particles, law, body_force=(0.0, -weight)),
         bcs=rollers(V, (0, 0.0), (0, upper[0]), (1, 0.0)),
-        petsc_options_prefix="column_",
+        solver=mpm.Solver(petsc_options_prefix="column_"),
     )
     return particles, problem
 
@@ -165,11 +163,13 @@ def compaction_in_space(
     particles = mpm.Particles(body, V, method=method, degree=degree)
     sides = [(axis, place) for axis in (0, 1) for place in (0.0, width)]
     problem = mpm.QuasiStaticProblem(
-        particles,
-        mpm.materials.Hencky(COMPACTION_IN_SPACE["young"], COMPACTION_IN_SPACE["poisson"]),
-        body_force=(0.0, 0.0, -COMPACTION_IN_SPACE["weight"]),
+        mpm.Body(
+            particles,
+            mpm.materials.Hencky(COMPACTION_IN_SPACE["young"], COMPACTION_IN_SPACE["poisson"]),
+            body_force=(0.0, 0.0, -COMPACTION_IN_SPACE["weight"]),
+        ),
         bcs=rollers(V, *sides, (2, 0.0)),
-        petsc_options_prefix="column_",
+        solver=mpm.Solver(petsc_options_prefix="column_"),
     )
     return Scene(problem, steps, lambda: position_error(particles.displacement))
 
@@ -237,12 +237,9 @@ def column_free(
     rule = 2 if f_bar == "domain" else None
     particles = mpm.Particles(body, V, method=method, degree=degree, quadrature_degree=rule)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        free_law(),
-        body_force=(0.0, -weight),
+        mpm.Body(particles, free_law(), body_force=(0.0, -weight), f_bar=f_bar),
         bcs=rollers(V, (0, 0.0), (1, 0.0)),
-        petsc_options_prefix="collapse_",
-        f_bar=f_bar,
+        solver=mpm.Solver(petsc_options_prefix="collapse_"),
     )
 
     def measure() -> dict[str, float]:
@@ -270,12 +267,14 @@ def cantilever(
     body = beam(size, domain)
     particles = mpm.Particles(body, V, method=method, degree=degree)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        mpm.materials.Hencky(12e6, 0.2),
+        mpm.Body(
+            particles,
+            mpm.materials.Hencky(12e6, 0.2),
+            tractions=[((0.0, -100e3), 1)],
+            facet_tags=beam_end(body),
+        ),
         bcs=rollers(V, (0, 0.0)) + clamp(V),
-        tractions=[((0.0, -100e3), 1)],
-        facet_tags=beam_end(body),
-        petsc_options_prefix="cantilever_",
+        solver=mpm.Solver(petsc_options_prefix="cantilever_"),
     )
     return Scene(problem, steps, lambda: tip_error(particles.displacement))
 
@@ -347,13 +346,15 @@ def block(
         for i in range(3)
     ]
     problem = mpm.QuasiStaticProblem(
-        particles,
-        block_law(),
+        mpm.Body(
+            particles,
+            block_law(),
+            pressures=[(1e3 * BLOCK["young"] * above, 1)],
+            facet_tags=mesh.meshtags(body, 2, top, np.full(len(top), 1, dtype=np.int32)),
+            f_bar=f_bar,
+        ),
         bcs=rollers(V, (0, 0.0), (1, 0.0)) + plate,
-        pressures=[(1e3 * BLOCK["young"] * above, 1)],
-        facet_tags=mesh.meshtags(body, 2, top, np.full(len(top), 1, dtype=np.int32)),
-        petsc_options_prefix="block_",
-        f_bar=f_bar,
+        solver=mpm.Solver(petsc_options_prefix="block_"),
     )
 
     def update(t: float) -> None:
@@ -445,8 +446,7 @@ def hertz(
     base = mesh.locate_entities_boundary(V.mesh, 1, lambda x: np.isclose(x[1], y[0]))
     floor = fem.dirichletbc(np.zeros(2), fem.locate_dofs_topological(V, 1, base), V)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        mpm.materials.LinearElastic(HERTZ["young"], HERTZ["poisson"]),
+        mpm.Body(particles, mpm.materials.LinearElastic(HERTZ["young"], HERTZ["poisson"])),
         bcs=[*rollers(V, (0, 0.0)), floor],
         terms=[die],
     )

@@ -35,7 +35,8 @@ def heavy(
         body = _compat.disconnected_mesh(MPI.COMM_WORLD, corners, body.basix_cell())
     particles = mpm.Particles(body, V)
     bcs = rollers(V, (0, 0.0), (0, 1.0), (1, 0.0))
-    return mpm.QuasiStaticProblem(particles, law, body_force=(0.0, -weight), bcs=bcs, **options)
+    heap = mpm.Body(particles, law, body_force=(0.0, -weight))
+    return mpm.QuasiStaticProblem(heap, bcs, solver=mpm.Solver(**options))
 
 
 class InPython(mpm.materials.Hencky):

@@ -70,7 +70,9 @@ def problem(
     V = fem.functionspace(background, ("Lagrange", 1, (dim,)))
     force = (*[0.0] * (dim - 1), -weight)
     return mpm.QuasiStaticProblem(
-        mpm.Particles(body, V), law, body_force=force, bcs=rollers(V, *planes), **options
+        mpm.Body(mpm.Particles(body, V), law, body_force=force),
+        bcs=rollers(V, *planes),
+        solver=mpm.Solver(**options),
     )
 
 

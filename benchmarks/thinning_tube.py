@@ -47,13 +47,15 @@ def tube(h, layers, offset, f_bar, degree, poisson=0.49, young=100.0):
     tags = mesh.meshtags(body, 1, np.sort(facets), np.ones(len(facets), dtype=np.int32))
     particles = mpm.Particles(body, V, degree=degree, quadrature_degree=2 if degree == 1 else None)
     return mpm.QuasiStaticProblem(
-        particles,
-        mpm.materials.VonMises(young, poisson, yield_stress=1.0),
+        mpm.Body(
+            particles,
+            mpm.materials.VonMises(young, poisson, yield_stress=1.0),
+            pressures=[(1.0, 1)],
+            facet_tags=tags,
+            f_bar=f_bar,
+        ),
         bcs=[fem.dirichletbc(fem.Function(axial), everywhere, V.sub(1))],
-        pressures=[(1.0, 1)],
-        facet_tags=tags,
         axisymmetric=True,
-        f_bar=f_bar,
     )
 
 

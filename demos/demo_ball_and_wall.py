@@ -59,9 +59,10 @@ bodies = [
 grounds = [mpm.contact.Rigid(body, ground, friction) for body in bodies]
 meet = (1, 3), (2, 3), (0, 1), (0, 2), (0, 3)
 pairs = [mpm.contact.Pair(bodies[i], bodies[j], friction, passes=1) for i, j in meet]
-motion = {"scheme": "conserving", "rayleigh": (0.0, 1e-3), "body_force": (0.0, 0.0, -gravity)}
 rubber, contacts = mpm.materials.Hencky(5e5, 0.3), [*grounds, *pairs]
-problem = mpm.DynamicProblem(bodies, rubber, density, terms=contacts, **motion)
+weight = {"density": density, "body_force": (0.0, 0.0, -gravity)}
+heavy = [mpm.Body(body, rubber, **weight) for body in bodies]
+problem = mpm.DynamicProblem(heavy, terms=contacts, scheme="conserving", rayleigh=(0.0, 1e-3))
 
 mass = density * comm.allreduce(bodies[0].initial_volume.sum())
 rows, shapes, pushed, rolls = [], [], [0.0], []

@@ -67,12 +67,14 @@ tags = mesh.meshtags(body, 2, np.sort(top), np.full(len(top), TOP, dtype=np.int3
 plane = fem.Constant(body, 1.0)
 above = ufl.SpatialCoordinate(body)[2] + particles.displacement[2] - plane
 problem = mpm.QuasiStaticProblem(
-    particles,
-    mpm.materials.VonMises(young, poisson, yield_stress=yield_stress),
+    mpm.Body(
+        particles,
+        mpm.materials.VonMises(young, poisson, yield_stress=yield_stress),
+        pressures=[(stiffness * above, TOP)],
+        facet_tags=tags,
+        f_bar="patch",
+    ),
     bcs=[held(0, 0), held(1, 1), plate, held(0, 2), held(1, 2)],
-    pressures=[(stiffness * above, TOP)],
-    facet_tags=tags,
-    f_bar="patch",
 )
 
 # Loads are multiplied by `particles.load`; a path sets it to one if the load's size is its own

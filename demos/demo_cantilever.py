@@ -60,11 +60,13 @@ clamp = fem.dirichletbc(np.zeros(2), fem.locate_dofs_topological(V, 1, side), V)
 
 particles = mpm.Particles(body, V)
 problem = mpm.QuasiStaticProblem(
-    particles,
-    mpm.materials.Hencky(young, poisson),
+    mpm.Body(
+        particles,
+        mpm.materials.Hencky(young, poisson),
+        tractions=[((0.0, -load / depth), 1)],
+        facet_tags=tags,
+    ),
     bcs=[clamp],
-    tractions=[((0.0, -load / depth), 1)],
-    facet_tags=tags,
 )
 
 X = particles.W.tabulate_dof_coordinates()[: particles.W.dofmap.index_map.size_local, :2]

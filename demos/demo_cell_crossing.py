@@ -70,7 +70,7 @@ def bar(**options):
         bcs.append(fem.dirichletbc(0.0, dofs, V.sub(i)))
     particles = mpm.Particles(body, V, **options)
     law = mpm.materials.Hencky(young, 0.0)
-    return mpm.QuasiStaticProblem(particles, law, body_force=(g0, 0.0), bcs=bcs)
+    return mpm.QuasiStaticProblem(mpm.Body(particles, law, body_force=(g0, 0.0)), bcs=bcs)
 
 
 def total(values):

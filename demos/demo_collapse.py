@@ -68,10 +68,12 @@ for axis in (0, 1):
 
 particles = mpm.Particles(body, V)
 problem = mpm.QuasiStaticProblem(
-    particles,
-    mpm.materials.VonMises(young, poisson, rho_y=rho_y),
-    density=density,
-    body_force=(0.0, -gravity),
+    mpm.Body(
+        particles,
+        mpm.materials.VonMises(young, poisson, rho_y=rho_y),
+        density=density,
+        body_force=(0.0, -gravity),
+    ),
     bcs=bcs,
 )
 

@@ -103,9 +103,7 @@ for axis in (0, 1):
 
 particles = mpm.Particles(body, V)
 problem = mpm.QuasiStaticProblem(
-    particles,
-    mpm.materials.VonMises(young, poisson, rho_y=rho_y),
-    body_force=(0.0, -g0),  # with a density of 1
+    mpm.Body(particles, mpm.materials.VonMises(young, poisson, rho_y=rho_y), body_force=(0.0, -g0)),
     bcs=bcs,
 )
 

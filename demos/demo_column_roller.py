@@ -69,10 +69,12 @@ for axis, places in ((0, (0.0, width)), (1, (0.0,))):
 
 particles = mpm.Particles(body, V)
 problem = mpm.QuasiStaticProblem(
-    particles,
-    mpm.materials.VonMises(young, poisson, rho_y=rho_y),
-    density=density,
-    body_force=(0.0, -gravity),
+    mpm.Body(
+        particles,
+        mpm.materials.VonMises(young, poisson, rho_y=rho_y),
+        density=density,
+        body_force=(0.0, -gravity),
+    ),
     bcs=bcs,
 )
 

@@ -81,10 +81,12 @@ def run(elements):
         bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
     particles = mpm.Particles(body, V)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        mpm.materials.Hencky(young, poisson),
-        density=density,
-        body_force=(0.0, -gravity),
+        mpm.Body(
+            particles,
+            mpm.materials.Hencky(young, poisson),
+            density=density,
+            body_force=(0.0, -gravity),
+        ),
         bcs=bcs,
     )
     problem.solve(steps=40)

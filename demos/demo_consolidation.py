@@ -63,8 +63,9 @@ particles, tags = ground()
 bcs = [held(0, 0, 0, WIDTH), held(0, 1, 0), held(1, 1, 0)]
 clay = mpm.materials.Hencky(YOUNG, POISSON)
 q = fem.Constant(particles.mesh, (0.0, 0.0))
-given = {"bcs": bcs, "tractions": [(q, 1)], "facet_tags": tags, "drained": [(0.0, 1), (0.0, 2)]}
-problem = mpm.PorousProblem(particles, clay, lambda J: PERMEABILITY * J**4, **given)
+water = mpm.PoreFluid(lambda J: PERMEABILITY * J**4, drained=[(0.0, 1), (0.0, 2)])
+wet = mpm.Body(particles, clay, tractions=[(q, 1)], facet_tags=tags, pore_fluid=water)
+problem = mpm.PorousProblem(wet, bcs)
 pressure = problem.pore_pressure[0]
 
 
@@ -97,8 +98,8 @@ time, settled, heaved, most = np.array(rows).T
 # Without water the clay settles at once by what it does with it in the end.
 
 dry, dry_tags = ground()
-given = {"bcs": bcs, "tractions": [((0.0, -LOAD), 1)], "facet_tags": dry_tags}
-mpm.QuasiStaticProblem(dry, clay, **given).solve(steps=4)
+loaded = mpm.Body(dry, clay, tractions=[((0.0, -LOAD), 1)], facet_tags=dry_tags)
+mpm.QuasiStaticProblem(loaded, bcs).solve(steps=4)
 drained = largest(dry.initial_centroid[:, 1] - dry.centroid[:, 1])
 
 if comm.rank == 0:

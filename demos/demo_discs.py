@@ -67,15 +67,15 @@ def draw(ax, problem, t):
 
 def collide(scheme, draws):
     """Let the discs collide; return the problem."""
-    bodies = [mpm.Particles(disc(c), V, quadrature_degree=3) for c in ((0.2, 0.2), (0.8, 0.8))]
+    rubber, bodies = mpm.materials.Hencky(1000.0, 0.3), []
+    for centre, way in (((0.2, 0.2), speed), ((0.8, 0.8), -speed)):
+        particles = mpm.Particles(disc(centre), V, quadrature_degree=3)
+        bodies.append(mpm.Body(particles, rubber, density=1000.0, velocity=(way, way)))
     problem = mpm.DynamicProblem(
         bodies,
-        mpm.materials.Hencky(1000.0, 0.3),
-        density=1000.0,
-        velocity=[(speed, speed), (-speed, -speed)],
         scheme=scheme,
         out_of_range="reflect",
-        petsc_options={"snes_rtol": 1e-12},
+        solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
     )
     if draws:
         draw(axes[0], problem, 0.0)

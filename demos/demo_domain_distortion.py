@@ -71,7 +71,7 @@ def moved(method):
     value = fem.Function(V)
     every = np.arange(V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts)
     bc = fem.dirichletbc(value, every.astype(np.int32))
-    problem = mpm.QuasiStaticProblem(particles, mpm.materials.Hencky(1.0, 0.3), bcs=[bc])
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, mpm.materials.Hencky(1.0, 0.3)), bcs=[bc])
     x = V.tabulate_dof_coordinates()[:, :2]
     total, last = np.zeros_like(value.x.array), 0.0
 

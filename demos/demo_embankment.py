@@ -62,12 +62,14 @@ ground = mpm.Particles(
 clay = mpm.materials.Tresca(5e6, 0.45, cohesion=12e3)
 fill = mpm.materials.MohrCoulomb(2e7, 0.3, cohesion=5e3, friction_angle=33.0)
 problem = mpm.QuasiStaticProblem(
-    ground,
-    clay,
-    density=CLAY,
-    body_force=GRAVITY,
+    mpm.Body(
+        ground,
+        clay,
+        density=CLAY,
+        body_force=GRAVITY,
+        initial_stress=mpm.geostatic(DEPTH, CLAY, 0.9, GRAVITY),
+    ),
     bcs=bcs,
-    initial_stress=mpm.geostatic(DEPTH, CLAY, 0.9, GRAVITY),
 )
 problem.solve()  # in equilibrium as it is
 
@@ -96,7 +98,8 @@ def profile():
 
 profiles, rows = [], []
 for number in range(LIFTS):
-    problem.add(lift(number), fill, density=FILL, body_force=GRAVITY, name=f"lift {number + 1}")
+    heap = mpm.Body(lift(number), fill, density=FILL, body_force=GRAVITY)
+    problem.add(heap, name=f"lift {number + 1}")
     problem.solve(2)
     x, way = profile()
     down = -comm.allreduce(way.min(initial=0.0), MPI.MIN)

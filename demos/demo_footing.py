@@ -123,14 +123,16 @@ tags = mesh.meshtags(body, 1, np.sort(under), np.full(len(under), 1, np.int32))
 footing = mpm.boundary.roller(particles, tags, 1, normal=(0.0, -1.0), value=settlement)
 
 problem = mpm.QuasiStaticProblem(
-    particles,
-    mpm.materials.VonMises(young, poisson, rho_y=np.sqrt(2.0) * cohesion),
+    mpm.Body(
+        particles,
+        mpm.materials.VonMises(young, poisson, rho_y=np.sqrt(2.0) * cohesion),
+        f_bar="patch",
+    ),
     bcs=[
         held(0, lambda x: np.isclose(x[0], 0.0) | np.isclose(x[0], size)),
         held(1, lambda x: np.isclose(x[1], 0.0)),
     ],
     supports=[footing],
-    f_bar="patch",
 )
 
 # The Dirichlet values are totals at full load, so the load factor is the share of the settlement.

@@ -115,11 +115,13 @@ clamp = fem.dirichletbc(np.zeros(2), held, V)
 
 particles = mpm.Particles(body, V)
 problem = mpm.QuasiStaticProblem(
-    particles,
-    {PLATE: mpm.materials.Hencky(1e6, 0.3), RINGS: mpm.materials.Hencky(10e6, 0.3)},
-    cell_tags=parts,
-    tractions=[((0.0, traction), END)],
-    facet_tags=edges,
+    mpm.Body(
+        particles,
+        {PLATE: mpm.materials.Hencky(1e6, 0.3), RINGS: mpm.materials.Hencky(10e6, 0.3)},
+        tractions=[((0.0, traction), END)],
+        cell_tags=parts,
+        facet_tags=edges,
+    ),
     bcs=[clamp],
 )
 

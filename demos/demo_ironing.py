@@ -71,9 +71,10 @@ touch = mpm.contact.Pair(a, b, friction)
 top, base = tagged(die, 1.0), tagged(block, 0.0)
 position = fem.Constant(die, (0.0, 0.0))
 problem = mpm.QuasiStaticProblem(
-    [a, b],
-    mpm.materials.Hencky(1e3, 0.3),
-    facet_tags=[top, base],
+    [
+        mpm.Body(a, mpm.materials.Hencky(1e3, 0.3), facet_tags=top),
+        mpm.Body(b, mpm.materials.Hencky(1e3, 0.3), facet_tags=base),
+    ],
     supports=[mpm.boundary.fixed(a, top, 1, value=position), mpm.boundary.fixed(b, base, 1)],
     terms=[touch],
 )

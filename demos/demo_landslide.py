@@ -74,11 +74,10 @@ particles = mpm.Particles(slab, V, quadrature_degree=2)
 
 base = mpm.contact.Rigid(particles, ground, friction)
 problem = mpm.DynamicProblem(
-    particles,
-    mpm.materials.Hencky(2e3, 0.3),
-    density=2.0,
+    mpm.Body(
+        particles, mpm.materials.Hencky(2e3, 0.3), density=2.0, body_force=(0.0, 0.0, -gravity)
+    ),
     scheme="conserving",
-    body_force=(0.0, 0.0, -gravity),
     terms=[base],
 )
 

@@ -83,15 +83,17 @@ look = {"facet_tags": tags, "tag": 1, "axisymmetric": True, "modulus": 4 * G}
 adheres = mpm.contact.Coulomb(cohesion=adhesion)
 pile = mpm.contact.Rigid(clay, steel, adheres, tangential_penalty=0.1, **look)
 problem = mpm.QuasiStaticProblem(
-    clay,
-    mpm.materials.VonMises(2 * G * (1 + nu), nu, rho_y=np.sqrt(2.0) * c),
-    density=density,
-    body_force=gravity,
+    mpm.Body(
+        clay,
+        mpm.materials.VonMises(2 * G * (1 + nu), nu, rho_y=np.sqrt(2.0) * c),
+        density=density,
+        body_force=gravity,
+        f_bar="patch",
+        initial_stress=mpm.geostatic(0.0, density, 1.0, gravity),
+    ),
     bcs=bcs,
     terms=[pile, mpm.contact.Rigid(clay, rod, **look)],
     axisymmetric=True,
-    f_bar="patch",
-    initial_stress=mpm.geostatic(0.0, density, 1.0, gravity),
 )
 
 

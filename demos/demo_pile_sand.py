@@ -94,7 +94,7 @@ def tagged(particles, where):
     return mesh.meshtags(particles.mesh, 1, facets, np.full(len(facets), 1, np.int32))
 
 
-soil = {"axisymmetric": True, "f_bar": "domain", "initial_stress": -p0 * np.eye(3)}
+soil = {"material": sand, "f_bar": "domain", "initial_stress": -p0 * np.eye(3)}
 
 # ### A hole is widened
 #
@@ -104,7 +104,7 @@ ring, bcs = body(lines(8), np.array([0.0, h]), [])
 wall = tagged(ring, lambda x: np.isclose(x[0], a0))
 wide = fem.Constant(ring.mesh, 0.0)
 held = mpm.boundary.roller(ring, wall, 1, normal=(-1.0, 0.0), value=wide)
-problem = mpm.QuasiStaticProblem(ring, sand, bcs=bcs, supports=[held], **soil)
+problem = mpm.QuasiStaticProblem(mpm.Body(ring, **soil), bcs, supports=[held], axisymmetric=True)
 problem.solve(1)
 hole = []
 for _ in problem.steps(20, update=lambda t: setattr(wide, "value", (a0 - R) * t)):
@@ -127,7 +127,10 @@ look = {"facet_tags": free, "tag": 1, "axisymmetric": True, "modulus": E}
 guide = mpm.contact.Rigid(ground, mpm.contact.box((-a0, -40.0), (a0, 40.0)), **look)
 pile = mpm.contact.Rigid(ground, mpm.contact.polygon(outline, radius=0.4 * R), **look)
 problem = mpm.QuasiStaticProblem(
-    ground, sand, bcs=bcs, pressures=[(p0, 1)], facet_tags=top, terms=[pile, guide], **soil
+    mpm.Body(ground, pressures=[(p0, 1)], facet_tags=top, **soil),
+    bcs,
+    terms=[pile, guide],
+    axisymmetric=True,
 )
 problem.solve(1)
 rows = []

@@ -70,13 +70,15 @@ def pressed(friction):
     circle = mpm.contact.disc((0.0, diameter / 2), diameter / 2)
     pipe = mpm.contact.Rigid(clay, circle, friction, tangential_penalty=0.1)
     problem = mpm.QuasiStaticProblem(
-        clay,
-        mpm.materials.VonMises(500.0 * strength, 0.45, rho_y=np.sqrt(2.0) * strength),
+        mpm.Body(
+            clay,
+            mpm.materials.VonMises(500.0 * strength, 0.45, rho_y=np.sqrt(2.0) * strength),
+            f_bar="patch",
+        ),
         bcs=[
             held(0, lambda x: np.isclose(x[0], 0.0) | np.isclose(x[0], 3.0)),
             held(1, lambda x: np.isclose(x[1], -2.0)),
         ],
-        f_bar="patch",
         terms=[pipe],
     )
     path = []

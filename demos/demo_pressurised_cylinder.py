@@ -59,11 +59,13 @@ def problem_of(background, body, held, radius, axisymmetric):
         bcs.append(fem.dirichletbc(0.0, dofs, V.sub(component)))
     inner = mesh.locate_entities_boundary(body, 1, lambda x: np.isclose(radius(x), a))
     return mpm.QuasiStaticProblem(
-        mpm.Particles(body, V),
-        mpm.materials.Hencky(young, poisson),
+        mpm.Body(
+            mpm.Particles(body, V),
+            mpm.materials.Hencky(young, poisson),
+            pressures=[(pressure, INNER)],
+            facet_tags=mesh.meshtags(body, 1, np.sort(inner), np.full(len(inner), INNER, np.int32)),
+        ),
         bcs=bcs,
-        pressures=[(pressure, INNER)],
-        facet_tags=mesh.meshtags(body, 1, np.sort(inner), np.full(len(inner), INNER, np.int32)),
         axisymmetric=axisymmetric,
     )
 

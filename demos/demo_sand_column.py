@@ -69,14 +69,16 @@ particles = mpm.Particles(body, V)
 
 sand = mpm.materials.MuIRheology(young, poisson, friction, friction + 0.26, grain, grain_density)
 problem = mpm.DynamicProblem(
-    particles,
-    sand,
-    density=density,
-    body_force=gravity,
+    mpm.Body(
+        particles,
+        sand,
+        density=density,
+        body_force=gravity,
+        initial_stress=mpm.geostatic(a * r0, density, 0.5, gravity),
+    ),
     bcs=bcs,
     scheme="euler",
     rayleigh=(0.0, 3e-6),
-    initial_stress=mpm.geostatic(a * r0, density, 0.5, gravity),
 )
 
 X = particles.W.tabulate_dof_coordinates()[:, 0]

@@ -56,15 +56,17 @@ laws = [
     mpm.materials.Hencky(2.6 * shear_rock, 0.3),
     mpm.materials.VonMises(2.6 * shear_clay, 0.3, rho_y=np.sqrt(2.0) * strength),
 ]
-densities, weight = [rho_rock, rho_clay], (0.0, -gravity)
+weight = (0.0, -gravity)
+embankment = mpm.Body(bodies[1], laws[1], density=rho_clay, body_force=weight)
 
 base = np.sort(mesh.locate_entities_boundary(rock, 1, lambda x: np.isclose(x[1], 1.0)))
 tags = mesh.meshtags(rock, 1, base, np.full(len(base), 1, dtype=np.int32))
 
 # Equilibrium first, on a base that is held. The last steps are under constant load.
 
+bedrock = mpm.Body(bodies[0], laws[0], density=rho_rock, body_force=weight)
 held = mpm.boundary.fixed(bodies[0], tags, 1)
-static = mpm.QuasiStaticProblem(bodies, laws, densities, weight, supports=[held])
+static = mpm.QuasiStaticProblem([bedrock, embankment], supports=[held])
 static.solve(steps=5)
 static.step()
 static.step()
@@ -78,12 +80,7 @@ supports = [
     mpm.boundary.dashpot(bodies[0], tags, 1, 0.0, resistance),
 ]
 problem = mpm.DynamicProblem(
-    bodies,
-    laws,
-    densities,
-    body_force=weight,
-    tractions=[[(wave, 1)], []],
-    facet_tags=[tags, None],
+    [bedrock.replace(tractions=[(wave, 1)], facet_tags=tags), embankment],
     supports=supports,
     after=static,
 )

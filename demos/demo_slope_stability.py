@@ -68,8 +68,8 @@ def slope(seam):
     silt = mpm.materials.MohrCoulomb(YOUNG, 0.3, cohesion=12e3, friction_angle=22.0)
     clay = mpm.materials.MohrCoulomb(YOUNG, 0.3, cohesion=8e3, friction_angle=8.0)
     soils = {SILT: silt, SEAM: clay if seam else silt}
-    options = {"density": DENSITY, "body_force": GRAVITY, "bcs": bcs, "cell_tags": layers}
-    problem = mpm.QuasiStaticProblem(mpm.Particles(body, V), soils, **options)
+    particles, weight = mpm.Particles(body, V), {"density": DENSITY, "body_force": GRAVITY}
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, soils, cell_tags=layers, **weight), bcs)
     problem.solve(2)
     return problem
 

@@ -56,10 +56,10 @@ for axis in (0, 1):
 
 
 def column():
-    """The body, and all that it needs in a problem."""
+    """The body under its weight."""
     body = mesh.create_rectangle(comm, [[0.0, 0.0], [4.0, 8.0]], [16, 32], quadrilateral)
     law = mpm.materials.VonMises(young, poisson, rho_y=rho_y)
-    return mpm.Particles(body, V), law, {"density": density, "body_force": (0.0, -gravity)}
+    return mpm.Body(mpm.Particles(body, V), law, density=density, body_force=(0.0, -gravity))
 
 
 def toe(particles):
@@ -69,19 +69,19 @@ def toe(particles):
 
 # In equilibrium the weight grows slowly; in motion it acts at once.
 
-still, law, options = column()
-mpm.QuasiStaticProblem(still, law, bcs=bcs, **options).solve(steps=40)
+still = column()
+mpm.QuasiStaticProblem(still, bcs).solve(steps=40)
 
-moving, law, options = column()
-problem = mpm.DynamicProblem(moving, law, bcs=bcs, scheme="conserving", **options)
+moving = column()
+problem = mpm.DynamicProblem(moving, bcs, scheme="conserving")
 times, toes = [0.0], [4.0]
 for step in problem.steps(end, dt):
     times.append(step.time)
-    toes.append(toe(moving))
+    toes.append(toe(moving.particles))
 
 # ## Result
 
-energies, rest = problem.history.energies, toe(still)
+energies, rest = problem.history.energies, toe(still.particles)
 last = energies[-1]
 largest = max(energy.kinetic for energy in energies)
 drift = max(abs(energy.balance - energies[0].balance) for energy in energies) / largest

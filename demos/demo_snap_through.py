@@ -84,11 +84,13 @@ def held(component, place):
 
 particles = mpm.Particles(body, V, degree=2)
 problem = mpm.QuasiStaticProblem(
-    particles,
-    mpm.materials.Hencky(young, poisson),
+    mpm.Body(
+        particles,
+        mpm.materials.Hencky(young, poisson),
+        tractions=[((0.0, -pressure), 1)],
+        facet_tags=tags,
+    ),
     bcs=[held(0, 0.0), held(1, 0.0), held(0, half)],
-    tractions=[((0.0, -pressure), 1)],
-    facet_tags=tags,
 )
 
 # What is controlled is the way of a point of the body, which need not be a node.

@@ -70,16 +70,18 @@ base_x, base_y = (held(i, lambda x: np.isclose(x[1], 0)) for i in (0, 1))
 q = fem.Constant(body, (0.0, 0.0))
 particles = mpm.Particles(body, V)
 problem = mpm.QuasiStaticProblem(
-    particles,
-    {
-        SOFT: mpm.materials.VonMises(1e7, 0.4, yield_stress=30e3),
-        STIFF: mpm.materials.VonMises(3e7, 0.3, yield_stress=70e3),
-    },
-    density=density,
-    body_force=(0.0, -GRAVITY),
-    tractions=[(q, CREST)],
-    cell_tags=layers,
-    facet_tags=strip,
+    mpm.Body(
+        particles,
+        {
+            SOFT: mpm.materials.VonMises(1e7, 0.4, yield_stress=30e3),
+            STIFF: mpm.materials.VonMises(3e7, 0.3, yield_stress=70e3),
+        },
+        density=density,
+        body_force=(0.0, -GRAVITY),
+        tractions=[(q, CREST)],
+        cell_tags=layers,
+        facet_tags=strip,
+    ),
     bcs=[side, base_x, base_y],
 )
 

@@ -42,7 +42,7 @@ floor = fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(1), 1, base), V.s
 
 clay = mpm.materials.VonMises(young=1e6, poisson=0.3, yield_stress=20e3)
 problem = mpm.QuasiStaticProblem(
-    particles, clay, density=1800.0, body_force=(0.0, -9.81), bcs=[roller, floor]
+    mpm.Body(particles, clay, density=1800.0, body_force=(0.0, -9.81)), bcs=[roller, floor]
 )
 problem.solve(steps=20)
 

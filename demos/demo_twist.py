@@ -56,8 +56,7 @@ x, y, _ = ufl.SpatialCoordinate(body)
 turned = [ufl.cos(theta) * x - ufl.sin(theta) * y, ufl.sin(theta) * x + ufl.cos(theta) * y]
 turn = ufl.as_vector([turned[0] - x, turned[1] - y, 0.0])
 problem = mpm.QuasiStaticProblem(
-    particles,
-    mpm.materials.Hencky(YOUNG, POISSON),
+    mpm.Body(particles, mpm.materials.Hencky(YOUNG, POISSON)),
     supports=[
         mpm.boundary.fixed(particles, tagged, LOWER),
         mpm.boundary.fixed(particles, tagged, UPPER, value=turn),

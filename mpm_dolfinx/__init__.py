@@ -15,13 +15,16 @@ from .errors import (  # noqa: E402
     ParticleOutsideError,
 )
 from .history import Energy, History, Loss, Stage, Statistics, Step  # noqa: E402
+from .meshes.regions import cell_tags, facet_tags, held, region  # noqa: E402
 from .particles.field import ParticleField  # noqa: E402
 from .particles.particles import Particles  # noqa: E402
+from .problems.body import Body, PoreFluid  # noqa: E402
 from .problems.dynamic import DynamicParticleProblem, DynamicProblem  # noqa: E402
 from .problems.initial_stress import geostatic  # noqa: E402
 from .problems.particle_problem import ParticleProblem  # noqa: E402
 from .problems.porous import PorousProblem  # noqa: E402
 from .problems.quasistatic import QuasiStaticProblem  # noqa: E402
+from .problems.solver import Solver  # noqa: E402
 from .problems.strength import StrengthReduction, strength_reduction  # noqa: E402
 from .stepping.displacement_control import DisplacementControl  # noqa: E402
 from .system.coupling import Tie  # noqa: E402
@@ -33,6 +36,7 @@ __version__ = "0.2.0"
 
 __all__ = [
     "AveragedVolumeRatio",
+    "Body",
     "ConvergenceError",
     "DisplacementControl",
     "DomainDistortionError",
@@ -47,10 +51,12 @@ __all__ = [
     "ParticleOutsideError",
     "ParticleProblem",
     "Particles",
+    "PoreFluid",
     "PorousProblem",
     "QuasiStaticProblem",
     "Rates",
     "Scheme",
+    "Solver",
     "Stage",
     "Statistics",
     "Step",
@@ -60,10 +66,14 @@ __all__ = [
     "Weights",
     "__version__",
     "boundary",
+    "cell_tags",
     "contact",
+    "facet_tags",
     "geostatic",
+    "held",
     "materials",
     "plot",
+    "region",
     "strength_reduction",
 ]
 

@@ -19,7 +19,6 @@ COUNTERS = (
     "transfers",
     "patterns",
     "free_dofs",
-    "dependent_dofs",
     "off_rank_rows",
     "off_rank_columns",
     "particle_imbalance",
@@ -57,8 +56,7 @@ class Statistics(dict[str, float]):
     The phases, which do not overlap, are ``locate``, ``transfer``, ``constitutive``,
     ``assemble``, ``factorise``, ``solve`` and ``commit``. Counters are ``transfers`` (how often
     the transfer was rebuilt), ``patterns`` (how often the sparsity of the reduced tangent was),
-    ``free_dofs`` (unknowns of the last step), ``dependent_dofs`` (the most that a step took from
-    them, with ``dependent_dofs="remove"``), ``off_rank_rows``
+    ``free_dofs`` (unknowns of the last step), ``off_rank_rows``
     (share of the bodies' nodes that move with an unknown of another rank, in the last step) and
     ``off_rank_columns`` (unknowns that ranks need of others for a product with T, 8 bytes each),
     ``particle_imbalance`` and ``dof_imbalance`` (largest number on a rank over the mean),

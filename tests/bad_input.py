@@ -4,6 +4,7 @@
 
 import numpy as np
 import scenes
+from posed import posed
 from scenes import QUADRILATERAL, TRIANGLE
 
 from dolfinx import fem
@@ -38,7 +39,7 @@ def problem(material=None, **options):
         more = {k: f(p) if callable(f) else f for k, f in options.items()}
         law = material(p) if callable(material) else material
         law = Hencky(1e3, 0.3) if law is None else law
-        return mpm.QuasiStaticProblem(p, law, **more)
+        return posed(mpm.QuasiStaticProblem, p, law, **more)
 
     return build
 
@@ -59,7 +60,7 @@ def held(kind, **options):
         make = getattr(mpm.boundary, kind)
         more = {"facet_tags": tags_of_facets(p), "tag": 1}
         more |= {k: f(p) if callable(f) else f for k, f in options.items()}
-        return mpm.QuasiStaticProblem(p, Hencky(1e3, 0.3), supports=[make(p, **more)])
+        return mpm.QuasiStaticProblem(mpm.Body(p, Hencky(1e3, 0.3)), supports=[make(p, **more)])
 
     return build
 

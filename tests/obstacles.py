@@ -4,6 +4,7 @@
 
 import numpy as np
 import scenes
+from posed import posed
 from scenes import QUADRILATERAL, WORLD
 
 from dolfinx import fem
@@ -33,7 +34,8 @@ def on_plane(friction, cell=QUADRILATERAL, angle=0.0, n=3, comm=WORLD, material=
     law = options.pop("law", "penalty")
     ground = contact.Rigid(particles, contact.plane((0.0, 0.0), normal), friction, law=law)
     force = fem.Constant(body, np.zeros(2))
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         particles,
         material or LinearElastic(YOUNG, POISSON),
         body_force=force,
@@ -57,7 +59,8 @@ def between_plates(cell, material, n=3, degree=1, law="penalty", **options):
         contact.Rigid(particles, contact.plane(at, n), law=law, axisymmetric=axisymmetric)
         for at, n in ((0.0 * up, up), (up, -up))
     )
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         particles,
         material,
         bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in range(dim - 1)],
@@ -112,8 +115,7 @@ def hertz(n, penalty, steps, depth=0.0108, law="penalty"):
     disc = contact.disc((0.0, radius), radius)
     die = contact.Rigid(particles, disc, facet_tags=top, tag=1, penalty=penalty, law=law)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        LinearElastic(1e3, POISSON),
+        mpm.Body(particles, LinearElastic(1e3, POISSON)),
         bcs=[scenes.fix(V, scenes.at(0, 0.0), component=0), scenes.fix(V, scenes.at(1, y[0]))],
         terms=[die],
     )
@@ -152,7 +154,8 @@ def dragged(
     own = {key: options.pop(key) for key in names if key in options}
     particles = mpm.Particles(body, V, method=method, degree=degree, **own)
     die = contact.Rigid(particles, contact.disc((0.7, 1.6), 0.6), friction, law=law)
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         particles,
         material or Hencky(1e3, POISSON),
         bcs=[fem.dirichletbc(np.zeros(2), base, V)],

@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 import scenes
+from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD, anywhere
 
 from dolfinx import fem
@@ -49,10 +50,12 @@ def patch(passes, degree, tilt=30.0, cells=(QUADRILATERAL, QUADRILATERAL), n=(9,
         a, b, facet_tags=tags, tags=(1, 1), passes=passes, quadrature_degree=degree, law=law
     )
     problem = mpm.QuasiStaticProblem(
-        [a, b],
-        LinearElastic(YOUNG, POISSON),
-        tractions=[[((s, -c), 3)], []],
-        facet_tags=tags,
+        [
+            mpm.Body(
+                a, LinearElastic(YOUNG, POISSON), tractions=[((s, -c), 3)], facet_tags=tags[0]
+            ),
+            mpm.Body(b, LinearElastic(YOUNG, POISSON)),
+        ],
         supports=[
             mpm.boundary.roller(a, tags[0], 2, (c, s)),
             mpm.boundary.roller(b, tags[1], 2, (c, s)),
@@ -117,8 +120,8 @@ def hertz(passes, order, n=8, ratio=1.3, moduli=(YOUNG, YOUNG), **options):
         mpm.boundary.fixed(bodies[1], tags[1], 2),
     ]
     laws = [LinearElastic(E, POISSON) for E in moduli]
-    problem = mpm.QuasiStaticProblem(
-        bodies, laws, facet_tags=tags, supports=supports, terms=[touch]
+    problem = posed(
+        mpm.QuasiStaticProblem, bodies, laws, facet_tags=tags, supports=supports, terms=[touch]
     )
     problem.solve(8)
     return problem, touch, radius
@@ -160,7 +163,9 @@ def two(
     motion = fem.Constant(Va.mesh, np.zeros(2))
     bcs = [fem.dirichletbc(motion, top, Va), fem.dirichletbc(np.zeros(2), base, Vb)]
     law = material or Hencky(YOUNG, POISSON)
-    problem = mpm.QuasiStaticProblem([a, b], law, bcs=bcs, terms=[touch], f_bar=f_bar)
+    problem = mpm.QuasiStaticProblem(
+        [mpm.Body(p, law, f_bar=f_bar) for p in (a, b)], bcs=bcs, terms=[touch]
+    )
 
     def path(t):
         motion.value[:] = [0.5 * max(t - 0.25, 0.0), -0.04 * min(4 * t, 1.0)]

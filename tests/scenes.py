@@ -7,6 +7,7 @@ from typing import NamedTuple
 from mpi4py import MPI
 
 import numpy as np
+from posed import posed
 from scipy.sparse import csr_array
 from scipy.special import lambertw
 
@@ -313,7 +314,8 @@ def column(
     if material_of is not None:
         material, options = material_of(body)
     bcs = [fix(V, at(0, 0.0, h), component=0), fix(V, at(1, 0.0), component=1)]
-    return mpm.QuasiStaticProblem(
+    return posed(
+        mpm.QuasiStaticProblem,
         mpm.Particles(body, V, method=method, quadrature_degree=quadrature_degree),
         material,
         density=case.density,
@@ -351,7 +353,8 @@ def slump(
     V = vectors(box([0.0, 0.0], [width, 10.0], n, QUADRILATERAL, comm))
     body = box([0.0, 0.0], [4.0, height], [round(8.0 / h), round(2 * height / h)], cell, comm)
     bcs = [fix(V, at(0, 0.0), component=0), fix(V, at(1, 0.0), component=1)]
-    return mpm.QuasiStaticProblem(
+    return posed(
+        mpm.QuasiStaticProblem,
         mpm.Particles(body, V, method=method, quadrature_degree=quadrature_degree),
         material or mpm.materials.VonMises(1e6, 0.3, rho_y=20e3),
         density=1000.0,
@@ -369,7 +372,8 @@ def block(material=None, cell=TRIANGLE, n=4, comm=WORLD, force=(0.0, -10.0), **o
     V = vectors(box([0.0, -0.25], [2.0, 1.25], [8, 6], QUADRILATERAL, comm))
     body = box([0.0, 0.0], [1.0, 1.0], [n, n], cell, comm)
     options.setdefault("bcs", [fix(V, at(0, 0.0))])
-    return mpm.QuasiStaticProblem(
+    return posed(
+        mpm.QuasiStaticProblem,
         mpm.Particles(body, V),
         material or mpm.materials.Hencky(1e3, 0.3),
         density=2.0,
@@ -399,7 +403,9 @@ def falling(depth=1.0, outside="delete", method="cpdi2", density=3.0, cell=QUADR
     bc, u = everywhere(V)
     u.x.array.reshape(-1, 2)[:] = [0.0, -depth]
     particles = mpm.Particles(unit(4, cell), V, method=method, outside=outside)
-    return mpm.QuasiStaticProblem(particles, LinearElastic(1e4, 0.3), density=density, bcs=[bc])
+    return mpm.QuasiStaticProblem(
+        mpm.Body(particles, LinearElastic(1e4, 0.3), density=density), bcs=[bc]
+    )
 
 
 def anywhere(body, seed=1):
@@ -417,5 +423,5 @@ def pulled(material, end=0.4, **options):
     grip = np.flatnonzero(nodes[:, 0] > 0.99).astype(np.int32)
     value = fem.Constant(V.mesh, np.array([end, 0.0]))
     bcs = [fix(V, at(0, 0.0)), fem.dirichletbc(value, grip, V)]
-    problem = mpm.QuasiStaticProblem(mpm.Particles(body, V), material, bcs=bcs, **options)
+    problem = posed(mpm.QuasiStaticProblem, mpm.Particles(body, V), material, bcs=bcs, **options)
     return problem, value

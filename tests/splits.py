@@ -4,6 +4,7 @@
 
 import numpy as np
 import scenes
+from posed import posed
 from scenes import HEXAHEDRON, PLANE, QUADRILATERAL, TETRAHEDRON, WORLD
 
 import ufl
@@ -30,7 +31,7 @@ def column(comm=WORLD, policy="error", outside="error", **options):
         "bcs": [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)],
     }
     particles = mpm.Particles(body, V, on_distortion=policy, outside=outside)
-    return mpm.QuasiStaticProblem(particles, **{**defaults, **options})
+    return posed(mpm.QuasiStaticProblem, particles, **{**defaults, **options})
 
 
 def some(particles, seed=3, share=0.3):
@@ -93,7 +94,8 @@ def block_of(cell, degree=1, **options):
     body = scenes.bend(scenes.box([0.0] * dim, [1.0] * dim, [count] * dim, cell), 0.03)
     force, pull = np.zeros(dim), np.zeros(dim)
     force[:2], pull[0] = (2.0, -10.0), 4.0
-    return mpm.QuasiStaticProblem(
+    return posed(
+        mpm.QuasiStaticProblem,
         mpm.Particles(body, V, degree=degree),
         VonMises(1e3, 0.3, yield_stress=12.0, hardening=200.0),
         density=2.0,

@@ -74,13 +74,14 @@ tags = mesh.meshtags(body, 2, np.sort(top), np.full(len(top), TOP, dtype=np.int3
 plane = fem.Constant(body, 1.0)
 above = ufl.SpatialCoordinate(body)[2] + particles.displacement[2] - plane
 problem = mpm.QuasiStaticProblem(
-    particles,
-    mpm.materials.VonMises(young, poisson, yield_stress=yield_stress),
+    mpm.Body(
+        particles,
+        mpm.materials.VonMises(young, poisson, yield_stress=yield_stress),
+        pressures=[(stiffness * above, TOP)],
+        facet_tags=tags,
+    ),
     bcs=bcs,
-    pressures=[(stiffness * above, TOP)],
-    facet_tags=tags,
-    petsc_options_prefix="block_",
-    stabilisation=kit.stabilisation(args),
+    solver=mpm.Solver(petsc_options_prefix="block_", stabilisation=kit.stabilisation(args)),
 )
 
 

@@ -73,15 +73,16 @@ bcs.append(fem.dirichletbc(0.0, held, V.sub(1)))
 
 particles = mpm.Particles(body, V, **kit.order(args))
 problem = mpm.QuasiStaticProblem(
-    particles,
-    mpm.materials.Hencky(young, poisson),
+    mpm.Body(
+        particles,
+        mpm.materials.Hencky(young, poisson),
+        tractions=[((0.0, -load / depth), 1)],
+        facet_tags=tags,
+        f_bar=args.f_bar,
+    ),
     bcs=bcs,
-    tractions=[((0.0, -load / depth), 1)],
-    facet_tags=tags,
-    f_bar=args.f_bar,
     mixed=None if args.mixed == "none" else args.mixed,
-    petsc_options_prefix="cantilever_",
-    stabilisation=kit.stabilisation(args),
+    solver=mpm.Solver(petsc_options_prefix="cantilever_", stabilisation=kit.stabilisation(args)),
 )
 
 # The tip is the body's node at half depth of its end; where the domains have none there, the mean

@@ -62,12 +62,11 @@ def bar(options):
         fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(1), 1, sides), V.sub(1)),
     ]
     problem = mpm.QuasiStaticProblem(
-        particles,
-        mpm.materials.Hencky(young, 0.0),
-        body_force=(g0, 0.0),  # with a density of 1
+        mpm.Body(particles, mpm.materials.Hencky(young, 0.0), body_force=(g0, 0.0)),
         bcs=bcs,
-        petsc_options_prefix="bar_",
-        stabilisation=kit.stabilisation(args) if high else None,
+        solver=mpm.Solver(
+            petsc_options_prefix="bar_", stabilisation=kit.stabilisation(args) if high else None
+        ),
     )
     return particles, problem
 

@@ -50,14 +50,15 @@ for axis in (0, 1):
 
 particles = mpm.Particles(body, V, **kit.order(args))
 problem = mpm.QuasiStaticProblem(
-    particles,
-    mpm.materials.VonMises(young, poisson, rho_y=rho_y),
-    density=density,
-    body_force=(0.0, -gravity),
+    mpm.Body(
+        particles,
+        mpm.materials.VonMises(young, poisson, rho_y=rho_y),
+        density=density,
+        body_force=(0.0, -gravity),
+        f_bar=args.f_bar,
+    ),
     bcs=bcs,
-    f_bar=args.f_bar,
-    petsc_options_prefix="collapse_",
-    stabilisation=kit.stabilisation(args),
+    solver=mpm.Solver(petsc_options_prefix="collapse_", stabilisation=kit.stabilisation(args)),
 )
 
 # What is watched is the top of the plane of symmetry and the toe, two nodes of the body.

@@ -60,14 +60,14 @@ bodies = [
 ]
 touch = mpm.contact.Pair(*bodies, friction=args.friction) if args.contact else None
 problem = mpm.DynamicProblem(
-    bodies,
-    mpm.materials.Hencky(1000.0, 0.3),
-    density=1000.0,
-    velocity=[(speed, speed), (-speed, -speed)],
+    [
+        mpm.Body(body, mpm.materials.Hencky(1000.0, 0.3), density=1000.0, velocity=(way, way))
+        for body, way in zip(bodies, (speed, -speed), strict=True)
+    ],
     scheme=args.scheme,
     out_of_range=args.out_of_range,
     terms=[touch] if touch else [],
-    petsc_options={"snes_rtol": 1e-12},
+    solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
 )
 
 

@@ -38,17 +38,15 @@ for axis in (0, 1):
     bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
 
 particles = mpm.Particles(body, V)
-options = {"density": 1000.0, "body_force": (0.0, -10.0), "bcs": bcs}
 law = mpm.materials.VonMises(1e6, 0.3, rho_y=20e3)
+column = mpm.Body(particles, law, density=1000.0, body_force=(0.0, -10.0))
 steps = args.steps or max(1, round(args.time / args.dt))
 failure = None
 if args.static:
-    problem = mpm.QuasiStaticProblem(particles, law, **options)
+    problem = mpm.QuasiStaticProblem(column, bcs)
     run = problem.steps(args.steps or 40)
 else:
-    problem = mpm.DynamicProblem(
-        particles, law, scheme=args.scheme, out_of_range=args.out_of_range, **options
-    )
+    problem = mpm.DynamicProblem(column, bcs, scheme=args.scheme, out_of_range=args.out_of_range)
     run = problem.steps(args.time, args.time / steps)
 X = particles.W.tabulate_dof_coordinates()
 path = [(0.0, 4.0, 8.0)]

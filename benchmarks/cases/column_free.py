@@ -124,15 +124,18 @@ def collapse(g0: float):
         **kit.order(args),
     )
     problem = mpm.QuasiStaticProblem(
-        particles,
-        mpm.materials.VonMises(young, poisson, rho_y=rho_y),
-        density=density,
-        body_force=(0.0, -g0 / density),
+        mpm.Body(
+            particles,
+            mpm.materials.VonMises(young, poisson, rho_y=rho_y),
+            density=density,
+            body_force=(0.0, -g0 / density),
+            f_bar=args.f_bar,
+        ),
         bcs=bcs,
-        petsc_options_prefix="collapse_",
-        f_bar=args.f_bar,
-        stabilisation=kit.stabilisation(args),
-        **({"shift": 0.0, "line_search": False} if args.plain_solver else {}),
+        solver=mpm.Solver(
+            stabilisation=kit.stabilisation(args),
+            **({"shift": 0.0, "line_search": False} if args.plain_solver else {}),
+        ),
     )
 
     # What each particle's yield function has been at most is no part of the package's state, so

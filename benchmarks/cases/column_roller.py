@@ -59,14 +59,15 @@ for axis in range(dim):
 particles = mpm.Particles(body, V, method=args.method, **kit.order(args))
 law = mpm.materials.SmallStrainVonMises if args.small_strain else mpm.materials.VonMises
 problem = mpm.QuasiStaticProblem(
-    particles,
-    law(young, poisson, rho_y=rho_y),
-    density=density,
-    body_force=(0.0,) * up + (-gravity,),
+    mpm.Body(
+        particles,
+        law(young, poisson, rho_y=rho_y),
+        density=density,
+        body_force=(0.0,) * up + (-gravity,),
+        f_bar=args.f_bar,
+    ),
     bcs=bcs,
-    f_bar=args.f_bar,
-    petsc_options_prefix="roller_",
-    stabilisation=kit.stabilisation(args),
+    solver=mpm.Solver(petsc_options_prefix="roller_", stabilisation=kit.stabilisation(args)),
 )
 
 # `steps` hands out each converged step. After each, the yield function (1) is looked at: by how

@@ -55,13 +55,16 @@ def column(elements: int) -> tuple[mpm.Particles, mpm.QuasiStaticProblem]:
 
     particles = mpm.Particles(body, V, method=args.method, **kit.order(args))
     problem = mpm.QuasiStaticProblem(
-        particles,
-        mpm.materials.Hencky(young, poisson),
-        density=density,
-        body_force=(0.0,) * up + (-gravity,),
+        mpm.Body(
+            particles,
+            mpm.materials.Hencky(young, poisson),
+            density=density,
+            body_force=(0.0,) * up + (-gravity,),
+        ),
         bcs=bcs,
-        petsc_options_prefix="compaction_",
-        stabilisation=kit.stabilisation(args),
+        solver=mpm.Solver(
+            petsc_options_prefix="compaction_", stabilisation=kit.stabilisation(args)
+        ),
     )
     return particles, problem
 

@@ -58,15 +58,16 @@ side = mesh.locate_entities_boundary(
     background, 1, lambda x: np.isclose(x[0], 0.0) | np.isclose(x[0], 2 * h)
 )
 problem = mpm.PorousProblem(
-    particles,
-    mpm.materials.LinearElastic(young, poisson),
-    permeability=args.settlement,
+    mpm.Body(
+        particles,
+        mpm.materials.LinearElastic(young, poisson),
+        tractions=[((0.0, -1.0), 1)],
+        facet_tags=tags,
+        pore_fluid=mpm.PoreFluid(args.settlement, drained=[(0.0, 1)]),
+    ),
     bcs=[fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(0), 1, side), V.sub(0))],
     supports=[mpm.boundary.roller(particles, tags, 2, normal=(0.0, -1.0))],
-    tractions=[((0.0, -1.0), 1)],
-    drained=[(0.0, 1)],
-    facet_tags=tags,
-    petsc_options_prefix="consolidation_",
+    solver=mpm.Solver(petsc_options_prefix="consolidation_"),
 )
 (p,) = problem.pore_pressure
 

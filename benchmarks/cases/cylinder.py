@@ -139,14 +139,15 @@ def quarter_ring(n):
 def solve(scene, n, axisymmetric):
     particles, bcs, tags = scene(n)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        mpm.materials.Hencky(young, poisson),
+        mpm.Body(
+            particles,
+            mpm.materials.Hencky(young, poisson),
+            pressures=[(pressure, INNER)],
+            facet_tags=tags,
+        ),
         bcs=bcs,
-        pressures=[(pressure, INNER)],
-        facet_tags=tags,
         axisymmetric=axisymmetric,
-        petsc_options_prefix="cylinder_",
-        stabilisation=kit.stabilisation(args),
+        solver=mpm.Solver(petsc_options_prefix="cylinder_", stabilisation=kit.stabilisation(args)),
     )
     for _ in kit.progress(problem.steps(args.steps), args.steps, args):
         pass

@@ -55,7 +55,9 @@ def two_domains(method, **options):
     for node, move in moves.items():
         at = np.flatnonzero(np.isclose(x[:, :2], node).all(axis=1))
         value.x.array.reshape(-1, 2)[at] = move
-    problem = mpm.QuasiStaticProblem(particles, material, bcs=[bc], petsc_options_prefix="two_")
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(particles, material), bcs=[bc], solver=mpm.Solver(petsc_options_prefix="two_")
+    )
     problem.solve(1)
     return particles
 
@@ -92,11 +94,12 @@ def moved(name, method):
     particles = mpm.Particles(body, V, method=method, **order)
     bc, value = prescribed(V)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        material,
+        mpm.Body(particles, material),
         bcs=[bc],
-        petsc_options_prefix="motion_",
-        stabilisation=kit.stabilisation(args) if method == "cpdi2" else None,
+        solver=mpm.Solver(
+            petsc_options_prefix="motion_",
+            stabilisation=kit.stabilisation(args) if method == "cpdi2" else None,
+        ),
     )
 
     dt = fem.Constant(V.mesh, 0.0)

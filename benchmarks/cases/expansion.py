@@ -64,16 +64,17 @@ everywhere = fem.locate_dofs_geometrical((V.sub(1), axial), lambda x: x[0] > -1.
 inner = mesh.locate_entities_boundary(body, 1, lambda x: np.isclose(x[0], a))
 particles = mpm.Particles(body, V, **kit.order(args))
 problem = mpm.QuasiStaticProblem(
-    particles,
-    mpm.materials.VonMises(young, poisson, yield_stress=strength),
+    mpm.Body(
+        particles,
+        mpm.materials.VonMises(young, poisson, yield_stress=strength),
+        pressures=[(1.0, 1)],
+        facet_tags=mesh.meshtags(body, 1, np.sort(inner), np.ones(len(inner), dtype=np.int32)),
+        f_bar=args.f_bar if args.mixed == "none" else "none",
+    ),
     bcs=[fem.dirichletbc(fem.Function(axial), everywhere, V.sub(1))],
-    pressures=[(1.0, 1)],
-    facet_tags=mesh.meshtags(body, 1, np.sort(inner), np.ones(len(inner), dtype=np.int32)),
     axisymmetric=True,
-    f_bar=args.f_bar if args.mixed == "none" else "none",
     mixed=None if args.mixed == "none" else args.mixed,
-    petsc_options_prefix="expansion_",
-    stabilisation=kit.stabilisation(args),
+    solver=mpm.Solver(petsc_options_prefix="expansion_", stabilisation=kit.stabilisation(args)),
 )
 
 # Small steps where the wall begins to flow, then larger ones.

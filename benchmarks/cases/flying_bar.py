@@ -49,15 +49,16 @@ body = mesh.create_rectangle(
 )
 particles = mpm.Particles(body, V, **kit.order(args))
 problem = mpm.DynamicProblem(
-    particles,
-    mpm.materials.LinearElastic(1.0, 0.0),
-    density=1.0,
-    velocity=lambda x: np.stack([args.speed + w * A * np.cos(w * (x[0] - left)), 0.0 * x[0]]),
+    mpm.Body(
+        particles,
+        mpm.materials.LinearElastic(1.0, 0.0),
+        density=1.0,
+        velocity=lambda x: np.stack([args.speed + w * A * np.cos(w * (x[0] - left)), 0.0 * x[0]]),
+    ),
     scheme=args.scheme,
     out_of_range=args.out_of_range,
     bcs=bcs,
-    stabilisation=kit.stabilisation(args),
-    petsc_options={"snes_rtol": 1e-12},
+    solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}, stabilisation=kit.stabilisation(args)),
 )
 
 x = particles.W.tabulate_dof_coordinates()[:, 0] - left

@@ -104,18 +104,19 @@ footing = (
 law = mpm.materials.SmallStrainVonMises if args.small_strain else mpm.materials.VonMises
 
 problem = mpm.QuasiStaticProblem(
-    particles,
-    law(young, poisson, rho_y=np.sqrt(2.0) * cohesion),
+    mpm.Body(
+        particles,
+        law(young, poisson, rho_y=np.sqrt(2.0) * cohesion),
+        f_bar=args.f_bar if args.mixed == "none" else "none",
+    ),
     bcs=[
         held(0, lambda x: np.isclose(x[0], 0.0) | np.isclose(x[0], size)),
         held(1, lambda x: np.isclose(x[1], 0.0)),
         *([] if on_body else [footing]),
     ],
     supports=[footing] if on_body else [],
-    f_bar=args.f_bar if args.mixed == "none" else "none",
     mixed=None if args.mixed == "none" else args.mixed,
-    stabilisation=kit.stabilisation(args),
-    petsc_options_prefix="footing_",
+    solver=mpm.Solver(petsc_options_prefix="footing_", stabilisation=kit.stabilisation(args)),
 )
 
 # The Dirichlet values are totals at full load, so the load factor is the share of the settlement.

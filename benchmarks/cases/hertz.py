@@ -81,7 +81,7 @@ for axis in range(2):
     dofs = fem.locate_dofs_geometrical((space, collapsed), lambda x, i=axis: np.isclose(x[i], 0.0))
     bcs.append(fem.dirichletbc(fem.Function(collapsed), dofs, space))
 problem = mpm.QuasiStaticProblem(
-    block, mpm.materials.LinearElastic(young, poisson), bcs=bcs, terms=[ball]
+    mpm.Body(block, mpm.materials.LinearElastic(young, poisson)), bcs=bcs, terms=[ball]
 )
 
 # The force grows with the depth to the power of 3/2, and the far field with the force.

@@ -107,14 +107,16 @@ def held(component: int, where) -> fem.DirichletBC:
 
 
 problem = mpm.QuasiStaticProblem(
-    soil,
-    mpm.materials.VonMises(young, poisson, rho_y=np.sqrt(2.0) * cohesion),
+    mpm.Body(
+        soil,
+        mpm.materials.VonMises(young, poisson, rho_y=np.sqrt(2.0) * cohesion),
+        f_bar=args.f_bar if args.mixed == "none" else "none",
+    ),
     bcs=[
         held(0, lambda x: np.isclose(x[0], 0.0) | np.isclose(x[0], wide)),
         held(0, lambda x: np.isclose(x[1], -deep)),
         held(1, lambda x: np.isclose(x[1], -deep)),
     ],
-    f_bar=args.f_bar if args.mixed == "none" else "none",
     mixed=None if args.mixed == "none" else args.mixed,
     terms=[obstacle],
 )

@@ -110,15 +110,17 @@ def law() -> mpm.materials.Material:
 
 at_rest = 1.0 - np.sin(np.radians(args.friction_angle))  # Jaky (1944)
 problem = mpm.DynamicProblem(
-    particles,
-    law(),
-    density=density,
-    body_force=(0.0, -gravity),
+    mpm.Body(
+        particles,
+        law(),
+        density=density,
+        body_force=(0.0, -gravity),
+        f_bar=args.f_bar,
+        initial_stress=mpm.geostatic(height, density, at_rest, (0.0, -gravity)),
+    ),
     bcs=bcs,
     scheme="euler",
     rayleigh=(0.0, args.rayleigh),
-    initial_stress=mpm.geostatic(height, density, at_rest, (0.0, -gravity)),
-    f_bar=args.f_bar,
 )
 end = args.time or 3.5 * sqrt(height / gravity) + sqrt(known * width / gravity)
 steps = args.steps or ceil(end / args.dt)

@@ -58,13 +58,14 @@ def held(component: int, place: float) -> fem.DirichletBC:
 
 particles = mpm.Particles(body, V, **kit.order(args))
 problem = mpm.QuasiStaticProblem(
-    particles,
-    mpm.materials.Hencky(young, poisson),
+    mpm.Body(
+        particles,
+        mpm.materials.Hencky(young, poisson),
+        tractions=[((0.0, -pressure), 1)],
+        facet_tags=tags,
+    ),
     bcs=[held(0, 0.0), held(1, 0.0), held(0, half)],
-    tractions=[((0.0, -pressure), 1)],
-    facet_tags=tags,
-    stabilisation=kit.stabilisation(args),
-    petsc_options_prefix="arch_",
+    solver=mpm.Solver(petsc_options_prefix="arch_", stabilisation=kit.stabilisation(args)),
 )
 
 # What is controlled is the way of a point of the body, which need not be a node.

@@ -44,13 +44,12 @@ law = (
 )
 particles = mpm.Particles(body, V)
 problem = mpm.DynamicProblem(
-    particles,
-    law,
-    density=1.0,
-    velocity=lambda x: np.stack([-x[1], x[0], 0.0 * x[2]][:dim]),
+    mpm.Body(
+        particles, law, density=1.0, velocity=lambda x: np.stack([-x[1], x[0], 0.0 * x[2]][:dim])
+    ),
     scheme=args.scheme,
     out_of_range=args.out_of_range,
-    petsc_options={"snes_rtol": 1e-12},
+    solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
 )
 turning, momentum = problem.angular_momentum[-1], problem.momentum
 spins, failure, drift = [turning], None, 0.0

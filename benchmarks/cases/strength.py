@@ -158,17 +158,20 @@ if has_strip:
     ]
 
 problem = mpm.QuasiStaticProblem(
-    particles,
-    law,
-    density=weight,
-    body_force=(0.0, -1.0),
+    mpm.Body(
+        particles,
+        law,
+        density=weight,
+        body_force=(0.0, -1.0),
+        f_bar=args.f_bar if args.mixed == "none" else "none",
+        initial_stress=mpm.geostatic(size, weight, 0.5, (0.0, -1.0))
+        if has_strip and weight
+        else None,
+    ),
     bcs=bcs,
     supports=supports,
-    f_bar=args.f_bar if args.mixed == "none" else "none",
     mixed=None if args.mixed == "none" else args.mixed,
-    stabilisation=kit.stabilisation(args),
-    petsc_options_prefix="strength_",
-    initial_stress=mpm.geostatic(size, weight, 0.5, (0.0, -1.0)) if has_strip and weight else None,
+    solver=mpm.Solver(petsc_options_prefix="strength_", stabilisation=kit.stabilisation(args)),
 )
 
 # The footing is pushed down; slope and cut carry their weight, and then their strength is reduced.

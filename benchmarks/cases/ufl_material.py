@@ -102,8 +102,7 @@ def run(elements: int, shortening: float, steps: int):
     problem = mpm.ParticleProblem(
         ufl.derivative(energy(d), d, v),
         particles,
-        petsc_options_prefix="rubber_",
-        stabilisation=kit.stabilisation(args),
+        solver=mpm.Solver(petsc_options_prefix="rubber_", stabilisation=kit.stabilisation(args)),
     )
 
     # Finite elements: a Function of the body's mesh.

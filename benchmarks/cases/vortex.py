@@ -108,7 +108,7 @@ problem = mpm.DynamicParticleProblem(
     scheme=args.scheme,
     out_of_range=args.out_of_range,
     symmetric=True,
-    stabilisation=kit.stabilisation(args),
+    solver=mpm.Solver(stabilisation=kit.stabilisation(args)),
 )
 
 

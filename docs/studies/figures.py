@@ -49,7 +49,7 @@ def block(size: tuple[float, float] = (2.0, 3.0)) -> tuple[mpm.Particles, mpm.Qu
     particles = mpm.Particles(body, V)
     material = mpm.materials.VonMises(1e4, 0.3, rho_y=600.0)
     problem = mpm.QuasiStaticProblem(
-        particles, material, density=100.0, body_force=(0.0, -10.0), bcs=bcs
+        mpm.Body(particles, material, density=100.0, body_force=(0.0, -10.0)), bcs=bcs
     )
     return particles, problem
 

@@ -37,13 +37,15 @@ def flight(speed: float, cells: float, degree: int, out: str) -> tuple[float, fl
     across = V.sub(1).collapse()[0]
     held = fem.locate_dofs_geometrical((V.sub(1), across), lambda x: x[0] > -1.0)
     problem = mpm.DynamicProblem(
-        mpm.Particles(body, V, degree=degree),
-        mpm.materials.LinearElastic(1.0, 0.0),
-        1.0,
-        velocity=lambda x: np.stack([speed + 0.1 * np.cos(np.pi * (x[0] - 0.3)), 0.0 * x[0]]),
+        mpm.Body(
+            mpm.Particles(body, V, degree=degree),
+            mpm.materials.LinearElastic(1.0, 0.0),
+            density=1.0,
+            velocity=lambda x: np.stack([speed + 0.1 * np.cos(np.pi * (x[0] - 0.3)), 0.0 * x[0]]),
+        ),
         bcs=[fem.dirichletbc(fem.Function(across), held, V.sub(1))],
-        stabilisation=None,
         out_of_range=out,
+        solver=mpm.Solver(stabilisation=None),
     )
     energies = problem.solve(STEPS * dt, dt).energies
     whole = np.array([energy.kinetic + energy.strain for energy in energies]) / (

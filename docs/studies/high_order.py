@@ -73,7 +73,7 @@ def errors(kind: Any, k: int, m: int, elements: int) -> tuple[float, float]:
         dofs = fem.locate_dofs_topological(V.sub(axis), 1, facets)
         bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
     problem = mpm.QuasiStaticProblem(
-        body, mpm.materials.Hencky(YOUNG, 0.0), body_force=(0.0, -WEIGHT), bcs=bcs
+        mpm.Body(body, mpm.materials.Hencky(YOUNG, 0.0), body_force=(0.0, -WEIGHT)), bcs=bcs
     )
     problem.solve(steps=40)
     volumes = body.point_volumes()
@@ -128,11 +128,13 @@ def condition(degree: int, stabilisation: str | None, offset: float) -> float:
     facets = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[0], 0.0))
     dofs = fem.locate_dofs_topological(V, 1, facets)
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, degree=degree),
-        mpm.materials.Hencky(YOUNG, 0.2),
-        body_force=(0.0, -1.0),
+        mpm.Body(
+            mpm.Particles(body, V, degree=degree),
+            mpm.materials.Hencky(YOUNG, 0.2),
+            body_force=(0.0, -1.0),
+        ),
         bcs=[fem.dirichletbc(np.zeros(2), dofs, V)],
-        stabilisation=stabilisation,
+        solver=mpm.Solver(stabilisation=stabilisation),
     )
     problem.solve(steps=1)
     K = problem.A.convert("dense").getDenseArray()

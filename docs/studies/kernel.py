@@ -49,7 +49,9 @@ def column(domain: str, g0: float, width: float, **options):
     particles = mpm.Particles(body, V)
     material = mpm.materials.VonMises(1e6, 0.3, rho_y=20e3)
     problem = mpm.QuasiStaticProblem(
-        particles, material, density=1000.0, body_force=(0.0, -g0 / 1000.0), bcs=bcs, **options
+        mpm.Body(particles, material, density=1000.0, body_force=(0.0, -g0 / 1000.0)),
+        bcs,
+        solver=mpm.Solver(**options),
     )
     return particles, problem, np.concatenate([bc.dof_indices()[0] for bc in bcs])
 

@@ -32,9 +32,11 @@ def collapse() -> mpm.QuasiStaticProblem:
     """A square block that slumps under its weight, half of it; 3 x 3 domains in a cell of 1 m."""
     V = fem.functionspace(kit.box([16.0, 9.0], [16, 9], QUAD), ("Lagrange", 1, (2,)))
     return mpm.QuasiStaticProblem(
-        mpm.Particles(kit.box([8.0, 8.0], [24, 24], QUAD), V),
-        mpm.materials.VonMises(1e6, 0.3, rho_y=20e3),
-        body_force=(0.0, -10e3),
+        mpm.Body(
+            mpm.Particles(kit.box([8.0, 8.0], [24, 24], QUAD), V),
+            mpm.materials.VonMises(1e6, 0.3, rho_y=20e3),
+            body_force=(0.0, -10e3),
+        ),
         bcs=rollers(V, (0, 0.0), (1, 0.0)),
     )
 
@@ -54,7 +56,7 @@ def footing() -> mpm.QuasiStaticProblem:
     domains = kit.grid([kit.divided(across, 2), kit.divided(up, 2)], QUAD)
     body = mpm.Particles(domains, V, quadrature_degree=2)
     law = mpm.materials.VonMises(1e7, 0.48, rho_y=np.sqrt(2.0) * 490.0)
-    return mpm.QuasiStaticProblem(body, law, bcs=held(V, sides), f_bar="patch")
+    return mpm.QuasiStaticProblem(mpm.Body(body, law, f_bar="patch"), bcs=held(V, sides))
 
 
 def slits() -> mpm.QuasiStaticProblem:
@@ -72,7 +74,7 @@ def slits() -> mpm.QuasiStaticProblem:
     domains = kit.grid([kit.divided(across, 2), kit.divided(up, 2)], QUAD)
     body = mpm.Particles(domains, V, quadrature_degree=2)
     law = mpm.materials.VonMises(1e7, 0.48, rho_y=np.sqrt(2.0) * 490.0)
-    return mpm.QuasiStaticProblem(body, law, bcs=held(V, sides), f_bar="patch")
+    return mpm.QuasiStaticProblem(mpm.Body(body, law, f_bar="patch"), bcs=held(V, sides))
 
 
 def held(V: fem.FunctionSpace, sides: Sequence[tuple]) -> list[fem.DirichletBC]:
@@ -154,10 +156,8 @@ def pressed(shape: mpm.contact.Shape, domain: str) -> Pressed:
     tags = mesh.meshtags(body.mesh, 1, ground, np.full(len(ground), 1, np.int32))
     obstacle = mpm.contact.Rigid(body, shape, facet_tags=tags, tag=1, tangential_penalty=0.1)
     problem = mpm.QuasiStaticProblem(
-        body,
-        mpm.materials.VonMises(500.0, 0.45, rho_y=np.sqrt(2.0)),
+        mpm.Body(body, mpm.materials.VonMises(500.0, 0.45, rho_y=np.sqrt(2.0)), f_bar="patch"),
         bcs=rollers(V, (0, 0.0), (0, 4.0), (1, -2.5)),
-        f_bar="patch",
         terms=[obstacle],
     )
     return problem, lambda t: obstacle.move((0.0, -0.3 * t))

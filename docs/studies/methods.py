@@ -83,7 +83,7 @@ def block(method: str, n: int = 32, weight: float = 50.0) -> mpm.QuasiStaticProb
         bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
     particles = mpm.Particles(body, V, method=method)
     material = mpm.materials.Hencky(1e3, 0.3)
-    return mpm.QuasiStaticProblem(particles, material, body_force=(0.0, -weight), bcs=bcs)
+    return mpm.QuasiStaticProblem(mpm.Body(particles, material, body_force=(0.0, -weight)), bcs=bcs)
 
 
 @cache

@@ -29,7 +29,7 @@ __all__ = [
     "as_bodies",
     "as_conditions",
     "as_fields",
-    "as_loads",
+    "as_pairs",
     "as_supports",
     "as_terms",
     "by_space",
@@ -79,24 +79,25 @@ def as_bodies(particles: Particles | Sequence[Particles]) -> list[Particles]:
     return list(bodies)
 
 
-def as_loads(name: str, loads: Any) -> Sequence[Any]:
-    """Return loads on facets, or a list of them for each body, as they are given.
+def as_pairs(name: str, loads: Any) -> Sequence[Any]:
+    """Return loads on facets as they are given.
 
     Args:
         name: What they are called in a message.
         loads: What is given; ``None``: none.
 
     Raises:
-        MPMError: No list, such as a ``zip`` that is empty after it was looked at once.
+        MPMError: No list of pairs, such as a ``zip`` that is empty after it was looked at once.
     """
     if loads is None:
         return ()
-    if not isinstance(loads, list | tuple):
-        raise MPMError(
-            f"{name} must be a list of pairs of a value and a tag, such as [(1.0, 1)], not "
-            f"{type(loads).__name__}."
-        )
-    return loads
+    for pair in loads if isinstance(loads, list | tuple) else [loads]:
+        if loads is pair or not isinstance(pair, list | tuple) or len(pair) != 2:
+            raise MPMError(
+                f"{name} must be a list of pairs of a value and a tag, such as [(1.0, 1)], not "
+                f"{loads!r}."
+            )
+    return tuple(loads)
 
 
 def as_fields(fields: Any, bodies: Sequence[Particles]) -> list[ParticleField]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ufl
+from dolfinx import fem
 
 from ..assembly.inputs import Density
 from ..boundary.supports import Support, is_one_sided
@@ -24,10 +25,16 @@ from ..system.inertia import Inertia
 from ..system.schemes import Scheme, as_scheme
 from ..system.term import Term
 from .arguments import as_bodies, as_supports, as_terms
-from .motion import MovingProblem, initial_velocities, rayleigh_of, require_motion
+from .body import Body, as_given
+from .motion import (
+    MovingProblem,
+    initial_velocities,
+    initial_velocity,
+    rayleigh_of,
+    require_motion,
+)
 from .parts import Contribution
 from .quasistatic import QuasiStaticProblem
-from .setup import BodySetup
 from .stages import join
 
 __all__ = ["DynamicParticleProblem", "DynamicProblem"]
@@ -44,12 +51,9 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
     Loads act in full from the beginning, unless the path says otherwise.
 
     Args:
-        particles: The body, or a list of bodies.
-        material: As in :class:`QuasiStaticProblem`.
-        density: Mass per undeformed volume, positive; it must not change in time.
-        velocity: At the beginning: a tuple, a function of coordinates ``(3, n)`` that returns
-            ``(gdim, n)``, a Function, or a UFL expression on the body mesh; ``None``: at rest. A
-            list has one for each body.
+        bodies: One :class:`Body`, or a list: each with a positive density that does not change in
+            time, and a velocity (``None``: at rest).
+        bcs: As in :class:`QuasiStaticProblem`.
         scheme: ``"midpoint"``: second order; the force of a step is the mean of those at its
             ends. ``"conserving"``: second order; stress is one of the whole step, by which angular
             momentum is kept to round-off, and the energy of elastic materials too; for what
@@ -63,10 +67,9 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
             same contacts, which know where points stick. Materials come in place of those of before
             as in :meth:`stage`. That problem cannot go on then.
         quasi_static: Bodies among these that have no inertia, beside others that move: they are in
-            equilibrium at the end of each step, whatever the scheme, and have no velocity given.
+            equilibrium at the end of each step, whatever the scheme, and have no velocity.
         terms: As in :class:`QuasiStaticProblem`.
-        **options: All else that :class:`QuasiStaticProblem` has but ``background`` and
-            ``predictor``: ``body_force``, ``bcs``, ``tractions``, ``supports``, ``f_bar``, ...
+        **options: All else that :class:`QuasiStaticProblem` has but ``background``.
 
     Attributes:
         inertia: The term that has the velocities.
@@ -77,11 +80,9 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
 
     def __init__(
         self,
-        particles: Particles | Sequence[Particles],
-        material: Any,
-        density: Any,
+        bodies: Body | Sequence[Body],
+        bcs: Sequence[fem.DirichletBC] = (),
         *,
-        velocity: Any = None,
         scheme: str | Scheme = "midpoint",
         out_of_range: str = "project",
         rayleigh: tuple[float, float] = (0.0, 0.0),
@@ -90,55 +91,46 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         terms: Sequence[Term] = (),
         **options: Any,
     ) -> None:
-        bodies = as_bodies(particles)
-        static = _static_among(bodies, quasi_static, velocity, options)
+        given = as_given(bodies)
+        particles = as_bodies([body.particles for body in given])
+        static = _static_among(given, quasi_static, options)
         if after is not None:
-            self._require_before(after, bodies, options)
+            self._require_before(after, given, options)
         require_same(
-            bodies[0].V.mesh.comm,
-            velocity=velocity,
+            particles[0].V.mesh.comm,
             scheme=scheme,
             out_of_range=out_of_range,
             rayleigh=rayleigh,
-            quasi_static=[number for number, body in enumerate(bodies) if body in static],
+            quasi_static=[number for number, body in enumerate(particles) if body in static],
             terms=terms,
         )
+        self._goes_on = after is not None
         damping = rayleigh_of(rayleigh)
         self._viscosity = damping[1]
         require_motion("DynamicProblem", options)
         rule = as_scheme(scheme, out_of_range)
         if rule.reflects and options.get("mixed") == "stabilised pressure":
             warn(
-                bodies[0].V.mesh.comm,
-                "With mixed='stabilised pressure' a motion with out_of_range='reflect' may win "
+                particles[0].V.mesh.comm,
+                "With mixed='stabilised pressure' a motion with out_of_range='reflect' may gain "
                 "energy, as points come into other cells; use out_of_range='project'.",
             )
-        start = initial_velocities(velocity, particles)
+        start = [initial_velocity(body.velocity, body.particles) for body in given]
         self._energies = []
-        for body, its in zip(bodies, start, strict=True):
-            if body in static:
-                its.x.array[:] = 0.0
-        self.inertia = Inertia(bodies, start, rule, damping, self._energies, static)
-        given = as_terms(terms, bodies)
+        self.inertia = Inertia(particles, start, rule, damping, self._energies, static)
+        own = as_terms(terms, particles)
         if after is not None:
-            join(given, after.terms)
-        governed = [body.governed_by for body in bodies]
+            join(own, after.terms)
+        governed = [body.governed_by for body in particles]
         try:
-            super().__init__(
-                particles,
-                material,
-                density,
-                predictor=False,
-                terms=[self.inertia, *given],
-                **options,
-            )
+            super().__init__(bodies, bcs, terms=[self.inertia, *own], **options)
             self.history.energies = self._energies
             self.inertia.mass()
             if after is not None:
                 for points, before in zip(self.points, after.points, strict=True):
                     points.take_over(before)
         except BaseException:
-            for body, by in zip(bodies, governed, strict=True):
+            for body, by in zip(particles, governed, strict=True):
                 body.governed_by = by
             raise
 
@@ -146,7 +138,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
 
     @staticmethod
     def _require_before(
-        after: QuasiStaticProblem, bodies: Sequence[Particles], options: dict[str, Any]
+        after: QuasiStaticProblem, bodies: Sequence[Body], options: dict[str, Any]
     ) -> None:
         """Raise an error unless a motion of these bodies can begin with the state of a problem."""
         if not isinstance(after, QuasiStaticProblem) or isinstance(after, MovingProblem):
@@ -155,7 +147,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
                 f"{type(after).__name__}."
             )
         same = len(after.bodies) == len(bodies) and all(
-            one is other for one, other in zip(after.bodies, bodies, strict=True)
+            one is other.particles for one, other in zip(after.bodies, bodies, strict=True)
         )
         if not same:
             raise MPMError("after= needs a problem of the same particles, in the same order.")
@@ -164,26 +156,34 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
                 "after= is a problem that no longer governs its particles, as another one was made "
                 "of them since; begin from that, or make all of them anew."
             )
-        if options.get("initial_stress") is not None:
-            raise MPMError("after= brings its stress with it; leave initial_stress= out.")
-        for name, default in (("axisymmetric", False), ("f_bar", "none"), ("mixed", None)):
-            its = getattr(after.setup, name)
-            if options.get(name, default) != its:
-                raise MPMError(f"after= is a problem with {name}={its!r}; give the same here.")
+        for mine, its in zip(bodies, after.setup.given, strict=True):
+            if mine.initial_stress is not None and mine.initial_stress is not its.initial_stress:
+                raise MPMError("after= brings its stress with it; omit another initial_stress=.")
+            if mine.f_bar != its.f_bar:
+                raise MPMError(f"after= is a problem with f_bar={its.f_bar!r}; give the same here.")
+        for name, default in (("axisymmetric", False), ("mixed", None)):
+            its_own = getattr(after.setup, name)
+            if options.get(name, default) != its_own:
+                raise MPMError(f"after= is a problem with {name}={its_own!r}; give the same here.")
 
-    def add(self, particles: Particles, *args: Any, velocity: Any = None, **options: Any) -> None:
-        """Add a body: see :meth:`QuasiStaticProblem.add`; what changes does so at once.
+    _further = ("velocity",)
 
-        Args:
-            particles: The body.
-            *args: As there.
-            velocity: As in the constructor.
-            **options: As there.
-        """
-        if not isinstance(particles, Particles):
-            raise MPMError(f"add() needs mpm.Particles, not a {type(particles).__name__}.")
-        (start,) = initial_velocities(velocity, particles)
-        super().add(particles, *args, **options)
+    def _require_given(self, bodies: Sequence[Body]) -> None:
+        """See :meth:`QuasiStaticProblem._require_given`."""
+        super()._require_given(bodies)
+        if any(body.density is None for body in bodies):
+            raise MPMError("A body that moves needs a density; give density= to its mpm.Body.")
+
+    def _carry_stress(self, stresses: Sequence[Any]) -> None:
+        """See :meth:`QuasiStaticProblem._carry_stress`; another problem brings its own."""
+        if not self._goes_on:
+            super()._carry_stress(stresses)
+
+    def add(self, body: Body, name: str | None = None, *, sudden: bool = False) -> None:
+        """Add a body: see :meth:`QuasiStaticProblem.add`; what changes does so at once."""
+        (given,) = as_given(body)
+        start = initial_velocity(given.velocity, given.particles)
+        super().add(given, name, sudden=sudden)
         self.inertia.velocities[-1].x.array[:] = start.x.array
 
     def _own_terms(self) -> list[Term]:
@@ -209,7 +209,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         """See :meth:`QuasiStaticProblem._force_share`."""
         return 1.0 if self.inertia.is_static(body) else self.inertia.scheme.share
 
-    def _contribution(self, given: BodySetup) -> Contribution:
+    def _contribution(self, given: Body) -> Contribution:
         """See :meth:`QuasiStaticProblem._contribution`."""
         static = self.inertia.is_static(given.particles)
         return super()._contribution(given)._replace(static=static)
@@ -240,7 +240,7 @@ class DynamicParticleProblem(MovingProblem):
         density: Mass per volume of the body mesh, positive: a number, Constant, Function or UFL; a
             list has one for each body.
         J: As in :class:`ParticleProblem`.
-        velocity: As in :class:`DynamicProblem`.
+        velocity: At the beginning: as that of a :class:`Body`; a list has one for each body.
         scheme: ``"midpoint"``, ``"euler"`` or a :class:`Scheme`. Stress of a whole step
             (``"conserving"``) is for materials: write the law as one.
         out_of_range: As in :class:`DynamicProblem`.
@@ -248,8 +248,7 @@ class DynamicParticleProblem(MovingProblem):
         supports: Supports with a modulus, of :mod:`mpm_dolfinx.boundary`. One-sided ones and
             dashpots must be given here, not be written into R.
         terms: As in :class:`ParticleProblem`.
-        **options: All else that :class:`ParticleProblem` has but ``background``,
-            ``fields`` and ``predictor``.
+        **options: All else that :class:`ParticleProblem` has but ``background`` and ``fields``.
 
     Raises:
         MPMError: As there; and what does not go with inertia.
@@ -303,7 +302,7 @@ class DynamicParticleProblem(MovingProblem):
         self._energies = []
         self.inertia = Inertia(bodies, start, rule, rayleigh, self._energies)
         every = [self.inertia, *as_terms(terms, bodies)]
-        super().__init__(R, particles, J, predictor=False, terms=every, **options)
+        super().__init__(R, particles, J, terms=every, **options)
         self.history.energies = self._energies
         self.inertia.mass()
 
@@ -340,7 +339,7 @@ class DynamicParticleProblem(MovingProblem):
 
 
 def _static_among(
-    bodies: Sequence[Particles], given: Any, velocity: Any, options: dict[str, Any]
+    bodies: Sequence[Body], given: Any, options: dict[str, Any]
 ) -> tuple[Particles, ...]:
     """Return the bodies without inertia.
 
@@ -350,20 +349,19 @@ def _static_among(
     if isinstance(given, Particles):
         given = [given]
     if not isinstance(given, list | tuple) or not all(
-        any(body is one for one in bodies) for body in given
+        any(body.particles is one for body in bodies) for one in given
     ):
         raise MPMError("quasi_static= needs a list of some of the problem's own particles.")
     if given and options.get("mixed") is not None:
         raise MPMError("quasi_static= does not go with mixed='pressure'; use f_bar= there.")
-    if given and all(any(body is one for one in given) for body in bodies):
+    static = [any(body.particles is one for one in given) for body in bodies]
+    if all(static):
         raise MPMError(
             "With quasi_static= at least one body must move; where none does, make a "
             "QuasiStaticProblem."
         )
-    velocities = velocity if isinstance(velocity, list) else [None] * len(bodies)
-    for body, its in zip(bodies, velocities, strict=False):
-        if its is not None and any(body is one for one in given):
-            raise MPMError("A body of quasi_static= has no velocity; give None for it.")
+    if any(still and body.velocity is not None for still, body in zip(static, bodies, strict=True)):
+        raise MPMError("A body of quasi_static= has no velocity; omit it.")
     return tuple(given)
 
 

@@ -35,7 +35,13 @@ from ..system.term import PointMaterial
 from .arguments import as_bodies
 from .through_time import TimeProblem
 
-__all__ = ["MovingProblem", "initial_velocities", "rayleigh_of", "require_motion"]
+__all__ = [
+    "MovingProblem",
+    "initial_velocities",
+    "initial_velocity",
+    "rayleigh_of",
+    "require_motion",
+]
 
 
 class MovingProblem(TimeProblem):
@@ -116,7 +122,7 @@ class MovingProblem(TimeProblem):
         form = self._mass_form(number, product)
         if body.deletion is not None:
             form = body.deletion.present_only(form)
-        matrix = fem.assemble_matrix(compiled_form(form, **self._numerics.of_forms))
+        matrix = fem.assemble_matrix(compiled_form(form, **self._how.of_forms))
         n, k = body.domain_nodes.shape
         return np.array(matrix.data[: n * k * k].reshape(n, k, k))
 
@@ -191,7 +197,7 @@ def initial_velocities(
     bodies = as_bodies(particles)
     count = len(bodies) if isinstance(particles, list | tuple) else 0
     velocities = _for_each(velocity, count)
-    return [_velocity(v, body) for v, body in zip(velocities, bodies, strict=True)]
+    return [initial_velocity(v, body) for v, body in zip(velocities, bodies, strict=True)]
 
 
 def require_motion(name: str, options: dict[str, Any]) -> None:
@@ -203,8 +209,6 @@ def require_motion(name: str, options: dict[str, Any]) -> None:
         )
     if options.get("fields"):
         raise MPMError(f"fields= are for mpm.ParticleProblem; a {name} has displacements alone.")
-    if "predictor" in options:
-        raise MPMError(f"A {name} starts each step from the velocities; leave predictor= out.")
 
 
 def _for_each(value: Any, count: int) -> list[Any]:
@@ -231,7 +235,7 @@ def rayleigh_of(values: Any) -> tuple[float, float]:
     return alpha, beta
 
 
-def _velocity(value: Any, body: Particles) -> fem.Function:
+def initial_velocity(value: Any, body: Particles) -> fem.Function:
     """Return an initial velocity on W (collective).
 
     Raises:

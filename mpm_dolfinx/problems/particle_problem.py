@@ -57,7 +57,7 @@ from .arguments import (
     residuals_of,
 )
 from .parts import Contribution, Parts
-from .setup import Numerics
+from .solver import Solver, as_solver
 from .staging import Change, Staging
 from .state import ProblemState
 from .summary import in_one_line, on_a_screen
@@ -94,38 +94,13 @@ class ParticleProblem:
             totals at full load.
         background: Form in ``particles.increment`` (of the first body on V) and a test function
             of V, added to R; a list where there are several V.
-        petsc_options_prefix: Prefix of the PETSc options.
-        petsc_options: PETSc options for SNES, KSP and PC, without prefix.
-        form_compiler_options: Options of FFCx.
-        jit_options: Options of the compilation at run time.
         symmetric: Whether J is symmetric (an LDL^T factorisation instead of LU).
-        shift: Diagonal shift in the factorisation, relative to the diagonal. Combinations of
-            background dofs that move no node of the body make the reduced tangent singular;
-            without a shift the factor of such a matrix is noise.
-        line_search: Whether Newton steps are halved where they invert domains or do not
-            reduce the residual, and where nothing yields taken on trust.
-        dependent_dofs: What becomes of dofs that others can stand for, as no node of the body
-            tells them apart: ``"shift"`` leaves them to the shift, ``"remove"`` looks for them in
-            each step and takes them from the unknowns (then ``shift=0.0`` is possible, and
-            ``statistics["dependent_dofs"]`` is the largest number of them).
-        predictor: Whether Newton's method starts from the last increments extrapolated, where
-            the residual there is not above twice that of a start from zero.
-        stabilisation: What is done about background dofs that the body supports badly:
-            ``"ghost"`` penalty, ``"aggregate"``, ``None``, or ``"auto"``, a ghost penalty where a
-            cut is small, on backgrounds of degree 2 or more and, on those of degree 1, while
-            the bodies have hardly more nodes than the background (not beside ``background=``
-            or ``dependent_dofs="remove"``); with degree 1 ``"auto"`` also keeps joints between
-            bodies shut (:class:`~mpm_dolfinx.stabilisation.joints.Joints`).
-        linear_solver: ``"direct"``: a factorisation by MUMPS; ``"multigrid"``: conjugate gradients
-            (generalised minimal residuals where the tangent is not symmetric or there are
-            ``fields``) with multigrid on boxes of the background; ``"auto"``: multigrid from as
-            many unknowns on as it takes less time, unless there are ``fields``, or
-            ``petsc_options`` has a ``ksp_type`` or ``pc_type``.
         terms: What else acts on the bodies: a list of :class:`mpm_dolfinx.Term`.
         fields: Unknowns besides displacements, made by :meth:`Particles.field`. Those on the same
             background space are one there, where bodies touch.
         entity_maps: Passed on to ``dolfinx.fem.form``: how the body mesh is related to others that
             R and J have Functions on, such as a submesh of facets.
+        solver: How it is solved.
 
     Attributes:
         particles: The body or bodies, as given.
@@ -148,21 +123,12 @@ class ParticleProblem:
         J: ufl.Form | Sequence[ufl.Form | None] | None = None,
         bcs: Sequence[fem.DirichletBC] = (),
         background: ufl.Form | Sequence[ufl.Form] | None = None,
-        petsc_options_prefix: str = "mpm_",
-        petsc_options: dict[str, Any] | None = None,
-        form_compiler_options: dict[str, Any] | None = None,
-        jit_options: dict[str, Any] | None = None,
         *,
         symmetric: bool = False,
-        shift: float = 1e-13,
-        line_search: bool = True,
-        dependent_dofs: str = "shift",
-        predictor: bool = True,
-        stabilisation: str | None = "auto",
-        linear_solver: str = "auto",
         terms: Sequence[Term] = (),
         fields: Sequence[ParticleField] = (),
         entity_maps: Any = None,
+        solver: Solver | None = None,
     ) -> None:
         bodies = as_bodies(particles)
         fields = as_fields(fields, bodies)
@@ -178,23 +144,9 @@ class ParticleProblem:
             terms=terms,
             fields=[field.name for field in fields],
         )
-        numerics = Numerics.agreed(
-            bodies[0].V.mesh.comm,
-            petsc_options_prefix=petsc_options_prefix,
-            petsc_options=petsc_options,
-            form_compiler_options=form_compiler_options,
-            jit_options=jit_options,
-            shift=shift,
-            line_search=line_search,
-            dependent_dofs=dependent_dofs,
-            predictor=predictor,
-            stabilisation=stabilisation,
-            linear_solver=linear_solver,
-            entity_maps=entity_maps,
-        )
         residuals, self._of_fields = residuals_of(R, bodies, fields)
         if fields and J is not None:
-            raise MPMError("With fields= the tangent is the derivative of R; leave J away.")
+            raise MPMError("With fields= the tangent is the derivative of R; omit J.")
         tangents = [None] * len(bodies) if J is None else one_for_each(J, bodies, "J")
         if any(body.on_distortion == "split" for body in bodies):
             raise MPMError(
@@ -206,14 +158,15 @@ class ParticleProblem:
             for r, j in zip(residuals, tangents, strict=True)
         ]
         self.fields = fields
-        self._begin(particles, bcs, background, numerics, terms)
+        self._entity_maps = entity_maps
+        self._begin(particles, bcs, background, as_solver(solver), terms)
 
     def _begin(
         self,
         particles: Particles | Sequence[Particles],
         bcs: Sequence[fem.DirichletBC],
         background: ufl.Form | Sequence[ufl.Form] | None,
-        numerics: Numerics,
+        solver: Solver,
         terms: Sequence[Term],
         mender: Mender | None = None,
     ) -> None:
@@ -223,7 +176,7 @@ class ParticleProblem:
             particles: The body or bodies.
             bcs: Dirichlet conditions.
             background: Form on the background.
-            numerics: How the problem is solved.
+            solver: How the problem is solved.
             terms: What else acts on the bodies.
             mender: What changes meshes between steps, if anything.
         """
@@ -234,7 +187,8 @@ class ParticleProblem:
         self.terms = as_terms(terms, self.bodies)
         self.history = History()
         self._comm: MPI.Comm = self.bodies[0].V.mesh.comm
-        self._background, self._numerics = background, numerics
+        require_same(self._comm, **vars(solver))
+        self._background, self._how = background, solver
         self._output = Output()
         self._held = Release()
         self._stepper = Stepper(self, self._held, mender)
@@ -268,10 +222,16 @@ class ParticleProblem:
         Args:
             clean_up: Frees what is out of use.
         """
-        numerics = self._numerics
+        how = self._how
         contributions = self._contributions()
         parts = Parts(
-            self.bodies, contributions, self.fields, self._of_fields, self._background, numerics
+            self.bodies,
+            contributions,
+            self.fields,
+            self._of_fields,
+            self._background,
+            how,
+            self._entity_maps,
         )
         parts.require_own_fields()
         self.body_terms = parts.body_terms()
@@ -289,20 +249,20 @@ class ParticleProblem:
             fields,
             [*self.body_terms, *self._field_terms, *self.terms, UserTerm(self), self._held],
             statistics,
-            Predictor(numerics.predictor),
+            Predictor(how.predictor and self._predicts),
         )
         degree = max(body.V.ufl_element().degree for body in self.bodies)
         newton = NewtonSolver(
             self._comm,
-            numerics.petsc_options_prefix,
-            numerics.petsc_options,
+            how.petsc_options_prefix,
+            how.petsc_options or {},
             all(given.symmetric for given in contributions)
             and all(term.symmetric for term in (*self._field_terms, *self.terms)),
-            numerics.shift,
-            numerics.line_search,
+            how.shift,
+            how.line_search,
             statistics,
             self.bodies[0].V.mesh.geometry.dim,
-            chosen(numerics.linear_solver, degree),
+            chosen(how.linear, degree),
         )
         self._stepper.follow(reduced, newton, clean_up)
         for body in self.bodies:
@@ -314,6 +274,9 @@ class ParticleProblem:
         return self._given
 
     fields: Sequence[ParticleField] = ()
+    _entity_maps: Any = None
+    #: Whether steps may start from an extrapolation of those before.
+    _predicts = True
     #: Residuals of the fields.
     _of_fields: Sequence[ufl.Form] = ()
     _field_terms: Sequence[FieldTerm] = ()
@@ -362,7 +325,7 @@ class ParticleProblem:
         Bodies with their materials, how far they have moved and yielded, background, solver, steps,
         linear solves and seconds (mean of the ranks): ``print(problem.summary())``.
         """
-        return on_a_screen(self, self._comm, self._numerics.in_words(), self._made_of())
+        return on_a_screen(self, self._comm, self._how.in_words(), self._made_of())
 
     def _made_of(self) -> list[str]:
         """Return what each body is made of and loaded by, in words."""

@@ -24,7 +24,7 @@ from ..system.body import BodyTerm, PointHistory, StepForce
 from ..system.field import Field
 from ..system.values import FormsTerm
 from .arguments import by_space, require_background_fields, require_own_fields
-from .setup import Numerics
+from .solver import Solver
 
 __all__ = ["Contribution", "Parts"]
 
@@ -65,7 +65,8 @@ class Parts:
         fields: Unknowns besides displacements.
         residuals: Their residuals.
         background: Forms on the backgrounds, one, several or ``None``.
-        numerics: How the problem is solved.
+        solver: How the problem is solved.
+        entity_maps: How body meshes are related to others that forms have Functions on.
     """
 
     bodies: Sequence[Particles]
@@ -73,7 +74,14 @@ class Parts:
     fields: Sequence[ParticleField]
     residuals: Sequence[ufl.Form]
     background: Any
-    numerics: Numerics
+    solver: Solver
+    entity_maps: Any = None
+
+    @property
+    def _form_options(self) -> dict[str, Any]:
+        """Options with which forms are compiled."""
+        maps = {} if self.entity_maps is None else {"entity_maps": self.entity_maps}
+        return {**self.solver.of_forms, **maps}
 
     def require_own_fields(self) -> None:
         """Raise an error where a form has unknowns of another body.
@@ -81,7 +89,7 @@ class Parts:
         Raises:
             MPMError: It has.
         """
-        mapped = self.numerics.entity_maps is not None
+        mapped = self.entity_maps is not None
         for number, given in enumerate(self.contributions):
             for form, what in ((given.residual, "residual R"), (given.tangent, "tangent J")):
                 require_own_fields(form, number, self.bodies, what, self.fields, mapped)
@@ -111,7 +119,7 @@ class Parts:
                     given.internal,
                     given.low_rank,
                     [field for field in self.fields if field.particles is body],
-                    **self.numerics.of_forms,
+                    **self._form_options,
                 ),
                 given.material,
                 given.contact,
@@ -136,7 +144,7 @@ class Parts:
             if not own:
                 continue
             fields = [field for field, _ in own]
-            options = self.numerics.of_forms
+            options = self._form_options
             forms = FieldForms(body, fields, given.residual, [form for _, form in own], **options)
             moving = body if self._moves(given) else None
             carried = [CarriedField(field) for field in fields]
@@ -150,13 +158,13 @@ class Parts:
             bcs: Dirichlet conditions.
         """
         groups = by_space(self.moving)
-        kind, remove = self.numerics.stabilisation, self.numerics.dependent_dofs == "remove"
+        kind = self.solver.stabilisation
         return [
             Field(
                 group,
                 bcs,
                 forms,
-                stabilisation_of(kind, group, remove, forms is not None),
+                stabilisation_of(kind, group, forms is not None),
                 joints_of(kind, group),
             )
             for group, forms in zip(groups, self._on_backgrounds(groups), strict=True)
@@ -179,7 +187,7 @@ class Parts:
             number = next((n for n, group in enumerate(groups) if group[0].V in spaces), 0)
             require_background_fields(form, groups[number])
             own[number].append(form)
-        options = self.numerics.of_forms
+        options = self._form_options
         return [
             BackgroundForms(sum(mine[1:], mine[0]), group[0], **options) if mine else None
             for mine, group in zip(own, groups, strict=True)

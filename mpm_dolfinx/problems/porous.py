@@ -36,11 +36,10 @@ from ..particles.field import ParticleField
 from ..particles.particles import Particles
 from ..reals import as_reals
 from ..system.term import PointMaterial
-from .arguments import as_bodies
+from .body import Body, PoreFluid, as_given
 from .particle_problem import Law
 from .parts import Contribution
 from .quasistatic import QuasiStaticProblem
-from .setup import BodySetup
 from .through_time import TimeProblem
 
 __all__ = ["PorousProblem"]
@@ -48,16 +47,6 @@ __all__ = ["PorousProblem"]
 #: Factor of Nitsche's penalty ``k m / h``, h the size of the domains across the boundary and m the
 #: degree of the pressure; inverse inequalities ask for up to 4 in simplices.
 PENALTY = 5.0
-
-
-@dataclass(frozen=True)
-class _Pores:
-    """What the pores of a body are like; see :class:`PorousProblem` for each."""
-
-    permeability: Any
-    storage: Any
-    drained: Sequence[Any]
-    inflow: Sequence[Any]
 
 
 @dataclass
@@ -90,27 +79,13 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
     the beginning unless a path sets others: ``problem.solve(time, dt, update)``.
 
     Args:
-        particles: The body, or a list of bodies, of degree 2 or 3 on a background of degree 2 or 3.
-        material: As in :class:`QuasiStaticProblem`, for the effective stress.
-        permeability: Hydraulic conductivity over the specific weight of water (length^2 over
-            pressure and time): a positive number, or what must not be negative anywhere when a step
-            begins: a Constant or Function, UFL on the body mesh, or a function of the volume ratio
-            J that returns UFL, ``lambda J: k * J**3``. ``None`` for a body without water, such as a
-            footing. A list has one for each body.
-        density: Mass of soil and water per undeformed volume.
-        storage: Change of the water's volume by its pressure, per undeformed volume (one over a
-            pressure): the porosity times the compressibility of water; one for all or a list.
-        fluid_density: Mass per volume of the water, on which ``body_force`` acts as well; 0 where p
-            is the excess over the hydrostatic pressure.
-        drained: Pairs of a pore pressure (number or UFL) and a tag of ``facet_tags``, where water
-            comes and goes at this pressure; with several bodies one list for each.
-        inflow: Pairs of a volume of water that flows in per undeformed area and time, and a tag.
-        pore_pressure: At the beginning: a number, or a function of coordinates ``(3, n)`` that
-            returns ``(n,)``; one for all or a list.
+        bodies: One :class:`Body`, or a list, of degree 2 or 3 on a background of degree 2 or 3
+            where they have a ``pore_fluid``; one at least has. Bodies without, such as a footing,
+            are dry.
+        bcs: As in :class:`QuasiStaticProblem`, and on the space of the pore pressure.
         pressure_space: Background space of the pore pressure, for Dirichlet conditions on it in
             ``bcs``; ``None``: continuous, of one degree less than V on its mesh.
-        **options: All else that :class:`QuasiStaticProblem` has but ``mixed``, ``background``
-            and ``predictor``.
+        **options: All else that :class:`QuasiStaticProblem` has but ``mixed`` and ``background``.
 
     Attributes:
         pore_pressure: Of each body with water, a :class:`mpm_dolfinx.ParticleField` at its nodes.
@@ -121,75 +96,44 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
 
     _gradual = False
 
+    _further = ("pore_fluid",)
+
     def __init__(
         self,
-        particles: Particles | Sequence[Particles],
-        material: Any,
-        permeability: Any,
-        density: Any = 1.0,
+        bodies: Body | Sequence[Body],
+        bcs: Sequence[fem.DirichletBC] = (),
         *,
-        storage: Any = 0.0,
-        fluid_density: float = 0.0,
-        drained: Sequence[Any] = (),
-        inflow: Sequence[Any] = (),
-        pore_pressure: Any = 0.0,
         pressure_space: fem.FunctionSpace | None = None,
         **options: Any,
     ) -> None:
-        bodies = as_bodies(particles)
-        require_same(
-            bodies[0].V.mesh.comm,
-            permeability=permeability,
-            storage=storage,
-            fluid_density=fluid_density,
-            drained=drained,
-            inflow=inflow,
-            pore_pressure=pore_pressure,
-            pressure_space=pressure_space,
-        )
-        for name in ("mixed", "background", "predictor", "fields"):
+        given = as_given(bodies)
+        require_same(given[0].particles.V.mesh.comm, pressure_space=pressure_space)
+        for name in ("mixed", "background", "fields"):
             if name in options:
-                raise MPMError(f"A PorousProblem has no {name}=; leave it out.")
-        count = len(bodies) if isinstance(particles, list | tuple) else 0
-        self._pores = [
-            (body, _Pores(*values))
-            for body, *values in zip(
-                bodies,
-                _of_bodies("permeability", permeability, count),
-                _of_bodies("storage", storage, count),
-                _lists("drained", drained, count),
-                _lists("inflow", inflow, count),
-                strict=True,
-            )
-        ]
-        if all(pores.permeability is None for _, pores in self._pores):
-            raise MPMError("A PorousProblem needs a permeability for one of its bodies at least.")
-        for body, pores in self._pores:
-            _require(body, pores)
-        self._fluid_density = _number("fluid_density", fluid_density)
-        self._spaces_of_water = _spaces(self._pores, pressure_space)
+                raise MPMError(f"A PorousProblem has no {name}=; omit it.")
+        if all(body.pore_fluid is None for body in given):
+            raise MPMError("A PorousProblem needs a body with a pore_fluid= at least.")
+        self._spaces_of_water = _spaces(given, pressure_space)
         self._filled: list[_Filled] = []
-        super().__init__(particles, material, density, predictor=False, **options)
-        start = _of_bodies("pore_pressure", pore_pressure, count)
-        for (body, _), value in zip(self._pores, start, strict=True):
-            for filled in self._filled:
-                if filled.particles is body:
-                    _begin_with(filled.field, value)
+        super().__init__(bodies, bcs, **options)
+        for filled in self._filled:
+            fluid = self.body(filled.particles).pore_fluid
+            assert fluid is not None
+            _begin_with(filled.field, fluid.pressure)
 
     def laws(self) -> list[list[Law]]:
-        """See :meth:`ParticleProblem.laws`; what pores are like goes with the material."""
+        """See :meth:`ParticleProblem.laws`; the pore fluid goes with the material."""
         found = super().laws()
-        for own, body in zip(found, self.bodies, strict=True):
-            pores = next(pores for its, pores in self._pores if its is body)
-            if pores.permeability is not None:
+        for own, body in zip(found, self.setup.bodies, strict=True):
+            if body.pore_fluid is not None:
                 water: dict[str, Any] = {
                     name: value
                     if isinstance(value, float | int | np.number)
                     else type(value).__name__  # it may have changed since, as loads may
                     for name, value in (
-                        ("permeability", pores.permeability),
-                        ("storage", pores.storage),
-                        ("fluid_density", self._fluid_density),
+                        ("permeability", body.pore_fluid.permeability),
+                        ("storage", body.pore_fluid.storage),
+                        ("fluid_density", body.pore_fluid.density),
                     )
                 }
                 own.append(("water", water))
@@ -202,16 +146,11 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
 
     # -- The system -----------------------------------------------------------------------
 
-    def _more_of(self, body: Particles) -> Mapping[str, Any]:
-        """See :meth:`QuasiStaticProblem._more_of`."""
-        pores = next(pores for its, pores in self._pores if its is body)
-        return dict(vars(pores))
-
-    def _made_of(self) -> list[str]:
-        """See :meth:`ParticleProblem._made_of`."""
-        wet = [filled.particles for filled in self._filled]
-        words = zip(super()._made_of(), self.bodies, strict=True)
-        return [f"{own}; water" if any(b is w for w in wet) else own for own, b in words]
+    def _require_change(self, body: Body) -> None:
+        """See :meth:`QuasiStaticProblem._require_change`."""
+        super()._require_change(body)
+        if (body.pore_fluid is None) != (self.body(body.particles).pore_fluid is None):
+            raise MPMError("Water cannot come to a dry body in a stage, nor leave a wet one.")
 
     def _spaces_of_fields(self) -> list[fem.FunctionSpace]:
         """See :meth:`ParticleProblem._spaces_of_fields`."""
@@ -223,7 +162,9 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
 
     def _contributions(self) -> list[Contribution]:
         """See :meth:`ParticleProblem._contributions`."""
-        self._filled = [self._water(body) for body, pores in self._porous()]
+        self._filled = [
+            self._water(body.particles) for body in self.setup.bodies if body.pore_fluid is not None
+        ]
         contributions = super()._contributions()
         self.fields = self.pore_pressure
         self._of_fields = [f.residual for f in self._filled if f.residual is not None]
@@ -246,15 +187,6 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         for filled in self._filled:
             filled.particles.fill_pores(filled.field)
 
-    def _porous(self) -> list[tuple[Particles, _Pores]]:
-        """Return the bodies with water that the problem has."""
-        own = [given.particles for given in self.setup.bodies]
-        return [
-            (body, pores)
-            for body, pores in self._pores
-            if pores.permeability is not None and any(body is known for known in own)
-        ]
-
     def _water(self, body: Particles) -> _Filled:
         """Return the water of a body, with the same pressure while its mesh is the same.
 
@@ -276,13 +208,14 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
             fem.Constant(body.mesh, 1.0),
         )
 
-    def _further_work(self, given: BodySetup, strain: Strain) -> tuple[list[ufl.Form], bool]:
+    def _further_work(self, given: Body, strain: Strain) -> tuple[list[ufl.Form], bool]:
         """See :meth:`QuasiStaticProblem._further_work`."""
         body = given.particles
         filled = next((f for f in self._filled if f.particles is body), None)
         if filled is None:
             return [], True
-        pores = next(pores for its, pores in self._pores if its is body)
+        pores = given.pore_fluid
+        assert pores is not None
         small = [_is_small(law) for law in _laws(given.material)]
         if any(small) != all(small):
             raise MPMError(
@@ -302,15 +235,15 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         return [flow.work_of_pressure()], all(small) and not follows
 
     def _balance(
-        self, given: BodySetup, pores: _Pores, flow: _Flow, storage: Any, k: Any
+        self, given: Body, pores: PoreFluid, flow: _Flow, storage: Any, k: Any
     ) -> ufl.Form:
         """Return the balance of mass, with the other sign, in which small strains are symmetric."""
         body, p, q, dt = given.particles, flow.p, flow.q, flow.dt
         weight = None
-        if given.body_force is not None and self._fluid_density:
+        if given.body_force is not None and pores.density:
             dim = body.mesh.geometry.dim
             b = as_expression(given.body_force, body, "body_force", (dim,))
-            weight = body.load * self._fluid_density * b
+            weight = body.load * pores.density * b
         stored = q * (flow.J - flow.J_n) + q * storage * (p - flow.p_n)
         flux = flow.flux(k, p, weight)
         turn = flow.strain.turn
@@ -350,46 +283,17 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
             for one in filled.checked:
                 one.require()
 
-    def add(  # type: ignore[override]
-        self,
-        particles: Particles,
-        material: Any,
-        permeability: Any = None,
-        density: Any = 1.0,
-        *args: Any,
-        storage: Any = 0.0,
-        drained: Sequence[Any] = (),
-        inflow: Sequence[Any] = (),
-        **options: Any,
-    ) -> None:
-        """Add a body: see :meth:`QuasiStaticProblem.add`; what changes does so at once.
-
-        Args:
-            particles: The body.
-            material: As in the constructor.
-            permeability: As in the constructor; ``None``: without water.
-            density: As in the constructor.
-            *args: As in :meth:`QuasiStaticProblem.add`.
-            storage: As in the constructor.
-            drained: As in the constructor.
-            inflow: As in the constructor.
-            **options: As in :meth:`QuasiStaticProblem.add`.
-        """
-        if not isinstance(particles, Particles):
-            raise MPMError(f"add() needs mpm.Particles, not a {type(particles).__name__}.")
-        its = (
-            _lists(name, given, 0)[0] for name, given in (("drained", drained), ("inflow", inflow))
-        )
-        pores = _Pores(permeability, storage, *its)
-        _require(particles, pores)
-        before = list(self._pores), list(self._spaces_of_water)
-        self._pores.append((particles, pores))
-        known = {id(body.V): V for body, V in self._spaces_of_water}
-        self._spaces_of_water = _spaces(self._pores, None, known)
+    def add(self, body: Body, name: str | None = None, *, sudden: bool = False) -> None:
+        """Add a body: see :meth:`QuasiStaticProblem.add`; what changes does so at once."""
+        (given,) = as_given(body)
+        self._require_given([given])
+        before = list(self._spaces_of_water)
+        known = {id(particles.V): V for particles, V in before}
+        self._spaces_of_water = before + _spaces([given], None, known)
         try:
-            super().add(particles, material, density, *args, **options)
+            super().add(given, name, sudden=sudden)
         except BaseException:
-            self._pores, self._spaces_of_water = before
+            self._spaces_of_water = before
             raise
 
 
@@ -551,63 +455,8 @@ def _is_small(material: Material) -> bool:
     return getattr(material, "kinematics", None) == "small"
 
 
-def _of_bodies(name: str, value: Any, count: int) -> list[Any]:
-    """Return one value for each of ``count`` bodies (0: one body that is not in a list)."""
-    if not isinstance(value, list) or count == 0:
-        return [value] * max(count, 1)
-    if len(value) != count:
-        raise MPMError(f"There are {count} bodies, but a list of {len(value)} for {name}.")
-    return value
-
-
-def _lists(name: str, value: Any, count: int) -> list[Any]:
-    """Return one list of pairs for each of ``count`` bodies."""
-    if not isinstance(value, list | tuple):
-        raise MPMError(f"{name} must be a list of pairs of a value and a tag, not {value!r}.")
-    if count == 0 or not value or not all(isinstance(part, list) for part in value):
-        lists = [value] * max(count, 1)
-    else:
-        lists = _of_bodies(name, list(value), count)
-    for pairs in lists:
-        for pair in pairs:
-            if not isinstance(pair, list | tuple) or len(pair) != 2:
-                raise MPMError(
-                    f"{name} must be a list of pairs of a value and a tag, such as [(0.0, 1)], "
-                    f"which {pair!r} is not."
-                )
-    return lists
-
-
-def _number(name: str, value: Any) -> float:
-    known = isinstance(value, float | int | np.number) and not isinstance(value, bool)
-    if not known or not 0.0 <= value < np.inf:
-        raise MPMError(f"{name} must be a number that is not negative, not {value!r}.")
-    return float(value)
-
-
-def _require(body: Particles, pores: _Pores) -> None:
-    """Raise an error unless a body can have such pores."""
-    if pores.permeability is None:
-        if pores.drained or pores.inflow:
-            raise MPMError("drained= and inflow= need a body with a permeability.")
-        return
-    degrees = [space.ufl_element().degree for space in (body.V, body.W)]
-    if min(degrees) < 2:
-        raise MPMError(
-            "A PorousProblem needs a background and particles of degree 2 or 3 (degree=2), not "
-            f"{degrees[0]} and {degrees[1]}: with displacements of degree 1 the pressure would "
-            "oscillate while no water can leave."
-        )
-    for name in ("permeability", "storage"):
-        value = getattr(pores, name)
-        if isinstance(value, float | int | np.number):
-            least = "positive" if name == "permeability" else "not negative"
-            if not (0.0 < value < np.inf or (value == 0.0 and name == "storage")):
-                raise MPMError(f"{name} must be {least}, not {value!r}.")
-
-
 def _spaces(
-    pores: Sequence[tuple[Particles, _Pores]],
+    bodies: Sequence[Body],
     given: fem.FunctionSpace | None,
     known: Mapping[int, fem.FunctionSpace] | None = None,
 ) -> list[tuple[Particles, fem.FunctionSpace]]:
@@ -616,21 +465,25 @@ def _spaces(
     Bodies that move by one V have one, so that water flows from one to the other.
 
     Args:
-        pores: All bodies.
+        bodies: All bodies.
         given: A space of the user's.
         known: Spaces by the identity of V.
 
     Raises:
-        MPMError: The user's space cannot be that of the pressure.
+        MPMError: The user's space cannot be that of the pressure, or a body is of degree 1.
     """
     if given is not None:
-        _require_space(given, [body.V for body, _ in pores])
+        _require_space(given, [body.particles.V for body in bodies])
     made = dict(known or {})
     found = []
-    for body, its in pores:
-        if its.permeability is None:
-            continue
-        V = body.V
+    for body in (body.particles for body in bodies if body.pore_fluid is not None):
+        V, degrees = body.V, [space.ufl_element().degree for space in (body.V, body.W)]
+        if min(degrees) < 2:
+            raise MPMError(
+                "A PorousProblem needs a background and particles of degree 2 or 3 (degree=2), not "
+                f"{degrees[0]} and {degrees[1]}: with displacements of degree 1 the pressure would "
+                "oscillate while no water can leave."
+            )
         if id(V) not in made:
             if given is not None and made:
                 raise MPMError("pressure_space= is for bodies that share one V.")
@@ -671,7 +524,7 @@ def _begin_with(field: ParticleField, value: Any) -> None:
             try:
                 values = as_reals(value(x))
             except Exception as error:
-                raise as_ours(error, "The function that gives pore_pressure") from error
+                raise as_ours(error, "The function that gives the pore pressure") from error
             if values.shape != x.shape[1:]:
                 raise MPMError(
                     f"pore_pressure must return values of the shape {x.shape[1:]} for coordinates "

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -34,13 +34,16 @@ from ..system.pressure import PressureTerm
 from ..system.smoothing import PressureSmoothing
 from ..system.term import Term
 from ..system.values import FieldTerm
-from .arguments import as_bodies, as_loads, as_supports, as_terms
-from .initial_stress import initial_stress_at_points, of_all_ranks
+from .arguments import as_bodies, as_supports, as_terms
+from .body import INITIAL, Body, as_given
+from .initial_stress import initial_stress_at_points
 from .particle_problem import Law, ParticleProblem
 from .parts import Contribution, Parts
 from .remeshing import Remeshing, as_indices
-from .setup import BodySetup, Numerics, Setup
+from .setup import Setup
+from .solver import Solver, as_solver
 from .stages import Addition, Given, Removal, chosen_cells
+from .summary import counted
 
 __all__ = ["QuasiStaticProblem"]
 
@@ -52,58 +55,29 @@ class QuasiStaticProblem(ParticleProblem):
     """Equilibrium of bodies with materials, under body force, tractions and supports.
 
     ``int P : grad v dX - load (int density b . v dX + int t . v dS) = 0`` on the undeformed
-    body, with the first Piola stress P and its tangent dP/dF at quadrature points. With several
-    bodies, ``material``, ``density``, ``body_force``, ``tractions``, ``pressures``, ``cell_tags``
-    and ``facet_tags`` are each one for all, or a list with one for each body.
+    body; the first Piola stress P and its tangent dP/dF come from the materials at the points.
 
     Args:
-        particles: The body, or a list of bodies. Those on the same V do not slip where they touch;
-            those on a V of their own meet by ``terms`` alone.
-        material: A material, or ``{cell tag: material}`` with ``cell_tags``.
-        density: Mass per undeformed volume: a number, Constant, Function or UFL expression.
-        body_force: Force per mass at full load: a tuple, Constant, Function or UFL expression
-            on the body mesh, or a function that makes one from the mesh.
+        bodies: One :class:`Body`, or a list. Those whose particles are on the same V do not slip
+            where they touch; those on a V of their own meet by ``terms`` alone.
         bcs: Dirichlet conditions on V, totals at full load.
-        tractions: Pairs of a dead load per undeformed area at full load (tuple or UFL) and a
-            tag of ``facet_tags``.
-        pressures: Pairs of a pressure at full load (number or UFL) and a tag of
-            ``facet_tags``; it acts on the deformed facets, against their normal, per deformed
-            area (a follower load, whose tangent is not symmetric).
-        cell_tags: Tags of the body's cells.
-        facet_tags: Tags of the body's facets.
+        supports: Supports on the bodies' own boundaries, of :mod:`mpm_dolfinx.boundary`.
+        terms: What else acts on the bodies: contacts, ties, any :class:`mpm_dolfinx.Term`.
+        background: Form on the background, as in :class:`ParticleProblem`.
         axisymmetric: Whether ``x[0]`` is the radius of a body of revolution about ``x[0] = 0``;
             loads and reactions are then those of the whole circumference.
-        supports: Supports on the bodies' own boundaries, of :mod:`mpm_dolfinx.boundary`.
-        background: Form on the background, as in :class:`ParticleProblem`.
-        f_bar: Average of the volume ratio that the material sees, against hourglass modes and
-            locking: ``"none"``, ``"domain"`` (over a domain's points) or ``"patch"`` (over the
-            domains of about one background cell).
-        petsc_options_prefix: Prefix of the PETSc options.
-        petsc_options: PETSc options, without prefix.
-        shift: As in :class:`ParticleProblem`.
-        line_search: As in :class:`ParticleProblem`.
-        dependent_dofs: As in :class:`ParticleProblem`.
-        predictor: As in :class:`ParticleProblem`.
-        stabilisation: As in :class:`ParticleProblem`.
-        linear_solver: As in :class:`ParticleProblem`.
-        form_compiler_options: As in :class:`ParticleProblem`.
-        jit_options: As in :class:`ParticleProblem`.
-        terms: As in :class:`ParticleProblem`.
-        initial_stress: Cauchy stress that the body carries before it has moved, which its material
-            must be able to bear: ``(3, 3)`` with the direction out of the plane (or around the
-            axis) at last, one for each owned particle or point ``(n, 3, 3)`` or
-            ``(n, nq, 3, 3)``, UFL of the shape ``(3, 3)`` on the body mesh, a function of
-            coordinates ``(3, n)`` that returns ``(3, 3, n)``, or :func:`mpm_dolfinx.geostatic`.
-            What it is not in equilibrium with goes in proportion, as loads come, in the first run.
         mixed: ``"pressure"``: the pressure is an unknown besides the displacement, continuous and
             of one degree less on the same background mesh (the pair of Taylor & Hood 1973), so that
             nothing locks however little volume changes; for laws in strain space (Hencky,
             von Mises, Mohr-Coulomb, Drucker-Prager, your own), backgrounds and particles of degree
-            2 or 3, instead of ``f_bar``. ``"stabilised pressure"``: displacement and pressure are
-            both of degree 1, and what the pressure deviates by from its mean in each cell counts as
-            compliance (Bochev, Dohrmann & Gunzburger 2006).
+            2 or 3, instead of ``f_bar``.
+            ``"stabilised pressure"``: displacement and pressure are both of degree 1, and what the
+            pressure deviates by from its mean in each cell counts as compliance (Bochev, Dohrmann &
+            Gunzburger 2006).
+        solver: How it is solved.
 
     Attributes:
+        particles: The particles of the body, or of each in a list.
         pressure: With ``mixed``, the pressure of each body: a :class:`mpm_dolfinx.ParticleField` at
             its points. It is the mean of the laws' own stress, positive in tension.
 
@@ -113,95 +87,38 @@ class QuasiStaticProblem(ParticleProblem):
 
     def __init__(
         self,
-        particles: Particles | Sequence[Particles],
-        material: Any,
-        density: Any = 1.0,
-        body_force: Any = None,
+        bodies: Body | Sequence[Body],
         bcs: Sequence[fem.DirichletBC] = (),
-        tractions: Sequence[Any] = (),
-        pressures: Sequence[Any] = (),
-        cell_tags: Any = None,
-        facet_tags: Any = None,
-        axisymmetric: bool = False,
-        supports: Sequence[Support] = (),
-        background: ufl.Form | Sequence[ufl.Form] | None = None,
-        f_bar: str = "none",
-        petsc_options_prefix: str = "mpm_",
-        petsc_options: dict[str, Any] | None = None,
         *,
-        shift: float = 1e-13,
-        line_search: bool = True,
-        dependent_dofs: str = "shift",
-        predictor: bool = True,
-        stabilisation: str | None = "auto",
-        linear_solver: str = "auto",
-        form_compiler_options: dict[str, Any] | None = None,
-        jit_options: dict[str, Any] | None = None,
+        supports: Sequence[Support] = (),
         terms: Sequence[Term] = (),
-        initial_stress: Any = None,
+        background: ufl.Form | Sequence[ufl.Form] | None = None,
+        axisymmetric: bool = False,
         mixed: str | None = None,
+        solver: Solver | None = None,
     ) -> None:
-        bodies = as_bodies(particles)
-        tractions, pressures = as_loads("tractions", tractions), as_loads("pressures", pressures)
+        given = as_given(bodies)
+        self._require_given(given)
+        listed = [body.particles for body in given]
+        particles = as_bodies(listed if isinstance(bodies, list | tuple) else listed[0])
         require_same(
-            bodies[0].V.mesh.comm,
-            particles=particles,
+            particles[0].V.mesh.comm,
+            bodies=[body.particles for body in given],
             mixed=mixed,
-            material=material,
-            density=density,
-            body_force=body_force,
             bcs=bcs,
-            tractions=tractions,
-            pressures=pressures,
-            cell_tags=cell_tags,
-            facet_tags=facet_tags,
             axisymmetric=axisymmetric,
             supports=supports,
             background=background,
-            f_bar=f_bar,
-            initial_stress=of_all_ranks(initial_stress),
             terms=terms,
         )
-        numerics = Numerics.agreed(
-            bodies[0].V.mesh.comm,
-            petsc_options_prefix=petsc_options_prefix,
-            petsc_options=petsc_options,
-            form_compiler_options=form_compiler_options,
-            jit_options=jit_options,
-            shift=shift,
-            line_search=line_search,
-            dependent_dofs=dependent_dofs,
-            predictor=predictor,
-            stabilisation=stabilisation,
-            linear_solver=linear_solver,
-        )
-        supports = as_supports(supports, bodies)
-        count = len(bodies) if isinstance(particles, list | tuple) else 0
-        given = zip(
-            bodies,
-            _for_each(material, count),
-            _for_each(density, count),
-            _for_each(body_force, count),
-            _for_each(tractions, count, pairs=True),
-            _for_each(pressures, count, pairs=True),
-            _for_each(cell_tags, count),
-            _for_each(facet_tags, count),
-            [tuple(s for s in supports if s.particles is body) for body in bodies],
-            [self._more_of(body) for body in bodies],
-            strict=True,
-        )
-        stresses = _for_each(initial_stress, count)
+        supports = as_supports(supports, particles)
         setup = Setup(
-            tuple(BodySetup(*values) for values in given),
-            axisymmetric,
-            f_bar,
-            tuple(as_terms(terms, bodies)),
-            mixed,
+            tuple(given), tuple(supports), tuple(as_terms(terms, particles)), axisymmetric, mixed
         )
-        if any(body.on_distortion == "split" for body in bodies):
+        if any(body.on_distortion == "split" for body in particles):
             setup.require_divisible()
-        for body in bodies:
-            moved = bodies[0].V.mesh.comm.allreduce(int(np.any(body.converged_displacement)))
+        for body in particles:
+            moved = particles[0].V.mesh.comm.allreduce(int(np.any(body.converged_displacement)))
             for support in supports:
                 if support.particles is body and not moved:
                     support.forget_modulus()
@@ -211,10 +128,39 @@ class QuasiStaticProblem(ParticleProblem):
         self.pressure: list[ParticleField] = []
         self._left: dict[int, tuple[fem.Function, NDArray[np.float64]]] = {}
         self._remeshing = Remeshing(self)
-        self._begin(particles, bcs, background, numerics, terms, self._remeshing)
-        self._carry_stress(stresses)
-        for body in bodies:
+        one = particles if isinstance(bodies, list | tuple) else particles[0]
+        self._begin(one, bcs, background, as_solver(solver), terms, self._remeshing)
+        self._carry_stress([body.initial_stress for body in given])
+        for body in particles:
             _warn_of_hourglass(body)
+
+    #: What bodies may have besides, which is for some problems alone.
+    _further: tuple[str, ...] = ()
+
+    def _require_given(self, bodies: Sequence[Body]) -> None:
+        """Raise an error where bodies have what is for other problems alone."""
+        for name, kind in (("velocity", "DynamicProblem"), ("pore_fluid", "PorousProblem")):
+            if name not in self._further and any(getattr(b, name) is not None for b in bodies):
+                raise MPMError(
+                    f"{name}= of a Body is for a {kind}; omit it in a {type(self).__name__}."
+                )
+
+    def body(self, particles: Particles | None = None) -> Body:
+        """Return what a body is made of and what acts on it, as it was given last.
+
+        Args:
+            particles: Its particles; ``None`` where there is one body.
+
+        Raises:
+            MPMError: There is no such body, or there are several.
+        """
+        if particles is None and len(self.setup.given) == 1:
+            return self.setup.given[0]
+        for body in self.setup.given:
+            if body.particles is particles:
+                return body
+        count = len(self.setup.given)
+        raise MPMError(f"There are {count} bodies; name one of them by its particles.")
 
     def _carry_stress(self, stresses: Sequence[Any]) -> None:
         """Let bodies that have not moved carry a stress (collective).
@@ -244,31 +190,24 @@ class QuasiStaticProblem(ParticleProblem):
         for body, stress in zip(self.bodies, self._stresses, strict=True):
             body.attach(stress)
 
-    def _more_of(self, body: Particles) -> Mapping[str, Any]:
-        """Return what else a user has given for a body, by name, which may lie on its mesh."""
-        return {}
-
     def _made_of(self) -> list[str]:
         """See :meth:`ParticleProblem._made_of`."""
-        more = ["body of revolution"] if self.setup.axisymmetric else []
-        if self.setup.f_bar != "none":
-            more.append(f"F-bar over each {self.setup.f_bar}")
-        return ["; ".join([body.in_words(), *more]) for body in self.setup.bodies]
+        whole = ["body of revolution"] if self.setup.axisymmetric else []
+        found = []
+        for body in self.setup.bodies:
+            held = self.setup.supports_of(body.particles)
+            more = [counted(len(held), "support")] if held else []
+            found.append("; ".join([body.in_words(), *more, *whole]))
+        return found
 
     # -- Stages ---------------------------------------------------------------------------
 
     def stage(
         self,
         name: str | None = None,
+        bodies: Body | Sequence[Body] = (),
         *,
-        material: Any = ...,
-        density: Any = ...,
-        body_force: Any = ...,
         bcs: Any = ...,
-        tractions: Any = ...,
-        pressures: Any = ...,
-        cell_tags: Any = ...,
-        facet_tags: Any = ...,
         supports: Any = ...,
         terms: Any = ...,
         sudden: bool = False,
@@ -278,70 +217,53 @@ class QuasiStaticProblem(ParticleProblem):
         What is taken away is unloaded over the next run, and what is new is loaded over it. Points
         whose law equals that of before go on as they were; others carry their stress on, and where
         the law is of the same class the internal variables that both begin with the same value.
-        All arguments but these are as in the constructor; ``...`` keeps what there is.
 
         Args:
             name: Name of the stage, for ``history.stages``.
-            material: As in the constructor.
-            density: As in the constructor.
-            body_force: As in the constructor.
-            bcs: As in the constructor, all that hold from now on.
-            tractions: As in the constructor, all that act from now on.
-            pressures: As in the constructor, all that act from now on.
-            cell_tags: On the present ``particles.mesh``.
-            facet_tags: On the present ``particles.mesh``.
-            supports: All that hold from now on.
+            bodies: Bodies that are made of or loaded by something else from now on, each in place
+                of the one of the same particles: ``problem.body().replace(tractions=[...])``. New
+                tags are of the present ``particles.mesh``.
+            bcs: All Dirichlet conditions that hold from now on; ``...`` keeps what there is, as
+                below.
+            supports: All supports that hold from now on.
             terms: All that act from now on.
             sudden: Whether the whole change acts from the first step on.
 
         Raises:
             MPMError: What does not go together. Nothing is changed then.
         """
-        bodies = self.bodies
+        changed = as_given(bodies) if bodies != () else []
         require_same(
             self._comm,
             name=name,
-            material=material,
-            density=density,
-            body_force=body_force,
+            bodies=[body.particles for body in changed],
             bcs=self.bcs if bcs is ... else bcs,
-            tractions=tractions,
-            pressures=pressures,
-            cell_tags=cell_tags,
-            facet_tags=facet_tags,
             supports=supports,
             terms=terms,
             sudden=sudden,
         )
-        count = len(bodies) if isinstance(self.particles, list | tuple) else 0
-        changes: list[dict[str, Any]] = [{} for _ in bodies]
-        for key, value, pairs in (
-            ("material", material, False),
-            ("density", density, False),
-            ("body_force", body_force, False),
-            ("tractions", tractions, True),
-            ("pressures", pressures, True),
-            ("cell_tags", cell_tags, False),
-            ("facet_tags", facet_tags, False),
-        ):
-            if value is not ...:
-                wanted = as_loads(key, value) if pairs else value
-                for own, part in zip(changes, _for_each(wanted, count, pairs), strict=True):
-                    own[key] = part
+        for body in changed:
+            self._require_change(body)
+        setup = self.setup.with_bodies(*changed)
         if supports is not ...:
-            every = as_supports(supports, bodies)
-            for own, body in zip(changes, bodies, strict=True):
-                own["supports"] = tuple(s for s in every if s.particles is body)
+            setup = replace(setup, supports=tuple(as_supports(supports, self.bodies)))
         own_terms = self._own_terms()
         given = [term for term in self.terms if all(term is not mine for mine in own_terms)]
         change = Given(
             self,
-            changes,
+            setup,
             self.bcs if bcs is ... else bcs,
             given if terms is ... else terms,
             own_terms,
         )
         self._go_on(name, change, sudden)
+
+    def _require_change(self, body: Body) -> None:
+        """Raise an error unless a body can be put in place of the one of the same particles."""
+        changes = body.changed_from(self.body(body.particles))
+        for name in (*INITIAL, "f_bar"):
+            if name in changes and changes[name] != getattr(self.body(body.particles), name):
+                raise MPMError(f"{name} cannot change in a stage; a body begins with it.")
 
     def remove(
         self,
@@ -375,22 +297,7 @@ class QuasiStaticProblem(ParticleProblem):
         cells = chosen_cells(self.bodies[body], particles, tags, own.cell_tags)
         self._go_on(name, Removal(self, body, cells), sudden)
 
-    def add(
-        self,
-        particles: Particles,
-        material: Any,
-        density: Any = 1.0,
-        body_force: Any = None,
-        tractions: Sequence[Any] = (),
-        pressures: Sequence[Any] = (),
-        *,
-        cell_tags: Any = None,
-        facet_tags: Any = None,
-        supports: Sequence[Support] = (),
-        initial_stress: Any = None,
-        name: str | None = None,
-        sudden: bool = False,
-    ) -> None:
+    def add(self, body: Body, name: str | None = None, *, sudden: bool = False) -> None:
         """Begin a stage in which a body comes: a lift, or a structure (collective).
 
         It is undeformed where it is placed; on the same V it sticks to the bodies that it touches.
@@ -399,57 +306,28 @@ class QuasiStaticProblem(ParticleProblem):
         Its loads come over the next run. ``problem.particles`` is a list from then on.
 
         Args:
-            particles: The body.
-            material: As in the constructor, as are all that follow.
-            density: See there.
-            body_force: See there.
-            tractions: See there.
-            pressures: See there.
-            cell_tags: See there.
-            facet_tags: See there.
-            supports: Supports on this body.
-            initial_stress: See there.
+            body: The body.
             name: As in :meth:`stage`.
             sudden: As in :meth:`stage`.
 
         Raises:
             MPMError: What does not go together. Nothing is changed then.
         """
-        if not isinstance(particles, Particles):
-            raise MPMError(f"add() needs mpm.Particles, not a {type(particles).__name__}.")
-        require_same(
-            self._comm,
-            material=material,
-            density=density,
-            body_force=body_force,
-            tractions=tractions,
-            pressures=pressures,
-            supports=supports,
-            initial_stress=of_all_ranks(initial_stress),
-            name=name,
-            sudden=sudden,
-        )
-        given = BodySetup(
-            particles,
-            material,
-            density,
-            body_force,
-            as_loads("tractions", tractions),
-            as_loads("pressures", pressures),
-            cell_tags,
-            facet_tags,
-            tuple(as_supports(supports, [particles])),
-            self._more_of(particles),
-        )
+        (given,) = as_given(body)
+        self._require_given([given])
+        require_same(self._comm, name=name, sudden=sudden)
+        particles = given.particles
         if particles.on_distortion == "split":
-            replace(self.setup, bodies=(*self.setup.bodies, given)).require_divisible()
+            replace(
+                self.setup, given=(*self.setup.given, given), bodies=(*self.setup.bodies, given)
+            ).require_divisible()
         np.copyto(particles.load.value, float(self.bodies[0].load.value))
         np.copyto(particles.proportional.value, float(self.bodies[0].proportional.value))
-        self._go_on(name, self._addition(given, initial_stress), sudden)
+        self._go_on(name, self._addition(given), sudden)
 
-    def _addition(self, given: BodySetup, initial_stress: Any) -> Addition:
+    def _addition(self, given: Body) -> Addition:
         """Return what adds a body."""
-        return Addition(self, given, initial_stress)
+        return Addition(self, given)
 
     def _own_terms(self) -> list[Term]:
         """Return the terms that the problem itself has."""
@@ -506,26 +384,27 @@ class QuasiStaticProblem(ParticleProblem):
             self._spaces_of_pressure.append((body, V))
         return body.field(V, at="points", name="pressure")
 
-    def _contribution(self, given: BodySetup) -> Contribution:
+    def _contribution(self, given: Body) -> Contribution:
         """Return what one body adds to the system (collective)."""
         body = given.particles
+        supports = self.setup.supports_of(body)
         strain = strain_of(body, self.setup.axisymmetric)
         history = MaterialPoints(
             strain,
             given.material,
             given.cell_tags,
-            self.setup.f_bar,
+            given.f_bar,
             next((field for field in self.pressure if field.particles is body), None),
         )
         if any(field.particles is body for field in self._new_pressures):
             history.begin_with_pressure()
         self._stresses.append(history)
         work = VirtualWork(strain)
-        density = Density(given.density, body)
+        density = Density(1.0 if given.density is None else given.density, body)
         density.require()
         self._density.append((work, density))
         mass = density.value * body.mass_ratio
-        acting, of_step = self._in_time(history, given.supports)
+        acting, of_step = self._in_time(history, supports)
         self._acting.append(acting)
         symmetric = acting.symmetric and not given.pressures
         loads: list[ufl.Form] = []
@@ -537,7 +416,7 @@ class QuasiStaticProblem(ParticleProblem):
         for load in loads:
             self._loads += changeable(load, body)
         share = self._force_share(body)
-        loads += [s.at_body(history.initial_modulus, strain.turn, share) for s in given.supports]
+        loads += [s.at_body(history.initial_modulus, strain.turn, share) for s in supports]
         if given.pressures:
             loads.append(work.pressures(given.pressures, given.facet_tags))
             self._loads += changeable(loads[-1], body)
@@ -556,11 +435,11 @@ class QuasiStaticProblem(ParticleProblem):
             acting.grouped,
             symmetric,
             acting,
-            any(support.one_sided for support in given.supports),
+            any(support.one_sided for support in supports),
             of_step,
         )
 
-    def _further_work(self, given: BodySetup, strain: Strain) -> tuple[list[ufl.Form], bool]:
+    def _further_work(self, given: Body, strain: Strain) -> tuple[list[ufl.Form], bool]:
         """Return forms of the residual besides those of stress and loads (collective).
 
         Args:
@@ -751,20 +630,6 @@ class QuasiStaticProblem(ParticleProblem):
         """
         values = [s.yield_function().max(axis=1, initial=-np.inf) for s in self._stresses]
         return np.concatenate(values)
-
-
-def _for_each(value: Any, count: int, pairs: bool = False) -> list[Any]:
-    """Return one value for each of ``count`` bodies (0: one body that is not in a list)."""
-    if count == 0:
-        return [value]
-    listed = isinstance(value, list) and (
-        not pairs or all(isinstance(entry, list) for entry in value)
-    )
-    if not listed or not value:
-        return [value] * count
-    if len(value) != count:
-        raise MPMError(f"There are {count} bodies, but a list of {len(value)} for them.")
-    return list(value)
 
 
 def _warn_of_hourglass(particles: Particles) -> None:

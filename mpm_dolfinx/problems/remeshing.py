@@ -265,6 +265,7 @@ class Remeshing:
         setup, consequence = problem.setup, "the body cannot be rebased"
         for given in setup.bodies:
             given.require_movable_nodes(consequence)
+        setup.require_no_supports(consequence)
         for term in setup.terms:
             term.require_remeshable(consequence)
         for body in problem.bodies:

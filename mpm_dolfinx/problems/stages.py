@@ -23,8 +23,9 @@ from ..particles.particles import Particles
 from ..system.reduced import ReducedSystem
 from ..system.term import Term
 from .arguments import as_bodies, as_conditions, as_terms, by_space
+from .body import Body
 from .initial_stress import initial_stress_at_points
-from .setup import BodySetup, Setup
+from .setup import Setup
 
 __all__ = ["Addition", "Given", "Removal", "Staged", "chosen_cells", "join"]
 
@@ -94,7 +95,7 @@ class Given(_Change):
 
     Args:
         problem: The problem.
-        bodies: What is given for each body that differs, by the names of :class:`BodySetup`.
+        setup: What it is made of from now on.
         bcs: The Dirichlet conditions.
         terms: What else acts on the bodies, without what the problem itself has.
         own: The terms that the problem itself has.
@@ -103,37 +104,32 @@ class Given(_Change):
     kind = "stage"
 
     def __init__(
-        self,
-        problem: Staged,
-        bodies: Sequence[dict[str, Any]],
-        bcs: Any,
-        terms: Any,
-        own: Sequence[Term] = (),
+        self, problem: Staged, setup: Setup, bcs: Any, terms: Any, own: Sequence[Term] = ()
     ) -> None:
         super().__init__(problem)
         spaces = [group[0].V for group in by_space(problem.bodies)]
-        self._bodies, self._bcs = list(bodies), as_conditions(bcs, spaces)
+        self._bcs = as_conditions(bcs, spaces)
         self._terms = [*own, *as_terms(terms, problem.bodies)]
+        self._setup = replace(setup, terms=tuple(self._terms))
+        self._changed = [
+            set(new.changed_from(old))
+            for new, old in zip(setup.given, problem.setup.given, strict=True)
+        ]
         self._points, self._moduli = list(problem.points), problem.reduced.moduli
 
     def make(self) -> None:
         """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         problem = self.problem
-        setups = [
-            replace(known, **changes)
-            for known, changes in zip(problem.setup.bodies, self._bodies, strict=True)
-        ]
-        problem.setup = replace(problem.setup, bodies=tuple(setups), terms=tuple(self._terms))
         join(self._terms, problem.terms)
-        problem.bcs, problem.terms = self._bcs, self._terms
+        problem.setup, problem.bcs, problem.terms = self._setup, self._bcs, self._terms
 
     def settle(self) -> None:
         """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         problem, factors = self.problem, {}
-        for body, changes, points, before in zip(
-            problem.bodies, self._bodies, problem.points, self._points, strict=True
+        for body, changed, points, before in zip(
+            problem.bodies, self._changed, problem.points, self._points, strict=True
         ):
-            if changes.keys() & OF_LAWS:
+            if changed & OF_LAWS:
                 points.take_over(before)
                 factors[id(body)] = points.shear_modulus() / before.shear_modulus()
         if self._moduli is not None:
@@ -146,8 +142,7 @@ class Given(_Change):
         """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         if body is None:
             return name == "moduli"
-        other = self._bodies[body].keys() & OF_LAWS
-        return bool(other) and name.startswith("history ")
+        return bool(self._changed[body] & OF_LAWS) and name.startswith("history ")
 
 
 class Removal(_Change):
@@ -186,30 +181,30 @@ class Addition(_Change):
 
     Args:
         problem: The problem.
-        given: What it is made of and loaded by.
-        stress: The initial stress that it carries, or ``None``.
+        given: The body.
     """
 
     kind = "add"
 
-    def __init__(self, problem: Staged, given: BodySetup, stress: Any = None) -> None:
+    def __init__(self, problem: Staged, given: Body) -> None:
         super().__init__(problem)
         self._bodies = as_bodies([*problem.bodies, given.particles])
-        self._given, self._stress = given, stress
+        self._given = given
 
     def make(self) -> None:
         """See :class:`~mpm_dolfinx.problems.staging.Change`."""
-        problem = self.problem
-        bodies = (*problem.setup.bodies, self._given)
-        problem.setup = replace(problem.setup, bodies=bodies)
+        problem, setup = self.problem, self.problem.setup
+        given, bodies = (*setup.given, self._given), (*setup.bodies, self._given)
+        problem.setup = replace(setup, given=given, bodies=bodies)
         problem.bodies = self._bodies
         problem.particles = list(self._bodies)
 
     def settle(self) -> None:
         """See :class:`~mpm_dolfinx.problems.staging.Change`."""
-        if self._stress is not None:
+        stress = self._given.initial_stress
+        if stress is not None:
             body, points = self._given.particles, self.problem.points[-1]
-            points.begin_with(initial_stress_at_points(self._stress, body))
+            points.begin_with(initial_stress_at_points(stress, body))
 
     def renews(self, body: int | None, name: str) -> bool:
         """See :class:`~mpm_dolfinx.problems.staging.Change`."""

@@ -27,6 +27,8 @@ SHORT = 1e-9
 class TimeProblem(ParticleProblem):
     """A problem whose steps have a duration. Loads act in full unless a path says otherwise."""
 
+    _predicts = False
+
     def _aim(self, t: float) -> None:
         """Take a time for the end of the step to try."""
 

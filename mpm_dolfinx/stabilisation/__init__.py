@@ -1,11 +1,10 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Cures of badly supported and of dependent dofs.
+"""Cures of badly supported dofs.
 
 Background dofs that hardly anything of a body supports make a tangent singular or nearly so. They
-are held by a penalty on facets (:mod:`~mpm_dolfinx.stabilisation.ghost_penalty`), follow the
-polynomial of a well filled cell (:mod:`~mpm_dolfinx.stabilisation.aggregation`), or stand in for
-each other (:mod:`~mpm_dolfinx.stabilisation.dependent_dofs`);
+are held by a penalty on facets (:mod:`~mpm_dolfinx.stabilisation.ghost_penalty`), or follow the
+polynomial of a well filled cell (:mod:`~mpm_dolfinx.stabilisation.aggregation`);
 :mod:`~mpm_dolfinx.stabilisation.choice` chooses. Bodies that bear on each other are kept together
 where the background would let them part (:mod:`~mpm_dolfinx.stabilisation.joints`).
 """

@@ -8,26 +8,22 @@ from collections.abc import Sequence
 
 from ..errors import MPMError
 from ..particles.particles import Particles
-from ..reals import is_one_of
 from .aggregation import Aggregation
 from .cure import Cure
-from .dependent_dofs import DependentDofs
 from .ghost_penalty import GhostPenalty
 from .joints import Joints
 
-__all__ = ["joints_of", "stabilisation_of"]
+__all__ = ["STABILISATIONS", "joints_of", "stabilisation_of"]
 
 #: Background nodes with weight over nodes of the bodies, from which on a background of degree 1
 #: needs a penalty.
 CROWDED = 0.9
-KINDS = ("auto", "ghost", "aggregate")
+#: Values of ``stabilisation`` besides ``None``.
+STABILISATIONS = ("auto", "ghost", "aggregate")
 
 
 def stabilisation_of(
-    kind: str | None,
-    bodies: Sequence[Particles],
-    remove_dependent: bool = False,
-    background: bool = False,
+    kind: str | None, bodies: Sequence[Particles], background: bool = False
 ) -> Cure:
     """Return what is done about badly supported dofs.
 
@@ -35,31 +31,18 @@ def stabilisation_of(
         kind: ``"ghost"``, ``"aggregate"``, ``None`` (nothing) or ``"auto"``: a ghost penalty
             for a background of degree 2 or more; for degree 1 only while the bodies have hardly
             more nodes than the background, for methods that move particles at their nodes, and
-            unless one of the following is asked for.
+            where there are no terms on the background.
         bodies: The bodies on one background space.
-        remove_dependent: Whether dofs that others can stand in for are to be no unknowns.
         background: Whether there are terms on the background.
 
     Raises:
-        MPMError: Something else, a method whose particles are not moved at their nodes, or two
-            cures.
+        MPMError: A method whose particles are not moved at their nodes.
     """
-    if kind is not None and not is_one_of(kind, KINDS):
-        raise MPMError(
-            f"Unknown stabilisation={kind!r}; choose {', '.join(map(repr, KINDS))} or None."
-        )
     simple = bodies[0].V.ufl_element().degree == 1
-    if simple and kind == "auto" and (remove_dependent or background):
+    if simple and kind == "auto" and background:
         kind = None
     cure = _stabilisation(kind, bodies)
-    if not remove_dependent:
-        return Cure() if cure is None else cure
-    if cure is not None or not simple:
-        raise MPMError(
-            "dependent_dofs='remove' is for a background of degree 1 without stabilisation; "
-            "use dependent_dofs='shift'."
-        )
-    return DependentDofs(bodies)
+    return Cure() if cure is None else cure
 
 
 def joints_of(kind: str | None, bodies: Sequence[Particles]) -> Joints | None:

@@ -43,8 +43,6 @@ from .term import Term
 
 __all__ = ["ReducedSystem"]
 
-#: Counters of which the largest of all steps is kept.
-LARGEST = ("dependent_dofs",)
 
 type Tangents = Mapping[tuple[int, int], PETSc.Mat]
 
@@ -353,7 +351,7 @@ class ReducedSystem:
             for name, count in field.counts.items():
                 counts[name] = counts.get(name, 0) + count
         for name, count in counts.items():
-            statistics[name] = max(statistics[name], count) if name in LARGEST else count
+            statistics[name] = count
         statistics.count("transfers")
         statistics["free_dofs"] = self.sizes[1]
         rows, off, columns = (int(count) for count in numbering.off_rank)

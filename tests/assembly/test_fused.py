@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from marks import thinned
+from posed import posed
 from routes import on_route
 
 import ufl
@@ -52,7 +53,8 @@ def quasi_static(particles, **options):
     V = (particles[0] if isinstance(particles, list) else particles).V
     dim = V.mesh.geometry.dim
     options.setdefault("material", PLASTIC)
-    return mpm.QuasiStaticProblem(
+    return posed(
+        mpm.QuasiStaticProblem,
         particles,
         density=2.0,
         body_force=(0.5,) * dim,
@@ -278,9 +280,7 @@ def sink():
     particles = mpm.Particles(bent(QUADRILATERAL), V)
     held = fem.locate_dofs_geometrical(V, lambda x: x[1] < 0.6)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        mpm.materials.Hencky(1e4, 0.3),
-        body_force=(0.0, -300.0),
+        mpm.Body(particles, mpm.materials.Hencky(1e4, 0.3), body_force=(0.0, -300.0)),
         bcs=[fem.dirichletbc(np.zeros(2), held, V)],
     )
     problem.solve(4)

@@ -7,6 +7,7 @@ import pytest
 import scenes
 from bad_input import held, particles, problem, tags_of_facets, with_one_value
 from compare import raises
+from posed import posed
 from scenes import QUADRILATERAL, TRIANGLE
 
 from dolfinx import fem
@@ -25,7 +26,7 @@ def test_a_facet_that_is_tagged_twice():
     told = r"name a facet twice with the tag 1, and tractions on it would count twice"
     raises(
         lambda: mpm.QuasiStaticProblem(
-            p, Hencky(1e3, 0.3), tractions=[((0.0, -1.0), 1)], facet_tags=twice
+            mpm.Body(p, Hencky(1e3, 0.3), tractions=[((0.0, -1.0), 1)], facet_tags=twice)
         ),
         mpm.MPMError,
         told,
@@ -40,7 +41,7 @@ def test_tags_of_another_mesh_or_of_no_boundary():
 
     def made(facets):
         return lambda: mpm.QuasiStaticProblem(
-            p, Hencky(1e3, 0.3), tractions=loads, facet_tags=facets
+            mpm.Body(p, Hencky(1e3, 0.3), tractions=loads, facet_tags=facets)
         )
 
     raises(made(tags), mpm.MPMError, r"of the body's mesh, not of another one")
@@ -53,7 +54,7 @@ def test_one_negative_density():
     p = particles()
     density = with_one_value(p, 1.0, -3.0)
     raises(
-        lambda: mpm.QuasiStaticProblem(p, Hencky(1e3, 0.3), density=density),
+        lambda: mpm.QuasiStaticProblem(mpm.Body(p, Hencky(1e3, 0.3), density=density)),
         mpm.MPMError,
         "density must not be negative, not -3",
     )
@@ -91,7 +92,8 @@ def test_a_constant_among_numbers_is_followed():
     bcs = [[scenes.fix(q.V, scenes.at(1, -1.0))] for q in (p, other)]
     tags = tags_of_facets(p)
     held = [mpm.boundary.fixed(q, tags_of_facets(q), 1) for q in (p, other)]
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         p,
         Hencky(1e3, 0.3),
         body_force=(0.0, gravity),
@@ -102,7 +104,8 @@ def test_a_constant_among_numbers_is_followed():
         **options,
     )
     problem.solve(2, update=lambda t: np.copyto(gravity.value, -5.0 * t))
-    expected = mpm.QuasiStaticProblem(
+    expected = posed(
+        mpm.QuasiStaticProblem,
         other,
         Hencky(1e3, 0.3),
         body_force=(0.0, -5.0),

@@ -33,10 +33,7 @@ def test_density_and_force_as_functions():
             X = ufl.SpatialCoordinate(body)
             force = ufl.as_vector([1.0 + 0 * X[0], -4.0 + 0 * X[1]])
         problem = mpm.QuasiStaticProblem(
-            mpm.Particles(body, V),
-            Hencky(1e3, 0.3),
-            density=density,
-            body_force=force,
+            mpm.Body(mpm.Particles(body, V), Hencky(1e3, 0.3), density=density, body_force=force),
             bcs=[scenes.fix(V, scenes.at(1, 0.0))],
         )
         problem.solve(steps=2)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from marks import thinned
+from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 
 import basix.ufl
@@ -73,15 +74,22 @@ def label(value):
 @pytest.mark.parametrize(("cell", "over", "rule"), thinned(2, CASES), ids=label)
 def test_is_the_f_bar_of_materials(cell, over, rule):
     particles, bcs = block(cell, rule)
-    material = mpm.QuasiStaticProblem(
-        particles, Hencky(YOUNG, POISSON), 2.0, (0.0, -10.0), bcs, f_bar=over, **TIGHT
+    material = posed(
+        mpm.QuasiStaticProblem,
+        particles,
+        Hencky(YOUNG, POISSON),
+        2.0,
+        (0.0, -10.0),
+        bcs,
+        f_bar=over,
+        **TIGHT,
     )
     material.solve(steps=2)
     other, bcs = block(cell, rule)
     ratio = mpm.AveragedVolumeRatio(other, over)
     F = ufl.Identity(2) + ufl.grad(other.displacement)
     R = ratio.residual(hencky(ufl.sqrt(ratio / ufl.det(F)) * F) * other.dx) + weight(other)
-    problem = mpm.ParticleProblem(R, other, bcs=bcs, symmetric=True, **TIGHT)
+    problem = posed(mpm.ParticleProblem, R, other, bcs=bcs, symmetric=True, **TIGHT)
     problem.solve(steps=2)
     gap = particles.displacement.x.array - other.displacement.x.array
     assert scenes.largest(gap) < 1e-12 < scenes.largest(other.displacement.x.array)
@@ -164,7 +172,7 @@ def test_is_the_mixed_method_with_constant_pressures():
     R = ratio.residual(rubber(d, ratio) * particles.dx)
     R += particles.load * 20.0 * v[1] * ufl.dx(domain=body, metadata={"quadrature_degree": 3})
     bcs = [scenes.fix(V, scenes.at(0, 0.0))]
-    problem = mpm.ParticleProblem(R, particles, bcs=bcs, symmetric=True, **TIGHT)
+    problem = posed(mpm.ParticleProblem, R, particles, bcs=bcs, symmetric=True, **TIGHT)
     particles.load.value = 1.0
     problem.step()
     X, exact = mixed_finite_elements(4, 20.0)

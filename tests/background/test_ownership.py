@@ -16,10 +16,10 @@ def test_particles_are_where_their_background_is():
     V = scenes.vectors(scenes.box([0.0, 0.0], [4.0, 4.0], [32, 32], QUADRILATERAL))
     body = scenes.box([0.0, 0.0], [4.0, 4.0], [64, 64], TRIANGLE)
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, partition="background"),
-        Hencky(1e3, 0.3),
+        mpm.Body(
+            mpm.Particles(body, V, partition="background"), Hencky(1e3, 0.3), body_force=(0.0, -1.0)
+        ),
         bcs=[scenes.fix(V, scenes.at(i, 0.0, 4.0), component=i) for i in (0, 1)],
-        body_force=(0.0, -1.0),
     )
     particles = problem.particles
     assert np.all(particles.ranks_of_background() == WORLD.rank)
@@ -52,7 +52,7 @@ def test_idle_ranks_get_particles():
     problem = scenes.block()
     particles = problem.particles
     particles.move(np.zeros(particles.num_local, dtype=np.int64))
-    problem = mpm.QuasiStaticProblem(particles, Hencky(1e3, 0.3), bcs=problem.bcs)
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, Hencky(1e3, 0.3)), bcs=problem.bcs)
     assert (particles.num_local == 0) == (WORLD.rank > 0)
     assert problem.repartition(0.1)
     assert particles.num_local <= np.ceil(1.05 * particles.num_global / WORLD.size)

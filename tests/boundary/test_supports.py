@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from marks import slow
+from posed import posed
 from scenes import QUADRILATERAL, TRIANGLE, WORLD
 
 import dolfinx
@@ -46,7 +47,8 @@ def inclined_column(case, ne, angle, cell, material, comm=WORLD, **options):
         angle, [0.0, 0.0], [h, case.length], [2, 2 * ne], cell, markers, h, comm=comm
     )
     supports = [roller(p, tags, 1, Q @ [0, 1]), roller(p, tags, 2, Q @ [1, 0])]
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         p,
         material,
         density=case.density,
@@ -112,7 +114,9 @@ def test_support_is_the_penalty_of_finite_elements(kind, cell):
         supports += [roller(p, tags, 1, [0.8, -0.6], 0.0, **more)]
     else:
         supports = [fixed(p, tags, 1, (0.012, 0.016), **more)]
-    problem = mpm.QuasiStaticProblem(p, law, density=1.0, body_force=(3.0, -2.0), supports=supports)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(p, law, density=1.0, body_force=(3.0, -2.0)), supports=supports
+    )
     problem.solve(steps=1)
 
     domain = grid()
@@ -156,7 +160,7 @@ def test_a_moving_plane_squeezes_a_block(angle):
         roller(p, tags, 2, Q @ [1, 0]),
         plane(p, Q @ [0, 2.0], Q @ [0, -1], top, tags, 3),
     ]
-    problem = mpm.QuasiStaticProblem(p, Hencky(1e4, 0.25), supports=supports)
+    problem = mpm.QuasiStaticProblem(mpm.Body(p, Hencky(1e4, 0.25)), supports=supports)
 
     def path(t):
         top.value = 0.8 * t
@@ -186,10 +190,12 @@ def slump(angle, h=1.0, g0=20e3, comm=WORLD):
     )
     supports = [roller(p, tags, 1, Q @ [1, 0]), plane(p, (0.0, 0.0), Q @ [0, 1])]
     problem = mpm.QuasiStaticProblem(
-        p,
-        VonMises(1e6, 0.3, rho_y=20e3),
-        density=1000.0,
-        body_force=tuple(Q @ [0.0, -g0 / 1000.0]),
+        mpm.Body(
+            p,
+            VonMises(1e6, 0.3, rho_y=20e3),
+            density=1000.0,
+            body_force=tuple(Q @ [0.0, -g0 / 1000.0]),
+        ),
         supports=supports,
     )
     return problem, supports, Q
@@ -249,10 +255,7 @@ def test_a_body_of_revolution_stands_on_its_roller():
     p = mpm.Particles(body, V)
     base = roller(p, scenes.facet_tags(body, scenes.at(1, 0.07)), 1, (0.0, 1.0))
     problem = mpm.QuasiStaticProblem(
-        p,
-        Hencky(1e4, 0.3),
-        density=2.0,
-        body_force=(0.0, -10.0),
+        mpm.Body(p, Hencky(1e4, 0.3), density=2.0, body_force=(0.0, -10.0)),
         bcs=[scenes.fix(V, scenes.at(0, 0.0), component=0)],
         supports=[base],
         axisymmetric=True,
@@ -268,7 +271,7 @@ def standing(first, *laws):
     p = mpm.Particles(body, V)
     base = fixed(p, scenes.facet_tags(body, scenes.at(1, 0.07)), 1)
     problems = [
-        mpm.QuasiStaticProblem(p, law, body_force=(0.0, -10.0), supports=[base])
+        mpm.QuasiStaticProblem(mpm.Body(p, law, body_force=(0.0, -10.0)), supports=[base])
         for law in (first, *laws)
     ]
     return p, base, problems[-1]
@@ -292,9 +295,11 @@ def test_a_problem_that_cannot_be_made_leaves_a_support_as_it_was():
         p, base, problem = standing(Hencky(1e3, 0.3))
         if fails:
             with pytest.raises(mpm.MPMError, match="needs a background and particles of degree 2"):
-                mpm.QuasiStaticProblem(p, Hencky(1e6, 0.3), supports=[base], mixed="pressure")
+                mpm.QuasiStaticProblem(
+                    mpm.Body(p, Hencky(1e6, 0.3)), supports=[base], mixed="pressure"
+                )
         problem.solve(steps=1)
-        problem.stage(material=Hencky(5e3, 0.3))
+        problem.stage(bodies=problem.body().replace(material=Hencky(5e3, 0.3)))
         problem.solve(steps=1)
         found.append(scenes.in_order(p, p.centroid))
     assert np.array_equal(*found) if WORLD.size == 1 else np.allclose(*found, rtol=0.0, atol=1e-12)
@@ -303,10 +308,10 @@ def test_a_problem_that_cannot_be_made_leaves_a_support_as_it_was():
 def test_a_stage_with_a_material_too_stiff_for_its_support():
     _, base, problem = standing(Hencky(1e3, 0.3))
     problem.solve(steps=1)
-    problem.stage(material=Hencky(5e3, 0.3))
+    problem.stage(bodies=problem.body().replace(material=Hencky(5e3, 0.3)))
     with warnings.catch_warnings(record=True) as told:  # on the first rank
         warnings.simplefilter("always")
-        problem.stage(material=Hencky(1e6, 0.3))
+        problem.stage(bodies=problem.body().replace(material=Hencky(1e6, 0.3)))
     sentences = [str(each.message) for each in told if "times as stiff" in str(each.message)]
     assert len(sentences) == (WORLD.rank == 0)
     assert all("1e+03 times" in one and "modulus=" in one for one in sentences)

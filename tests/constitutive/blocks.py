@@ -47,8 +47,6 @@ def block(
         x = body.geometry.x[:, :dim]
         x[:] = scenes.bend(scenes.unit(n - 2, cell, comm), 0.04).geometry.x[:, :dim] + 0.1
     return mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, quadrature_degree=rule, **options),
-        material,
-        f_bar=f_bar,
+        mpm.Body(mpm.Particles(body, V, quadrature_degree=rule, **options), material, f_bar=f_bar),
         axisymmetric=axisymmetric,
     )

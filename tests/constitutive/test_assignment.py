@@ -71,11 +71,15 @@ def test_one_value_out_of_range_in_arrays_of_the_ranks(name, value, match):
     values[p.global_index == 0] = value
     parameters = {"young": 1e3, "yield_stress": 1.0, name: values}
     raises(
-        lambda: mpm.QuasiStaticProblem(p, VonMises(poisson=0.3, **parameters)), mpm.MPMError, match
+        lambda: mpm.QuasiStaticProblem(mpm.Body(p, VonMises(poisson=0.3, **parameters))),
+        mpm.MPMError,
+        match,
     )
 
 
 def test_one_array_of_another_length():
     p = particles()
     young = np.full(p.num_local + (WORLD.rank == WORLD.size - 1), 1e3)
-    raises(lambda: mpm.QuasiStaticProblem(p, Hencky(young, 0.3)), mpm.MPMError, "young has")
+    raises(
+        lambda: mpm.QuasiStaticProblem(mpm.Body(p, Hencky(young, 0.3))), mpm.MPMError, "young has"
+    )

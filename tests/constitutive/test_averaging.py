@@ -178,7 +178,9 @@ def test_kinds_that_do_not_fit_are_refused():
     def problem(cell, f_bar, **options):
         V = vectors(box([0.0, 0.0], [1.0, 1.0], [2, 2], QUADRILATERAL))
         body = box([0.0, 0.0], [1.0, 1.0], [4, 4], cell)
-        return mpm.QuasiStaticProblem(mpm.Particles(body, V, **options), ELASTIC, f_bar=f_bar)
+        return mpm.QuasiStaticProblem(
+            mpm.Body(mpm.Particles(body, V, **options), ELASTIC, f_bar=f_bar)
+        )
 
     with pytest.raises(mpm.MPMError, match="quadrature_degree=2"):
         problem(QUADRILATERAL, "domain")
@@ -250,13 +252,15 @@ def test_an_axisymmetric_tube_needs_two_solves(f_bar, solves):
     V = vectors(box([0.0, 0.0], [3.0, 0.5], [12, 2], QUADRILATERAL))
     body = box([1.0, 0.0], [2.0, 0.5], [8, 4], QUADRILATERAL)
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, quadrature_degree=2),
-        ELASTIC,
-        pressures=[(0.2, 1)],
-        facet_tags=scenes.facet_tags(body, scenes.at(0, 1.0)),
+        mpm.Body(
+            mpm.Particles(body, V, quadrature_degree=2),
+            ELASTIC,
+            pressures=[(0.2, 1)],
+            facet_tags=scenes.facet_tags(body, scenes.at(0, 1.0)),
+            f_bar=f_bar,
+        ),
         bcs=[scenes.fix(V, scenes.at(1, 0.0, 0.5), component=1)],
         axisymmetric=True,
-        f_bar=f_bar,
     )
     problem.solve(1)
     assert problem.history.iterations == [solves]
@@ -281,10 +285,12 @@ def footing(f_bar):
 
     strip = held(1, -0.002, lambda x: np.isclose(x[1], 2.0) & (x[0] < 0.5001))
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, quadrature_degree=2),
-        VonMises(1e7, 0.48, rho_y=490.0 * np.sqrt(2.0)),
+        mpm.Body(
+            mpm.Particles(body, V, quadrature_degree=2),
+            VonMises(1e7, 0.48, rho_y=490.0 * np.sqrt(2.0)),
+            f_bar=f_bar,
+        ),
         bcs=[held(0, 0.0, scenes.at(0, 0.0, 3.0)), held(1, 0.0, scenes.at(1, 0.0)), strip],
-        f_bar=f_bar,
     )
     pressure = [-problem.reaction(strip)[1] for _ in problem.steps(16)]
     return 2.0 * pressure[-1] / ((2.0 + np.pi) * 490.0), pressure[-1] / pressure[-4] - 1.0
@@ -310,13 +316,15 @@ def test_pressure_in_a_tube_whose_wall_thins(cell, offset, f_bar, degree, bound)
     held = fem.locate_dofs_geometrical((V.sub(1), axial), lambda x: x[0] > -1.0)
     particles = mpm.Particles(body, V, degree=degree, quadrature_degree=2 if degree == 1 else None)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        VonMises(100.0, 0.49, yield_stress=1.0),
+        mpm.Body(
+            particles,
+            VonMises(100.0, 0.49, yield_stress=1.0),
+            pressures=[(1.0, 1)],
+            facet_tags=scenes.facet_tags(body, at(0, 1.0)),
+            f_bar=f_bar,
+        ),
         bcs=[fem.dirichletbc(fem.Function(axial), held, V.sub(1))],
-        pressures=[(1.0, 1)],
-        facet_tags=scenes.facet_tags(body, at(0, 1.0)),
         axisymmetric=True,
-        f_bar=f_bar,
     )
     control = mpm.DisplacementControl(particles, 1.0, point=(1.0, 0.0), direction=(1.0, 0.0))
     patches = round(1.0 / cell) if f_bar == "patch" else 0

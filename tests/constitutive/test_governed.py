@@ -36,9 +36,7 @@ def test_law_that_fails_at_one_particle(quadrature_degree):
     young.x.array[young.function_space.dofmap.list[: len(X), 0]] = np.where(bad, 7.0, 1e3)
     p = mpm.Particles(domain, V, quadrature_degree=quadrature_degree)
     failed = mpm.QuasiStaticProblem(
-        p,
-        Touchy(young, 0.3),
-        body_force=(0.0, -1.0),
+        mpm.Body(p, Touchy(young, 0.3), body_force=(0.0, -1.0)),
         bcs=[scenes.fix(V, scenes.at(0, 0.0))],
     )
     expected = [int(i) for i in scenes.gather(p.global_index[bad[: p.num_local]])]
@@ -123,10 +121,12 @@ def spun(law):
     V = scenes.vectors(scenes.box([-1.0, -1.0], [2.0, 2.0], [6, 6], QUADRILATERAL))
     body = scenes.unit(4, QUADRILATERAL)
     problem = mpm.DynamicProblem(
-        mpm.Particles(body, V),
-        law(100.0, 0.3, rho_y=1.5, hardening=30.0),
-        1.0,
-        velocity=lambda x: np.stack([2.0 * x[0] - 3.0 * x[1], 3.0 * x[0] - 2.0 * x[1]]),
+        mpm.Body(
+            mpm.Particles(body, V),
+            law(100.0, 0.3, rho_y=1.5, hardening=30.0),
+            density=1.0,
+            velocity=lambda x: np.stack([2.0 * x[0] - 3.0 * x[1], 3.0 * x[0] - 2.0 * x[1]]),
+        ),
         scheme="conserving",
     )
     problem.solve(0.1, 0.02)

@@ -37,7 +37,7 @@ def test_groups_do_not_depend_on_the_ranks(cell, f_bar, rule, axisymmetric):
 def test_patches_fill_about_a_background_cell(cell, offset):
     V = vectors(box([0.0, 0.0], [2.0, 2.0], [8, 8], QUADRILATERAL))
     body = box([offset, offset], [1.0 + offset, 1.0 + offset], [8, 8], cell)
-    problem = mpm.QuasiStaticProblem(mpm.Particles(body, V), ELASTIC, f_bar="patch")
+    problem = mpm.QuasiStaticProblem(mpm.Body(mpm.Particles(body, V), ELASTIC, f_bar="patch"))
     group = members(problem)
     volume = scenes.in_order(problem.particles, problem.particles.initial_volume)
     size = np.bincount(group, volume)[np.unique(group)] * 16.0
@@ -56,7 +56,7 @@ def test_patches_do_not_depend_on_round_off(cell):
         body = box([0.1, 0.13], [1.1, 1.13], [9, 9], cell)
         for domain in (V.mesh, body):
             domain.geometry.x[:] = size * domain.geometry.x + origin
-        problem = mpm.QuasiStaticProblem(mpm.Particles(body, V), ELASTIC, f_bar="patch")
+        problem = mpm.QuasiStaticProblem(mpm.Body(mpm.Particles(body, V), ELASTIC, f_bar="patch"))
         found.append(members(problem))
     np.testing.assert_array_equal(found[1], found[0])
     np.testing.assert_array_equal(found[2], found[0])
@@ -67,7 +67,9 @@ def test_patches_keep_materials_apart():
     body = box([0.0, 0.0], [1.0, 1.0], [4, 4], QUADRILATERAL)
     tags = scenes.cell_tags(body, lambda x: 1 + (x[:, 0] > 0.25))
     laws = {1: ELASTIC, 2: PLASTIC}
-    problem = mpm.QuasiStaticProblem(mpm.Particles(body, V), laws, cell_tags=tags, f_bar="patch")
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(mpm.Particles(body, V), laws, cell_tags=tags, f_bar="patch")
+    )
     centre = scenes.in_order(problem.particles, problem.particles.initial_centroid)
     left = centre[:, 0] < 0.25
     assert (left == left[members(problem)]).all()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scenes
 from marks import thinned
+from posed import posed, staged
 from scenes import QUADRILATERAL, TRIANGLE, at, box, cell_tags, facet_tags, fix, vectors
 
 from dolfinx import fem
@@ -52,7 +53,8 @@ def pressed(law, half=False, degree=1, cell=QUADRILATERAL, quadrature_degree=Non
     if "axisymmetric" in options:
         bcs.append(fix(V, at(0, 0.0), component=0))
     top = facet_tags(mesh, lambda x: np.isclose(x[1], 2.0) & (x[0] > 0.49) & (x[0] < 1.51))
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         body,
         {1: law, 2: law} if half else law,
         bcs=bcs,
@@ -87,7 +89,7 @@ def test_an_equal_law_changes_nothing(name, way, half):
         body = problem.particles
         before = body.stress, body.plastic_strain
         if other is not None:
-            problem.stage(material={1: law, 2: other} if half else other)
+            staged(problem, material={1: law, 2: other} if half else other)
             np.testing.assert_allclose(body.stress, before[0], atol=1e-9)
             np.testing.assert_array_equal(body.plastic_strain, before[1])
         body.load.value = 1.05
@@ -109,11 +111,11 @@ def test_another_law_carries_the_stress(law, other):
     top = facet_tags(body.mesh, at(1, 4.0))
     bcs = [fix(V, at(1, 0.0)), fix(V, at(0, 0.0, 1.0), component=0)]
     loads = {"tractions": [((0.0, -200.0), 1)], "facet_tags": top}
-    problem = mpm.QuasiStaticProblem(body, law, bcs=bcs, **loads)
+    problem = posed(mpm.QuasiStaticProblem, body, law, bcs=bcs, **loads)
     problem.solve(4)
     settled, before = body.displacement.x.array.copy(), body.stress
     assert scenes.largest(-settled) > 0.6
-    problem.stage(material=other)
+    staged(problem, material=other)
     np.testing.assert_allclose(body.stress, before, atol=1e-9)
     problem.solve(2)
     np.testing.assert_allclose(body.displacement.x.array, settled, atol=1e-8)
@@ -129,7 +131,7 @@ def test_another_law_is_in_the_balance_of_before(way, half):
     # (the stabilisation of a pressure is scaled by the shear modulus)
     young = E if way == "stabilised pressure" else 3 * E
     other = MohrCoulomb(young, NU, 1e4, 30.0)
-    problem.stage(material={1: LAWS["hencky"], 2: other} if half else other)
+    staged(problem, material={1: LAWS["hencky"], 2: other} if half else other)
     for one, two in zip(problem.reduced.nodal_forces(), before, strict=True):
         assert scenes.largest(np.abs(one - two)) < 2e-6 * scenes.largest(np.abs(two))
 
@@ -141,13 +143,13 @@ def test_a_motion_after_rest_begins_at_rest(scheme, mixed, law):
     V = vectors(box([-1, 0], [3, 3], [8, 6], QUADRILATERAL))
     body = mpm.Particles(box([0, 0], [2, 2], [8, 8], QUADRILATERAL), V)
     given = {"body_force": (0.0, -10.0), "bcs": [fix(V, at(1, 0.0))], "mixed": mixed}
-    problem = mpm.QuasiStaticProblem(body, law, 10.0, **given)
+    problem = posed(mpm.QuasiStaticProblem, body, law, 10.0, **given)
     problem.solve(6)
     for _ in range(12):
         problem.step()
     still = body.displacement.x.array.copy()
     other = law.with_parameters()
-    motion = mpm.DynamicProblem(body, other, 10.0, after=problem, scheme=scheme, **given)
+    motion = posed(mpm.DynamicProblem, body, other, 10.0, after=problem, scheme=scheme, **given)
     motion.solve(0.1, 0.02)
     assert scenes.largest(np.abs(body.displacement.x.array - still)) < 1e-9
 

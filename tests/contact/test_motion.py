@@ -7,6 +7,7 @@ import pytest
 import scenes
 from compare import breaks, error_of_a_term, outcome, same_run
 from marks import thinned
+from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD, box
 
 from dolfinx import fem
@@ -37,7 +38,8 @@ def falling(shape, friction=0.0, comm=WORLD, turn=0.0, **options):
     body = box([0.1, 0.55], [0.9, 1.2], [5, 4], TRIANGLE, comm)
     particles = mpm.Particles(body, V)
     ground = contact.Rigid(particles, shape, friction)
-    problem = mpm.DynamicProblem(
+    problem = posed(
+        mpm.DynamicProblem,
         particles,
         Hencky(100.0, 0.3),
         1.0,
@@ -110,7 +112,8 @@ def on_a_mat(speed, friction=0.0, cell=TRIANGLE, static=True, sideways=0.0, **op
     block = mpm.Particles(box([0.1, 0.55], [0.9, 1.2], [5, 4], cell), spaces[0])
     mat = mpm.Particles(box([-0.3, 0.0], [1.3, 0.5], [13, 4], QUADRILATERAL), spaces[1])
     touch = contact.Pair(block, mat, friction)
-    problem = mpm.DynamicProblem(
+    problem = posed(
+        mpm.DynamicProblem,
         [block, mat],
         [Hencky(100.0, 0.3), Hencky(30.0, 0.3)],
         1.0,
@@ -228,7 +231,8 @@ def colliding(friction=0.0, comm=WORLD, cells=(QUADRILATERAL, TRIANGLE), passes=
     lower = box([0.0, -0.3], [1.0, 0.2], [7, 4], cells[1], comm)
     a, b = mpm.Particles(upper, Va), mpm.Particles(lower, Vb)
     touch = contact.Pair(a, b, friction, passes=passes)
-    problem = mpm.DynamicProblem(
+    problem = posed(
+        mpm.DynamicProblem,
         [a, b],
         Hencky(100.0, 0.3),
         1.0,
@@ -351,8 +355,12 @@ def test_a_contact_of_a_motion_serves_equilibrium_again():
     V = problem.particles.V
     top = fem.locate_dofs_geometrical(V, lambda x: x[1] > 1.0)
     motion = fem.Constant(V.mesh, np.array([0.0, -0.02]))
-    still = mpm.QuasiStaticProblem(
-        problem.particles, Hencky(100.0, 0.3), bcs=[fem.dirichletbc(motion, top, V)], terms=[ground]
+    still = posed(
+        mpm.QuasiStaticProblem,
+        problem.particles,
+        Hencky(100.0, 0.3),
+        bcs=[fem.dirichletbc(motion, top, V)],
+        terms=[ground],
     )
     assert ground.symmetric
     still.solve(1)
@@ -369,7 +377,8 @@ def test_cubes_collide_in_space(cell):
     a = mpm.Particles(box([0.2, 0.25, 0.53], [0.7, 0.75, 1.0], [3, 3, 3], cell), Va)
     b = mpm.Particles(box([0.0] * 3, [0.8, 0.8, 0.5], [4, 4, 2], cell), Vb)
     touch = contact.Pair(a, b)
-    problem = mpm.DynamicProblem(
+    problem = posed(
+        mpm.DynamicProblem,
         [a, b],
         Hencky(100.0, 0.3),
         1.0,

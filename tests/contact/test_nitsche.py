@@ -139,7 +139,9 @@ def test_tangent_in_space(cell):
     ball = contact.Rigid(particles, contact.sphere((0.5, 0.5, 1.5), 0.5), 0.3, law="nitsche")
     bottom = fem.locate_dofs_geometrical(V, lambda x: x[2] < 0.2)
     bcs = [fem.dirichletbc(np.zeros(3), bottom, V)]
-    problem = mpm.QuasiStaticProblem(particles, Hencky(1e3, POISSON), bcs=bcs, terms=[ball])
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(particles, Hencky(1e3, POISSON)), bcs=bcs, terms=[ball]
+    )
     problem.solve(3, update=lambda t: ball.move((0.05 * t, 0.0, -0.1 * t)))
     assert WORLD.allreduce(int(ball.touches.sum())) > 0
     # (within 1e-7 a point of the tetrahedra begins to slip)
@@ -256,14 +258,16 @@ def test_a_body_that_is_rebased_goes_on_as_one_that_is_not(cell, degree):
         plane = contact.plane((0.0, 0.0), (0.0, 1.0))
         ground = contact.Rigid(particles, plane, 0.3, law="nitsche")
         problem = mpm.QuasiStaticProblem(
-            particles,
-            Hencky(1e3, POISSON),
-            body_force=(20.0, -50.0),
-            pressures=[(30.0, 1)],
-            facet_tags=scenes.facet_tags(shape, scenes.at(1, 1.0)),
+            mpm.Body(
+                particles,
+                Hencky(1e3, POISSON),
+                body_force=(20.0, -50.0),
+                pressures=[(30.0, 1)],
+                facet_tags=scenes.facet_tags(shape, scenes.at(1, 1.0)),
+            ),
             bcs=[scenes.fix(V, scenes.at(0, 0.0), component=0)],
             terms=[ground],
-            petsc_options={"snes_rtol": 1e-12},
+            solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
         )
         for _ in problem.steps(3):
             if rebased:
@@ -309,10 +313,12 @@ def test_what_cannot_be_is_refused():
         mpm.ParticleProblem(form, particles, terms=[ground])
     particles, ground = body(2)
     with pytest.raises(mpm.MPMError, match=r"does not go with mixed='pressure'"):
-        mpm.QuasiStaticProblem(particles, Hencky(1e3, 0.3), mixed="pressure", terms=[ground])
+        mpm.QuasiStaticProblem(
+            mpm.Body(particles, Hencky(1e3, 0.3)), mixed="pressure", terms=[ground]
+        )
     particles, ground = body()
     with pytest.raises(mpm.MPMError, match=r"forces of a step's end.*scheme='euler'"):
-        mpm.DynamicProblem(particles, Hencky(1e3, 0.3), 1.0, terms=[ground])
+        mpm.DynamicProblem(mpm.Body(particles, Hencky(1e3, 0.3), density=1.0), terms=[ground])
     with pytest.raises(mpm.MPMError, match="law must be one of 'penalty', 'nitsche', not 'hard'"):
         contact.Rigid(particles, ground.shape, law="hard")
 
@@ -321,11 +327,8 @@ def test_it_goes_with_implicit_euler():
     # a block that is let go on the ground comes to rest with its weight on it
     particles, ground = body()
     problem = mpm.DynamicProblem(
-        particles,
-        LinearElastic(1e4, POISSON),
-        1.0,
+        mpm.Body(particles, LinearElastic(1e4, POISSON), density=1.0, body_force=(0.0, -10.0)),
         scheme="euler",
-        body_force=(0.0, -10.0),
         terms=[ground],
     )
     problem.solve(0.5, 0.05)
@@ -354,11 +357,8 @@ def test_an_impact_wins_no_energy(cell, steps, friction):
         particles, contact.plane((0.0, -0.03), (0.0, 1.0)), friction, law="nitsche"
     )
     problem = mpm.DynamicProblem(
-        particles,
-        Hencky(1.0, 0.0),
-        1.0,
+        mpm.Body(particles, Hencky(1.0, 0.0), density=1.0, velocity=(0.1, -0.8)),
         scheme="euler",
-        velocity=(0.1, -0.8),
         terms=[ground],
     )
     problem.solve(0.75, 0.75 / steps)

@@ -99,7 +99,9 @@ def test_bodies_with_fields_of_their_own_meet_where_their_facets_do():
     base = fem.locate_dofs_geometrical(Vb, lambda x: x[1] < 0.01)
     motion = fem.Constant(Va.mesh, np.zeros(2))
     bcs = [fem.dirichletbc(motion, top, Va), fem.dirichletbc(np.zeros(2), base, Vb)]
-    problem = mpm.QuasiStaticProblem([a, b], Hencky(YOUNG, POISSON), bcs=bcs, terms=[touch])
+    problem = mpm.QuasiStaticProblem(
+        [mpm.Body(p, Hencky(YOUNG, POISSON)) for p in (a, b)], bcs=bcs, terms=[touch]
+    )
 
     def path(t):
         motion.value[:] = [0.0, -0.12 * t]
@@ -150,8 +152,7 @@ def test_a_step_through_the_other_body_is_refused():
     way = fem.Constant(Va.mesh, np.zeros(2))
     base = fem.locate_dofs_geometrical(Vb, lambda x: x[1] < 0.6)
     problem = mpm.QuasiStaticProblem(
-        [a, b],
-        Hencky(YOUNG, POISSON),
+        [mpm.Body(p, Hencky(YOUNG, POISSON)) for p in (a, b)],
         bcs=[
             fem.dirichletbc(way, fem.locate_dofs_geometrical(Va, lambda x: x[1] > -1.0), Va),
             fem.dirichletbc(np.zeros(2), base, Vb),
@@ -225,8 +226,7 @@ def test_a_pair_of_a_body_that_has_lost_domains_is_that_of_a_shorter_body(passes
         )
         aside, down = (fem.Constant(V.mesh, np.zeros(2)) for V in (Va, Vb))
         problem = mpm.QuasiStaticProblem(
-            [lower, upper],
-            Hencky(YOUNG, POISSON),
+            [mpm.Body(p, Hencky(YOUNG, POISSON)) for p in (lower, upper)],
             bcs=[fem.dirichletbc(aside, base, Va), fem.dirichletbc(down, top, Vb)],
             terms=[touch],
         )
@@ -256,7 +256,9 @@ def test_bodies_of_different_degrees_come_to_touch():
     )
     motion = fem.Constant(Va.mesh, np.zeros(3))
     bcs = [fem.dirichletbc(motion, top, Va), fem.dirichletbc(np.zeros(3), base, Vb)]
-    problem = mpm.QuasiStaticProblem([b, a], Hencky(YOUNG, POISSON), bcs=bcs, terms=[touch])
+    problem = mpm.QuasiStaticProblem(
+        [mpm.Body(p, Hencky(YOUNG, POISSON)) for p in (b, a)], bcs=bcs, terms=[touch]
+    )
     steps = problem.steps(2, update=lambda t: np.put(motion.value, 2, -0.018 * t))
     next(steps)
     assert not problem.reaction(touch).any()
@@ -277,7 +279,9 @@ def test_a_cube_is_dragged_on_another(cell):
     base = fem.locate_dofs_geometrical(Vb, lambda x: x[2] < 0.15)
     motion = fem.Constant(Va.mesh, np.zeros(3))
     bcs = [fem.dirichletbc(motion, top, Va), fem.dirichletbc(np.zeros(3), base, Vb)]
-    problem = mpm.QuasiStaticProblem([a, b], Hencky(YOUNG, POISSON), bcs=bcs, terms=[touch])
+    problem = mpm.QuasiStaticProblem(
+        [mpm.Body(p, Hencky(YOUNG, POISSON)) for p in (a, b)], bcs=bcs, terms=[touch]
+    )
 
     def path(t):
         motion.value[:] = [0.06 * max(2 * t - 1, 0.0), 0.0, -0.04 * min(2 * t, 1.0)]
@@ -313,10 +317,10 @@ def test_a_slit_in_a_body_opens_and_closes(passes):
     slit = contact.Pair(a, b, facet_tags=tags, tags=(2, 2), passes=passes)
     load = fem.Constant(upper, (0.0, 0.0))
     problem = mpm.QuasiStaticProblem(
-        [a, b],
-        LinearElastic(YOUNG, 0.0),
-        tractions=[[(load, 3)], []],
-        facet_tags=tags,
+        [
+            mpm.Body(a, LinearElastic(YOUNG, 0.0), tractions=[(load, 3)], facet_tags=tags[0]),
+            mpm.Body(b, LinearElastic(YOUNG, 0.0)),
+        ],
         supports=[mpm.boundary.fixed(b, tags[1], 3)],
         terms=[root, slit],
     )
@@ -342,7 +346,9 @@ def test_bodies_that_overlap_at_the_beginning_are_refused():
     a = mpm.Particles(scenes.box([0.2, 0.9], [0.8, 1.5], [4, 4], QUADRILATERAL), Va)
     b = mpm.Particles(scenes.unit(6, QUADRILATERAL), Vb)
     with pytest.raises(mpm.MPMError, match=r"overlap at the beginning: particles .* up to 0\.1"):
-        mpm.QuasiStaticProblem([a, b], Hencky(1e3, 0.3), terms=[contact.Pair(a, b)])
+        mpm.QuasiStaticProblem(
+            [mpm.Body(p, Hencky(1e3, 0.3)) for p in (a, b)], terms=[contact.Pair(a, b)]
+        )
 
 
 @pytest.mark.parametrize("cell", [QUADRILATERAL, HEXAHEDRON], ids=scenes.name)
@@ -357,7 +363,11 @@ def test_narrow_blocks_of_one_width_stand_on_each_other(cell):
     ground = contact.Rigid(lower, contact.plane([0.0] * dim, up), 0.4)
     touch = contact.Pair(upper, lower, 0.4)
     problem = mpm.QuasiStaticProblem(
-        [upper, lower], Hencky(1e4, 0.3), 1.0, body_force=-100.0 * up, terms=[ground, touch]
+        [
+            mpm.Body(p, Hencky(1e4, 0.3), density=1.0, body_force=-100.0 * up)
+            for p in (upper, lower)
+        ],
+        terms=[ground, touch],
     )
     problem.solve(3)
     weight = 100.0 * np.prod(size)
@@ -407,8 +417,7 @@ def test_a_slit_in_one_body_does_not_close():
         foot = fem.locate_dofs_geometrical(V, lambda x: x[1] < 1e-9)
         lid = contact.Rigid(particles, contact.plane((0.0, 1.0), (0.0, -1.0)))
         problem = mpm.QuasiStaticProblem(
-            particles,
-            Hencky(1e3, 0.3),
+            mpm.Body(particles, Hencky(1e3, 0.3)),
             bcs=[fem.dirichletbc(np.zeros(2), foot, V)],
             terms=[lid],
         )

@@ -7,6 +7,7 @@ import pytest
 import scenes
 from compare import error_of_blocks, outcome, same_run
 from pairs import POISSON, YOUNG, balance, fail_after, go_on_other_meshes, hertz, patch, spaces, two
+from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 
 import ufl
@@ -37,8 +38,8 @@ def stacked(cells, material, friction=0.0, rule=None, law="nitsche", **options):
     above = contact.Rigid(a, contact.plane(up, -up), law=law, axisymmetric=axisymmetric)
     below = contact.Rigid(b, contact.plane(0.0 * up, up), law=law, axisymmetric=axisymmetric)
     bcs = [scenes.fix(W, scenes.at(i, 0.0), component=i) for W in V for i in range(dim - 1)]
-    problem = mpm.QuasiStaticProblem(
-        [a, b], material, bcs=bcs, terms=[touch, above, below], **options
+    problem = posed(
+        mpm.QuasiStaticProblem, [a, b], material, bcs=bcs, terms=[touch, above, below], **options
     )
     return problem, touch, above, up
 
@@ -93,7 +94,9 @@ def test_points_that_face_nothing_are_not_pressed(cells, law, passes):
     top = fem.locate_dofs_geometrical(Va, lambda x: x[dim - 1] > 0.7)
     base = fem.locate_dofs_geometrical(Vb, lambda x: x[dim - 1] < 0.01)
     bcs = [fem.dirichletbc(motion, top, Va), fem.dirichletbc(np.zeros(dim), base, Vb)]
-    problem = mpm.QuasiStaticProblem([a, b], Hencky(YOUNG, POISSON), bcs=bcs, terms=[touch])
+    problem = mpm.QuasiStaticProblem(
+        [mpm.Body(p, Hencky(YOUNG, POISSON)) for p in (a, b)], bcs=bcs, terms=[touch]
+    )
     problem.solve(1)
     x, p, gap = (scenes.gather(v) for v in (touch.points, touch.pressure, touch.gap))
     foot = scenes.gather(a.domains.reshape(-1, dim))[:, :-1]
@@ -309,14 +312,20 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(mpm.MPMError, match=r"of a Pair takes the stress.*use a QuasiStaticProblem"):
         mpm.ParticleProblem([form, other], [a, b], terms=[touch])
     with pytest.raises(mpm.MPMError, match=r"law='nitsche' of a Pair has forces of a step's end"):
-        mpm.DynamicProblem([a, b], Hencky(YOUNG, POISSON), 1.0, terms=[touch])
+        mpm.DynamicProblem(
+            [mpm.Body(p, Hencky(YOUNG, POISSON), density=1.0) for p in (a, b)], terms=[touch]
+        )
     with pytest.raises(mpm.MPMError, match="law must be one of 'penalty', 'nitsche', not 'hard'"):
         contact.Pair(a, b, law="hard")
     problem, _, _ = two(degree=2)
     touch = contact.Pair(*problem.bodies, law="nitsche")
     with pytest.raises(mpm.MPMError, match=r"of a Pair does not go with mixed='pressure'"):
-        mpm.QuasiStaticProblem(
-            problem.bodies, Hencky(YOUNG, POISSON), mixed="pressure", terms=[touch]
+        posed(
+            mpm.QuasiStaticProblem,
+            problem.bodies,
+            Hencky(YOUNG, POISSON),
+            mixed="pressure",
+            terms=[touch],
         )
 
 
@@ -328,11 +337,11 @@ def test_it_goes_with_implicit_euler():
     touch = contact.Pair(a, b, law="nitsche")
     base = fem.locate_dofs_geometrical(Vb, lambda x: x[1] < 0.01)
     problem = mpm.DynamicProblem(
-        [a, b],
-        LinearElastic(1e4, POISSON),
-        1.0,
+        [
+            mpm.Body(p, LinearElastic(1e4, POISSON), density=1.0, body_force=(0.0, -10.0))
+            for p in (a, b)
+        ],
         scheme="euler",
-        body_force=(0.0, -10.0),
         bcs=[fem.dirichletbc(np.zeros(2), base, Vb)],
         terms=[touch],
     )
@@ -348,11 +357,11 @@ def test_an_impact_wins_no_energy(passes, steps):
     a = mpm.Particles(scenes.box([0.0, 0.03], [1.0, 0.5], [8, 5], QUADRILATERAL), Va)
     b = mpm.Particles(scenes.box([0.05, -0.5], [0.95, 0.0], [6, 5], TRIANGLE), Vb)
     problem = mpm.DynamicProblem(
-        [a, b],
-        Hencky(1.0, 0.0),
-        1.0,
+        [
+            mpm.Body(a, Hencky(1.0, 0.0), density=1.0, velocity=(0.1, -0.8)),
+            mpm.Body(b, Hencky(1.0, 0.0), density=1.0, velocity=(0.0, 0.8)),
+        ],
         scheme="euler",
-        velocity=[(0.1, -0.8), (0.0, 0.8)],
         terms=[contact.Pair(a, b, 0.6, law="nitsche", passes=passes)],
     )
     problem.solve(0.75, 0.75 / steps)

@@ -6,6 +6,7 @@ import numpy as np
 import pairs
 import pytest
 import scenes
+from posed import posed
 from scenes import QUADRILATERAL, WORLD, box
 
 import mpm_dolfinx as mpm
@@ -33,8 +34,8 @@ def pressed(law="penalty", count=1, names=(None,), order=1):
     ]
     for disc, name in zip(discs, names, strict=False):
         disc.name = name
-    problem = mpm.QuasiStaticProblem(
-        particles, Hencky(1e3, 0.3), bcs=base, terms=discs[::order], **TIGHT
+    problem = posed(
+        mpm.QuasiStaticProblem, particles, Hencky(1e3, 0.3), bcs=base, terms=discs[::order], **TIGHT
     )
     return problem, discs
 
@@ -121,7 +122,7 @@ def test_a_new_rigid_body_moves_as_it_was_made(scheme):
 
     old = boulder((0.9, 1.31), velocity=(1.0, -2.0), spin=3.0)
     problem = mpm.DynamicProblem(
-        particles, Hencky(1e3, 0.3), 1.0, scheme=scheme, terms=[old], bcs=base
+        mpm.Body(particles, Hencky(1e3, 0.3), density=1.0), scheme=scheme, terms=[old], bcs=base
     )
     problem.solve(0.02, 0.01)
     new = boulder((2.2, 1.5), velocity=(0.5, 0.0))
@@ -156,8 +157,8 @@ def equal_rigid_body():
     particles, base = soil()
     shape = contact.box((1.2, 1.0), (1.8, 1.4), 0.1)
     footing = contact.RigidBody(particles, shape, friction=0.3)
-    problem = mpm.QuasiStaticProblem(
-        particles, Hencky(1e3, 0.3), bcs=base, terms=[footing], **TIGHT
+    problem = posed(
+        mpm.QuasiStaticProblem, particles, Hencky(1e3, 0.3), bcs=base, terms=[footing], **TIGHT
     )
     problem.solve(2, update=lambda t: footing.push((3.0 * t, -30.0 * t)))
 
@@ -322,7 +323,9 @@ def test_a_users_term_is_known_by_itself_not_by_its_key():
     particles, base = soil()
     old = Worn(particles)
     problem = mpm.QuasiStaticProblem(
-        particles, Hencky(1e3, 0.3), 1.0, body_force=(0.0, -1.0), bcs=base, terms=[old]
+        mpm.Body(particles, Hencky(1e3, 0.3), density=1.0, body_force=(0.0, -1.0)),
+        bcs=base,
+        terms=[old],
     )
     problem.solve(3)
     problem.stage(terms=[old])

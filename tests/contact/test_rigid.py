@@ -87,11 +87,9 @@ def test_a_cylinder_between_plates(f_bar, rebased):
     below = contact.Rigid(particles, contact.plane((0.0, 0.0), (0.0, 1.0)), **options)
     above = contact.Rigid(particles, contact.plane((0.0, 1.0), (0.0, -1.0)), **options)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        LinearElastic(YOUNG, POISSON),
+        mpm.Body(particles, LinearElastic(YOUNG, POISSON), f_bar=f_bar),
         bcs=[scenes.fix(V, scenes.at(0, 0.0), component=0)],
         axisymmetric=True,
-        f_bar=f_bar,
         terms=[below, above],
     )
     p = strain * YOUNG
@@ -118,8 +116,7 @@ def test_a_limit_of_friction_is_per_area_of_the_stretched_facets(axisymmetric):
     value = fem.Function(V)
     everywhere = fem.dirichletbc(value, np.arange(len(value.x.array) // 2, dtype=np.int32))
     problem = mpm.QuasiStaticProblem(
-        particles,
-        Hencky(YOUNG, POISSON),
+        mpm.Body(particles, Hencky(YOUNG, POISSON)),
         bcs=[everywhere],
         axisymmetric=axisymmetric,
         terms=[wall],
@@ -288,8 +285,7 @@ def test_a_sphere_pressed_into_a_cube_and_turned():
     particles = mpm.Particles(scenes.unit(4, TETRAHEDRON), V)
     ball = contact.Rigid(particles, contact.sphere((0.5, 0.5, 1.5), 0.5), 0.5)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        Hencky(1e3, POISSON),
+        mpm.Body(particles, Hencky(1e3, POISSON)),
         bcs=[fem.dirichletbc(np.zeros(3), bottom, V)],
         terms=[ball],
     )
@@ -316,11 +312,8 @@ def test_a_block_slides_down_an_incline_or_stays(friction, scheme):
     particles = mpm.Particles(body, V)
     ground = contact.Rigid(particles, contact.plane((0.0, 0.0), normal), friction)
     problem = mpm.DynamicProblem(
-        particles,
-        LinearElastic(YOUNG, POISSON),
-        1.0,
+        mpm.Body(particles, LinearElastic(YOUNG, POISSON), density=1.0, body_force=(0.0, -10.0)),
         scheme=scheme,
-        body_force=(0.0, -10.0),
         terms=[ground],
     )
     exact = 10.0 * max(0.5 - friction * np.sqrt(0.75), 0.0)
@@ -347,7 +340,7 @@ def pressed(terms=lambda plate: [plate]):
     plate = contact.Rigid(particles, contact.plane((0.0, 1.0), (0.0, -1.0)))
     bcs = [scenes.fix(V, scenes.at(1, 0.0))]
     return mpm.QuasiStaticProblem(
-        particles, Hencky(YOUNG, POISSON), bcs=bcs, terms=terms(plate)
+        mpm.Body(particles, Hencky(YOUNG, POISSON)), bcs=bcs, terms=terms(plate)
     ), plate
 
 
@@ -383,7 +376,7 @@ def test_what_differs_between_ranks_is_refused(what):
         particles = dragged(n=2)[0].particles
         disc = contact.Rigid(particles, contact.disc((0.5, 5.0), 0.3 + other))
         with pytest.raises(mpm.MPMError, match=r"shape\S* differs between the ranks"):
-            mpm.QuasiStaticProblem(particles, Hencky(YOUNG, POISSON), terms=[disc])
+            mpm.QuasiStaticProblem(mpm.Body(particles, Hencky(YOUNG, POISSON)), terms=[disc])
         return
     problem, plate = pressed()
     plate.move((0.0, -other), 0.0) if what == "offset" else plate.move((0.0, 0.0), other)
@@ -398,7 +391,7 @@ def test_a_body_that_begins_in_an_obstacle_is_refused():
     )
     ball = contact.Rigid(particles, contact.disc((0.5, 1.2), 0.3))
     with pytest.raises(mpm.MPMError, match=r"begins within the obstacle.*0\.09"):
-        mpm.QuasiStaticProblem(particles, Hencky(1e3, 0.3), terms=[ball])
+        mpm.QuasiStaticProblem(mpm.Body(particles, Hencky(1e3, 0.3)), terms=[ball])
 
 
 def test_a_body_that_nothing_holds_yet_is_no_false_verdict():
@@ -408,7 +401,7 @@ def test_a_body_that_nothing_holds_yet_is_no_false_verdict():
     particles = mpm.Particles(body, V)
     ground = contact.Rigid(particles, contact.plane((0.0, 0.0), (0.0, 1.0)))
     problem = mpm.QuasiStaticProblem(
-        particles, Hencky(1e3, 0.3), body_force=(0.0, -1.0), terms=[ground]
+        mpm.Body(particles, Hencky(1e3, 0.3), body_force=(0.0, -1.0)), terms=[ground]
     )
     with pytest.raises(
         mpm.ConvergenceError, match="nothing holds the bodies once what only pushes"

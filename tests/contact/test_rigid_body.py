@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import breaks, error_of_a_term, outcome, raises, same_run
+from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD, box
 
 from dolfinx import fem
@@ -43,7 +44,8 @@ def thrown(shape="disc", friction=0.0, comm=WORLD, origin=0.0, law=None, **optio
         velocity=(0.3, -1.0),
         spin=2.0,
     )
-    problem = mpm.DynamicProblem(
+    problem = posed(
+        mpm.DynamicProblem,
         particles,
         Hencky(YOUNG, POISSON) if law is None else law,
         1.0,
@@ -135,7 +137,9 @@ def test_a_body_falls_and_spins_as_nothing_touches_it():
             velocity=(1.0, 0.0, 2.0),
             spin=start,
         )
-        problem = mpm.DynamicProblem(particles, Hencky(1e3, 0.3), 1.0, terms=[stone])
+        problem = mpm.DynamicProblem(
+            mpm.Body(particles, Hencky(1e3, 0.3), density=1.0), terms=[stone]
+        )
         momentum, kinetic = J @ start, 0.5 * start @ J @ start
         for _ in problem.steps(2.0, dt):
             t = problem.history.time
@@ -199,8 +203,7 @@ def test_tangent_is_the_derivative_of_the_forces(dim, friction, share):
     )
     material = Hencky(YOUNG, POISSON)
     kind = mpm.QuasiStaticProblem if share is None else mpm.DynamicProblem
-    density = () if share is None else (1.0,)
-    kind(particles, material, *density, terms=[stone])
+    kind([mpm.Body(p, material, density=1.0) for p in particles], terms=[stone])
     start = [body.displacement.x.array.copy() for body in particles]
     for d in start:
         d.reshape(-1, dim)[:] += depth
@@ -234,9 +237,7 @@ def test_a_disc_rolls_down_an_incline_with_two_thirds_of_the_acceleration(n, dt,
         gravity=gravity,
     )
     problem = mpm.DynamicProblem(
-        particles,
-        Hencky(1e6, 0.3),
-        1000.0,
+        mpm.Body(particles, Hencky(1e6, 0.3), density=1000.0),
         scheme=scheme,
         bcs=[base(V, -0.29)],
         rayleigh=(0.0, 1e-3),
@@ -260,7 +261,8 @@ def footing(comm=WORLD, cell=QUADRILATERAL, fixed=(), **options):
     particles = mpm.Particles(box([0.0, 0.0], [1.0, 1.0], [9, 9], cell, comm), V)
     shape = contact.box((-0.4, 1.0), (1.4, 1.4), 0.05)
     plate = contact.RigidBody(particles, shape, centre=(0.5, 1.0), fixed=fixed, **options)
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         particles,
         Hencky(YOUNG, POISSON),
         bcs=[base(V, 0.01)],
@@ -305,10 +307,7 @@ def test_a_plate_settles_as_a_column_is_compressed():
         ]
     ]
     problem = mpm.QuasiStaticProblem(
-        particles,
-        LinearElastic(1e4, POISSON),
-        bcs=[*sides, base(V, 0.01)],
-        terms=[plate],
+        mpm.Body(particles, LinearElastic(1e4, POISSON)), bcs=[*sides, base(V, 0.01)], terms=[plate]
     )
     problem.solve(1, update=lambda t: plate.push((0.0, -82.0)))
     # (the last row of domains is as soft once more: the penalty is 1)
@@ -343,7 +342,8 @@ def test_it_touches_several_bodies_and_goes_with_splitting_and_plasticity():
         velocity=(0.1, -2.0),
         spin=1.0,
     )
-    problem = mpm.DynamicProblem(
+    problem = posed(
+        mpm.DynamicProblem,
         bodies,
         [VonMises(YOUNG, POISSON, 2.0), Hencky(YOUNG, POISSON)],
         [1.0, 1.5],
@@ -385,7 +385,7 @@ def test_what_follows_a_path_has_its_velocity_from_the_first_step_on(scheme):
         particles, disc, MASS, inertia=TURNING, fixed=("x", "rotation"), velocity=(0.0, 0.3)
     )
     problem = mpm.DynamicProblem(
-        particles, Hencky(YOUNG, POISSON), 1.0, terms=[tool], scheme=scheme
+        mpm.Body(particles, Hencky(YOUNG, POISSON), density=1.0), terms=[tool], scheme=scheme
     )
     for _ in problem.steps(0.1, 0.02, update=lambda t: tool.move((0.5 * t, 0.0), 0.1 * t)):
         assert np.abs(tool.velocity - (0.5, 0.3)).max() < 1e-12
@@ -398,7 +398,9 @@ def test_what_turns_on_a_path_turns_by_less_than_half_a_turn_in_a_step():
         scenes.vectors(box([-1.0, -1.0], [2.0, 2.0], [4, 4], QUADRILATERAL)),
     )
     tool = contact.RigidBody(particles, contact.disc((5.0, 0.5), 0.3), MASS, fixed="rotation")
-    problem = mpm.DynamicProblem(particles, Hencky(YOUNG, POISSON), 1.0, terms=[tool])
+    problem = mpm.DynamicProblem(
+        mpm.Body(particles, Hencky(YOUNG, POISSON), density=1.0), terms=[tool]
+    )
     tool.move((0.0, 0.0), 4.0)
     raises(lambda: problem.step(0.1), mpm.ConvergenceError, "half a turn or more in one step")
     assert tool.angle[0] == 0.0
@@ -447,7 +449,8 @@ def test_a_drop_weight_on_a_column_of_revolution():
         velocity=(0.0, -1.0),
         axisymmetric=True,
     )
-    problem = mpm.DynamicProblem(
+    problem = posed(
+        mpm.DynamicProblem,
         particles,
         Hencky(YOUNG, POISSON),
         1.0,
@@ -485,9 +488,7 @@ def test_a_ball_rolls_down_an_incline_with_five_sevenths_of_the_acceleration():
         gravity=gravity,
     )
     problem = mpm.DynamicProblem(
-        particles,
-        Hencky(1e6, 0.3),
-        1000.0,
+        mpm.Body(particles, Hencky(1e6, 0.3), density=1000.0),
         scheme="euler",
         bcs=[base(V, -0.19)],
         terms=[ball],
@@ -534,7 +535,9 @@ def test_what_makes_no_sense_is_refused():
     ):
         term = contact.RigidBody(particles, disc, **options)
         raises(
-            lambda term=term: mpm.DynamicProblem(particles, Hencky(1e3, 0.3), 1.0, terms=[term]),
+            lambda term=term: mpm.DynamicProblem(
+                mpm.Body(particles, Hencky(1e3, 0.3), density=1.0), terms=[term]
+            ),
             mpm.MPMError,
             sentence,
         )
@@ -558,7 +561,9 @@ def test_an_error_in_any_one_call_of_a_shape_ends_the_step():
         shape = contact.signed_distance(distance, (0.5, 1.2))
         plate = contact.RigidBody(particles, shape, centre=(0.5, 1.0), fixed=("rotation",))
         law = Hencky(YOUNG, POISSON)
-        problem = mpm.QuasiStaticProblem(particles, law, bcs=[base(V, 0.01)], terms=[plate])
+        problem = mpm.QuasiStaticProblem(
+            mpm.Body(particles, law), bcs=[base(V, 0.01)], terms=[plate]
+        )
         begun = len(calls)
         problem.solve(1, update=lambda t: plate.push((0.0, -8.0 * t), 0.0))
         return begun, len(calls)

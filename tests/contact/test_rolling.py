@@ -48,15 +48,14 @@ def rolled(dim, friction, n, cell, dt, steps, scheme="euler", rests=False):
     law, force = Hencky(1e6, 0.3), fem.Constant(body, -GRAVITY * c * normal)
     before = None
     if rests:
-        before = mpm.QuasiStaticProblem(particles, law, 1000.0, body_force=force, terms=[ground])
+        before = mpm.QuasiStaticProblem(
+            mpm.Body(particles, law, density=1000.0, body_force=force), terms=[ground]
+        )
         before.solve(4)
     weight = np.append(np.zeros(dim - 1), -GRAVITY)
     problem = mpm.DynamicProblem(
-        particles,
-        law,
-        1000.0,
+        mpm.Body(particles, law, density=1000.0, body_force=fem.Constant(body, weight)),
         scheme=scheme,
-        body_force=fem.Constant(body, weight),
         terms=[ground],
         after=before,
     )
@@ -116,7 +115,7 @@ def test_a_block_in_space_sticks_up_to_the_angle_of_friction(friction, kind, til
     ground = contact.Rigid(particles, contact.plane(np.zeros(3), normal), friction)
     force = fem.Constant(body, np.zeros(3))
     problem = mpm.QuasiStaticProblem(
-        particles, LinearElastic(1e4, 0.3), body_force=force, terms=[ground]
+        mpm.Body(particles, LinearElastic(1e4, 0.3), body_force=force), terms=[ground]
     )
     last = 0.0
 

@@ -281,8 +281,7 @@ def dragged(shape, comm=WORLD, friction=0.4):
     particles = mpm.Particles(body, V)
     die = contact.Rigid(particles, shape, friction)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        Hencky(1e3, 0.3),
+        mpm.Body(particles, Hencky(1e3, 0.3)),
         bcs=[fem.dirichletbc(np.zeros(2), base, V)],
         terms=[die],
     )
@@ -342,11 +341,8 @@ def on_slope(n, comm=WORLD, triangles=True, friction=0.3, angle=25.0):
     shape = contact.terrain(x, y, z) if triangles else contact.plane((0, 0, 0), normal)
     ground = contact.Rigid(particles, shape, friction)
     problem = mpm.DynamicProblem(
-        particles,
-        LinearElastic(1e5, 0.3),
-        1.0,
+        mpm.Body(particles, LinearElastic(1e5, 0.3), density=1.0, body_force=(0.0, 0.0, -10.0)),
         scheme="euler",
-        body_force=(0.0, 0.0, -10.0),
         terms=[ground],
     )
     return problem, ground, normal

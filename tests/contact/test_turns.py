@@ -19,7 +19,7 @@ def pressed(friction=0.3):
     body = mpm.Particles(box([0.2, 0.0], [1.8, 1.0], [16, 8], QUADRILATERAL), V)
     disc = contact.Rigid(body, contact.disc((1.0, 1.3), 0.3), friction)
     base = [scenes.fix(V, lambda x: x[1] < 0.01)]
-    problem = mpm.QuasiStaticProblem(body, Hencky(1e3, 0.3), bcs=base, terms=[disc])
+    problem = mpm.QuasiStaticProblem(mpm.Body(body, Hencky(1e3, 0.3)), bcs=base, terms=[disc])
     problem.solve(2, update=lambda t: disc.move((0.0, -0.05 * t)))
     return problem, disc
 
@@ -72,7 +72,9 @@ def test_a_body_that_spins_fast_turns_as_far_as_it_should(scheme):
     V = scenes.vectors(box([0.0, -0.2], [2.0, 3.0], [5, 8], QUADRILATERAL))
     body = mpm.Particles(box([0.2, 0.0], [1.8, 1.0], [4, 3], QUADRILATERAL), V)
     disc = contact.RigidBody(body, contact.disc((1.0, 2.0), 0.3), 1.0, inertia=0.05, spin=50.0)
-    problem = mpm.DynamicProblem(body, Hencky(1e3, 0.3), 1.0, scheme=scheme, terms=[disc])
+    problem = mpm.DynamicProblem(
+        mpm.Body(body, Hencky(1e3, 0.3), density=1.0), scheme=scheme, terms=[disc]
+    )
     problem.solve(0.2, 0.1)
     assert disc.angle == pytest.approx(10.0, rel=0.02) and disc.spin == pytest.approx(50.0)
     assert problem.history.cutbacks > 0

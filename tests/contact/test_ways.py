@@ -46,7 +46,9 @@ def under(shape):
     particles = mpm.Particles(scenes.unit(4, QUADRILATERAL), V)
     rigid = contact.Rigid(particles, shape, 0.3)
     bcs = [fem.dirichletbc(np.zeros(2), fem.locate_dofs_geometrical(V, lambda x: x[1] < 0.01), V)]
-    problem = mpm.QuasiStaticProblem(particles, Hencky(YOUNG, POISSON), bcs=bcs, terms=[rigid])
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(particles, Hencky(YOUNG, POISSON)), bcs=bcs, terms=[rigid]
+    )
     return problem, rigid
 
 

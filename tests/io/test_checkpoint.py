@@ -84,11 +84,13 @@ def test_f_bar(kind, mpi_tmp_path):
         body = scenes.box([0.0, 0.0], [1.0, 1.0], [4, 4], QUADRILATERAL)
         degree = 2 if kind == "domain" else None
         return mpm.QuasiStaticProblem(
-            mpm.Particles(body, V, quadrature_degree=degree),
-            VonMises(1e3, 0.3, rho_y=20.0, hardening=50.0),
-            body_force=(0.0, -60.0),
+            mpm.Body(
+                mpm.Particles(body, V, quadrature_degree=degree),
+                VonMises(1e3, 0.3, rho_y=20.0, hardening=50.0),
+                body_force=(0.0, -60.0),
+                f_bar=kind,
+            ),
             bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)],
-            f_bar=kind,
         )
 
     problem = interrupt(make, 4, mpi_tmp_path / "block.ckpt", 2)
@@ -101,10 +103,12 @@ def test_deleted_particles(mpi_tmp_path):
         body = scenes.box([0.0, 0.0], [4.0, 8.0], [8, 16], TRIANGLE)
         bcs = [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)]
         return mpm.QuasiStaticProblem(
-            mpm.Particles(body, V, outside="delete"),
-            VonMises(1e6, 0.3, rho_y=20e3),
-            density=1000.0,
-            body_force=(0.0, -10.0),
+            mpm.Body(
+                mpm.Particles(body, V, outside="delete"),
+                VonMises(1e6, 0.3, rho_y=20e3),
+                density=1000.0,
+                body_force=(0.0, -10.0),
+            ),
             bcs=bcs,
         )
 
@@ -133,15 +137,22 @@ def two_bodies(comm=WORLD, young=1e3):
     tags = scenes.cell_tags(upper, lambda x: 1 + (x[:, 0] > 1.0))
     laws = {1: Hencky(5e2, 0.2), 2: VonMises(8e2, 0.3, rho_y=30.0, hardening=50.0)}
     return mpm.QuasiStaticProblem(
-        [mpm.Particles(lower, V), mpm.Particles(upper, V)],
-        [VonMises(stiffness, 0.3, rho_y=40.0, hardening=100.0), laws],
-        density=1.0,
-        body_force=(2.0, -40.0),
+        [
+            mpm.Body(
+                mpm.Particles(lower, V),
+                VonMises(stiffness, 0.3, rho_y=40.0, hardening=100.0),
+                density=1.0,
+                body_force=(2.0, -40.0),
+                cell_tags=tags,
+            ),
+            mpm.Body(
+                mpm.Particles(upper, V), laws, density=1.0, body_force=(2.0, -40.0), cell_tags=tags
+            ),
+        ],
         bcs=[
             scenes.fix(V, scenes.at(1, 0.0)),
             scenes.fix(V, scenes.at(0, 2.0), component=0),
         ],
-        cell_tags=[tags, tags],
     )
 
 
@@ -158,7 +169,8 @@ def test_path(mpi_tmp_path):
         value = fem.Constant(V.mesh, np.zeros(2))
         bcs = [scenes.fix(V, scenes.at(0, 0.0)), fem.dirichletbc(value, grip, V)]
         problem = mpm.QuasiStaticProblem(
-            mpm.Particles(body, V), Brittle(0.2, 30.0, 200.0), bcs=bcs, body_force=(0.0, -3.0)
+            mpm.Body(mpm.Particles(body, V), Brittle(0.2, 30.0, 200.0), body_force=(0.0, -3.0)),
+            bcs=bcs,
         )
         problem.grip = value
         return problem
@@ -179,9 +191,11 @@ def test_higher_degrees(degree, cell, mpi_tmp_path):
         V = scenes.vectors(scenes.box([0.0, -0.5], [2.0, 1.5], [5, 5], QUADRILATERAL, comm), degree)
         body = scenes.box([0.0, 0.0], [1.0, 1.0], [4, 4], cell, comm)
         return mpm.QuasiStaticProblem(
-            mpm.Particles(body, V, degree=degree),
-            VonMises(1e3, 0.3, rho_y=20.0, hardening=50.0),
-            body_force=(0.0, -5.0),
+            mpm.Body(
+                mpm.Particles(body, V, degree=degree),
+                VonMises(1e3, 0.3, rho_y=20.0, hardening=50.0),
+                body_force=(0.0, -5.0),
+            ),
             bcs=[scenes.fix(V, scenes.at(0, 0.0))],
         )
 
@@ -195,9 +209,11 @@ def test_in_space(mpi_tmp_path):
         V = scenes.vectors(scenes.unit(3, HEXAHEDRON))
         body = scenes.box([0.0] * 3, [0.9, 0.9, 0.8], [4, 4, 3], HEXAHEDRON)
         return mpm.QuasiStaticProblem(
-            mpm.Particles(body, V),
-            VonMises(1e3, 0.3, rho_y=10.0, hardening=20.0),
-            body_force=(0.0, 0.0, -20.0),
+            mpm.Body(
+                mpm.Particles(body, V),
+                VonMises(1e3, 0.3, rho_y=10.0, hardening=20.0),
+                body_force=(0.0, 0.0, -20.0),
+            ),
             bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in range(3)],
         )
 
@@ -450,21 +466,21 @@ def test_another_problem(mpi_tmp_path):
     V, body = moved.particles.V, moved.particles.mesh
     corner = np.isclose(body.geometry.x, [1.0, 1.0, 0.0]).all(axis=1)
     body.geometry.x[corner, 0] += 1e-5
-    moved = mpm.QuasiStaticProblem(mpm.Particles(body, V), law, bcs=moved.bcs)
+    moved = mpm.QuasiStaticProblem(mpm.Body(mpm.Particles(body, V), law), bcs=moved.bcs)
     refuse(moved, path, "the body mesh is not the same")
     wide = scenes.vectors(scenes.box([0.0, -0.25], [2.5, 1.25], [8, 6], QUADRILATERAL))
     fine = scenes.vectors(scenes.box([0.0, -0.25], [2.0, 1.25], [8, 7], QUADRILATERAL))
     for V in (wide, fine):
         body = scenes.box([0.0, 0.0], [1.0, 1.0], [4, 4], TRIANGLE)
         refuse(
-            mpm.QuasiStaticProblem(mpm.Particles(body, V), law),
+            mpm.QuasiStaticProblem(mpm.Body(mpm.Particles(body, V), law)),
             path,
             "the background mesh is not the same",
         )
     V = scenes.block().particles.V
     for options, what in (({"method": "cpdi"}, "method"), ({"quadrature_degree": 2}, "method")):
         body = scenes.box([0.0, 0.0], [1.0, 1.0], [4, 4], TRIANGLE)
-        other = mpm.QuasiStaticProblem(mpm.Particles(body, V, **options), law)
+        other = mpm.QuasiStaticProblem(mpm.Body(mpm.Particles(body, V, **options), law))
         refuse(other, path, f"the particles' {what} is not the same")
     twins = two_bodies()
     with pytest.raises(mpm.MPMError, match="the number of bodies is not the same"):

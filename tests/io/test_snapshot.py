@@ -30,10 +30,12 @@ def made(comm=WORLD):
     V = scenes.vectors(scenes.box([0.0, -0.5], [2.0, 1.5], [8, 8], QUADRILATERAL, comm))
     body = scenes.box([0.0, 0.0], [0.75, 0.75], [3, 3], QUADRILATERAL, comm)
     return mpm.QuasiStaticProblem(
-        mpm.Particles(body, V),
-        VonMises(1e3, 0.3, rho_y=20.0, hardening=100.0),
-        density=1.0,
-        body_force=(0.0, -30.0),
+        mpm.Body(
+            mpm.Particles(body, V),
+            VonMises(1e3, 0.3, rho_y=20.0, hardening=100.0),
+            density=1.0,
+            body_force=(0.0, -30.0),
+        ),
         bcs=[scenes.fix(V, scenes.at(0, 0.0))],
     )
 
@@ -248,7 +250,8 @@ def test_what_does_not_say_where_it_lives_is_refused(mpi_tmp_path):
     V = scenes.vectors(scenes.box([0.0, -0.5], [2.0, 1.5], [8, 8], QUADRILATERAL))
     body = scenes.box([0.0, 0.0], [0.75, 0.75], [3, 3], QUADRILATERAL)
     bcs = [scenes.fix(V, scenes.at(0, 0.0))]
-    problem = Silent(mpm.Particles(body, V), VonMises(1e3, 0.3, rho_y=20.0), bcs=bcs)
+    law = VonMises(1e3, 0.3, rho_y=20.0)
+    problem = Silent(mpm.Body(mpm.Particles(body, V), law), bcs)
     for attempt in (
         lambda: problem.split([4]),
         problem.rebase,

@@ -222,7 +222,7 @@ def test_confined_layer_between_plates_is_compressed_along_lambda():
     last = -0.05
     moves = [fix(V, at(i, 0.0), component=i) for i in (0, 1)]
     moves += [fix(V, at(i, 1.0), value=last, component=i) for i in (0, 1)]
-    problem = mpm.QuasiStaticProblem(mpm.Particles(body, V), clay(2.0), bcs=moves)
+    problem = mpm.QuasiStaticProblem(mpm.Body(mpm.Particles(body, V), clay(2.0)), bcs=moves)
     problem.solve(steps=1)
     stress = problem.particles.stress
     H = np.broadcast_to(last * np.eye(2), (1, 2, 2))

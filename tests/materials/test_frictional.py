@@ -441,7 +441,7 @@ def test_softening_of_a_body_follows_functions_and_is_weakened():
     law = Tresca(*ELASTIC, COHESION, cohesion_residual=residual, decay=100.0)
     every, moved = everywhere(V)
     particles = mpm.Particles(body, V)
-    problem = mpm.QuasiStaticProblem(particles, law, bcs=[every])
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, law), bcs=[every])
 
     def squeeze(t):
         moved.interpolate(lambda x: (0.02 * t * x[0], -0.02 * t * x[1]))
@@ -489,10 +489,7 @@ def test_confined_column_of_sand_is_active(law, axisymmetric):
     sides = [fix(V, at(0, 0.0, 1.0), component=0), fix(V, at(1, 0.0), component=1)]
     particles = mpm.Particles(body, V)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        material,
-        density=1.0,
-        body_force=(0.0, -10.0),
+        mpm.Body(particles, material, density=1.0, body_force=(0.0, -10.0)),
         bcs=sides,
         axisymmetric=axisymmetric,
     )

@@ -62,7 +62,7 @@ def test_boxes_without_a_mesh_are_those_of_a_mesh():
     stresses = []
     for particles in bodies:
         problem = mpm.QuasiStaticProblem(
-            particles, Hencky(1e3, 0.3), density=2.0, body_force=(0.0, -10.0), bcs=[held]
+            mpm.Body(particles, Hencky(1e3, 0.3), density=2.0, body_force=(0.0, -10.0)), bcs=[held]
         )
         problem.solve(steps=4)
         stresses.append(particles.stress)

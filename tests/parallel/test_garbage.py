@@ -11,6 +11,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import scenes
+from posed import staged as staged_with
 from routes import on_route
 
 from dolfinx import fem
@@ -93,7 +94,7 @@ def moving():
     V = scenes.vectors(scenes.box([-0.5] * 2, [1.5] * 2, [4, 4], scenes.QUADRILATERAL))
     body = mpm.Particles(scenes.unit(4, scenes.TRIANGLE), V)
     law = mpm.materials.Hencky(1e3, 0.3)
-    mpm.DynamicProblem(body, law, density=2.0, body_force=(0.0, -1.0)).solve(1e-3, 1e-3)
+    mpm.DynamicProblem(mpm.Body(body, law, density=2.0, body_force=(0.0, -1.0))).solve(1e-3, 1e-3)
 
 
 def with_a_pressure():
@@ -101,7 +102,9 @@ def with_a_pressure():
     body = mpm.Particles(scenes.unit(4, scenes.QUADRILATERAL), V, degree=2)
     law = mpm.materials.Hencky(1e3, 0.4999)
     bcs = [fem.dirichletbc(np.zeros(2), fem.locate_dofs_geometrical(V, lambda x: x[1] < 0.1), V)]
-    problem = mpm.QuasiStaticProblem(body, law, 2.0, (0.0, -1.0), bcs=bcs, mixed="pressure")
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(body, law, density=2.0, body_force=(0.0, -1.0)), bcs=bcs, mixed="pressure"
+    )
     problem.repartition(0.0)
     problem.solve(1)
 
@@ -110,7 +113,10 @@ def with_water():
     V = scenes.vectors(scenes.box([-0.5] * 2, [1.5] * 2, [4, 4], scenes.QUADRILATERAL), 2)
     body = mpm.Particles(scenes.unit(2, scenes.QUADRILATERAL), V, degree=2)
     law = mpm.materials.Hencky(1e3, 0.3)
-    mpm.PorousProblem(body, law, 0.02, body_force=(0.0, -1.0), bcs=on_the_ground(V)).step(0.05)
+    mpm.PorousProblem(
+        mpm.Body(body, law, body_force=(0.0, -1.0), pore_fluid=mpm.PoreFluid(0.02)),
+        bcs=on_the_ground(V),
+    ).step(0.05)
 
 
 def on_the_ground(V):
@@ -126,7 +132,7 @@ def pressed(law):
     body = ground()
     die = contact.Rigid(body, contact.disc((0.5, 1.51), 0.5), 0.4, law=law)
     law = mpm.materials.Hencky(1e3, 0.3)
-    problem = mpm.QuasiStaticProblem(body, law, bcs=on_the_ground(body.V), terms=[die])
+    problem = mpm.QuasiStaticProblem(mpm.Body(body, law), bcs=on_the_ground(body.V), terms=[die])
     die.move((0.0, -0.03))
     problem.step()
 
@@ -136,7 +142,9 @@ def under_a_footing():
     shape = contact.box((0.2, 1.0), (0.8, 1.5), radius=0.1)
     footing = contact.RigidBody(body, shape, centre=(0.5, 1.0), friction=0.5)
     law = mpm.materials.Hencky(1e3, 0.3)
-    problem = mpm.QuasiStaticProblem(body, law, bcs=on_the_ground(body.V), terms=[footing])
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(body, law), bcs=on_the_ground(body.V), terms=[footing]
+    )
     footing.push((0.0, -10.0))
     problem.step()
 
@@ -160,7 +168,9 @@ def two_bodies(term):
         )
         for dofs in [fem.locate_dofs_geometrical(V, inside)]
     ]
-    mpm.QuasiStaticProblem([upper, lower], law, bcs=bcs, terms=[term(upper, lower)]).step()
+    mpm.QuasiStaticProblem(
+        [mpm.Body(p, law) for p in (upper, lower)], bcs=bcs, terms=[term(upper, lower)]
+    ).step()
 
 
 def tied(a, b):
@@ -170,7 +180,7 @@ def tied(a, b):
 def staged():
     problem = scenes.block()
     problem.solve(1)
-    problem.stage(density=2.0)
+    staged_with(problem, density=2.0)
     problem.solve(1)
 
 

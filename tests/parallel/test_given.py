@@ -11,6 +11,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import scenes
+from posed import posed
 from scenes import QUADRILATERAL, WORLD
 
 import ufl
@@ -62,14 +63,16 @@ def made(law=None, n=2, **options):
     options.setdefault("bcs", [scenes.fix(V, scenes.at(0, 0.0))])
     options.setdefault("body_force", (0.0, -1.0))
     options.setdefault("f_bar", "domain")
-    return mpm.QuasiStaticProblem(particles, Hencky(1e3, 0.3) if law is None else law, **options)
+    return posed(
+        mpm.QuasiStaticProblem, particles, Hencky(1e3, 0.3) if law is None else law, **options
+    )
 
 
 def conditions(count):
     V = scenes.vectors(scenes.box([0.0, -1.0], [2.0, 2.0], [4, 6], QUADRILATERAL))
     bcs = [scenes.fix(V, scenes.at(0, 0.0)), scenes.fix(V, scenes.at(1, -1.0))]
     particles = mpm.Particles(scenes.unit(2, QUADRILATERAL), V, quadrature_degree=2)
-    mpm.QuasiStaticProblem(particles, Hencky(1e3, 0.3), bcs=bcs[:count])
+    mpm.QuasiStaticProblem(mpm.Body(particles, Hencky(1e3, 0.3)), bcs=bcs[:count])
 
 
 def stepping(usual, other, **options):
@@ -88,7 +91,9 @@ def constant():
     particles = mpm.Particles(scenes.unit(2, QUADRILATERAL), V, quadrature_degree=2)
     force = fem.Constant(particles.mesh, (0.0, -1.0))
     bcs = [scenes.fix(V, scenes.at(0, 0.0))]
-    problem = mpm.QuasiStaticProblem(particles, Hencky(1e3, 0.3), body_force=force, bcs=bcs)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(particles, Hencky(1e3, 0.3), body_force=force), bcs=bcs
+    )
     problem.solve(steps=1)
     force.value[1] = differing(-1.0, -2.0)
     problem.step()
@@ -112,7 +117,7 @@ def terms(kind):
         R = ufl.inner(ufl.grad(p.displacement), ufl.grad(ufl.TestFunction(p.W))) * p.dx
         kind(R, p, **given)
     else:
-        kind(p, Hencky(1e3, 0.3), 1.0, **given)
+        kind(mpm.Body(p, Hencky(1e3, 0.3), 1.0), **given)
 
 
 DIFFERENT = {
@@ -191,7 +196,7 @@ def test_support_whose_law_fails_on_one_rank():
     support = mpm.boundary.fixed(p, scenes.facet_tags(p.mesh, scenes.at(0, 0.0)), 1)
     law = Failing("update")
     fails(
-        lambda: mpm.QuasiStaticProblem(p, law, supports=[support]),
+        lambda: mpm.QuasiStaticProblem(mpm.Body(p, law), supports=[support]),
         "update of Failing failed with ValueError: no table",
     )
 
@@ -248,7 +253,9 @@ def test_warnings_that_are_errors():
         V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 1.0], [4, 2], QUADRILATERAL))
         p = mpm.Particles(scenes.unit(2, QUADRILATERAL), V, quadrature_degree=2)
         bcs = [scenes.fix(V, scenes.at(0, 0.0))]
-        problem = mpm.QuasiStaticProblem(p, Hencky(1e3, 0.3), body_force=(0.0, -9.0), bcs=bcs)
+        problem = mpm.QuasiStaticProblem(
+            mpm.Body(p, Hencky(1e3, 0.3), body_force=(0.0, -9.0)), bcs=bcs
+        )
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             problem.solve(steps=1)
@@ -291,7 +298,9 @@ def test_one_rank_that_wants_to_end(kind, where, f_bar):
     bodies = [mpm.Particles(body, V, quadrature_degree=2) for body in meshes]
     laws = [Leaving(1e3, 0.3), Leaving(1e3, 0.3)]
     bcs = [scenes.fix(V, scenes.at(0, 0.0))]
-    problem = mpm.QuasiStaticProblem(bodies, laws, body_force=(0.0, -1.0), bcs=bcs, f_bar=f_bar)
+    problem = posed(
+        mpm.QuasiStaticProblem, bodies, laws, body_force=(0.0, -1.0), bcs=bcs, f_bar=f_bar
+    )
     if where != "path":
         laws[("first body", "second body").index(where)].kind = kind
 

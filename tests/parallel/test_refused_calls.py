@@ -33,12 +33,13 @@ ENDS = {
     # What Python refuses to call drops the only reference to its arguments, or to the object.
     "constructor": "refused(lambda: mpm.QuasiStaticProblem(particles(), bodyforce=1), TypeError)",
     "method": (
-        "refused(lambda: mpm.QuasiStaticProblem(particles(), Hencky(1e3, 0.3)).solve(stepps=1),"
-        " TypeError)"
+        "refused(lambda: mpm.QuasiStaticProblem(mpm.Body(particles(), Hencky(1e3, 0.3)))"
+        ".solve(stepps=1), TypeError)"
     ),
     "half built": (
-        "refused(lambda: mpm.QuasiStaticProblem(particles(), Hencky(1e3, 0.3),"
-        " petsc_options={'pc_type': 'foo'}), mpm.MPMError)\n"
+        "foo = mpm.Solver(petsc_options={'pc_type': 'foo'})\n"
+        "refused(lambda: mpm.QuasiStaticProblem(mpm.Body(particles(), Hencky(1e3, 0.3)),"
+        " solver=foo), mpm.MPMError)\n"
         "refused(lambda: mpm.QuasiStaticProblem(particles(), bodyforce=1), TypeError)"
     ),
 }
@@ -50,7 +51,7 @@ def test_what_is_made_after_a_call_that_was_refused(how):
     program = BEGINNING.format(tests=str(Path(__file__).parents[1])) + ENDS[how]
     program += (
         "\nfor _ in range(3):\n"
-        "    mpm.QuasiStaticProblem(particles(), Hencky(1e3, 0.3)).solve(steps=1)\n"
+        "    mpm.QuasiStaticProblem(mpm.Body(particles(), Hencky(1e3, 0.3))).solve(steps=1)\n"
         "print('went on')"
     )
     done = programs.run("-c", program)

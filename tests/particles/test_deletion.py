@@ -57,7 +57,9 @@ def test_mass_by_a_density_that_varies():
     u.x.array.reshape(-1, 2)[:] = [0.0, -1.0]
     x = ufl.SpatialCoordinate(body)
     p = mpm.Particles(body, V, outside="delete")
-    problem = mpm.QuasiStaticProblem(p, LinearElastic(1e4, 0.3), density=1 + x[0] * x[1], bcs=[bc])
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(p, LinearElastic(1e4, 0.3), density=1 + x[0] * x[1]), bcs=[bc]
+    )
     problem.solve(steps=4)
     # Rows below y = 0.5 are out: the integral of 1 + x y over [0, 1] x [0, 0.5].
     assert len(problem.history.losses) == 2
@@ -68,7 +70,9 @@ def stretched(body, V, outside, material):
     """Return a bar held at its left side and pulled by its weight to the right."""
     p = mpm.Particles(body, V, outside=outside)
     bcs = [scenes.fix(V, scenes.at(0, 0.0))]
-    return mpm.QuasiStaticProblem(p, material, density=1.0, body_force=(1.0, 0.0), bcs=bcs)
+    return mpm.QuasiStaticProblem(
+        mpm.Body(p, material, density=1.0, body_force=(1.0, 0.0)), bcs=bcs
+    )
 
 
 @pytest.mark.parametrize("cell", [TRIANGLE, QUADRILATERAL], ids=scenes.name)

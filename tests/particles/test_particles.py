@@ -129,7 +129,7 @@ def test_stress_of_homogeneous_motion(cell, kind):
     bc, values = scenes.everywhere(particles.V)
     A = STRETCH[:2, :2]
     values.interpolate(lambda x: (A - np.eye(2)) @ x[:2])
-    problem = mpm.QuasiStaticProblem(particles, law(young, poisson, **strength), bcs=[bc])
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, law(young, poisson, **strength)), bcs=[bc])
     assert np.all(particles.stress == 0.0) and np.all(particles.plastic_strain == 0.0)
     problem.solve(steps=1)
 

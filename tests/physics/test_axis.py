@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scenes
 from marks import all_but
+from posed import posed, staged
 from routes import ROUTES
 from scenes import QUADRILATERAL, TRIANGLE, gather
 
@@ -45,7 +46,8 @@ def pressed(material=LAW, force=FORCE, steps=2, **options):
     own = {"assembly", "f_bar", "mixed"} & options.keys()
     given = {name: options.pop(name) for name in own}
     particles, bcs, tags = cylinder(**options)
-    made = mpm.QuasiStaticProblem(
+    made = posed(
+        mpm.QuasiStaticProblem,
         particles,
         material,
         bcs=bcs,
@@ -116,7 +118,7 @@ def test_uniform_compression_goes_on_after_a_rebase(options, take):
     )
     plain = pressed(force=60.0, bent=True, **options)
     for one in (problem, plain):
-        one.stage(tractions=[((0.0, -90.0), TOP)])
+        staged(one, tractions=[((0.0, -90.0), TOP)])
         one.solve(2)
     assert unevenness(problem, 90.0) < 1e-9
     np.testing.assert_allclose(
@@ -132,12 +134,11 @@ def test_pressure_of_contact_is_uniform_up_to_the_axis(law):
     shape = mpm.contact.plane((0.0, top), (0.0, -1.0))
     plate = mpm.contact.Rigid(particles, shape, axisymmetric=True, law=law)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        LAW,
+        mpm.Body(particles, LAW),
         bcs=bcs,
         axisymmetric=True,
         terms=[plate],
-        petsc_options={"snes_rtol": 1e-13},
+        solver=mpm.Solver(petsc_options={"snes_rtol": 1e-13}),
     )
     problem.solve(2, update=lambda t: plate.move((0.0, -0.01 * t)))
     stress = gather(particles.stress)[:, 1, 1]
@@ -157,13 +158,15 @@ def test_ground_around_an_axis_rests_under_its_weight():
     wall = fem.locate_dofs_topological(V.sub(0), 1, facets)
     side = fem.dirichletbc(0.0, wall, V.sub(0))
     problem = mpm.QuasiStaticProblem(
-        particles,
-        Hencky(1e6, 0.3),
-        density=2000.0,
-        body_force=gravity,
+        mpm.Body(
+            particles,
+            Hencky(1e6, 0.3),
+            density=2000.0,
+            body_force=gravity,
+            initial_stress=mpm.geostatic(1.0, 2000.0, 0.5, gravity),
+        ),
         bcs=[*bcs, side],
         axisymmetric=True,
-        initial_stress=mpm.geostatic(1.0, 2000.0, 0.5, gravity),
     )
     problem.solve()
     settled = 2000.0 * 9.81 / 1e6
@@ -174,13 +177,15 @@ def test_a_cylinder_swings_as_a_bar():
     """A motion that is uniform across the cylinder does not bend its cross-sections."""
     particles, bcs, _ = cylinder(off=0.0)
     problem = mpm.DynamicProblem(
-        particles,
-        Hencky(1e3, 0.0),
-        1.0,
-        velocity=lambda x: np.array([0.0 * x[0], -0.1 * x[1]]),
+        mpm.Body(
+            particles,
+            Hencky(1e3, 0.0),
+            density=1.0,
+            velocity=lambda x: np.array([0.0 * x[0], -0.1 * x[1]]),
+        ),
         bcs=bcs,
         axisymmetric=True,
-        petsc_options={"snes_rtol": 1e-13},
+        solver=mpm.Solver(petsc_options={"snes_rtol": 1e-13}),
     )
     problem.solve(0.02, 0.005)
     at, stress = gather(particles.initial_centroid), gather(particles.stress)[:, 1, 1]

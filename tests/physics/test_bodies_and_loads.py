@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 import pytest
 import scenes
+from posed import posed
 from scenes import QUADRILATERAL, TRIANGLE, WORLD, A, B, box, vectors
 from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
@@ -60,7 +61,8 @@ def disc(n, cell, comm=WORLD, **options):
     h = (OUTER - INNER) / n
     V = vectors(box([0.5, 0.0], [3.0, h], [round(2.5 / h), 1], QUADRILATERAL, comm))
     body = box([INNER, 0.0], [OUTER, h], [2 * n, 2], cell, comm)
-    return mpm.QuasiStaticProblem(
+    return posed(
+        mpm.QuasiStaticProblem,
         mpm.Particles(body, V),
         Hencky(YOUNG, POISSON),
         bcs=[scenes.fix(V, scenes.at(1, 0.0, h), component=1)],
@@ -154,7 +156,8 @@ def test_two_half_columns_are_one_column(case, material):
         for low, high in itertools.pairwise(ends):
             cells = round(2 * ne * (high - low) / case.length)
             bodies.append(mpm.Particles(box([0.0, low], [h, high], [2, cells], QUADRILATERAL), V))
-        problem = mpm.QuasiStaticProblem(
+        problem = posed(
+            mpm.QuasiStaticProblem,
             bodies if len(bodies) > 1 else bodies[0],
             material,
             density=case.density,
@@ -179,9 +182,10 @@ def test_two_bodies_whose_nodes_do_not_match(cell):
     lower = mpm.Particles(box([0.0, 0.0], [2.0, 1.0], [8, 4], cell), V)
     upper = mpm.Particles(box([0.3, 1.0], [1.7, 2.0], [9, 9], TRIANGLE), V)
     problem = mpm.QuasiStaticProblem(
-        [lower, upper],
-        VonMises(1e3, 0.3, rho_y=20.0),
-        body_force=(0.0, -15.0),
+        [
+            mpm.Body(p, VonMises(1e3, 0.3, rho_y=20.0), body_force=(0.0, -15.0))
+            for p in (lower, upper)
+        ],
         bcs=[scenes.fix(V, scenes.at(0, 0.0), component=0), scenes.fix(V, scenes.at(1, 0.0))],
     )
     problem.solve(steps=10)
@@ -204,15 +208,15 @@ def test_several_bodies_in_ufl_and_their_errors():
         ([low, 3], "list of them"),
     ):
         with pytest.raises(mpm.MPMError, match=sentence):
-            mpm.QuasiStaticProblem(bodies, Hencky(1e3, 0.3))
+            posed(mpm.QuasiStaticProblem, bodies, Hencky(1e3, 0.3))
     with pytest.raises(mpm.MPMError, match="2 bodies"):
-        mpm.QuasiStaticProblem([low, high], [Hencky(1e3, 0.3)] * 3)
+        mpm.QuasiStaticProblem([mpm.Body(p, [Hencky(1e3, 0.3)] * 3) for p in (low, high)])
     laws = [Hencky(1e3, 0.3), Hencky(4e3, 0.3)]
     problem = mpm.QuasiStaticProblem(
-        [low, high],
-        laws,
-        density=[2.0, 4.0],
-        body_force=(0.0, -10.0),
+        [
+            mpm.Body(low, laws, density=2.0, body_force=(0.0, -10.0)),
+            mpm.Body(high, laws, density=4.0, body_force=(0.0, -10.0)),
+        ],
         bcs=[
             scenes.fix(V, scenes.at(0, 0.0, 1.0), component=0),
             scenes.fix(V, scenes.at(1, 0.0), component=1),
@@ -226,7 +230,7 @@ def test_revolution_needs_a_radius():
     V = vectors(box([-1.0, -1.0], [2.0, 2.0], [6, 6], QUADRILATERAL))
     left = mpm.Particles(box([-0.5, 0.0], [0.5, 1.0], [4, 4], QUADRILATERAL), V)
     with pytest.raises(mpm.MPMError, match="negative radius") as caught:
-        mpm.QuasiStaticProblem(left, Hencky(1e3, 0.3), axisymmetric=True)
+        mpm.QuasiStaticProblem(mpm.Body(left, Hencky(1e3, 0.3)), axisymmetric=True)
     assert len(caught.value.particles) == 8
     with pytest.raises(mpm.MPMError, match="facet_tags"):
-        mpm.QuasiStaticProblem(left, Hencky(1e3, 0.3), pressures=[(1.0, 1)])
+        mpm.QuasiStaticProblem(mpm.Body(left, Hencky(1e3, 0.3), pressures=[(1.0, 1)]))

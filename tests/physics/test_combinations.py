@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import scenes
 from marks import all_but, slow
+from posed import posed, staged
 from scenes import HEXAHEDRON, QUADRILATERAL, WORLD
 
 import ufl
@@ -56,7 +57,6 @@ FEATURES = {
     "ModifiedCamClay": {"law": ModifiedCamClay(0.02, 0.004, 2.5, 400.0, 5.0, 1.0)},
     "ghost": {"stabilisation": "ghost"},
     "aggregate": {"stabilisation": "aggregate"},
-    "remove": {"dependent_dofs": "remove"},
     "path": {"stage": "path"},
     "control": {"stage": "control"},
     "split": {"split": True},
@@ -126,7 +126,10 @@ class Scene:
         wanted: Options of the features.
     """
 
-    kind = mpm.QuasiStaticProblem
+    def problem_of(self, bodies, law, **options):
+        """Return the problem."""
+        return posed(mpm.QuasiStaticProblem, bodies, law, **options)
+
     speed = 0.0
 
     def __init__(self, wanted):
@@ -214,11 +217,10 @@ class Scene:
             "f_bar",
             "axisymmetric",
             "stabilisation",
-            "dependent_dofs",
             "mixed",
             "linear_solver",
         )
-        return self.kind(
+        return self.problem_of(
             bodies if two else first,
             wanted.get("law", Hencky(YOUNG, POISSON)),
             body_force=(*[0.0] * up, -GRAVITY),
@@ -293,7 +295,7 @@ class Scene:
         up = np.zeros(self.dim)
         up[-1] = -GRAVITY
         bcs = [*self.bases, *(side_of(V) for V in spaces)]
-        problem.stage(material=law, bcs=bcs, body_force=tuple(up), **given)
+        staged(problem, material=law, bcs=bcs, body_force=tuple(up), **given)
 
     def steps(self, goal=None):
         """Return the second stage.
@@ -483,12 +485,13 @@ class Moving(Scene):
         self.scheme = scheme
         super().__init__(wanted)
 
-    def kind(self, bodies, law, **options):
+    def problem_of(self, bodies, law, **options):
         """Return the problem."""
         start, still = tuple(self.start), []
         if "quasi_static" in self.wanted:
             start, still = [None, start], [bodies[0]]
-        return mpm.DynamicProblem(
+        return posed(
+            mpm.DynamicProblem,
             bodies,
             law,
             1.0,
@@ -581,11 +584,11 @@ class Wet(Scene):
     def __init__(self, wanted):
         super().__init__({"degree": 2} | wanted)
 
-    def kind(self, bodies, law, **options):
+    def problem_of(self, bodies, law, **options):
         """Return the problem."""
         if options["background"] is None:
             del options["background"]
-        return mpm.PorousProblem(bodies, law, 1e-2, **options)
+        return posed(mpm.PorousProblem, bodies, law, 1e-2, **options)
 
     def require_its_volume(self):
         """Compare the volume of each body with that of the beginning, as no water has left."""
@@ -663,7 +666,8 @@ def stages(wanted):
     problem.solve(2)
     scene.require_equilibrium()
     scene.change()
-    problem.stage(body_force=(*[0.0] * up, -GRAVITY))
+    weight = (*[0.0] * up, -GRAVITY)
+    problem.stage(bodies=[body.replace(body_force=weight) for body in problem.setup.given])
     problem.solve(1)
     scene.require_equilibrium()
     assert problem.history.time == 3.0

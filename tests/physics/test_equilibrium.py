@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import scenes
+from posed import posed
 from scenes import PLANE, QUADRILATERAL, TRIANGLE, WORLD, A, B, top
 from scipy.integrate import quad, solve_ivp
 from scipy.linalg import logm
@@ -165,7 +166,7 @@ def test_patch_on_a_whole_background(background, cell, law):
     u.interpolate(lambda x: LINEAR @ x[:2])
     dofs = scenes.fix(V, lambda x: np.full(x.shape[1], True)).dof_indices()[0]
     bc = fem.dirichletbc(u, (np.unique(dofs) // 2)[::1].astype(np.int32))
-    problem = mpm.QuasiStaticProblem(particles, law(1e3, 0.3), bcs=[bc])
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, law(1e3, 0.3)), bcs=[bc])
     problem.step()
     F = np.eye(3)
     F[:2, :2] += LINEAR
@@ -197,11 +198,13 @@ def test_patch_of_a_body_that_cuts_the_background(background, cell):
     held = np.flatnonzero(V.tabulate_dof_coordinates()[:, 0] < 0.3).astype(np.int32)
     bc = fem.dirichletbc(u, held)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        LinearElastic(1e3, 0.3),
+        mpm.Body(
+            particles,
+            LinearElastic(1e3, 0.3),
+            tractions=[(traction, 1), (traction, 2)],
+            facet_tags=tags,
+        ),
         bcs=[bc],
-        tractions=[(traction, 1), (traction, 2)],
-        facet_tags=tags,
     )
     assert problem.solve(steps=1).iterations == [1]
     assert scenes.largest(particles.stress - stress) < 1e-10 * np.abs(stress).max()
@@ -220,7 +223,7 @@ def test_rigid_motion_across_cells_turns_the_stress(law, cell):
     particles = mpm.Particles(body, V)
     bc, u = scenes.everywhere(V)
     strength = {"rho_y": 30.0} if law is VonMises else {}
-    problem = mpm.QuasiStaticProblem(particles, law(1e3, 0.3, **strength), bcs=[bc])
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, law(1e3, 0.3, **strength)), bcs=[bc])
     stretch = np.array([[0.1, 0.05], [0.05, -0.1]])
     c, s = np.cos(angle), np.sin(angle)
     R = np.array([[c, -s], [s, c]])
@@ -257,7 +260,7 @@ def test_rigid_body_in_a_rigid_shift_has_no_stress():
     problem = scenes.block(Hencky(1e3, 0.3), force=None, bcs=[])
     V = problem.particles.V
     bc, u = scenes.everywhere(V)
-    problem = mpm.QuasiStaticProblem(problem.particles, Hencky(1e3, 0.3), bcs=[bc])
+    problem = posed(mpm.QuasiStaticProblem, problem.particles, Hencky(1e3, 0.3), bcs=[bc])
 
     def path(t):
         u.x.array.reshape(-1, 2)[:] = [0.9 * t, 0.2 * t]
@@ -295,13 +298,15 @@ def plastic_slump(cell):
     body = scenes.box([0.0, 0.0], [4.0, 8.0], [8, 16], cell)
     push = scenes.fix(V, scenes.at(0, 0.0), 0.3, component=0)
     return mpm.QuasiStaticProblem(
-        mpm.Particles(body, V),
-        VonMises(1e6, 0.3, rho_y=20e3, hardening=1e4),
-        density=1000.0,
-        body_force=(0.0, -8.0),
+        mpm.Body(
+            mpm.Particles(body, V),
+            VonMises(1e6, 0.3, rho_y=20e3, hardening=1e4),
+            density=1000.0,
+            body_force=(0.0, -8.0),
+            tractions=[((3e3, 0.0), 1)],
+            facet_tags=scenes.facet_tags(body, scenes.at(1, 8.0)),
+        ),
         bcs=[push, scenes.fix(V, scenes.at(1, 0.0), component=1)],
-        tractions=[((3e3, 0.0), 1)],
-        facet_tags=scenes.facet_tags(body, scenes.at(1, 8.0)),
     )
 
 

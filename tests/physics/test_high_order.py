@@ -42,10 +42,12 @@ def column(case, ne, cell, degree, domain_degree=None, steps=40, material=None, 
     body = box([0.0] * dim, upper, [2] * (dim - 1) + [2 * ne], cell)
     ends = [(0.0, h)] * (dim - 1) + [(0.0,)]
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, degree=domain_degree or degree, **options),
-        material or Hencky(case.young, case.poisson),
-        density=case.density,
-        body_force=(0.0,) * (dim - 1) + (-10.0,),
+        mpm.Body(
+            mpm.Particles(body, V, degree=domain_degree or degree, **options),
+            material or Hencky(case.young, case.poisson),
+            density=case.density,
+            body_force=(0.0,) * (dim - 1) + (-10.0,),
+        ),
         bcs=[fix(V, at(i, *places), component=i) for i, places in enumerate(ends)],
     )
     problem.solve(steps=steps)
@@ -153,7 +155,7 @@ def test_crowded_quadrilaterals_are_warned_of():
     V = vectors(scenes.unit(3, QUADRILATERAL), 2)
     particles = mpm.Particles(scenes.unit(3, QUADRILATERAL), V, degree=2)
     with pytest.warns(UserWarning, match="4 quadrature points .* quadrature_degree=4"):
-        mpm.QuasiStaticProblem(particles, Hencky(1.0, 0.3))
+        mpm.QuasiStaticProblem(mpm.Body(particles, Hencky(1.0, 0.3)))
 
 
 @pytest.mark.parametrize("pair", [(2, 1), (3, 1), (3, 2)])
@@ -224,11 +226,13 @@ def lame(n, geometry, degree):
     V = scenes.vectors(grid, degree)
     particles = mpm.Particles(body, V, degree=degree)
     problem = mpm.QuasiStaticProblem(
-        particles,
-        LinearElastic(1e3, 0.3),
+        mpm.Body(
+            particles,
+            LinearElastic(1e3, 0.3),
+            pressures=[(1e-4, 1)],
+            facet_tags=scenes.facet_tags(body, lambda x: np.hypot(x[0], x[1]) < 1.0 + 1e-6),
+        ),
         bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in range(2)],
-        pressures=[(1e-4, 1)],
-        facet_tags=scenes.facet_tags(body, lambda x: np.hypot(x[0], x[1]) < 1.0 + 1e-6),
     )
     problem.solve(1)
     X = particles.W.tabulate_dof_coordinates()[:, :2]

@@ -68,7 +68,7 @@ def smoothing(particles, reduced, unit):
     It is the difference of two tangents, of a problem with it and one without.
     """
     law = Hencky(2.6, 0.3)
-    problem = mpm.QuasiStaticProblem(particles, law, mixed="stabilised pressure")
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, law), mixed="stabilised pressure")
     own = problem.reduced
     own.begin([np.zeros(len(f.bodies[0].increment.x.array)) for f in own.fields], 1.0)
     x = own.restricted(own.forces)

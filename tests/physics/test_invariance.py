@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import scenes
 from marks import all_but
+from posed import staged as staged_with
 from routes import on_route
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE
 
@@ -348,7 +349,7 @@ def staged(frame):
     scene = weight(frame)
     problem = scene.made
     problem.rebase()
-    problem.stage(material=materials.Hencky(0.5 * YOUNG * frame.stress, 0.2))
+    staged_with(problem, material=materials.Hencky(0.5 * YOUNG * frame.stress, 0.2))
     problem.solve(2)
     corner = frame.point([1.6, 1.55])
     size = 0.6 * frame.length

@@ -25,7 +25,7 @@ def kept_and_most(cells):
     try:
         particles = mpm.Particles(body, V)
         law = mpm.materials.VonMises(1e6, 0.3, rho_y=20e3)
-        problem = mpm.QuasiStaticProblem(particles, law, body_force=(0.0, -1.0))
+        problem = mpm.QuasiStaticProblem(mpm.Body(particles, law, body_force=(0.0, -1.0)))
         (term,) = problem.body_terms
         problem.reduced.begin([np.zeros_like(particles.increment.x.array)], 1.0)
         tracemalloc.reset_peak()

@@ -62,13 +62,15 @@ def test_ghosts_make_no_difference(ghosts):
         body = scenes.box([0.0, 0.0], [1.0, 1.0], [6, 6], QUADRILATERAL, comm, ghost_mode=mode)
         tags = scenes.facet_tags(body, scenes.at(0, 1.0))
         return mpm.QuasiStaticProblem(
-            mpm.Particles(body, V),
-            Hencky(1e3, 0.3),
-            density=1.0,
-            body_force=(0.0, -20.0),
+            mpm.Body(
+                mpm.Particles(body, V),
+                Hencky(1e3, 0.3),
+                density=1.0,
+                body_force=(0.0, -20.0),
+                tractions=[((20.0, 10.0), 1)],
+                facet_tags=tags,
+            ),
             bcs=[scenes.fix(V, scenes.at(0, 0.0))],
-            tractions=[((20.0, 10.0), 1)],
-            facet_tags=tags,
         )
 
     compare(make, 4)
@@ -93,7 +95,9 @@ def test_ranks_without_particles(cell):
         bc, u = scenes.everywhere(V)
         u.interpolate(lambda x: np.array([[0.2, 0.1], [0.0, -0.1]]) @ x[:2])
         body = scenes.unit(1, cell, comm)
-        problem = mpm.QuasiStaticProblem(mpm.Particles(body, V), Hencky(1e3, 0.3), bcs=[bc])
+        problem = mpm.QuasiStaticProblem(
+            mpm.Body(mpm.Particles(body, V), Hencky(1e3, 0.3)), bcs=[bc]
+        )
         problem.solve(steps=4)
         moved.append(outcome(problem))
     for key, values in moved[0].items():
@@ -107,10 +111,9 @@ def test_ranks_without_background_cells():
         body = scenes.box([0.0, 0.0], [1.5, 1.5], [4, 4], TRIANGLE, comm)
         bcs = [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)]
         return mpm.QuasiStaticProblem(
-            mpm.Particles(body, V),
-            Hencky(1e3, 0.3),
-            density=1.0,
-            body_force=(0.0, -30.0),
+            mpm.Body(
+                mpm.Particles(body, V), Hencky(1e3, 0.3), density=1.0, body_force=(0.0, -30.0)
+            ),
             bcs=bcs,
         )
 
@@ -126,10 +129,12 @@ def test_particles_far_from_the_rank_of_their_background():
         V = scenes.vectors(scenes.box([0.0, 0.0], [20.0, 20.0], [20, 20], QUADRILATERAL, comm))
         body = scenes.box([17.1, 0.0], [19.3, 2.2], [6, 6], TRIANGLE, comm)
         return mpm.QuasiStaticProblem(
-            mpm.Particles(body, V),
-            VonMises(1e4, 0.3, rho_y=20.0),
-            density=1.0,
-            body_force=(0.0, -25.0),
+            mpm.Body(
+                mpm.Particles(body, V),
+                VonMises(1e4, 0.3, rho_y=20.0),
+                density=1.0,
+                body_force=(0.0, -25.0),
+            ),
             bcs=[scenes.fix(V, scenes.at(1, 0.0))],
         )
 

@@ -123,7 +123,9 @@ def patch_error(method, scene, velocity=SHEAR, steps=3, law="hencky", **options)
     G = (expm(L / steps) - np.eye(3))[:dim, :dim]
     bc = held(scene.V, lambda x: steps * (x - 0.5) @ G.T, scene.lower, scene.upper)
     particles = mpm.Particles(scene.body, scene.V, method=method, **options)
-    problem = mpm.QuasiStaticProblem(particles, LAWS[law], bcs=[bc], petsc_options=TIGHT)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(particles, LAWS[law]), bcs=[bc], solver=mpm.Solver(petsc_options=TIGHT)
+    )
     problem.solve(steps=steps)
     assert problem.history.cutbacks == 0
     exact = exact_stress(law, expm(L))

@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 from compare import EXACT, raises
+from posed import posed
 from scenes import QUADRILATERAL, WORLD, anywhere, box, in_order, largest, vectors
 
 import mpm_dolfinx as mpm
@@ -53,12 +54,9 @@ def bar(scheme):
 
     law = LinearElastic(1.0, 0.0)
     return mpm.DynamicProblem(
-        particles,
-        law,
-        1.0,
-        velocity=velocity,
+        mpm.Body(particles, law, density=1.0, velocity=velocity),
         scheme=scheme,
-        petsc_options={"snes_rtol": 1e-12},
+        solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
     )
 
 
@@ -99,7 +97,8 @@ def bouncing(scheme, on_plane=True, **options):
     V = vectors(box([0.0, 0.0], [3.0, 3.0], [12, 12], QUADRILATERAL))
     particles = mpm.Particles(box([1.03, 1.01], [2.03, 2.01], [8, 8], QUADRILATERAL), V)
     floor = plane(particles, (0.0, 0.95), (0.0, 1.0))
-    return mpm.DynamicProblem(
+    return posed(
+        mpm.DynamicProblem,
         particles,
         VonMises(100.0, 0.3, rho_y=3.0),
         2.0,

@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 import scenes
+from posed import posed
 from scenes import QUADRILATERAL
 
 import mpm_dolfinx as mpm
@@ -35,8 +36,14 @@ def case(name, length=1.0, stress=1.0, **options):
     sides = (0.0,) if name == "C" else (0.0, h)
     bcs = [fix(V, 0, [x / length for x in sides]), fix(V, 1, [0.0])]
     force = -weight * length / stress
-    problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V), law(), density=1.0, body_force=(0.0, force), bcs=bcs, **options
+    problem = posed(
+        mpm.QuasiStaticProblem,
+        mpm.Particles(body, V),
+        law(),
+        density=1.0,
+        body_force=(0.0, force),
+        bcs=bcs,
+        **options,
     )
     return problem, steps
 
@@ -101,7 +108,7 @@ def test_a_body_on_lines_of_its_background_wherever_the_origin_is(cell, ground):
         bcs = [near(V, 0, [low[0], low[0] + 7 * h]), near(V, 1, low[1:])]
         particles = mpm.Particles(body, V)
         problem = mpm.QuasiStaticProblem(
-            particles, Hencky(1e4, 0.3), body_force=(0.0, -100.0), bcs=bcs
+            mpm.Body(particles, Hencky(1e4, 0.3), body_force=(0.0, -100.0)), bcs=bcs
         )
         problem.solve(steps=2)
         force = problem.reaction(bcs[1])
@@ -119,7 +126,9 @@ def test_a_controlled_point_in_coordinates_of_a_map():
         scenes.box(low, low + np.array([7.0, 3.0]), [14, 6], scenes.TRIANGLE), V
     )
     bcs = [near(V, 1, low[1:]), near(V, 0, [low[0], low[0] + 7.0])]
-    problem = mpm.QuasiStaticProblem(particles, Hencky(1e4, 0.3), body_force=(0.0, -10.0), bcs=bcs)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(particles, Hencky(1e4, 0.3), body_force=(0.0, -10.0)), bcs=bcs
+    )
     top = low + np.array([7.0, 3.0])
     control = mpm.DisplacementControl(particles, 0.01, point=top, direction=(0.0, -1.0))
     problem.solve(2, control=control)

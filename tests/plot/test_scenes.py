@@ -101,9 +101,9 @@ def test_scene_in_space_is_rendered_without_a_word(tmp_path, recwarn, capfd):
     V = vectors(box([0.0] * 3, [2.0, 2.0, 1.5], [2, 2, 2], HEXAHEDRON))
     body = box([0.0] * 3, [1.0, 1.0, 1.0], [2, 2, 2], HEXAHEDRON)
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V),
-        mpm.materials.Hencky(1e3, 0.3),
-        body_force=(0.0, 0.0, -10.0),
+        mpm.Body(
+            mpm.Particles(body, V), mpm.materials.Hencky(1e3, 0.3), body_force=(0.0, 0.0, -10.0)
+        ),
         bcs=[fix(V, at(i, 0.0), component=i) for i in range(3)],
     )
     problem.solve(1)
@@ -147,7 +147,7 @@ def test_history_of_a_motion_shows_energies():
     V = vectors(box([0.0, 0.0], [2.0, 2.0], [4, 4], TRIANGLE))
     particles = mpm.Particles(box([0.5, 1.0], [1.0, 1.5], [2, 2], TRIANGLE), V)
     problem = mpm.DynamicProblem(
-        particles, mpm.materials.Hencky(1e4, 0.3), density=1.0, body_force=(0.0, -1.0)
+        mpm.Body(particles, mpm.materials.Hencky(1e4, 0.3), density=1.0, body_force=(0.0, -1.0))
     )
     problem.solve(0.1, 0.05)
     figure = mpm.plot.history(problem)
@@ -165,7 +165,7 @@ def pressed(shape, dim):
     particles = mpm.Particles(scenes.unit(2, kind), V)
     die = mpm.contact.Rigid(particles, shape)
     law = mpm.materials.Hencky(1e3, 0.3)
-    return mpm.QuasiStaticProblem(particles, law, terms=[die]), die
+    return mpm.QuasiStaticProblem(mpm.Body(particles, law), terms=[die]), die
 
 
 def test_an_obstacle_is_drawn_where_it_is():
@@ -218,7 +218,8 @@ def test_bodies_in_space_fill_the_picture_whatever_is_around_them(wide):
     particles = mpm.Particles(scenes.unit(2, HEXAHEDRON), V)
     hills = mpm.contact.terrain([-wide, wide], [-wide, wide], np.full((2, 2), -0.05))
     problem = mpm.QuasiStaticProblem(
-        particles, mpm.materials.Hencky(1e3, 0.3), terms=[mpm.contact.Rigid(particles, hills)]
+        mpm.Body(particles, mpm.materials.Hencky(1e3, 0.3)),
+        terms=[mpm.contact.Rigid(particles, hills)],
     )
     height = particles.centroid[:, 2]
     figure = mpm.plot.scene(problem, height, cmap="autumn", camera="xz", lines=False)

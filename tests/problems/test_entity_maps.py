@@ -70,7 +70,7 @@ def rubbing(cell, on_facets=True):
     kind = Rubbing if on_facets else mpm.ParticleProblem
     # (a term says that the body may be let go, so that smaller steps are tried where it is)
     options = {"entity_maps": maps, "terms": [mpm.Term([body])]} if on_facets else {}
-    problem = kind(R, body, petsc_options_prefix="ufl_", **options)
+    problem = kind(R, body, **options)
     sums = [fem.form(part * ds(1), entity_maps=maps) for part in (pressure, shear)]
 
     def path(t):

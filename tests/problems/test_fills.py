@@ -5,6 +5,7 @@
 import warnings
 
 import pytest
+from posed import posed
 from scenes import QUADRILATERAL, WORLD, at, box, fix, vectors
 
 import mpm_dolfinx as mpm
@@ -16,7 +17,8 @@ GRAVITY = (0.0, -10.0)
 def fill(lifts, rows, cutoff=None, **options):
     """Return an embankment of height 2 and slope 1:2 (kPa, m, t), built in lifts."""
     V = vectors(box([0, 0], [26, 9], [26, 9], QUADRILATERAL))
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         mpm.Particles(box([0, 0], [26, 6], [52, 12], QUADRILATERAL), V),
         materials.Tresca(4500.0, 0.49, cohesion=15.0),
         density=1.6,
@@ -35,7 +37,10 @@ def fill(lifts, rows, cutoff=None, **options):
         x = lift.geometry.x
         x[:, 1] = 6.0 + height * (k + x[:, 1])
         x[:, 0] *= 4.0 + 2.0 * (8.0 - x[:, 1])
-        problem.add(mpm.Particles(lift, V), soil, density=1.9, body_force=GRAVITY)
+        heap = mpm.Body(
+            mpm.Particles(lift, V), soil, density=1.9, body_force=GRAVITY, f_bar="patch"
+        )
+        problem.add(heap)
         problem.solve(3)
     return problem
 

@@ -20,12 +20,9 @@ def column(material, **options):
     body = box([0.0, 0.0], [1.0, 1.5], [4, 6], QUADRILATERAL)
     particles = mpm.Particles(body, V, quadrature_degree=2, **options)
     return mpm.QuasiStaticProblem(
-        particles,
-        material(body),
-        body_force=(0.0, -20.0),
+        mpm.Body(particles, material(body), body_force=(0.0, -20.0), f_bar="domain"),
         bcs=[fix(V, at(0, 0.0), component=0), fix(V, at(1, 0.0), component=1)],
-        f_bar="domain",
-        petsc_options={"snes_rtol": 1e-12},
+        solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
     )
 
 
@@ -75,8 +72,7 @@ def test_a_path_lowers_a_strength():
     moved = fem.Function(V)
     dofs = fem.locate_dofs_geometrical(V, lambda x: np.ones(x.shape[1], dtype=bool))
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, quadrature_degree=2),
-        VonMises(1e4, 0.3, rho_y=strength),
+        mpm.Body(mpm.Particles(body, V, quadrature_degree=2), VonMises(1e4, 0.3, rho_y=strength)),
         bcs=[fem.dirichletbc(moved, dofs)],
     )
 
@@ -154,9 +150,7 @@ def test_a_function_on_a_mesh_that_was_left_is_refused():
     V = vectors(box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
     body = box([0.0, 0.0], [1.0, 1.5], [4, 6], QUADRILATERAL)
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V),
-        material(body),
-        body_force=(0.0, -20.0),
+        mpm.Body(mpm.Particles(body, V), material(body), body_force=(0.0, -20.0)),
         bcs=[fix(V, at(0, 0.0), component=0), fix(V, at(1, 0.0), component=1)],
     )
     problem.solve(1)

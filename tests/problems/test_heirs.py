@@ -82,10 +82,10 @@ class Bedding(mpm.Term, Kept):
 class Bedded(mpm.QuasiStaticProblem):
     """A problem that brings its own term, and counts its steps."""
 
-    def __init__(self, particles, material, **options):
-        self.bedding = Bedding(particles)
+    def __init__(self, body, **options):
+        self.bedding = Bedding(body.particles)
         self.count = 0
-        super().__init__(particles, material, terms=[self.bedding], **options)
+        super().__init__(body, terms=[self.bedding], **options)
         self.keep(Count(self))
 
     def commit(self):
@@ -111,13 +111,11 @@ class Count(Kept):
 def made():
     V = scenes.vectors(scenes.box([0.0, -0.5], [2.0, 1.5], [8, 8], QUADRILATERAL))
     body = scenes.box([0.0, 0.0], [0.75, 0.75], [6, 6], QUADRILATERAL)
+    law = VonMises(1e3, 0.3, rho_y=20.0, hardening=100.0)
     return Bedded(
-        mpm.Particles(body, V),
-        VonMises(1e3, 0.3, rho_y=20.0, hardening=100.0),
-        density=1.0,
-        body_force=(0.0, -60.0),
+        mpm.Body(mpm.Particles(body, V), law, density=1.0, body_force=(0.0, -60.0)),
         bcs=[scenes.fix(V, scenes.at(0, 0.0))],
-        petsc_options={"snes_rtol": 1e-12},
+        solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
     )
 
 

@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 from compare import outcome, same_run
+from posed import posed
 from scenes import (
     HEXAHEDRON,
     PLANE,
@@ -47,7 +48,8 @@ def ground(material, cell=QUADRILATERAL, stress=None, problem=mpm.QuasiStaticPro
     V = vectors(box([0, 0], [4, 6], [4, 6], cell))
     kind = {k: options.pop(k) for k in ("method", "quadrature_degree") if k in options}
     body = mpm.Particles(box([0, 0], [4, HEIGHT], [8, 10], cell), V, **kind)
-    return problem(
+    return posed(
+        problem,
         body,
         material,
         density=DENSITY,
@@ -110,12 +112,14 @@ def test_in_space():
     gravity = (0.0, 0.0, -10.0)
     sides = [fix(V, at(i, 0, 1), component=i) for i in (0, 1)]
     problem = mpm.QuasiStaticProblem(
-        body,
-        LAWS[4],
-        density=DENSITY,
-        body_force=gravity,
+        mpm.Body(
+            body,
+            LAWS[4],
+            density=DENSITY,
+            body_force=gravity,
+            initial_stress=mpm.geostatic(3.0, DENSITY, 0.6, gravity),
+        ),
         bcs=[*sides, fix(V, at(2, 0), component=2)],
-        initial_stress=mpm.geostatic(3.0, DENSITY, 0.6, gravity),
     )
     problem.solve()
     assert largest(np.abs(body.displacement.x.array)) <= 1e-12
@@ -134,18 +138,20 @@ def test_layers_and_surcharge():
     V = vectors(box([0, 0], [4, 6], [4, 6], QUADRILATERAL))
     body = mpm.Particles(box([0, 0], [4, HEIGHT], [8, 10], QUADRILATERAL), V)
     problem = mpm.QuasiStaticProblem(
-        body,
-        LAWS[4],
-        density=lambda mesh: ufl.conditional(
-            ufl.gt(ufl.SpatialCoordinate(mesh)[1], 3.0),
-            1.6,
-            ufl.conditional(ufl.gt(ufl.SpatialCoordinate(mesh)[1], 2.0), 2.4, 2.0),
+        mpm.Body(
+            body,
+            LAWS[4],
+            density=lambda mesh: ufl.conditional(
+                ufl.gt(ufl.SpatialCoordinate(mesh)[1], 3.0),
+                1.6,
+                ufl.conditional(ufl.gt(ufl.SpatialCoordinate(mesh)[1], 2.0), 2.4, 2.0),
+            ),
+            body_force=GRAVITY,
+            tractions=[((0.0, -surcharge), 1)],
+            facet_tags=facet_tags(body.mesh, at(1, HEIGHT)),
+            initial_stress=stress,
         ),
-        body_force=GRAVITY,
-        tractions=[((0.0, -surcharge), 1)],
-        facet_tags=facet_tags(body.mesh, at(1, HEIGHT)),
         bcs=[fix(V, at(0, 0, 4), component=0), fix(V, at(1, 0), component=1)],
-        initial_stress=stress,
     )
     problem.solve()
     assert largest(np.abs(body.displacement.x.array)) <= 1e-12 * HEIGHT
@@ -170,7 +176,9 @@ def test_what_may_be_given():
     ):
         if isinstance(value, ufl.core.expr.Expr):
             V = body.V
-            problem = mpm.QuasiStaticProblem(mpm.Particles(body.mesh, V), law, initial_stress=value)
+            problem = mpm.QuasiStaticProblem(
+                mpm.Body(mpm.Particles(body.mesh, V), law, initial_stress=value)
+            )
             found = problem.bodies[0].stress
         else:
             found = stress(value)
@@ -260,11 +268,11 @@ def punched(water):
     given["initial_stress"] = mpm.geostatic(HEIGHT, DENSITY, 0.5, GRAVITY)
     law = materials.MohrCoulomb(YOUNG, 0.3, cohesion=5.0, friction_angle=30.0)
     if not water:
-        problem = mpm.QuasiStaticProblem(body, law, **given)
+        problem = posed(mpm.QuasiStaticProblem, body, law, **given)
         return problem, lambda: problem.steps(4, update=lambda t: np.put(way.value, 1, -0.1 * t))
     tags = facet_tags(body.mesh, at(1, HEIGHT))
     drained = {"facet_tags": tags, "drained": [(0.0, 1)], "permeability": 1e-3, "storage": 1e-4}
-    problem = mpm.PorousProblem(body, law, **given, **drained)
+    problem = posed(mpm.PorousProblem, body, law, **given, **drained)
     return problem, lambda: problem.steps(
         0.4, 0.1, update=lambda t: np.put(way.value, 1, -0.25 * t)
     )

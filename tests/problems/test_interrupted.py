@@ -9,6 +9,7 @@ import pytest
 import scenes
 from compare import same_run
 from marks import slow
+from posed import posed
 from scenes import QUADRILATERAL, WORLD
 
 import ufl
@@ -65,7 +66,9 @@ def in_ufl(terms):
     p = body()
     R = ufl.derivative(scenes.neo_hookean(p.displacement, 1e3) * p.dx, p.displacement)
     R -= p.load * ufl.inner(ufl.as_vector((20.0, -60.0)), ufl.TestFunction(p.W)) * p.dx_exact
-    problem = mpm.ParticleProblem(R, p, bcs=[held(p)], terms=terms([p]), petsc_options=TIGHT)
+    problem = mpm.ParticleProblem(
+        R, p, bcs=[held(p)], terms=terms([p]), solver=mpm.Solver(petsc_options=TIGHT)
+    )
     return problem, loaded
 
 
@@ -80,7 +83,12 @@ def with_temperature(terms):
     R -= p.load * ufl.inner(ufl.as_vector((20.0, -60.0)), ufl.TestFunction(p.W)) * p.dx_exact
     heat = ((T - T.previous) * S + 0.05 * ufl.inner(ufl.grad(T), ufl.grad(S))) * dx
     problem = mpm.ParticleProblem(
-        [R, heat], p, bcs=[held(p)], fields=[T], terms=terms([p]), petsc_options=TIGHT
+        [R, heat],
+        p,
+        bcs=[held(p)],
+        fields=[T],
+        terms=terms([p]),
+        solver=mpm.Solver(petsc_options=TIGHT),
     )
     return problem, loaded
 
@@ -88,7 +96,8 @@ def with_temperature(terms):
 def of_materials(terms, **options):
     p = body(2 if "mixed" in options else 1)
     law = VonMises(1e3, 0.3, rho_y=8.0, hardening=200.0)
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         p,
         law,
         body_force=(4.0, -16.0),
@@ -103,16 +112,16 @@ def of_materials(terms, **options):
 def with_water(terms):
     p = body(2)
     problem = mpm.PorousProblem(
-        p,
-        Hencky(1e3, 0.3),
-        permeability=0.02,
-        fluid_density=1.0,
-        body_force=(1.0, -10.0),
+        mpm.Body(
+            p,
+            Hencky(1e3, 0.3),
+            body_force=(1.0, -10.0),
+            facet_tags=scenes.facet_tags(p.mesh, scenes.at(1, 1.0)),
+            pore_fluid=mpm.PoreFluid(0.02, density=1.0, drained=[(0.1, 1)]),
+        ),
         bcs=[held(p)],
-        facet_tags=scenes.facet_tags(p.mesh, scenes.at(1, 1.0)),
-        drained=[(0.1, 1)],
         terms=terms([p]),
-        petsc_options=TIGHT,
+        solver=mpm.Solver(petsc_options=TIGHT),
     )
     return problem, lambda problem, _: problem.step(0.1)
 
@@ -121,7 +130,10 @@ def on_an_obstacle(terms):
     p = body()
     die = contact.Rigid(p, contact.disc((0.5, 1.51), 0.5), 0.4)
     problem = mpm.QuasiStaticProblem(
-        p, Hencky(1e3, 0.3), bcs=[held(p)], terms=[die, *terms([p])], petsc_options=TIGHT
+        mpm.Body(p, Hencky(1e3, 0.3)),
+        bcs=[held(p)],
+        terms=[die, *terms([p])],
+        solver=mpm.Solver(petsc_options=TIGHT),
     )
 
     def step(problem, load):
@@ -137,13 +149,11 @@ def in_motion(terms):
         p, contact.disc((0.5, 1.36), 0.35), 0.2, inertia=0.01, friction=0.4, velocity=(0.3, -2.0)
     )
     problem = mpm.DynamicProblem(
-        p,
-        VonMises(1e2, 0.3, rho_y=2.0),
-        1.0,
+        mpm.Body(p, VonMises(1e2, 0.3, rho_y=2.0), density=1.0),
         scheme="conserving",
         bcs=[held(p)],
         terms=[ball, *terms([p])],
-        petsc_options=TIGHT,
+        solver=mpm.Solver(petsc_options=TIGHT),
     )
     return problem, lambda problem, _: problem.step(0.02)
 
@@ -153,11 +163,10 @@ def of_a_pair(terms):
     lower, upper = (body(low=low, V=scenes.vectors(grid)) for low in (0.0, 1.0))
     motion = fem.Constant(grid, np.zeros(2))
     problem = mpm.QuasiStaticProblem(
-        [lower, upper],
-        Hencky(1e3, 0.3),
+        [mpm.Body(p, Hencky(1e3, 0.3)) for p in (lower, upper)],
         bcs=[held(lower), held(upper, lambda x: x[1] > 1.9, motion)],
         terms=[contact.Pair(lower, upper, 0.3), *terms([lower, upper])],
-        petsc_options=TIGHT,
+        solver=mpm.Solver(petsc_options=TIGHT),
     )
 
     def step(problem, load):

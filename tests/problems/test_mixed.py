@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import EXACT, error_of_blocks, outcome, raises, same_run
+from posed import posed
 from routes import ROUTES, on_route
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 from stock import held, mixed_space, newton, same_values
@@ -72,7 +73,7 @@ def beam(
     force = (0.0,) * (shape.geometry.dim - 1) + (-load,)
     bcs = [scenes.fix(particles.V, scenes.at(0, 0.0))]
     options = {"mixed": "pressure", "bcs": bcs, "body_force": force} | options
-    return mpm.QuasiStaticProblem(particles, material, **options)
+    return posed(mpm.QuasiStaticProblem, particles, material, **options)
 
 
 def test_the_same_as_in_ufl():
@@ -134,7 +135,8 @@ def test_a_pressure_jumps_between_bodies():
     V = scenes.vectors(scenes.box([0.0, 0.0], [1.0, 3.0], (2, 6), QUADRILATERAL), 2)
     shapes = [scenes.box([0.0, y], [1.0, y + 1.0], (4, 4), QUADRILATERAL) for y in (0.0, 1.0)]
     bodies = [mpm.Particles(shape, V, degree=2) for shape in shapes]
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         bodies,
         [LinearElastic(1e3, 0.49), LinearElastic(1e3, 0.25)],
         bcs=[
@@ -166,7 +168,7 @@ def driven(**options):
     V = scenes.vectors(scenes.box([0.0, 0.0], [2.5, 2.0], (5, 4), QUADRILATERAL), 2)
     body = mpm.Particles(scenes.box([0.0, 0.61], [2.0, 1.11], (8, 2), QUADRILATERAL), V, degree=2)
     bcs = [scenes.fix(V, scenes.at(0, 0.0), value=np.array([0.05, -0.02]))]
-    return mpm.QuasiStaticProblem(body, YIELDING, bcs=bcs, mixed="pressure", **options)
+    return posed(mpm.QuasiStaticProblem, body, YIELDING, bcs=bcs, mixed="pressure", **options)
 
 
 def two_lifts(**options):
@@ -178,7 +180,7 @@ def two_lifts(**options):
     ]
     bcs = [scenes.fix(V, scenes.at(1, 0.0))]
     options |= {"bcs": bcs, "body_force": (0.0, -1.0), "density": 1.0, "mixed": "pressure"}
-    return mpm.QuasiStaticProblem(parts, [STIFF, YIELDING], **options)
+    return posed(mpm.QuasiStaticProblem, parts, [STIFF, YIELDING], **options)
 
 
 @pytest.mark.parametrize(
@@ -267,7 +269,8 @@ def shell(law=VonMises(3.0 * 3.8e3, 0.4997, yield_stress=0.5), cells=4, **option
     )
     zero = fem.Function(particles.V.sub(1).collapse()[0])
     bcs = [fem.dirichletbc(zero, axial, particles.V.sub(1))]
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         particles,
         law,
         axisymmetric=True,
@@ -342,7 +345,7 @@ def test_what_does_not_go_together_is_refused():
     shape = scenes.box([0.0, 0.61], [2.0, 1.11], (8, 2), QUADRILATERAL)
     body = mpm.Particles(shape, scenes.vectors(triangles, 1))
     raises(
-        lambda: mpm.QuasiStaticProblem(body, STIFF, mixed="stabilised pressure"),
+        lambda: mpm.QuasiStaticProblem(mpm.Body(body, STIFF), mixed="stabilised pressure"),
         mpm.MPMError,
         "needs a background of quadrilaterals or hexahedra",
     )
@@ -374,7 +377,9 @@ def test_a_stabilised_pressure_comes_near_that_of_degree_2():
         V = scenes.vectors(background, degree)
         body = mpm.Particles(shape, V, degree=degree)
         bcs = [scenes.fix(V, scenes.at(0, 0.0))]
-        problem = mpm.QuasiStaticProblem(body, STIFF, body_force=(0, -0.2), bcs=bcs, mixed=mixed)
+        problem = mpm.QuasiStaticProblem(
+            mpm.Body(body, STIFF, body_force=(0, -0.2)), bcs=bcs, mixed=mixed
+        )
         problem.solve(2)
         assert problem.history.iterations == [4, 4]
         pressure = np.abs(scenes.in_order(body, body.stress).trace(axis1=1, axis2=2)).mean() / 3.0
@@ -396,13 +401,15 @@ def test_a_constant_pressure_is_not_smoothed():
         sides = scenes.facet_tags(shape, scenes.at(0, 1.0), scenes.at(1, 1.0))
         bcs = [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in range(2)]
         problem = mpm.QuasiStaticProblem(
-            mpm.Particles(shape, V),
-            Hencky(10.0, 0.3),
-            pressures=[(2.0, 1), (2.0, 2)],
-            facet_tags=sides,
+            mpm.Body(
+                mpm.Particles(shape, V),
+                Hencky(10.0, 0.3),
+                pressures=[(2.0, 1), (2.0, 2)],
+                facet_tags=sides,
+            ),
             bcs=bcs,
             mixed=mixed,
-            petsc_options={"snes_rtol": 1e-11},
+            solver=mpm.Solver(petsc_options={"snes_rtol": 1e-11}),
         )
         problem.solve(2)
         return outcome(problem)
@@ -512,7 +519,7 @@ def pressed(law, width=1.0, comm=WORLD, push=0.03, **options):
     plate = mpm.boundary.roller(body, tags, 1, normal=(0.0, -1.0), value=push)
     sides = [scenes.fix(body.V, scenes.at(axis, 0), component=axis) for axis in (0, 1)]
     options = {"mixed": "pressure", "bcs": sides, "supports": [plate]} | options
-    return mpm.QuasiStaticProblem(body, law, **options)
+    return posed(mpm.QuasiStaticProblem, body, law, **options)
 
 
 @pytest.mark.parametrize("name", SOILS)
@@ -581,12 +588,13 @@ def test_two_laws_in_a_body_and_a_file(mpi_tmp_path):
 
 def pressed_again(problem, laws, tags):
     """Return the problem of the same body with other laws."""
-    return mpm.QuasiStaticProblem(
+    return posed(
+        mpm.QuasiStaticProblem,
         problem.particles,
         laws,
         cell_tags=tags,
         bcs=problem.bcs,
-        supports=problem.setup.bodies[0].supports,
+        supports=problem.setup.supports,
         mixed="pressure",
     )
 
@@ -649,10 +657,10 @@ def test_a_lift_and_another_material():
         scenes.fix(V, scenes.at(1, 0), component=1),
     ]
     body, law, loads = ground(V, 0.0, 1.0, law)
-    problem = mpm.QuasiStaticProblem(body, law, bcs=bcs, mixed="pressure", **loads)
+    problem = posed(mpm.QuasiStaticProblem, body, law, bcs=bcs, mixed="pressure", **loads)
     problem.solve(2)
     lift, _, loads = ground(V, 1.0, 2.0, law)
-    problem.add(lift, law, **loads)
+    problem.add(mpm.Body(lift, law, **loads))
     assert len(problem.pressure) == 2
     for step in problem.steps(2):
         weight = 2.0 * 20.0 * (1.0 + step.load)
@@ -665,12 +673,13 @@ def test_a_lift_and_another_material():
         np.testing.assert_allclose(mean, -20.0 * share * (2.0 - z), atol=1e-3)
     before, moved = [b.stress for b in (body, lift)], scenes.in_order(body, body.centroid)
     stiffer = Hencky(2e7, 0.4999)
-    problem.stage("another below", material=[stiffer, law])
+    problem.stage("another below", problem.body(body).replace(material=stiffer))
     for part, stress in zip((body, lift), before, strict=True):
         np.testing.assert_allclose(part.stress, stress, rtol=1e-7, atol=1e-7)
     problem.solve(1)
     np.testing.assert_allclose(scenes.in_order(body, body.centroid), moved, atol=1e-9)
-    problem.stage("more weight", body_force=(0.0, -12.0))
+    heavier = [given.replace(body_force=(0.0, -12.0)) for given in problem.setup.given]
+    problem.stage("more weight", heavier)
     problem.solve(1)
     change = scenes.in_order(body, body.centroid)[:, 1] - moved[:, 1]
     E, nu = 2e7, 0.4999
@@ -689,8 +698,14 @@ def test_an_initial_stress():
     for law in (Hencky(1e3, 0.4999), SmallStrainVonMises(1e3, 0.4999, yield_stress=50.0)):
         body, law, loads = ground(V, 0.0, 2.0, law)
         stress = mpm.geostatic(2.0, 2.0, 0.8, (0.0, -10.0))
-        problem = mpm.QuasiStaticProblem(
-            body, law, bcs=bcs, mixed="pressure", initial_stress=stress, **loads
+        problem = posed(
+            mpm.QuasiStaticProblem,
+            body,
+            law,
+            bcs=bcs,
+            mixed="pressure",
+            initial_stress=stress,
+            **loads,
         )
         problem.solve(1)
         assert scenes.largest(body.displacement.x.array) < 1e-12
@@ -705,15 +720,19 @@ def test_a_stage_is_taken_back_where_it_cannot_be():
         scenes.fix(V, scenes.at(0, 0, 2), component=0),
         scenes.fix(V, scenes.at(1, 0), component=1),
     ]
-    problem = mpm.QuasiStaticProblem(body, law, bcs=bcs, mixed="pressure", **loads)
+    problem = posed(mpm.QuasiStaticProblem, body, law, bcs=bcs, mixed="pressure", **loads)
     problem.solve(1)
     pressure = problem.pressure[0].previous.x.array.copy()
-    raises(lambda: problem.stage(material=Foreign()), mpm.MPMError, "not Foreign")
+    raises(
+        lambda: problem.stage(bodies=problem.body().replace(material=Foreign())),
+        mpm.MPMError,
+        "not Foreign",
+    )
     flat = scenes.box([0.0, 1.0], [2.0, 2.0], (4, 2), QUADRILATERAL)
     lift = mpm.Particles(flat, scenes.vectors(V.mesh), degree=1)
-    raises(lambda: problem.add(lift, law), mpm.MPMError, "of degree 2 or 3")
+    raises(lambda: problem.add(mpm.Body(lift, law)), mpm.MPMError, "of degree 2 or 3")
     assert np.array_equal(problem.pressure[0].previous.x.array, pressure)
-    problem.stage(body_force=(0.0, -11.0))
+    problem.stage(bodies=problem.body().replace(body_force=(0.0, -11.0)))
     problem.solve(1)
     assert problem.reaction(bcs[1])[1] == pytest.approx(44.0, rel=1e-8)
 
@@ -733,15 +752,10 @@ def test_a_small_motion_as_in_stock_finite_elements():
         return size * np.array([0.0 * x[0], x[0] * (0.3 + x[1])])
 
     problem = mpm.DynamicProblem(
-        body,
-        law,
-        density,
-        velocity=start,
+        mpm.Body(body, law, density=density, body_force=(0.0, -size), velocity=start),
         bcs=[scenes.fix(body.V, scenes.at(0, 0.0))],
-        body_force=(0.0, -size),
         mixed="pressure",
-        stabilisation=None,
-        petsc_options={"snes_rtol": 1e-12},
+        solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}, stabilisation=None),
     )
     for _ in range(3):
         problem.step(dt)
@@ -772,7 +786,8 @@ def turning(scheme, law=STIFF, mixed="pressure", **options):
     background = scenes.box([-2.0] * 2, [2.0] * 2, (8, 8), QUADRILATERAL)
     shape = scenes.box([-0.8, -0.3], [0.8, 0.3], (6, 3), QUADRILATERAL)
     body = mpm.Particles(shape, scenes.vectors(background, 2), degree=2)
-    return mpm.DynamicProblem(
+    return posed(
+        mpm.DynamicProblem,
         body,
         law,
         1.0,

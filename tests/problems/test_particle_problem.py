@@ -9,6 +9,7 @@ import pytest
 import scenes
 from bad_input import body, held_background
 from compare import raises
+from posed import posed
 from routes import ROUTES, ReferenceForms
 from scenes import PLANE, QUADRILATERAL, TRIANGLE, WORLD
 
@@ -100,7 +101,9 @@ def test_particles_that_are_cells_are_finite_elements(cell, degree):
 
     R = residual(particles.displacement, ufl.TestFunction(particles.W), particles.load)
     bcs = grips(particles.V)
-    problem = mpm.ParticleProblem(R, particles, bcs=bcs, petsc_options_prefix="twin_")
+    problem = mpm.ParticleProblem(
+        R, particles, bcs=bcs, solver=mpm.Solver(petsc_options_prefix="twin_")
+    )
     problem.solve(steps=1)
     d = finite_elements(particles, residual, grips)
     assert scenes.largest(d.x.array) > 0.2
@@ -158,8 +161,13 @@ def test_hencky_in_ufl_is_the_material(cell):
     history = mpm.ParticleProblem(R, particles, bcs=bcs).solve(steps=steps)
 
     others, bcs, b = leaning_block(cell, force=400.0)
-    problem = mpm.QuasiStaticProblem(
-        others, mpm.materials.Hencky(young, poisson), density=1.0, body_force=b, bcs=bcs
+    problem = posed(
+        mpm.QuasiStaticProblem,
+        others,
+        mpm.materials.Hencky(young, poisson),
+        density=1.0,
+        body_force=b,
+        bcs=bcs,
     )
     cells = []
     for _ in problem.steps(steps):
@@ -401,11 +409,13 @@ def test_loads_that_are_zero_load_nothing():
     (a, _), bcs = pair_of_bodies()
     x = ufl.SpatialCoordinate(a.mesh)
     problem = mpm.QuasiStaticProblem(
-        a,
-        mpm.materials.Hencky(1e3, 0.3),
-        body_force=0.0 * x,
-        pressures=[(0.0 * x[0], 1)],
-        facet_tags=scenes.facet_tags(a.mesh, scenes.at(1, 0.5)),
+        mpm.Body(
+            a,
+            mpm.materials.Hencky(1e3, 0.3),
+            body_force=0.0 * x,
+            pressures=[(0.0 * x[0], 1)],
+            facet_tags=scenes.facet_tags(a.mesh, scenes.at(1, 0.5)),
+        ),
         bcs=bcs,
     )
     problem.solve(1)

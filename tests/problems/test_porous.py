@@ -9,6 +9,7 @@ import pytest
 import scenes
 from compare import EXACT, error_of_blocks, outcome, raises, same_run
 from marks import slow, thinned
+from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, WORLD
 
 import ufl
@@ -79,7 +80,7 @@ def column(law=SOIL, permeability=None, load=1.0, n=4, offset=0.37, comm=WORLD, 
         "drained": [(0.0, 1)],
     } | options
     permeability = 1.0 / confined(law) if permeability is None else permeability
-    problem = mpm.PorousProblem(body, law, permeability, **options)
+    problem = posed(mpm.PorousProblem, body, law, permeability, **options)
     (p,) = problem.pore_pressure
     height = p.W.tabulate_dof_coordinates()[:, up] - low
     return problem, p, height
@@ -161,7 +162,12 @@ def test_the_same_as_in_ufl():
     R_p += dt * (-q * ufl.dot(flux, n) + k * field * ufl.dot(ufl.grad(q), n)) * ds(1)
     R_p -= dt * 5.0 / size * k * field * q * ds(1)
     twin = mpm.ParticleProblem(
-        [R_u, R_p], body, bcs=other.bcs, fields=[field], symmetric=True, predictor=False
+        [R_u, R_p],
+        body,
+        bcs=other.bcs,
+        fields=[field],
+        symmetric=True,
+        solver=mpm.Solver(predictor=False),
     )
     body.load.value = 1.0
     for _ in range(3):
@@ -212,7 +218,8 @@ def slab(n, poisson=0.2, shear=1e3, **options):
     top = fem.Constant(shape, 0.0)
     plate = mpm.boundary.roller(body, tags, 3, (0.0, 1.0), top)
     held = [mpm.boundary.roller(body, tags, i + 1, -np.eye(2)[i]) for i in (0, 1)]
-    problem = mpm.PorousProblem(
+    problem = posed(
+        mpm.PorousProblem,
         body,
         law,
         1.0 / confined(law),
@@ -311,13 +318,14 @@ def test_flat_domains_on_a_drained_top():
     body = mpm.Particles(shape, scenes.vectors(background, 2), degree=2, quadrature_degree=4)
     walls = [scenes.fix(body.V, scenes.at(0, x), component=0) for x in (0.0, 10.0)]
     problem = mpm.PorousProblem(
-        body,
-        SOIL,
-        1.0 / confined(SOIL),
+        mpm.Body(
+            body,
+            SOIL,
+            tractions=[((0.0, -1.0), 1)],
+            facet_tags=scenes.facet_tags(shape, scenes.at(1, 1.0), scenes.at(1, 0.0)),
+            pore_fluid=mpm.PoreFluid(1.0 / confined(SOIL), drained=[(0.0, 1)]),
+        ),
         bcs=[*walls, scenes.fix(body.V, scenes.at(1, 0.0), component=1)],
-        tractions=[((0.0, -1.0), 1)],
-        facet_tags=scenes.facet_tags(shape, scenes.at(1, 1.0), scenes.at(1, 0.0)),
-        drained=[(0.0, 1)],
     )
     (p,) = problem.pore_pressure
     largest = [scenes.largest(p.x.array) for _ in problem.steps(5e-3, 5e-4)]
@@ -336,23 +344,26 @@ def test_a_field_split_whose_block_has_no_factor():
     shape = scenes.box([0.0, 0.0], [0.5, 1.0], (1, 1), QUADRILATERAL, comm)
     body = mpm.Particles(shape, scenes.vectors(background, 2), degree=2)
     problem = mpm.PorousProblem(
-        body,
-        SOIL,
-        1.0,
+        mpm.Body(
+            body,
+            SOIL,
+            tractions=[((0.0, -1.0), 1)],
+            facet_tags=scenes.facet_tags(shape, scenes.at(1, 1.0), scenes.at(1, 0.0)),
+            pore_fluid=mpm.PoreFluid(1.0, drained=[(0.0, 1)]),
+        ),
         bcs=[scenes.fix(body.V, scenes.at(1, 0.0), component=1)]
         + [scenes.fix(body.V, scenes.at(0, x), component=0) for x in (0.0, 0.5)],
-        tractions=[((0.0, -1.0), 1)],
-        facet_tags=scenes.facet_tags(shape, scenes.at(1, 1.0), scenes.at(1, 0.0)),
-        drained=[(0.0, 1)],
-        petsc_options={
-            "ksp_type": "gmres",
-            "pc_type": "fieldsplit",
-            "pc_fieldsplit_type": "schur",
-            "fieldsplit_displacement_pc_type": "lu",
-            "fieldsplit_displacement_pc_factor_mat_solver_type": "petsc",
-            "fieldsplit_displacement_pc_factor_zeropivot": 1e9,
-            "fieldsplit_pore_pressure_pc_type": "none",
-        },
+        solver=mpm.Solver(
+            petsc_options={
+                "ksp_type": "gmres",
+                "pc_type": "fieldsplit",
+                "pc_fieldsplit_type": "schur",
+                "fieldsplit_displacement_pc_type": "lu",
+                "fieldsplit_displacement_pc_factor_mat_solver_type": "petsc",
+                "fieldsplit_displacement_pc_factor_zeropivot": 1e9,
+                "fieldsplit_pore_pressure_pc_type": "none",
+            }
+        ),
     )
     raises(lambda: problem.step(0.1), mpm.ConvergenceError, "factorisation of the tangent failed")
     assert problem.history.statistics["factorisations"] > 2
@@ -404,13 +415,13 @@ def test_a_dry_lift_on_wet_ground():
     problem.solve(1e-6, 1e-6)
     V = problem.particles.V
     lift = mpm.Particles(scenes.box([0.0, 1.0], [0.5, 1.25], (4, 1), QUADRILATERAL), V, degree=2)
-    problem.add(lift, SOIL, density=4.0, body_force=(0.0, -1.0))
+    problem.add(mpm.Body(lift, SOIL, density=4.0, body_force=(0.0, -1.0)))
     assert len(problem.pore_pressure) == 1 and problem.pore_pressure[0] is p
     problem.solve(2e-6, 1e-6)
     assert scenes.largest(p.x.array[y < 0.6] - 1.0) < 1e-4
     problem.solve(5.0, 1.0)
     assert scenes.largest(p.x.array) < 0.02
-    held = problem.reaction(problem.setup.bodies[0].supports[0])
+    held = problem.reaction(problem.setup.supports[0])
     assert held[1] == pytest.approx(0.5, rel=1e-6)
 
 
@@ -456,9 +467,13 @@ def test_restart_and_a_step_that_fails(mpi_tmp_path):
 
 def test_what_does_not_go_together_is_refused():
     raises(lambda: column(mixed="pressure"), mpm.MPMError, "has no mixed=")
-    raises(lambda: column(permeability=-1.0), mpm.MPMError, "permeability must be positive")
-    raises(lambda: column(storage=-1.0), mpm.MPMError, "storage must be not negative")
-    raises(lambda: column(fluid_density=-1.0), mpm.MPMError, "fluid_density must be a number")
+    raises(
+        lambda: column(permeability=-1.0),
+        mpm.MPMError,
+        "permeability of a PoreFluid must be positive",
+    )
+    raises(lambda: column(storage=-1.0), mpm.MPMError, "storage of a PoreFluid must be")
+    raises(lambda: column(fluid_density=-1.0), mpm.MPMError, "density of a PoreFluid must be")
     raises(lambda: column(drained=[(0.0, 7)]), mpm.MPMError, "drained are pairs")
     raises(lambda: column(drained=3), mpm.MPMError, "drained must be a list")
     raises(lambda: column(pore_pressure="high"), mpm.MPMError, "pore_pressure must be a number")
@@ -478,10 +493,15 @@ def test_what_does_not_go_together_is_refused():
     for space in (("Lagrange", 2), ("Lagrange", 1, (2,))):
         V_p = fem.functionspace(body.V.mesh, space)
         raises(lambda V_p=V_p: column(pressure_space=V_p), mpm.MPMError, "must be a scalar space")
-    raises(lambda: mpm.PorousProblem(body, SOIL, None), mpm.MPMError, "for one of its bodies")
+    raises(lambda: mpm.PoreFluid(None), mpm.MPMError, "permeability of a PoreFluid must be")
+    raises(lambda: mpm.PorousProblem(mpm.Body(body, SOIL)), mpm.MPMError, "needs a body with a")
     flat = scenes.unit(2, QUADRILATERAL)
     low = mpm.Particles(flat, scenes.vectors(scenes.unit(2, QUADRILATERAL)))
-    raises(lambda: mpm.PorousProblem(low, SOIL, 1.0), mpm.MPMError, "of degree 2 or 3")
+    raises(
+        lambda: mpm.PorousProblem(mpm.Body(low, SOIL, pore_fluid=mpm.PoreFluid(1.0))),
+        mpm.MPMError,
+        "of degree 2 or 3",
+    )
     raises(lambda: problem.remove([0]), mpm.MPMError, "cannot be taken from a body with water")
     problem, _, _ = column()
     raises(lambda: problem.solve(0.0, 0.1), mpm.MPMError, "give a later time")
@@ -507,7 +527,7 @@ def soaked(comm=WORLD, **options):
     } | options
     if options.get("axisymmetric"):
         defaults["bcs"].append(scenes.fix(V, scenes.at(0, 0.0), component=0))
-    return mpm.PorousProblem(body, defaults.pop("material", Hencky(10.0, 0.3)), **defaults)
+    return posed(mpm.PorousProblem, body, defaults.pop("material", Hencky(10.0, 0.3)), **defaults)
 
 
 @pytest.mark.parametrize(
@@ -558,7 +578,7 @@ def test_what_lies_on_the_mesh_of_before_is_refused(name):
     held = [scenes.fix(body.V, scenes.at(1, 0.0))]
     again = mpm.Particles(body.mesh, body.V, degree=2)
     law = Hencky(10.0, 0.3)
-    problem = mpm.PorousProblem(again, law, facet_tags=tags, bcs=held, **given)
+    problem = posed(mpm.PorousProblem, again, law, facet_tags=tags, bcs=held, **given)
     before = scenes.state(problem)
     for change in (problem.rebase, lambda: problem.repartition(0.0)):
         raises(change, mpm.MPMError, f"{name} is written on the present body mesh")
@@ -595,7 +615,9 @@ def test_a_body_without_water_has_no_pore_pressure():
         mpm.Particles(scenes.box(*size, QUADRILATERAL), V, degree=2, quadrature_degree=4)
         for size in made
     ]
-    problem = mpm.PorousProblem(bodies, SOIL, [1.0, None], bcs=[scenes.fix(V, scenes.at(1, 0.0))])
+    problem = posed(
+        mpm.PorousProblem, bodies, SOIL, [1.0, None], bcs=[scenes.fix(V, scenes.at(1, 0.0))]
+    )
     soil, footing = values_of(problem, bodies, "pore_pressure")
     assert not np.isnan(soil).any() and np.isnan(footing).all()
     assert {"pressure"} == bodies[1].fields().keys() - bodies[0].fields().keys()

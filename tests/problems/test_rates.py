@@ -7,6 +7,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from marks import slow
+from posed import posed
 from scenes import (
     HEXAHEDRON,
     QUADRILATERAL,
@@ -36,7 +37,7 @@ def test_a_sheared_block_has_the_friction_of_its_rate(scheme):
     bc, u = everywhere(V)
     stress = -pressure * np.eye(3)
     problem = mpm.DynamicProblem(
-        particles, LAW, 2.0, bcs=[bc], scheme=scheme, initial_stress=stress
+        mpm.Body(particles, LAW, density=2.0, initial_stress=stress), bcs=[bc], scheme=scheme
     )
     y = V.tabulate_dof_coordinates()[:, 1]
 
@@ -67,7 +68,8 @@ def collapse(comm=WORLD, law=LAW, cell=TRIANGLE, particles=(), **options):
     bcs = [fix(V, at(0, 0.0), 0.0, 0), fix(V, at(1, 0.0))]
     if dim == 3:
         bcs.append(fix(V, at(2, 0.0, 0.25), 0.0, 2))
-    return mpm.DynamicProblem(
+    return posed(
+        mpm.DynamicProblem,
         mpm.Particles(body, V, **dict(particles)),
         law,
         density=2.0,
@@ -122,7 +124,7 @@ def test_a_stage_leaves_the_stress_of_what_flows():
     before = problem.points[0].first_piola.copy()
     over = problem.points[0].yield_function()
     assert WORLD.allreduce(over.max(initial=0.0), MPI.MAX) > 0.1
-    problem.stage(body_force=(1.0, -10.0))
+    problem.stage(bodies=problem.body().replace(body_force=(1.0, -10.0)))
     np.testing.assert_allclose(
         problem.points[0].first_piola, before, atol=1e-12 * np.abs(before).max()
     )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import outcome, same_run
+from posed import posed
 from routes import ROUTES, on_route
 from scenes import ALL, HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 from splits import block_of, column, half_way, some, sums
@@ -68,12 +69,11 @@ def test_split_at_first_is_a_body_of_triangles():
     def bar(body):
         V = scenes.vectors(scenes.box([0.0, -0.5], [3.0, 1.0], [12, 6], QUADRILATERAL))
         return mpm.QuasiStaticProblem(
-            mpm.Particles(body, V),
-            Hencky(20.0, 0.3),
-            density=1.0,
-            body_force=(1.0, -0.2),
+            mpm.Body(
+                mpm.Particles(body, V), Hencky(20.0, 0.3), density=1.0, body_force=(1.0, -0.2)
+            ),
             bcs=[scenes.fix(V, scenes.at(0, 0.0))],
-            stabilisation=None,
+            solver=mpm.Solver(stabilisation=None),
         )
 
     corners = ([0.0, 0.0], [2.0, 0.5], [9, 3])
@@ -103,7 +103,7 @@ def dented(policy="split", comm=WORLD):
     u.x.array.reshape(-1, 2)[inside] = -0.35
     body = scenes.box([0.0, 0.0], [1.0, 1.0], [2, 2], QUADRILATERAL, comm)
     particles = mpm.Particles(body, V, on_distortion=policy)
-    return mpm.QuasiStaticProblem(particles, Hencky(1e4, 0.3), density=2.0, bcs=[bc])
+    return mpm.QuasiStaticProblem(mpm.Body(particles, Hencky(1e4, 0.3), density=2.0), bcs=[bc])
 
 
 def test_concave_domains_are_split():
@@ -160,12 +160,14 @@ def test_what_keeps_a_step_from_converging_is_split():
     V = scenes.vectors(scenes.box([0.0, 0.0], [12.0, 9.0], [12, 9], QUADRILATERAL))
     body = scenes.box([0.0, 0.0], [4.0, 8.0], [4, 8], QUADRILATERAL)
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, on_distortion="split"),
-        VonMises(1e6, 0.3, rho_y=20e3),
-        density=1000.0,
-        body_force=(0.0, -20.0),
+        mpm.Body(
+            mpm.Particles(body, V, on_distortion="split"),
+            VonMises(1e6, 0.3, rho_y=20e3),
+            density=1000.0,
+            body_force=(0.0, -20.0),
+        ),
         bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)],
-        stabilisation=None,
+        solver=mpm.Solver(stabilisation=None),
     )
     p, failing = problem.particles, 0.0
     for step in problem.steps(10):
@@ -406,7 +408,9 @@ def test_one_of_two_bodies():
         ]
         bcs = [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in range(2)]
         law = Hencky(1e3, 0.3)
-        return mpm.QuasiStaticProblem(halves, law, density=[2.0, 3.0], body_force=(3, -9), bcs=bcs)
+        return posed(
+            mpm.QuasiStaticProblem, halves, law, density=[2.0, 3.0], body_force=(3, -9), bcs=bcs
+        )
 
     problem = half_way(blocks(), 4)
     whole = np.array([problem.reaction(bc) for bc in problem.bcs])
@@ -435,7 +439,9 @@ def test_split_beside_a_body_of_degree_2():
     shape = scenes.bend(scenes.box([0.0, 0.0], [1.0, 1.0], [4, 4], QUADRILATERAL), 0.03)
     bodies = [mpm.Particles(shape, V, degree=degree) for degree, V in enumerate(spaces, start=1)]
     bcs = [scenes.fix(V, scenes.at(i, 0.0), component=i) for V in spaces for i in range(2)]
-    problem = mpm.QuasiStaticProblem(bodies, Hencky(1e3, 0.3), 2.0, body_force=(3, -9), bcs=bcs)
+    problem = posed(
+        mpm.QuasiStaticProblem, bodies, Hencky(1e3, 0.3), 2.0, body_force=(3, -9), bcs=bcs
+    )
     half_way(problem, 4)
     other = bodies[1]
     before = [scenes.in_order(other, a) for a in (other.centroid, other.stress, other.domains)]
@@ -478,7 +484,7 @@ def test_refused():
         ({"body_force": ufl.SpatialCoordinate(body)}, "so domains cannot be split"),
     ):
         with pytest.raises(mpm.MPMError, match=reason):
-            mpm.QuasiStaticProblem(particles, LinearElastic(1.0, 0.3), **options)
+            posed(mpm.QuasiStaticProblem, particles, LinearElastic(1.0, 0.3), **options)
     d, v = particles.displacement, ufl.TestFunction(particles.W)
     R = ufl.derivative(scenes.neo_hookean(d) * particles.dx, d, v)
     with pytest.raises(mpm.MPMError, match=r"is for mpm\.QuasiStaticProblem"):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import outcome, same_run
+from posed import posed
 from scenes import QUADRILATERAL, TRIANGLE, WORLD, anywhere
 
 import ufl
@@ -65,7 +66,8 @@ def flowing(partition, comm=WORLD, **options):
     young = fem.Function(fem.functionspace(body, ("DG", 0)))
     young.interpolate(lambda x: 1e6 * (1.0 + 0.05 * x[1]))
     law = VonMises(young, 0.3, rho_y=20e3, hardening=2e4)
-    return mpm.QuasiStaticProblem(
+    return posed(
+        mpm.QuasiStaticProblem,
         mpm.Particles(body, V, partition=partition),
         {1: law, 2: Hencky(1e6, 0.3)},
         density=1000.0,
@@ -101,7 +103,7 @@ def test_clouds_of_boxes(mpi_tmp_path):
         particles = mpm.Particles.from_points(own, 0.25, V, method="gimp", partition=partition)
         bcs = [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)]
         problem = mpm.QuasiStaticProblem(
-            particles, Hencky(1e3, 0.3), bcs=bcs, body_force=(0.0, -10.0)
+            mpm.Body(particles, Hencky(1e3, 0.3), body_force=(0.0, -10.0)), bcs=bcs
         )
         for _ in problem.steps(3, repartition=0.0):
             problem.write(mpi_tmp_path / f"{partition}.pvd")
@@ -153,7 +155,7 @@ def test_what_cannot_move():
         ({"material": Hencky(np.full(problem.particles.num_local, 1e3), 0.3)}, "use DG0"),
     ):
         arguments = {"material": law, "bcs": problem.bcs, **options}
-        other = mpm.QuasiStaticProblem(mpm.Particles(body, V), **arguments)
+        other = posed(mpm.QuasiStaticProblem, mpm.Particles(body, V), **arguments)
         with pytest.raises(mpm.MPMError, match=match):
             other.repartition()
     particles = mpm.Particles(body, V)

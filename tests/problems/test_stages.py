@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from posed import posed
 from scenes import (
     HEXAHEDRON,
     QUADRILATERAL,
@@ -40,7 +41,8 @@ def layer(cell=QUADRILATERAL, dim=2, material=None, space=1, problem=None, **opt
     gravity = (*[0.0] * (dim - 1), -G)
     sides = [fix(V, at(i, 0, 2), component=i) for i in range(dim - 1)]
     K0 = POISSON / (1 - POISSON)
-    return (problem or mpm.QuasiStaticProblem)(
+    return posed(
+        problem or mpm.QuasiStaticProblem,
         body,
         material or materials.Hencky(STIFF, POISSON),
         density=DENSITY,
@@ -133,11 +135,11 @@ def test_lifts():
         return np.array(found)
 
     bcs = [fix(V, at(0, 0, 2), component=0), fix(V, at(1, 0), component=1)]
-    problem = mpm.QuasiStaticProblem(lift(0), law, bcs=bcs, **given)
+    problem = posed(mpm.QuasiStaticProblem, lift(0), law, bcs=bcs, **given)
     problem.solve(2)
     placed = [tops(problem)[-1]]
     for k in range(1, n):
-        problem.add(lift(k), law, **given)
+        problem.add(mpm.Body(lift(k), law, **given))
         assert problem.particles is not problem.bodies and len(problem.particles) == k + 1
         problem.solve(2)
         placed.append(tops(problem)[-1])
@@ -162,8 +164,13 @@ def strip(supported=True, **options):
         owned = np.unique(dofs.ravel())
         own = owned[np.isin(owned // 2, prop)].astype(np.int32)
         bcs.append(fem.dirichletbc(0.0, own, V.sub(1)))
-    return mpm.QuasiStaticProblem(
-        body, materials.LinearElastic(1e9, 0.3), body_force=(0.0, -1.0), bcs=bcs, **options
+    return posed(
+        mpm.QuasiStaticProblem,
+        body,
+        materials.LinearElastic(1e9, 0.3),
+        body_force=(0.0, -1.0),
+        bcs=bcs,
+        **options,
     )
 
 
@@ -191,10 +198,12 @@ def test_loads_are_changed():
         problem = layer()
         body = problem.particles
         tags = facet_tags(body.mesh, at(1, 10.0))
-        problem.stage(tractions=[(first, 1)], facet_tags=tags)
+        problem.stage(bodies=problem.body().replace(tractions=[(first, 1)], facet_tags=tags))
         problem.solve(2)
         if second is not None:
-            problem.stage(tractions=[(second, 1)], body_force=(0.0, -G))
+            problem.stage(
+                bodies=problem.body().replace(tractions=[(second, 1)], body_force=(0.0, -G))
+            )
             for step in problem.steps(2):
                 held = problem.reaction(problem.bcs[0])[1]
                 load = 30.0 + (12.0 - 30.0) * step.load
@@ -228,14 +237,14 @@ def test_other_materials_carry_the_stress():
     soft, hard = materials.VonMises(1e4, 0.3, rho_y=100.0), materials.Hencky(1e6, 0.2)
     problem = layer(material=soft)
     tags = cell_tags(problem.particles.mesh, lambda x: np.where(x[:, 1] > 5.0, 2, 1))
-    problem.stage("tags", material={1: soft, 2: soft}, cell_tags=tags)
+    problem.stage("tags", problem.body().replace(material={1: soft, 2: soft}, cell_tags=tags))
     facets = facet_tags(problem.particles.mesh, at(1, 10.0))
-    problem.stage("load", tractions=[((0.0, -200.0), 1)], facet_tags=facets)
+    problem.stage("load", problem.body().replace(tractions=[((0.0, -200.0), 1)], facet_tags=facets))
     problem.solve(4)
     body = problem.particles
     stress, plastic = body.stress, body.plastic_strain
     assert total(body, plastic > 1e-3) > 50
-    problem.stage("cement", material={1: soft, 2: hard})
+    problem.stage("cement", problem.body().replace(material={1: soft, 2: hard}))
     np.testing.assert_allclose(body.stress, stress, rtol=1e-9, atol=1e-9)
     below = body.initial_centroid[:, 1] < 5.0
     assert np.array_equal(body.plastic_strain, np.where(below, plastic, 0.0))
@@ -250,9 +259,11 @@ def test_what_cannot_be_leaves_all_as_it_was():
     problem.solve()
     body, x = problem.particles, in_order(problem.particles, problem.particles.stress)
     with pytest.raises(mpm.MPMError, match="facet_tags"):
-        problem.stage(tractions=[((0.0, -1.0), 1)])
+        problem.stage(bodies=problem.body().replace(tractions=[((0.0, -1.0), 1)]))
     with pytest.raises(mpm.MPMError, match="beyond yield"):
-        problem.stage(material=materials.VonMises(1e4, 0.3, rho_y=1.0))
+        problem.stage(
+            bodies=problem.body().replace(material=materials.VonMises(1e4, 0.3, rho_y=1.0))
+        )
     with pytest.raises(mpm.MPMError, match="Nothing would be left"):
         problem.remove(lambda x: x[1] > -1.0)
     with pytest.raises(mpm.MPMError, match="no cells 5000"):
@@ -264,7 +275,7 @@ def test_what_cannot_be_leaves_all_as_it_was():
     with pytest.raises(mpm.MPMError, match="Nothing is to be"):
         problem.remove([])
     with pytest.raises(mpm.MPMError, match="given twice"):
-        problem.add(body, problem.setup.bodies[0].material)
+        problem.add(mpm.Body(body, problem.setup.bodies[0].material))
     with pytest.raises(mpm.MPMError, match="no body 1"):
         problem.remove([0], body=1)
     V = vectors(box([0, 0], [2, 12], [2, 12], QUADRILATERAL))
@@ -284,7 +295,7 @@ def staged(tags=False):
     V = problem.particles.V
     problem.remove(lambda x: (x[1] > 8.0) & (x[0] < 1.0))
     lift = mpm.Particles(box([1, 10], [2, 11], [2, 2], QUADRILATERAL), V)
-    problem.add(lift, law, density=DENSITY, body_force=(0.0, -G))
+    problem.add(mpm.Body(lift, law, density=DENSITY, body_force=(0.0, -G)))
     return problem
 
 
@@ -353,7 +364,7 @@ def test_dynamics():
     assert abs(rest[1]) < abs(before[1])
     assert problem.velocity.x.array is not None and v.function_space is body.W
     lift = mpm.Particles(box([0, 10], [2, 11], [4, 2], QUADRILATERAL), body.V)
-    problem.add(lift, materials.Hencky(STIFF, POISSON), DENSITY, (0.0, -G))
+    problem.add(mpm.Body(lift, materials.Hencky(STIFF, POISSON), DENSITY, (0.0, -G)))
     np.testing.assert_allclose(problem.momentum, rest, rtol=1e-12)
     problem.solve(0.04, 0.01)
     assert problem.history.time == 0.04

@@ -10,6 +10,7 @@ from mpi4py.MPI import MAX
 import numpy as np
 import pytest
 from marks import slow
+from posed import posed
 from routes import ROUTES
 from scenes import QUADRILATERAL, WORLD, at, box, fix, in_order, vectors
 
@@ -30,7 +31,8 @@ def slope(cell=1.0, degree=1, **options):
     x[:, 0] *= (crest + width * (1 - x[:, 1] / H)) / (crest + width)
     cells = [round((crest + width) / cell) + 4, round(H / cell) + 1]
     V = vectors(box([0, 0], [cell * c for c in cells], cells, QUADRILATERAL), degree)
-    return mpm.QuasiStaticProblem(
+    return posed(
+        mpm.QuasiStaticProblem,
         mpm.Particles(body, V, degree=degree),
         materials.MohrCoulomb(1e5, 0.3, cohesion=0.05 * weight * H, friction_angle=20.0),
         density=weight,
@@ -49,12 +51,14 @@ def cut(cell=0.125, weight=3.0):
     cells = [round(2.5 / cell), round(1.5 / cell) + 1]
     V = vectors(box([0, 0], [cell * c for c in cells], cells, QUADRILATERAL))
     return mpm.QuasiStaticProblem(
-        mpm.Particles(body, V),
-        materials.Tresca(1e5, 0.49, cohesion=1.0),
-        density=weight,
-        body_force=(0.0, -1.0),
+        mpm.Body(
+            mpm.Particles(body, V),
+            materials.Tresca(1e5, 0.49, cohesion=1.0),
+            density=weight,
+            body_force=(0.0, -1.0),
+            f_bar="patch",
+        ),
         bcs=[fix(V, at(0, 0, 2.5), component=0), fix(V, at(1, 0))],
-        f_bar="patch",
     )
 
 
@@ -145,11 +149,10 @@ def test_slope_with_a_pressure_of_its_own(take):
 def block(law=None, kind=mpm.QuasiStaticProblem, **options):
     """Return a block that stands on its base."""
     V = vectors(box([0, 0], [3, 3], [3, 3], QUADRILATERAL))
+    particles = mpm.Particles(box([0, 0], [2, 2], [4, 4], QUADRILATERAL), V, **options)
+    law = law or materials.Tresca(1e3, 0.3, cohesion=6.0)
     return kind(
-        mpm.Particles(box([0, 0], [2, 2], [4, 4], QUADRILATERAL), V, **options),
-        law or materials.Tresca(1e3, 0.3, cohesion=6.0),
-        density=1.0,
-        body_force=(0.0, -4.0),
+        mpm.Body(particles, law, density=1.0, body_force=(0.0, -4.0)),
         bcs=[fix(V, at(0, 0), component=0), fix(V, at(1, 0), component=1)],
     )
 
@@ -158,7 +161,7 @@ CHANGES = {
     "split": lambda problem: problem.split([0]),
     "rebase": lambda problem: problem.rebase(),
     "repartition": lambda problem: problem.repartition(0.0),
-    "stage": lambda problem: problem.stage(body_force=(0.0, -4.0)),
+    "stage": lambda problem: problem.stage(bodies=problem.body().replace(body_force=(0.0, -4.0))),
     "remove": lambda problem: problem.remove(lambda x: (x[0] > 1.5) & (x[1] > 1.5)),
     "state": lambda problem: problem.return_to(problem.capture()),
 }
@@ -363,9 +366,11 @@ def test_domains_that_may_be_split_are_refused():
 def test_a_law_without_strength_is_refused():
     V = vectors(box([0, 0], [1, 1], [1, 1], QUADRILATERAL))
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(box([0, 0], [1, 0.5], [2, 1], QUADRILATERAL), V),
-        materials.Hencky(1e3, 0.3),
-        body_force=(0.0, -1.0),
+        mpm.Body(
+            mpm.Particles(box([0, 0], [1, 0.5], [2, 1], QUADRILATERAL), V),
+            materials.Hencky(1e3, 0.3),
+            body_force=(0.0, -1.0),
+        ),
         bcs=[fix(V, at(1, 0))],
     )
     problem.solve()

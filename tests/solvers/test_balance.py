@@ -8,6 +8,7 @@ from petsc4py import PETSc
 import numpy as np
 import pytest
 import scenes
+from posed import posed
 from scenes import QUADRILATERAL, WORLD
 
 from dolfinx import fem, mesh
@@ -35,7 +36,8 @@ def column(contrast=1.0, where=is_top, law=LinearElastic, load=10.0, held=None, 
     cells = np.arange(len(young.x.array), dtype=np.int32)
     middles = mesh.compute_midpoints(body, 2, cells)
     young.x.array[:] = np.where(where(middles.T), contrast, 1.0) * YOUNG
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         mpm.Particles(body, V),
         law(young, 0.3),
         body_force=(-0.15 * load, -0.5 * load),

@@ -8,6 +8,7 @@ from petsc4py import PETSc
 import numpy as np
 import pytest
 import scenes
+from posed import posed
 from scenes import QUADRILATERAL
 from solvers.double_well import DoubleWell, newton
 
@@ -149,7 +150,7 @@ def test_histories_and_contact_are_not_smooth():
     assert not WithHistory(R, particles, bcs=problem.bcs).reduced.smooth()
     wall = mpm.boundary.plane(particles, (1.5, 0.0), (-1.0, 0.0))
     touching = mpm.QuasiStaticProblem(
-        particles, mpm.materials.Hencky(1e3, 0.3), bcs=problem.bcs, supports=[wall]
+        mpm.Body(particles, mpm.materials.Hencky(1e3, 0.3)), bcs=problem.bcs, supports=[wall]
     )
     assert not touching.reduced.smooth()
 
@@ -158,7 +159,8 @@ def nearly_incompressible(**options):
     """A cantilever that bends by 0.6 of its length in 10 steps, volume averaged over patches."""
     V = scenes.vectors(scenes.box([0.0, 0.0], [11.0, 10.0], [22, 20], QUADRILATERAL))
     body = scenes.box([0.0, 8.5], [10.0, 9.5], [40, 4], QUADRILATERAL)
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         mpm.Particles(body, V),
         mpm.materials.Hencky(12e6, 0.4999),
         bcs=[scenes.fix(V, scenes.at(0, 0.0))],

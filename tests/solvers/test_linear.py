@@ -55,12 +55,9 @@ def test_multigrid_knows_the_rigid_motions():
     body = scenes.box([0.5, 0.3], [3.5, 2.7], [30, 24], TRIANGLE)
     options = {"ksp_type": "cg", "pc_type": "gamg", "ksp_rtol": 1e-10}
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V),
-        Hencky(1e4, 0.3),
-        density=1.0,
-        body_force=(0.0, -1.0),
+        mpm.Body(mpm.Particles(body, V), Hencky(1e4, 0.3), density=1.0, body_force=(0.0, -1.0)),
         bcs=[scenes.fix(V, scenes.at(1, 0.6))],
-        petsc_options=options,
+        solver=mpm.Solver(petsc_options=options),
     )
     problem.bcs.clear()
     problem.reduced.begin([np.zeros_like(problem.particles.increment.x.array)], 1.0)

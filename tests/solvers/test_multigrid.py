@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import outcome, same_run
+from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE
 
 import mpm_dolfinx as mpm
@@ -40,7 +41,8 @@ def heavy(
     body = scenes.box([0.0] * dim, [4.0] * dim, [finer * n] * dim, domains, comm)
     bcs = [scenes.fix(V, scenes.at(axis, 0.0), component=axis) for axis in range(dim)]
     options.setdefault("petsc_options", TIGHT)
-    return mpm.QuasiStaticProblem(
+    return posed(
+        mpm.QuasiStaticProblem,
         mpm.Particles(body, V, degree=degree),
         material,
         density=1.0,
@@ -149,14 +151,15 @@ def test_a_saddle_point_in_space_whose_body_may_swell(monkeypatch):
         body = scenes.box([0.0] * 3, [2.0] * 3, [2] * 3, HEXAHEDRON)
         V = scenes.vectors(grid, 2)
         run = mpm.QuasiStaticProblem(
-            mpm.Particles(body, V, degree=2, quadrature_degree=4),
-            Hencky(1e6, 0.49999),
-            density=1.0,
-            body_force=(0.0, 0.0, -4e4),
+            mpm.Body(
+                mpm.Particles(body, V, degree=2, quadrature_degree=4),
+                Hencky(1e6, 0.49999),
+                density=1.0,
+                body_force=(0.0, 0.0, -4e4),
+            ),
             bcs=[scenes.fix(V, scenes.at(axis, 0.0), component=axis) for axis in range(3)],
             mixed="pressure",
-            petsc_options=TIGHT,
-            linear_solver=name,
+            solver=mpm.Solver(petsc_options=TIGHT, linear=name),
         )
         run.solve(steps=1)
         runs.append(run)
@@ -172,16 +175,16 @@ def test_water_in_the_pores():
         body = mpm.Particles(shape, scenes.vectors(grid, 2), degree=2, quadrature_degree=4)
         tags = scenes.facet_tags(shape, scenes.at(1, 1.01), scenes.at(1, 0.01))
         problem = mpm.PorousProblem(
-            body,
-            Hencky(1e3, 0.25),
-            1e-4,
+            mpm.Body(
+                body,
+                Hencky(1e3, 0.25),
+                tractions=[((0.0, -100.0), 1)],
+                facet_tags=tags,
+                pore_fluid=mpm.PoreFluid(1e-4, drained=[(0.0, 1)]),
+            ),
             bcs=[scenes.fix(body.V, scenes.at(0, 0.0), component=0)],
             supports=[mpm.boundary.roller(body, tags, 2, (0.0, -1.0))],
-            tractions=[((0.0, -100.0), 1)],
-            facet_tags=tags,
-            drained=[(0.0, 1)],
-            petsc_options=TIGHT,
-            linear_solver=name,
+            solver=mpm.Solver(petsc_options=TIGHT, linear=name),
         )
         problem.solve(0.2, 0.1)
         results.append((problem, scenes.own(problem.pore_pressure[0])))
@@ -210,7 +213,8 @@ def tied(linear_solver):
         bcs.append(scenes.fix(V, scenes.at(0, 0.0), component=0))
     bcs.append(scenes.fix(bodies[0].V, scenes.at(1, 0.0), component=1))
     tags = scenes.facet_tags(bodies[1].mesh, scenes.at(1, 2.0))
-    return mpm.QuasiStaticProblem(
+    return posed(
+        mpm.QuasiStaticProblem,
         bodies,
         Hencky(1e5, 0.3),
         density=1.0,
@@ -259,8 +263,8 @@ def test_many_unknowns_are_for_multigrid(monkeypatch):
     for crossover, used in (({2: 2000}, False), ({2: 700}, True)):
         monkeypatch.setattr(linear, "CROSSOVER_IN_MOTION", crossover)
         still = heavy(20)
-        motion = mpm.DynamicProblem(
-            still.particles, PLASTIC, 1.0, body_force=(0.0, -8e3), bcs=still.bcs
+        motion = posed(
+            mpm.DynamicProblem, still.particles, PLASTIC, 1.0, body_force=(0.0, -8e3), bcs=still.bcs
         )
         motion.step(1e-3)
         assert (motion.history.statistics["krylov_iterations"] > 0) == used
@@ -332,7 +336,7 @@ def test_a_linear_problem_takes_no_more_than_one_solve_besides():
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"linear_solver": "magic"}, "Unknown linear_solver='magic'; choose one of 'auto'"),
+        ({"linear_solver": "magic"}, "Unknown linear='magic'; choose one of 'auto'"),
         (
             {"linear_solver": "multigrid", "petsc_options": {"pc_type": "gamg"}},
             "linear_solver='multigrid' chooses ksp_type and pc_type",
@@ -370,7 +374,8 @@ def test_an_indefinite_tangent_whose_step_does_needs_no_smaller_load():
         ]
         bodies = [mpm.Particles(base, lower), mpm.Particles(top, upper)]
         touch = mpm.contact.Pair(bodies[1], bodies[0], facet_tags=tags[::-1], tags=(1, 1))
-        run = mpm.QuasiStaticProblem(
+        run = posed(
+            mpm.QuasiStaticProblem,
             bodies,
             Hencky(1e6, 0.3),
             tractions=[[], [((0.0, -1e5), 2)]],

@@ -18,7 +18,10 @@ def test_a_body_that_nothing_holds(held):
     V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
     bcs = [] if held is None else [scenes.fix(V, scenes.at(held, 0.0), component=held)]
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(scenes.unit(4, TRIANGLE), V), Hencky(1e3, 0.3), bcs=bcs, body_force=(1.0, 1.0)
+        mpm.Body(
+            mpm.Particles(scenes.unit(4, TRIANGLE), V), Hencky(1e3, 0.3), body_force=(1.0, 1.0)
+        ),
+        bcs=bcs,
     )
     raises(lambda: problem.solve(steps=1), mpm.MPMError, r"nothing holds the bodies; support each")
     assert not problem.history.steps and not np.any(problem.particles.displacement.x.array)
@@ -31,11 +34,13 @@ def test_a_motion_without_strain_that_is_not_rigid():
     V = scenes.vectors(lines)
     bcs = [scenes.fix(V, scenes.at(axis, 0.0), component=axis) for axis in (0, 1)]
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(scenes.unit(7, QUADRILATERAL), V),
-        mpm.materials.VonMises(1.0, 0.4, rho_y=0.0125),
+        mpm.Body(
+            mpm.Particles(scenes.unit(7, QUADRILATERAL), V),
+            mpm.materials.VonMises(1.0, 0.4, rho_y=0.0125),
+            body_force=(0.0, -0.0178),
+            f_bar="patch",
+        ),
         bcs=bcs,
-        body_force=(0.0, -0.0178),
-        f_bar="patch",
     )
     raises(lambda: problem.solve(steps=10), mpm.ConvergenceError, r"not rigid and .* hourglass")
     assert problem.history.cutbacks == 10 and not problem.history.steps
@@ -47,7 +52,7 @@ def test_a_body_that_what_only_pushes_may_let_go():
     bcs = [scenes.fix(V, scenes.at(1, 0.0), component=1)]
     wall = mpm.boundary.plane(particles, (1.2, 0.0), (-1.0, 0.0))
     problem = mpm.QuasiStaticProblem(
-        particles, Hencky(1e3, 0.3), bcs=bcs, body_force=(1.0, 0.0), supports=[wall]
+        mpm.Body(particles, Hencky(1e3, 0.3), body_force=(1.0, 0.0)), bcs=bcs, supports=[wall]
     )
     raises(lambda: problem.solve(steps=1), mpm.ConvergenceError, r"what only pushes has let")
     assert problem.history.cutbacks == 10
@@ -58,10 +63,12 @@ def test_what_is_held_softly_is_held():
     V = scenes.vectors(scenes.box([0.0, 0.0], [600.0, 3.0], [600, 3], QUADRILATERAL))
     beam = scenes.box([0.0, 1.0], [600.0, 2.0], [600, 1], QUADRILATERAL)
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(beam, V, quadrature_degree=2),
-        LinearElastic(1e3, 0.0),
+        mpm.Body(
+            mpm.Particles(beam, V, quadrature_degree=2),
+            LinearElastic(1e3, 0.0),
+            body_force=(0.0, -1e-10),
+        ),
         bcs=[scenes.fix(V, scenes.at(0, 0.0))],
-        body_force=(0.0, -1e-10),
     )
     problem.solve(steps=1)
     np.testing.assert_allclose(problem.reaction(problem.bcs[0]), [0.0, 6e-8], rtol=1e-6, atol=1e-12)

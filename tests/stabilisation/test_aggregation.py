@@ -48,13 +48,10 @@ def test_dofs_that_follow_others_are_no_unknowns_beside_a_background_form(stiffn
         u, v = particles.increment, ufl.TestFunction(V)
         form = stiffness * ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx
         problem = mpm.QuasiStaticProblem(
-            particles,
-            Hencky(1e3, 0.3),
-            body_force=(0.0, -10.0),
+            mpm.Body(particles, Hencky(1e3, 0.3), body_force=(0.0, -10.0)),
             bcs=[scenes.fix(V, scenes.at(0, 0.0))],
             background=form if background else None,
-            stabilisation="aggregate",
-            petsc_options={"snes_rtol": 1e-12},
+            solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}, stabilisation="aggregate"),
         )
         problem.solve()
         assert problem.history.statistics["aggregated_dofs"] > 0

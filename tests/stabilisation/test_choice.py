@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 import scenes
+from posed import posed
 from scenes import QUADRILATERAL
 
 import ufl
@@ -20,7 +21,8 @@ def cantilever(offset, stabilisation, degree=2, h=0.5, **options):
     n = round(2 / h)
     body = scenes.box([0.0, 2.5 - offset], [3.0, 3.5 - offset], [3 * n, n], QUADRILATERAL)
     tags = scenes.facet_tags(body, scenes.at(0, 3.0))
-    return mpm.QuasiStaticProblem(
+    return posed(
+        mpm.QuasiStaticProblem,
         mpm.Particles(body, V, degree=degree),
         mpm.materials.Hencky(1e4, 0.2),
         bcs=[scenes.fix(V, scenes.at(0, 0.0))],
@@ -72,9 +74,7 @@ def test_auto_acts_for_degree_2_and_where_a_cut_is_small():
     particles = mpm.Particles(scenes.unit(6, QUADRILATERAL), grid, degree=2)
     sides = [(0, (0.0, 1.0)), (1, (0.0,))]
     problem = mpm.QuasiStaticProblem(
-        particles,
-        mpm.materials.Hencky(1e3, 0.3),
-        body_force=(0.0, -1.0),
+        mpm.Body(particles, mpm.materials.Hencky(1e3, 0.3), body_force=(0.0, -1.0)),
         bcs=[scenes.fix(grid, scenes.at(i, *ends), component=i) for i, ends in sides],
     )
     problem.solve(steps=1)
@@ -91,7 +91,9 @@ def test_modulus_and_answer_do_not_depend_on_units():
         R = ufl.inner(scenes.linear_stress(d, 1e3 * unit, 0.3), ufl.grad(v)) * particles.dx
         b = ufl.as_vector([0.0, -unit])
         R -= particles.load * ufl.inner(b, v) * particles.dx_exact
-        mine = mpm.ParticleProblem(R, particles, bcs=problem.bcs, stabilisation="ghost")
+        mine = mpm.ParticleProblem(
+            R, particles, bcs=problem.bcs, solver=mpm.Solver(stabilisation="ghost")
+        )
         mine.solve(steps=2)
         assert np.isclose(mine.reduced.moduli[0], unit * 1e3 / 2.6)
         tips.append(scenes.in_order(particles, particles.centroid))
@@ -107,14 +109,16 @@ def held(origin, degree=2, axisymmetric=False, stabilisation="ghost"):
         domain.geometry.x[:, :2] += origin
     particles = mpm.Particles(body, V, degree=degree)
     return mpm.QuasiStaticProblem(
-        particles,
-        mpm.materials.Hencky(1e3, 0.3),
-        body_force=(0.0, -10.0),
+        mpm.Body(
+            particles,
+            mpm.materials.Hencky(1e3, 0.3),
+            body_force=(0.0, -10.0),
+            pressures=[(3.0, 2)],
+            facet_tags=tags,
+        ),
         supports=[mpm.boundary.fixed(particles, tags, 1)],
-        pressures=[(3.0, 2)],
-        facet_tags=tags,
         axisymmetric=axisymmetric,
-        stabilisation=stabilisation,
+        solver=mpm.Solver(stabilisation=stabilisation),
     )
 
 
@@ -138,8 +142,8 @@ def test_modulus_of_a_residual_knows_neither_supports_nor_the_origin():
         d, v = particles.displacement, ufl.TestFunction(particles.W)
         R = ufl.inner(scenes.linear_stress(d, 1e3, 0.3), ufl.grad(v)) * particles.dx
         R -= particles.load * ufl.inner(ufl.as_vector([0.0, -1.0]), v) * particles.dx_exact
-        R += problem.setup.bodies[0].supports[0].residual
-        mine = mpm.ParticleProblem(R, particles, stabilisation="ghost")
+        R += problem.setup.supports[0].residual
+        mine = mpm.ParticleProblem(R, particles, solver=mpm.Solver(stabilisation="ghost"))
         mine.solve(steps=1)
         assert np.isclose(mine.reduced.moduli[0], 1e3 / 2.6, rtol=1e-8)
 
@@ -166,7 +170,9 @@ def test_imposed_displacement(stabilisation):
     ]
     particles = mpm.Particles(body, V, degree=2)
     problem = mpm.QuasiStaticProblem(
-        particles, mpm.materials.Hencky(1e3, 0.3), bcs=bcs, stabilisation=stabilisation
+        mpm.Body(particles, mpm.materials.Hencky(1e3, 0.3)),
+        bcs=bcs,
+        solver=mpm.Solver(stabilisation=stabilisation),
     )
     problem.solve(steps=1)
     stress = particles.stress

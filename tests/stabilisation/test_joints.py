@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 import scenes
+from posed import posed
 from scenes import ALL, HEXAHEDRON, QUADRILATERAL, TETRAHEDRON
 from stabilisation.slivers import polynomial, vector
 
@@ -82,8 +83,14 @@ def stack(above, **options):
     bodies = stacked(above=above)
     V = bodies[0].V
     bcs = [scenes.fix(V, scenes.at(1, 0.0))]
-    return mpm.QuasiStaticProblem(
-        bodies, Hencky(1e3, 0.3), density=DENSITY, body_force=(0.0, -GRAVITY), bcs=bcs, **options
+    return posed(
+        mpm.QuasiStaticProblem,
+        bodies,
+        Hencky(1e3, 0.3),
+        density=DENSITY,
+        body_force=(0.0, -GRAVITY),
+        bcs=bcs,
+        **options,
     )
 
 
@@ -102,7 +109,8 @@ def test_a_toe_settles_as_it_does_where_no_line_is_near(linear_solver):
 
 def test_in_motion_the_account_closes():
     bodies = stacked()
-    problem = mpm.DynamicProblem(
+    problem = posed(
+        mpm.DynamicProblem,
         bodies,
         Hencky(1e3, 0.3),
         density=DENSITY,

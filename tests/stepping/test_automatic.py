@@ -227,8 +227,7 @@ def pressed(law=None):
         tag=1,
     )
     problem = mpm.QuasiStaticProblem(
-        particles,
-        law or mpm.materials.VonMises(500.0, 0.3, rho_y=1.0),
+        mpm.Body(particles, law or mpm.materials.VonMises(500.0, 0.3, rho_y=1.0)),
         bcs=[
             scenes.fix(V, scenes.at(axis, place), component=axis)
             for axis, place in ((0, 0.0), (0, 4.0), (1, 0.0))

@@ -53,11 +53,13 @@ def test_limit_load_is_told():
     V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 1.5], [4, 3], QUADRILATERAL))
     body = scenes.box([0.0, 0.0], [1.1, 0.9], [4, 4], QUADRILATERAL)
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V),
-        mpm.materials.SmallStrainVonMises(1e4, 0.3, rho_y=10.0),
+        mpm.Body(
+            mpm.Particles(body, V),
+            mpm.materials.SmallStrainVonMises(1e4, 0.3, rho_y=10.0),
+            tractions=[((2 * np.sqrt(2) * 10.0, 0.0), 1)],
+            facet_tags=scenes.facet_tags(body, scenes.at(0, 1.1)),
+        ),
         bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)],
-        tractions=[((2 * np.sqrt(2) * 10.0, 0.0), 1)],
-        facet_tags=scenes.facet_tags(body, scenes.at(0, 1.1)),
     )
     with pytest.raises(mpm.MPMError) as caught:
         problem.solve(steps=10)

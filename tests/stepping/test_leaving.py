@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 import scenes
+from posed import posed
 from scenes import QUADRILATERAL, TRIANGLE, WORLD, falling
 
 import mpm_dolfinx as mpm
@@ -39,10 +40,12 @@ def slumping(outside, comm=WORLD):
     body = scenes.box([0.0, 0.0], [4.0, 8.0], [8, 16], TRIANGLE, comm)
     bcs = [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)]
     return mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, outside=outside),
-        VonMises(1e6, 0.3, rho_y=20e3),
-        density=1000.0,
-        body_force=(0.0, -20.0),
+        mpm.Body(
+            mpm.Particles(body, V, outside=outside),
+            VonMises(1e6, 0.3, rho_y=20e3),
+            density=1000.0,
+            body_force=(0.0, -20.0),
+        ),
         bcs=bcs,
     )
 
@@ -96,7 +99,7 @@ def test_two_bodies_one_of_which_must_stay():
         mpm.Particles(scenes.box([0.0, low], [1.0, low + 0.5], [4, 2], TRIANGLE), V, outside=policy)
         for low, policy in ((0.0, "delete"), (0.5, "error"))
     ]
-    problem = mpm.QuasiStaticProblem(bodies, LinearElastic(1e4, 0.3), density=2.0, bcs=[bc])
+    problem = posed(mpm.QuasiStaticProblem, bodies, LinearElastic(1e4, 0.3), density=2.0, bcs=[bc])
     with pytest.raises(mpm.ParticleOutsideError):
         problem.solve(steps=10)
     # The last of the first body, and the first of the second, would leave at once.

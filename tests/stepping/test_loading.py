@@ -7,6 +7,7 @@ import pytest
 import scenes
 from compare import raises
 from laws import Brittle, Sulky
+from posed import posed
 from scenes import PLANE, QUADRILATERAL, TRIANGLE, WORLD, pulled
 
 from dolfinx import fem
@@ -185,7 +186,8 @@ def test_beyond_the_limit_load_fails_whole(cell, plain):
     # is no equilibrium beyond half of the load.
     V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 1.5], [8, 6], QUADRILATERAL))
     body = scenes.box([0.0, 0.0], [1.1, 0.9], [8, 8], cell)
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         mpm.Particles(body, V),
         mpm.materials.SmallStrainVonMises(1e4, 0.3, rho_y=10.0),
         bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)],
@@ -321,7 +323,7 @@ def falling(material, depth=1.0):
     bc, u = scenes.everywhere(V)
     u.x.array.reshape(-1, 2)[:] = [0.0, -depth]
     particles = mpm.Particles(scenes.unit(4, TRIANGLE), V)
-    return mpm.QuasiStaticProblem(particles, material, bcs=[bc])
+    return mpm.QuasiStaticProblem(mpm.Body(particles, material), bcs=[bc])
 
 
 def test_leaving_in_the_last_step_is_a_warning():
@@ -366,7 +368,8 @@ def test_path_may_set_the_load_factor():
     V = problem.particles.V
     value = fem.Constant(V.mesh, np.zeros(2))
     nodes = np.flatnonzero(V.tabulate_dof_coordinates()[:, 0] < 0.3).astype(np.int32)
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         problem.particles,
         Hencky(1e3, 0.3),
         density=2.0,
@@ -423,10 +426,12 @@ def test_two_problems_on_one_background_do_not_disturb_each_other():
     V = alone.particles.V
     first, second = (
         mpm.QuasiStaticProblem(
-            mpm.Particles(scenes.unit(4, TRIANGLE), V),
-            Hencky(1e3, 0.3),
-            density=2.0,
-            body_force=(0.0, -10.0),
+            mpm.Body(
+                mpm.Particles(scenes.unit(4, TRIANGLE), V),
+                Hencky(1e3, 0.3),
+                density=2.0,
+                body_force=(0.0, -10.0),
+            ),
             bcs=alone.bcs,
         )
         for _ in range(2)
@@ -447,9 +452,11 @@ def test_nodes_that_would_cross_the_axis(cell):
         bcs = [scenes.fix(V, scenes.at(1, 0.0), component=1)]
         bcs += [scenes.fix(V, scenes.at(0, 0.0), component=0)] if held else []
         return mpm.QuasiStaticProblem(
-            mpm.Particles(body, V, quadrature_degree=2),
-            mpm.materials.Hencky(1e3, 0.3),
-            body_force=(-strength, 0.0),
+            mpm.Body(
+                mpm.Particles(body, V, quadrature_degree=2),
+                mpm.materials.Hencky(1e3, 0.3),
+                body_force=(-strength, 0.0),
+            ),
             bcs=bcs,
             axisymmetric=True,
         )

@@ -25,12 +25,14 @@ def slope():
     strip = fem.Constant(body, np.zeros(2))
     crest = scenes.facet_tags(body, lambda x: np.isclose(x[1], 4.0) & (x[0] < 2.0 + 1e-9))
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V),
-        VonMises(2e7, 0.3, rho_y=3e4),
-        density=2000.0,
-        body_force=(0.0, -10.0),
-        tractions=[(strip, 1)],
-        facet_tags=crest,
+        mpm.Body(
+            mpm.Particles(body, V),
+            VonMises(2e7, 0.3, rho_y=3e4),
+            density=2000.0,
+            body_force=(0.0, -10.0),
+            tractions=[(strip, 1)],
+            facet_tags=crest,
+        ),
         bcs=[scenes.fix(V, scenes.at(1, 0.0)), scenes.fix(V, scenes.at(0, 0.0), component=0)],
     )
     volume = WORLD.allreduce(problem.particles.initial_volume.sum())
@@ -143,7 +145,9 @@ def test_displacements_are_totals_on_a_path(kind):
         supports = [fixed(particles, top, 1, wall)]
     else:
         supports = [plane(particles, (0.0, 1.0), (0.0, -1.0), -wall[1], top, 1)]
-    problem = mpm.QuasiStaticProblem(particles, Hencky(1e3, 0.3), bcs=bcs, supports=supports)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(particles, Hencky(1e3, 0.3)), bcs=bcs, supports=supports
+    )
     upper = np.isclose(particles.W.tabulate_dof_coordinates()[:, 1], 1.0)
 
     def moved_to(total):
@@ -188,7 +192,9 @@ def test_a_first_path_moves_supports_to_totals():
     wall = fem.Constant(body, 0.0)
     top = roller(particles, scenes.facet_tags(body, scenes.at(1, 1.0)), 1, (0.0, 1.0), wall)
     problem = mpm.QuasiStaticProblem(
-        particles, Hencky(1e3, 0.3), bcs=[scenes.fix(V, scenes.at(1, 0.0))], supports=[top]
+        mpm.Body(particles, Hencky(1e3, 0.3)),
+        bcs=[scenes.fix(V, scenes.at(1, 0.0))],
+        supports=[top],
     )
 
     def too_far(t):

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from mpi4py import MPI
 
 import numpy as np
+from posed import posed
 
 from dolfinx import fem, mesh
 from stress import generator
@@ -410,7 +411,8 @@ def make(scene, comm) -> Run:
             **{k: about[k] for k in ("scheme", "out_of_range")},
         }
         time = about["time"], about["time"] / scene["steps"]
-    problem = kind(
+    problem = posed(
+        kind,
         bodies if len(bodies) > 1 else bodies[0],
         material,
         density=density,

@@ -33,7 +33,7 @@ def test_reaction_counts_a_dof_once(component):
     both = fem.dirichletbc(value, np.concatenate([*sides, *sides, sides[0]]), space)
     others = [] if component is None else [scenes.fix(V, scenes.at(0, 0.0), component=0)]
     problem = mpm.QuasiStaticProblem(
-        particles, Hencky(1e3, 0.2), body_force=(0.0, -10.0), bcs=[both, *others]
+        mpm.Body(particles, Hencky(1e3, 0.2), body_force=(0.0, -10.0)), bcs=[both, *others]
     )
     problem.solve(steps=1)
     force = sum(problem.reaction(bc) for bc in problem.bcs)
@@ -45,7 +45,7 @@ def test_condition_that_is_not_a_number():
     bc = scenes.fix(V, scenes.at(0, 0.0), np.array([np.nan, 0.0]))
     failed = scenes.block(bcs=[])
     failed = mpm.QuasiStaticProblem(
-        mpm.Particles(scenes.unit(2, TRIANGLE), V), Hencky(1e3, 0.3), bcs=[bc]
+        mpm.Body(mpm.Particles(scenes.unit(2, TRIANGLE), V), Hencky(1e3, 0.3)), bcs=[bc]
     )
     kept = scenes.state(failed)
     error = raises(lambda: failed.solve(steps=2), mpm.MPMError, r"Dirichlet.*finite")

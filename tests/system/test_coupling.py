@@ -7,6 +7,7 @@ from petsc4py import PETSc
 import numpy as np
 import pytest
 import scenes
+from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 
 import dolfinx
@@ -63,7 +64,8 @@ def tied(stiffness, left, right, load=(3.0, -2.0), **options):
     """Return a bar of two parts, held at its left end."""
     tags = scenes.facet_tags(left.mesh, scenes.at(0, 1.0))
     tie = mpm.Tie(left, right, tags, 1, stiffness)
-    return mpm.ParticleProblem(
+    return posed(
+        mpm.ParticleProblem,
         [linear(body, load) for body in (left, right)],
         [left, right],
         bcs=[hold(left.V, scenes.at(0, 0.0))],
@@ -138,16 +140,16 @@ def test_a_tie_of_faces_that_do_not_match_carries_a_uniform_stress(cell):
     tie = mpm.Tie(left, right, tags, 1, 1e6)
     law = Hencky(YOUNG, 0.0)
     problem = mpm.QuasiStaticProblem(
-        [left, right],
-        law,
-        tractions=[[], [((1.0, *[0.0] * (dim - 1)), 1)]],
-        facet_tags=[tags, ends],
+        [
+            mpm.Body(left, law, facet_tags=tags),
+            mpm.Body(right, law, tractions=[((1.0, *[0.0] * (dim - 1)), 1)], facet_tags=ends),
+        ],
         supports=[mpm.boundary.fixed(left, tags, 2)],
         terms=[tie],
-        petsc_options={"snes_rtol": 1e-12},
+        solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
     )
     problem.solve()
-    assert np.allclose(problem.reaction(problem.setup.bodies[0].supports[0])[0], -1.0, rtol=1e-8)
+    assert np.allclose(problem.reaction(problem.setup.supports[0])[0], -1.0, rtol=1e-8)
     # On b pull the springs by the traction, and open a gap of a 1e-6th.
     tractions = scenes.gather(tie.tractions())
     assert np.allclose(tractions[:, 0], -1.0, atol=0.1)
@@ -160,7 +162,9 @@ def test_tangent_and_lift_of_a_tie_by_finite_differences():
     tags = scenes.facet_tags(left.mesh, scenes.at(0, 1.0))
     ends = [hold(right.V, lambda x: x[0] > 1.9, 0.01)]
     problem = mpm.QuasiStaticProblem(
-        [left, right], Hencky(YOUNG, POISSON), bcs=ends, terms=[mpm.Tie(left, right, tags, 1, 1e4)]
+        [mpm.Body(p, Hencky(YOUNG, POISSON)) for p in (left, right)],
+        bcs=ends,
+        terms=[mpm.Tie(left, right, tags, 1, 1e4)],
     )
     system = problem.reduced
     changes = []
@@ -203,12 +207,10 @@ def test_tied_particles_move_to_other_ranks():
         left, right = half(0.0, 1.0, 5, 0.3, shift=0.05), half(1.0, 2.0, 3, 0.4, shift=0.11)
         tags = scenes.facet_tags(left.mesh, scenes.at(0, 1.0))
         problem = mpm.QuasiStaticProblem(
-            [left, right],
-            Hencky(YOUNG, POISSON),
-            body_force=(0.0, -20.0),
+            [mpm.Body(p, Hencky(YOUNG, POISSON), body_force=(0.0, -20.0)) for p in (left, right)],
             bcs=[hold(left.V, lambda x: x[0] < 0.1)],
             terms=[mpm.Tie(left, right, tags, 1, 1e5)],
-            petsc_options={"snes_rtol": 1e-12},
+            solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
         )
         for _ in problem.steps(3):
             if moves:
@@ -234,12 +236,13 @@ def test_what_is_deleted_is_tied_no_more():
     held = fem.locate_dofs_geometrical(V, lambda x: x[0] > 1.9)
     bcs = [hold(left.V, lambda x: x[0] < 1e-9), fem.dirichletbc(push, held, V)]
     problem = mpm.QuasiStaticProblem(
-        [left, right],
-        Hencky(YOUNG, POISSON),
-        body_force=[(0.0, -5.0), (0.0, 0.0)],
+        [
+            mpm.Body(left, Hencky(YOUNG, POISSON), body_force=(0.0, -5.0)),
+            mpm.Body(right, Hencky(YOUNG, POISSON), body_force=(0.0, 0.0)),
+        ],
         bcs=bcs,
         terms=[tie],
-        petsc_options={"snes_rtol": 1e-12},
+        solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
     )
     problem.solve()
     assert [loss.body for loss in problem.history.losses] == [1]
@@ -290,7 +293,7 @@ def wearing():
     bcs = [hold(left.V, lambda x: x[0] < 0.1)]
     law = Hencky(YOUNG, POISSON)
     options = {"body_force": (5.0, -5.0), "petsc_options": {"snes_rtol": 1e-12}}
-    return mpm.QuasiStaticProblem([left, right], law, bcs=bcs, terms=[tie], **options), tie
+    return posed(mpm.QuasiStaticProblem, [left, right], law, bcs=bcs, terms=[tie], **options), tie
 
 
 def test_what_a_term_remembers_is_committed_rolled_back_saved_and_restored(tmp_path):
@@ -333,11 +336,13 @@ def test_ties_that_cannot_be():
             mpm.Tie(*arguments)
     tie = mpm.Tie(left, right, tags, 1, 1e3)
     with pytest.raises(mpm.MPMError, match="A Tie acts on other particles"):
-        mpm.QuasiStaticProblem(left, Hencky(1e3, 0.3), terms=[tie])
+        mpm.QuasiStaticProblem(mpm.Body(left, Hencky(1e3, 0.3)), terms=[tie])
     with pytest.raises(mpm.MPMError, match="A Tie was made with axisymmetric=False"):
-        mpm.QuasiStaticProblem([left, right], Hencky(1e3, 0.3), axisymmetric=True, terms=[tie])
+        mpm.QuasiStaticProblem(
+            [mpm.Body(p, Hencky(1e3, 0.3)) for p in (left, right)], axisymmetric=True, terms=[tie]
+        )
     with pytest.raises(mpm.MPMError, match="terms must be a list"):
-        mpm.QuasiStaticProblem(left, Hencky(1e3, 0.3), terms=tie)
+        mpm.QuasiStaticProblem(mpm.Body(left, Hencky(1e3, 0.3)), terms=tie)
     R = ufl.inner(ufl.grad(left.displacement), ufl.grad(ufl.TestFunction(left.W))) * left.dx
     with pytest.raises(mpm.MPMError, match="terms must be a list"):
         mpm.ParticleProblem(R, left, terms=tie)

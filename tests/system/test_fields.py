@@ -7,6 +7,7 @@ from petsc4py import PETSc
 import numpy as np
 import pytest
 import scenes
+from posed import posed
 from scenes import QUADRILATERAL, TRIANGLE
 
 import ufl
@@ -53,15 +54,23 @@ def require_same(one, other, tolerance=1e-12):
 
 def alone(make, law, density, **options):
     particles, bc = make()
-    problem = mpm.QuasiStaticProblem(
-        particles, law, density=density, body_force=(2.0, -10.0), bcs=[bc], **OPTIONS, **options
+    problem = posed(
+        mpm.QuasiStaticProblem,
+        particles,
+        law,
+        density=density,
+        body_force=(2.0, -10.0),
+        bcs=[bc],
+        **OPTIONS,
+        **options,
     )
     return problem, [(particles, bc)]
 
 
 def together(laws, densities, makes=(left, right), **options):
     pairs = [make() for make in makes]
-    problem = mpm.QuasiStaticProblem(
+    problem = posed(
+        mpm.QuasiStaticProblem,
         [particles for particles, _ in pairs],
         laws,
         density=densities,
@@ -116,7 +125,9 @@ def test_the_same_space_is_one_field():
     bodies = [
         mpm.Particles(scenes.box([x, 0.0], [x + 1.0, 1.0], [4, 4], TRIANGLE), V) for x in (0.0, 2.0)
     ]
-    problem = mpm.QuasiStaticProblem(bodies, Hencky(1e3, 0.3), bcs=[scenes.fix(V, scenes.at(1, 0))])
+    problem = posed(
+        mpm.QuasiStaticProblem, bodies, Hencky(1e3, 0.3), bcs=[scenes.fix(V, scenes.at(1, 0))]
+    )
     (field,) = problem.reduced.fields
     assert field.bodies == bodies and field.V is V
 
@@ -196,7 +207,7 @@ def test_bodies_of_one_problem_share_space_and_ranks():
     V = scenes.vectors(scenes.unit(2, scenes.HEXAHEDRON))
     solid = mpm.Particles(scenes.unit(4, scenes.HEXAHEDRON), V)
     with pytest.raises(mpm.MPMError, match="same dimension"):
-        mpm.QuasiStaticProblem([plane, solid], Hencky(1e3, 0.3))
+        mpm.QuasiStaticProblem([mpm.Body(p, Hencky(1e3, 0.3)) for p in (plane, solid)])
 
 
 @pytest.mark.parametrize(
@@ -226,7 +237,7 @@ def test_the_tangent_is_one_object_within_a_step(options, take):
         ]
         options = {"background": drag}
     bcs = [bc for _, bc in pairs]
-    problem = mpm.QuasiStaticProblem(bodies, LAWS[1], bcs=bcs, **options)
+    problem = posed(mpm.QuasiStaticProblem, bodies, LAWS[1], bcs=bcs, **options)
     system = problem.reduced
     system.begin([np.zeros(len(p.increment.x.array)) for p in bodies], 1.0)
     x = PETSc.Vec().createMPI(system.sizes, comm=scenes.WORLD)
@@ -243,7 +254,8 @@ def test_the_tangent_is_one_object_within_a_step(options, take):
 def test_terms_on_the_background_of_each_field():
     def draggy(pairs, law, densities):
         forms = [50.0 * ufl.inner(p.increment, ufl.TestFunction(p.V)) * ufl.dx for p, _ in pairs]
-        return mpm.QuasiStaticProblem(
+        return posed(
+            mpm.QuasiStaticProblem,
             [p for p, _ in pairs],
             law,
             density=densities,
@@ -260,16 +272,3 @@ def test_terms_on_the_background_of_each_field():
         single = draggy([other := make()], [law], [density])
         single.solve(steps=2)
         require_same(state(single, *other), state(problem, *pair))
-
-
-def test_dependent_dofs_are_looked_for_in_each_field():
-    def other():
-        return pillar(10.0, 0.5, 1, QUADRILATERAL)
-
-    options = {"dependent_dofs": "remove", "shift": 0.0}
-    problem, pairs = together(LAWS, DENSITIES, makes=(left, other), **options)
-    problem.solve(steps=2)
-    for make, law, density, pair in zip((left, other), LAWS, DENSITIES, pairs, strict=True):
-        single, ((particles, bc),) = alone(make, law, density, **options)
-        single.solve(steps=2)
-        require_same(state(single, particles, bc), state(problem, *pair))

@@ -9,6 +9,7 @@ from petsc4py import PETSc
 import numpy as np
 import pytest
 import scenes
+from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 
 import mpm_dolfinx as mpm
@@ -21,8 +22,8 @@ def begun(cell, degree, n, **options):
     dim = 3 if cell in (TETRAHEDRON, HEXAHEDRON) else 2
     V = scenes.vectors(scenes.box([0.0] * dim, [2.0] * dim, [2 * n] * dim, cell), degree)
     body = scenes.box([0.3] * dim, [1.4] * dim, [round(1.5 * n)] * dim, cell)
-    problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, degree=degree), Hencky(1e4, 0.3), **options
+    problem = posed(
+        mpm.QuasiStaticProblem, mpm.Particles(body, V, degree=degree), Hencky(1e4, 0.3), **options
     )
     problem.reduced.begin([np.zeros_like(problem.particles.increment.x.array)], 1.0)
     return problem

@@ -18,10 +18,7 @@ def corner():
     V = scenes.vectors(scenes.box([0.0, 0.0], [20.0, 20.0], [20, 20], QUADRILATERAL))
     body = scenes.box([0.1, 0.0], [4.1, 4.0], [12, 12], TRIANGLE)
     return mpm.QuasiStaticProblem(
-        mpm.Particles(body, V),
-        Hencky(1e4, 0.3),
-        density=1.0,
-        body_force=(0.0, -25.0),
+        mpm.Body(mpm.Particles(body, V), Hencky(1e4, 0.3), density=1.0, body_force=(0.0, -25.0)),
         bcs=[scenes.fix(V, scenes.at(1, 0.0))],
     )
 

@@ -32,7 +32,9 @@ def gripped(predictor, end=0.4, law=None):
     low = np.flatnonzero(V.tabulate_dof_coordinates()[:, 1] < 0.6).astype(np.int32)
     bcs = [scenes.fix(V, scenes.at(1, 2.0)), fem.dirichletbc(value, low, V)]
     law = law or Hencky(1e3, 0.3)
-    return mpm.QuasiStaticProblem(mpm.Particles(body, V), law, bcs=bcs, predictor=predictor)
+    return mpm.QuasiStaticProblem(
+        mpm.Body(mpm.Particles(body, V), law), bcs=bcs, solver=mpm.Solver(predictor=predictor)
+    )
 
 
 # -- Extrapolation -----------------------------------------------------------------------

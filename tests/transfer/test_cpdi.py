@@ -47,11 +47,13 @@ def test_cpdi_is_cpdi2_on_tetrahedra():
         body = box([0.0] * 3, [1.0, 1.0, 1.0], [3, 3, 3], TETRAHEDRON)
         bcs = [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in range(3)]
         problem = mpm.QuasiStaticProblem(
-            mpm.Particles(body, V, method=method),
-            Hencky(1e3, 0.3),
-            body_force=(0.0, 0.0, -300.0),
+            mpm.Body(
+                mpm.Particles(body, V, method=method),
+                Hencky(1e3, 0.3),
+                body_force=(0.0, 0.0, -300.0),
+            ),
             bcs=bcs,
-            stabilisation=None,
+            solver=mpm.Solver(stabilisation=None),
         )
         problem.solve(steps=4)
         runs.append(scenes.in_order(problem.particles, problem.particles.domains))

@@ -31,7 +31,7 @@ def test_a_linear_motion_of_the_background_is_followed_exactly(method):
     body = box([0.1, 0.2], [0.6, 0.5], [5, 3], QUADRILATERAL)
     condition, values = scenes.everywhere(V)
     problem = mpm.QuasiStaticProblem(
-        mpm.Particles(body, V, method=method), Hencky(1e3, 0.3), bcs=[condition]
+        mpm.Body(mpm.Particles(body, V, method=method), Hencky(1e3, 0.3)), bcs=[condition]
     )
     centre = problem.particles.centroid.copy()
     turn, F = 0.0, np.eye(2)

@@ -1,0 +1,245 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""A body of a problem: its particles, what they are made of, and what acts on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+import ufl
+from dolfinx import mesh
+
+from ..constitutive.averaging import F_BARS
+from ..errors import MPMError
+from ..parallel.given import require_same
+from ..particles.particles import Particles
+from ..reals import is_one_of
+from .arguments import as_pairs, carried, holds
+from .initial_stress import of_all_ranks
+from .summary import counted
+
+__all__ = ["Body", "PoreFluid", "as_given"]
+
+#: What a body begins with, which a stage cannot change.
+INITIAL = ("initial_stress", "velocity")
+
+
+@dataclass(frozen=True, eq=False)
+class PoreFluid:
+    """The water in the pores of a body, for :class:`PorousProblem`.
+
+    Args:
+        permeability: Hydraulic conductivity over the specific weight of water (length^2 over
+            pressure and time): a positive number, or what must not be negative anywhere when a step
+            begins: a Constant or Function, UFL on the body mesh, or a function of the volume ratio
+            J that returns UFL, ``lambda J: k * J**3``.
+        storage: Change of the water's volume by its pressure, per undeformed volume (one over a
+            pressure): the porosity times the compressibility of water.
+        density: Mass per volume of the water, on which the ``body_force`` of the body acts as well;
+            0 where the pore pressure is the excess over the hydrostatic one.
+        drained: Pairs of a pore pressure (number or UFL) and a tag of the body's ``facet_tags``,
+            where water comes and goes at this pressure; the rest of the boundary is impervious.
+        inflow: Pairs of a volume of water that flows in per undeformed area and time, and a tag.
+        pressure: Pore pressure at the beginning: a number, or a function of coordinates ``(3, n)``
+            that returns ``(n,)``.
+
+    Raises:
+        MPMError: Numbers or lists that make no sense.
+    """
+
+    permeability: Any
+    storage: Any = 0.0
+    density: float = 0.0
+    drained: Sequence[Any] = ()
+    inflow: Sequence[Any] = ()
+    pressure: Any = 0.0
+
+    def __post_init__(self) -> None:
+        """Say so where something makes no sense."""
+        for name in ("drained", "inflow"):
+            object.__setattr__(self, name, as_pairs(name, getattr(self, name)))
+        for name, least in (("permeability", True), ("storage", False), ("density", False)):
+            value = getattr(self, name)
+            known = isinstance(value, float | int | np.number) and not isinstance(value, bool)
+            if name == "density" and not known:
+                raise MPMError(f"density of a PoreFluid must be a number, not {value!r}.")
+            if value is None or (known and not (value > 0.0 if least else value >= 0.0)):
+                how = "positive" if least else "not negative"
+                raise MPMError(f"{name} of a PoreFluid must be {how}, not {value!r}.")
+            if known and not np.isfinite(value):
+                raise MPMError(f"{name} of a PoreFluid must be finite, not {value!r}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A body: its particles, what they are made of, and what acts on them (collective).
+
+    Args:
+        particles: The particles.
+        material: A material, or ``{cell tag: material}`` with ``cell_tags``.
+        density: Mass per undeformed volume: a number, Constant, Function or UFL expression; in a
+            :class:`PorousProblem` that of soil and water together. ``None`` is one where the body
+            is at rest, and missing where it moves.
+        body_force: Force per mass at full load: a tuple, Constant, Function or UFL expression
+            on the body mesh, or a function that makes one from the mesh.
+        tractions: Pairs of a dead load per undeformed area at full load (tuple or UFL) and a
+            tag of ``facet_tags``.
+        pressures: Pairs of a pressure at full load (number or UFL) and a tag of
+            ``facet_tags``; it acts on the deformed facets, against their normal, per deformed
+            area (a follower load, whose tangent is not symmetric).
+        cell_tags: Tags of the cells of ``particles.mesh``.
+        facet_tags: Tags of its facets.
+        f_bar: Average of the volume ratio that the material sees, against hourglass modes and
+            locking: ``"none"``, ``"domain"`` (over a domain's points) or ``"patch"`` (over the
+            domains of about one background cell).
+        initial_stress: Cauchy stress that the body carries before it has moved, which its material
+            must be able to bear: ``(3, 3)`` with the direction out of the plane (or around the
+            axis) at last, one for each owned particle or point ``(n, 3, 3)`` or
+            ``(n, nq, 3, 3)``, UFL of the shape ``(3, 3)`` on the body mesh, a function of
+            coordinates ``(3, n)`` that returns ``(3, 3, n)``, or :func:`mpm_dolfinx.geostatic`.
+            What it is not in equilibrium with goes in proportion, as loads come, in the first run.
+        velocity: At the beginning, in a :class:`DynamicProblem`: a tuple, a function of coordinates
+            ``(3, n)`` that returns ``(gdim, n)``, a Function, or a UFL expression on the body mesh.
+        pore_fluid: The water in its pores, in a :class:`PorousProblem`.
+
+    Raises:
+        MPMError: Something that is none of these, or differs between ranks.
+    """
+
+    particles: Particles
+    material: Any
+    density: Any = None
+    body_force: Any = None
+    tractions: Sequence[Any] = ()
+    pressures: Sequence[Any] = ()
+    cell_tags: Any = None
+    facet_tags: Any = None
+    f_bar: str = "none"
+    initial_stress: Any = None
+    velocity: Any = None
+    pore_fluid: PoreFluid | None = None
+
+    def __post_init__(self) -> None:
+        """Say so where something makes no sense."""
+        if not isinstance(self.particles, Particles):
+            raise MPMError(
+                f"A Body is made of mpm.Particles, not of a {type(self.particles).__name__}."
+            )
+        given = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "particles"}
+        given["initial_stress"] = of_all_ranks(self.initial_stress)
+        given["pore_fluid"] = None if self.pore_fluid is None else vars(self.pore_fluid)
+        require_same(self.particles.V.mesh.comm, **given)
+        for name in ("tractions", "pressures"):
+            object.__setattr__(self, name, as_pairs(name, getattr(self, name)))
+        for name in ("cell_tags", "facet_tags"):
+            tags = getattr(self, name)
+            if tags is not None and not isinstance(tags, mesh.MeshTags):
+                raise MPMError(f"{name} must be dolfinx MeshTags, not {type(tags).__name__}.")
+        if not is_one_of(self.f_bar, F_BARS):
+            raise MPMError(
+                f"Unknown f_bar={self.f_bar!r}; choose one of {', '.join(map(repr, F_BARS))}."
+            )
+        if self.pore_fluid is not None and not isinstance(self.pore_fluid, PoreFluid):
+            raise MPMError(
+                f"pore_fluid must be an mpm.PoreFluid, not a {type(self.pore_fluid).__name__}."
+            )
+
+    def replace(self, **changes: Any) -> Body:
+        """Return the same body with some things changed, such as ``tractions=[...]`` for a stage.
+
+        Args:
+            **changes: By the names of the arguments.
+        """
+        return replace(self, **changes)
+
+    def changed_from(self, other: Body) -> dict[str, Any]:
+        """Return what is another object than it is in another body, by name."""
+        return {
+            f.name: getattr(self, f.name)
+            for f in fields(self)
+            if getattr(self, f.name) is not getattr(other, f.name)
+        }
+
+    def in_words(self) -> str:
+        """Return the laws, and what loads the body."""
+        laws = self.material
+        if isinstance(laws, Mapping):
+            words = "; ".join(f"tag {tag}: {law!r}" for tag, law in laws.items())
+        else:
+            words = repr(laws)
+        acts = ["body force"] if self.body_force is not None else []
+        for loads, noun in ((self.tractions, "traction"), (self.pressures, "pressure")):
+            if loads:
+                acts.append(counted(len(loads), noun))
+        more = [] if self.f_bar == "none" else [f"F-bar over each {self.f_bar}"]
+        more += [] if self.pore_fluid is None else ["water"]
+        return "; ".join([words, ", ".join(acts) or "no loads", *more])
+
+    def carried(self) -> Body:
+        """Return the same on the present mesh of the particles (collective)."""
+        return replace(
+            self,
+            material=carried(self.particles, self.material),
+            cell_tags=self.particles.carry(self.cell_tags),
+            facet_tags=self.particles.carry(self.facet_tags),
+        )
+
+    def require_movable(self, consequence: str = "the particles cannot move") -> None:
+        """Raise an error unless the body can be taken to another mesh.
+
+        Args:
+            consequence: What else cannot be.
+
+        Raises:
+            MPMError: Something lives on its present mesh.
+        """
+        for name in ("density", "body_force", "tractions", "pressures"):
+            if holds(getattr(self, name), ufl.core.expr.Expr):
+                raise MPMError(
+                    f"{name} is written on the present body mesh, so {consequence}; give a "
+                    "function that makes it from a mesh, e.g. "
+                    "lambda mesh: ufl.SpatialCoordinate(mesh)[1]."
+                )
+        for name, value in ({} if self.pore_fluid is None else vars(self.pore_fluid)).items():
+            if holds(value, ufl.core.expr.Expr):
+                raise MPMError(
+                    f"{name} is written on the present body mesh, so {consequence}; give numbers."
+                )
+        laws = self.material.values() if isinstance(self.material, Mapping) else [self.material]
+        for law in laws:
+            if any(isinstance(value, np.ndarray) for value in law.parameters.values()):
+                raise MPMError(
+                    "A material has arrays of parameters, one value for each particle of a rank, "
+                    f"so {consequence}; use DG0 Functions."
+                )
+
+    def require_movable_nodes(self, consequence: str) -> None:
+        """Raise an error unless the nodes of the body's mesh can be moved; see above."""
+        self.require_movable(consequence)
+        for name in ("density", "body_force", "tractions", "pressures"):
+            if holds(getattr(self, name), Callable):
+                raise MPMError(
+                    f"{name} is a function of the mesh, whose nodes move, so {consequence}."
+                )
+
+
+def as_given(bodies: Body | Sequence[Body]) -> list[Body]:
+    """Return the bodies of a problem as a list.
+
+    Raises:
+        MPMError: Something else than bodies.
+    """
+    every: list[Any] = list(bodies) if isinstance(bodies, list | tuple) else [bodies]
+    for body in every:
+        if not isinstance(body, Body):
+            raise MPMError(
+                "A problem is made of an mpm.Body(particles, material, ...) or a list of them, not "
+                f"of a {type(body).__name__}."
+            )
+    if not every:
+        raise MPMError("A problem is made of one mpm.Body at least; the list is empty.")
+    return every
