@@ -88,7 +88,7 @@ class Gradients(NamedTuple):
 
 
 def mean(ends: Ends, gradients: Gradients, factor: float) -> tuple[Array, Array]:
-    """Return what acts over a step, and its derivative by F at the end.
+    """Return the discrete gradient, and its derivative by F at the end.
 
     Args:
         ends: Derivatives of the potential.
@@ -165,13 +165,8 @@ def mean_of_groups(
     change, slope = gradients.strain()
     turned = np.einsum("nIi,nIJ->niJ", inverse, change)
     whole = h[:, None, None, None] * gamma + left
-    energy = np.zeros(len(S))
-    if ends.potentials is not None:
-        energy = np.where(ends.kind >= 2, ends.potentials[0] - ends.potentials[1], 0.0)
-    square = np.einsum("nIJ,nIJ->n", change, change) + SMALL**2
     own = [
-        (energy - np.einsum("nIJ,nIJ->n", S_mean, change)).reshape(volumes.shape),
-        square.reshape(volumes.shape),
+        *(part.reshape(volumes.shape) for part in _quotient(ends, S_mean, change)),
         np.einsum("nqiJ,nqiJ->nq", turned.reshape(shape), whole),
         np.einsum("nqiJ,nqiJ->nq", turned.reshape(shape), gamma),
     ]
@@ -200,6 +195,15 @@ def mean_of_groups(
     second -= 0.5 * sums[:, 3, None, None] * along
     after = (averaging.nodal(gamma), averaging.nodal(right), averaging.nodal(X.reshape(shape)))
     return stress, tangent, LowRankTerm(averaging.groups, (first, second, along), after)
+
+
+def _quotient(ends: Ends, S_mean: Array, change: Array) -> tuple[Array, Array]:
+    """Return numerator and denominator of c at each point."""
+    energy = np.zeros(len(change))
+    if ends.potentials is not None:
+        energy = np.where(ends.kind >= 2, ends.potentials[0] - ends.potentials[1], 0.0)
+    work = np.einsum("nIJ,nIJ->n", S_mean, change)
+    return energy - work, np.einsum("nIJ,nIJ->n", change, change) + SMALL**2
 
 
 def _times(factor: Array, tangent: Array) -> Array:

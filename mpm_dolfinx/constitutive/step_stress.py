@@ -76,7 +76,7 @@ class _Beginning(NamedTuple):
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """What acts over a step that ends at a displacement.
+    """Stress over a step that ends at a displacement.
 
     Attributes:
         stress: First Piola stress, over the share.
@@ -161,7 +161,7 @@ class _PressurePart:
 
 
 class _OfGroups:
-    """What knows what a tangent has from other points of a group.
+    """The low-rank part of a tangent, from other points of a group.
 
     Args:
         stress: Has the last evaluation.
@@ -238,7 +238,7 @@ class StepStress:
 
     @property
     def volume_strain(self) -> VolumeStrain:
-        """What a pressure of its own is the multiplier of: that at the step's end.
+        """The strain of which a pressure of its own is the multiplier, at the step's end.
 
         It counts ``1 / share`` times, as its pressure does: the tangent of small strains is
         symmetric then.
@@ -268,12 +268,12 @@ class StepStress:
 
     @property
     def low_rank(self) -> LowRankTerm | None:
-        """What other points of a group added to the tangent in the last update."""
+        """The part of the tangent from other points of a group, in the last update."""
         return self._found.low_rank
 
     @property
     def grouped(self) -> Linearised | None:
-        """What knows what the tangent has from other points of a group; ``None`` without F-bar."""
+        """The low-rank part of the tangent, from a group's other points; ``None`` without F-bar."""
         averaging = self._points.averaging
         if averaging is None or not self._conserving:
             return averaging
@@ -329,7 +329,7 @@ class StepStress:
         self._found = end if plain else self._of_step(end)
 
     def _of_step(self, end: _Evaluation) -> _Evaluation:
-        """Return what acts over the step, made of what acts at its end."""
+        """Return the stress over the step by that at its end."""
         begin, part, factor = self._begin, self._part, 1.0 / self._share
         gradients = Gradients(_gradient(self._points), begin.gradient)
         if part is not None:
@@ -370,7 +370,7 @@ class StepStress:
     def _of_volume(
         self, part: _PressurePart, volume: _Volume, gradients: Gradients
     ) -> tuple[Array, Array, Array]:
-        """Return what a pressure of the whole step is multiplied with, and derivatives.
+        """Return the factor of a pressure of the whole step in the stress, and derivatives.
 
         Those are by F at the step's end, and that of all stress by the pressure.
         """
@@ -388,7 +388,7 @@ class StepStress:
         return slope, tangent, slope + own
 
     def _between(self, before: Array, after: Array) -> Array:
-        """Return what the ends of a step have as its mean, by their weights."""
+        """Return the mean over a step of values at its ends, by their weights."""
         return (1.0 - self._share) * before + self._share * after
 
     def initial_modulus(self) -> Array:
@@ -475,6 +475,6 @@ def _gradient(points: MaterialPoints) -> Array:
 
 
 def _reference(points: MaterialPoints) -> Reference | None:
-    """Return what the body's mesh is strained by now, the same object while it is the same."""
+    """Return the present reference of a body's mesh, the same object while it is the same."""
     particles = points.strain.particles
     return particles.reference if particles.rebased else None
