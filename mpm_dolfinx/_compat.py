@@ -397,7 +397,7 @@ class _NonlinearProblem:
 
     @property
     def solver(self) -> _NonlinearProblem:
-        """What tells whether the last solve converged."""
+        """The object that tells whether the last solve converged."""
         return self
 
     def getConvergedReason(self) -> int:

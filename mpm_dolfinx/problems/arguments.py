@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What users give to a problem, made uniform, and whether it can move."""
+"""Arguments of problems, made uniform, and whether a problem can move."""
 
 from __future__ import annotations
 
@@ -325,7 +325,7 @@ def by_space[Moved: (Particles, CarriedField)](bodies: Sequence[Moved]) -> list[
 
 
 def as_terms(terms: Any, bodies: Sequence[Particles]) -> list[Term]:
-    """Return what acts on bodies as a list.
+    """Return the terms that act on bodies, as a list.
 
     Raises:
         MPMError: Something else than terms, or terms on other bodies.

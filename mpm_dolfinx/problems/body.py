@@ -157,7 +157,7 @@ class Body:
         return replace(self, **changes)
 
     def changed_from(self, other: Body) -> dict[str, Any]:
-        """Return what is another object than it is in another body, by name."""
+        """Return the attributes that are another object than in another body, by name."""
         return {
             f.name: getattr(self, f.name)
             for f in fields(self)

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,14 +168,15 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
 
     _further = ("velocity",)
 
+    @override
     def _require_given(self, bodies: Sequence[Body]) -> None:
-        """See :meth:`QuasiStaticProblem._require_given`."""
         super()._require_given(bodies)
         if any(body.density is None for body in bodies):
             raise MPMError("A body that moves needs a density; give density= to its mpm.Body.")
 
+    @override
     def _carry_stress(self, stresses: Sequence[Any]) -> None:
-        """See :meth:`QuasiStaticProblem._carry_stress`; another problem brings its own."""
+        """Let bodies carry a stress, but for those of a problem that goes on with its own."""
         if not self._goes_on:
             super()._carry_stress(stresses)
 
@@ -186,31 +187,31 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         super().add(given, name, sudden=sudden)
         self.inertia.velocities[-1].x.array[:] = start.x.array
 
+    @override
     def _own_terms(self) -> list[Term]:
-        """See :meth:`QuasiStaticProblem.stage`."""
         return [self.inertia]
 
+    @override
     def _in_time(
         self, history: MaterialPoints, supports: Sequence[Support]
     ) -> tuple[StepStress, Sequence[StepForce]]:
-        """See :meth:`QuasiStaticProblem._in_time`."""
         body = history.strain.particles
         whole = self.inertia.scheme.stress_of_step and not self.inertia.is_static(body)
         stress = StepStress(history, whole, self._viscosity, self._force_share(body))
         self._step_stresses.append(stress)
         return stress, (stress, *supports)
 
+    @override
     def _contributions(self) -> list[Contribution]:
-        """See :meth:`ParticleProblem._contributions`."""
         self._step_stresses: list[StepStress] = []
         return super()._contributions()
 
+    @override
     def _force_share(self, body: Particles) -> float:
-        """See :meth:`QuasiStaticProblem._force_share`."""
         return 1.0 if self.inertia.is_static(body) else self.inertia.scheme.share
 
+    @override
     def _contribution(self, given: Body) -> Contribution:
-        """See :meth:`QuasiStaticProblem._contribution`."""
         static = self.inertia.is_static(given.particles)
         return super()._contribution(given)._replace(static=static)
 
@@ -220,8 +221,8 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         energy, work = self._comm.allreduce(np.sum(own, axis=0))
         return float(energy), float(work)
 
+    @override
     def _mass_form(self, number: int, product: Any) -> ufl.Form:
-        """See :meth:`MovingProblem._mass_form`."""
         work, density = self._density[number]
         return work.mass(density.value, product)
 
@@ -306,8 +307,8 @@ class DynamicParticleProblem(MovingProblem):
         self.history.energies = self._energies
         self.inertia.mass()
 
+    @override
     def _contributions(self) -> list[Contribution]:
-        """See :meth:`ParticleProblem._contributions`."""
         return [
             self._with_supports(given, [s for s in self._supports if s.particles is body])
             for given, body in zip(super()._contributions(), self.bodies, strict=True)
@@ -326,13 +327,13 @@ class DynamicParticleProblem(MovingProblem):
             of_step=tuple(supports),
         )
 
+    @override
     def _mass_form(self, number: int, product: Any) -> ufl.Form:
-        """See :meth:`MovingProblem._mass_form`."""
         form: ufl.Form = self._densities[number].value * product * self.bodies[number].dx_exact
         return form
 
+    @override
     def begin_step(self) -> None:
-        """See :meth:`ParticleProblem.begin_step`."""
         super().begin_step()
         for density in self._densities:
             density.require()

@@ -1,13 +1,13 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What problems of motion share: velocities and the account of energies."""
+"""Common part of problems of motion: velocities and the account of energies."""
 
 from __future__ import annotations
 
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, override
 
 from petsc4py import PETSc
 
@@ -54,8 +54,8 @@ class MovingProblem(TimeProblem):
     inertia: Inertia
     _energies: list[Energy]
 
+    @override
     def _build(self) -> None:
-        """See :meth:`ParticleProblem._build`."""
         self.inertia.join(self.bodies)
         super()._build()
         self._stepper.newton.lets_go = self._stepper.newton.gives_up_early = True
@@ -72,8 +72,9 @@ class MovingProblem(TimeProblem):
         )
         self.inertia.follow(followed)
 
+    @override
     def _let_take_part(self, materials: Sequence[PointMaterial | None]) -> None:
-        """See :meth:`ParticleProblem._let_take_part`; terms learn that there is motion."""
+        """Let terms take part, and learn that there is motion."""
         super()._let_take_part(materials)
         for term in self.terms:
             if term is not self.inertia:
@@ -157,16 +158,16 @@ class MovingProblem(TimeProblem):
 
     # -- Through time -------------------------------------------------------------------------
 
+    @override
     def _aim(self, t: float) -> None:
-        """See :meth:`TimeProblem._aim`."""
         self.inertia.aim(t)
 
+    @override
     def _begin_run(self, now: float) -> None:
-        """See :meth:`TimeProblem._begin_run`."""
         self.inertia.begin_run(now)
 
+    @override
     def _resume_run(self) -> None:
-        """See :meth:`TimeProblem._resume_run`."""
         self.inertia.resume()
 
     def reaction(self, bc: fem.DirichletBC | Support | Contact | RigidBody) -> NDArray[np.float64]:

@@ -270,7 +270,7 @@ class ParticleProblem:
         self._constants, self._data = parts.constants(), parts.data_at_points()
 
     def _contributions(self) -> list[Contribution]:
-        """Return what each body adds to the system, on its present mesh (collective)."""
+        """Return the contribution of each body to the system, on its present mesh (collective)."""
         return self._given
 
     fields: Sequence[ParticleField] = ()
@@ -290,7 +290,7 @@ class ParticleProblem:
         return spaces
 
     def _couplings(self, parts: Parts) -> Sequence[FieldTerm]:
-        """Return what has unknowns besides displacements (collective).
+        """Return the terms that have unknowns besides displacements (collective).
 
         Args:
             parts: What the system is put together from.
@@ -302,7 +302,7 @@ class ParticleProblem:
         raise MPMError("A problem cannot be copied; make another one, of particles of its own.")
 
     def __deepcopy__(self, memo: Any) -> NoReturn:
-        """See :meth:`__copy__`."""
+        """Raise an error: a problem cannot be copied."""
         self.__copy__()
 
     def __del__(self) -> None:
@@ -320,7 +320,7 @@ class ParticleProblem:
         return in_one_line(self)
 
     def summary(self) -> str:
-        """Return what the problem is and what it did, a screen of text (collective).
+        """Return a summary of the problem and of its run, a screen of text (collective).
 
         Bodies with their materials, how far they have moved and yielded, background, solver, steps,
         linear solves and seconds (mean of the ranks): ``print(problem.summary())``.
@@ -328,7 +328,7 @@ class ParticleProblem:
         return on_a_screen(self, self._comm, self._how.in_words(), self._made_of())
 
     def _made_of(self) -> list[str]:
-        """Return what each body is made of and loaded by, in words."""
+        """Return a description of each body: its material and its loads."""
         return ["residual in UFL"] * len(self.bodies)
 
     def _release(self) -> None:
@@ -775,7 +775,7 @@ class ParticleProblem:
         return None
 
     def loads(self) -> Sequence[fem.Constant | fem.Function]:
-        """Return what the load factor multiplies and the user may change, where that is known.
+        """Return the loads that the load factor multiplies and the user may change, if known.
 
         A residual in UFL says itself what it multiplies by ``particles.load``.
         """

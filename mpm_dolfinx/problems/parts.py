@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What the system of a problem is put together from: what bodies and fields add to it."""
+"""Parts of a problem's system: contributions of bodies and of fields."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = ["Contribution", "Parts"]
 
 
 class Contribution(NamedTuple):
-    """What a body adds to the system.
+    """Contribution of a body to the system.
 
     Attributes:
         residual: Form on the body mesh, or ``None``.
@@ -57,7 +57,7 @@ class Contribution(NamedTuple):
 
 @dataclass(frozen=True)
 class Parts:
-    """What a system is put together from, on the present meshes of the bodies.
+    """Parts of a system, on the present meshes of the bodies.
 
     Args:
         bodies: The bodies.

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, override
 
 import numpy as np
 
@@ -121,8 +121,9 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
             assert fluid is not None
             _begin_with(filled.field, fluid.pressure)
 
+    @override
     def laws(self) -> list[list[Law]]:
-        """See :meth:`ParticleProblem.laws`; the pore fluid goes with the material."""
+        """Laws of the bodies; the pore fluid goes with the material."""
         found = super().laws()
         for own, body in zip(found, self.setup.bodies, strict=True):
             if body.pore_fluid is not None:
@@ -146,22 +147,22 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
 
     # -- The system -----------------------------------------------------------------------
 
+    @override
     def _require_change(self, body: Body) -> None:
-        """See :meth:`QuasiStaticProblem._require_change`."""
         super()._require_change(body)
         if (body.pore_fluid is None) != (self.body(body.particles).pore_fluid is None):
             raise MPMError("Water cannot come to a dry body in a stage, nor leave a wet one.")
 
+    @override
     def _spaces_of_fields(self) -> list[fem.FunctionSpace]:
-        """See :meth:`ParticleProblem._spaces_of_fields`."""
         spaces: list[fem.FunctionSpace] = []
         for _, V in self._spaces_of_water:
             if all(V is not known for known in spaces):
                 spaces.append(V)
         return spaces
 
+    @override
     def _contributions(self) -> list[Contribution]:
-        """See :meth:`ParticleProblem._contributions`."""
         self._filled = [
             self._water(body.particles) for body in self.setup.bodies if body.pore_fluid is not None
         ]
@@ -170,8 +171,8 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         self._of_fields = [f.residual for f in self._filled if f.residual is not None]
         return contributions
 
+    @override
     def _let_take_part(self, materials: Sequence[PointMaterial | None]) -> None:
-        """See :meth:`ParticleProblem._let_take_part`."""
         wet = [filled.particles for filled in self._filled]
         for term in self.terms:
             if term.takes_stress and any(body is its for body in wet for its in term.bodies):
@@ -181,8 +182,8 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
                 )
         super()._let_take_part(materials)
 
+    @override
     def _build(self) -> None:
-        """See :meth:`ParticleProblem._build`."""
         super()._build()
         for filled in self._filled:
             filled.particles.fill_pores(filled.field)
@@ -208,8 +209,8 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
             fem.Constant(body.mesh, 1.0),
         )
 
+    @override
     def _further_work(self, given: Body, strain: Strain) -> tuple[list[ufl.Form], bool]:
-        """See :meth:`QuasiStaticProblem._further_work`."""
         body = given.particles
         filled = next((f for f in self._filled if f.particles is body), None)
         if filled is None:
@@ -269,13 +270,13 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
 
     # -- Through time ---------------------------------------------------------------------
 
+    @override
     def _aim(self, t: float) -> None:
-        """See :meth:`TimeProblem._aim`."""
         for filled in self._filled:
             np.copyto(filled.dt.value, t - self.history.time)
 
+    @override
     def begin_step(self) -> None:
-        """See :meth:`ParticleProblem.begin_step`."""
         super().begin_step()
         for filled in self._filled:
             before = filled.particles.converged_displacement
@@ -318,7 +319,7 @@ class _Undeformed:
         return ufl.grad(w) if self._to_mesh is None else ufl.dot(ufl.grad(w), self._to_mesh)
 
     def strained(self, w: Any) -> Any:
-        """Return what :meth:`Strain.ufl_gradient` does."""
+        """Return the gradient of :meth:`Strain.ufl_gradient`."""
         return self._strain.with_turn(self.grad(w), w)
 
     def displacement_gradient(self, d: Any) -> Any:
@@ -351,7 +352,7 @@ class _Undeformed:
 
 
 class _Flow:
-    """What the balance of a body's water is written in.
+    """Quantities of the balance of a body's water.
 
     Args:
         filled: The water.

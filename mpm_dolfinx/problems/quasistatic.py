@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,7 +146,7 @@ class QuasiStaticProblem(ParticleProblem):
                 )
 
     def body(self, particles: Particles | None = None) -> Body:
-        """Return what a body is made of and what acts on it, as it was given last.
+        """Return the body of particles, as it was given last.
 
         Args:
             particles: Its particles; ``None`` where there is one body.
@@ -179,8 +179,8 @@ class QuasiStaticProblem(ParticleProblem):
     #: Whether loads and stages act little by little.
     _gradual = True
 
+    @override
     def _build(self) -> None:
-        """See :meth:`ParticleProblem._build`."""
         self.setup = self.setup.carried()
         present = self._functions()
         for function in self._parameters:
@@ -190,8 +190,8 @@ class QuasiStaticProblem(ParticleProblem):
         for body, stress in zip(self.bodies, self._stresses, strict=True):
             body.attach(stress)
 
+    @override
     def _made_of(self) -> list[str]:
-        """See :meth:`ParticleProblem._made_of`."""
         whole = ["body of revolution"] if self.setup.axisymmetric else []
         found = []
         for body in self.setup.bodies:
@@ -326,7 +326,7 @@ class QuasiStaticProblem(ParticleProblem):
         self._go_on(name, self._addition(given), sudden)
 
     def _addition(self, given: Body) -> Addition:
-        """Return what adds a body."""
+        """Return the change that adds a body."""
         return Addition(self, given)
 
     def _own_terms(self) -> list[Term]:
@@ -352,16 +352,16 @@ class QuasiStaticProblem(ParticleProblem):
         """The materials at the points of each body."""
         return self._stresses
 
+    @override
     def loads(self) -> list[fem.Constant | fem.Function]:
-        """See :meth:`ParticleProblem.loads`."""
         return self._loads
 
     def _functions(self) -> list[fem.Function]:
         """Return the parameters of materials that are Functions."""
         return [f for body in self.setup.bodies for f in functions_of(body.material)]
 
+    @override
     def _contributions(self) -> list[Contribution]:
-        """See :meth:`ParticleProblem._contributions`."""
         self._stresses: list[MaterialPoints] = []
         self._acting: list[MaterialPoints | StepStress] = []
         self._density: list[tuple[VirtualWork, Density]] = []
@@ -385,7 +385,7 @@ class QuasiStaticProblem(ParticleProblem):
         return body.field(V, at="points", name="pressure")
 
     def _contribution(self, given: Body) -> Contribution:
-        """Return what one body adds to the system (collective)."""
+        """Return the contribution of one body to the system (collective)."""
         body = given.particles
         supports = self.setup.supports_of(body)
         strain = strain_of(body, self.setup.axisymmetric)
@@ -454,15 +454,15 @@ class QuasiStaticProblem(ParticleProblem):
     def _in_time(
         self, history: MaterialPoints, supports: Sequence[Support]
     ) -> tuple[MaterialPoints | StepStress, Sequence[StepForce]]:
-        """Return what stress acts on a body, and what among its forces is of a whole step."""
+        """Return the stress that acts on a body, and its forces that act over a whole step."""
         return history, ()
 
     def _force_share(self, body: Particles) -> float | None:
-        """Return what of a body's forces at a step's end is force; ``None`` without motion."""
+        """Return the share of force in a body's last residual; ``None`` without motion."""
         return None
 
+    @override
     def _couplings(self, parts: Parts) -> Sequence[FieldTerm]:
-        """See :meth:`ParticleProblem._couplings`."""
         if self.setup.mixed is None:
             return super()._couplings(parts)
         found: list[FieldTerm] = []
@@ -475,8 +475,9 @@ class QuasiStaticProblem(ParticleProblem):
                 found.append(PressureSmoothing(carried, points, self._force_share(body) or 1.0))
         return found
 
+    @override
     def begin_step(self) -> None:
-        """See :meth:`ParticleProblem.begin_step`; parameters of materials have new values then."""
+        """Begin a step, in which parameters of materials have new values."""
         super().begin_step()
         with agree(self._comm):
             for function, values in self._left.values():
@@ -491,15 +492,15 @@ class QuasiStaticProblem(ParticleProblem):
         for stress in self._stresses:
             stress.follow_parameters()
 
+    @override
     def improper(self) -> MPMError | None:
-        """See :meth:`ParticleProblem.improper`."""
         found: MPMError | None = None
         for stress in self._stresses:
             found = found or DomainDistortionError.of(*stress.strain.beyond())
         return super().improper() or agreed(self._comm, found)
 
+    @override
     def masses(self, number: int) -> NDArray[np.float64]:
-        """See :meth:`ParticleProblem.masses`."""
         return self.nodal_masses(number).sum(axis=1)
 
     def repartition(self, threshold: float = 0.1) -> bool:
@@ -598,27 +599,27 @@ class QuasiStaticProblem(ParticleProblem):
         n, k = body.num_local, space.dofmap.list.shape[1]
         return matrix.data[: n * k * k].reshape(n, k, k)
 
+    @override
     def cut_as(self, snapshot: Snapshot, functions: bool, source: str) -> None:
-        """See :meth:`ParticleProblem.cut_as`."""
         self._remeshing.repeat(snapshot, functions, source)
 
     _history_at = None
 
+    @override
     def material_points(self) -> list[MaterialPoints]:
-        """See :meth:`ParticleProblem.material_points`."""
         return self._stresses
 
+    @override
     def converged_state(self) -> list[dict[str, Any]]:
-        """See :meth:`ParticleProblem.converged_state`."""
         return [dict(stress.converged_state()) for stress in self._stresses]
 
+    @override
     def set_converged_state(self, states: list[dict[str, NDArray[Any]]]) -> None:
-        """See :meth:`ParticleProblem.set_converged_state`."""
         for stress, arrays in zip(self._stresses, states, strict=True):
             stress.set_converged_state(arrays)
 
+    @override
     def laws(self) -> list[list[Law]]:
-        """See :meth:`ParticleProblem.laws`."""
         return [stress.laws() for stress in self._stresses]
 
     @property

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What a problem with materials is made of: bodies, and what holds for all of them.
+"""Setup of a problem with materials: bodies, and options that hold for all of them.
 
 A problem is built from its setup and the present meshes of its bodies, at first and again whenever
 these are other ones.

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What a stage changes: what is given for a problem, cells that are taken away, bodies that come.
+"""Changes of a stage: new input, cells that are taken away, bodies that come.
 
 Each change is made in the same state: displacement, stress and history stay where they were
 (:meth:`ParticleProblem.begin_stage`).
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, Protocol, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +62,7 @@ class Staged(Protocol):
 
 
 class _Change:
-    """What all changes have in common: the problem as it was.
+    """Base of all changes, which holds the problem as it was.
 
     Args:
         problem: The problem.
@@ -75,17 +75,17 @@ class _Change:
         self._was = problem.setup, problem.bcs, problem.terms, problem.bodies, problem.particles
 
     def make(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
+        """Change what the problem is made of; here nothing."""
 
     def settle(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
+        """Give what is new its state; here nothing is."""
 
     def renews(self, body: int | None, name: str) -> bool:
-        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
+        """Return whether something of a state is new; here nothing is."""
         return False
 
     def undo(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
+        """Take back what was changed."""
         p = self.problem
         p.setup, p.bcs, p.terms, p.bodies, p.particles = self._was
 
@@ -117,14 +117,14 @@ class Given(_Change):
         ]
         self._points, self._moduli = list(problem.points), problem.reduced.moduli
 
+    @override
     def make(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         problem = self.problem
         join(self._terms, problem.terms)
         problem.setup, problem.bcs, problem.terms = self._setup, self._bcs, self._terms
 
+    @override
     def settle(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         problem, factors = self.problem, {}
         for body, changed, points, before in zip(
             problem.bodies, self._changed, problem.points, self._points, strict=True
@@ -138,8 +138,8 @@ class Given(_Change):
                 for moved, modulus in zip(problem.reduced.bodies, self._moduli, strict=True)
             ]
 
+    @override
     def renews(self, body: int | None, name: str) -> bool:
-        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         if body is None:
             return name == "moduli"
         return bool(self._changed[body] & OF_LAWS) and name.startswith("history ")
@@ -162,16 +162,16 @@ class Removal(_Change):
         self._body = problem.bodies[number]
         self._deletable = self._body.deletion is not None
 
+    @override
     def make(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         self._body.remove(self._cells)
 
+    @override
     def renews(self, body: int | None, name: str) -> bool:
-        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         return body == self._number and name in ("deleted", "kept")
 
+    @override
     def undo(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         super().undo()
         self._body.allow_deletion(self._deletable)
 
@@ -191,23 +191,23 @@ class Addition(_Change):
         self._bodies = as_bodies([*problem.bodies, given.particles])
         self._given = given
 
+    @override
     def make(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         problem, setup = self.problem, self.problem.setup
         given, bodies = (*setup.given, self._given), (*setup.bodies, self._given)
         problem.setup = replace(setup, given=given, bodies=bodies)
         problem.bodies = self._bodies
         problem.particles = list(self._bodies)
 
+    @override
     def settle(self) -> None:
-        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         stress = self._given.initial_stress
         if stress is not None:
             body, points = self._given.particles, self.problem.points[-1]
             points.begin_with(initial_stress_at_points(stress, body))
 
+    @override
     def renews(self, body: int | None, name: str) -> bool:
-        """See :class:`~mpm_dolfinx.problems.staging.Change`."""
         return body is None and name in ("moduli", "cuts", "fields units")
 
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, override
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -51,8 +51,9 @@ class Aggregation(Cure):
         dofs = self._V.dofmap.list[:own]
         self._positions = coordinates[dofs][:, :, : self._V.mesh.geometry.dim]
 
+    @override
     def unknowns(self, touched: TouchedNodes, held: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """See :meth:`Cure.unknowns`: not those that follow a well filled cell."""
+        """Return the unknowns, without dofs that follow a well filled cell."""
         cells, V = self._cells, self._V
         support = CellFill.of(self._bodies, cells)
         good = support.active & ~poorly_filled(support.fill)
@@ -133,14 +134,14 @@ class Aggregation(Cure):
         self._node, first = np.unique(node[order], return_index=True)
         self._value, self._root = value[order][first], root[order][first]
 
+    @override
     def followers(self, owned: int) -> NDArray[np.bool_]:
-        """See :meth:`Cure.followers`."""
         follows = np.zeros(owned, dtype=bool)
         follows.reshape(-1, self._V.dofmap.index_map_bs)[self._node] = True
         return follows
 
+    @override
     def extension(self, fixed: NDArray[np.bool_]) -> PETSc.Mat:
-        """See :meth:`Cure.extension`."""
         V = self._V
         bs = V.dofmap.index_map_bs
         start = V.dofmap.index_map.local_range[0]

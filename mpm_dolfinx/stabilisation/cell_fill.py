@@ -35,7 +35,7 @@ def poorly_filled(fill: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 class CellFill(NamedTuple):
-    """What the bodies do to the cells of the background that this rank owns.
+    """Fill of the cells of the background that this rank owns by the bodies.
 
     Attributes:
         fill: Volume of each body inside each cell over the cell's, shape ``(c, bodies)``.

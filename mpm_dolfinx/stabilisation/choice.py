@@ -25,7 +25,7 @@ STABILISATIONS = ("auto", "ghost", "aggregate")
 def stabilisation_of(
     kind: str | None, bodies: Sequence[Particles], background: bool = False
 ) -> Cure:
-    """Return what is done about badly supported dofs.
+    """Return the cure of badly supported dofs.
 
     Args:
         kind: ``"ghost"``, ``"aggregate"``, ``None`` (nothing) or ``"auto"``: a ghost penalty
@@ -46,7 +46,7 @@ def stabilisation_of(
 
 
 def joints_of(kind: str | None, bodies: Sequence[Particles]) -> Joints | None:
-    """Return what keeps the joints between bodies shut, by default with degree 1.
+    """Return the term that keeps joints between bodies shut, by default with degree 1.
 
     Args:
         kind: As for :func:`stabilisation_of`.

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What is done about background dofs that the bodies support badly: here, nothing."""
+"""Cures of background dofs that the bodies support badly: here, none."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Cure:
         return None
 
     def penalty(self, moduli: Sequence[float]) -> PETSc.Mat | None:
-        """Return what is added to the tangent on all dofs of V, and its product to the residual.
+        """Return an addition to the tangent on all dofs of V, its product one to the residual.
 
         Args:
             moduli: Shear modulus of each body.

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import override
 
 from petsc4py import PETSc
 
@@ -63,12 +64,13 @@ class GhostPenalty(Cure):
         return CellPolynomials(self._V)
 
     @property
+    @override
     def penalises(self) -> bool:
-        """See :class:`Cure`."""
         return self._acts
 
+    @override
     def unknowns(self, touched: TouchedNodes, held: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """See :meth:`Cure.unknowns`: also all dofs of cells that are tied together."""
+        """Return the unknowns, with all dofs of cells that are tied together."""
         active = touched.has_weight
         self._acts = over_ranks(self._V.mesh.comm, len(touched.active)) >= self._least
         if self._acts:
@@ -91,8 +93,8 @@ class GhostPenalty(Cure):
         self._marked = marked(self._V, cells.nodes[chosen])
         self._num_chosen: int = over_ranks(self._V.mesh.comm, len(chosen))
 
+    @override
     def penalty(self, moduli: Sequence[float]) -> PETSc.Mat | None:
-        """See :meth:`Cure.penalty`."""
         if not self._acts:
             return None
         chosen, cells, bs = self._chosen, self._cells, self._V.dofmap.index_map_bs
