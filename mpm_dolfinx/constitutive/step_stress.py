@@ -159,21 +159,43 @@ class _PressurePart:
         its = self._points.by_pressure - slope
         return np.where(self.pressed[:, None, None], its, 0.0)
 
+    def over_step(
+        self, before: _Volume, volume: _Volume, gradients: Gradients, share: float, conserving: bool
+    ) -> tuple[Array, Array, Array]:
+        """Return the factor of a pressure of the whole step in the stress, and derivatives.
+
+        Those are by F at the step's end, and that of all stress by the pressure.
+        """
+        turning, own, factor = (
+            self.turning(volume.slope),
+            self.by_pressure(volume.slope),
+            1.0 / share,
+        )
+        if not conserving:
+            slope = _between(share, before.slope, volume.slope) * factor
+            return slope, turning, slope + own
+        kind = np.where(self._small, 0, 2).astype(np.uint8)
+        ends = Ends(volume.slope, before.slope, turning, (volume.value, before.value), kind)
+        slope, tangent = mean(ends, gradients, factor)
+        if self.pressed.any():
+            own = factor * by_end(gradients, self._small) @ own
+        return slope, tangent, slope + own
+
 
 class _OfGroups:
     """The low-rank part of a tangent, from other points of a group.
 
     Args:
-        stress: Has the last evaluation.
+        last: Returns the last evaluation.
         groups: The groups of domains.
     """
 
-    def __init__(self, stress: StepStress, groups: Groups) -> None:
-        self._stress, self.groups = stress, groups
+    def __init__(self, last: Callable[[], _Evaluation], groups: Groups) -> None:
+        self._last, self.groups = last, groups
 
     def linearise(self) -> LowRankTerm:
         """See :class:`Linearised`."""
-        found = self._stress.low_rank
+        found = self._last().low_rank
         assert found is not None
         return found
 
@@ -267,17 +289,12 @@ class StepStress:
         return self._found.tangent
 
     @property
-    def low_rank(self) -> LowRankTerm | None:
-        """The part of the tangent from other points of a group, in the last update."""
-        return self._found.low_rank
-
-    @property
     def grouped(self) -> Linearised | None:
         """The low-rank part of the tangent, from a group's other points; ``None`` without F-bar."""
         averaging = self._points.averaging
         if averaging is None or not self._conserving:
             return averaging
-        return _OfGroups(self, averaging.groups)
+        return _OfGroups(lambda: self._found, averaging.groups)
 
     # -- The course of a step -------------------------------------------------------------
 
@@ -339,8 +356,9 @@ class StepStress:
             end = _Evaluation(own, tangent)
         if self._conserving:
             end = self._whole(end, gradients)
-        if part is not None:
-            slope, its, by = self._of_volume(part, volume, gradients)
+        if part is not None and begin.volume is not None:
+            way = gradients, self._share, self._conserving
+            slope, its, by = part.over_step(begin.volume, volume, *way)
             stress = end.stress + p[:, None, None] * slope
             tangent = end.tangent + p[:, None, None, None, None] * its
             end = _Evaluation(stress, tangent, own, slope, by, low_rank=end.low_rank)
@@ -366,30 +384,6 @@ class StepStress:
             return _Evaluation(*mean(ends, gradients, factor))
         stress, tangent, low_rank = mean_of_groups(averaging, ends, gradients, factor)
         return _Evaluation(stress, tangent, low_rank=low_rank)
-
-    def _of_volume(
-        self, part: _PressurePart, volume: _Volume, gradients: Gradients
-    ) -> tuple[Array, Array, Array]:
-        """Return the factor of a pressure of the whole step in the stress, and derivatives.
-
-        Those are by F at the step's end, and that of all stress by the pressure.
-        """
-        assert self._begin.volume is not None
-        before, turning = self._begin.volume, part.turning(volume.slope)
-        own, factor = part.by_pressure(volume.slope), 1.0 / self._share
-        if not self._conserving:
-            slope = self._between(before.slope, volume.slope) * factor
-            return slope, turning, slope + own
-        kind = np.where(self._small, 0, 2).astype(np.uint8)
-        ends = Ends(volume.slope, before.slope, turning, (volume.value, before.value), kind)
-        slope, tangent = mean(ends, gradients, factor)
-        if part.pressed.any():
-            own = factor * by_end(gradients, self._small) @ own
-        return slope, tangent, slope + own
-
-    def _between(self, before: Array, after: Array) -> Array:
-        """Return the mean over a step of values at its ends, by their weights."""
-        return (1.0 - self._share) * before + self._share * after
 
     def initial_modulus(self) -> Array:
         """Return :meth:`MaterialPoints.initial_modulus` (collective)."""
@@ -417,9 +411,9 @@ class StepStress:
             stress = whole = self._share * found.stress - viscous
         elif self._part is not None and found.own is not None and found.slope is not None:
             whole = self._share * self._part.pressure[:, None, None] * found.slope
-            stress = self._between(self._begin.stress, found.own) + whole
+            stress = _between(self._share, self._begin.stress, found.own) + whole
         else:
-            stress = self._between(self._begin.stress, points.first_piola)
+            stress = _between(self._share, self._begin.stress, points.first_piola)
         weights = points.weights.ravel()
         works = (
             float(weights @ np.einsum("niJ,niJ->n", np.broadcast_to(one, H.shape), H))
@@ -467,6 +461,11 @@ class StepStress:
         weights = self._points.weights.ravel()
         present = weights > 0.0
         return float(weights[present] @ self._begin.energy[present])
+
+
+def _between(share: float, before: Array, after: Array) -> Array:
+    """Return the mean over a step of values at its ends, by their weights."""
+    return (1.0 - share) * before + share * after
 
 
 def _gradient(points: MaterialPoints) -> Array:
