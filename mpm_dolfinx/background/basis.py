@@ -18,8 +18,8 @@ from .tiles import Tiles
 
 __all__ = ["BackgroundBasis", "PointBasis"]
 
-#: Distance in cells over which the cells beside a point are looked for.
-BESIDE = 0.1
+#: Distance in cells at which the cells beside a point are looked for.
+BESIDE = 0.25
 
 
 class PointBasis(NamedTuple):

@@ -68,7 +68,7 @@ class Aggregation(Cure):
         self._take(cells.nodes[lost], values, root.nodes[lost], distance, cells.index[lost])
         count = V.mesh.comm.allreduce(len(self._node)) * V.dofmap.index_map_bs
         self.counts = {"aggregated_dofs": count}
-        result = touched.has_weight | self._good
+        result = touched.has_weight | marked(V, self._root)
         result[self._node] = False
         return touched.on_dofs(result)
 

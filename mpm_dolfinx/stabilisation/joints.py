@@ -17,10 +17,10 @@ from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
 from ..transfer.touched import TouchedNodes
 
-__all__ = ["Joints"]
+__all__ = ["HARDLY", "Joints"]
 
 #: Largest weight of a background node below which next to nothing holds it.
-HARDLY = 1e-3
+HARDLY = 1e-2
 
 
 class Joints:
@@ -28,7 +28,7 @@ class Joints:
 
     Bodies on one background space stick to each other by the nodes that both touch. A node of a
     body that has just crossed a line of the grid has a small weight at nodes beyond it. Where no
-    other weight of theirs is as large as 1e-3 these move it at will: where it bears on another
+    other weight of theirs is as large as 0.01 these move it at will: where it bears on another
     body, it is let loose. Such a node of a body follows the cell beside its own that it lies next
     to, continued to it, of which all nodes are held better: rigid motions and uniform strains
     stay exact, and the background nodes that next to nothing held are no unknowns.

@@ -16,14 +16,15 @@ from ..errors import TRIAL_ERRORS, ConvergenceError, DomainDistortionError, MPME
 from ..history import Statistics
 from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
+from ..stabilisation.joints import HARDLY
 from ..system.field import Field, ValueField
 from ..system.reduced import ReducedSystem
 
 __all__ = ["count_folded", "crossed", "placed"]
 
 #: Share of the bodies' largest motion from which on it is that of a node of the background which is
-#: held by next to nothing, and the largest weight of such a node.
-ASTRAY, HARDLY = 0.5, 1e-2
+#: held by next to nothing.
+ASTRAY = 0.5
 #: How often a particle begins or ceases to yield, late in a solve, that flips to and fro.
 FLIPS = 2
 

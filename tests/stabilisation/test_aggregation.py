@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 import scenes
+from posed import posed
 from scenes import HEXAHEDRON, PLANE
 from stabilisation.slivers import look, polynomial, sliver, vector
 
@@ -62,3 +63,20 @@ def test_dofs_that_follow_others_are_no_unknowns_beside_a_background_form(stiffn
         assert abs(ends[1] / ends[0] - 1.0) < 1e-9
     else:
         assert 0.5 < ends[1] / ends[0] < 0.99
+
+
+@pytest.mark.parametrize("motion", [False, True])
+def test_a_filled_cell_beyond_the_reach_of_all_nodes_is_no_unknown(motion):
+    """Domains wider than cells fill cells with nodes that have no weight."""
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [8, 8], scenes.QUADRILATERAL))
+    body = scenes.box([0.0, 0.0], [1.41, 1.41], [2, 2], scenes.QUADRILATERAL)
+    given = {
+        "density": 2.0,
+        "body_force": (0.0, -10.0),
+        "bcs": [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)],
+        "stabilisation": "aggregate",
+    }
+    kind = mpm.DynamicProblem if motion else mpm.QuasiStaticProblem
+    problem = posed(kind, mpm.Particles(body, V), Hencky(1e3, 0.3), **given)
+    problem.solve(*((0.02, 0.01) if motion else (2,)))
+    assert problem.history.cutbacks == 0
