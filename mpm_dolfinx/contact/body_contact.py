@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, override
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -26,7 +26,7 @@ __all__ = ["ActingPoints", "BodyContact", "YieldBlocks"]
 
 
 class ActingPoints(NamedTuple):
-    """What a contact tells of the points that touch.
+    """Points of a contact that touch, and the tractions there.
 
     Attributes:
         facets: Numbers of their facets, shape ``(n,)``.
@@ -97,12 +97,14 @@ class BodyContact(Rigid):
         """
         raise MPMError("A contact of a RigidBody is moved by it; use move() of the RigidBody.")
 
+    @override
     def _turn(self, last: Pose, pose: Pose) -> float:
-        """See :class:`Rigid`; its vector of rotation in space tells no whole turns."""
+        """Return the turn in the step; a vector of rotation in space tells no whole turns."""
         return pose.least_turn_from(last)
 
+    @override
     def begin(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.begin`; where the rigid body goes is found out later."""
+        """Begin a step; where the rigid body goes is found later."""
         self._settle()
         self._surface.look_at_deleted()
         self._new_pattern()
@@ -125,8 +127,9 @@ class BodyContact(Rigid):
         self._pose = self._aim = pose
         self._trial = self._evaluated()
 
+    @override
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        """See :meth:`Term.tangents`: derivatives, as the rigid body's own are."""
+        """Return tangents by exact derivatives, as the rigid body's own are."""
         return self.derivatives()
 
     @property
@@ -221,7 +224,7 @@ class BodyContact(Rigid):
         return float(0.5 * self._surface.weights.ravel() @ (points.stiffness * pressed**2))
 
     def acting(self) -> ActingPoints:
-        """Return what there is at the points that touch."""
+        """Return the points that touch, with their tractions."""
         assert self._trial is not None
         trial, surface = self._trial, self._surface
         memory = self._known(trial)

@@ -1,12 +1,12 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What all contacts have in common: stiffness, what they remember, what they tell."""
+"""Common part of all contacts: stiffness, memory, output."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, override
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -32,7 +32,7 @@ LAWS = ("penalty", "nitsche")
 
 @dataclass(frozen=True)
 class Outcome:
-    """What acts on the points of a surface.
+    """Tractions at the points of a surface.
 
     Attributes:
         positions: Shape ``(m, nq, gdim)``.
@@ -85,22 +85,22 @@ class Contact(Term):
         """The contacts that it consists of: itself."""
         return (self,)
 
+    @override
     def come_after(self, gone: Sequence[Term]) -> None:
-        """See :meth:`Term.come_after`.
+        """Begin anew, but where points stuck to a contact that is gone.
 
-        It begins anew; but points of a contact that is gone which touch it in the same place stick
-        to it where they have stuck to that one.
+        Points of that contact which touch this one in the same place stick to it.
         """
         self._joins = True
         self._gone = [contact for term in gone for contact in getattr(term, "contacts", ())]
 
+    @override
     def take_part(
         self,
         number: int,
         bodies: Sequence[Particles],
         materials: Sequence[PointMaterial | None],
     ) -> None:
-        """See :meth:`Term.take_part`."""
         self._number, self._share, self._masses = number, 1.0, ()
         self._places = [
             next(i for i, body in enumerate(bodies) if body is mine) for mine in self.bodies
@@ -108,18 +108,19 @@ class Contact(Term):
         self._materials = [materials[place] for place in self._places]
 
     @property
+    @override
     def symmetric(self) -> bool:
-        """See :attr:`Term.symmetric`."""
         return self.friction.smooth and not self._of_step and not self._nitsche
 
     @property
+    @override
     def takes_stress(self) -> bool:
-        """See :attr:`Term.takes_stress`."""
         return self._nitsche
 
     @property
+    @override
     def one_sided(self) -> bool:
-        """See :attr:`Term.one_sided`: bodies may lift off."""
+        """Whether it can only press: bodies may lift off."""
         return True
 
     # -- In a motion ----------------------------------------------------------------------------
@@ -129,8 +130,9 @@ class Contact(Term):
         """Whether forces are those of whole steps of a motion."""
         return self._share < 1.0
 
+    @override
     def pace(self, dt: float, share: float) -> None:
-        """See :meth:`Term.pace`: where others take means of forces, contact has one of the step.
+        """Begin a step of a motion, of which contact has one force, where others take means.
 
         Raises:
             MPMError: The forces of the scheme are no ones of a step's end, where those of the
@@ -143,12 +145,12 @@ class Contact(Term):
             )
         self._share = share
 
+    @override
     def weigh(self, masses: Sequence[NDArray[np.float64]]) -> None:
-        """See :meth:`Term.weigh`."""
         self._masses = masses
 
     def _inertial(self, body: int, surface: Surface, dt: float) -> NDArray[np.float64]:
-        """Return what the mass behind facets adds to the stiffness in a step, shape ``(m,)``.
+        """Return the stiffness in a step from the mass behind facets, shape ``(m,)``.
 
         That is the density times the height over the square of the step, as the modulus is over the
         height. The stress behind a facet is not on it by as much as that mass is accelerated: held
@@ -162,12 +164,13 @@ class Contact(Term):
         behind = np.where(area > 0.0, mass / np.where(area > 0.0, area, 1.0), 0.0)
         return np.asarray(behind / (degree * dt) ** 2)
 
+    @override
     def end_forces(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.end_forces`."""
         return () if self._of_step else self.residuals()
 
+    @override
     def step_work(self) -> tuple[float, float]:
-        """See :meth:`Term.step_work`: that of friction counts as damping."""
+        """Return the work of the step, of which that of friction counts as damping."""
         if not self._of_step:
             return 0.0, 0.0
         normal, shear = self._comm.allreduce(np.array(self._works()))
@@ -190,24 +193,24 @@ class Contact(Term):
 
     # -- What is kept -------------------------------------------------------------------------
 
+    @override
     def kept(self) -> Sequence[Kept]:
-        """See :meth:`Term.kept`."""
         return [self.remembered(self.name or f"contact{self._number}")]
 
     def remembered(self, key: str) -> Kept:
-        """Return what it remembers, by the key that this has."""
+        """Return the memory of the contact, under the given key."""
         return _Anchors(self, key)
 
     def known_by(self) -> list[Any]:
-        """Return what tells it from other contacts in a checkpoint, in types that JSON has."""
+        """Return the identity of the contact in a checkpoint, in types that JSON has."""
         raise NotImplementedError
 
     def numbers(self) -> dict[str, Any]:
-        """Return what is kept besides columns; see :class:`Kept`."""
+        """Return the numbers kept besides columns; see :class:`Kept`."""
         return {}
 
     def columns(self, body: int | None) -> dict[str, Column]:
-        """Return what is kept on a body, by its number in the problem."""
+        """Return the columns kept on a body, by its number in the problem."""
         raise NotImplementedError
 
     def take(self, taken: Taken) -> None:
@@ -217,7 +220,7 @@ class Contact(Term):
     # -- What it tells, at the last converged step ---------------------------------------------
 
     def _outcome(self) -> tuple[Surface, Outcome]:
-        """Return what there was at the last converged step."""
+        """Return the outcome of the last converged step."""
         raise NotImplementedError
 
     @property
@@ -260,7 +263,7 @@ class Contact(Term):
 
     @property
     def friction_memory(self) -> NDArray[np.float64]:
-        """What the law of friction remembers at this rank's points, shape ``(n, k)``."""
+        """Memory of the law of friction at this rank's points, shape ``(n, k)``."""
         raise NotImplementedError
 
     @property
@@ -296,7 +299,7 @@ class Contact(Term):
 
 
 class _Anchors(Kept):
-    """What a contact remembers.
+    """Memory of a contact.
 
     Args:
         contact: The contact.
@@ -306,12 +309,12 @@ class _Anchors(Kept):
     def __init__(self, contact: Contact, key: str) -> None:
         self._contact, self.key = contact, key
 
+    @override
     def numbers(self) -> dict[str, Any]:
-        """See :class:`Kept`."""
         return self._contact.numbers() | {"known by": self._contact.known_by()}
 
+    @override
     def require(self, source: str, taken: Taken) -> None:
-        """See :class:`Kept`."""
         there, here = taken.numbers.get("known by"), self._contact.known_by()
         if there is not None and not same(there, here):
             raise MPMError(
@@ -320,12 +323,12 @@ class _Anchors(Kept):
             )
         super().require(source, taken)
 
+    @override
     def columns(self, body: int | None) -> dict[str, Column]:
-        """See :class:`Kept`."""
         return self._contact.columns(body)
 
+    @override
     def restore(self, taken: Taken) -> None:
-        """See :class:`Kept`."""
         self._contact.take(taken)
 
 

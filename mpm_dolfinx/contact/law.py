@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,7 +116,7 @@ class Friction:
         raise NotImplementedError
 
     def remember(self, at: Rubbing) -> Array:
-        """Return what points remember at the end of a step, shape ``(n, k)``.
+        """Return the memory of points at the end of a step, shape ``(n, k)``.
 
         Args:
             at: The points that touch then.
@@ -129,7 +129,7 @@ class Friction:
 
     @property
     def told(self) -> list[Any]:
-        """What ranks must agree on: the kind of the law, and its numbers."""
+        """Values that ranks must agree on: the kind of the law, and its numbers."""
         numbers = {k: v for k, v in vars(self).items() if isinstance(v, float | int)}
         return [type(self).__name__, *numbers.values()]
 
@@ -162,24 +162,24 @@ class Coulomb(Friction):
                 raise MPMError(f"{name} must be a number from 0 on, not {value!r}.")
 
     @property
+    @override
     def smooth(self) -> bool:
-        """See :class:`Friction`."""
         none = self.limit == 0.0 or (self.friction == 0.0 and self.cohesion == 0.0)
         return none and type(self).bound is Coulomb.bound
 
     @property
+    @override
     def by_area(self) -> bool:
-        """See :class:`Friction`."""
         known = type(self).bound is Coulomb.bound
         return not known or self.cohesion > 0.0 or bool(np.isfinite(self.limit))
 
+    @override
     def bound(self, at: Rubbing) -> Array:
-        """See :class:`Friction`."""
         p, stretch = map(np.ascontiguousarray, (at.pressure, at.stretch))
         return np.asarray(loops.coulomb(p, stretch, self.friction, self.cohesion, self.limit))
 
+    @override
     def shared(self, share: float) -> Friction:
-        """See :class:`Friction`."""
         if self.compiled:
             return Coulomb(self.friction, share * self.cohesion, share * self.limit)
         return super().shared(share)
@@ -197,29 +197,29 @@ class _Shared(Friction):
         self._whole, self._share, self.memory = whole, share, whole.memory
 
     @property
+    @override
     def smooth(self) -> bool:
-        """See :class:`Friction`."""
         return self._whole.smooth
 
     @property
+    @override
     def by_area(self) -> bool:
-        """See :class:`Friction`."""
         return self._whole.by_area
 
     @property
+    @override
     def told(self) -> list[Any]:
-        """See :class:`Friction`."""
         return self._whole.told
 
     def _wholly(self, at: Rubbing) -> Rubbing:
         return at._replace(pressure=at.pressure / self._share)
 
+    @override
     def bound(self, at: Rubbing) -> Array:
-        """See :class:`Friction`."""
         return self._share * self._whole.bound(self._wholly(at))
 
+    @override
     def remember(self, at: Rubbing) -> Array:
-        """See :class:`Friction`."""
         return self._whole.remember(self._wholly(at))
 
 
@@ -233,7 +233,7 @@ def as_friction(value: Any) -> Friction:
 
 
 def unworn(law: Friction, shape: tuple[int, ...]) -> Array:
-    """Return what a law of friction remembers of points that have touched nothing yet.
+    """Return the memory of a law of friction at points that have touched nothing yet.
 
     Args:
         law: The law.
@@ -305,7 +305,7 @@ class Separation(NamedTuple):
 
 
 class Traction(NamedTuple):
-    """What acts on points.
+    """Tractions at points.
 
     Attributes:
         pressure: Shape ``(n,)``.
@@ -355,7 +355,7 @@ class Slopes(NamedTuple):
 
 
 def traction(law: Friction, points: Points, at: Separation) -> Traction:
-    """Return what acts on points, where positions may have small imaginary parts.
+    """Return the tractions at points, where positions may have small imaginary parts.
 
     Args:
         law: The friction.
@@ -377,7 +377,7 @@ def slopes(law: Friction, points: Points, at: Separation) -> Slopes:
 def known(
     law: Friction, points: Points, touch: float, behind: Array | None, most: Array
 ) -> tuple[Any, ...]:
-    """Return what the compiled loops take of points and their friction.
+    """Return the arguments of the compiled loops for points and their friction.
 
     Args:
         law: The friction.
@@ -396,14 +396,14 @@ def known(
 
 
 def _given(at: Separation, kind: Any) -> list[NDArray[Any]]:
-    """Return what the compiled loops take of places, as numbers of some kind."""
+    """Return the arguments of the compiled loops for places, as numbers of some kind."""
     pressure = np.zeros(0) if at.pressure is None else at.pressure
     parts = (at.gap, at.normal, at.delta, pressure)
     return [np.ascontiguousarray(part, dtype=kind) for part in parts]
 
 
 def _acting(at: Separation, known: tuple[Any, ...]) -> Traction:
-    """Return what acts on points, by what the compiled loops take of them."""
+    """Return the tractions at points, by the arguments of the compiled loops."""
     kind: Any = np.complex128 if np.iscomplexobj(at.delta) else np.float64
     (n, dim) = at.normal.shape
     acts = Traction(np.zeros(n, kind), np.zeros((n, dim), kind), *np.zeros((2, n), dtype=bool))
@@ -438,7 +438,7 @@ def bounds(law: Friction, points: Points, at: Separation) -> Array:
 
 
 def remembered(law: Friction, points: Points, at: Separation) -> Array:
-    """Return what points remember at the end of a step: see :func:`traction`."""
+    """Return the memory of points at the end of a step: see :func:`traction`."""
     if not law.memory:
         return points.memory
     inside = traction(law, points, at).inside
@@ -503,7 +503,7 @@ def _along(at: Separation) -> Array:
 
 
 def secant_along(at: Separation, shear: Array) -> Array:
-    """Return what the secant of friction has along the shear of points that slip.
+    """Return the secant of friction along the shear of points that slip.
 
     That is the traction over the way from the anchor, of which :func:`slopes` have what is across
     the shear alone.

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What an obstacle knows of the points of a body: at a converged step, and at one that is tried."""
+"""Memory of an obstacle at the points of a body: of a converged step, and of a trial."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Memory:
-    """What is known of the last converged step.
+    """State of the points at the last converged step.
 
     Attributes:
         pose: Where the shape was.
@@ -98,7 +98,7 @@ class Memory:
         return here if self.facets is None else self.facets[here]
 
     def of(self, which: NDArray[np.int64]) -> Memory:
-        """Return what is known of some facets."""
+        """Return the memory of some facets."""
         outcome = Outcome(*(getattr(self.outcome, field.name)[which] for field in fields(Outcome)))
         return Memory(
             self.pose,

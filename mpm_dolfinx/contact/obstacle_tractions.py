@@ -135,7 +135,7 @@ class ObstacleTractions:
     # -- What acts on them ----------------------------------------------------------------------
 
     def evaluated(self, memory: Memory, x: NDArray[np.float64], pose: Pose) -> Memory:
-        """Return what acts on facets of which something is known.
+        """Return facets with the tractions that act on them, of which something is known.
 
         Args:
             memory: What is known of the last converged step.
@@ -222,7 +222,7 @@ class ObstacleTractions:
         y: NDArray[np.float64],
         gap: NDArray[np.float64],
     ) -> Step:
-        """Return what there is of a step to positions and gaps at all points."""
+        """Return the step to positions and gaps at all points."""
         before = memory.gap.ravel()
         x = memory.outcome.positions
         change = y - framed(self._shape, memory.pose, x).reshape(y.shape)
@@ -255,7 +255,7 @@ class ObstacleTractions:
         return Acting(here, inside, flat)
 
     def rotation(self, trial: Memory, memory: Memory) -> NDArray[np.float64]:
-        """Return what turns tractions out of the frame of the shape."""
+        """Return the rotations of tractions out of the frame of the shape."""
         return memory.pose.mean(trial.pose) if self.of_step else trial.pose.Q
 
     def derivative(
@@ -294,7 +294,7 @@ class ObstacleTractions:
     def secants(
         self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return what tangents have besides :meth:`derivative` where points change their slip.
+        """Return the part of tangents besides :meth:`derivative` where points change their slip.
 
         It notes how they slip, and is called on all ranks, also where nothing touches.
         """

@@ -51,7 +51,7 @@ OVERLAP = 0.1
 
 
 class Memory(NamedTuple):
-    """What a pass knows of the last converged step.
+    """State of a pass at the last converged step.
 
     Attributes:
         touched: Which points were in contact, shape ``(n,)``.
@@ -80,7 +80,7 @@ class Memory(NamedTuple):
     friction: NDArray[np.float64]
 
     def of(self, points: NDArray[np.int64]) -> Memory:
-        """Return what is known of some points."""
+        """Return the memory of some points."""
         parts: list[Any] = [part[points] for part in self]
         return Memory(*parts)
 
@@ -234,7 +234,7 @@ class Pass:
 
     @property
     def _last(self) -> Memory:
-        """What is known of the points that it looks at."""
+        """Memory of the points that it looks at."""
         assert self.memory is not None
         if self._known is None or self._known[0] is not self.memory:
             self._known = self.memory, self.memory.of(self._which)
@@ -270,13 +270,13 @@ class Pass:
         self.outcome = replace(untouched, gap=_spread(gap, self._facets, untouched.gap))
 
     def _untouched(self, x: NDArray[np.float64]) -> Outcome:
-        """Return what there is of all points, at x, to which nothing is near."""
+        """Return the outcome without contact, at x."""
         shape = len(self.source.cells), self.source.nq
         place, zero, none = x.reshape(*shape, x.shape[-1]), np.zeros(shape), np.zeros(shape, bool)
         return Outcome(place, np.full(shape, np.inf), zero, np.zeros_like(place), none, none)
 
     def _remembered(self, x: NDArray[np.float64], known: Memory) -> Memory:
-        """Return what is to be remembered of all points.
+        """Return the memory of all points.
 
         Args:
             x: Their positions.
@@ -584,7 +584,7 @@ class Pass:
     # -- The next step --------------------------------------------------------------------------
 
     def after(self) -> tuple[Memory, Outcome]:
-        """Return what is to be remembered of the last evaluation, if it is that of a step."""
+        """Return memory and outcome of the last evaluation, if it is that of a step."""
         near, last, found = self._near, self._last, self._paired
         assert near is not None and found is not None and self.stencil is not None
         trial, x, offset = self._trial, self._x, self._offset
@@ -733,7 +733,7 @@ def _numbers(near: NearFacets, facet: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _nothing(n: int, e: int) -> Closest:
-    """Return what there is of n points to which no facet is near."""
+    """Return the closest points of n points to which no facet is near."""
     facet, gap, place = np.full(n, -1, dtype=np.int64), np.full(n, np.inf), np.zeros((n, e))
     return Closest(facet, place, gap, np.zeros(n, dtype=bool), np.zeros(n))
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, override
 
 from petsc4py import PETSc
 
@@ -144,13 +144,13 @@ class Pair(Contact):
 
     # -- The term -------------------------------------------------------------------------------
 
+    @override
     def take_part(
         self,
         number: int,
         bodies: Sequence[Particles],
         materials: Sequence[PointMaterial | None],
     ) -> None:
-        """See :meth:`Term.take_part`."""
         super().take_part(number, bodies, materials)
         if self._nitsche:
             for material, _ in zip(self._materials, self._passes, strict=False):
@@ -212,8 +212,8 @@ class Pair(Contact):
         self._take_stress()
         self._new_pattern()
 
+    @override
     def pace(self, dt: float, share: float) -> None:
-        """See :meth:`Contact.pace`."""
         super().pace(dt, share)
         if self._nitsche:
             k = [
@@ -237,7 +237,7 @@ class Pair(Contact):
         self._begins = True
 
     def _shares(self) -> list[float]:
-        """Return what each pass bears (collective).
+        """Return the share of the load that each pass bears (collective).
 
         Points on facets of a size h see kinks of the other body's shape functions with an error of
         the order of h^2, so that the points of facets that are much finer bear more.
@@ -272,11 +272,9 @@ class Pair(Contact):
                         deep[0],
                     )
 
+    @override
     def begin(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.begin`.
-
-        What was evaluated last stays until the next evaluation: it may still be committed.
-        """
+        """Begin a step; the last evaluation stays until the next, and may still be committed."""
         self._settle()
         for surface in self._surfaces:
             surface.look_at_deleted()
@@ -294,8 +292,8 @@ class Pair(Contact):
         for each in self._passes:
             each.look()
 
+    @override
     def update(self) -> MPMError | None:
-        """See :meth:`Term.update`."""
         self._look()
         try:
             for each in self._passes:
@@ -306,12 +304,13 @@ class Pair(Contact):
             return error
         return None
 
+    @override
     def smooth(self) -> bool:
-        """See :meth:`Term.smooth`: contact is not."""
+        """Return false: contact is not smooth."""
         return not any(each.touches() for each in self._passes)
 
+    @override
     def residuals(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.residuals`."""
         if self._begins or any(each.stencil is None for each in self._passes):
             self._look()
             for each in self._passes:
@@ -325,13 +324,13 @@ class Pair(Contact):
             force.scale(-1.0 / self._share)
         return [first, second]
 
+    @override
     def _works(self) -> tuple[float, float]:
-        """See :meth:`Contact._works`."""
         normal, shear = np.sum([each.works for each in self._passes], axis=0)
         return float(normal), float(shear)
 
+    @override
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        """See :meth:`Term.tangents`."""
         if self._learned != [each.learned for each in self._passes]:
             self._new_pattern()
         groups = self._matrices.groups([each.met() for each in self._passes])
@@ -348,8 +347,9 @@ class Pair(Contact):
 
     # -- What it remembers ----------------------------------------------------------------------
 
+    @override
     def commit(self) -> Callable[[], None]:
-        """See :meth:`Term.commit`.
+        """Commit the step.
 
         Raises:
             ConvergenceError: One body has gone through the other.
@@ -372,7 +372,7 @@ class Pair(Contact):
         return undo
 
     def _outcome(self) -> tuple[Surface, Outcome]:
-        """Return what the points of a tell: with two passes they bear their share alone."""
+        """Return the outcome at the points of a: with two passes they bear their share alone."""
         if not self._made:
             raise MPMError("A contact belongs to no problem yet; give it as terms=[contact].")
         told, share = self._passes[0].outcome, self._passes[0].share
@@ -393,8 +393,9 @@ class Pair(Contact):
         return found
 
     @property
+    @override
     def friction_memory(self) -> NDArray[np.float64]:
-        """See :class:`Contact`: at the points of a."""
+        """Memory of the law of friction at the points of a."""
         self._outcome()
         memory = self._passes[0].memory
         assert memory is not None
@@ -411,8 +412,8 @@ class Pair(Contact):
         parts = self._forces()
         return self._moment([x for x, _ in parts], [force for _, force in parts], about)
 
+    @override
     def columns(self, body: int | None) -> dict[str, Column]:
-        """See :meth:`Contact.columns`."""
         if body is None or body not in self._places:
             return {}
         number = self._places.index(body)
@@ -432,8 +433,8 @@ class Pair(Contact):
             columns["traction"] = surface.column(outcome.traction)
         return columns
 
+    @override
     def take(self, taken: Taken) -> None:
-        """See :meth:`Contact.take`."""
         self._settle()
         every = [taken.columns[place] for place in self._places]
         self._take_over(every)
@@ -441,11 +442,11 @@ class Pair(Contact):
         for each, surface, columns in zip(self._passes, self._surfaces, every, strict=False):
             each.outcome = replace(each.after()[1], **_told(surface, columns))
 
+    @override
     def known_by(self) -> list[Any]:
-        """See :meth:`Contact.known_by`."""
         return [type(self).__name__, self._places, len(self._passes)]
 
 
 def _told(surface: Surface, columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Return what is known of what acted at the points of a surface."""
+    """Return the outcome at the points of a surface, from columns."""
     return {name: surface.of_column(columns[column]) for name, column in OUTCOME.items()}

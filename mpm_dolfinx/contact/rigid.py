@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, override
 
 from petsc4py import PETSc
 
@@ -205,13 +205,13 @@ class Rigid(Contact):
 
     # -- The term -------------------------------------------------------------------------------
 
+    @override
     def take_part(
         self,
         number: int,
         bodies: Sequence[Particles],
         materials: Sequence[PointMaterial | None],
     ) -> None:
-        """See :meth:`Term.take_part`."""
         super().take_part(number, bodies, materials)
         if self._nitsche:
             require_stress(self._materials[0], "a Rigid")
@@ -227,8 +227,8 @@ class Rigid(Contact):
             self._require_apart(self._memory)
             self._joins, self._gone = False, []
 
+    @override
     def pace(self, dt: float, share: float) -> None:
-        """See :meth:`Contact.pace`."""
         super().pace(dt, share)
         self._tractions.of_step = self._of_step
         self._tractions.inertial = self._inertial(0, self._surface, dt)
@@ -311,8 +311,8 @@ class Rigid(Contact):
                     index,
                 )
 
+    @override
     def begin(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.begin`."""
         self._settle()
         self._surface.look_at_deleted()
         assert self._memory is not None
@@ -345,8 +345,8 @@ class Rigid(Contact):
         self._reach.forget()
         self._tractions.forget_stretch()
 
+    @override
     def update(self) -> MPMError | None:
-        """See :meth:`Term.update`."""
         try:
             self._trial = self._evaluated()
         except MPMError as error:
@@ -354,7 +354,7 @@ class Rigid(Contact):
         return None
 
     def _evaluated(self, whole: bool = False) -> Memory:
-        """Return what acts at the present positions.
+        """Return the memory with tractions at the present positions.
 
         Args:
             whole: Whether to look at facets as well that are too far to touch.
@@ -369,37 +369,39 @@ class Rigid(Contact):
         return self._tractions.evaluated(near, self._reach.positions(near.facets), self._pose)
 
     def _known(self, trial: Memory) -> Memory:
-        """Return what was known of the facets that were looked at in a trial."""
+        """Return the memory of the facets that were looked at in a trial."""
         assert self._memory is not None
         return self._reach.known(trial, self._memory)
 
+    @override
     def _works(self) -> tuple[float, float]:
-        """See :meth:`Contact._works`."""
         assert self._trial is not None
         return self._trial.works
 
+    @override
     def smooth(self) -> bool:
-        """See :meth:`Term.smooth`: contact is not."""
+        """Return false: contact is not smooth."""
         assert self._trial is not None and self._memory is not None
         return not bool(self._trial.touched.any() or self._memory.touched.any())
 
+    @override
     def drives(self) -> bool:
-        """See :meth:`Term.drives`."""
         assert self._memory is not None
         return not self._pose.same_as(self._memory.pose) and not self.smooth()
 
+    @override
     def residuals(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.residuals`."""
         assert self._trial is not None
         trial = self._trial
         return [self._surface.force(trial.outcome.traction, -1.0 / self._share, trial.facets)]
 
+    @override
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        """See :meth:`Term.tangents`; points that change their slip have secants."""
+        """Return tangents, with secants where points change their slip."""
         return self._tangents(not self.friction.smooth)
 
+    @override
     def derivatives(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        """See :meth:`Term.derivatives`."""
         return self._tangents(False)
 
     def _tangents(self, secants: bool) -> Mapping[tuple[int, int], PETSc.Mat]:
@@ -435,8 +437,9 @@ class Rigid(Contact):
 
     # -- What it remembers ------------------------------------------------------------------------
 
+    @override
     def commit(self) -> Callable[[], None]:
-        """See :meth:`Term.commit`.
+        """Commit the step.
 
         Raises:
             ConvergenceError: The body has gone through the obstacle.
@@ -482,7 +485,7 @@ class Rigid(Contact):
         return pose.turn_from(last)
 
     def _exact(self, memory: Memory, which: NDArray[np.int64] | None = None) -> Memory:
-        """Return what is known with the gaps of all points of some facets, or of all facets."""
+        """Return the memory with the gaps of all points of some facets, or of all facets."""
         chosen = slice(None) if which is None else which
         x = memory.outcome.positions[chosen]
         phi, n = self.shape.distance(framed(self.shape, memory.pose, x).reshape(-1, x.shape[2]))
@@ -492,8 +495,8 @@ class Rigid(Contact):
         return replace(memory, gap=gap, normal=normal, outcome=outcome, exact=which is None)
 
     @property
+    @override
     def gap(self) -> NDArray[np.float64]:
-        """See :class:`Contact`."""
         self._outcome()
         assert self._memory is not None
         if not self._memory.exact:
@@ -501,14 +504,14 @@ class Rigid(Contact):
         return super().gap
 
     @property
+    @override
     def friction_memory(self) -> NDArray[np.float64]:
-        """See :class:`Contact`."""
         self._outcome()
         assert self._memory is not None
         return self._tractions.points(self._memory).memory
 
+    @override
     def roll_back(self) -> None:
-        """See :meth:`Term.roll_back`."""
         assert self._memory is not None
         self._trial = self._memory
         self._pose = self._memory.pose
@@ -520,7 +523,7 @@ class Rigid(Contact):
         return self._surface, self._memory.outcome
 
     def columns(self, body: int | None) -> dict[str, Column]:
-        """Return what is kept on a body, by its number in the problem."""
+        """Return the columns kept on a body, by its number in the problem."""
         if body is None or body != self._places[0]:
             return {}
         assert self._memory is not None
@@ -548,8 +551,8 @@ class Rigid(Contact):
             "aim": [aim.offset.tolist(), aim.angle.tolist()],
         }
 
+    @override
     def known_by(self) -> list[Any]:
-        """See :meth:`Contact.known_by`."""
         pivot = self.shape.pivot
         depth = float(self.shape.distance(pivot[None])[0][0])
         kind = type(self.shape).__name__.strip("_")

@@ -19,7 +19,7 @@ rest, which is of the rank of their number, and dense in the unknowns near the c
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, override
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -352,8 +352,9 @@ class RigidBody(Term):
         onto[np.ix_(free, free)] = scale[:, None] * (U[:, kept] @ U[:, kept].T) / scale
         return inverse, onto
 
+    @override
     def update(self) -> MPMError | None:
-        """See :meth:`Term.update`: find where the body is for what the others have."""
+        """Find where the body is for what the others have."""
         for contact in self.contacts:
             contact.look()
         starts = [self._motion.guess(self._memory, self._aim)]
@@ -507,18 +508,19 @@ class RigidBody(Term):
 
     # -- The term -------------------------------------------------------------------------------
 
+    @override
     def come_after(self, gone: Sequence[Term]) -> None:
-        """See :meth:`Term.come_after`: it is and moves as before, points begin anew."""
+        """Keep place and motion of the body of before; points begin anew."""
         for contact in self.contacts:
             contact.come_after(gone)
 
+    @override
     def take_part(
         self,
         number: int,
         bodies: Sequence[Particles],
         materials: Sequence[PointMaterial | None],
     ) -> None:
-        """See :meth:`Term.take_part`."""
         self._number, self._share = number, 1.0
         self._motion.dt, self._motion.whole = None, False
         for contact in self.contacts:
@@ -529,8 +531,9 @@ class RigidBody(Term):
             self._lever = gyration
         self._begins = True
 
+    @override
     def pace(self, dt: float, share: float) -> None:
-        """See :meth:`Term.pace`.
+        """Begin a step of a motion.
 
         Raises:
             MPMError: It has no mass.
@@ -547,8 +550,9 @@ class RigidBody(Term):
         for contact in self.contacts:
             contact.pace(dt, share)
 
+    @override
     def begin(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.begin`.
+        """Begin a step.
 
         Raises:
             ConvergenceError: It is to turn by half a turn or more, which no Cayley vector tells.
@@ -572,12 +576,13 @@ class RigidBody(Term):
         self._condensed = Yielding(self.bodies, len(self._held))
         return ()
 
+    @override
     def end_forces(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.end_forces`."""
         return () if self._share < 1.0 else self.residuals()
 
+    @override
     def step_work(self) -> tuple[float, float]:
-        """See :meth:`Term.step_work`: what it has taken up counts as internal."""
+        """Return the work of the step; the energy taken up counts as internal."""
         if self._share == 1.0:
             return 0.0, 0.0
         u, theta = np.split(self._found, [self.shape.dim])
@@ -590,16 +595,18 @@ class RigidBody(Term):
         taken_up, damped = self._comm.allreduce(own)
         return float(taken_up), float(damped)
 
+    @override
     def smooth(self) -> bool:
-        """See :meth:`Term.smooth`: contact is not."""
+        """Return false: contact is not smooth."""
         return all([contact.smooth() for contact in self.contacts])
 
+    @override
     def residuals(self) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.residuals`."""
         return [force for contact in self.contacts for force in contact.residuals()]
 
+    @override
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        """See :meth:`Term.tangents`: those of an obstacle at rest."""
+        """Return the tangents of an obstacle at rest."""
         found = {}
         for place, contact in enumerate(self.contacts):
             for K in contact.tangents().values():
@@ -614,18 +621,19 @@ class RigidBody(Term):
         assert self._condensed is not None
         self._condensed.set(self._found, inverse, parts, self._share)
 
+    @override
     def reduced_tangents(self, transfer: Transfer) -> Sequence[PETSc.Mat]:
-        """See :meth:`Term.reduced_tangents`: what it adds by yielding, for the last tangents."""
+        """Return the part of the last tangents by yielding."""
         assert self._condensed is not None
         return self._condensed.reduced([transfer(body) for body in self.bodies])
 
+    @override
     def reduced_product(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.reduced_product`."""
         assert self._condensed is not None
         return self._condensed.times(motions)
 
+    @override
     def stiffness_force(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
-        """See :meth:`Term.stiffness_force`."""
         forces = [motion.duplicate() for motion in motions]
         for force in forces:
             force.set(0.0)
@@ -635,8 +643,9 @@ class RigidBody(Term):
             force.axpy(1.0, more)
         return forces
 
+    @override
     def commit(self) -> Callable[[], None]:
-        """See :meth:`Term.commit`.
+        """Commit the step.
 
         Raises:
             ConvergenceError: It turns too far for the scheme, or a contact is refused.
@@ -664,8 +673,8 @@ class RigidBody(Term):
         self._memory = self._trial
         return undo
 
+    @override
     def roll_back(self) -> None:
-        """See :meth:`Term.roll_back`."""
         for contact in self.contacts:
             contact.roll_back()
         self._trial = self._memory
@@ -680,8 +689,8 @@ class RigidBody(Term):
 
     # -- What is kept ---------------------------------------------------------------------------
 
+    @override
     def kept(self) -> Sequence[Kept]:
-        """See :meth:`Term.kept`."""
         of_contacts = self.name or f"contact{self._number}"
         return [
             *(one.remembered(f"{of_contacts}_{i}") for i, one in enumerate(self.contacts)),
@@ -720,10 +729,10 @@ class _KeptMotion(Kept):
     def __init__(self, body: RigidBody, key: str) -> None:
         self._body, self.key = body, key
 
+    @override
     def numbers(self) -> dict[str, Any]:
-        """See :class:`Kept`."""
         return self._body.numbers()
 
+    @override
     def restore(self, taken: Taken) -> None:
-        """See :class:`Kept`."""
         self._body.take(taken)

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What acts between a point and a facet of another body, and its derivative.
+"""Contact between a point and a facet of another body, and its derivative.
 
 A point is projected on the facet; the gap gives the pressure, the way from the anchor the shear.
 What acts on the point acts the other way on the facet's nodes, as if the point were fixed to the
@@ -62,7 +62,7 @@ class Start(NamedTuple):
 
 
 class Stencil(NamedTuple):
-    """What the tractions at some points depend on.
+    """Quantities that the tractions at some points depend on.
 
     Attributes:
         which: The points.
@@ -126,7 +126,7 @@ class Foot(NamedTuple):
 
 
 class Acting(NamedTuple):
-    """What acts on points and on nodes of their facets.
+    """Tractions at points, and forces on nodes of their facets.
 
     Attributes:
         pushes: Tractions by pressure on points and nodes, shape ``(n, 1 + k, gdim)``.
@@ -173,7 +173,7 @@ def _gradient(foot: Foot) -> NDArray[Any]:
 def over_step(
     law: Friction, stencil: Stencil, z: NDArray[Any], touch: float, extent: float
 ) -> Acting:
-    """Return what acts on the points and on nodes of their facets in a step of a motion.
+    """Return tractions at points and forces on nodes of their facets in a step of a motion.
 
     Args:
         law: Friction.
@@ -219,7 +219,7 @@ def _seen(
 
 
 def _rubs(foot: Foot, shear: NDArray[Any]) -> NDArray[Any]:
-    """Return what shear does to points and to nodes of their facets, ``(n, 1 + k, i)``."""
+    """Return the effect of shear on points and nodes of their facets, ``(n, 1 + k, i)``."""
     # the arm g n turns with the facet
     A = foot.along
     along = solved(A @ A.swapaxes(1, 2), np.einsum("nei,ni->ne", A, shear))
@@ -247,7 +247,7 @@ def by_stress(law: Friction, stencil: Stencil, touch: float) -> tuple[Array, Arr
 
 
 def remembered(law: Friction, stencil: Stencil, touch: float, extent: float) -> Array:
-    """Return what the law remembers of points at the end of a step, shape ``(n, k)``.
+    """Return the memory of the law at points at the end of a step, shape ``(n, k)``.
 
     Args:
         law: Friction.
@@ -263,7 +263,7 @@ def remembered(law: Friction, stencil: Stencil, touch: float, extent: float) -> 
 
 
 def _compiled_arguments(law: Friction, stencil: Stencil, touch: float) -> tuple[Any, ...]:
-    """Return what the compiled loops take."""
+    """Return the arguments of the compiled loops."""
     most = np.zeros(0)
     if not law.compiled:
         most = bounds(law, stencil.points, _seen(law, stencil, stencil.x, touch)[1])
@@ -276,7 +276,7 @@ def _compiled_arguments(law: Friction, stencil: Stencil, touch: float) -> tuple[
 
 
 def acting(law: Friction, stencil: Stencil, touch: float, extent: float) -> Acting:
-    """Return what acts on the points and on nodes of their facets, at the stencil's positions.
+    """Return tractions and forces on nodes of the points' facets, at the stencil's positions.
 
     Args:
         law: Friction.
