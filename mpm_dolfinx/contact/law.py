@@ -45,7 +45,7 @@ STEP = 6e-6
 #: Most iterations for the slip of a user's law, and its error over the bound.
 ITERATIONS, ERROR = 60, 1e-12
 #: Least length over which a user's law is varied, over the round-off of positions.
-LENGTH = 1e6
+LENGTH = 1e8
 
 
 type Array = NDArray[np.float64]

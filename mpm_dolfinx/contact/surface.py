@@ -42,7 +42,7 @@ MOST = 100
 SIMPLICES = (basix.CellType.triangle, basix.CellType.tetrahedron)
 
 #: Position, relative to the coordinates of a body, at which a point touches: their round-off.
-TOUCH = 1e-12
+TOUCH = 1e-14
 
 
 class Facets:
@@ -197,9 +197,12 @@ class Surface:
         self._distinct, places = np.unique(self.nodes, return_inverse=True)
         self.own = places.reshape(self.nodes.shape)
         self._own_mesh = x[self._distinct]
-        edges = np.einsum("jqk,mki->mqij", self.slopes, x[self.nodes])
-        area = np.sqrt(np.linalg.det(edges.swapaxes(2, 3) @ edges)) * weights
-        self._plain = self._in_mesh = area
+        origin = self.particles.origin
+        X = x if origin is None else origin.x.array.reshape(-1, self.gdim)
+        edges, undeformed = (np.einsum("jqk,mki->mqij", self.slopes, y[self.nodes]) for y in (x, X))
+        self._in_mesh, self._plain = (
+            np.linalg.norm(normals(part), axis=2) * weights for part in (edges, undeformed)
+        )
         self._edges, self._places = edges, []
         for side in range(count):
             at = corners[sides[side]]
@@ -210,14 +213,12 @@ class Surface:
         self.outward = np.where(((centre - middle) * n).sum(axis=1) < 0.0, -1.0, 1.0)
         self.narrowing = self.gdim if cell in SIMPLICES else 1
         self.thickness = (
-            self.narrowing * self.particles.initial_volume[self.cells] / area.sum(axis=1)
+            self.narrowing * self.particles.initial_volume[self.cells] / self._plain.sum(axis=1)
         )
         extent = float(np.abs(self.particles.initial_domains).max(initial=0.0))
         self.extent = float(body.comm.allreduce(extent, MPI.MAX))
-        self._around = np.ones_like(area)
+        self._around = np.ones_like(self._plain)
         if self.axisymmetric:
-            origin = self.particles.origin
-            X = x if origin is None else origin.x.array.reshape(-1, self.gdim)
             self._around = 2.0 * np.pi * (self.shapes @ X[self.nodes])[:, :, 0]
         self.look_at_deleted()
         return True

@@ -62,6 +62,23 @@ def above(particles):
     return contact.Rigid(particles, contact.plane((1.5, 1.02), (0.0, -1.0)))
 
 
+@pytest.mark.parametrize("axisymmetric", [False, True])
+def test_a_new_contact_knows_the_undeformed_areas_of_a_body_that_was_rebased(axisymmetric):
+    particles, base = soil()
+    options = {"axisymmetric": axisymmetric}
+    disc = contact.Rigid(particles, contact.disc(CENTRE, RADIUS), **options)
+    problem = mpm.QuasiStaticProblem(
+        particles, Hencky(100.0, 0.3), bcs=base, terms=[disc], **options
+    )
+    problem.solve(3, update=lambda t: disc.move((0.0, -0.1 * t)))
+    problem.rebase()
+    new = contact.Rigid(problem.particles, contact.disc((9.0, 9.0), 0.1), **options)
+    problem.stage(terms=[disc, new])
+    np.testing.assert_allclose(new.area, disc.area, rtol=1e-9)
+    stiffness = [one.remembered("a").columns(0)["thickness"].values for one in (new, disc)]
+    np.testing.assert_allclose(*stiffness, rtol=1e-9)
+
+
 def test_a_new_contact_begins_where_it_was_made():
     problem, (disc,) = pressed()
     press(problem, [disc])

@@ -506,15 +506,9 @@ def compare(scene, frames):
     assert not wrong, wrong
 
 
-#: What differs in coordinates of a map by more than :data:`MAP`: points touch a round obstacle to
-#: 1e-12 of coordinates, which is 5e-6 there (1.4e-5 of the stress).
-COARSE = {"Rigid, disc"}
-
-
 @pytest.mark.parametrize("name", all_but(QUICK, SCENES))
 def test_a_feature_in_other_frames_and_units(name):
-    left = {"map"} if name in COARSE else set()
-    compare(SCENES[name], {key: FRAMES[key] for key in FRAMES if key not in left})
+    compare(SCENES[name], FRAMES)
 
 
 @pytest.mark.parametrize("name", all_but(("cpdi2",), ROUND))
