@@ -68,7 +68,7 @@ def test_a_new_contact_knows_the_undeformed_areas_of_a_body_that_was_rebased(axi
     options = {"axisymmetric": axisymmetric}
     disc = contact.Rigid(particles, contact.disc(CENTRE, RADIUS), **options)
     problem = mpm.QuasiStaticProblem(
-        particles, Hencky(100.0, 0.3), bcs=base, terms=[disc], **options
+        mpm.Body(particles, Hencky(100.0, 0.3)), bcs=base, terms=[disc], **options
     )
     problem.solve(3, update=lambda t: disc.move((0.0, -0.1 * t)))
     problem.rebase()
