@@ -19,8 +19,6 @@ from .. import _compat
 
 __all__ = ["box_weights", "cell_lines", "coarser", "grid_lines"]
 
-#: Grid points for each vertex of a background up to which its vertices are taken for a grid's.
-GRID = 4.0
 #: Slabs across a background in which the size of its cells is looked at.
 SLABS = 256
 #: Share of the whole within which coordinates are the same.
@@ -58,7 +56,8 @@ def grid_lines(V: fem.FunctionSpace) -> list[NDArray[np.float64]] | None:
     """
     x = _vertices(V)
     comm: MPI.Comm = V.mesh.comm
-    most = GRID * V.mesh.topology.index_map(0).size_global
+    # a background with four times as many grid points as vertices is no grid
+    most = 4.0 * V.mesh.topology.index_map(0).size_global
     lines = []
     for axis in range(V.mesh.geometry.dim):
         parts = comm.allgather(_distinct(x[:, :, axis].ravel()))

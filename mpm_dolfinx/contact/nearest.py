@@ -19,8 +19,6 @@ __all__ = ["FacetTree", "Nearest"]
 
 #: Boxes in a box of the next level, and points that are looked at together.
 ARITY, AT_ONCE = 4, 2048
-#: Most numbers of points for which the facets that were found are kept.
-MOST_HINTS = 4
 #: Relative difference of squared distances below which they are equal, and distance, relative to
 #: coordinates, below which it is nothing.
 EQUAL, NOTHING = 1e-12, 1e-15
@@ -92,7 +90,7 @@ class FacetTree:
             here = slice(i, i + AT_ONCE)
             parts.append(self._find(points[here], None if hints is None else hints[here]))
         facet = np.concatenate(parts)
-        if len(self._hints) >= MOST_HINTS:
+        if len(self._hints) >= 4:  # sets of points for which facets are kept
             self._hints.clear()
         self._hints[len(points)] = facet
         _, corner, edge = self._places(points, facet)

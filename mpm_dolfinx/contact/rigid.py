@@ -45,8 +45,6 @@ OVERLAP = 0.1
 MOST_TURN = 0.5 * np.pi
 #: Difference of normals, and of gaps over the body's coordinates, of obstacles in the same place.
 SAME = 1e-10
-#: Most points of each rank at which the shapes of ranks are compared.
-LOOKED_AT = 16
 
 
 class Rigid(Contact):
@@ -238,7 +236,8 @@ class Rigid(Contact):
         if self._comm.size == 1:
             return
         x = self._surface.positions(converged=True).reshape(-1, self.shape.dim)
-        places = np.concatenate(self._comm.allgather(x[:: 1 + len(x) // LOOKED_AT]))
+        # at most 16 points of each rank
+        places = np.concatenate(self._comm.allgather(x[:: 1 + len(x) // 16]))
         with agree(self._comm):
             distances = self.shape.distance(framed(self.shape, self._pose, places))[0]
         told = distances.astype(np.float32).tolist()

@@ -35,8 +35,6 @@ __all__ = [
     "sizes_of",
 ]
 
-#: Highest degree of a rule on a facet: 51 points each way.
-MOST = 100
 
 #: Cells that narrow to a point over each of their facets.
 SIMPLICES = (basix.CellType.triangle, basix.CellType.tetrahedron)
@@ -155,7 +153,7 @@ class Surface:
     ) -> None:
         if degree is None:
             degree = 2 * int(particles.W.ufl_element().degree) + 1
-        require_degree(f"quadrature_degree of {what}", degree, MOST)
+        require_degree(f"quadrature_degree of {what}", degree, 100)  # 51 points each way
         self.particles = particles
         self.axisymmetric = axisymmetric
         self._where = Facets(particles, facet_tags, tag, what)

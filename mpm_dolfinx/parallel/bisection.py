@@ -13,8 +13,6 @@ __all__ = ["bisect"]
 
 #: Places at which a cut is tried at once.
 BINS = 64
-#: Slope of the cuts, so that points in line on a grid lie on either side of one.
-SLOPE = 1e-3
 
 
 def bisect(comm: MPI.Comm, points: NDArray[np.float64], parts: int) -> NDArray[np.int64]:
@@ -72,7 +70,8 @@ def _beyond_cut(
     comm.Allreduce(MPI.IN_PLACE, low, MPI.MIN)
     comm.Allreduce(MPI.IN_PLACE, high, MPI.MAX)
     edges = np.maximum(high - low, 0.0)
-    normal = np.tile(SLOPE * 0.7 ** np.arange(gdim), (m, 1))
+    # inclined, so that points in line on a grid lie on either side of a cut
+    normal = np.tile(1e-3 * 0.7 ** np.arange(gdim), (m, 1))
     every = np.arange(m)
     normal[every, edges.argmax(axis=1)] = 1.0
     place = np.einsum("ni,ni->n", points - low[group], normal[group])

@@ -26,8 +26,6 @@ __all__ = ["require_degree", "require_same", "require_truth"]
 
 #: What describes a law besides its parameters.
 KINDS = ("symmetric", "kinematics", "inelastic")
-#: A description longer than this is told by its hash.
-LONG = 60
 
 
 def require_same(comm: MPI.Comm, **given: Any) -> None:
@@ -153,6 +151,6 @@ def _shown(value: Any) -> str:
         return str(value)
     array = np.asarray(value)
     shown = str(array.tolist() if array.dtype.kind == "b" else (array + 0.0).tolist())
-    if len(shown) <= LONG:
+    if len(shown) <= 60:  # what is longer is told by its hash
         return shown
     return f"an array of shape {array.shape} ({hashlib.sha256(shown.encode()).hexdigest()[:8]})"

@@ -35,8 +35,6 @@ __all__ = [
 ]
 
 DEGREES = (1, 2, 3)
-#: Highest degree of the rule that carries the history: 16 points each way.
-HIGHEST = 30
 #: Curved cells looked at together.
 BLOCK = 1 << 14
 
@@ -172,7 +170,7 @@ def validate_options(
             "of degree 1; use 'cpdi2' for others."
         )
     if quadrature_degree is not None:
-        require_degree("quadrature_degree", quadrature_degree, HIGHEST)
+        require_degree("quadrature_degree", quadrature_degree, 30)  # 16 points each way
     if quadrature_degree is not None and degree > 1 and quadrature_degree < 2 * degree - 2:
         raise MPMError(
             f"A rule of degree {quadrature_degree} does not see all strains of a domain of degree "

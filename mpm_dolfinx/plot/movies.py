@@ -22,9 +22,6 @@ from .scenes import Look, Shot, corners, draw, framed, new_figure, take
 
 __all__ = ["movie"]
 
-#: Milliseconds that the last frame stays.
-LAST = 1500
-
 
 def movie(
     problem: Any,
@@ -131,7 +128,7 @@ def _write(
     still = [
         image.fromarray(p).quantize(palette=palette, dither=image.Dither.NONE) for p in pictures
     ]
-    times = [round(1000.0 / fps)] * (len(still) - 1) + [LAST]
+    times = [round(1000.0 / fps)] * (len(still) - 1) + [1500]  # ms, the last one stays
     still[0].save(path, save_all=True, append_images=still[1:], duration=times, loop=0)
 
 

@@ -24,10 +24,6 @@ from ..reals import as_reals
 __all__ = ["background", "domains", "edges", "grid", "imported", "outlines", "surface_algorithm"]
 
 
-#: Straight pieces that an edge is drawn with where it is curved.
-PIECES = 8
-
-
 def domains(
     particles: Particles,
     values: ArrayLike | None = None,
@@ -199,7 +195,7 @@ def outlines(particles: Particles, warp: float) -> NDArray[np.float64]:
     cell = particles.mesh.basix_cell()
     corners = basix.geometry(cell)[_compat.vtk_cell(cell, 1, 0)[1]]
     shape_functions = particles.W.ufl_element().basix_element
-    pieces = 1 if shape_functions.degree == 1 else PIECES
+    pieces = 1 if shape_functions.degree == 1 else 8  # straight ones of a curved edge
     share = np.arange(pieces)[:, None] / pieces
     points = np.concatenate(
         [

@@ -25,12 +25,8 @@ __all__ = ["Look", "Shot", "corners", "draw", "framed", "new_figure", "scene", "
 
 #: Room around the bodies, relative to their extent, and pixels of the longer side in space.
 MARGIN, PIXELS = 0.04, 1500
-#: Size of a background in space over that of what is shown, up to which its box is drawn.
-ROOMY = 2.0
 #: Height over width of what is shown, below which the colour bar lies beneath it.
 FLAT = 0.4
-#: Radius of the marks of contact points in points.
-MARK = 3.0
 #: Colour of obstacles; in the plane and in space, how far they are shown around the bodies, over
 #: the extent of these, and samples of their distance along the longest side.
 OBSTACLE = "#b9b2a6"
@@ -187,7 +183,7 @@ def corners(box: Any, gdim: int) -> NDArray[np.float64] | None:
 def framed(extent: NDArray[np.float64], around: NDArray[np.float64] | None) -> NDArray[np.float64]:
     """Return a box with some room around the bodies, and in space around a background near them."""
     if around is not None and extent.shape[1] == 3:
-        if np.ptp(around, axis=0).max() <= ROOMY * np.ptp(extent, axis=0).max():
+        if np.ptp(around, axis=0).max() <= 2.0 * np.ptp(extent, axis=0).max():
             extent = np.array([np.minimum(extent[0], around[0]), np.maximum(extent[1], around[1])])
     room = MARGIN * float((extent[1] - extent[0]).max())
     return np.array([extent[0] - room, extent[1] + room])
@@ -384,7 +380,7 @@ def _draw_plane(shot: Shot, look: Look, limits: tuple[float, float], ax: Any) ->
         ax.add_collection(collections.PolyCollection(polygons, facecolors=filled, **style))
     if shot.marks is not None:
         points, pressures = shot.marks
-        ax.scatter(*points.T, s=MARK**2, c=colours.to_rgba(pressures), zorder=3)
+        ax.scatter(*points.T, s=9.0, c=colours.to_rgba(pressures), zorder=3)
     low, high = framed(shot.extent, shot.around) if look.box is None else look.box
     for obstacle in shot.obstacles:
         (x, y), phi = _sampled(obstacle, low, high)
@@ -451,7 +447,7 @@ def _rendered(shot: Shot, look: Look, limits: tuple[float, float]) -> NDArray[np
             for data in (body.point_data, body.cell_data):
                 for name in [n for n in data.keys() if n != "shown"]:
                     del data[name]
-            linear = int(body.celltypes.max(initial=0)) < LAGRANGE
+            linear = int(body.celltypes.max(initial=0)) < 68  # VTK's first type of any degree
             surface = body.clean(tolerance=1e-9) if linear else body
             surface = surface.extract_surface(
                 nonlinear_subdivision=0 if linear else 3, **surface_algorithm(pyvista)
@@ -506,10 +502,6 @@ def _rendered(shot: Shot, look: Look, limits: tuple[float, float]) -> NDArray[np
         return image
     (top, left), (bottom, right) = drawn.min(axis=0), drawn.max(axis=0) + 1
     return image[top:bottom, left:right]
-
-
-#: The first of VTK's cell types of any degree.
-LAGRANGE = 68
 
 
 @contextmanager

@@ -20,13 +20,8 @@ __all__ = ["StrengthReduction", "strength_reduction"]
 
 type Array = NDArray[np.float64]
 
-#: Decimals of a factor: sums of steps are told as 1.2, not as 1.2000000000000002.
-DIGITS = 12
 #: Least step and tolerance of a factor.
 FINEST = 1e-9
-#: Share of the limit of the displacement up to which a body that Newton's method fails for does not
-#: look as if it slid.
-FAR = 0.25
 #: What says that there is no equilibrium, or none was found.
 FAILURES = (*TRIAL_ERRORS, ParticleOutsideError)
 
@@ -81,7 +76,8 @@ class _Search:
     def next(self) -> float:
         """Return the factor to try."""
         middle = 0.5 * (self.good + self.bad)
-        return round(min(self.good + self._step, middle, self._most), DIGITS)
+        # sums of steps are told as 1.2, not as 1.2000000000000002
+        return round(min(self.good + self._step, middle, self._most), 12)
 
     def stood(self, factor: float) -> None:
         """Go on from a factor, also to those at which Newton's method has failed."""
@@ -228,7 +224,7 @@ def _result(
 def _warn_if_far(problem: QuasiStaticProblem, result: StrengthReduction) -> None:
     """Warn where Newton's method failed for a body that has hardly moved (collective)."""
     limit = result.limit if result.limit < np.inf else _elastic_displacement(problem)
-    if result.displacements[-1] < FAR * limit:
+    if result.displacements[-1] < 0.25 * limit:  # it does not look as if it slid
         problem.warn(
             f"The factor of safety of {result.factor:g} may be too low: at {result.above:g} "
             f"Newton's method failed, for a body that has moved by {result.displacements[-1]:.3g} "

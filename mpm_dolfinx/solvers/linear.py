@@ -82,7 +82,6 @@ ACCURATE, ITERATIONS = 1e-6, 200
 FIRST, ROUGHEST, FINAL = 1e-2, 0.1, 0.2
 #: Tries of a step that end where a tangent is indefinite, before it is solved with all the same.
 PATIENCE = 3
-GOLDEN = 0.5 * (1.0 + math.sqrt(5.0))
 #: Relative shift of a tangent with zeros on its diagonal, where no other is asked for.
 TINY = 1e-13
 #: By which conjugate gradients say that a tangent is not positive definite.
@@ -460,7 +459,8 @@ class ShiftedFactor:
             return
         rtol = min(FIRST, self._bent)
         if len(norms) > 1 and norms[-2] > 0.0:
-            rtol = min(float((norms[-1] / norms[-2]) ** GOLDEN), ROUGHEST)
+            golden = 0.5 * (1.0 + math.sqrt(5.0))  # Eisenstat & Walker's exponent
+            rtol = min(float((norms[-1] / norms[-2]) ** golden), ROUGHEST)
             if self._left is not None:
                 missed = abs(norms[-1] - self._left) / norms[-2]
                 rtol = min(rtol, missed)

@@ -40,8 +40,6 @@ ELASTIC = 0.02
 OF_MOTION, OF_LENGTH = 8.0, 5.0
 #: The same where an obstacle drives the motion: nothing relaxes what it has pushed aside wrongly.
 OF_DRIVEN = 1.5
-#: Share of what is left to the next level from which a step covers half of it.
-HALF = 0.5
 
 
 @dataclass(frozen=True)
@@ -204,7 +202,7 @@ class ErrorControl:
         left = level - self._now
         if self._size >= left * (1.0 - 1e-9):
             return level
-        return self._now + min(self._size, HALF * left)
+        return self._now + min(self._size, 0.5 * left)  # no short step is left over
 
     def judge(self, found: StepError) -> float:
         """Return the error of the step that was tried, over the allowed one.

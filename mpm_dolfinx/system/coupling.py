@@ -26,8 +26,6 @@ from .term import Term
 
 __all__ = ["Tie"]
 
-#: Highest degree of a rule on a facet.
-MOST = 100
 #: Share of a point's displacement from nodes of deleted domains, from which it is gone with them.
 GONE = 1e-9
 
@@ -86,7 +84,7 @@ class Tie(Term):
         self.stiffness = float(stiffness)
         self._tags, self._tag = facet_tags, tag
         degree = 2 * a.W.ufl_element().degree if quadrature_degree is None else quadrature_degree
-        require_degree("quadrature_degree of a Tie", degree, MOST)
+        require_degree("quadrature_degree of a Tie", degree, 100)  # 51 points each way
         require_truth("axisymmetric", axisymmetric)
         self._degree, self.axisymmetric = int(degree), axisymmetric
         self._spaces: tuple[fem.FunctionSpace, ...] = ()

@@ -18,9 +18,6 @@ from .values import FieldTerm
 
 __all__ = ["PressureSmoothing", "ShearPoints"]
 
-#: Factor of the compliance in shear ``1 / (2 G)``.
-WEIGHT = 1.0
-
 
 class ShearPoints(Protocol):
     """The material at a body's points, as far as smoothing asks for it."""
@@ -51,7 +48,7 @@ class PressureSmoothing(FieldTerm):
         super().__init__(None, [pressure])
         self.fields = []  # committed by the constraint's own term
         self._pressure, self._material = pressure, material
-        self._weight = WEIGHT / share
+        self._weight = 1.0 / share  # of the compliance in shear, 1 / (2 G)
         self._matrix: PETSc.Mat | None = None
         self._force = pressure.T.createVecLeft()
 
