@@ -80,12 +80,8 @@ class Scene:
 
     def plastic(self) -> mpm.ParticleProblem:
         force = (*(0.0,) * (self.dim - 1), -1.0)
-        problem = mpm.QuasiStaticProblem(
-            self.particles,
-            MATERIAL,
-            body_force=force,
-        )
-        return self.prepared(problem)
+        body = mpm.Body(self.particles, MATERIAL, body_force=force)
+        return self.prepared(mpm.QuasiStaticProblem(body))
 
     def ufl(self) -> mpm.ParticleProblem:
         d = self.particles.displacement

@@ -86,7 +86,8 @@ def heavy(
     background: Callable[[], mesh.Mesh] | None = None,
     method: str = "cpdi2",
     rule: int | None = None,
-    **options: Any,
+    f_bar: str = "none",
+    stabilisation: str = "auto",
 ) -> Made:
     """A heavy cube of 4 m between rollers, n cells wide in a background twice as wide."""
     if background is not None:
@@ -100,10 +101,11 @@ def heavy(
     if degree > 1 and body in (HEXAHEDRON, QUADRILATERAL):
         rule = 2 * degree
     particles = mpm.Particles(shape, V, method=method, degree=degree, quadrature_degree=rule)
+    force = (*[0.0] * (dim - 1), -weight)
     problem = mpm.QuasiStaticProblem(
-        mpm.Body(particles, law, density=1.0, body_force=(*[0.0] * (dim - 1), -weight)),
+        mpm.Body(particles, law, density=1.0, body_force=force, f_bar=f_bar),
         bcs=rollers(V, *[(axis, 0.0) for axis in range(dim)]),
-        solver=mpm.Solver(linear=solver, **options),
+        solver=mpm.Solver(linear=solver, stabilisation=stabilisation),
     )
     return problem, lambda: problem.solve(steps=steps)
 
