@@ -51,6 +51,8 @@ class MovingProblem(TimeProblem):
         inertia: The term that has the velocities.
     """
 
+    # (bodies that have met part again, which a joint would not let them)
+    _keeps_joints = False
     inertia: Inertia
     _energies: list[Energy]
 

@@ -239,7 +239,7 @@ class ParticleProblem:
         carried = self.carried
         self._let_take_part([given.material for given in contributions])
         fields = [
-            *parts.displacement_fields(self.bcs),
+            *parts.displacement_fields(self.bcs, self._keeps_joints),
             *(ValueField(group, self.bcs) for group in by_space(carried)),
         ]
         statistics = self.history.statistics
@@ -275,6 +275,8 @@ class ParticleProblem:
 
     fields: Sequence[ParticleField] = ()
     _entity_maps: Any = None
+    #: Whether bodies that bear on each other are kept together where the background would let go.
+    _keeps_joints = True
     #: Whether steps may start from an extrapolation of those before.
     _predicts = True
     #: Residuals of the fields.

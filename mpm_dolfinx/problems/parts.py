@@ -151,11 +151,12 @@ class Parts:
             found.append(FormsTerm(moving, carried, forms, given.symmetric))
         return found
 
-    def displacement_fields(self, bcs: Sequence[fem.DirichletBC]) -> list[Field]:
+    def displacement_fields(self, bcs: Sequence[fem.DirichletBC], joints: bool) -> list[Field]:
         """Return the fields of displacement, one for each background space (collective).
 
         Args:
             bcs: Dirichlet conditions.
+            joints: Whether joints between bodies may be kept shut.
         """
         groups = by_space(self.moving)
         kind = self.solver.stabilisation
@@ -165,7 +166,7 @@ class Parts:
                 bcs,
                 forms,
                 stabilisation_of(kind, group, forms is not None),
-                joints_of(kind, group),
+                joints_of(kind, group) if joints else None,
             )
             for group, forms in zip(groups, self._on_backgrounds(groups), strict=True)
         ]
