@@ -54,16 +54,9 @@ V = fem.functionspace(background, ("Lagrange", 1, (3,)))
 body = mesh.create_box(comm, [[0, 0, 0], [1, 1, 1]], [8, 8, 8], hexahedron)
 particles = mpm.Particles(body, V, quadrature_degree=2)
 
-
-def held(component, plane):
-    facets = mesh.locate_entities_boundary(background, 2, lambda x: np.isclose(x[plane], 0.0))
-    dofs = fem.locate_dofs_topological(V.sub(component), 2, facets)
-    return fem.dirichletbc(0.0, dofs, V.sub(component))
-
-
-plate = held(2, 2)
-top = mesh.locate_entities_boundary(body, 2, lambda x: np.isclose(x[2], 1.0))
-tags = mesh.meshtags(body, 2, np.sort(top), np.full(len(top), TOP, dtype=np.int32))
+plate = mpm.held(V, 2, z=0.0)
+rough = [mpm.held(V, 0, z=0.0), mpm.held(V, 1, z=0.0)]
+symmetry = [mpm.held(V, 0, x=0.0), mpm.held(V, 1, y=0.0)]
 plane = fem.Constant(body, 1.0)
 above = ufl.SpatialCoordinate(body)[2] + particles.displacement[2] - plane
 problem = mpm.QuasiStaticProblem(
@@ -71,10 +64,10 @@ problem = mpm.QuasiStaticProblem(
         particles,
         mpm.materials.VonMises(young, poisson, yield_stress=yield_stress),
         pressures=[(stiffness * above, TOP)],
-        facet_tags=tags,
+        facet_tags=mpm.facet_tags(body, {TOP: mpm.region(z=1.0)}),
         f_bar="patch",
     ),
-    bcs=[held(0, 0), held(1, 1), plate, held(0, 2), held(1, 2)],
+    bcs=[plate, *rough, *symmetry],
 )
 
 # Loads are multiplied by `particles.load`; a path sets it to one if the load's size is its own
@@ -112,5 +105,5 @@ assert force[-1] > 4.0 * yield_stress / (1.0 - squeeze)
 #
 # 1. Elements of low order cannot flow at constant volume as freely as the material (locking): leave
 #    `f_bar="patch"` out. How much larger is the force?
-# 2. Make the plate smooth: leave out `held(0, 2)` and `held(1, 2)`. Is (1) met?
+# 2. Make the plate smooth: leave out `rough`. Is (1) met?
 # 3. Use tetrahedra for the body.

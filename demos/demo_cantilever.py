@@ -52,11 +52,7 @@ V = fem.functionspace(background, ("Lagrange", 1, (2,)))
 body = mesh.create_rectangle(
     comm, [[0.0, axis - depth / 2.0], [length, axis + depth / 2.0]], [40, 4], quadrilateral
 )
-ends = np.sort(mesh.locate_entities_boundary(body, 1, lambda x: np.isclose(x[0], length)))
-tags = mesh.meshtags(body, 1, ends, np.full(len(ends), 1, dtype=np.int32))
-
-side = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[0], 0.0))
-clamp = fem.dirichletbc(np.zeros(2), fem.locate_dofs_topological(V, 1, side), V)
+clamp = mpm.held(V, x=0.0)
 
 particles = mpm.Particles(body, V)
 problem = mpm.QuasiStaticProblem(
@@ -64,7 +60,7 @@ problem = mpm.QuasiStaticProblem(
         particles,
         mpm.materials.Hencky(young, poisson),
         tractions=[((0.0, -load / depth), 1)],
-        facet_tags=tags,
+        facet_tags=mpm.facet_tags(body, {1: mpm.region(x=length)}),
     ),
     bcs=[clamp],
 )

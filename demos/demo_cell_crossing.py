@@ -61,13 +61,7 @@ def bar(**options):
     background = mesh.create_rectangle(comm, [[0, 0], [14, 1]], [14, 1], quadrilateral)
     body = mesh.create_rectangle(comm, [[0, 0], [length, 1]], [16, 2], quadrilateral)
     V = fem.functionspace(background, ("Lagrange", 1, (2,)))
-    bcs = []
-    for i, places in enumerate(((0.0,), (0.0, 1.0))):
-        facets = mesh.locate_entities_boundary(
-            background, 1, lambda x, i=i, at=places: np.isclose(x[i][:, None], at).any(axis=1)
-        )
-        dofs = fem.locate_dofs_topological(V.sub(i), 1, facets)
-        bcs.append(fem.dirichletbc(0.0, dofs, V.sub(i)))
+    bcs = [mpm.held(V, 0, x=0.0), mpm.held(V, 1, y=0.0), mpm.held(V, 1, y=1.0)]
     particles = mpm.Particles(body, V, **options)
     law = mpm.materials.Hencky(young, 0.0)
     return mpm.QuasiStaticProblem(mpm.Body(particles, law, body_force=(g0, 0.0)), bcs=bcs)

@@ -60,11 +60,7 @@ background = mesh.create_rectangle(comm, [[0.0, 0.0], [16.0, 9.0]], [16, 9], qua
 V = fem.functionspace(background, ("Lagrange", 1, (2,)))
 body = mesh.create_rectangle(comm, [[0.0, 0.0], [size, size]], [24, 24], quadrilateral)
 
-bcs = []
-for axis in (0, 1):
-    facets = mesh.locate_entities_boundary(background, 1, lambda x, i=axis: np.isclose(x[i], 0.0))
-    dofs = fem.locate_dofs_topological(V.sub(axis), 1, facets)
-    bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
+bcs = [mpm.held(V, 0, x=0.0), mpm.held(V, 1, y=0.0)]
 
 particles = mpm.Particles(body, V)
 problem = mpm.QuasiStaticProblem(

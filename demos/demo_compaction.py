@@ -72,13 +72,7 @@ def run(elements):
     background = mesh.create_rectangle(comm, corners, [1, elements], quadrilateral)
     V = fem.functionspace(background, ("Lagrange", 1, (2,)))
     body = mesh.create_rectangle(comm, corners, [2, 2 * elements], quadrilateral)
-    bcs = []
-    for axis, places in ((0, (0.0, width)), (1, (0.0,))):
-        facets = mesh.locate_entities_boundary(
-            background, 1, lambda x, i=axis, at=places: np.isclose(x[i][:, None], at).any(axis=1)
-        )
-        dofs = fem.locate_dofs_topological(V.sub(axis), 1, facets)
-        bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
+    bcs = [mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=width), mpm.held(V, 1, y=0.0)]
     particles = mpm.Particles(body, V)
     problem = mpm.QuasiStaticProblem(
         mpm.Body(

@@ -41,26 +41,17 @@ YOUNG, POISSON, PERMEABILITY = 400.0, 0.3, 9e-6  # kPa, -, m2/(kPa d)
 
 background = mesh.create_rectangle(comm, [[0, 0], [WIDTH, 6]], [20, 6], quadrilateral)
 V = fem.functionspace(background, ("Lagrange", 2, (2,)))
-
-
-def held(component, axis, *places):
-    facets = mesh.locate_entities_boundary(
-        background, 1, lambda x: np.isclose(x[axis][:, None], places).any(axis=1)
-    )
-    dofs = fem.locate_dofs_topological(V.sub(component), 1, facets)
-    return fem.dirichletbc(0.0, dofs, V.sub(component))
+bcs = [mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=WIDTH), mpm.held(V, y=0.0)]
 
 
 def ground():
     """The clay, and tags of its surface: 1 where it is loaded, and 2."""
     body = mesh.create_rectangle(comm, [[0, 0], [WIDTH, DEPTH]], [40, 10], quadrilateral)
-    top = np.sort(mesh.locate_entities_boundary(body, 1, lambda x: np.isclose(x[1], DEPTH)))
-    tag = np.where(mesh.compute_midpoints(body, 1, top)[:, 0] < HALF, 1, 2).astype(np.int32)
-    return mpm.Particles(body, V, degree=2), mesh.meshtags(body, 1, top, tag)
+    loaded, free = (mpm.region(x=ends, y=DEPTH) for ends in ((0, HALF), (HALF, WIDTH)))
+    return mpm.Particles(body, V, degree=2), mpm.facet_tags(body, {1: loaded, 2: free})
 
 
 particles, tags = ground()
-bcs = [held(0, 0, 0, WIDTH), held(0, 1, 0), held(1, 1, 0)]
 clay = mpm.materials.Hencky(YOUNG, POISSON)
 q = fem.Constant(particles.mesh, (0.0, 0.0))
 water = mpm.PoreFluid(lambda J: PERMEABILITY * J**4, drained=[(0.0, 1), (0.0, 2)])

@@ -46,12 +46,7 @@ background = mesh.create_rectangle(
     quadrilateral,
 )
 V = fem.functionspace(background, ("Lagrange", 1, (2,)))
-sides = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[0] % WIDTH, 0))
-base = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[1], 0))
-bcs = [
-    fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 1, where), V.sub(i))
-    for i, where in ((0, sides), (0, base), (1, base))
-]
+bcs = [mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=WIDTH), mpm.held(V, y=0.0)]
 
 ground = mpm.Particles(
     mesh.create_rectangle(

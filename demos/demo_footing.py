@@ -107,19 +107,7 @@ particles = mpm.Particles(body, V, quadrature_degree=2)
 
 # Rollers on grid lines, and the strip: it presses on the facets of the body that lie under it.
 
-background.topology.create_connectivity(1, 2)
-
-
-def held(component, where):
-    facets = mesh.locate_entities(background, 1, where)
-    dofs = fem.locate_dofs_topological(V.sub(component), 1, facets)
-    return fem.dirichletbc(0.0, dofs, V.sub(component))
-
-
-under = mesh.locate_entities_boundary(
-    body, 1, lambda x: np.isclose(x[1], size) & (x[0] < half_width * (1.0 + 1e-9))
-)
-tags = mesh.meshtags(body, 1, np.sort(under), np.full(len(under), 1, np.int32))
+tags = mpm.facet_tags(body, {1: mpm.region(x=(0.0, half_width), y=size)})
 footing = mpm.boundary.roller(particles, tags, 1, normal=(0.0, -1.0), value=settlement)
 
 problem = mpm.QuasiStaticProblem(
@@ -128,10 +116,7 @@ problem = mpm.QuasiStaticProblem(
         mpm.materials.VonMises(young, poisson, rho_y=np.sqrt(2.0) * cohesion),
         f_bar="patch",
     ),
-    bcs=[
-        held(0, lambda x: np.isclose(x[0], 0.0) | np.isclose(x[0], size)),
-        held(1, lambda x: np.isclose(x[1], 0.0)),
-    ],
+    bcs=[mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=size), mpm.held(V, 1, y=0.0)],
     supports=[footing],
 )
 

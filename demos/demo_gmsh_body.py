@@ -39,7 +39,7 @@ from mpi4py import MPI
 import gmsh
 import numpy as np
 
-from dolfinx import fem, mesh
+from dolfinx import fem
 
 import mpm_dolfinx as mpm
 
@@ -109,9 +109,7 @@ background, _, _ = meshed(room, 0.12)
 # From here on nothing tells that gmsh was there.
 
 V = fem.functionspace(background, ("Lagrange", 1, (2,)))
-wall = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[0], 0.0))
-held = fem.locate_dofs_topological(V, 1, wall)
-clamp = fem.dirichletbc(np.zeros(2), held, V)
+clamp = mpm.held(V, x=0.0)
 
 particles = mpm.Particles(body, V)
 problem = mpm.QuasiStaticProblem(

@@ -50,12 +50,6 @@ def background(corner):
     return fem.functionspace(domain, ("Lagrange", 1, (2,)))
 
 
-def tagged(body, y):
-    """Tags of the facets at a height."""
-    facets = mesh.locate_entities_boundary(body, 1, lambda x: np.isclose(x[1], y))
-    return mesh.meshtags(body, 1, np.sort(facets), np.full(len(facets), 1, dtype=np.int32))
-
-
 die = mesh.create_rectangle(comm, [[0.3, 0.6], [1.1, 1.0]], [10, 5], quadrilateral)
 x = die.geometry.x
 x[:, 1] += (radius - np.sqrt(radius**2 - (x[:, 0] - 0.7) ** 2)) * (1.0 - (x[:, 1] - 0.6) / 0.4)
@@ -68,7 +62,8 @@ touch = mpm.contact.Pair(a, b, friction)
 # The die is held on its top, the block on its base. The top goes along a path of the parameter $t$:
 # down up to $t = 0.2$, then to the right. `value=` of a support is a displacement.
 
-top, base = tagged(die, 1.0), tagged(block, 0.0)
+top = mpm.facet_tags(die, {1: mpm.region(y=1.0)})
+base = mpm.facet_tags(block, {1: mpm.region(y=0.0)})
 position = fem.Constant(die, (0.0, 0.0))
 problem = mpm.QuasiStaticProblem(
     [

@@ -36,7 +36,6 @@
 from mpi4py import MPI
 
 import matplotlib.pyplot as plt
-import numpy as np
 
 import ufl
 from dolfinx import fem, mesh
@@ -60,15 +59,7 @@ def energy(d, dx, load):
 
 def held(space):
     """A roller on the left, a base that holds, in either space."""
-    domain = space.mesh
-    side = mesh.locate_entities_boundary(domain, 1, lambda x: np.isclose(x[0], 0))
-    base = mesh.locate_entities_boundary(domain, 1, lambda x: np.isclose(x[1], 0))
-    roller = fem.locate_dofs_topological(space.sub(0), 1, side)
-    rough = fem.locate_dofs_topological(space, 1, base)
-    return [
-        fem.dirichletbc(0.0, roller, space.sub(0)),
-        fem.dirichletbc(np.zeros(2), rough, space),
-    ]
+    return [mpm.held(space, 0, x=0.0), mpm.held(space, y=0.0)]
 
 
 # ## Finite elements

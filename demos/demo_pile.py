@@ -62,11 +62,7 @@ across, down = lines(8, 12), -lines(30, 8)[::-1]
 room = grid(across, np.append(down, h * np.arange(1, 7)), 1)
 V = fem.functionspace(room, ("Lagrange", 1, (2,)))
 clay = mpm.Particles(grid(across[1:], down, 2), V, quadrature_degree=2)
-bcs = []
-for i, end in enumerate((across[-1], down[0])):
-    facets = mesh.locate_entities_boundary(room, 1, lambda x, i=i, end=end: np.isclose(x[i], end))
-    dofs = fem.locate_dofs_topological(V.sub(i), 1, facets)
-    bcs.append(fem.dirichletbc(0.0, dofs, V.sub(i)))
+bcs = [mpm.held(V, 0, x=across[-1]), mpm.held(V, 1, y=down[0])]
 
 # The stiffness of contact is in proportion to a modulus: 4 G here. By default it is the confined
 # one, 51 G for this $\nu$, and points stick and slip by turns from one iteration to the next.
@@ -75,11 +71,9 @@ rod = mpm.contact.box((-h, -20 * R), (h, 20 * R))
 shoulder, tip = (R - h) * np.sqrt(3.0), -h * np.sqrt(3.0)
 outline = [(0, tip), (R, shoulder), (R, 20 * R), (-R, 20 * R), (-R, shoulder)]
 steel = mpm.contact.polygon(outline, radius=0.3 * R)
-free = mesh.locate_entities_boundary(
-    clay.mesh, 1, lambda x: np.isclose(x[0], h) | np.isclose(x[1], 0.0)
-)
-tags = mesh.meshtags(clay.mesh, 1, np.sort(free), np.full(len(free), 1, np.int32))
-look = {"facet_tags": tags, "tag": 1, "axisymmetric": True, "modulus": 4 * G}
+hole, ground = mpm.region(x=h), mpm.region(y=0.0)
+free = mpm.facet_tags(clay.mesh, {1: lambda x: hole(x) | ground(x)})
+look = {"facet_tags": free, "tag": 1, "axisymmetric": True, "modulus": 4 * G}
 adheres = mpm.contact.Coulomb(cohesion=adhesion)
 pile = mpm.contact.Rigid(clay, steel, adheres, tangential_penalty=0.1, **look)
 problem = mpm.QuasiStaticProblem(

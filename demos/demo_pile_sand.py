@@ -79,19 +79,10 @@ def grid(x, y, parts):
 def body(x, y, above):
     """Sand around a hole, with rollers on side, base and, if closed, top."""
     V = fem.functionspace(grid(x, np.append(y, above), 1), ("Lagrange", 1, (2,)))
-    bcs = []
-    for i, ends in ((0, x[-1:]), (1, y[:1] if len(above) else y)):
-        where = mesh.locate_entities_boundary(
-            V.mesh, 1, lambda x, i=i, ends=ends: np.isclose(x[i][:, None], ends).any(axis=1)
-        )
-        bcs.append(fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 1, where), V.sub(i)))
+    bcs = [mpm.held(V, 0, x=x[-1]), mpm.held(V, 1, y=y[0])]
+    if len(above) == 0:
+        bcs.append(mpm.held(V, 1, y=y[-1]))
     return mpm.Particles(grid(x[1:], y, 2), V, quadrature_degree=2), bcs
-
-
-def tagged(particles, where):
-    """Tags of facets on the boundary."""
-    facets = np.sort(mesh.locate_entities_boundary(particles.mesh, 1, where))
-    return mesh.meshtags(particles.mesh, 1, facets, np.full(len(facets), 1, np.int32))
 
 
 soil = {"material": sand, "f_bar": "domain", "initial_stress": -p0 * np.eye(3)}
@@ -101,7 +92,7 @@ soil = {"material": sand, "f_bar": "domain", "initial_stress": -p0 * np.eye(3)}
 # One row of cells between rollers. At first the hole is held, while what it bore comes to act.
 
 ring, bcs = body(lines(8), np.array([0.0, h]), [])
-wall = tagged(ring, lambda x: np.isclose(x[0], a0))
+wall = mpm.facet_tags(ring.mesh, {1: mpm.region(x=a0)})
 wide = fem.Constant(ring.mesh, 0.0)
 held = mpm.boundary.roller(ring, wall, 1, normal=(-1.0, 0.0), value=wide)
 problem = mpm.QuasiStaticProblem(mpm.Body(ring, **soil), bcs, supports=[held], axisymmetric=True)
@@ -121,8 +112,9 @@ down = -lines(30)[::-1]
 ground, bcs = body(lines(8), down, h * np.arange(1, 7))
 shoulder, tip = (R - a0) / np.tan(beta), -a0 / np.tan(beta)
 outline = [(0, tip), (R, shoulder), (R, 20 * R), (-R, 20 * R), (-R, shoulder)]
-top = tagged(ground, lambda x: np.isclose(x[1], 0.0))
-free = tagged(ground, lambda x: np.isclose(x[1], 0.0) | np.isclose(x[0], a0))
+bore, surface = mpm.region(x=a0), mpm.region(y=0.0)
+top = mpm.facet_tags(ground.mesh, {1: surface})
+free = mpm.facet_tags(ground.mesh, {1: lambda x: bore(x) | surface(x)})
 look = {"facet_tags": free, "tag": 1, "axisymmetric": True, "modulus": E}
 guide = mpm.contact.Rigid(ground, mpm.contact.box((-a0, -40.0), (a0, 40.0)), **look)
 pile = mpm.contact.Rigid(ground, mpm.contact.polygon(outline, radius=0.4 * R), **look)

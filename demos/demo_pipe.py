@@ -53,13 +53,6 @@ background = box([0.0, -2.0], [3.0, 0.5], h)
 V = fem.functionspace(background, ("Lagrange", 1, (2,)))
 
 
-def held(component, where):
-    """A roller on dofs of the background."""
-    space = V.sub(component)
-    facets = mesh.locate_entities_boundary(background, 1, where)
-    return fem.dirichletbc(0.0, fem.locate_dofs_topological(space, 1, facets), space)
-
-
 # The stiffness along the surface of points that stick is in proportion to the shear modulus here,
 # which is a tenth of the confined modulus for this $\nu$: Newton's method takes fewer solves.
 
@@ -75,10 +68,7 @@ def pressed(friction):
             mpm.materials.VonMises(500.0 * strength, 0.45, rho_y=np.sqrt(2.0) * strength),
             f_bar="patch",
         ),
-        bcs=[
-            held(0, lambda x: np.isclose(x[0], 0.0) | np.isclose(x[0], 3.0)),
-            held(1, lambda x: np.isclose(x[1], -2.0)),
-        ],
+        bcs=[mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=3.0), mpm.held(V, 1, y=-2.0)],
         terms=[pipe],
     )
     path = []

@@ -50,22 +50,16 @@ young, poisson, N = 1e6, 0.3, 16  # Pa, -, background cells through the wall
 EXACT = {a: 1.2080252432, b: 2.1408492820}
 
 
-def problem_of(background, body, held, radius, axisymmetric):
+def problem_of(background, body, rollers, radius, axisymmetric):
     V = fem.functionspace(background, ("Lagrange", 1, (2,)))
-    bcs = []
-    for component, where in held.items():
-        facets = mesh.locate_entities_boundary(background, 1, where)
-        dofs = fem.locate_dofs_topological(V.sub(component), 1, facets)
-        bcs.append(fem.dirichletbc(0.0, dofs, V.sub(component)))
-    inner = mesh.locate_entities_boundary(body, 1, lambda x: np.isclose(radius(x), a))
     return mpm.QuasiStaticProblem(
         mpm.Body(
             mpm.Particles(body, V),
             mpm.materials.Hencky(young, poisson),
             pressures=[(pressure, INNER)],
-            facet_tags=mesh.meshtags(body, 1, np.sort(inner), np.full(len(inner), INNER, np.int32)),
+            facet_tags=mpm.facet_tags(body, {INNER: lambda x: np.isclose(radius(x), a)}),
         ),
-        bcs=bcs,
+        bcs=[mpm.held(V, component, **plane) for component, plane in rollers],
         axisymmetric=axisymmetric,
     )
 
@@ -76,7 +70,7 @@ h = (b - a) / N
 strip = problem_of(
     mesh.create_rectangle(comm, [[0.5, 0], [3, h]], [round(2.5 / h), 1], quadrilateral),
     mesh.create_rectangle(comm, [[a, 0], [b, h]], [2 * N, 2], quadrilateral),
-    {1: lambda x: np.isclose(x[1], 0) | np.isclose(x[1], h)},
+    [(1, {"y": 0.0}), (1, {"y": h})],
     lambda x: x[0],
     axisymmetric=True,
 )
@@ -86,7 +80,7 @@ body.geometry.x[:, :2] = np.maximum(R * [np.cos(angle), np.sin(angle)], 0.0).T
 ring = problem_of(
     mesh.create_rectangle(comm, [[0, 0], [2.5, 2.5]], [round(2.5 / h)] * 2, quadrilateral),
     body,
-    {i: lambda x, i=i: np.isclose(x[i], 0) for i in (0, 1)},
+    [(0, {"x": 0.0}), (1, {"y": 0.0})],
     lambda x: np.hypot(x[0], x[1]),
     axisymmetric=False,
 )

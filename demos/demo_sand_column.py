@@ -53,13 +53,7 @@ end, dt, run_out = 1.45, 0.01, 1.2 * a  # s, s, -
 corners, quadrilateral = [[0.0, -h], [28 * h, 11 * h]], mesh.CellType.quadrilateral
 background = mesh.create_rectangle(comm, corners, [28, 12], quadrilateral)
 V = fem.functionspace(background, ("Lagrange", 1, (2,)))
-background.topology.create_connectivity(1, 2)
-floor = mesh.locate_entities(background, 1, lambda x: x[1] < 1e-9)
-wall = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[0], 0.0))
-bcs = [
-    fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 1, facets), V.sub(i))
-    for i, facets in ((0, floor), (1, floor), (0, wall))
-]
+bcs = [mpm.held(V, y=(-h, 0.0)), mpm.held(V, 0, x=0.0)]
 both = mesh.DiagonalType.left_right
 body = mesh.create_rectangle(comm, [[0.0, 0.0], [r0, a * r0]], [16, 16], diagonal=both)
 particles = mpm.Particles(body, V)

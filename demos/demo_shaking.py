@@ -59,8 +59,7 @@ laws = [
 weight = (0.0, -gravity)
 embankment = mpm.Body(bodies[1], laws[1], density=rho_clay, body_force=weight)
 
-base = np.sort(mesh.locate_entities_boundary(rock, 1, lambda x: np.isclose(x[1], 1.0)))
-tags = mesh.meshtags(rock, 1, base, np.full(len(base), 1, dtype=np.int32))
+tags = mpm.facet_tags(rock, {1: mpm.region(y=1.0)})
 
 # Equilibrium first, on a base that is held. The last steps are under constant load.
 

@@ -47,12 +47,7 @@ background = mesh.create_rectangle(
     comm, [[0, 0], [width + 4 * h, H + 2 * h]], [cells[0] + 4, cells[1] + 2], quadrilateral
 )
 V = fem.functionspace(background, ("Lagrange", 1, (2,)))
-side = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[0], 0))
-base = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[1], 0))
-bcs = [
-    fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 1, where), V.sub(i))
-    for i, where in ((0, side), (0, base), (1, base))
-]
+bcs = [mpm.held(V, 0, x=0.0), mpm.held(V, y=0.0)]
 
 
 def slope(seam):
@@ -60,11 +55,7 @@ def slope(seam):
     body = mesh.create_rectangle(comm, [[0, 0], [width, H]], [2 * n for n in cells], quadrilateral)
     x = body.geometry.x
     x[:, 0] *= (CREST + FOOT * (1 - x[:, 1] / H)) / width
-    index = body.topology.index_map(2)
-    every = np.arange(index.size_local + index.num_ghosts, dtype=np.int32)
-    y = mesh.compute_midpoints(body, 2, every)[:, 1]
-    soft = np.where((y > 2 * h) & (y < 4 * h), SEAM, SILT).astype(np.int32)
-    layers = mesh.meshtags(body, 2, every, soft)
+    layers = mpm.cell_tags(body, {SILT: mpm.region(y=(0, H)), SEAM: mpm.region(y=(2 * h, 4 * h))})
     silt = mpm.materials.MohrCoulomb(YOUNG, 0.3, cohesion=12e3, friction_angle=22.0)
     clay = mpm.materials.MohrCoulomb(YOUNG, 0.3, cohesion=8e3, friction_angle=8.0)
     soils = {SILT: silt, SEAM: clay if seam else silt}

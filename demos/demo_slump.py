@@ -33,7 +33,6 @@
 from mpi4py import MPI
 
 import matplotlib.pyplot as plt
-import numpy as np
 
 from dolfinx import fem, mesh
 
@@ -47,12 +46,7 @@ end, dt = 2.0, 0.02  # s
 quadrilateral = mesh.CellType.quadrilateral
 background = mesh.create_rectangle(comm, [[0.0, 0.0], [20.0, 10.0]], [40, 20], quadrilateral)
 V = fem.functionspace(background, ("Lagrange", 1, (2,)))
-
-bcs = []
-for axis in (0, 1):
-    facets = mesh.locate_entities_boundary(background, 1, lambda x, i=axis: np.isclose(x[i], 0.0))
-    dofs = fem.locate_dofs_topological(V.sub(axis), 1, facets)
-    bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
+bcs = [mpm.held(V, 0, x=0.0), mpm.held(V, 1, y=0.0)]
 
 
 def column():
@@ -62,9 +56,9 @@ def column():
     return mpm.Body(mpm.Particles(body, V), law, density=density, body_force=(0.0, -gravity))
 
 
-def toe(particles):
-    """How far the body reaches."""
-    return comm.allreduce(particles.domains[..., 0].max(initial=0.0), MPI.MAX)
+def toe(body):
+    """How far a body reaches."""
+    return comm.allreduce(body.particles.domains[..., 0].max(initial=0.0), MPI.MAX)
 
 
 # In equilibrium the weight grows slowly; in motion it acts at once.
@@ -77,11 +71,11 @@ problem = mpm.DynamicProblem(moving, bcs, scheme="conserving")
 times, toes = [0.0], [4.0]
 for step in problem.steps(end, dt):
     times.append(step.time)
-    toes.append(toe(moving.particles))
+    toes.append(toe(moving))
 
 # ## Result
 
-energies, rest = problem.history.energies, toe(still.particles)
+energies, rest = problem.history.energies, toe(still)
 last = energies[-1]
 largest = max(energy.kinetic for energy in energies)
 drift = max(abs(energy.balance - energies[0].balance) for energy in energies) / largest
@@ -95,8 +89,10 @@ if comm.rank == 0:
 kinds = {"external": "work of the weight", "dissipated": "dissipated", "kinetic": "kinetic"}
 figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4), layout="constrained")
 mpm.plot.background(V, ax=left, color="0.92")
-mpm.plot.domains(still, ax=left, facecolor="none", edgecolor="C1", linewidth=0.4)
-mpm.plot.domains(moving, moving.plastic_strain, ax=left, cmap="YlGnBu", vmin=0.0)
+mpm.plot.domains(still.particles, ax=left, facecolor="none", edgecolor="C1", linewidth=0.4)
+mpm.plot.domains(
+    moving.particles, moving.particles.plastic_strain, ax=left, cmap="YlGnBu", vmin=0.0
+)
 left.set(xlim=(0, 14), ylim=(0, 8.2), xlabel="x, m", ylabel="y, m")
 left.set_title("After 2 s; orange: in equilibrium")
 for name, label in kinds.items():

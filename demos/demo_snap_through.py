@@ -70,17 +70,8 @@ body.geometry.x[:, 1] += axis(body.geometry.x[:, 0])
 
 # The upper face near the crown is tagged; the load rides on it.
 
-loaded = mesh.locate_entities_boundary(
-    body, 1, lambda x: (x[0] > half - 1.0 - 1e-9) & np.isclose(x[1] - axis(x[0]), depth)
-)
-tags = mesh.meshtags(body, 1, np.sort(loaded), np.full(len(loaded), 1, dtype=np.int32))
-
-
-def held(component, place):
-    side = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[0], place))
-    dofs = fem.locate_dofs_topological(V.sub(component), 1, side)
-    return fem.dirichletbc(0.0, dofs, V.sub(component))
-
+near = mpm.region(x=(half - 1.0, half))
+tags = mpm.facet_tags(body, {1: lambda x: near(x) & np.isclose(x[1] - axis(x[0]), depth)})
 
 particles = mpm.Particles(body, V, degree=2)
 problem = mpm.QuasiStaticProblem(
@@ -90,7 +81,7 @@ problem = mpm.QuasiStaticProblem(
         tractions=[((0.0, -pressure), 1)],
         facet_tags=tags,
     ),
-    bcs=[held(0, 0.0), held(1, 0.0), held(0, half)],
+    bcs=[mpm.held(V, x=0.0), mpm.held(V, 0, x=half)],
 )
 
 # What is controlled is the way of a point of the body, which need not be a node.

@@ -75,10 +75,10 @@ def strip(hot):
     R_d = ufl.derivative(energy(d, theta) * dx, d, v) - pull * end * v[0] * ufl.ds(body)
     flow = ufl.dot(G * ufl.grad(theta), G * ufl.grad(q)) / ufl.det(G)
     R_q = (heat(d, theta) - heat(before, theta.previous)) * q * dx + dt * flow * dx
-    at, F = lambda x: np.isclose(x[0], 0.0) & (x[1] < 0.6), ufl.Identity(2) + ufl.grad(d)
-    bcs = [fem.dirichletbc(np.zeros(2), fem.locate_dofs_geometrical(V, at), V)]
+    wall, F = {"x": 0.0, "y": (-0.5, 0.5)}, ufl.Identity(2) + ufl.grad(d)
+    bcs = [mpm.held(V, **wall)]
     if hot:
-        bcs.append(fem.dirichletbc(1.0, fem.locate_dofs_geometrical(Q, at), Q))
+        bcs.append(mpm.held(Q, value=1.0, **wall))
     problem = mpm.ParticleProblem([R_d, R_q], particles, bcs=bcs, fields=[theta])
     means = [F[i, 1] * end / h * ufl.ds(body) for i in (0, 1)] + [theta / (L * h) * dx]
     return problem, particles, theta, before, dt, pull, fem.form(means)

@@ -14,8 +14,6 @@
 
 from mpi4py import MPI
 
-import numpy as np
-
 from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
@@ -33,10 +31,8 @@ particles = mpm.Particles(body, V)
 # Conditions are on the background: no horizontal displacement on the plane of symmetry, no vertical
 # one on the smooth base.
 
-side = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[0], 0))
-base = mesh.locate_entities_boundary(background, 1, lambda x: np.isclose(x[1], 0))
-roller = fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(0), 1, side), V.sub(0))
-floor = fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(1), 1, base), V.sub(1))
+roller = mpm.held(V, 0, x=0.0)
+floor = mpm.held(V, 1, y=0.0)
 
 # The clay yields at a von Mises stress of 20 kPa. Its weight is applied in 20 equal steps.
 

@@ -46,10 +46,7 @@ particles = mpm.Particles(body, V, quadrature_degree=2)
 
 # Both ends are tagged; the supports (1) are penalties on these facets, wherever they go.
 
-ends = [mesh.locate_entities_boundary(body, 2, lambda x, z=z: np.isclose(x[2], z)) for z in (0, 4)]
-facets, tags = np.concatenate(ends), np.repeat([LOWER, UPPER], [len(end) for end in ends])
-order = np.argsort(facets)
-tagged = mesh.meshtags(body, 2, facets[order], tags[order].astype(np.int32))
+tagged = mpm.facet_tags(body, {LOWER: mpm.region(z=0.0), UPPER: mpm.region(z=LENGTH)})
 
 theta = fem.Constant(body, 0.0)
 x, y, _ = ufl.SpatialCoordinate(body)

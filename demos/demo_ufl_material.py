@@ -67,8 +67,8 @@ def run(shortening, steps):
     body = mesh.create_rectangle(comm, corners, [32, 16], quadrilateral)
     particles = mpm.Particles(body, V, quadrature_degree=3)
 
-    glued = mesh.locate_entities_boundary(body, 1, lambda x: np.isclose(abs(x[0] - CENTRE[0]), 1))
-    tags = mesh.meshtags(body, 1, np.sort(glued), np.ones(len(glued), dtype=np.int32))
+    left, right = mpm.region(x=CENTRE[0] - half[0]), mpm.region(x=CENTRE[0] + half[0])
+    tags = mpm.facet_tags(body, {1: lambda x: left(x) | right(x)})
     ds = ufl.Measure("ds", domain=body, subdomain_data=tags, metadata={"quadrature_degree": 3})
     s, theta = fem.Constant(body, 0.0), fem.Constant(body, 0.0)
     X, centre = ufl.SpatialCoordinate(body), ufl.as_vector(CENTRE)
