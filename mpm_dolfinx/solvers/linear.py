@@ -202,7 +202,7 @@ class ShiftedFactor:
             self._own_type = any(database.hasName(prefix + key) for key in ("pc_type", "ksp_type"))
             if self._own_type and linear_solver == "multigrid":
                 raise MPMError(
-                    "linear_solver='multigrid' chooses ksp_type and pc_type; leave them out of "
+                    "linear='multigrid' chooses ksp_type and pc_type; leave them out of "
                     "petsc_options=."
                 )
             if pc.getType() in FACTORS:

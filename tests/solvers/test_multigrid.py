@@ -339,7 +339,7 @@ def test_a_linear_problem_takes_no_more_than_one_solve_besides():
         ({"linear_solver": "magic"}, "Unknown linear='magic'; choose one of 'auto'"),
         (
             {"linear_solver": "multigrid", "petsc_options": {"pc_type": "gamg"}},
-            "linear_solver='multigrid' chooses ksp_type and pc_type",
+            "linear='multigrid' chooses ksp_type and pc_type",
         ),
     ],
 )
