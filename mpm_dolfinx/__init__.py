@@ -32,7 +32,7 @@ from .system.schemes import Kinematics, Rates, Scheme  # noqa: E402
 from .system.term import Term  # noqa: E402
 from .transfer.weights import Weights  # noqa: E402
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 __all__ = [
     "AveragedVolumeRatio",
