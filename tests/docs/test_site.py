@@ -24,7 +24,15 @@ ROOT = Path(__file__).resolve().parents[2]
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
-NEEDED = ("mkdocs", "mkdocstrings", "jupytext", "latex2mathml", "material", "pymdownx")
+NEEDED = (
+    "griffe_inherited_docstrings",
+    "mkdocs",
+    "mkdocstrings",
+    "jupytext",
+    "latex2mathml",
+    "material",
+    "pymdownx",
+)
 
 pytestmark = [pytest.mark.skip_in_parallel, pytest.mark.slow]
 
