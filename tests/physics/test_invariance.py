@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import scenes
 from marks import all_but
+from posed import posed
 from posed import staged as staged_with
 from routes import on_route
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE
@@ -176,7 +177,7 @@ class Scene:
             "petsc_options": {"snes_rtol": 1e-13},
         }
         bodies = self.bodies[0] if len(self.bodies) == 1 else self.bodies[::order]
-        self.made = kind(bodies, law or self.law, **{**given, **options})
+        self.made = posed(kind, bodies, law or self.law, **{**given, **options})
         return self.made
 
     @property
