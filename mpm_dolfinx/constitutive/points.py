@@ -486,9 +486,9 @@ class MaterialPoints:
         result = np.zeros(self._points, dtype=bool)
         for part, before, after in zip(self._governed, self._last.states, self._trial, strict=True):
             for name in getattr(part.material, "internal_variables", ()):
-                changed = (before[name] != after[name]).reshape(len(before[name]), -1)
-                result[part.points] |= changed.any(axis=1)
-        return result.reshape(self._particles.num_local, -1).any(axis=1)
+                changed = before[name] != after[name]
+                result[part.points] |= changed.any(axis=tuple(range(1, changed.ndim)))
+        return result.reshape(self._particles.num_local, self._particles.num_points).any(axis=1)
 
     def commit(self) -> Callable[[], None]:
         """Make the last update the history (collective with F-bar).
