@@ -242,6 +242,7 @@ class QuasiStaticProblem(ParticleProblem):
             terms=terms,
             sudden=sudden,
         )
+        self._require_given(changed)
         for body in changed:
             self._require_change(body)
         setup = self.setup.with_bodies(*changed)
@@ -260,10 +261,10 @@ class QuasiStaticProblem(ParticleProblem):
 
     def _require_change(self, body: Body) -> None:
         """Raise an error unless a body can be put in place of the one of the same particles."""
-        changes = body.changed_from(self.body(body.particles))
-        for name in (*INITIAL, "f_bar"):
-            if name in changes and changes[name] != getattr(self.body(body.particles), name):
-                raise MPMError(f"{name} cannot change in a stage; a body begins with it.")
+        before = self.body(body.particles)
+        other = [name for name in INITIAL if getattr(body, name) is not getattr(before, name)]
+        for name in [*other, *(["f_bar"] if body.f_bar != before.f_bar else [])]:
+            raise MPMError(f"{name} cannot change in a stage; a body begins with it.")
 
     def remove(
         self,

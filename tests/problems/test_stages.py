@@ -288,6 +288,32 @@ def test_what_cannot_be_leaves_all_as_it_was():
     assert total(body, body.deleted) == 24
 
 
+@pytest.mark.parametrize(
+    ("kind", "change", "sentence"),
+    [
+        (mpm.QuasiStaticProblem, {"velocity": (0.0, 1.0)}, "velocity= of a Body is for a Dynamic"),
+        (
+            mpm.QuasiStaticProblem,
+            {"pore_fluid": mpm.PoreFluid(permeability=1.0, density=1.0)},
+            "pore_fluid= of a Body is for a Porous",
+        ),
+        (mpm.QuasiStaticProblem, {"f_bar": "patch"}, "f_bar cannot change in a stage"),
+        (mpm.QuasiStaticProblem, {"initial_stress": np.zeros((3, 3))}, "initial_stress cannot"),
+        (mpm.DynamicProblem, {"density": None}, "needs a density"),
+        (mpm.DynamicProblem, {"velocity": (0.0, 1.0)}, "velocity cannot change in a stage"),
+    ],
+)
+def test_a_stage_gives_a_body_nothing_that_it_must_begin_with(kind, change, sentence):
+    V = vectors(box([0, 0], [1, 2], [2, 4], QUADRILATERAL))
+    body = mpm.Particles(box([0, 0], [1, 1], [4, 4], QUADRILATERAL), V)
+    own = mpm.Body(body, materials.Hencky(1e4, 0.3), density=1.0, initial_stress=np.eye(3))
+    problem = kind(own, bcs=[fix(V, at(1, 0))])
+    with pytest.raises(mpm.MPMError, match=sentence):
+        problem.stage(bodies=own.replace(**change))
+    assert problem.body() is own and not problem.history.stages
+    problem.stage(bodies=own.replace(initial_stress=own.initial_stress, f_bar="none"))
+
+
 def staged(tags=False):
     """Return ground that yields, after its stages were begun: a pit, and a lift beside it."""
     law = materials.MohrCoulomb(1e4, 0.3, cohesion=5.0, friction_angle=30.0)
