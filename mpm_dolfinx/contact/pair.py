@@ -158,27 +158,29 @@ class Pair(Contact):
         self._settle(self._joins)
         self._take_stress()
         if self._joins:
-            for contact in self._gone:
-                if isinstance(contact, Pair) and set(contact.bodies) == set(self.bodies):
-                    self._stand_in(contact)
+            gone = [contact for contact in self._gone if isinstance(contact, Pair)]
+            self._stand_in([one for one in gone if set(one.bodies) == set(self.bodies)])
             self._require_apart()
             self._joins, self._gone = False, []
 
-    def _stand_in(self, before: Pair) -> None:
-        """Take over where points stick from a contact of the same bodies that is gone (collective).
+    def _stand_in(self, gone: Sequence[Pair]) -> None:
+        """Take over where points stick from contacts that are gone (collective).
 
         Args:
-            before: That contact.
+            gone: Contacts of the same bodies.
         """
-        columns = [before.columns(place) for place in self._places]
-        every = [{name: column.values for name, column in own.items()} for own in columns]
-        points = [surface.nq for surface in self._surfaces]
-        alike = [own["area"].shape[2] for own in every] == points
-        if not alike or any("anchor" not in own for own in every[: len(self._passes)]):
+        every: list[dict[str, NDArray[Any]]] = []
+        for before in gone:
+            columns = [before.columns(place) for place in self._places]
+            own = [{name: column.values for name, column in one.items()} for one in columns]
+            alike = [one["area"].shape[2] for one in own] == [s.nq for s in self._surfaces]
+            if alike and all("anchor" in one for one in own[: len(self._passes)]):
+                every = [_both(*pair) for pair in zip(every, own, strict=True)] if every else own
+        if not every:
             return
         self._take_over(every)
-        for each, surface, own in zip(self._passes, self._surfaces, every, strict=False):
-            each.outcome = replace(each.outcome, **_told(surface, own))
+        for each, surface, mine in zip(self._passes, self._surfaces, every, strict=False):
+            each.outcome = replace(each.outcome, **_told(surface, mine))
 
     def _take_over(self, every: Sequence[dict[str, NDArray[Any]]]) -> None:
         """Take areas, and where points stick (collective).
@@ -445,6 +447,20 @@ class Pair(Contact):
     @override
     def known_by(self) -> list[Any]:
         return [type(self).__name__, self._places, len(self._passes)]
+
+
+def _both(one: dict[str, NDArray[Any]], other: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return the columns of two contacts as one: the second has points that it alone has."""
+    found = {}
+    for name, values in one.items():
+        new = one["area"] == 0.0
+        if name in MEMORY or name in OUTCOME.values():
+            new = new | (other["touches"] & ~one["touches"])
+        found[name] = values
+        if name in other and other[name].shape == values.shape:
+            more = (1,) * (values.ndim - new.ndim)
+            found[name] = np.where(new.reshape(*new.shape, *more), other[name], values)
+    return found
 
 
 def _told(surface: Surface, columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

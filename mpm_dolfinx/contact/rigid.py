@@ -591,7 +591,8 @@ class Rigid(Contact):
     def grip(self) -> Grip:
         """Return how its points hold on to the obstacle at the last converged step."""
         assert self._memory is not None
-        memory, pose = self._memory, self._memory.pose
+        memory = self._memory if self._memory.exact else self._exact(self._memory)
+        pose = memory.pose
         return Grip(
             self._surface,
             memory.touched,
@@ -616,23 +617,24 @@ class Rigid(Contact):
         def seen(values: NDArray[Any]) -> NDArray[Any]:
             return surface.of_column(before.surface.column(values).values)
 
-        surface.restore({name: c.values for name, c in before.surface.columns().items()})
-        self._take_stiffness()
         n = memory.normal @ memory.pose.Q.T
-        same = seen(before.touched) & (
-            np.abs(seen(before.gap) - memory.gap) <= SAME * surface.extent
-        )
+        there = np.abs(seen(before.gap) - memory.gap) <= SAME * surface.extent
+        whole = surface.column(there & there.all(axis=1)[:, None]).values
+        known = before.surface.columns().items()
+        surface.restore({name: np.where(whole, c.values, 0.0) for name, c in known})
+        self._take_stiffness()
+        same = seen(before.touched) & there
         same &= np.abs(seen(before.normal) - n).max(axis=2) <= SAME
         anchor = framed(self.shape, memory.pose, seen(before.anchor))
-        acts, rubbed = before.outcome, memory.friction
+        acts, mine, rubbed = before.outcome, memory.outcome, memory.friction
         if before.friction.shape[2] == rubbed.shape[2]:
             rubbed = np.where(same[:, :, None], seen(before.friction), rubbed)
         outcome = replace(
-            memory.outcome,
-            pressure=np.where(same, seen(acts.pressure), 0.0),
-            traction=np.where(same[:, :, None], seen(acts.traction), 0.0),
-            inside=same,
-            slips=same & seen(acts.slips),
+            mine,
+            pressure=np.where(same, seen(acts.pressure), mine.pressure),
+            traction=np.where(same[:, :, None], seen(acts.traction), mine.traction),
+            inside=same | mine.inside,
+            slips=np.where(same, seen(acts.slips), mine.slips),
         )
         self._memory = self._trial = replace(
             memory,

@@ -59,18 +59,14 @@ class Facets:
     def __init__(self, particles: Particles, facet_tags: Any, tag: Any, what: str) -> None:
         body = particles.mesh
         dim = body.topology.dim - 1
-        body.topology.create_connectivity(dim, dim + 1)
-        outer = mesh.exterior_facet_indices(body.topology)
+        outer = _marked(body, particles.boundary())
         if tag is not None or facet_tags is not None:
             known = known_tags(particles, facet_tags, what)
             if not is_tag(tag) or tag not in known:
                 raise MPMError(f"There is no facet tag {tag!r}; there are {sorted(known)}.")
             known_tags(particles, facet_tags, what, [tag])
             # (on any rank that knows the facet)
-            own = _marked(body, facet_tags.find(tag))
-            outer = np.intersect1d(_marked(body, outer), own)
-        else:
-            outer = _marked(body, outer)
+            outer = np.intersect1d(outer, _marked(body, facet_tags.find(tag)))
         # Tags are carried along where particles move; what a cut lays bare is none of them.
         self.tags = mesh.meshtags(body, dim, outer, np.ones(len(outer), dtype=np.int32))
         self._particles = particles
@@ -136,7 +132,9 @@ class Surface:
         weights: Undeformed area of each point, all around the axis of a body of revolution,
             shape ``(m, nq)``; 0 where deleted.
         thickness: Undeformed height of the domain behind each facet, shape ``(m,)``: volume over
-            area, times the dimension for triangles and tetrahedra.
+            area, times :attr:`narrowing`.
+        narrowing: The dimension where that domain narrows to a point, as triangles, halves of
+            quadrilaterals and tetrahedra do, elsewhere 1, shape ``(m,)``.
         outward: Whether the normal that the facet's order of nodes gives points outwards, as
             1 or -1, shape ``(m,)``.
         extent: Largest coordinate of the undeformed body.
@@ -209,7 +207,8 @@ class Surface:
         centre = (self.shapes @ x[self.nodes]).mean(axis=1)
         n = normals(edges).mean(axis=1)
         self.outward = np.where(((centre - middle) * n).sum(axis=1) < 0.0, -1.0, 1.0)
-        self.narrowing = self.gdim if cell in SIMPLICES else 1
+        narrows = (cell in SIMPLICES) | self.particles.halves[self.cells]
+        self.narrowing = np.where(narrows, self.gdim, 1)
         self.thickness = (
             self.narrowing * self.particles.initial_volume[self.cells] / self._plain.sum(axis=1)
         )

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dolfinx import mesh
+
 from .redistribution import Carrier
 from .remesh import Cuts
 
@@ -60,6 +62,25 @@ class Trail:
             thing = carrier.carry(thing)
         return thing
 
+    def boundary(self, body: mesh.Mesh) -> NDArray[np.int32]:
+        """Return this rank's own facets on the boundary that was given (collective).
+
+        What a cut has laid bare inside the body is none of it.
+
+        Args:
+            body: The present mesh.
+        """
+        first = self._carriers[0].source if len(self.cuts) else body
+        dim = body.topology.dim - 1
+        first.topology.create_connectivity(dim, dim + 1)
+        outer = mesh.exterior_facet_indices(first.topology)
+        if first is body:
+            return np.asarray(outer)
+        tags = self.carry(mesh.meshtags(first, dim, outer, np.ones(len(outer), dtype=np.int32)))
+        body.topology.create_connectivity(dim, dim + 1)
+        own = tags.indices < body.topology.index_map(dim).size_local
+        return np.asarray(tags.indices[own])
+
     def origin_index(self, index: NDArray[np.int64], count: int) -> NDArray[np.int64]:
         """Return the input indices of the domains that the present ones are, or are halves of.
 
@@ -72,3 +93,7 @@ class Trail:
         half = index >= first
         origin[half] = self.cuts[index[half] - first, 0]
         return origin
+
+    def halves(self, index: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+        """Return which of the present domains are halves of others; arguments as above."""
+        return np.isin(self.origin_index(index, count), self.cuts[:, 0])

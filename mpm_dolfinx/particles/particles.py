@@ -247,6 +247,14 @@ class Particles(MaterialDomains):
         """
         return self._trail.carry(thing)
 
+    def boundary(self) -> NDArray[np.int32]:
+        """Return this rank's own facets of ``mesh`` on the body's boundary (collective).
+
+        Where quadrilaterals were cut in two, halves do not share their diagonal: DOLFINx takes it
+        for a boundary, and this does not.
+        """
+        return self._trail.boundary(self.mesh)
+
     def ranks_of_background(self) -> NDArray[np.int64]:
         """Return the rank on which each particle would best be now, shape ``(n,)`` (collective).
 
@@ -324,6 +332,11 @@ class Particles(MaterialDomains):
     def origin_index(self) -> NDArray[np.int64]:
         """Input index of the domain that each particle is, or is half of, shape ``(n,)``."""
         return self._trail.origin_index(self.global_index, self.num_global)
+
+    @property
+    def halves(self) -> NDArray[np.bool_]:
+        """Whether each particle is half of a quadrilateral, shape ``(n,)``."""
+        return self._trail.halves(self.global_index, self.num_global)
 
     @property
     def shares_nodes(self) -> bool:

@@ -248,14 +248,12 @@ class QuasiStaticProblem(ParticleProblem):
         setup = self.setup.with_bodies(*changed)
         if supports is not ...:
             setup = replace(setup, supports=tuple(as_supports(supports, self.bodies)))
-        own_terms = self._own_terms()
-        given = [term for term in self.terms if all(term is not mine for mine in own_terms)]
         change = Given(
             self,
             setup,
             self.bcs if bcs is ... else bcs,
-            given if terms is ... else terms,
-            own_terms,
+            self.terms if terms is ... else terms,
+            self._own_terms(),
         )
         self._go_on(name, change, sudden)
 

@@ -97,7 +97,7 @@ class Given(_Change):
         problem: The problem.
         setup: What it is made of from now on.
         bcs: The Dirichlet conditions.
-        terms: What else acts on the bodies, without what the problem itself has.
+        terms: What else acts on the bodies; what the problem itself has may be among it.
         own: The terms that the problem itself has.
     """
 
@@ -109,7 +109,8 @@ class Given(_Change):
         super().__init__(problem)
         spaces = [group[0].V for group in by_space(problem.bodies)]
         self._bcs = as_conditions(bcs, spaces)
-        self._terms = [*own, *as_terms(terms, problem.bodies)]
+        given = as_terms(terms, problem.bodies)
+        self._terms = [*own, *(term for term in given if all(term is not mine for mine in own))]
         self._setup = replace(setup, terms=tuple(self._terms))
         self._changed = [
             set(new.changed_from(old))

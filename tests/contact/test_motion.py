@@ -220,7 +220,14 @@ def test_tangent_is_the_derivative_of_the_forces(what, friction):
     assert error_of_a_term(term, bodies, start) < 1e-6
 
 
-def colliding(friction=0.0, comm=WORLD, cells=(QUADRILATERAL, TRIANGLE), passes=2, **options):
+def colliding(
+    friction=0.0,
+    comm=WORLD,
+    cells=(QUADRILATERAL, TRIANGLE),
+    passes=2,
+    law="penalty",
+    **options,
+):
     """Return two blocks on fields of their own that fly towards each other, one of them tilted."""
     mesh = box([-0.8, -0.7], [1.9, 1.3], [9, 7], QUADRILATERAL, comm)
     Va, Vb = (scenes.vectors(mesh) for _ in range(2))
@@ -230,7 +237,7 @@ def colliding(friction=0.0, comm=WORLD, cells=(QUADRILATERAL, TRIANGLE), passes=
     upper.geometry.x[:, :2] = x @ np.array([[c, s], [-s, c]]) + (0.35, 0.31)
     lower = box([0.0, -0.3], [1.0, 0.2], [7, 4], cells[1], comm)
     a, b = mpm.Particles(upper, Va), mpm.Particles(lower, Vb)
-    touch = contact.Pair(a, b, friction, passes=passes)
+    touch = contact.Pair(a, b, friction, passes=passes, law=law)
     problem = posed(
         mpm.DynamicProblem,
         [a, b],
@@ -346,6 +353,34 @@ def test_a_run_that_is_interrupted_leaves_everything_as_it_was():
     other.solve(0.32, 0.04)
     end = other.reaction(again)
     assert np.abs(problem.reaction(touch) - end).max() < 1e-9 * np.abs(end).max()
+
+
+@pytest.mark.parametrize(
+    ("scheme", "law", "passes"),
+    [
+        ("conserving", "penalty", 2),
+        ("midpoint", "penalty", 1),
+        ("euler", "penalty", 2),
+        ("euler", "nitsche", 2),
+    ],
+)
+def test_an_equal_pair_put_in_during_an_impact_changes_nothing(scheme, law, passes):
+    """Beside all that acts already, of which the bodies' inertia is not to act twice."""
+    found = []
+    for replaced in (False, True):
+        problem, touch = colliding(0.2, scheme=scheme, law=law, passes=passes)
+        problem.solver.setTolerances(rtol=1e-13)
+        problem.solve(0.26, 0.02)
+        if replaced:
+            assert WORLD.allreduce(int(touch.sticks.sum())) > 2
+            new = contact.Pair(*touch.bodies, 0.2, law=law, passes=passes)
+            problem.stage(terms=[new if term is touch else term for term in problem.terms])
+            problem.solver.setTolerances(rtol=1e-13)
+        problem.solve(0.32, 0.02)
+        places = [scenes.in_order(body, body.centroid) for body in problem.bodies]
+        found.append((np.concatenate(places), problem.momentum))
+    for one, two in zip(*found, strict=True):
+        assert np.abs(one - two).max() < 1e-12 * np.abs(one).max()
 
 
 def test_a_contact_of_a_motion_serves_equilibrium_again():

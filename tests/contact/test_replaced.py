@@ -79,6 +79,26 @@ def test_a_new_contact_knows_the_undeformed_areas_of_a_body_that_was_rebased(axi
     np.testing.assert_allclose(*stiffness, rtol=1e-9)
 
 
+def test_a_new_contact_knows_the_boundary_of_a_body_that_was_split():
+    """Diagonals that cuts have laid bare are none of it, and halves are as stiff as they were."""
+    problem, (disc,) = pressed()
+    before = {}
+    for cuts in ([], np.arange(0, 156, 4), [1]):
+        if len(cuts):
+            problem.split(cuts)
+        top = mpm.facet_tags(problem.particles.mesh, {1: mpm.region(y=1.0)})
+        far = contact.disc((9.0 + len(cuts), 9.0), 0.1)
+        new = contact.Rigid(problem.particles, far)
+        upper = contact.Rigid(problem.particles, far, facet_tags=top, tag=1)
+        problem.stage(terms=[disc, new, upper])
+        for name, one, length in (("disc", disc, 7.2), ("new", new, 7.2), ("upper", upper, 2.6)):
+            columns = one.remembered(name).columns(0)
+            area, height = columns["area"].values, columns["thickness"].values
+            assert WORLD.allreduce(area.sum()) == pytest.approx(length, rel=1e-12)
+            behind = WORLD.allreduce((area * height).sum())
+            assert behind == pytest.approx(before.setdefault(name, behind), rel=1e-12)
+
+
 def test_a_new_contact_begins_where_it_was_made():
     problem, (disc,) = pressed()
     press(problem, [disc])
@@ -233,6 +253,78 @@ def test_an_equal_pair_in_its_place_changes_nothing(law, passes, swapped):
         problem.solve(2, update=lambda t, path=path: path(0.5 + 0.1 * t))
         places = [scenes.in_order(body, body.centroid) for body in problem.bodies]
         found.append((np.concatenate(places), sign * problem.reaction(new)))
+    for one, two in zip(*found, strict=True):
+        assert np.abs(one - two).max() < 1e-12 * np.abs(one).max()
+
+
+@pytest.mark.parametrize("law", ["penalty", "nitsche"])
+@pytest.mark.parametrize("split", [False, True])
+def test_equals_of_two_contacts_in_their_places_change_nothing(law, split):
+    """Also where one of them was made after the body was split, and has areas of its own."""
+    found = []
+    for replaced in (False, True):
+        problem, discs = pressed(law)
+        press(problem, discs)
+        if split:
+            problem.split(np.arange(3, 156, 6))
+        other = contact.Rigid(problem.particles, contact.disc((0.6, 1.3), 0.3), 0.3, law=law)
+        problem.stage(terms=[*discs, other])
+        other.move((0.0, -0.03))
+        problem.solve(1)
+        both = [discs[0], other]
+        forces = [one.reaction for one in both]
+        assert min(abs(force[1]) for force in forces) > 1.0
+        if replaced:
+            made = [((1.5, 1.3), discs[0]), ((0.6, 1.3), other)]
+            both = []
+            for centre, old in made:
+                both.append(
+                    contact.Rigid(problem.particles, contact.disc(centre, 0.3), 0.3, law=law)
+                )
+                both[-1].move(old.offset, old.angle)
+        problem.stage(terms=both)
+        now = [one.reaction for one in both]
+        np.testing.assert_allclose(now, forces, rtol=0.0, atol=1e-12 * 30.0)
+        problem.solve(2, update=lambda t, both=both: both[1].move((0.01 * t, -0.03 - 0.01 * t)))
+        x = scenes.in_order(problem.particles, problem.particles.centroid)
+        found.append((x, np.array([problem.reaction(one) for one in both])))
+    for one, two in zip(*found, strict=True):
+        assert np.abs(one - two).max() < 1e-12 * np.abs(one).max()
+
+
+@pytest.mark.parametrize("law", ["penalty", "nitsche"])
+def test_equals_of_two_pairs_in_their_places_change_nothing(law):
+    """Each has facets of its own of the same bodies."""
+    found = []
+    for replaced in (False, True):
+        problem, _, path = pairs.two(friction=0.3, law=law)
+        problem.solver.setTolerances(rtol=1e-13)
+        a, b = problem.bodies
+        sides = {
+            1: lambda x: (x[1] < 1.01) & (x[0] < 0.58),
+            2: lambda x: (x[1] < 1.01) & (x[0] > 0.57),
+        }
+        bottom = mpm.facet_tags(a.mesh, sides)
+        top = mpm.facet_tags(b.mesh, {1: mpm.region(y=1.0)})
+
+        def of_sides(a=a, b=b, tags=(bottom, top)):
+            return [
+                contact.Pair(a, b, 0.3, law=law, passes=1, facet_tags=tags, tags=(side, 1))
+                for side in (1, 2)
+            ]
+
+        old = of_sides()
+        problem.stage(terms=old)
+        problem.solve(3, update=lambda t, path=path: path(0.5 * t))
+        new = of_sides() if replaced else old
+        forces = np.array([one.reaction for one in old])
+        assert np.abs(forces[:, 1]).min() > 1.0
+        problem.stage(terms=new)
+        now = [one.reaction for one in new]
+        np.testing.assert_allclose(now, forces, rtol=0.0, atol=1e-12 * 30.0)
+        problem.solve(2, update=lambda t, path=path: path(0.5 + 0.1 * t))
+        places = [scenes.in_order(body, body.centroid) for body in problem.bodies]
+        found.append((np.concatenate(places), np.array([problem.reaction(one) for one in new])))
     for one, two in zip(*found, strict=True):
         assert np.abs(one - two).max() < 1e-12 * np.abs(one).max()
 

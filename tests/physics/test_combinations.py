@@ -22,6 +22,7 @@ import ufl
 from dolfinx import fem, la
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.contact.rotation import rotation
 from mpm_dolfinx.io import Kept
 from mpm_dolfinx.materials import DruckerPrager, Hencky, ModifiedCamClay, MohrCoulomb, VonMises
 from mpm_dolfinx.solvers import linear
@@ -245,8 +246,13 @@ class Scene:
         own = [(5.0, 1)] if "pressure" in self.wanted else []
         return [own, []] if self.two else own
 
-    def touching(self, bodies):
-        """Return a wall at a side, or a rigid one whose weight presses it there, or on the top."""
+    def touching(self, bodies, before=None):
+        """Return a wall at a side, or a rigid one whose weight presses it there, or on the top.
+
+        Args:
+            bodies: The bodies.
+            before: A rigid one, to which this is to be an equal.
+        """
         first, axisymmetric = bodies[0], "axisymmetric" in self.wanted
         out = np.eye(self.dim)[0]
         if self.wanted["contact"] != "rigid body":
@@ -257,16 +263,20 @@ class Scene:
         centre[0] = 1.0
         if axisymmetric:
             first, out, centre = bodies[-1], np.eye(2)[1], np.array([0.0, float(len(bodies))])
+        normal, motion = -out, {"velocity": self.start}
+        if before is not None:
+            normal, centre = rotation(before.angle) @ normal, before.centre
+            motion = {"velocity": before.velocity, "spin": before.spin}
         return mpm.contact.RigidBody(
             first,
-            mpm.contact.plane(centre, -out),
+            mpm.contact.plane(centre, normal),
             0.1,
             inertia=None if axisymmetric else 0.02,
             centre=centre,
             friction=0.3,
             gravity=-GRAVITY * out,
-            velocity=self.start,
             axisymmetric=axisymmetric,
+            **motion,
         )
 
     def change(self):
@@ -282,7 +292,7 @@ class Scene:
             problem.repartition(0.0)
 
     def put_equals(self, law):
-        """Begin a stage with a law, and with equals of all conditions, loads and supports."""
+        """Begin a stage with a law, and equals of all conditions, loads, supports and contacts."""
         problem, first = self.problem, self.problem.bodies[0]
         spaces = list({id(body.V): body.V for body in problem.bodies}.values())
         self.bases = [self.base(V, 1.0 * i, self.bases[i].g) for i, V in enumerate(spaces)]
@@ -292,6 +302,10 @@ class Scene:
             given["supports"] = self.supports
         if "pressure" in self.wanted:
             given["pressures"] = self.pressures()
+        if self.contact is not None:
+            old = self.contact
+            self.contact = self.touching(problem.bodies, old)
+            given["terms"] = [self.contact if term is old else term for term in problem.terms]
         up = np.zeros(self.dim)
         up[-1] = -GRAVITY
         bcs = [*self.bases, *(side_of(V) for V in spaces)]
