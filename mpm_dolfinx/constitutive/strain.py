@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 import ufl
 
+from ..errors import MPMError
 from ..meshes.quadrature import nodal_forces
 from ..particles.particles import Particles
 
@@ -121,12 +122,18 @@ class Revolution(Strain):
     """A body of revolution about ``x[0] = 0``, with the strain ``d_r / R`` around it.
 
     Raises:
-        MPMError: ``x[0]`` cannot be a radius.
+        MPMError: ``x[0]`` cannot be a radius, or weights are means in the plane.
     """
 
     def __init__(self, particles: Particles) -> None:
         super().__init__(particles)
         particles.require_radius()
+        if not particles.moves_at_nodes:
+            raise MPMError(
+                f"A body of revolution needs method='cpdi2' or 'cpdi': the weights of "
+                f"{particles.method!r} are means in the plane, and stresses at the axis would be "
+                "wrong on any grid."
+            )
         particles.revolve(True)
         self.dim = 3
         self._mesh_radius = ufl.SpatialCoordinate(particles.mesh)[0]
