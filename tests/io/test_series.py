@@ -10,7 +10,7 @@ import scenes
 from scenes import PLANE, QUADRILATERAL, TRIANGLE, WORLD, box, vectors
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.io.series import TimeSeries
+from mpm_dolfinx.io.series import Entry, Output, TimeSeries
 
 
 @pytest.mark.parametrize("degree", [2, 3])
@@ -341,3 +341,21 @@ def test_domains_that_are_deleted_stay_apart(mpi_tmp_path):
         np.testing.assert_allclose(sizes, np.where(deleted, 0.55**2, 0.75**2), rtol=1e-12)
         assert np.array_equal(grid.cell_data["deleted"], deleted)
     WORLD.Barrier()
+
+
+@pytest.mark.parametrize(
+    ("state", "time", "step", "kept"),
+    [
+        # a state is known by its step, also before the first one, whatever time it was given
+        (Entry(2.0, "a.vtu", 0), 0.5, 0, 1),
+        (Entry(0.5, "a.vtu", 1), 0.5, 0, 0),
+        (Entry(2.0, "a.vtu", 1), 0.5, 1, 1),
+        # one of an older file by its time
+        (Entry(0.5, "a.vtu", -1), 0.5, 3, 1),
+        (Entry(0.6, "a.vtu", -1), 0.5, 3, 0),
+    ],
+)
+def test_which_states_written_after_a_save_are_those_of_it(state, time, step, kept):
+    output = Output()
+    output.go_back({"a.pvd": [state]}, {"a.pvd": 0}, time, step)
+    assert output.written() == {"a.pvd": kept}

@@ -313,3 +313,26 @@ def test_stretched_domain_has_the_polar_parts_of_its_motion():
         rotation, stretch = polar(F[:2, :2])
         np.testing.assert_allclose(rotation, R, atol=1e-13)
         np.testing.assert_allclose(stretch, U, atol=1e-13)
+
+
+def test_tags_of_the_first_mesh_and_of_the_last_eight_are_carried():
+    """Each mesh that is known holds communicators, of which there are not many."""
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
+    particles = mpm.Particles(scenes.box([0.2, 0.2], [1.2, 1.2], [3, 3], QUADRILATERAL), V)
+    every = []
+    for _ in range(12):
+        every.append(mpm.facet_tags(particles.mesh, {7: mpm.region(x=0.2)}))
+        particles.rebase(np.zeros((0, 2), dtype=np.int64))
+    present = mpm.facet_tags(particles.mesh, {7: mpm.region(x=0.2)})
+    for number, tags in enumerate(every):
+        carried = particles.carry(tags)
+        if number == 0 or number >= 12 - 8:
+            assert np.array_equal(carried.indices, present.indices), number
+        else:
+            assert carried is tags, number
+
+
+def test_a_body_that_is_dealt_out_anew_at_first_was_not_rebased():
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
+    block = scenes.box([0.2, 0.2], [1.2, 1.2], [3, 3], QUADRILATERAL)
+    assert mpm.Particles(block, V, partition="background").rebases == 0
