@@ -104,8 +104,9 @@ RUNS = {
     ),
     "expansion": (
         "expansion",
-        "--cells 4 --steps 20 --widest 4 --offset 0.37",
-        {"error_early": 1e-4, "error": 1e-4, "iterations": 250, "cutbacks": 0},
+        # (in fewer steps Newton's method begins where round-off decides whether it gets there)
+        "--cells 4 --steps 36 --widest 4 --offset 0.37",
+        {"error_early": 1e-4, "error": 1e-4, "iterations": 260, "cutbacks": 0},
     ),
     "expansion-whole": ("expansion", "", {"error_early": 1e-5, "error": 1e-5, "iterations": 800}),
     "crossing": ("cell_crossing", "--steps 20", {"scatter_cpdi2": 0.02, "scatter_gimp": 0.025}),

@@ -139,6 +139,16 @@ def test_inverted_points_are_named():
         assert caught.value.particles == [1, 3, 4]
 
 
+def test_points_that_are_crushed_to_round_off_are_named():
+    """Their determinants are positive, and the logarithm of their stretches is none."""
+    H = np.zeros((3, 2, 2))
+    H[2, 0, 0] = -1.0 + 1e-12
+    for material in (Hencky(YOUNG, POISSON), VonMises(YOUNG, POISSON, rho_y=1.0)):
+        with pytest.raises(DomainDistortionError, match="1 of 3 points") as caught:
+            update(material, H)
+        assert caught.value.particles == [2]
+
+
 def test_overflow_is_reported_as_distortion():
     H = np.zeros((2, 3, 3))
     H[1] = 1e200 * np.eye(3)
