@@ -45,17 +45,22 @@ def exact_degree(cell: str, degree: int) -> int:
     return 2 * degree + {"quadrilateral": 1, "hexahedron": 2}.get(cell, 0)
 
 
-def default_degree(cell: str, degree: int) -> int:
+def default_degree(cell: str, degree: int, free: bool = False) -> int:
     """Return the degree of the rule that carries the history by default.
 
     It is the smallest that sees all strains of a domain and keeps the order: degree^dim Gauss
     points on quadrilaterals and hexahedra (one for degree 1: CPDI2 as published), and on
-    triangles 1, 3, 6, on tetrahedra 1, 4, 14 points for the degrees 1, 2, 3.
+    triangles 1, 3, 6, on tetrahedra 1, 4, 14 points for the degrees 1, 2, 3. Quadrilaterals and
+    hexahedra whose nodes have unknowns of their own take (degree + 1)^dim points: with fewer they
+    have modes without strain.
 
     Args:
         cell: Name of the cell type.
         degree: Degree of the shape functions.
+        free: Whether the nodes have unknowns of their own.
     """
+    if free and cell in ("quadrilateral", "hexahedron"):
+        return 2 * degree
     if degree == 1 or cell in ("quadrilateral", "hexahedron"):
         return 2 * degree - 1
     return 2 * degree - 2

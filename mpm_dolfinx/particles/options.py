@@ -65,11 +65,32 @@ class Coordinates:
 
 
 def validate_spaces(body: Any, V: Any) -> None:
-    """Raise an error unless a body and a background space go together (collective)."""
+    """Raise an error unless a body and a background space, if any, go together (collective)."""
     if not isinstance(body, mesh.Mesh):
         raise MPMError(f"The body must be a dolfinx.mesh.Mesh, not {type(body).__name__}.")
     with agree(body.comm):
-        _require_spaces(body, V)
+        _require_mesh("body", body)
+        if V is not None:
+            _require_spaces(body, V)
+
+
+def _require_mesh(what: str, domain: mesh.Mesh) -> None:
+    gdim = domain.geometry.dim
+    if what == "body" and (gdim not in (2, 3) or domain.topology.dim != gdim):
+        raise MPMError(
+            f"The body must fill its space in 2-D or 3-D; it has topological dimension "
+            f"{domain.topology.dim} in {gdim} dimensions."
+        )
+    cells = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
+    if domain.topology.cell_name() not in cells:
+        raise MPMError(
+            f"The {what} has {domain.topology.cell_name()} cells; use one of {', '.join(cells)}."
+        )
+    if domain.geometry.x.dtype != np.float64:
+        raise MPMError(
+            f"The {what} mesh has coordinates of type {domain.geometry.x.dtype}; make it with "
+            "dtype=np.float64, as PETSc here has double precision."
+        )
 
 
 def _require_spaces(body: mesh.Mesh, V: Any) -> None:
@@ -80,24 +101,16 @@ def _require_spaces(body: mesh.Mesh, V: Any) -> None:
     background = V.mesh
     gdim = body.geometry.dim
     if V.mesh is body:
-        raise MPMError("V lives on the body mesh; make it on the background mesh.")
-    if gdim not in (2, 3) or body.topology.dim != gdim:
         raise MPMError(
-            f"The body must fill its space in 2-D or 3-D; it has topological dimension "
-            f"{body.topology.dim} in {gdim} dimensions."
+            "V lives on the body mesh; make it on the background mesh, or omit it for finite "
+            "elements."
         )
     if background.geometry.dim != gdim or background.topology.dim != gdim:
         raise MPMError(
             f"The body is {gdim}-dimensional, the background {background.geometry.dim}-"
             "dimensional; both must have the same dimension."
         )
-    cells = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
-    for what, domain in (("body", body), ("background", background)):
-        if domain.topology.cell_name() not in cells:
-            raise MPMError(
-                f"The {what} has {domain.topology.cell_name()} cells; use one of "
-                f"{', '.join(cells)}."
-            )
+    _require_mesh("background", background)
     element = V.ufl_element()
     if (
         element.reference_value_shape != (gdim,)
@@ -120,28 +133,22 @@ def _require_spaces(body: mesh.Mesh, V: Any) -> None:
             "The body and the background number their ranks differently; make both on the same "
             "communicator."
         )
-    for what, domain in (("body", body), ("background", background)):
-        if domain.geometry.x.dtype != np.float64:
-            raise MPMError(
-                f"The {what} mesh has coordinates of type {domain.geometry.x.dtype}; make it with "
-                "dtype=np.float64, as PETSc here has double precision."
-            )
 
 
-def _validate_degrees(body: mesh.Mesh, background: int, domains: Any) -> None:
+def _validate_degrees(body: mesh.Mesh, background: int | None, domains: Any) -> None:
     """Raise an error unless the degrees of background and domains are a good pair.
 
     Domains of a lower degree than the background's lose its order; quadrilaterals and hexahedra
     with one point also have modes without strain at any density (docs/high-order.md).
     """
-    if background not in DEGREES:
+    if background is not None and background not in DEGREES:
         raise MPMError(
             f"The background has degree {background}; use "
             f"{'1' if background < 1 else '3, the highest that is supported'}."
         )
     if isinstance(domains, bool) or not isinstance(domains, int) or domains not in DEGREES:
         raise MPMError(f"The domains' degree must be 1, 2 or 3, not {domains!r}.")
-    if domains < background:
+    if background is not None and domains < background:
         hourglass = domains == 1 and body.basix_cell() in BOX_CELLS
         why = "leave modes without strain and lose its order" if hourglass else "lose its order"
         raise MPMError(
@@ -152,7 +159,7 @@ def _validate_degrees(body: mesh.Mesh, background: int, domains: Any) -> None:
 
 def validate_options(
     body: mesh.Mesh,
-    V: fem.FunctionSpace,
+    V: fem.FunctionSpace | None,
     method: str,
     degree: int,
     quadrature_degree: int | None,
@@ -160,25 +167,34 @@ def validate_options(
     domain_update: str,
 ) -> None:
     """Raise an error unless method, degrees and policies go together."""
-    element = V.ufl_element()
     if not is_one_of(method, METHODS):
         raise MPMError(f"Unknown method {method!r}; choose one of {', '.join(map(repr, METHODS))}.")
-    _validate_degrees(body, element.degree, degree)
-    if METHODS[method].one_point and (element.degree, degree, quadrature_degree or 1) != (1, 1, 1):
+    if METHODS[method].free != (V is None):
+        raise MPMError(
+            f"Method {method!r} has no background; omit V."
+            if V is not None
+            else f"Method {method!r} needs a background space V; finite elements have no method."
+        )
+    background = None if V is None else V.ufl_element().degree
+    _validate_degrees(body, background, degree)
+    if METHODS[method].one_point and (background, degree, quadrature_degree or 1) != (1, 1, 1):
         raise MPMError(
             f"Method {method!r} has one quadrature point per domain of degree 1, on a background "
             "of degree 1; use 'cpdi2' for others."
         )
     if quadrature_degree is not None:
         require_degree("quadrature_degree", quadrature_degree, 30)  # 16 points each way
-    if quadrature_degree is not None and degree > 1 and quadrature_degree < 2 * degree - 2:
+    enough = default_degree(body.basix_cell().name, degree, V is None)
+    least = enough if V is None else 2 * degree - 2
+    if quadrature_degree is not None and quadrature_degree < least and (degree > 1 or V is None):
         raise MPMError(
             f"A rule of degree {quadrature_degree} does not see all strains of a domain of degree "
-            f"{degree}; use quadrature_degree={default_degree(body.basix_cell().name, degree)} "
-            "or more."
+            f"{degree}; use quadrature_degree={enough} or more."
         )
     if not is_one_of(outside, ("error", "stop", "delete")):
         raise MPMError(f"Unknown policy outside={outside!r}; choose 'error', 'stop' or 'delete'.")
+    if V is None and outside != "error":
+        raise MPMError(f"Finite elements have no background to leave; omit outside={outside!r}.")
     if not is_one_of(domain_update, ("stretch", "fixed")):
         raise MPMError(f"Unknown domain_update={domain_update!r}; choose 'stretch' or 'fixed'.")
 

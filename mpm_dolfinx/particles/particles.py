@@ -19,12 +19,14 @@ from ..background.basis import BackgroundBasis, PointBasis
 from ..background.ownership import ranks_of_background
 from ..errors import MPMError, ParticleOutsideError, agree
 from ..meshes.boxes import mesh_of_boxes
-from ..meshes.quadrature import volume_ratio
+from ..meshes.quadrature import default_degree, volume_ratio
 from ..meshes.redistribution import Carrier, Redistribution, cell_centres
 from ..meshes.remesh import Column, Cuts, Remesh
 from ..meshes.trail import Trail
 from ..parallel.given import require_same
 from ..reals import is_one_of
+from ..transfer.cpdi import CPDI2
+from ..transfer.elements import FiniteElements
 from ..transfer.method import CornerBasis, DomainState, ParticleState
 from ..transfer.methods import METHODS
 from ..transfer.transfer import Transfer
@@ -62,14 +64,19 @@ class Particles(MaterialDomains):
       rectangles or boxes;
     - ``"mpm"``: points (Sulsky, Chen & Schreyer 1994).
 
+    Without V there is no background: the nodes have unknowns of their own, T is the identity, and
+    the body is one of total Lagrangian finite elements, with Dirichlet conditions on ``W`` as in
+    any DOLFINx script. It goes on as long as its mesh does.
+
     Args:
         body: Undeformed body: triangles or quadrilaterals in the plane, tetrahedra or
             hexahedra in space. Its cells are the particles.
-        V: Vector Lagrange space on the background mesh, on the same ranks.
-        method: ``"cpdi2"``, ``"cpdi"``, ``"gimp"`` or ``"mpm"``.
+        V: Vector Lagrange space on the background mesh, on the same ranks; ``None``: finite
+            elements.
+        method: ``"cpdi2"`` (default), ``"cpdi"``, ``"gimp"`` or ``"mpm"``; without V ``"fem"``.
         degree: Degree of the domains' shape functions.
         quadrature_degree: Degree of the rule that carries the history; ``None`` is one point
-            per domain for degree 1.
+            per domain for degree 1, and for finite elements the least without hourglass modes.
         outside: What happens when a step takes a corner of a domain out of the background:
             ``"error"`` ends the run with an error, ``"stop"`` without one (both before that
             step), ``"delete"`` goes on without the domain and adds up what is lost.
@@ -84,7 +91,7 @@ class Particles(MaterialDomains):
 
     Attributes:
         mesh: The body mesh, undeformed: ``body``, or its copy with ``partition="background"``.
-        V: The background space.
+        V: The background space; of finite elements ``W``.
         W: Space of the domains' displacement.
         displacement: Total displacement d in W.
         increment: The background displacement u in V of the step being solved.
@@ -117,8 +124,8 @@ class Particles(MaterialDomains):
     def __init__(
         self,
         body: mesh.Mesh,
-        V: fem.FunctionSpace,
-        method: str = "cpdi2",
+        V: fem.FunctionSpace | None = None,
+        method: str | None = None,
         degree: int = 1,
         quadrature_degree: int | None = None,
         outside: str = "error",
@@ -127,6 +134,7 @@ class Particles(MaterialDomains):
         on_distortion: str = "error",
     ) -> None:
         validate_spaces(body, V)
+        method = method or (FiniteElements if V is None else CPDI2).name
         require_same(
             body.comm,
             V=V,
@@ -140,29 +148,41 @@ class Particles(MaterialDomains):
         )
         validate_options(body, V, method, degree, quadrature_degree, outside, domain_update)
         validate_distortion(body, method, degree, quadrature_degree, on_distortion)
-        if not is_one_of(partition, ("given", "background")):
-            raise MPMError(f"Unknown partition={partition!r}; choose 'given' or 'background'.")
+        if not is_one_of(partition, ("given", "background")) or (V is None and partition != "given"):
+            raise MPMError(
+                f"Unknown partition={partition!r}; choose 'given'"
+                + (" or 'background'." if V is not None else ", as there is no background.")
+            )
         validate_cells(body, "body")
-        validate_cells(V.mesh, "background")
-        self.V = V
         self.method = method
-        self.increment = fem.Function(V, name="increment")
         self.outside = outside
         self.on_distortion = on_distortion
+        if V is None:
+            quadrature_degree = quadrature_degree or default_degree(
+                body.basix_cell().name, degree, free=True
+            )
         self._degrees = degree, quadrature_degree
         self._domain_update = domain_update
-        self._background = BackgroundBasis(V)
-        self._background_coordinates = Coordinates(V.mesh, "background")
         self._trail = Trail()
+        if V is not None:
+            validate_cells(V.mesh, "background")
+            self._ride_on(V)
         if partition == "background":
-            ranks = ranks_of_background(V, self._background, cell_centres(body))
+            ranks = ranks_of_background(self.V, self._background, cell_centres(body))
             self._trail.append(move := Redistribution(body, ranks))
             body = move.mesh
         self._settle(body)
-        self._method = METHODS[method](V, domain_update)
         self._method.require(body, self.initial_domains, self.global_index)
         self._geometry.require_volume(self.quadrature)
         self.locate()
+
+    def _ride_on(self, V: fem.FunctionSpace) -> None:
+        """Take the space that moves the nodes (collective)."""
+        self.V = V
+        self.increment = fem.Function(V, name="increment")
+        self._background = BackgroundBasis(V)
+        self._background_coordinates = Coordinates(V.mesh, "background")
+        self._method = METHODS[self.method](V, self._domain_update)
 
     def __copy__(self) -> NoReturn:
         """Raise an error: a copy would have the mesh, the load and the displacement in common."""
@@ -191,6 +211,11 @@ class Particles(MaterialDomains):
         kind = self.V.mesh.basix_cell().name
         kinds = kind.removesuffix("on") + "a" if kind.endswith("hedron") else kind + "s"
         points = f"{self.num_points} point{'s' if self.num_points > 1 else ''} each"
+        if self.is_free:
+            return (
+                f"{self.num_global} {self.mesh.basix_cell().name} finite elements of degree "
+                f"{degree}, {points}"
+            )
         return (
             f"{self.num_global} {self.mesh.basix_cell().name} domains ({self.method}, degree "
             f"{degree}, {points}) in a background of {cells.index_map(cells.dim).size_global} "
@@ -203,6 +228,8 @@ class Particles(MaterialDomains):
         deletable = self.outside == "delete" or getattr(self, "deletion", None) is not None
         self._live_on(Geometry(body, family, *self._degrees), deletable)
         self._coordinates = Coordinates(body, "body")
+        if METHODS[self.method].free:
+            self._ride_on(self.W)
         self.load = LoadFactor(body, 0.0)
         self.proportional = fem.Constant(body, 1.0)
         self._converged = np.zeros_like(self._geometry.nodes)
@@ -342,6 +369,11 @@ class Particles(MaterialDomains):
     def shares_nodes(self) -> bool:
         """Whether neighbours share their nodes, so that the body hangs together."""
         return self._method.shares_nodes
+
+    @property
+    def is_free(self) -> bool:
+        """Whether all nodes have unknowns of their own, without a background."""
+        return self._method.free
 
     @property
     def moves_at_nodes(self) -> bool:

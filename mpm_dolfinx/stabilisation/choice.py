@@ -38,8 +38,9 @@ def stabilisation_of(
     Raises:
         MPMError: A method whose particles are not moved at their nodes.
     """
+    # nodes with unknowns of their own are held by their own elements
     simple = bodies[0].V.ufl_element().degree == 1
-    if simple and kind == "auto" and background:
+    if bodies[0].is_free or (simple and kind == "auto" and background):
         kind = None
     cure = _stabilisation(kind, bodies)
     return Cure() if cure is None else cure

@@ -118,12 +118,14 @@ class Method(ABC):
         shares_nodes: Whether neighbours share their nodes, so that the body hangs together.
         at_nodes: Whether the rows of T are values of the background at the domains' corners.
         one_point: Whether a domain has one quadrature point and degree 1.
+        free: Whether corners have unknowns of their own, so that there is no background.
     """
 
     name: ClassVar[str]
     shares_nodes: ClassVar[bool] = False
     at_nodes: ClassVar[bool] = False
     one_point: ClassVar[bool] = True
+    free: ClassVar[bool] = False
 
     def __init__(self, V: fem.FunctionSpace, domain_update: str) -> None:
         del V, domain_update  # most methods need neither
@@ -148,7 +150,7 @@ class Method(ABC):
 
         Args:
             state: Where the domains are.
-            background: What evaluates the background's basis.
+            background: Evaluates the background's basis.
         """
 
     def domains(self, state: DomainState) -> NDArray[np.float64]:

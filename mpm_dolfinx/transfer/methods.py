@@ -5,10 +5,13 @@
 from __future__ import annotations
 
 from .cpdi import CPDI, CPDI2
+from .elements import FiniteElements
 from .gimp import GIMP
 from .method import Method
 from .points import Points
 
 __all__ = ["METHODS"]
 
-METHODS: dict[str, type[Method]] = {method.name: method for method in (CPDI2, CPDI, GIMP, Points)}
+METHODS: dict[str, type[Method]] = {
+    method.name: method for method in (CPDI2, CPDI, GIMP, Points, FiniteElements)
+}

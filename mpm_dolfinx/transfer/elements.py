@@ -1,0 +1,48 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Finite elements: each node of a body has an unknown of its own."""
+
+from __future__ import annotations
+
+from typing import override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from ..background.basis import BackgroundBasis, PointBasis
+from .method import CornerBasis, DomainState, Method
+
+__all__ = ["FiniteElements"]
+
+
+class FiniteElements(Method):
+    """Nodes have unknowns of their own: T is the identity on W, which is V too.
+
+    Args:
+        V: Space of the body's own displacement.
+        domain_update: Not used.
+    """
+
+    name = "fem"
+    shares_nodes = True
+    at_nodes = True
+    one_point = False
+    free = True
+
+    def __init__(self, V: fem.FunctionSpace, domain_update: str) -> None:
+        super().__init__(V, domain_update)
+        layout = V.dofmap.index_map
+        local = np.arange(layout.size_local + layout.num_ghosts, dtype=np.int32)
+        self._nodes: NDArray[np.int64] = layout.local_to_global(local)
+
+    @override
+    def rows(self, state: DomainState, background: BackgroundBasis) -> CornerBasis:
+        nodes = self._nodes[:, None]
+        ones = np.ones(nodes.shape)
+        return CornerBasis(None, PointBasis(nodes.copy(), ones, np.ones(len(nodes), dtype=bool)))
+
+    @override
+    def domains(self, state: DomainState) -> NDArray[np.float64]:
+        return state.corners
