@@ -21,6 +21,7 @@ from dolfinx import fem
 
 from ..background.basis import BackgroundBasis
 from ..background.cells import cell_volumes
+from ..background.grids import cell_lines, coarser
 from ..particles.particles import Particles
 
 __all__ = ["Groups", "background_cells", "patches", "singles"]
@@ -212,14 +213,30 @@ def _facets(body: Any, vertices: NDArray[np.int64]) -> NDArray[np.int64]:
 def background_cells(particles: Particles) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return in which background cells the domains' centroids start (collective).
 
+    Of finite elements, which have no background: in which boxes of about two elements each way.
+
     Returns:
         Global cell numbers, -1 where there is none, and the cells' volumes, each ``(n,)``.
     """
     background = particles.V.mesh
+    if particles.is_free:
+        return _boxes(coarser(cell_lines(particles.V)), particles.initial_centroid)
     cells = BackgroundBasis(fem.functionspace(background, ("Discontinuous Lagrange", 0)))
     found = cells.at(particles.initial_centroid)
     volumes = np.concatenate(background.comm.allgather(cell_volumes(background)))
     return np.where(found.found, found.nodes[:, 0], -1), volumes[found.nodes[:, 0]]
+
+
+def _boxes(
+    lines: list[NDArray[np.float64]], points: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return numbers and volumes of the boxes between grid lines that points lie in."""
+    number, volume = np.zeros(len(points), dtype=np.int64), np.ones(len(points))
+    for axis, line in enumerate(lines):
+        place = np.clip(np.searchsorted(line, points[:, axis]) - 1, 0, len(line) - 2)
+        number = number * (len(line) - 1) + place
+        volume *= np.diff(line)[place]
+    return number, volume
 
 
 def _connected(n: int, links: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -286,8 +286,11 @@ class Particles(MaterialDomains):
         """Return the rank on which each particle would best be now, shape ``(n,)`` (collective).
 
         That which owns the background where the particle is; where a rank would get more than
-        5 % above an even share, that of the compact part that the particle is in.
+        5 % above an even share, that of the compact part that the particle is in. Finite elements
+        stay where they are.
         """
+        if self.is_free:
+            return np.full(self.num_local, self.mesh.comm.rank, dtype=np.int64)
         return ranks_of_background(self.V, self._background, self.centroid)
 
     def move(self, ranks: NDArray[np.int64]) -> None:

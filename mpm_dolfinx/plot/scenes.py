@@ -222,7 +222,8 @@ def take(
         shapes.append(shape)
         if len(points):
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
-    backgrounds = {id(body.V.mesh): body.V.mesh for body in bodies}
+    backgrounds = {id(body.V.mesh): body.V.mesh for body in bodies if not body.is_free}
+    background = background and len(backgrounds) > 0
     boxes = [_box(one, comm) for one in backgrounds.values()]
     cells = [edges(one) for one in backgrounds.values()] if planar and background else []
     marks = (
@@ -230,9 +231,6 @@ def take(
     )
     if comm.rank > 0:
         return None
-    around = np.array(
-        [np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)]
-    )
     terms = getattr(problem, "terms", ())
     obstacles = [t.placed() for t in terms if hasattr(type(t), "placed")]
     extent = _with_obstacles(np.array([low, high]), obstacles)
@@ -242,7 +240,9 @@ def take(
         [cell for cell in cells if cell is not None],
         marks,
         extent,
-        around if background else None,
+        np.array([np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)])
+        if background
+        else None,
         obstacles,
     )
 

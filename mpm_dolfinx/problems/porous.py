@@ -202,9 +202,10 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
             if known.particles is body and known.field.W.mesh is body.mesh:
                 return known
         V = next(V for its, V in self._spaces_of_water if its is body)
+        kind = "body" if body.is_free else "total"
         return _Filled(
             body,
-            body.field(V, at="nodes", name="pore_pressure"),
+            body.field(V, at="nodes", kind=kind, name="pore_pressure"),
             fem.Function(body.W, name="displacement before"),
             fem.Constant(body.mesh, 1.0),
         )

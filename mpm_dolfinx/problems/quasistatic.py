@@ -381,7 +381,8 @@ class QuasiStaticProblem(ParticleProblem):
             degree = max(body.V.ufl_element().degree - 1, 1)
             V = fem.functionspace(body.V.mesh, ("Lagrange", degree))
             self._spaces_of_pressure.append((body, V))
-        return body.field(V, at="points", name="pressure")
+        kind = "body" if body.is_free else "total"
+        return body.field(V, at="points", kind=kind, name="pressure")
 
     def _contribution(self, given: Body) -> Contribution:
         """Return the contribution of one body to the system (collective)."""
@@ -533,7 +534,8 @@ class QuasiStaticProblem(ParticleProblem):
 
         def move() -> None:
             for body, targets in zip(self.bodies, ranks, strict=True):
-                body.move(targets)
+                if not body.is_free:
+                    body.move(targets)
 
         self.renew(move, lambda snapshot: snapshot)
         self.history.statistics.count("repartitions")

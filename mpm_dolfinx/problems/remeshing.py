@@ -270,7 +270,7 @@ class Remeshing:
             term.require_remeshable(consequence)
         for body in problem.bodies:
             degree, cells = body.W.ufl_element().degree, _compat.geometry_degree(body.mesh)
-            if not body.shares_nodes or cells not in (1, degree):
+            if body.is_free or not body.shares_nodes or cells not in (1, degree):
                 raise MPMError(
                     "Only a body that moves by 'cpdi2', with straight cells or such of its own "
                     "degree, can be rebased."

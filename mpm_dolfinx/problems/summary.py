@@ -64,7 +64,7 @@ def on_a_screen(
         rows.append(("", _state(body, comm)))
     spaces: list[fem.FunctionSpace] = []
     for body in bodies:
-        if all(body.V is not V for V in spaces):
+        if not body.is_free and all(body.V is not V for V in spaces):
             spaces.append(body.V)
     rows += [("background", _space(V)) for V in spaces]
     if problem.bcs or problem.terms:

@@ -72,6 +72,7 @@ FEATURES = {
     "contact, Nitsche": {"contact": "nitsche"},
     "stabilised pressure": {"mixed": "stabilised pressure"},
     "RigidBody": {"contact": "rigid body"},
+    "finite elements": {"method": "fem"},
 }
 
 
@@ -147,17 +148,19 @@ class Scene:
         two = "bodies" in wanted
         V = self.space(0.0, 2.0 if wanted.get("bodies") == "one V" else 1.0, h)
         bodies = [self.body(V, 0.0, n)]
-        self.wall = fem.Constant(V.mesh, np.zeros(self.dim))
+        self.wall = fem.Constant(bodies[0].V.mesh, np.zeros(self.dim))
         self.wall.value[-1] = -0.3 if "delete" in wanted else 0.0
-        self.bases = [self.base(V, 0.0, self.wall)]
+        self.bases = [self.base(bodies[0].V, 0.0, self.wall)]
         if two:
             above = V
             if wanted["bodies"] == "several V":
                 above = self.space(1.0, 2.0, h)
-                self.bases.append(self.base(above, 1.0, fem.Constant(above.mesh, self.wall.value)))
             elif wanted["bodies"] == "tied":
                 above = self.space(1.0 - 1.5 * h, 2.0, h)
             bodies.append(self.body(above, 1.0, n))
+            above = bodies[1].V
+            if wanted["bodies"] != "tied" and above is not bodies[0].V:
+                self.bases.append(self.base(above, 1.0, fem.Constant(above.mesh, self.wall.value)))
         self.problem = self.made(bodies, two)
 
     def space(self, bottom, top, h):
@@ -175,10 +178,11 @@ class Scene:
         cell = HEXAHEDRON if self.dim == 3 else QUADRILATERAL
         lower, upper = np.zeros(self.dim), np.ones(self.dim)
         lower[-1], upper[-1] = bottom, bottom + 1.0
+        method = self.wanted.get("method", "cpdi2")
         return mpm.Particles(
             scenes.box(lower, upper, [n] * self.dim, cell),
-            V,
-            method=self.wanted.get("method", "cpdi2"),
+            None if method == "fem" else V,
+            method=method,
             degree=self.degree,
             quadrature_degree=self.wanted.get("quadrature") if self.degree == 1 else None,
             outside="delete" if "delete" in self.wanted else "error",
