@@ -143,6 +143,7 @@ class Step:
         time: Time at its end: the number of stages before it, and how much of its own is done.
         output: Whether it ends at one of the levels that were asked for (``output_at``), or at the
             end of the run.
+        error: What :meth:`ParticleProblem.error` found at its end, ``None`` where it was not asked.
     """
 
     load: float
@@ -151,6 +152,7 @@ class Step:
     displacement: float | None = None
     time: float = 0.0
     output: bool = False
+    error: float | None = None
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import error
 import high_order
 import load_steps
 import locking
@@ -44,7 +45,18 @@ import supports
 from case_runs import ROOT, Table, head, row
 
 DOCS = ROOT / "docs"
-SCRIPTS = (step_size, load_steps, locking, splitting, soils, methods, high_order, solver, supports)
+SCRIPTS = (
+    error,
+    step_size,
+    load_steps,
+    locking,
+    splitting,
+    soils,
+    methods,
+    high_order,
+    solver,
+    supports,
+)
 TABLES: dict[str, tuple[Table, Path]] = {
     name: (table, Path(str(script.__file__)))
     for script in SCRIPTS

@@ -329,12 +329,31 @@ class MaterialPoints:
     def shear_modulus(self) -> float:
         """Return the mean shear modulus of the unstrained body (collective)."""
         volumes = self.strain.volumes().ravel()
-        with agree(self._particles.mesh.comm):
-            shear = self.undeformed_tangent()[:, 0, 1, 0, 1]
+        shear = self.undeformed_moduli()[1]
         whole, volume = self._particles.mesh.comm.allreduce(
             np.array([volumes @ shear, volumes.sum()])
         )
         return float(whole / volume)
+
+    def undeformed_moduli(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return bulk and shear modulus of all unstrained points, ``(n nq,)`` each (collective)."""
+        with agree(self._particles.mesh.comm):
+            tangent = self.undeformed_tangent()
+        shear = tangent[:, 0, 1, 0, 1]
+        return tangent[:, 0, 0, 0, 0] - 4.0 / 3.0 * shear, shear
+
+    @property
+    def num_laws(self) -> int:
+        """Number of laws, the same on all ranks."""
+        return len(self._governed)
+
+    @property
+    def law_numbers(self) -> NDArray[np.int64]:
+        """Number of the law of each domain, shape ``(n,)``."""
+        result = np.zeros(self._points, dtype=np.int64)
+        for number, part in enumerate(self._governed):
+            result[part.points] = number
+        return result.reshape(self._particles.num_local, -1)[:, 0]
 
     def undeformed_tangent(self) -> NDArray[np.float64]:
         """Return dP/dF of all points where nothing is strained, ``(n nq, dim, dim, dim, dim)``."""

@@ -148,7 +148,9 @@ class Particles(MaterialDomains):
         )
         validate_options(body, V, method, degree, quadrature_degree, outside, domain_update)
         validate_distortion(body, method, degree, quadrature_degree, on_distortion)
-        if not is_one_of(partition, ("given", "background")) or (V is None and partition != "given"):
+        if not is_one_of(partition, ("given", "background")) or (
+            V is None and partition != "given"
+        ):
             raise MPMError(
                 f"Unknown partition={partition!r}; choose 'given'"
                 + (" or 'background'." if V is not None else ", as there is no background.")

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -56,6 +57,7 @@ from .arguments import (
     require_entity_maps,
     residuals_of,
 )
+from .errors import Errors, estimated
 from .parts import Contribution, Parts
 from .solver import Solver, as_solver
 from .staging import Change, Staging
@@ -279,6 +281,8 @@ class ParticleProblem:
     _keeps_joints = True
     #: Whether steps may start from an extrapolation of those before.
     _predicts = True
+    #: Whether a step ends in equilibrium.
+    _at_rest = True
     #: Residuals of the fields.
     _of_fields: Sequence[ufl.Form] = ()
     _field_terms: Sequence[FieldTerm] = ()
@@ -622,6 +626,56 @@ class ParticleProblem:
             if any(bc is known for known in field.conditions)
         )
         return force_at(bc, None if reactions is None else reactions[number], field.V)
+
+    def error(self) -> float:
+        """Return an estimate of the error of the last converged step (collective).
+
+        In equilibrium the background sees no force: ``T^T R = 0``. R itself, on the bodies' own
+        nodes, is what it could not balance; its energy, node by node, tells how far the bodies'
+        own finite elements are from here. It is kept as ``error`` of the last of
+        ``history.steps``.
+
+        Not seen is what these elements cannot do themselves (shear or volumetric locking, a mesh
+        too coarse for the load), nor the error of load steps, for which ``steps="auto"`` has a
+        tolerance. A body of finite elements has none that it sees.
+
+        Returns:
+            Energy norm of the error over that of the deformation.
+
+        Raises:
+            MPMError: A motion, or a flow of water, which is in no equilibrium of its own.
+        """
+        found = self._errors().total(self.bodies)
+        steps = self.history.steps
+        if steps:
+            steps[-1] = replace(steps[-1], error=found)
+        return found
+
+    def error_of_particles(self, body: int = 0) -> NDArray[np.float64]:
+        """Return where :meth:`error` comes from, for pictures (collective).
+
+        Args:
+            body: Number of the body.
+
+        Returns:
+            Share of each particle of this rank, shape ``(n,)``; the squares of all bodies' add
+            up to the square of the error.
+
+        Raises:
+            MPMError: As for :meth:`error`, or there is no such body.
+        """
+        if body not in range(len(self.bodies)):
+            raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
+        return self._errors().of_particles(body, self.bodies[body])
+
+    def _errors(self) -> Errors:
+        if not self._at_rest:
+            raise MPMError(
+                f"A {type(self).__name__} is in no equilibrium of which an error could be told; "
+                "error() is for problems at rest."
+            )
+        self._require_governing()
+        return estimated(self.bodies, self.body_terms, self.reduced)
 
     def write(self, path: str | Path, time: float | None = None) -> None:
         """Add the present state to a time series for ParaView (collective).

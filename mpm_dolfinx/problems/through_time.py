@@ -28,6 +28,7 @@ class TimeProblem(ParticleProblem):
     """A problem whose steps have a duration. Loads act in full unless a path says otherwise."""
 
     _predicts = False
+    _at_rest = False
 
     def _aim(self, t: float) -> None:
         """Take a time for the end of the step to try."""

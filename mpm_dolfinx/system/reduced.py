@@ -433,6 +433,11 @@ class ReducedSystem:
                 size += joint_norm(forces, self._comm)
         return size
 
+    @property
+    def terms(self) -> Sequence[Term]:
+        """Everything that acts on the bodies."""
+        return self._terms
+
     def nodal_forces(self) -> list[NDArray[np.float64]]:
         """Return the forces of all terms in the last converged state (collective).
 

@@ -256,6 +256,7 @@ RUNS = {
         "--aspect 2 --cells 10 --rayleigh 1e-5 --cohesion 1e3 --dilation-angle 10",
         {"ratio": 1.3, "kinetic_left": 1e-3, "cutbacks": 35},
     ),
+    "lshape": ("lshape", "--offset 0.37", {"error": 0.21, "estimate": 0.21, "iterations": 1}),
     "column": ("column_dynamic", "--time 0.4", {"cutbacks": 0, "balance_error": 1e-12}),
 }
 #: Cases that go through time, whose load is that.
@@ -295,6 +296,7 @@ KEYS = {
     "consolidation": {"error", "degree", "error_degree", "particles"},
     "penetration": {"force", "depth", "ratio", "iterations_per_step", "penetration"},
     "hertz": {"force", "error_force", "error_radius", "error_pressure", "error_most"},
+    "lshape": {"error", "estimate", "unknowns", "error_all_free", "unknowns_carried"},
     "snap_through": {"limit", "valley", "crown", "error"},
 }
 
@@ -463,6 +465,7 @@ def test_case_is_a_program(name, tmp_path):
         "sand_column": "--cells 4 --time 0.1 --steps 5",
         "hertz": "--cells 2 --steps 2",
         "penetration": "--cell 0.25 --depth 0.05 --steps 4",
+        "lshape": "--cells 2",
     }.get(name, "--elements 4 --steps 4")
     done = programs.run(CASES / f"{name}.py", *small.split(), "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -1,0 +1,87 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The error of a body's stress, by a smoother one that is recovered from it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import la
+
+from ..particles.particles import Particles
+from .points import MaterialPoints
+
+__all__ = ["stress_errors"]
+
+type Array = NDArray[np.float64]
+
+
+def stress_errors(particles: Particles, points: MaterialPoints) -> Array:
+    """Return the energy by which the stress differs from a continuous one (collective).
+
+    The continuous stress is linear in the domains' shape functions, with values at nodes that are
+    means of the domains around, each continued to its nodes as far as its points tell
+    (Zienkiewicz & Zhu 1987). Domains of other laws have means of their own.
+
+    Args:
+        particles: The body.
+        points: Its material.
+
+    Returns:
+        ``int ds : C^-1 : ds dX`` with the undeformed body's moduli, shape ``(n,)``.
+    """
+    stress = points.cauchy_stress()
+    stress = stress + np.broadcast_to(points.recovery, (len(stress), 3, 3))[:, None]
+    weights = points.weights
+    at_nodes = _continued(particles, stress, weights)
+    smooth = np.empty_like(stress)
+    shapes = particles.quadrature.shapes
+    for law in range(points.num_laws):
+        mine = points.law_numbers == law
+        means = _means(particles, at_nodes, weights.sum(axis=1) * mine)
+        smooth[mine] = np.einsum("qk,nkij->nqij", shapes, means[mine])
+    bulk, shear = (m.reshape(weights.shape) for m in points.undeformed_moduli())
+    change = smooth - stress
+    mean = np.trace(change, axis1=2, axis2=3) / 3.0
+    deviator = change - mean[:, :, None, None] * np.eye(3)
+    energy = np.einsum("nqij,nqij->nq", deviator, deviator) / (2.0 * shear) + mean**2 / bulk
+    return np.asarray((weights * energy).sum(axis=1))
+
+
+def _continued(particles: Particles, values: Array, weights: Array) -> Array:
+    """Return values at points at the nodes of their domains, ``(n, k, 3, 3)``.
+
+    They follow the plane through a domain's points where there are enough, else their mean.
+    """
+    nodes = particles.initial_domains
+    whole = weights.sum(axis=1)
+    parts = np.divide(weights, whole[:, None], out=np.zeros_like(weights), where=whole[:, None] > 0)
+    mean = np.einsum("nq,nqij->nij", parts, values)[:, None]
+    gdim = nodes.shape[2]
+    if values.shape[1] <= gdim:
+        return np.repeat(mean, nodes.shape[1], axis=1)
+    places = np.einsum("qk,nki->nqi", particles.quadrature.shapes, nodes)
+    middle = np.einsum("nq,nqi->ni", parts, places)[:, None]
+    slopes = np.einsum("niq,nqab->niab", np.linalg.pinv(places - middle), values - mean)
+    return np.asarray(mean + np.einsum("nki,niab->nkab", nodes - middle, slopes))
+
+
+def _means(particles: Particles, values: Array, weights: Array) -> Array:
+    """Return means over the domains around each node, at the domains' nodes (collective).
+
+    Args:
+        particles: The body.
+        values: At the nodes of the domains, ``(n, k, 3, 3)``.
+        weights: Of the domains, shape ``(n,)``.
+    """
+    layout, domains = particles.W.dofmap.index_map, particles.domain_nodes
+    sums = la.vector(layout, 10)
+    table = sums.array.reshape(-1, 10)
+    table[:] = 0.0
+    rows = np.concatenate([values.reshape(*domains.shape, 9), np.ones((*domains.shape, 1))], axis=2)
+    np.add.at(table, domains, weights[:, None, None] * rows)
+    sums.scatter_reverse(la.InsertMode.add)
+    sums.scatter_forward()
+    known = np.where(table[:, 9:] > 0.0, table[:, 9:], 1.0)
+    return np.asarray((table[:, :9] / known)[domains].reshape(*domains.shape, 3, 3))

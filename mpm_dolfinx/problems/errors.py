@@ -1,0 +1,103 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The estimated error of the last converged step, body by body."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from ..constitutive.points import MaterialPoints
+from ..constitutive.recovery import stress_errors
+from ..particles.particles import Particles
+from ..system.body import BodyTerm
+from ..system.conditions import fixed_dofs
+from ..system.estimate import nodal_errors, shares_of_domains
+from ..system.reduced import ReducedSystem
+
+__all__ = ["Errors", "estimated"]
+
+
+class Errors(NamedTuple):
+    """Errors of a state of equilibrium, in energy.
+
+    Attributes:
+        nodal: What the background cannot do: squares of energies at this rank's own nodes of W of
+            each body, shape ``(N,)``.
+        own: What the bodies' own elements cannot: those of this rank's own domains, ``(n,)``.
+        energy: Square of the energy norm of all bodies' deformation.
+    """
+
+    nodal: Sequence[NDArray[np.float64]]
+    own: Sequence[NDArray[np.float64]]
+    energy: float
+
+    def total(self, bodies: Sequence[Particles]) -> float:
+        """Return the error over the size of the deformation (collective)."""
+        mine = sum(float(values.sum()) for values in (*self.nodal, *self.own))
+        whole = bodies[0].mesh.comm.allreduce(mine)
+        return float(np.sqrt(whole / self.energy)) if self.energy > 0.0 else 0.0
+
+    def of_particles(self, number: int, particles: Particles) -> NDArray[np.float64]:
+        """Return the share of each particle of a body, of which squares add up (collective)."""
+        parts = shares_of_domains(particles, self.nodal[number]) + self.own[number]
+        return np.sqrt(parts / self.energy) if self.energy > 0.0 else np.zeros(len(parts))
+
+
+def estimated(
+    bodies: Sequence[Particles], terms: Sequence[BodyTerm], reduced: ReducedSystem
+) -> Errors:
+    """Return the errors of the last converged step (collective).
+
+    Args:
+        bodies: The bodies.
+        terms: What each is made of and loaded by.
+        reduced: Their system.
+    """
+    forces = reduced.nodal_forces()
+    nodal, own, energy = [], [], 0.0
+    for body, term, force in zip(bodies, terms, forces, strict=False):
+        field = next(field for field in reduced.fields if any(b is body for b in field.bodies))
+        held = _prescribed(body, field.conditions)
+        nodal.append(nodal_errors(body, reduced.terms, force, held))
+        points = term.forms.internal
+        if isinstance(points, MaterialPoints):
+            own.append(stress_errors(body, points))
+        else:
+            own.append(np.zeros(body.num_local))
+        energy += _energy(body, term, force)
+    return Errors(nodal, own, bodies[0].mesh.comm.allreduce(energy))
+
+
+def _prescribed(body: Particles, conditions: Sequence[fem.DirichletBC]) -> NDArray[np.bool_]:
+    """Return which own dofs of W move by prescribed dofs of V alone, or not at all (collective)."""
+    weights, moved = body.T.createVecRight(), body.T.createVecLeft()
+    fixed = fixed_dofs(conditions, body.V)
+    # numbers of no pattern, whose sums with signed weights do not vanish
+    weights.array_w[:] = np.where(fixed, 0.0, 1.0 + np.modf(np.arange(len(fixed)) * np.pi)[0])
+    body.T.mult(weights, moved)
+    return np.asarray(moved.array_r == 0.0)
+
+
+def _energy(body: Particles, term: BodyTerm, force: NDArray[np.float64]) -> float:
+    """Return this rank's part of the square of a body's energy norm.
+
+    It is the integral of ``tau : ln V``, twice the energy of an elastic body of Hencky's law, or,
+    without a material, the work of the forces that depend on the displacement.
+    """
+    internal = term.forms.internal
+    if not body.has_material or internal is None:
+        own = len(force)
+        inner = force - term.forms.external.array_r
+        return float(abs(inner @ body.converged_displacement[:own]))
+    F = body.point_deformation_gradient
+    squares, axes = np.linalg.eigh(F @ F.swapaxes(-1, -2))
+    strain = np.einsum("nqik,nqk,nqjk->nqij", axes, 0.5 * np.log(squares), axes)
+    density = np.linalg.det(F) * np.einsum("nqij,nqij->nq", body.point_stress, strain)
+    weights = internal.weights.reshape(density.shape)
+    return float(abs((weights * density)[~body.deleted].sum()))
