@@ -134,7 +134,8 @@ class Particles(MaterialDomains):
         on_distortion: str = "error",
     ) -> None:
         validate_spaces(body, V)
-        method = method or (FiniteElements if V is None else CPDI2).name
+        if method is None:
+            method = (FiniteElements if V is None else CPDI2).name
         require_same(
             body.comm,
             V=V,

@@ -107,7 +107,7 @@ PARTICLES = {
     "degree of W": (vectors(degree=4), r"degree must be 1, 2 or 3, not 4"),
     "degree of no number": (vectors(degree="one"), r"1, 2 or 3, not 'one'"),
     "few points": (vectors(degree=2, quadrature_degree=1), r"degree 2; use quadrature_degree=2"),
-    "method": (vectors(method="fem"), r"Unknown method 'fem'; choose one of 'cpdi2'"),
+    "method": (vectors(method="fdm"), r"Unknown method 'fdm'; choose one of 'cpdi2'"),
     "method of no name": (vectors(method=None), r"Unknown method None"),
     "negative rule": (vectors(quadrature_degree=-1), r"quadrature_degree.*not -1"),
     "broken rule": (vectors(quadrature_degree=1.5), r"quadrature_degree.*not 1\.5"),
