@@ -77,7 +77,6 @@ class Trail:
         if first is body:
             return np.asarray(outer)
         tags = self.carry(mesh.meshtags(first, dim, outer, np.ones(len(outer), dtype=np.int32)))
-        body.topology.create_connectivity(dim, dim + 1)
         own = tags.indices < body.topology.index_map(dim).size_local
         return np.asarray(tags.indices[own])
 
