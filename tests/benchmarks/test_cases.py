@@ -256,6 +256,11 @@ RUNS = {
         "--aspect 2 --cells 10 --rayleigh 1e-5 --cohesion 1e3 --dilation-angle 10",
         {"ratio": 1.3, "kinetic_left": 1e-3, "cutbacks": 35},
     ),
+    "free-body": (
+        "free_body",
+        "--scene block --size 3 --steps 2",
+        {"difference": 1e-9, "iterations": 12, "cutbacks": 0},
+    ),
     "lshape": ("lshape", "--offset 0.37", {"error": 0.21, "estimate": 0.21, "iterations": 1}),
     "column": ("column_dynamic", "--time 0.4", {"cutbacks": 0, "balance_error": 1e-12}),
 }
@@ -296,6 +301,7 @@ KEYS = {
     "consolidation": {"error", "degree", "error_degree", "particles"},
     "penetration": {"force", "depth", "ratio", "iterations_per_step", "penetration"},
     "hertz": {"force", "error_force", "error_radius", "error_pressure", "error_most"},
+    "free_body": {"difference", "seconds_ratio", "unknowns"},
     "lshape": {"error", "estimate", "unknowns", "error_all_free", "unknowns_carried"},
     "snap_through": {"limit", "valley", "crown", "error"},
 }
@@ -326,7 +332,8 @@ def test_numbers(case, capfd):
     assert status == 0
     numbers = json.loads(out)
     assert COMMON | KEYS[name] <= numbers.keys()
-    assert not any("time" in key or "seconds" in key for key in numbers)
+    timed = {key for key in numbers if "time" in key or "seconds" in key}
+    assert timed == ({"seconds_ratio"} if name == "free_body" else set())
     assert numbers["completed"] == 1 and numbers["failure"] is None
     assert numbers["load"] == 1.0 or name in {"snap_through", "expansion", *IN_TIME}
     assert (numbers["iterations"] > 0) == (name != "domain_distortion")  # there all is prescribed
@@ -466,6 +473,7 @@ def test_case_is_a_program(name, tmp_path):
         "hertz": "--cells 2 --steps 2",
         "penetration": "--cell 0.25 --depth 0.05 --steps 4",
         "lshape": "--cells 2",
+        "free_body": "--size 2 --steps 2",
     }.get(name, "--elements 4 --steps 4")
     done = programs.run(CASES / f"{name}.py", *small.split(), "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
