@@ -493,6 +493,32 @@ def test_a_quiet_boundary_lets_a_pulse_go(scheme):
     raises(lambda: dashpot(particles, tags, 1, -1.0, 0.0), mpm.MPMError, "must not be negative")
 
 
+@pytest.mark.parametrize("scheme", ["midpoint", "euler"])
+def test_a_quiet_boundary_resists_motions_across_and_along_it(scheme):
+    V = vectors(box([0.0, 0.0], [2.0, 2.0], [8, 8], QUADRILATERAL))
+    body = box([0.3, 0.3], [1.2, 1.3], [5, 6], QUADRILATERAL)
+    particles = mpm.Particles(body, V)
+    tags = mpm.facet_tags(body, {1: mpm.region(x=1.2)})
+    quiet = dashpot(particles, tags, 1, 3.0, 0.7)
+    law = LinearElastic(50.0, 0.2)
+    problem = mpm.DynamicProblem(
+        mpm.Body(particles, law, density=1.0, velocity=(0.2, -0.3)), supports=[quiet], scheme=scheme
+    )
+    change, ds = fem.Function(particles.W), ufl.Measure("ds", domain=body, subdomain_data=tags)(1)
+    sides = [fem.form(change[i] * ds) for i in (0, 1)]
+    change.x.array[:] = 0.0
+    momentum = problem.momentum
+    for _ in problem.steps(0.1, 0.02):
+        change.x.array[:] = (particles.displacement.x.array - change.x.array) / 0.02
+        across, along = (WORLD.allreduce(fem.assemble_scalar(side)) for side in sides)
+        force = [-3.0 * across, -0.7 * along]
+        np.testing.assert_allclose(problem.reaction(quiet), force, rtol=1e-9)
+        np.testing.assert_allclose(problem.momentum - momentum, np.multiply(0.02, force), rtol=1e-6)
+        momentum = problem.momentum
+        change.x.array[:] = particles.displacement.x.array
+    assert min(abs(across), abs(along)) > 0.05
+
+
 def test_a_plane_that_moves_throws_a_body():
     # A wall at speed 0.1 meets a bar at rest, which leaves it at twice that; work is done on it.
     V = vectors(box([0.0, 0.0], [2.0, 3 / 8], [16, 3], QUADRILATERAL))
