@@ -1,12 +1,19 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Errors, and how ranks agree on them."""
+"""Errors, and how ranks agree on them.
+
+Wherever ranks agree or compare something they make the same call of MPI, on one communicator for
+all meshes of the same ranks. A rank on which a user's code fails, or that was given something else,
+therefore meets the others where these agree next, and all end with its error.
+"""
 
 from __future__ import annotations
 
 import pickle
+import sys
+import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Self, cast
 
@@ -24,11 +31,19 @@ __all__ = [
     "agree",
     "agreed",
     "as_ours",
+    "called_last",
+    "forget",
+    "gathered",
     "gravest",
+    "met",
     "name_particles",
-    "on_all_ranks",
     "warn",
 ]
+
+#: What a rank brings to a meeting besides a token.
+NOTHING, FLAG, ERROR = 0, 1, 2
+#: Seconds after which a rank tells of an error for which the others do not come.
+PATIENCE = 20.0
 
 
 class MPMError(RuntimeError):
@@ -57,7 +72,7 @@ class MPMError(RuntimeError):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Let ranks send errors to each other."""
-        return type(self), (self.message, self.particles, self.load)
+        return type(self), (self.message, self.particles, self.load), {"dofs": self.dofs}
 
 
 class ParticleOutsideError(MPMError):
@@ -113,26 +128,121 @@ def agreed[E: BaseException](comm: MPI.Comm, error: E | None) -> E | None:
         The gravest error, of several the lowest rank's, or ``None``; one of this package has the
         particles of all ranks that have one of its class.
     """
-    if comm.size == 1 or not comm.allreduce(error is not None, MPI.LOR):
+    if comm.size == 1 or getattr(error, _AGREED, False):
         return error
-    errors = comm.allgather(None if error is None else _sendable(error))
+    place = _place(comm)
+    if error is None:
+        worst, _ = _meet(place, NOTHING)
+    else:
+        late = threading.Timer(PATIENCE, _tell, [comm.rank, error])
+        late.daemon = True
+        late.start()
+        worst, _ = _meet(place, ERROR)
+        late.cancel()
+    return _common(place, error) if worst == ERROR else None
+
+
+def met(comm: MPI.Comm, token: int = 0, flag: bool = False) -> tuple[bool, bool]:
+    """Meet the other ranks (collective).
+
+    Args:
+        comm: The ranks, more than one.
+        token: A whole number of 63 bits.
+        flag: Something that may be so on this rank.
+
+    Returns:
+        Whether all have the same token, and whether the flag is set on any.
+
+    Raises:
+        BaseException: What another rank has raised before it came here.
+    """
+    place = _place(comm)
+    worst, same = _meet(place, FLAG if flag else NOTHING, token)
+    if worst == ERROR:
+        error = _common(place, None)
+        assert error is not None
+        raise error from error.__cause__
+    return same, worst == FLAG
+
+
+def gathered[T](comm: MPI.Comm, value: T) -> list[T]:
+    """Return the values of all ranks, which meet as in :func:`met` (collective)."""
+    return _place(comm).allgather(value)
+
+
+#: The mark of an error that all ranks know of.
+_AGREED = "_known_to_all_ranks"
+_PLACE = MPI.Comm.Create_keyval()
+_PLACES: dict[tuple[int, ...], MPI.Comm] = {}
+_LAST: list[MPI.Comm] = []
+
+
+def called_last() -> MPI.Comm | None:
+    """Return the ranks that have met last, if any have."""
+    return _LAST[0] if _LAST else None
+
+
+def forget(error: BaseException) -> None:
+    """Let an error that leaves this package be one that ranks do not know of, if it comes again."""
+    vars(error).pop(_AGREED, None)
+
+
+def _place(comm: MPI.Comm) -> MPI.Comm:
+    """Return where ranks meet, whichever of their communicators they know (collective at first)."""
+    known = cast(MPI.Comm | None, comm.Get_attr(_PLACE))
+    if known is None:
+        ranks, all_ranks = comm.Get_group(), MPI.COMM_WORLD.Get_group()
+        key = tuple(ranks.Translate_ranks(None, all_ranks))
+        ranks.Free()
+        all_ranks.Free()
+        if key not in _PLACES:
+            _PLACES[key] = comm.Dup()
+            _PLACES[key].Set_attr(_PLACE, _PLACES[key])
+        known = _PLACES[key]
+        comm.Set_attr(_PLACE, known)
+    _LAST[:] = [known]
+    return known
+
+
+def _meet(place: MPI.Comm, brought: int, token: int = 0) -> tuple[int, bool]:
+    """Return the worst of what ranks have brought, and whether their tokens are the same."""
+    values = np.array([brought, token, -token], dtype=np.int64)
+    place.Allreduce(MPI.IN_PLACE, values, MPI.MAX)
+    worst, largest, smallest = values.tolist()
+    return worst, largest == -smallest
+
+
+def _tell(rank: int, error: BaseException) -> None:
+    """Say what this rank ends with, where the others are in something that it has left."""
+    print(
+        f"Rank {rank} waits for the others to end with {type(error).__name__}: {error}",
+        file=sys.stderr,
+        flush=True,
+    )
+
+
+def _common[E: BaseException](place: MPI.Comm, error: E | None) -> E | None:
+    """Return the gravest error of all ranks, of which one has one at least (collective)."""
+    errors = place.allgather(None if error is None else _sendable(error))
     first = gravest(errors)
     rank = next(r for r, e in enumerate(errors) if e is first)
+    common: Any = error if rank == place.rank else first
     if isinstance(first, MPMError):
         particles = {p for e in errors if type(e) is type(first) for p in e.particles}
         common = type(first)(first.message, particles, first.load)
-        if rank == comm.rank and error is not None:
+        common.dofs = first.dofs
+        if rank == place.rank and error is not None:
             common.__cause__ = error.__cause__
-        return cast(E, common)
-    return error if rank == comm.rank else first
+    setattr(common, _AGREED, True)
+    return cast(E, common)
 
 
 @contextmanager
 def agree(comm: MPI.Comm, what: str | None = None) -> Iterator[None]:
     """Raise an error of any rank on all ranks, with one sentence and all particles.
 
-    It is for what may fail on one rank alone, such as a user's code. The block must hold no
-    collective call that an error on one rank would skip on that rank alone.
+    It is for what may fail on one rank alone, such as a user's code. An error on one rank must
+    not skip a collective call there, unless the first one that it skips is such a block too.
 
     Args:
         comm: The ranks that reach this block together (collective).
@@ -171,21 +281,6 @@ def as_ours(error: Exception, what: str) -> MPMError:
     ours = MPMError(f"{what} failed with {type(error).__name__}: {error}")
     ours.__cause__ = error
     return ours
-
-
-def on_all_ranks(comm: MPI.Comm, function: Callable[[float], None]) -> Callable[[float], None]:
-    """Return a user's function that fails on all ranks, with one error, where it fails on any.
-
-    Args:
-        comm: The ranks, which call the function together (collective).
-        function: The function.
-    """
-
-    def call(value: float) -> None:
-        with agree(comm):
-            function(value)
-
-    return call
 
 
 def warn(comm: MPI.Comm, sentence: str, stacklevel: int = 2) -> None:

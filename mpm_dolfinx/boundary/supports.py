@@ -27,6 +27,7 @@ from ufl.algorithms.analysis import extract_coefficients, extract_constants
 
 from ..assembly.inputs import as_expression, is_tag, known_tags
 from ..errors import MPMError, agree, warn
+from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
 from ..particles.particles import Particles
 
@@ -422,6 +423,7 @@ def _copy_of(value: Any) -> Any:
     return fem.Constant(value.ufl_domain(), np.array(value.value))
 
 
+@collective()
 def roller(
     particles: Particles,
     facet_tags: Any,
@@ -458,6 +460,7 @@ def roller(
     return Support(particles, gap * n, facet_tags, tag, modulus, penalty)
 
 
+@collective()
 def fixed(
     particles: Particles,
     facet_tags: Any,
@@ -490,6 +493,7 @@ def fixed(
     return Support(particles, gap, facet_tags, tag, modulus, penalty)
 
 
+@collective()
 def plane(
     particles: Particles,
     point: Any,
@@ -530,6 +534,7 @@ def plane(
     return Plane(particles, gap, n, facet_tags, tag, modulus, penalty)
 
 
+@collective()
 def dashpot(
     particles: Particles,
     facet_tags: Any,

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any, NamedTuple
 
@@ -363,7 +363,7 @@ class MaterialPoints:
         return result
 
     def strain_energy(self, trial: bool = False) -> NDArray[np.float64]:
-        """Return the elastic energy per undeformed volume of all points, shape ``(n nq,)``.
+        """Return the elastic energy per undeformed volume of all points, ``(n nq,)`` (collective).
 
         Args:
             trial: Whether it is that of the last update, not of the last converged step.
@@ -373,27 +373,33 @@ class MaterialPoints:
             know it.
         """
         result = np.full(self._points, np.nan)
-        for part, state in self._states(trial):
-            energy = part.strain_energy(state)
+        for part, energy in self._told(Governed.strain_energy, trial):
             if energy is not None:
                 result[part.points] = energy
         if self.averaging is not None:
             result += self.averaging.energy().ravel() if trial else self._last.resisted
         return result
 
-    def _states(self, trial: bool) -> Iterator[tuple[Governed, State]]:
-        """Return materials with their states in the last update, or at the converged step."""
-        return zip(self._governed, self._trial if trial else self._last.states, strict=True)
+    def _told[T](
+        self, ask: Callable[[Governed, State], T], trial: bool
+    ) -> list[tuple[Governed, T]]:
+        """Return the answers of materials about their last update, or about the converged step.
+
+        An error of one of them on one rank is one on all (collective); in a trial whoever updates
+        lets ranks agree.
+        """
+        states = self._trial if trial else self._last.states
+        with nullcontext() if trial else agree(self._particles.mesh.comm):
+            return [(p, ask(p, its)) for p, its in zip(self._governed, states, strict=True)]
 
     def potential(self, trial: bool = False) -> NDArray[np.float64]:
-        """Return the elastic energy and, where a law knows it, the plastic work, ``(n nq,)``.
+        """Return elastic energy and, where laws know it, plastic work, ``(n nq,)`` (collective).
 
         Args:
             trial: As for :meth:`strain_energy`.
         """
         result = self.strain_energy(trial)
-        for part, state in self._states(trial):
-            work = part.plastic_work(state)
+        for part, work in self._told(Governed.plastic_work, trial):
             if work is not None:
                 result[part.points] += work
         return result
@@ -410,14 +416,14 @@ class MaterialPoints:
 
     @property
     def has_potential(self) -> NDArray[np.bool_]:
-        """Which points have a stress that derives from :meth:`potential` over a step, ``(n nq,)``.
+        """Whether stresses derive from :meth:`potential` over a step, ``(n nq,)`` (collective).
 
         That is one of F there; with F-bar, of F at the points of a group, which has one material.
         With a pressure of its own that is the stress without it.
         """
         found = self._where(lambda law: not getattr(law, "inelastic", True))
-        for part, state in self._states(False):
-            if part.plastic_work(state) is not None:
+        for part, work in self._told(Governed.plastic_work, False):
+            if work is not None:
                 found[part.points] = True
         return found & np.isfinite(self.strain_energy())
 

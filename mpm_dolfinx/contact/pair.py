@@ -25,7 +25,7 @@ from ..assembly.petsc import MatrixSum
 from ..errors import ConvergenceError, MPMError, agree, agreed
 from ..io.snapshot import Taken
 from ..meshes.remesh import Column
-from ..parallel.given import require_same
+from ..parallel.boundary import collective
 from ..particles.particles import Particles
 from ..system.term import PointMaterial
 from .contact import Contact, Outcome, stiffness
@@ -78,6 +78,7 @@ class Pair(Contact):
         MPMError: What makes no sense.
     """
 
+    @collective()
     def __init__(
         self,
         a: Particles,
@@ -114,18 +115,6 @@ class Pair(Contact):
             if not isinstance(value, list | tuple) or len(value) != 2:
                 raise MPMError(f"{name} of a Pair must be two, one for each body, not {value!r}.")
         rubs = as_friction(friction)
-        require_same(
-            a.mesh.comm,
-            friction=rubs.told,
-            tags=list(tags),
-            moduli=list(moduli),
-            passes=passes,
-            penalty=penalty,
-            tangential_penalty=tangential_penalty,
-            quadrature_degree=quadrature_degree,
-            axisymmetric=axisymmetric,
-            law=law,
-        )
         super().__init__([a, b], rubs, axisymmetric, law)
         self._moduli = [None if m is None else as_positive(m, "modulus") for m in moduli]
         penalties = (

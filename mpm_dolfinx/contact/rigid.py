@@ -19,6 +19,7 @@ from ..assembly.petsc import MatrixSum
 from ..errors import ConvergenceError, MPMError, agree, agreed
 from ..io.snapshot import Taken
 from ..meshes.remesh import Column
+from ..parallel.boundary import collective
 from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..reals import as_reals
@@ -86,6 +87,7 @@ class Rigid(Contact):
         MPMError: What makes no sense.
     """
 
+    @collective()
     def __init__(
         self,
         particles: Particles,
@@ -112,17 +114,6 @@ class Rigid(Contact):
         if shape.dim != gdim:
             raise MPMError(f"The shape is one in {shape.dim} dimensions, the body in {gdim}.")
         rubs = as_friction(friction)
-        require_same(
-            particles.mesh.comm,
-            friction=rubs.told,
-            tag=tag,
-            modulus=modulus,
-            penalty=penalty,
-            tangential_penalty=tangential_penalty,
-            quadrature_degree=quadrature_degree,
-            axisymmetric=axisymmetric,
-            law=law,
-        )
         super().__init__([particles], rubs, axisymmetric, law)
         self.shape = shape
         self._modulus = None if modulus is None else as_positive(modulus, "modulus")

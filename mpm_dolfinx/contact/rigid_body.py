@@ -29,13 +29,14 @@ from numpy.typing import NDArray
 
 from ..errors import TRIAL_ERRORS, ConvergenceError, MPMError, agree
 from ..io.snapshot import Kept, Taken
+from ..parallel.boundary import collective
 from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..system.term import PointMaterial, Term, Transfer
 from .body_contact import BodyContact
 from .law import Friction
 from .placed import Placed
-from .rigid_motion import RigidMotion, State, as_inertia, as_rotation, held_of, names_of
+from .rigid_motion import RigidMotion, State, as_inertia, as_rotation, held_of
 from .rotation import Pose, Turn, crossing
 from .shapes import Shape, as_point, as_positive
 from .yielding import Yielding
@@ -118,6 +119,7 @@ class RigidBody(Term):
         MPMError: What makes no sense.
     """
 
+    @collective()
     def __init__(
         self,
         particles: Particles | Sequence[Particles],
@@ -161,16 +163,6 @@ class RigidBody(Term):
             np.zeros(nr),
         )
         self._comm = bodies[0].mesh.comm
-        require_same(
-            self._comm,
-            mass=mass,
-            inertia=self._inertia,
-            centre=at,
-            gravity=down,
-            velocity=still.velocity,
-            spin=still.spin,
-            fixed=[name for name, one in zip(names_of(gdim), held, strict=False) if one],
-        )
         self._memory = self._trial = still
         self._found = np.zeros(gdim + nr)
         self._lever = self._span = 1.0

@@ -17,7 +17,9 @@ from dolfinx import fem
 from .. import _compat
 from ..errors import MPMError, agree
 from ..meshes.remesh import PLACES, Column
+from ..parallel.boundary import Hooked, collective
 from ..parallel.exchange import RowExchange
+from ..parallel.given import require_same
 from ..particles.particles import Particles
 from .checkpoint import Snapshot, Table
 
@@ -35,7 +37,7 @@ __all__ = [
 ]
 
 
-class Kept:
+class Kept(Hooked):
     """Something that goes with a problem: split, moved to other ranks, saved and restored.
 
     A heir says what it is and where it lives, and takes it again; give it to
@@ -151,7 +153,10 @@ def capture(
         tables.append(Table(index[some], {name: c.values[some] for name, c in columns.items()}))
     numbers: dict[str, Any] = {}
     for thing in things:
-        numbers |= {_name(thing.key, name): value for name, value in thing.numbers().items()}
+        its = {_name(thing.key, name): value for name, value in thing.numbers().items()}
+        if thing.key:
+            require_same(comm, **its)
+        numbers |= its
     return Snapshot(numbers, tables)
 
 
@@ -337,6 +342,7 @@ def of_cells(function: fem.Function) -> NDArray[np.float64]:
     return np.asarray(values[space.dofmap.list[:cells]])
 
 
+@collective("values")
 def fill(function: fem.Function, values: NDArray[np.float64]) -> None:
     """Give a Function the nodal values of each owned cell, ``(n, k, bs)`` (collective)."""
     space = function.function_space

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dolfinx import fem, mesh
 
 from ..errors import MPMError, agree, as_ours
-from ..parallel.given import require_same
+from ..parallel.boundary import collective
 from ..reals import as_reals
 
 __all__ = ["cell_tags", "facet_tags", "held", "region"]
@@ -115,6 +115,7 @@ def _in_polygon(
     return inside | on
 
 
+@collective()
 def facet_tags(domain: mesh.Mesh, where: Mapping[int, Where], interior: bool = False) -> Any:
     """Return tags of a mesh's facets (collective).
 
@@ -136,6 +137,7 @@ def facet_tags(domain: mesh.Mesh, where: Mapping[int, Where], interior: bool = F
     return _tags(domain, dim, where, lambda inside: locate(domain, dim, inside), "facet")
 
 
+@collective()
 def cell_tags(domain: mesh.Mesh, where: Mapping[int, Where]) -> Any:
     """Return tags of a mesh's cells (collective).
 
@@ -180,7 +182,6 @@ def _tags(
                     f"Where the {noun}s of tag {tag} are is a function of coordinates, such as "
                     f"mpm.region(x=0.0), not {inside!r}."
                 )
-    require_same(comm, tags=[int(tag) for tag in where])
     values: dict[int, int] = {}
     for tag, inside in where.items():
         with agree(comm):
@@ -196,6 +197,7 @@ def _tags(
     return mesh.meshtags(domain, dim, places, tags)
 
 
+@collective()
 def held(
     V: fem.FunctionSpace,
     component: int | None = None,

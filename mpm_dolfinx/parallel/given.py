@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
@@ -20,10 +22,11 @@ import ufl
 from dolfinx import fem, mesh
 from ufl.corealg.traversal import traverse_unique_terminals
 
-from ..errors import MPMError
+from ..errors import MPMError, gathered, met
 
 __all__ = ["require_degree", "require_same", "require_truth"]
 
+PACKAGE = __name__.partition(".")[0]
 #: What describes a law besides its parameters.
 KINDS = ("symmetric", "kinematics", "inelastic")
 
@@ -31,8 +34,8 @@ KINDS = ("symmetric", "kinematics", "inelastic")
 def require_same(comm: MPI.Comm, **given: Any) -> None:
     """Raise an error unless all ranks were given the same (collective).
 
-    Arrays of a material's parameters, Functions and tags are a rank's own part of what is the same
-    for all, so only their kind is compared.
+    Arrays of a material's parameters, or of more than two dimensions, Functions and tags are a
+    rank's own part of what is the same for all, so only their kind is compared.
 
     Args:
         comm: The ranks.
@@ -45,9 +48,10 @@ def require_same(comm: MPI.Comm, **given: Any) -> None:
         return
     parts = [part for name, value in given.items() for part in _parts(name, value)]
     digest = hashlib.sha256(repr(parts).encode()).digest()
-    if all(other == digest for other in comm.allgather(digest)):
+    same, _ = met(comm, int.from_bytes(digest[:7]))
+    if same:
         return
-    every = [dict(each) for each in comm.allgather(parts)]
+    every = [dict(each) for each in gathered(comm, parts)]
     names = {name: None for each in every for name in each}  # in the order in which they stand
     for name in names:
         values = [each.get(name, "nothing") for each in every]
@@ -99,6 +103,14 @@ def _parts(name: str, value: Any) -> Iterator[tuple[str, str]]:
         for key, parameter in sorted(getattr(value, "parameters", {}).items()):
             own = isinstance(parameter, np.ndarray) and parameter.ndim > 0
             yield from [(key, "an array")] if own else _parts(key, parameter)
+    elif hasattr(value, "told"):
+        yield from _parts(name, value.told)
+    elif is_dataclass(value) and type(value).__module__.partition(".")[0] == PACKAGE:
+        yield name, type(value).__name__
+        for field in fields(value):
+            yield from _parts(f"{field.name} of {name}", getattr(value, field.name))
+    elif isinstance(value, np.ndarray) and value.ndim > 2:
+        yield name, "an array"
     elif isinstance(value, fem.DirichletBC):
         held: Any = value.g
         number = getattr(held, "value", None)
@@ -112,14 +124,16 @@ def _parts(name: str, value: Any) -> Iterator[tuple[str, str]]:
         yield name, f"a Function of {value.function_space.ufl_element()}"
     elif isinstance(value, ufl.core.expr.Expr):
         terminals = sorted(traverse_unique_terminals(value), key=_order)
-        yield name, f"UFL of shape {value.ufl_shape} with {len(terminals)} terminals"
+        numbers = [float(t) for t in terminals if isinstance(t, ufl.constantvalue.RealValue)]
+        told = f"UFL of shape {value.ufl_shape} with {len(terminals)} terminals"
+        yield name, f"{told}, of numbers {_shown(sorted(numbers))}" if numbers else told
         yield from _constants(name, [t for t in terminals if isinstance(t, fem.Constant)])
     elif isinstance(value, fem.FunctionSpace):
         yield name, f"a space of {value.ufl_element()}"
     elif isinstance(value, mesh.MeshTags):
         yield name, f"tags of dimension {value.dim}"
-    elif isinstance(value, str):
-        yield name, repr(value)
+    elif isinstance(value, str | Path):
+        yield name, repr(str(value))
     elif value is None or _numbers(value):
         yield name, _shown(value)
     else:

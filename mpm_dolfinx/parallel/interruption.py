@@ -19,7 +19,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from ..errors import MPMError
+from ..errors import MPMError, met
 
 __all__ = ["Hold", "Interrupted", "held", "interrupted", "note", "noted", "settle"]
 
@@ -135,7 +135,7 @@ def interrupted(comm: MPI.Comm, pending: bool = False) -> bool:
         pending: Whether this rank has had one before.
     """
     mine = pending or _SIGINT.noted
-    return bool(comm.allreduce(mine, MPI.LOR)) if comm.size > 1 else mine
+    return met(comm, flag=mine)[1] if comm.size > 1 else mine
 
 
 def settle(comm: MPI.Comm) -> None:

@@ -18,8 +18,8 @@ from .. import _compat
 from ..background.basis import BackgroundBasis, PointBasis
 from ..errors import MPMError, ParticleOutsideError, agree
 from ..meshes.quadrature import DomainQuadrature, quadrature_rule
+from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_expression
-from ..parallel.given import require_same
 from ..transfer.matrix import transfer_matrix
 from ..transfer.transfer import Transfer
 
@@ -112,11 +112,10 @@ class ParticleField(fem.Function):
         dx: A measure whose rule knows the values: ``particles.dx``.
     """
 
+    @collective()
     def __init__(
         self, particles: Body, V: fem.FunctionSpace, at: str, kind: str, name: str
     ) -> None:
-        comm = particles.mesh.comm
-        require_same(comm, V=V, at=at, kind=kind, name=name)
         _validate(particles, V, at, kind, name)
         shape = tuple(V.ufl_element().reference_value_shape)
         if at == "points":
@@ -143,6 +142,7 @@ class ParticleField(fem.Function):
             values = np.einsum("qk,nki->nqi", shapes, values)
         return np.asarray(values[..., 0] if block == 1 else values)
 
+    @collective("values")
     def set(self, values: Any) -> None:
         """Set present and converged values, before the first step.
 

@@ -23,7 +23,7 @@ from ..meshes.quadrature import default_degree, volume_ratio
 from ..meshes.redistribution import Carrier, Redistribution, cell_centres
 from ..meshes.remesh import Column, Cuts, Remesh
 from ..meshes.trail import Trail
-from ..parallel.given import require_same
+from ..parallel.boundary import collective
 from ..reals import is_one_of
 from ..transfer.cpdi import CPDI2
 from ..transfer.elements import FiniteElements
@@ -121,6 +121,7 @@ class Particles(MaterialDomains):
         DomainDistortionError: A cell of the body is degenerate.
     """
 
+    @collective()
     def __init__(
         self,
         body: mesh.Mesh,
@@ -136,17 +137,6 @@ class Particles(MaterialDomains):
         validate_spaces(body, V)
         if method is None:
             method = (FiniteElements if V is None else CPDI2).name
-        require_same(
-            body.comm,
-            V=V,
-            method=method,
-            degree=degree,
-            quadrature_degree=quadrature_degree,
-            outside=outside,
-            domain_update=domain_update,
-            partition=partition,
-            on_distortion=on_distortion,
-        )
         validate_options(body, V, method, degree, quadrature_degree, outside, domain_update)
         validate_distortion(body, method, degree, quadrature_degree, on_distortion)
         if not is_one_of(partition, ("given", "background")) or (
@@ -468,6 +458,7 @@ class Particles(MaterialDomains):
                     self.global_index[lost],
                 )
 
+    @collective()
     def field(
         self, V: fem.FunctionSpace, at: str = "points", kind: str = "total", name: str = "field"
     ) -> ParticleField:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError, agree
+from ..parallel.boundary import collective
 from .fields import LABELS, Field, bodies_of
 from .outlines import imported
 from .scenes import Look, Shot, corners, draw, framed, new_figure, take
@@ -23,6 +24,7 @@ from .scenes import Look, Shot, corners, draw, framed, new_figure, take
 __all__ = ["movie"]
 
 
+@collective("steps", "field")
 def movie(
     problem: Any,
     steps: Iterable[Any],

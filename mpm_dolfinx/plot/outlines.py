@@ -18,12 +18,14 @@ from dolfinx import fem, mesh
 
 from .. import _compat
 from ..errors import MPMError, agree
+from ..parallel.boundary import collective
 from ..particles.particles import Particles
 from ..reals import as_reals
 
 __all__ = ["background", "domains", "edges", "grid", "imported", "outlines", "surface_algorithm"]
 
 
+@collective("values", "ax")
 def domains(
     particles: Particles,
     values: ArrayLike | None = None,
@@ -94,6 +96,7 @@ def domains(
     return _added(artist, ax)
 
 
+@collective("ax")
 def background(
     V: fem.FunctionSpace | mesh.Mesh,
     ax: Any = None,
@@ -139,6 +142,7 @@ def edges(grid_mesh: mesh.Mesh) -> NDArray[np.float64] | None:
     return None if cells is None else np.concatenate(cells)
 
 
+@collective()
 def grid(particles: Particles) -> Any:
     """Return the particles' own domains at their current positions for pyvista (collective).
 

@@ -14,11 +14,13 @@ import numpy as np
 
 from ..errors import MPMError, agree
 from ..history import History
+from ..parallel.boundary import collective
 from .outlines import imported
 
 __all__ = ["history"]
 
 
+@collective()
 def history(
     problem: Any,
     path: str | Path | None = None,

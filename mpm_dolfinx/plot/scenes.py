@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError, agree
+from ..parallel.boundary import collective
 from ..particles.particles import Particles
 from .fields import LABELS, Field, bodies_of, values_of
 from .outlines import edges, grid, imported, outlines, surface_algorithm
@@ -83,6 +84,7 @@ class Shot:
         return (float(shown.min()), float(shown.max())) if shown.size else (0.0, 1.0)
 
 
+@collective("field", "ax")
 def scene(
     problem: Any,
     field: Field = "displacement",

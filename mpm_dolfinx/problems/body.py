@@ -15,11 +15,11 @@ from dolfinx import mesh
 
 from ..constitutive.averaging import F_BARS
 from ..errors import MPMError
+from ..parallel.boundary import collective
 from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..reals import is_one_of
 from .arguments import as_pairs, carried, holds
-from .initial_stress import of_all_ranks
 from .summary import counted
 
 __all__ = ["Body", "PoreFluid", "as_given"]
@@ -123,6 +123,7 @@ class Body:
     velocity: Any = None
     pore_fluid: PoreFluid | None = None
 
+    @collective()
     def __post_init__(self) -> None:
         """Say so where something makes no sense."""
         if not isinstance(self.particles, Particles):
@@ -130,8 +131,6 @@ class Body:
                 f"A Body is made of mpm.Particles, not of a {type(self.particles).__name__}."
             )
         given = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "particles"}
-        given["initial_stress"] = of_all_ranks(self.initial_stress)
-        given["pore_fluid"] = None if self.pore_fluid is None else vars(self.pore_fluid)
         require_same(self.particles.V.mesh.comm, **given)
         for name in ("tractions", "pressures"):
             object.__setattr__(self, name, as_pairs(name, getattr(self, name)))

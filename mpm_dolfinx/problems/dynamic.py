@@ -18,6 +18,7 @@ from ..boundary.supports import Support, is_one_sided
 from ..constitutive.points import MaterialPoints
 from ..constitutive.step_stress import StepStress
 from ..errors import MPMError, warn
+from ..parallel.boundary import collective
 from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..system.body import StepForce
@@ -78,6 +79,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         MPMError: As there; and what does not go with inertia.
     """
 
+    @collective()
     def __init__(
         self,
         bodies: Body | Sequence[Body],
@@ -96,14 +98,8 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         static = _static_among(given, quasi_static, options)
         if after is not None:
             self._require_before(after, given, options)
-        require_same(
-            particles[0].V.mesh.comm,
-            scheme=scheme,
-            out_of_range=out_of_range,
-            rayleigh=rayleigh,
-            quasi_static=[number for number, body in enumerate(particles) if body in static],
-            terms=terms,
-        )
+        numbers = [number for number, body in enumerate(particles) if body in static]
+        require_same(particles[0].V.mesh.comm, quasi_static=numbers)
         self._goes_on = after is not None
         damping = rayleigh_of(rayleigh)
         self._viscosity = damping[1]
@@ -255,6 +251,7 @@ class DynamicParticleProblem(MovingProblem):
         MPMError: As there; and what does not go with inertia.
     """
 
+    @collective()
     def __init__(
         self,
         R: ufl.Form | Sequence[ufl.Form],
@@ -271,15 +268,6 @@ class DynamicParticleProblem(MovingProblem):
         **options: Any,
     ) -> None:
         bodies = as_bodies(particles)
-        require_same(
-            bodies[0].V.mesh.comm,
-            density=density,
-            velocity=velocity,
-            scheme=scheme,
-            out_of_range=out_of_range,
-            damping=damping,
-            supports=supports,
-        )
         rayleigh = rayleigh_of((damping, 0.0))
         require_motion("DynamicParticleProblem", options)
         rule = as_scheme(scheme, out_of_range)

@@ -21,7 +21,7 @@ from ..parallel.compilation import compiled_expression
 from ..particles.particles import Particles
 from ..reals import as_reals
 
-__all__ = ["geostatic", "initial_stress_at_points", "of_all_ranks"]
+__all__ = ["geostatic", "initial_stress_at_points"]
 
 type Array = NDArray[np.float64]
 
@@ -47,11 +47,6 @@ class _Geostatic:
     densities: Array
     ratios: Array
     loads: Array
-
-    def numbers(self) -> list[float]:
-        """Return all that it is made of."""
-        parts = (self.down, self.tops, self.densities, self.ratios, self.loads)
-        return [self.surface, self.strength, *np.concatenate(parts).tolist()]
 
     def require_for(self, gdim: int) -> None:
         """Raise an error where gravity does not lie in a body's plane."""
@@ -126,15 +121,6 @@ def geostatic(
     weights = np.cumsum(densities[:-1] * np.diff(tops)) * strength
     loads = float(surcharge) + np.concatenate([[0.0], weights])
     return _Geostatic(float(surface), strength, g / strength, tops, densities, ratios, loads)
-
-
-def of_all_ranks(value: Any) -> Any:
-    """Return the part of an initial stress, or of a list of them, that ranks must share."""
-    if isinstance(value, list) and not np.isscalar(value[0] if value else 0.0):
-        return [of_all_ranks(entry) for entry in value]
-    if isinstance(value, _Geostatic):
-        return value.numbers()
-    return "its own part" if isinstance(value, np.ndarray) and value.ndim > 2 else value
 
 
 def initial_stress_at_points(value: Any, particles: Particles) -> Array:

@@ -29,6 +29,7 @@ from ..io import checkpoint
 from ..io.files import as_path
 from ..io.series import Output
 from ..io.snapshot import Kept, spaces_of
+from ..parallel.boundary import Hooked, by_itself, collective
 from ..parallel.garbage import Cleaner
 from ..parallel.given import require_same, require_truth
 from ..particles.field import CarriedField, ParticleField
@@ -74,7 +75,7 @@ type Law = tuple[str, dict[str, Any]]
 """Name of a material, and its parameters: numbers, or indices and values of points."""
 
 
-class ParticleProblem:
+class ParticleProblem(Hooked):
     """Find the displacement of particles at which a UFL residual vanishes.
 
     The residual is written on the body mesh as for finite elements. Each step's increment
@@ -118,6 +119,7 @@ class ParticleProblem:
         MPMError: Forms, spaces or conditions that do not go together.
     """
 
+    @collective()
     def __init__(
         self,
         R: ufl.Form | Sequence[ufl.Form | None],
@@ -135,17 +137,6 @@ class ParticleProblem:
         bodies = as_bodies(particles)
         fields = as_fields(fields, bodies)
         require_entity_maps(entity_maps)
-        require_same(
-            bodies[0].V.mesh.comm,
-            R=R,
-            particles=particles,
-            J=J,
-            bcs=bcs,
-            background=background,
-            symmetric=symmetric,
-            terms=terms,
-            fields=[field.name for field in fields],
-        )
         residuals, self._of_fields = residuals_of(R, bodies, fields)
         if fields and J is not None:
             raise MPMError("With fields= the tangent is the derivative of R; omit J.")
@@ -189,7 +180,6 @@ class ParticleProblem:
         self.terms = as_terms(terms, self.bodies)
         self.history = History()
         self._comm: MPI.Comm = self.bodies[0].V.mesh.comm
-        require_same(self._comm, **vars(solver))
         self._background, self._how = background, solver
         self._output = Output()
         self._held = Release()
@@ -325,6 +315,7 @@ class ParticleProblem:
     def __repr__(self) -> str:
         return in_one_line(self)
 
+    @collective()
     def summary(self) -> str:
         """Return a summary of the problem and of its run, a screen of text (collective).
 
@@ -454,6 +445,7 @@ class ParticleProblem:
 
     # -- Loading --------------------------------------------------------------------------
 
+    @collective()
     def solve(
         self,
         steps: int | str = 1,
@@ -513,6 +505,7 @@ class ParticleProblem:
             pass
         return self.history
 
+    @collective()
     def steps(
         self,
         steps: int | str,
@@ -552,14 +545,6 @@ class ParticleProblem:
             "first_step": first_step,
             "length": length,
         }
-        require_same(
-            self._comm,
-            steps=steps,
-            update=update,
-            repartition=repartition,
-            control=control,
-            **automatic,
-        )
         if isinstance(steps, str) and steps == "auto":
             chosen: Any = ErrorControl(tolerance, output_at, first_step, length)
         elif automatic != AUTOMATIC:
@@ -575,6 +560,7 @@ class ParticleProblem:
         """Return how much of the run is done."""
         return self._stepper.share
 
+    @collective()
     def step(self) -> Step:
         """Make one increment to the present values of loads and conditions.
 
@@ -593,6 +579,7 @@ class ParticleProblem:
 
     # -- Results --------------------------------------------------------------------------
 
+    @collective()
     def reaction(self, bc: fem.DirichletBC | Support | Contact | RigidBody) -> NDArray[np.float64]:
         """Return the force of a support on the body at the last converged load.
 
@@ -627,6 +614,7 @@ class ParticleProblem:
         )
         return force_at(bc, None if reactions is None else reactions[number], field.V)
 
+    @collective()
     def error(self) -> float:
         """Return an estimate of the error of the last converged step (collective).
 
@@ -651,6 +639,7 @@ class ParticleProblem:
             steps[-1] = replace(steps[-1], error=found)
         return found
 
+    @collective()
     def error_of_particles(self, body: int = 0) -> NDArray[np.float64]:
         """Return where :meth:`error` comes from, for pictures (collective).
 
@@ -677,6 +666,7 @@ class ParticleProblem:
         self._require_governing()
         return estimated(self.bodies, self.body_terms, self.reduced)
 
+    @collective()
     def write(self, path: str | Path, time: float | None = None) -> None:
         """Add the present state to a time series for ParaView (collective).
 
@@ -711,6 +701,7 @@ class ParticleProblem:
         """Warn the user, on one rank (collective)."""
         warn(self._comm, sentence, stacklevel=4)
 
+    @collective()
     def repartition(self, threshold: float = 0.1) -> bool:
         """Move particles with their history to where they are best now (collective).
 
@@ -728,6 +719,7 @@ class ParticleProblem:
             "place them at the start with Particles(..., partition='background')."
         )
 
+    @collective()
     def save(self, path: str | Path, functions: Sequence[fem.Function] = ()) -> None:
         """Write a checkpoint of the last converged step (collective).
 
@@ -747,10 +739,12 @@ class ParticleProblem:
         self._require_governing()
         self._state.save(as_path(path), functions)
 
+    @collective()
     def capture(self) -> checkpoint.Snapshot:
         """Return the state at the last converged step, for :meth:`return_to` (collective)."""
         return self._state.capture()
 
+    @collective()
     def return_to(self, snapshot: checkpoint.Snapshot) -> None:
         """Return to a state of this problem on the present meshes (collective)."""
         self._state.adopt(snapshot)
@@ -760,6 +754,7 @@ class ParticleProblem:
         """The unknowns besides displacements, as the system moves them."""
         return [one for term in self._field_terms for one in term.fields]
 
+    @collective()
     def keep(self, thing: Kept) -> None:
         """Let something of the user's own go with the problem.
 
@@ -773,6 +768,7 @@ class ParticleProblem:
         """
         self._state.keep(thing)
 
+    @collective()
     def restore(
         self, path: str | Path, functions: Sequence[fem.Function] = (), resume: bool = True
     ) -> None:
@@ -820,6 +816,7 @@ class ParticleProblem:
         own = type(self)
         return own.evaluate is ParticleProblem.evaluate and own.commit is ParticleProblem.commit
 
+    @by_itself
     def evaluate(self) -> MPMError | None:
         """Update what the forms hold besides the displacement; return why that cannot be.
 

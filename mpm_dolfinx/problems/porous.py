@@ -31,6 +31,7 @@ from ..assembly.inputs import NotNegative, as_expression, facet_measure
 from ..constitutive.strain import Strain
 from ..errors import MPMError, agree, as_ours
 from ..materials.base import Material
+from ..parallel.boundary import collective
 from ..parallel.given import require_same
 from ..particles.field import ParticleField
 from ..particles.particles import Particles
@@ -98,6 +99,7 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
 
     _further = ("pore_fluid",)
 
+    @collective()
     def __init__(
         self,
         bodies: Body | Sequence[Body],
@@ -107,7 +109,6 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         **options: Any,
     ) -> None:
         given = as_given(bodies)
-        require_same(given[0].particles.V.mesh.comm, pressure_space=pressure_space)
         for name in ("mixed", "background", "fields"):
             if name in options:
                 raise MPMError(f"A PorousProblem has no {name}=; omit it.")
@@ -285,6 +286,7 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
             for one in filled.checked:
                 one.require()
 
+    @collective()
     def add(self, body: Body, name: str | None = None, *, sudden: bool = False) -> None:
         """Add a body: see :meth:`QuasiStaticProblem.add`; what changes does so at once."""
         (given,) = as_given(body)
@@ -433,11 +435,11 @@ def _evaluated(permeability: Any, body: Particles, J: Any) -> Any:
     """
     if not callable(permeability) or isinstance(permeability, Expr):
         return permeability
-    with agree(body.mesh.comm):
-        try:
-            return permeability(J)
-        except Exception as error:
-            raise as_ours(error, "The function that gives permeability") from error
+    comm = body.mesh.comm
+    with agree(comm, "The function that gives permeability"):
+        made = permeability(J)
+    require_same(comm, permeability=made)
+    return made
 
 
 # -- What is given ---------------------------------------------------------------------------

@@ -24,8 +24,9 @@ from ..constitutive.step_stress import StepStress
 from ..constitutive.strain import Strain, strain_of
 from ..errors import DomainDistortionError, MPMError, agree, agreed, warn
 from ..io.checkpoint import Snapshot
+from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
-from ..parallel.given import require_same, require_truth
+from ..parallel.given import require_truth
 from ..particles.domains import separate_nodes
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
@@ -85,6 +86,7 @@ class QuasiStaticProblem(ParticleProblem):
         MPMError: Materials, loads or conditions that do not go together.
     """
 
+    @collective()
     def __init__(
         self,
         bodies: Body | Sequence[Body],
@@ -101,16 +103,6 @@ class QuasiStaticProblem(ParticleProblem):
         self._require_given(given)
         listed = [body.particles for body in given]
         particles = as_bodies(listed if isinstance(bodies, list | tuple) else listed[0])
-        require_same(
-            particles[0].V.mesh.comm,
-            bodies=[body.particles for body in given],
-            mixed=mixed,
-            bcs=bcs,
-            axisymmetric=axisymmetric,
-            supports=supports,
-            background=background,
-            terms=terms,
-        )
         supports = as_supports(supports, particles)
         setup = Setup(
             tuple(given), tuple(supports), tuple(as_terms(terms, particles)), axisymmetric, mixed
@@ -202,6 +194,7 @@ class QuasiStaticProblem(ParticleProblem):
 
     # -- Stages ---------------------------------------------------------------------------
 
+    @collective()
     def stage(
         self,
         name: str | None = None,
@@ -233,15 +226,6 @@ class QuasiStaticProblem(ParticleProblem):
             MPMError: What does not go together. Nothing is changed then.
         """
         changed = as_given(bodies) if bodies != () else []
-        require_same(
-            self._comm,
-            name=name,
-            bodies=[body.particles for body in changed],
-            bcs=self.bcs if bcs is ... else bcs,
-            supports=supports,
-            terms=terms,
-            sudden=sudden,
-        )
         self._require_given(changed)
         for body in changed:
             self._require_change(body)
@@ -264,6 +248,7 @@ class QuasiStaticProblem(ParticleProblem):
         for name in [*other, *(["f_bar"] if body.f_bar != before.f_bar else [])]:
             raise MPMError(f"{name} cannot change in a stage; a body begins with it.")
 
+    @collective("particles")
     def remove(
         self,
         particles: Any = None,
@@ -291,11 +276,11 @@ class QuasiStaticProblem(ParticleProblem):
         """
         if not isinstance(body, int | np.integer) or body not in range(len(self.bodies)):
             raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
-        require_same(self._comm, tags=tags, body=body, name=name, sudden=sudden)
         own = self.setup.bodies[body]
         cells = chosen_cells(self.bodies[body], particles, tags, own.cell_tags)
         self._go_on(name, Removal(self, body, cells), sudden)
 
+    @collective()
     def add(self, body: Body, name: str | None = None, *, sudden: bool = False) -> None:
         """Begin a stage in which a body comes: a lift, or a structure (collective).
 
@@ -314,7 +299,6 @@ class QuasiStaticProblem(ParticleProblem):
         """
         (given,) = as_given(body)
         self._require_given([given])
-        require_same(self._comm, name=name, sudden=sudden)
         particles = given.particles
         if particles.on_distortion == "split":
             replace(
@@ -503,6 +487,7 @@ class QuasiStaticProblem(ParticleProblem):
     def masses(self, number: int) -> NDArray[np.float64]:
         return self.nodal_masses(number).sum(axis=1)
 
+    @collective()
     def repartition(self, threshold: float = 0.1) -> bool:
         """Move particles with their history to where they are best now (collective).
 
@@ -541,6 +526,7 @@ class QuasiStaticProblem(ParticleProblem):
         self.history.statistics.count("repartitions")
         return True
 
+    @collective("particles")
     def split(self, particles: Sequence[int], body: int = 0) -> None:
         """Cut quadrilaterals with one point in two, as they are now (collective).
 
@@ -566,6 +552,7 @@ class QuasiStaticProblem(ParticleProblem):
             chosen[body] = as_indices(particles)
         self._remeshing.split(chosen)
 
+    @collective()
     def rebase(self) -> None:
         """Take the body as it is now for the mesh that displacements are counted from (collective).
 

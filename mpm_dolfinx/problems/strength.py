@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import TRIAL_ERRORS, MPMError, ParticleOutsideError
-from ..parallel.given import require_same
+from ..parallel.boundary import collective
 from ..parallel.interruption import held, interrupted, settle
 from .quasistatic import QuasiStaticProblem
 from .through_time import TimeProblem
@@ -90,6 +90,7 @@ class _Search:
             self._too_far = factor
 
 
+@collective()
 def strength_reduction(
     problem: QuasiStaticProblem,
     step: float = 0.1,
@@ -247,8 +248,6 @@ def _require(
             "strength_reduction() needs an mpm.QuasiStaticProblem, whose steps have no duration, "
             f"not an mpm.{type(problem).__name__}."
         )
-    comm = problem.bodies[0].V.mesh.comm
-    require_same(comm, step=step, tolerance=tolerance, most=most, displacement=displacement)
     anywhere = displacement is None or displacement == np.inf
     numbers = [step, tolerance, most, 1.0 if anywhere else displacement]
     if not all(

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import MPMError, on_all_ranks
+from ..errors import MPMError
 from ..history import History, Step
-from ..parallel.given import require_same
+from ..parallel.boundary import collective, of_user
 from ..stepping.progress import with_bar
 from .particle_problem import ParticleProblem
 
@@ -39,6 +39,7 @@ class TimeProblem(ParticleProblem):
     def _resume_run(self) -> None:
         """Take notice that a run goes on from a checkpoint (collective)."""
 
+    @collective()
     def solve(  # type: ignore[override]
         self,
         time: float,
@@ -86,6 +87,7 @@ class TimeProblem(ParticleProblem):
                 self.write(output)
         return self.history
 
+    @collective()
     def steps(  # type: ignore[override]
         self,
         time: float,
@@ -113,14 +115,6 @@ class TimeProblem(ParticleProblem):
             MPMError: As in :meth:`solve`.
         """
         self._require_governing()
-        require_same(
-            self._comm,
-            time=time,
-            dt=dt,
-            update=update,
-            output_at=output_at,
-            repartition=repartition,
-        )
         if update is not None and not callable(update):
             raise MPMError(f"update= is a function of t, not {update!r}.")
         now = self.history.time
@@ -150,7 +144,7 @@ class TimeProblem(ParticleProblem):
     ) -> Iterator[Step]:
         """Go from one of the times to the next."""
         if update is not None:
-            update = on_all_ranks(self._comm, update)
+            update = of_user(self._comm, update)
         interrupted = self._stepper.interrupted
         resumes = interrupted is not None and interrupted.end == ends[0]
 
@@ -182,6 +176,7 @@ class TimeProblem(ParticleProblem):
             np.copyto(body.load.value, 1.0)
             np.copyto(body.proportional.value, 0.0)
 
+    @collective()
     def step(self, dt: float) -> Step:  # type: ignore[override]
         """Go on by a duration, with loads as they are set now all through it.
 
@@ -194,7 +189,6 @@ class TimeProblem(ParticleProblem):
         Raises:
             MPMError: As in :meth:`solve`.
         """
-        require_same(self._comm, dt=dt)
         if not isinstance(dt, float | int | np.number) or not dt > 0.0:
             raise MPMError(f"dt must be positive, not {dt!r}.")
         for _ in self.steps(self.history.time + dt, 2.0 * dt):

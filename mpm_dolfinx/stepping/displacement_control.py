@@ -19,8 +19,8 @@ from ..assembly.rules import depends_on, split_by_rule
 from ..background.basis import BackgroundBasis
 from ..background.cells import COORDINATES, TOLERANCE
 from ..errors import MPMError, agree
+from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
-from ..parallel.given import require_same
 from ..particles.geometry import RING
 from ..particles.particles import Particles
 from ..reals import as_reals
@@ -60,6 +60,7 @@ class DisplacementControl:
             that make no sense.
     """
 
+    @collective()
     def __init__(
         self,
         particles: Particles,
@@ -73,13 +74,6 @@ class DisplacementControl:
             raise MPMError(
                 f"A displacement control needs mpm.Particles, not {type(particles).__name__}."
             )
-        require_same(
-            particles.mesh.comm,
-            value=value,
-            point=point,
-            direction=direction,
-            functional=functional,
-        )
         with agree(particles.mesh.comm):
             if not _is_number(value):
                 raise MPMError(

@@ -20,11 +20,10 @@ from ..errors import (
     TRIAL_ERRORS,
     MPMError,
     ParticleOutsideError,
-    agree,
-    on_all_ranks,
 )
 from ..history import Attempt, History, Step
 from ..log import STEPS, tell
+from ..parallel.boundary import of_user
 from ..parallel.garbage import Cleaner
 from ..parallel.interruption import Hold, Interrupted, held, interrupted, settle
 from ..parallel.totals import over_ranks
@@ -223,7 +222,7 @@ class Stepper:
         if update is not None:
             if not callable(update):
                 raise MPMError(f"update= is a function of t, not {update!r}.")
-            update = on_all_ranks(self._comm, update)
+            update = of_user(self._comm, update)
         if control is not None and not isinstance(control, DisplacementControl):
             raise MPMError(f"control= is a DisplacementControl, not {control!r}.")
         comm = self._comm
@@ -589,8 +588,7 @@ class Stepper:
         )
 
     def _end_step(self, owner: Owner) -> None:
-        with agree(self._comm, "end_step()"):
-            owner.end_step()
+        owner.end_step()
         if self._mender is not None:
             self._mender.after_step()
 

@@ -20,6 +20,7 @@ from .. import _compat
 from ..assembly.inputs import is_tag, known_tags
 from ..background.basis import BackgroundBasis
 from ..errors import MPMError, agree
+from ..parallel.boundary import collective
 from ..parallel.given import require_degree, require_truth
 from ..particles.particles import Particles
 from .term import Term
@@ -56,6 +57,7 @@ class Tie(Term):
             what makes no sense.
     """
 
+    @collective()
     def __init__(
         self,
         a: Particles,

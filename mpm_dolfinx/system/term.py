@@ -21,6 +21,7 @@ from ..constitutive.averaging import VolumeAveraging
 from ..constitutive.pressure import MeanStress
 from ..errors import MPMError
 from ..io.snapshot import Kept
+from ..parallel.boundary import Hooked, by_itself
 from ..particles.particles import Particles
 
 __all__ = ["Hooks", "Motion", "PointMaterial", "Term", "Transfer", "UserTerm"]
@@ -57,7 +58,7 @@ class PointMaterial(Protocol):
         """A pressure of its own in place of the mean stress, or ``None``."""
 
 
-class Term:
+class Term(Hooked):
     """Something that acts on the nodes of one body or of several.
 
     The residual of a step is ``sum_b T_b^T r_b`` and its tangent ``sum_ab T_a^T K_ab T_b``, where
@@ -210,6 +211,7 @@ class Term:
         """
         return 0.0, 0.0
 
+    @by_itself
     def update(self) -> MPMError | None:
         """Update what the forces depend on; return why that cannot be. It must not be kept yet.
 

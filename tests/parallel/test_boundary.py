@@ -1,0 +1,309 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""A user's code that fails on one rank, and arguments that are wrong there: found by reflection."""
+
+import inspect
+
+import numpy as np
+import pytest
+import scenes
+from posed import posed
+from ranks import LAST, differing, fails
+from scenes import QUADRILATERAL
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx import boundary, contact, plot
+from mpm_dolfinx.io import Column, Kept, fill, of_cells
+from mpm_dolfinx.materials import Hencky, VonMises
+from mpm_dolfinx.parallel.boundary import collective, hooks_of, is_collective
+
+PROBLEMS = (
+    mpm.ParticleProblem,
+    mpm.QuasiStaticProblem,
+    mpm.DynamicProblem,
+    mpm.DynamicParticleProblem,
+    mpm.PorousProblem,
+)
+CLASSES = (
+    *PROBLEMS,
+    mpm.Particles,
+    mpm.ParticleField,
+    mpm.DisplacementControl,
+    mpm.Tie,
+    contact.Pair,
+    contact.Rigid,
+    contact.RigidBody,
+)
+FUNCTIONS = (
+    fill,
+    mpm.cell_tags,
+    mpm.facet_tags,
+    mpm.held,
+    mpm.strength_reduction,
+    *(getattr(module, name) for module in (boundary, plot) for name in module.__all__),
+)
+#: What users call on one rank, or is made of what is collective.
+LOCAL = (boundary.Support,)
+
+
+def particles(lower=(0.0, 0.0), upper=(1.0, 1.0)):
+    V = scenes.vectors(scenes.box([0.0, -1.0], [2.0, 2.0], [4, 6], QUADRILATERAL))
+    return mpm.Particles(scenes.box(lower, upper, [3, 3], QUADRILATERAL), V, quadrature_degree=2)
+
+
+def made(kind=mpm.QuasiStaticProblem, law=None, terms=lambda body: (), **options):
+    body = particles()
+    options = {"body_force": (0.0, -1.0), "bcs": [scenes.fix(body.V, scenes.at(0, 0.0))]} | options
+    if issubclass(kind, mpm.DynamicProblem):
+        options["density"] = 1.0
+    law = Hencky(1e3, 0.3) if law is None else law
+    return posed(kind, body, law, terms=terms(body), **options)
+
+
+# -- What a user has written ------------------------------------------------------------------
+
+
+def failing(base, name):
+    """Return an heir in which something fails on the last rank."""
+
+    def fail(self, *args):
+        if LAST:
+            raise ValueError("no table")
+        found = inspect.getattr_static(base, name)
+        return found.fget(self) if isinstance(found, property) else found(self, *args)
+
+    hook = property(fail) if isinstance(inspect.getattr_static(base, name), property) else fail
+    return type("Own", (base,), {name: hook})
+
+
+@collective()
+def ask(body, thing, name):
+    """Ask for something as this package does."""
+    found = inspect.getattr_static(type(thing), name)
+    if isinstance(found, property):
+        return getattr(thing, name)
+    count = len(inspect.signature(found).parameters) - 1
+    return getattr(thing, name)(*[None] * count)
+
+
+HOOKS = [(base, name) for base in (mpm.Term, Kept, *PROBLEMS) for name in sorted(hooks_of(base))]
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize(("base", "name"), HOOKS, ids=lambda v: getattr(v, "__name__", v))
+def test_each_hook_that_fails_on_one_rank_fails_on_all(base, name, monkeypatch):
+    # The heir's own method is asked, for what it does on the other ranks a stand-in is enough.
+    own = failing(base, name)
+    hook = inspect.getattr_static(base, name)
+    monkeypatch.setattr(
+        base, name, property(lambda _: 1) if isinstance(hook, property) else lambda *_: 1
+    )
+    thing = object.__new__(own)
+    fails(lambda: ask(scenes.WORLD, thing, name), rf"Own\.{name}.* failed with ValueError: no")
+
+
+def run(problem):
+    problem.solve(2)
+    problem.summary()
+    return problem
+
+
+def in_motion(terms):
+    made(mpm.DynamicProblem, terms=terms).solve(0.2, 0.1)
+
+
+REACHED = {
+    **{name: lambda terms: run(made(terms=terms)) for name in (
+        "take_part", "begin", "start", "residuals", "background_forces", "tangents",
+        "reduced_tangents", "commit", "kept", "symmetric", "one_sided", "fused", "coupling",
+    )},
+    **dict.fromkeys(("pace", "end_forces", "step_work"), in_motion),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REACHED)
+def test_a_term_that_fails_on_one_rank_in_a_run(name):
+    def build(body):
+        return [failing(mpm.Term, name)([body])]
+
+    fails(lambda: REACHED[name](build), rf"Own\.{name}.* failed with ValueError: no table")
+
+
+def test_the_last_converged_state_is_whole_after_a_hook_failed_on_one_rank():
+    class Own(mpm.Term):
+        fails = False
+
+        def residuals(self):
+            if self.fails and LAST:
+                raise ValueError("no table")
+            return ()
+
+    problem, twin = (made(terms=lambda body: [Own([body])]) for _ in range(2))
+    for each in (problem, twin):
+        each.solve(1)
+        each.particles.load.value = 2.0
+    before = problem.particles.converged_displacement.copy()
+    problem.terms[0].fails = True
+    fails(problem.step, r"Own\.residuals\(\) failed with ValueError: no table")
+    assert np.array_equal(problem.particles.converged_displacement, before)
+    problem.terms[0].fails = False
+    for each in (problem, twin):
+        each.particles.load.value = 2.0
+        each.step()
+    displaced = [each.particles.converged_displacement for each in (problem, twin)]
+    assert np.array_equal(*displaced)
+
+
+@pytest.mark.mpi
+def test_a_truth_that_differs_between_ranks_is_named():
+    class Own(mpm.Term):
+        symmetric = property(lambda self: LAST)
+
+    fails(lambda: made(terms=lambda body: [Own([body])]), r"Own\.symmetric differs between")
+
+
+@pytest.mark.parametrize("name", ["strain_energy", "plastic_work"])
+def test_a_law_whose_energy_fails_on_one_rank(name):
+    law = failing(VonMises, name)(1e2, 0.3, rho_y=2.0)
+    fails(
+        lambda: made(mpm.DynamicProblem, law, scheme="conserving").step(0.1),
+        "no table",
+        ValueError,
+    )
+
+
+class Own(Kept):
+    """Nodal values that go with a problem; on the last rank one method fails or differs."""
+
+    key = "mine"
+
+    def __init__(self, problem, where):
+        self.problem, self.where = problem, where
+        self.values = mpm.particles.particles.fem.Function(problem.particles.W)
+
+    def fail(self, where):
+        if LAST and where == self.where:
+            raise ValueError("no table")
+
+    def columns(self, body):
+        self.fail("columns")
+        return {} if body is None else {"v": Column(of_cells(self.values), "nodes")}
+
+    def numbers(self):
+        self.fail("numbers")
+        return {"n": differing(1, 2) if self.where == "differ" else 1}
+
+    def require(self, source, taken):
+        self.fail("require")
+        super().require(source, taken)
+
+    def restore(self, taken):
+        self.fail("restore")
+        fill(self.values, taken.columns[0]["v"])
+
+
+@pytest.mark.parametrize("where", ["columns", "numbers", "require", "restore", "differ"])
+def test_what_is_kept_fails_on_one_rank(where, mpi_tmp_path):
+    if where == "differ" and scenes.WORLD.size == 1:
+        pytest.skip("ranks differ")
+    problem = made()
+
+    def keep():
+        problem.keep(Own(problem, where))
+        problem.save(mpi_tmp_path / "kept.npz")
+        problem.restore(mpi_tmp_path / "kept.npz")
+
+    fails(keep, "^mine n differs" if where == "differ" else rf"Own\.{where}\(\) failed with Value")
+
+
+# -- What a user gives ------------------------------------------------------------------------
+
+
+def methods():
+    for cls in CLASSES:
+        for name, value in inspect.getmembers(cls, inspect.isfunction):
+            if is_collective(value):
+                yield f"{cls.__name__}.{name}", value
+
+
+CALLS = dict(methods()) | {f.__name__: f for f in FUNCTIONS if f not in LOCAL}
+
+
+def test_all_that_is_public_and_takes_arguments_is_compared():
+    assert [name for name, call in CALLS.items() if not is_collective(call)] == []
+    assert [c.__name__ for c in CLASSES if not is_collective(c.__init__)] == []
+    assert is_collective(mpm.Body.__post_init__)
+    known = {*CLASSES, *FUNCTIONS, *LOCAL}
+    classes = {v for v in vars(mpm).values() if inspect.isclass(v) and hasattr(v, "solve")}
+    assert classes <= known
+    assert {"solve", "steps", "step", "write", "save", "restore", "stage", "remove", "add"} <= {
+        name.partition(".")[2] for name in CALLS
+    }
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("name", CALLS)
+def test_each_argument_that_differs_is_named(name):
+    call = CALLS[name]
+    own = [p for p in inspect.signature(call).parameters.values() if p.name != "self"]
+    method = "self" in inspect.signature(call).parameters
+    for wrong in own:
+        if wrong.kind in (wrong.VAR_KEYWORD, wrong.VAR_POSITIONAL):
+            continue
+        usual = {
+            p.name: None
+            for p in own
+            if p.default is p.empty and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
+        }
+        values = usual | {wrong.name: differing(1.0, "another")}
+        first = [scenes.WORLD] if method else []
+        if wrong.name in call.__own__:
+            continue
+        fails(
+            lambda first=first, values=values: call(*first, **values),
+            rf"^{wrong.name} differs between the ranks: 1.0 on rank 0, 'another'",
+        )
+
+
+WRONG = {
+    "unknown": lambda: made(**differing({}, {"foo": 1})),
+    "nothing": lambda: made().remove(differing([0], None)),
+    "function": lambda: made().remove(lambda x: [][LAST] if LAST else x[0] < 0.4),
+    "no indices": lambda: made().split(differing([0], "abc")),
+    "no particles": lambda: mpm.Body(differing(particles(), None), Hencky(1e3, 0.3)),
+    "no body": lambda: mpm.QuasiStaticProblem(
+        differing(mpm.Body(particles(), Hencky(1e3, 0.3)), None)
+    ),
+    "no tags": lambda: mpm.facet_tags(particles().mesh, differing({1: mpm.region(x=0.0)}, {})),
+    "no problem": lambda: mpm.strength_reduction(differing(made(), None)),
+    "no shape": lambda: contact.Rigid(particles(), differing(contact.disc((0.5, 2.0), 0.3), None)),
+    "time": lambda: made().write("unwritten.pvd", time=differing(1.0, 2.0)),
+}
+
+
+@pytest.mark.mpi
+@pytest.mark.parametrize("what", WRONG)
+def test_arguments_that_are_wrong_on_one_rank(what):
+    try:
+        WRONG[what]()
+        caught = None
+    except Exception as error:
+        caught = error
+    ended = scenes.WORLD.allgather(f"{type(caught).__name__}: {caught}")
+    assert caught is not None and len(set(ended)) == 1, ended
+
+
+@pytest.mark.mpi
+def test_stiffnesses_and_permeabilities_that_differ():
+    def tie():
+        a, b = particles(), particles((0.0, 1.0), (1.0, 1.5))
+        mpm.Tie(a, b, scenes.facet_tags(a.mesh, scenes.at(1, 1.0)), 1, differing(1e3, 1e5))
+
+    def water():
+        V = scenes.vectors(scenes.box([0.0, -1.0], [2.0, 2.0], [4, 6], QUADRILATERAL), 2)
+        body = mpm.Particles(scenes.unit(2, QUADRILATERAL), V, degree=2)
+        pores = mpm.PoreFluid(lambda J: differing(0.1, 0.2) * J**3)
+        mpm.PorousProblem(mpm.Body(body, Hencky(1e3, 0.3), pore_fluid=pores))
+
+    fails(tie, "^stiffness differs between the ranks: 1000.0 on rank 0, 100000.0")
+    fails(water, "permeability differs between the ranks")
