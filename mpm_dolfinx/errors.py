@@ -231,8 +231,7 @@ def _common[E: BaseException](place: MPI.Comm, error: E | None) -> E | None:
         particles = {p for e in errors if type(e) is type(first) for p in e.particles}
         common = type(first)(first.message, particles, first.load)
         common.dofs = first.dofs
-        if rank == place.rank and error is not None:
-            common.__cause__ = error.__cause__
+        common.__cause__ = None if error is None else error.__cause__
     setattr(common, _AGREED, True)
     return cast(E, common)
 
@@ -264,7 +263,7 @@ def agree(comm: MPI.Comm, what: str | None = None) -> Iterator[None]:
     common = agreed(comm, mine)
     try:
         if common is not None:
-            raise common from common.__cause__
+            raise common
     finally:
         del mine, common  # an error that its own frame holds would keep problems alive
 

@@ -176,7 +176,7 @@ class Governed:
         try:
             state = law.stressed_state(carried.stress[points], gradient, variables)
         except MPMError as error:
-            raise self._named(error, points) from None
+            raise self._named(error, points) from error
         except Exception as error:
             what = f"stressed_state of {type(self.material).__name__}"
             raise as_ours(error, what) from error
@@ -195,9 +195,10 @@ class Governed:
             state: At them.
 
         Raises:
-            MPMError: The law gives something else.
+            MPMError: The law fails, or gives something else.
         """
-        stress = self.material.cauchy_stress(_read_only(gradient), _protected(state))
+        received = _read_only(gradient), _protected(state)
+        stress = self._asked(lambda: self.material.cauchy_stress(*received), "cauchy_stress")
         shape = (len(self.points), 3, 3)
         if np.shape(stress) != shape:
             raise MPMError(
@@ -210,9 +211,9 @@ class Governed:
         """Return the elastic energy per undeformed volume, shape ``(n,)``, where it is known.
 
         Raises:
-            MPMError: The law gives something else.
+            MPMError: The law fails, or gives something else.
         """
-        return self._known("strain energy", self.material.strain_energy(state))
+        return self._known("strain_energy", state)
 
     def plastic_work(self, state: State) -> NDArray[np.float64] | None:
         """Return the plastic work per undeformed volume, shape ``(n,)``, where it is known.
@@ -220,29 +221,30 @@ class Governed:
         It is not where an heir of the law that tells it has changed the law.
 
         Raises:
-            MPMError: The law gives something else.
+            MPMError: The law fails, or gives something else.
         """
         if not is_as_inherited(self.material, "plastic_work"):
             return None
-        return self._known("plastic work", self.material.plastic_work(state))
+        return self._known("plastic_work", state)
 
-    def _known(self, what: str, values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    def _known(self, method: str, state: State) -> NDArray[np.float64] | None:
         """Return numbers at the points, which must be that unless they are not known."""
+        values = self._asked(lambda: getattr(self.material, method)(state), method)
         if values is not None:
-            self._require(what, values, (len(self.points),))
+            self._require(method.replace("_", " "), values, (len(self.points),))
         return values
 
-    def _asked[T](self, law: Callable[[], T]) -> T:
+    def _asked[T](self, law: Callable[[], T], method: str = "The update") -> T:
         """Return the answer of a law, with an error of its own raised as one of ours."""
-        name = type(self.material).__name__
+        what = f"{method} of {type(self.material).__name__}"
         try:
             return law()
         except MPMError as error:
-            raise self._named(error, self.points) from None
+            raise self._named(error, self.points) from error
         except np.linalg.LinAlgError as error:
-            raise ConvergenceError(f"The update of {name} broke down ({error})") from error
+            raise ConvergenceError(f"{what} broke down ({error})") from error
         except Exception as error:
-            ours = as_ours(error, f"The update of {name}")
+            ours = as_ours(error, what)
             if "read-only" in str(error):
                 ours = MPMError(f"{ours.message}; a law must not write into what it receives.")
             raise ours from error

@@ -58,10 +58,11 @@ def collective[**P, R](*own: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
             if _within and _within[-1] is not None:
                 return function(*args, **given)
             comm = _ranks_of([*args, *given.values()], 3) or called_last()
-            if comm is None or comm.size == 1:
+            if comm is None:
                 return function(*args, **given)
             with _entered(comm):
-                require_same(comm, **_named(signature, own, args, given))
+                if comm.size > 1:
+                    require_same(comm, **_named(signature, own, args, given))
                 result = function(*args, **given)
             return cast(R, _together(result, comm)) if isinstance(result, Generator) else result
 
@@ -152,7 +153,7 @@ def asked[**P, R](function: Callable[P, R], name: str) -> Callable[P, R]:
     @functools.wraps(function)
     def call(*args: P.args, **given: P.kwargs) -> R:
         comm = _within[-1] if _within else None
-        if comm is None or comm.size == 1:
+        if comm is None:
             return function(*args, **given)
         with agree(comm, name), _in(None):
             return function(*args, **given)
