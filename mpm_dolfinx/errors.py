@@ -10,6 +10,7 @@ therefore meets the others where these agree next, and all end with its error.
 from __future__ import annotations
 
 import pickle
+import re
 import sys
 import threading
 import warnings
@@ -44,6 +45,8 @@ __all__ = [
 NOTHING, FLAG, ERROR = 0, 1, 2
 #: Seconds after which a rank tells of an error for which the others do not come.
 PATIENCE = 20.0
+#: What makes the name of an object differ between ranks.
+ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
 
 
 class MPMError(RuntimeError):
@@ -55,7 +58,7 @@ class MPMError(RuntimeError):
         load: Load factor of the last converged step.
 
     Attributes:
-        message: The sentence as given.
+        message: The sentence as given, on one line and without addresses in memory.
         particles: Global indices of the particles concerned, sorted (may be empty).
         load: Load factor of the last converged step, or ``None`` before a run.
         dofs: Global dofs of V with the largest residual, where Newton's method failed.
@@ -64,11 +67,12 @@ class MPMError(RuntimeError):
     def __init__(
         self, message: str, particles: Iterable[int] = (), load: float | None = None
     ) -> None:
-        self.message = message
+        self.message = " ".join(ADDRESS.sub("", message).split())
         self.particles: list[int] = sorted({int(p) for p in particles})
         self.load = load
         self.dofs: list[int] = []
-        super().__init__(message.replace("{particles}", name_particles(self.particles)))
+        names = name_particles(self.particles)
+        super().__init__(self.message.replace("{particles}", names))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Let ranks send errors to each other."""

@@ -20,15 +20,15 @@ def as_reals(value: Any) -> NDArray[np.float64]:
     """Return numbers as a new array.
 
     Raises:
-        TypeError: Complex numbers, whose imaginary part would be dropped, or UFL that has no value
-            (NumPy goes through the components of a scalar without end).
+        TypeError: Complex numbers, whose imaginary part would be dropped, truths, or UFL that has
+            no value (NumPy goes through the components of a scalar without end).
         ValueError: Something else that is none.
     """
     if holds_ufl(value, fem.Constant):
         raise TypeError("UFL is no number")
     array = np.asarray(value)
-    if np.iscomplexobj(array):
-        raise TypeError("complex numbers")
+    if array.dtype.kind in "cb":
+        raise TypeError("complex numbers, or truths")
     try:
         return np.array(array, dtype=np.float64)
     except OverflowError as error:

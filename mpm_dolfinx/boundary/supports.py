@@ -29,6 +29,7 @@ from ..assembly.inputs import as_expression, is_tag, known_tags
 from ..errors import MPMError, agree, warn
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
+from ..parallel.given import as_positive
 from ..particles.particles import Particles
 
 __all__ = ["Dashpot", "Plane", "Support", "dashpot", "fixed", "plane", "roller"]
@@ -72,8 +73,6 @@ class Support:
         modulus: Any,
         penalty: float,
     ) -> None:
-        if not isinstance(penalty, float | int) or not 0.0 < penalty < np.inf:
-            raise MPMError(f"penalty must be a positive number, not {penalty!r}.")
         self.particles = particles
         body = particles.mesh
         metadata = particles.dx_exact.metadata()
@@ -91,7 +90,7 @@ class Support:
         self._stiffness = fem.Function(
             fem.functionspace(body, ("Discontinuous Lagrange", 0)), name=self.stiffness_name
         )
-        self._penalty = float(penalty)
+        self._penalty = as_positive(penalty, "penalty")
         self._modulus = modulus is not None
         self._found: NDArray[np.float64] | None = None
         if modulus is not None:

@@ -229,6 +229,7 @@ class Governed:
 
     def _known(self, method: str, state: State) -> NDArray[np.float64] | None:
         """Return numbers at the points, which must be that unless they are not known."""
+        values: NDArray[np.float64] | None
         values = self._asked(lambda: getattr(self.material, method)(state), method)
         if values is not None:
             self._require(method.replace("_", " "), values, (len(self.points),))

@@ -26,6 +26,7 @@ from ..errors import ConvergenceError, MPMError, agree, agreed
 from ..io.snapshot import Taken
 from ..meshes.remesh import Column
 from ..parallel.boundary import collective
+from ..parallel.given import as_positive
 from ..particles.particles import Particles
 from ..system.term import PointMaterial
 from .contact import Contact, Outcome, stiffness
@@ -33,7 +34,6 @@ from .law import Friction, as_friction
 from .nitsche import Nitsche, require_stress
 from .one_pass import Pass
 from .pair_matrices import PairMatrices
-from .shapes import as_positive
 from .surface import Surface
 
 __all__ = ["Pair"]

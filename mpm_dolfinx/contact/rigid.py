@@ -20,7 +20,7 @@ from ..errors import ConvergenceError, MPMError, agree, agreed
 from ..io.snapshot import Taken
 from ..meshes.remesh import Column
 from ..parallel.boundary import collective
-from ..parallel.given import require_same
+from ..parallel.given import as_positive, require_same
 from ..particles.particles import Particles
 from ..reals import as_reals
 from ..system.term import PointMaterial
@@ -33,7 +33,7 @@ from .obstacle_tractions import ObstacleTractions
 from .placed import Placed, framed, placed, unframed
 from .reach import Reach, is_near
 from .rotation import Pose
-from .shapes import Shape, as_positive
+from .shapes import Shape
 from .surface import Blocks, PointMatrix, Surface, global_dofs
 from .ways import OPPOSITE, passes
 

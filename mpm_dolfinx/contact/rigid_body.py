@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from ..errors import TRIAL_ERRORS, ConvergenceError, MPMError, agree
 from ..io.snapshot import Kept, Taken
 from ..parallel.boundary import collective
-from ..parallel.given import require_same
+from ..parallel.given import as_positive, require_same
 from ..particles.particles import Particles
 from ..system.term import PointMaterial, Term, Transfer
 from .body_contact import BodyContact
@@ -38,7 +38,7 @@ from .law import Friction
 from .placed import Placed
 from .rigid_motion import RigidMotion, State, as_inertia, as_rotation, held_of
 from .rotation import Pose, Turn, crossing
-from .shapes import Shape, as_point, as_positive
+from .shapes import Shape, as_point
 from .yielding import Yielding
 
 __all__ = ["RigidBody"]

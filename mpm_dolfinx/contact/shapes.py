@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConvergenceError, MPMError, as_ours
+from ..parallel.given import as_positive, is_number
 from ..reals import as_reals
 
 __all__ = [
     "Shape",
     "as_direction",
     "as_point",
-    "as_positive",
     "as_radius",
     "box",
     "cavity",
@@ -492,27 +492,12 @@ def as_direction(value: Any, name: str, dim: int) -> NDArray[np.float64]:
     return vector / length
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, float | int | np.number) and not isinstance(value, bool)
-
-
-def as_positive(value: Any, name: str) -> float:
-    """Return a positive number.
-
-    Raises:
-        MPMError: It is something else.
-    """
-    if not _is_number(value) or not 0.0 < value < np.inf:
-        raise MPMError(f"{name} must be a positive number, not {value!r}.")
-    return float(value)
-
-
 def as_radius(value: Any) -> float:
     """Return a radius, which may be 0.
 
     Raises:
         MPMError: It is none.
     """
-    if not _is_number(value) or not 0.0 <= value < np.inf:
+    if not is_number(value) or not 0.0 <= value < np.inf:
         raise MPMError(f"radius must be a number from 0 on, not {value!r}.")
     return float(value)

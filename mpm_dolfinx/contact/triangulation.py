@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError, agree, as_ours
+from ..parallel.given import as_positive
 from ..plot.outlines import surface_algorithm
 from ..reals import as_reals
 from .nearest import FacetTree
-from .shapes import Shape, as_direction, as_point, as_positive, as_radius
+from .shapes import Shape, as_direction, as_point, as_radius
 
 __all__ = ["polyline", "read_surface", "terrain", "triangulated"]
 

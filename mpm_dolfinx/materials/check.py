@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
+from ..parallel.given import as_positive, is_number, require_whole
 from .base import Material, State
 
 __all__ = ["check_tangent"]
@@ -52,6 +53,15 @@ def check_tangent(
         MPMError: The error exceeds the tolerance, the tangent lacks the symmetry that
             ``material.symmetric`` claims, or ``update`` modified the state it was given.
     """
+    if not isinstance(material, Material):
+        raise MPMError(f"check_tangent() needs a material, not {material!r}.")
+    require_whole("dim", dim, 3, least=2)
+    require_whole("seed", seed)
+    require_whole("points", points, least=1)
+    require_whole("steps", steps, least=1)
+    strain, tolerance = as_positive(strain, "strain"), as_positive(tolerance, "tolerance")
+    if rotation is not None and not (is_number(rotation) and np.isfinite(rotation)):
+        raise MPMError(f"rotation must be a finite number of radians or None, not {rotation!r}.")
     name = type(material).__name__
     arrays = [v for v in material.parameters.values() if isinstance(v, np.ndarray)]
     points = len(arrays[0]) if arrays else points

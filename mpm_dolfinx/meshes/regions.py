@@ -16,6 +16,7 @@ from dolfinx import fem, mesh
 
 from ..errors import MPMError, agree, as_ours
 from ..parallel.boundary import collective
+from ..parallel.given import require_truth
 from ..reals import as_reals
 
 __all__ = ["cell_tags", "facet_tags", "held", "region"]
@@ -133,6 +134,7 @@ def facet_tags(domain: mesh.Mesh, where: Mapping[int, Where], interior: bool = F
     """
     dim = domain.topology.dim - 1
     domain.topology.create_connectivity(dim, dim + 1)
+    require_truth("interior", interior)
     locate = mesh.locate_entities if interior else mesh.locate_entities_boundary
     return _tags(domain, dim, where, lambda inside: locate(domain, dim, inside), "facet")
 
@@ -230,7 +232,7 @@ def held(
         unknown = set(planes) - {"x", "y", "z", "polygon"}
         if unknown:
             raise MPMError(f"held() has no {unknown.pop()}=; give x=, y=, z= or polygon=.")
-        if component is not None and component not in range(count):
+        if component is not None and (isinstance(component, bool) or component not in range(count)):
             raise MPMError(f"There is no component {component!r} of a space with {count}.")
         inside = region(**planes) if where is None else where
         if not callable(inside):

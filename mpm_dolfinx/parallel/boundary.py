@@ -20,6 +20,7 @@ from mpi4py import MPI
 
 from ..errors import agree, called_last, forget
 from .given import require_same
+from .kinds import explained
 
 __all__ = ["Hooked", "asked", "by_itself", "collective", "hooks_of", "is_collective", "of_user"]
 
@@ -57,10 +58,8 @@ def collective[**P, R](*own: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
         def call(*args: P.args, **given: P.kwargs) -> R:
             if _within and _within[-1] is not None:
                 return function(*args, **given)
-            comm = _ranks_of([*args, *given.values()], 3) or called_last()
-            if comm is None:
-                return function(*args, **given)
-            with _entered(comm):
+            comm = _ranks_of([*args, *given.values()], 3) or called_last() or MPI.COMM_SELF
+            with _entered(comm), explained(function, args, given):
                 if comm.size > 1:
                     require_same(comm, **_named(signature, own, args, given))
                 result = function(*args, **given)

@@ -24,7 +24,7 @@ from ufl.corealg.traversal import traverse_unique_terminals
 
 from ..errors import MPMError, gathered, met
 
-__all__ = ["require_degree", "require_same", "require_truth"]
+__all__ = ["as_positive", "is_number", "require_same", "require_truth", "require_whole"]
 
 PACKAGE = __name__.partition(".")[0]
 #: What describes a law besides its parameters.
@@ -74,17 +74,35 @@ def require_truth(name: str, value: Any) -> None:
         raise MPMError(f"{name} must be True or False, not {value!r}.")
 
 
-def require_degree(name: str, value: Any, most: int) -> None:
-    """Raise an error unless a value is a degree of a rule.
+def require_whole(name: str, value: Any, most: int | None = None, least: int = 0) -> None:
+    """Raise an error unless a value is a whole number, such as a degree or a count.
 
     Args:
         name: What it is called in a message.
         value: What is given.
-        most: The highest.
+        most: The highest; ``None``: there is none.
+        least: The lowest.
     """
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not whole or not 0 <= value <= most:
-        raise MPMError(f"{name} must be a whole number from 0 to {most}, not {value!r}.")
+    if not whole or value < least or (most is not None and value > most):
+        how = f"from {least} {'on' if most is None else f'to {most}'}"
+        raise MPMError(f"{name} must be a whole number {how}, not {value!r}.")
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is a real number, and no truth."""
+    return isinstance(value, float | int | np.integer | np.floating) and not isinstance(value, bool)
+
+
+def as_positive(value: Any, name: str) -> float:
+    """Return a positive number.
+
+    Raises:
+        MPMError: It is something else.
+    """
+    if not is_number(value) or not 0.0 < value < np.inf:
+        raise MPMError(f"{name} must be a positive number, not {value!r}.")
+    return float(value)
 
 
 def _parts(name: str, value: Any) -> Iterator[tuple[str, str]]:

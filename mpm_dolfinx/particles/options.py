@@ -22,7 +22,7 @@ from ..meshes.boxes import BOX_CELLS
 from ..meshes.jacobian_bound import JacobianBound
 from ..meshes.quadrature import default_degree
 from ..parallel.exchange import swap
-from ..parallel.given import require_degree
+from ..parallel.given import require_whole
 from ..reals import is_one_of
 from ..transfer.methods import METHODS
 
@@ -183,7 +183,7 @@ def validate_options(
             "of degree 1; use 'cpdi2' for others."
         )
     if quadrature_degree is not None:
-        require_degree("quadrature_degree", quadrature_degree, 30)  # 16 points each way
+        require_whole("quadrature_degree", quadrature_degree, 30)  # 16 points each way
     enough = default_degree(body.basix_cell().name, degree, V is None)
     least = enough if V is None else 2 * degree - 2
     if quadrature_degree is not None and quadrature_degree < least and (degree > 1 or V is None):

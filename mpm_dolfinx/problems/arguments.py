@@ -95,7 +95,7 @@ def as_pairs(name: str, loads: Any) -> Sequence[Any]:
         if loads is pair or not isinstance(pair, list | tuple) or len(pair) != 2:
             raise MPMError(
                 f"{name} must be a list of pairs of a value and a tag, such as [(1.0, 1)], not "
-                f"{_told(loads)}."
+                f"{loads!r}."
             )
     return tuple(loads)
 
@@ -404,9 +404,3 @@ def as_supports(supports: Any, bodies: Sequence[Particles]) -> list[Support]:
     if len({id(support) for support in supports}) < len(supports):
         raise MPMError("A support stands twice in supports, and would hold twice; give it once.")
     return list(supports)
-
-
-def _told(value: Any) -> str:
-    """Return a value for a message that is the same on all ranks: without an address in memory."""
-    text = repr(value)
-    return f"a {type(value).__name__}" if " at 0x" in text else text

@@ -21,6 +21,7 @@ from ..background.cells import COORDINATES, TOLERANCE
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
+from ..parallel.given import is_number
 from ..particles.geometry import RING
 from ..particles.particles import Particles
 from ..reals import as_reals
@@ -75,7 +76,7 @@ class DisplacementControl:
                 f"A displacement control needs mpm.Particles, not {type(particles).__name__}."
             )
         with agree(particles.mesh.comm):
-            if not _is_number(value):
+            if not is_number(value) or not np.isfinite(value):
                 raise MPMError(
                     f"The controlled displacement must be a finite number, not {value!r}."
                 )
@@ -428,11 +429,6 @@ class ControlledSystem:
 
 def _norm(vectors: Sequence[PETSc.Vec]) -> float:
     return float(np.linalg.norm([vector.norm() for vector in vectors]))
-
-
-def _is_number(value: Any) -> bool:
-    number = isinstance(value, float | int | np.number) and not isinstance(value, bool)
-    return number and bool(np.isfinite(value))
 
 
 def _vector(value: Any, particles: Particles, name: str) -> NDArray[np.float64]:

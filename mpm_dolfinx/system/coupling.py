@@ -21,7 +21,7 @@ from ..assembly.inputs import is_tag, known_tags
 from ..background.basis import BackgroundBasis
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
-from ..parallel.given import require_degree, require_truth
+from ..parallel.given import as_positive, require_truth, require_whole
 from ..particles.particles import Particles
 from .term import Term
 
@@ -73,9 +73,7 @@ class Tie(Term):
                 raise MPMError("A Tie needs two bodies of mpm.Particles with method='cpdi2'.")
         if a is b:
             raise MPMError("A Tie needs two bodies, not the same one twice.")
-        known = isinstance(stiffness, float | int | np.number) and not isinstance(stiffness, bool)
-        if not known or not 0.0 < stiffness < np.inf:
-            raise MPMError(f"The stiffness of a Tie must be a positive number, not {stiffness!r}.")
+        self.stiffness = as_positive(stiffness, "The stiffness of a Tie")
         if _compat.geometry_degree(a.mesh) > 1:
             raise MPMError("A Tie needs straight facets; exchange the two bodies.")
         tags = known_tags(a, facet_tags, "A Tie")
@@ -83,10 +81,9 @@ class Tie(Term):
             raise MPMError(f"There is no facet tag {tag!r}; there are {sorted(tags)}.")
         known_tags(a, facet_tags, "A Tie", [tag])
         super().__init__([a, b])
-        self.stiffness = float(stiffness)
         self._tags, self._tag = facet_tags, tag
         degree = 2 * a.W.ufl_element().degree if quadrature_degree is None else quadrature_degree
-        require_degree("quadrature_degree of a Tie", degree, 100)  # 51 points each way
+        require_whole("quadrature_degree of a Tie", degree, 100)  # 51 points each way
         require_truth("axisymmetric", axisymmetric)
         self._degree, self.axisymmetric = int(degree), axisymmetric
         self._spaces: tuple[fem.FunctionSpace, ...] = ()
