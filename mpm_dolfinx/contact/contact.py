@@ -18,6 +18,7 @@ from ..errors import MPMError, agree
 from ..io.identity import same
 from ..io.snapshot import Kept, Taken
 from ..meshes.remesh import Column
+from ..parallel.given import require_truth
 from ..particles.particles import Particles
 from ..reals import is_one_of
 from ..system.term import PointMaterial, Term
@@ -69,6 +70,7 @@ class Contact(Term):
     ) -> None:
         if not is_one_of(law, LAWS):
             raise MPMError(f"law must be one of {', '.join(map(repr, LAWS))}, not {law!r}.")
+        require_truth("axisymmetric", axisymmetric)
         super().__init__(bodies)
         self._nitsche = law == "nitsche"
         self.friction = friction

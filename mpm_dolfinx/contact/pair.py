@@ -109,7 +109,7 @@ class Pair(Contact):
                 "The bodies of a Pair are on the same V, which makes them stick; give each its "
                 "own, such as a second function space on the same mesh."
             )
-        if passes not in (1, 2):
+        if isinstance(passes, bool) or passes not in (1, 2):
             raise MPMError(f"A Pair has 1 or 2 passes, not {passes!r}.")
         for name, value in (("facet_tags", facet_tags), ("tags", tags), ("moduli", moduli)):
             if not isinstance(value, list | tuple) or len(value) != 2:

@@ -77,7 +77,7 @@ def _fits(value: Any, kind: Any) -> bool:
         whole = isinstance(value, NUMBERS[kind])
         return whole and (kind is bool or not isinstance(value, bool)) and value == value
     wanted = NoneType if kind is None else origin or kind
-    if not isinstance(wanted, type) or wanted is object:
+    if not isinstance(wanted, type) or wanted in (Any, object):
         return True
     if isinstance(value, str):  # which is a sequence, but never meant
         return wanted is str

@@ -46,8 +46,10 @@ def history(
     Raises:
         MPMError: There is no step yet, a curve that is none, or matplotlib is missing.
     """
+    run: History = getattr(problem, "history", None)
+    if not isinstance(run, History):
+        raise MPMError(f"A history is drawn of a problem, not of {problem!r}.")
     comm: MPI.Comm = problem.bodies[0].mesh.comm
-    run: History = problem.history
     with agree(comm):
         if not run.steps:
             raise MPMError("There is no step yet; draw the history after a run.")

@@ -26,7 +26,7 @@ from ..errors import DomainDistortionError, MPMError, agree, agreed, warn
 from ..io.checkpoint import Snapshot
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
-from ..parallel.given import require_truth
+from ..parallel.given import is_number, require_truth
 from ..particles.domains import separate_nodes
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
@@ -508,7 +508,7 @@ class QuasiStaticProblem(ParticleProblem):
                 parameters on the present body mesh. Nothing is changed.
         """
         self._require_governing()
-        if not isinstance(threshold, float | int) or not 0.0 <= threshold <= 1.0:
+        if not is_number(threshold) or not 0.0 <= threshold <= 1.0:
             raise MPMError(f"threshold must be a share from 0 to 1, not {threshold!r}.")
         self.setup.require_movable()
         ranks = [body.ranks_of_background() for body in self.bodies]

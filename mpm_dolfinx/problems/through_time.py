@@ -13,6 +13,7 @@ import numpy as np
 from ..errors import MPMError
 from ..history import History, Step
 from ..parallel.boundary import collective, of_user
+from ..parallel.given import as_positive
 from ..stepping.progress import with_bar
 from .particle_problem import ParticleProblem
 
@@ -189,8 +190,7 @@ class TimeProblem(ParticleProblem):
         Raises:
             MPMError: As in :meth:`solve`.
         """
-        if not isinstance(dt, float | int | np.number) or not dt > 0.0:
-            raise MPMError(f"dt must be positive, not {dt!r}.")
+        dt = as_positive(dt, "dt")
         for _ in self.steps(self.history.time + dt, 2.0 * dt):
             pass
         return self.history.steps[-1]

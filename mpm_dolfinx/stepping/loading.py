@@ -213,10 +213,10 @@ class Stepper:
         control: DisplacementControl | None,
         span: tuple[float, float] | None,
     ) -> Iterator[Step]:
-        if isinstance(steps, int | np.integer) and steps >= 1:
-            chosen: Control = StepControl(int(steps))
-        elif isinstance(steps, ErrorControl):
-            chosen = steps
+        if isinstance(steps, ErrorControl):
+            chosen: Control = steps
+        elif isinstance(steps, int | np.integer) and steps >= 1 and not isinstance(steps, bool):
+            chosen = StepControl(int(steps))
         else:
             raise MPMError(f"steps must be a whole number from 1 on or 'auto', not {steps!r}.")
         if update is not None:

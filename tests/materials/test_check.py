@@ -171,3 +171,23 @@ def test_a_function_stays_until_its_values_are_put_in_its_place():
     Vector.array = np.array([1.0, -2.0])
     with pytest.raises(MPMError, match="young is -2"):
         VonMises(field, 0.3, rho_y=1.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"material": "steel"}, "needs a material, not 'steel'"),
+        ({"dim": 4}, "dim must be a whole number from 2 to 3, not 4"),
+        ({"seed": -1}, "seed must be a whole number from 0 on, not -1"),
+        ({"points": 0}, "points must be a whole number from 1 on, not 0"),
+        ({"steps": 0}, "steps must be a whole number from 1 on, not 0"),
+        ({"steps": True}, "steps must be .* not True"),
+        ({"strain": -0.1}, "strain must be a positive number"),
+        ({"strain": [0.1]}, "strain must be a positive number"),
+        ({"rotation": np.nan}, "rotation must be a finite number"),
+        ({"tolerance": np.inf}, "tolerance must be a positive number"),
+    ],
+)
+def test_a_check_of_nothing_is_refused(options, sentence):
+    with pytest.raises(MPMError, match=sentence):
+        check_tangent(**{"material": Hencky(1e3, 0.3)} | options)

@@ -244,6 +244,16 @@ def test_all_that_is_public_and_takes_arguments_is_compared():
     }
 
 
+@pytest.mark.parametrize("call", [c for c in (*CLASSES, *FUNCTIONS) if c not in LOCAL])
+def test_each_call_says_what_it_cannot_work_with(call):
+    required = [
+        p.name for p in inspect.signature(call).parameters.values()
+        if p.default is p.empty and p.kind is p.POSITIONAL_OR_KEYWORD
+    ]  # fmt: skip
+    error = fails(lambda: call(*[object() for _ in required]), "")
+    assert "\n" not in str(error) and " at 0x" not in str(error)
+
+
 @pytest.mark.mpi
 @pytest.mark.parametrize("name", CALLS)
 def test_each_argument_that_differs_is_named(name):

@@ -1560,7 +1560,7 @@ def test_what_does_not_go_with_inertia_is_refused():
         (lambda: problem.solve(np.nan, 0.1), "time must be a finite number"),
         (lambda: problem.solve(1.0, 0.1, output_at=[2.0]), "later than the end"),
         (lambda: problem.solve(1.0, 0.1, output_at=3), "must be a list of times"),
-        (lambda: problem.step(-0.1), "dt must be positive"),
+        (lambda: problem.step(-0.1), "dt must be a positive number"),
     ):
         raises(call, mpm.MPMError, sentence)
 

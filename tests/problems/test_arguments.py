@@ -260,6 +260,38 @@ PROBLEMS = {
         lambda: scenes.block().remove([0], body=np.ones(2)),
         r"There is no body array",
     ),
+    "steps that are true": (run(steps=True), r"steps must be a whole number .*not True"),
+    "half a truth": (
+        lambda: scenes.block().repartition(True),
+        r"threshold must be a share from 0 to 1, not True",
+    ),
+    # kinds
+    "condition on nothing": (
+        lambda: mpm.held(None, x=0.0),
+        r"V of held\(\) must be fem\.FunctionSpace, not None",
+    ),
+    "condition on particles": (lambda: mpm.held(particles(), x=0.0), r"V of held\(\) must be fem"),
+    "component that is true": (
+        lambda: mpm.held(particles().V, True, x=-1.0),
+        r"There is no component True",
+    ),
+    "plane that is true": (lambda: mpm.held(particles().V, x=True), r"x= must be a number"),
+    "value that is true": (
+        lambda: mpm.held(particles().V, x=-1.0, value=True),
+        r"value= must be a number",
+    ),
+    "tags of nothing": (
+        lambda: mpm.facet_tags(None, {1: mpm.region(x=0.0)}),
+        r"domain of facet_tags\(\) must be mesh\.Mesh, not None",
+    ),
+    "facets inside in words": (
+        lambda: mpm.facet_tags(body(), {1: mpm.region(x=0.0)}, interior="no"),
+        r"interior must be True or False, not 'no'",
+    ),
+    "field of a kind that is an array": (
+        lambda: (p := particles()).field(scenes.vectors(p.V.mesh), kind=np.ones(2)),
+        r"kind of field\(\) must be str, not array\(\[1\., 1\.\]\)",
+    ),
     # bodies
     "particles twice by a copy": (lambda: copy.copy(particles()), r"Particles cannot be copied"),
     "particles twice by a deep one": (
@@ -403,6 +435,7 @@ PROBLEMS = {
     ),
     "displacement of one number": (held("fixed", value=1.0), r"value has the shape"),
     "no penalty": (held("fixed", penalty=0.0), r"penalty must be a positive number, not 0\.0"),
+    "penalty that is true": (held("fixed", penalty=True), r"penalty must be a positive.*True"),
     "penalty in words": (held("fixed", penalty="stiff"), r"penalty must be a positive number"),
     "support on no facet": (held("fixed", tag=9), r"no facet tag 9; there are \[1\]"),
     "support without tags": (held("fixed", facet_tags=None), r"Supports need facet_tags="),
