@@ -46,7 +46,7 @@ def history(
     Raises:
         MPMError: There is no step yet, a curve that is none, or matplotlib is missing.
     """
-    run: History = getattr(problem, "history", None)
+    run = getattr(problem, "history", None)
     if not isinstance(run, History):
         raise MPMError(f"A history is drawn of a problem, not of {problem!r}.")
     comm: MPI.Comm = problem.bodies[0].mesh.comm
