@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Comparisons of runs, states and errors."""
 
+from petsc4py import PETSc
+
 import numpy as np
 import pytest
 import scenes
@@ -107,7 +109,8 @@ def error_of_blocks(problem, step=1e-5, size=1e-3):
 def error_of_a_term(term, bodies, start):
     """Return the error of a term's tangent, against differences, over the size of its forces.
 
-    The motion is a smooth one of nodes, and the bodies are left where they begin.
+    The motion is a smooth one of nodes, and any one of unknowns of its own, from some place. The
+    bodies are left where they begin.
 
     Args:
         term: The term, which has begun a step.
@@ -118,12 +121,17 @@ def error_of_a_term(term, bodies, start):
     dim = bodies[0].mesh.geometry.dim
     X = [body.W.tabulate_dof_coordinates()[:, :dim] for body in bodies]
     ways = [1e-8 * np.sin(x @ some.uniform(3, 9, (dim, dim)) + i).ravel() for i, x in enumerate(X)]
+    own = term.own
+    place, turn = some.uniform(-1.0, 1.0, (2, 0 if own is None else own.total))
 
     def forces(factor):
         for body, d, way in zip(bodies, start, ways, strict=True):
             body.displacement.x.array[:] = d + factor * way
+        if own is not None:
+            own.values = 5e-3 * place + 1e-8 * factor * turn
         assert term.update() is None
-        return np.concatenate([f.array_r.copy() for f in term.residuals()])
+        found = [f.array_r.copy() for f in term.residuals()]
+        return np.concatenate(found if own is None else [*found, own.residual[: own.count]])
 
     numeric = (8 * (forces(1.0) - forces(-1.0)) - (forces(2.0) - forces(-2.0))) / 12.0
     forces(0.0)
@@ -132,6 +140,9 @@ def error_of_a_term(term, bodies, start):
         vector = body.T.createVecLeft()
         vector.array_w[:] = way[: vector.getLocalSize()]
         motions.append(vector)
+    if own is not None:
+        motions.append(PETSc.Vec().createMPI(own.layout, comm=bodies[0].mesh.comm))
+        motions[-1].array_w[:] = 1e-8 * turn[: own.count]
     exact = np.concatenate([f.array_r.copy() for f in term.stiffness_force(motions)])
     size = scenes.largest(exact)
     assert size > 0.0

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, override
 
 from mpi4py import MPI
@@ -17,52 +17,28 @@ from ..errors import MPMError
 from ..particles.particles import Particles
 from .law import Friction
 from .placed import distance_within, framed
-from .rigid import Rigid
+from .rigid import Rigid, Slopes
 from .rotation import Pose, cayley_variation, crossing
 from .shapes import Shape
-from .surface import global_dofs
+from .surface import Blocks, PointMatrix
 
-__all__ = ["ActingPoints", "BodyContact", "YieldBlocks"]
-
-
-class ActingPoints(NamedTuple):
-    """Points of a contact that touch, and the tractions there.
-
-    Attributes:
-        facets: Numbers of their facets, shape ``(n,)``.
-        dofs: Global dofs of these, shape ``(n, k gdim)``.
-        shapes: Shape functions of nodes at points, shape ``(nq, k)``.
-        weights: Shape ``(n, nq)``.
-        before: Positions at the step's beginning, shape ``(n, nq, gdim)``.
-        after: At its end.
-        force: Tractions.
-        within: Tractions in the frame of the shape.
-        slopes: Their derivatives by coordinates there, shape ``(n, nq, gdim, gdim)``.
-    """
-
-    facets: NDArray[np.int64]
-    dofs: NDArray[np.int64]
-    shapes: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    before: NDArray[np.float64]
-    after: NDArray[np.float64]
-    force: NDArray[np.float64]
-    within: NDArray[np.float64]
-    slopes: NDArray[np.float64]
+__all__ = ["BodyContact", "Coupled"]
 
 
-class YieldBlocks(NamedTuple):
-    """Derivatives that a contact adds, s being a step ``(dX, theta)`` of the rigid body.
+class Coupled(NamedTuple):
+    """Tangents of a contact, by the unknowns of the rigid body too.
 
     Attributes:
-        own: Of the rigid body's balance by s, ``(n, n)``.
-        by_nodes: Of the balance by nodes of the other body, ``(m, n, k gdim)``.
-        of_nodes: Of tractions on these nodes by s, ``(m, k gdim, n)``.
+        nodes: Of forces on nodes by nodes.
+        of_motion: Of forces and moments on the rigid body by nodes; ``None``: none yet, as above.
+        by_motion: Of forces on nodes by unknowns of the rigid body.
+        own: Of forces on the rigid body by its own unknowns, of this rank.
     """
 
+    nodes: PETSc.Mat | None
+    of_motion: PETSc.Mat | None
+    by_motion: PETSc.Mat | None
     own: NDArray[np.float64]
-    by_nodes: NDArray[np.float64]
-    of_nodes: NDArray[np.float64]
 
 
 class BodyContact(Rigid):
@@ -111,9 +87,10 @@ class BodyContact(Rigid):
         self._look_near()
         return ()
 
-    def look(self) -> None:
-        """Look where the body is now, for all places in which the shape is tried."""
-        self._reach.hold()
+    def couple(self, layout: tuple[int, int]) -> None:
+        """Take how many unknowns the rigid body has, of this rank and of all."""
+        W = self.bodies[0].W
+        self._couplings = PointMatrix(layout, W), PointMatrix(W, layout)
 
     def put(self, pose: Pose) -> None:
         """Evaluate what acts with the shape in some place.
@@ -127,10 +104,10 @@ class BodyContact(Rigid):
         self._pose = self._aim = pose
         self._trial = self._evaluated()
 
-    @override
-    def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        """Return tangents by exact derivatives, as the rigid body's own are."""
-        return self.derivatives()
+    @property
+    def whole_stiffness(self) -> float:
+        """Stiffness of all of this rank's points together."""
+        return float((self._surface.weights * self._tractions.stiffnesses()[0]).sum())
 
     @property
     def extent(self) -> float:
@@ -146,15 +123,14 @@ class BodyContact(Rigid):
         return float((above + below).max())
 
     def total(self, centres: tuple[NDArray[np.float64], ...]) -> NDArray[np.float64]:
-        """Return this rank's force and moment on the other body, their size, and their round-off.
-
-        Gaps have the round-off of the body's coordinates.
+        """Return this rank's force and moment on the other body.
 
         Args:
             centres: Centre of the rigid body at the step's beginning and end.
 
         Returns:
-            Force, moment about the centre, size and round-off of the force, ``(gdim + nr + 2,)``.
+            Force, moment about the centre, size of the force, and number of points that touch,
+            ``(gdim + nr + 2,)``.
         """
         assert self._trial is not None
         trial, traction = self._trial, self._trial.outcome.traction
@@ -164,10 +140,9 @@ class BodyContact(Rigid):
         arm = self._arms(here, centres)
         moments = np.einsum("mqij,mqi->j", crossing(arm), f)
         size = np.linalg.norm(f, axis=2).sum()
-        k = sum(self._tractions.stiffnesses(which))
-        stiffness = float((self._surface.weights[which] * k).sum())
-        round_off = np.finfo(np.float64).eps * self._surface.extent * stiffness
-        return np.concatenate([f.sum(axis=(0, 1)), moments, [size, round_off]])
+        return np.concatenate(
+            [f.sum(axis=(0, 1)), moments, [size, np.count_nonzero(trial.touched)]]
+        )
 
     def _arms(
         self, here: NDArray[np.int64], centres: tuple[NDArray[np.float64], ...]
@@ -223,66 +198,69 @@ class BodyContact(Rigid):
         pressed = np.where(gap <= self._surface.touch, gap, 0.0)
         return float(0.5 * self._surface.weights.ravel() @ (points.stiffness * pressed**2))
 
-    def acting(self) -> ActingPoints:
-        """Return the points that touch, with their tractions."""
-        assert self._trial is not None
-        trial, surface = self._trial, self._surface
-        memory = self._known(trial)
-        here, inside, flat = self._tractions.acting(trial, memory)
-        which = trial.numbers(here)
-        slopes = np.zeros((len(which), surface.nq, surface.gdim, surface.gdim))
-        if len(flat):
-            slopes[inside] = self._tractions.derivative_within(trial, memory, flat)
-        force = trial.outcome.traction[here]
-        return ActingPoints(
-            which,
-            global_dofs(self.bodies[0].W, surface.nodes[which]),
-            surface.shapes,
-            surface.weights[which],
-            memory.outcome.positions[here],
-            trial.outcome.positions[here],
-            force,
-            np.linalg.solve(self._tractions.rotation(trial, memory), force[..., None])[..., 0],
-            slopes,
-        )
-
-    def blocks(
+    def coupled(
         self,
-        acting: ActingPoints,
         centres: tuple[NDArray[np.float64], ...],
         theta: NDArray[np.float64],
-        on_nodes: bool = True,
-    ) -> YieldBlocks:
-        """Return the derivatives by a step of the rigid body.
+        per_unknown: NDArray[np.float64],
+    ) -> Coupled:
+        """Return the tangents (collective).
 
         Args:
-            acting: What :meth:`acting` has returned.
             centres: As for :meth:`total`.
             theta: Cayley vector of the step.
-            on_nodes: Whether those by and of nodes are asked for.
+            per_unknown: Displacement and Cayley vector by each unknown, ``(gdim + nr, n)``.
         """
-        trial, memory = self._trial, self._memory
-        assert trial is not None and memory is not None
-        gdim, share = acting.force.shape[2], 0.5 if self._of_step else 1.0
-        Q, last = self._tractions.rotation(trial, memory), trial.pose.Q
+        slopes = self._slopes(False)
+        rows, by_s, own = self._by_motion(slopes, centres, theta)
+        N, w = self._surface.shapes, self._surface.weights[slopes.facets]
+        m, k = slopes.dofs.shape
+        keys, n = slopes.facets, per_unknown.shape[1]
+        motions = np.broadcast_to(np.arange(n), (m, n))
+        of = np.einsum("mq,qa,mqsi,sn->mnai", w, N, rows, per_unknown, optimize=True)
+        by = np.einsum("mq,qa,mqis,sn->main", -w, N, by_s, per_unknown, optimize=True)
+        of_motion, by_motion = self._couplings
+        return Coupled(
+            self._matrix.of([self._blocks_of(slopes)]),
+            of_motion.of([Blocks(keys, motions, slopes.dofs, of.reshape(m, n, k))]),
+            by_motion.of([Blocks(keys, slopes.dofs, motions, by.reshape(m, k, n))]),
+            per_unknown.T @ own @ per_unknown,
+        )
+
+    def of_own(
+        self, centres: tuple[NDArray[np.float64], ...], theta: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return this rank's derivative of force and moment by a step of the rigid body."""
+        return self._by_motion(self._slopes(False), centres, theta)[2]
+
+    def _by_motion(
+        self,
+        slopes: Slopes,
+        centres: tuple[NDArray[np.float64], ...],
+        theta: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return derivatives by and of a step ``(dX, theta)`` of the rigid body.
+
+        Returns:
+            Of force and moment at points by their positions ``(m, nq, n, gdim)``, of tractions by
+            the step ``(m, nq, gdim, n)``, and of all force and moment by it ``(n, n)``.
+        """
+        trial, memory = slopes.trial, self._known(slopes.trial)
+        here, D = slopes.acting.here, slopes.by_position
+        share = 0.5 if self._of_step else 1.0
+        gdim, force = D.shape[3], trial.outcome.traction[here] / self._share
+        within = np.linalg.solve(self._tractions.rotation(trial, memory), force[..., None])[..., 0]
         H = cayley_variation(theta)
-        arm = acting.after - centres[1]
-        middle = 0.5 * (acting.before - centres[0] + arm) if self._of_step else arm
-        here = np.broadcast_to(np.eye(gdim), (*arm.shape, gdim))
-        by_x = Q @ acting.slopes @ last.T
-        by_s = -by_x @ np.concatenate([here, crossing(arm) @ H], axis=3)
-        by_s[..., gdim:] += share * crossing(acting.within @ last.T) @ H
-        rigid = np.concatenate([here, crossing(middle)], axis=3)
-        w = acting.weights[:, :, None, None]
-        turning = share * crossing(acting.force).swapaxes(2, 3)
-        own = (w * (rigid.swapaxes(2, 3) @ by_s)).sum(axis=(0, 1))
+        arm = trial.outcome.positions[here] - centres[1]
+        middle = self._arms(here, centres)
+        unit = np.broadcast_to(np.eye(gdim), (*arm.shape, gdim))
+        by_s = -D @ np.concatenate([unit, crossing(arm) @ H], axis=3)
+        by_s[..., gdim:] += share * crossing(within @ trial.pose.Q.T) @ H
+        rigid = np.concatenate([unit, crossing(middle)], axis=3).swapaxes(2, 3)
+        turning = share * crossing(force).swapaxes(2, 3)
+        w = self._surface.weights[slopes.facets][:, :, None, None]
+        own = (w * (rigid @ by_s)).sum(axis=(0, 1))
         own[gdim:, :gdim] += (w * turning).sum(axis=(0, 1))
-        if not on_nodes:
-            nothing = np.zeros((0, 0, 0))
-            return YieldBlocks(own, nothing, nothing)
-        rows = rigid.swapaxes(2, 3) @ by_x
+        rows = rigid @ D
         rows[:, :, gdim:] -= turning
-        N, m, n = acting.shapes, len(arm), len(own)
-        by_nodes = np.einsum("qa,mqsi->msai", N, w * rows).reshape(m, n, N.shape[1] * gdim)
-        of_nodes = np.einsum("qa,mqis->mais", N, w * by_s).reshape(m, N.shape[1] * gdim, n)
-        return YieldBlocks(own, by_nodes, of_nodes)
+        return rows, by_s, own

@@ -57,8 +57,6 @@ class Reach:
         self._surface, self._shape = surface, shape
         self._near: Near | None = None
         self._wider: Near | None = None
-        self._change: float | None = None
-        self._seen: list[tuple[NDArray[np.int64], NDArray[np.float64]]] | None = None
 
     def forget(self) -> None:
         """Take all facets for near, until they are looked for."""
@@ -71,13 +69,6 @@ class Reach:
             memory: What is known of the last converged step.
         """
         self._near, self._wider = self._within(memory, 0.0), None
-        self._change = self._seen = None
-
-    def hold(self) -> None:
-        """Look where the body is now, once for all places in which the shape is tried."""
-        self._change, self._seen = None, []
-        if self._near is not None:
-            self._change = self._largest_change(self._near)
 
     def of(self, memory: Memory, pose: Pose) -> Memory | None:
         """Return the memory of facets that may touch at the present positions; ``None``: all.
@@ -110,16 +101,6 @@ class Reach:
                 return near.memory
         return memory.of(trial.facets)
 
-    def positions(self, which: NDArray[np.int64] | None) -> NDArray[np.float64]:
-        """Return where points of some facets are, ``None``: of all."""
-        if which is None or self._seen is None:
-            return self._surface.positions(which=which)
-        for known, positions in self._seen:
-            if known is which:
-                return positions
-        self._seen.append((which, self._surface.positions(which=which)))
-        return self._seen[-1][1]
-
     def _within(self, memory: Memory, distance: float) -> Near | None:
         """Return the facets that are within a distance, or some domains; ``None``: nearly all."""
         surface, shape = self._surface, self._shape
@@ -141,13 +122,9 @@ class Reach:
         """Return by how much points have come nearer to the obstacle in the step at most."""
         shifted = float(np.linalg.norm(pose.offset - memory.pose.offset))
         turned = float(np.linalg.norm(pose.Q - memory.pose.Q, 2)) * near.radius
-        change = self._largest_change(near) if self._change is None else self._change
-        return self._surface.spread * (change + turned) + shifted
-
-    def _largest_change(self, near: Near) -> float:
-        """Return how far a node of the facets has moved in the step at most."""
         change = self._surface.own_nodes() - near.nodes
-        return float(np.sqrt((change * change).sum(axis=1).max(initial=0.0)))
+        moved = float(np.sqrt((change * change).sum(axis=1).max(initial=0.0)))
+        return self._surface.spread * (moved + turned) + shifted
 
 
 def is_near(memory: Memory, surface: Surface, distance: float = 0.0) -> NDArray[np.bool_]:

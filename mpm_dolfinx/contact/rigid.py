@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, override
+from typing import Any, NamedTuple, override
 
 from petsc4py import PETSc
 
@@ -29,7 +29,7 @@ from .contact import Contact, Outcome, stiffness
 from .law import Friction, as_friction, unworn
 from .memory import Grip, Memory
 from .nitsche import Nitsche, Spread, require_stress
-from .obstacle_tractions import ObstacleTractions
+from .obstacle_tractions import Acting, ObstacleTractions
 from .placed import Placed, framed, placed, unframed
 from .reach import Reach, is_near
 from .rotation import Pose
@@ -46,6 +46,24 @@ OVERLAP = 0.1
 MOST_TURN = 0.5 * np.pi
 #: Difference of normals, and of gaps over the body's coordinates, of obstacles in the same place.
 SAME = 1e-10
+
+
+class Slopes(NamedTuple):
+    """Derivatives of what acts at points that touch.
+
+    Attributes:
+        trial: What acts.
+        acting: The points.
+        facets: Numbers of their facets, shape ``(n,)``.
+        dofs: Global dofs of these, shape ``(n, k gdim)``.
+        by_position: Of tractions by positions, as often as forces count, ``(n, nq, gdim, gdim)``.
+    """
+
+    trial: Memory
+    acting: Acting
+    facets: NDArray[np.int64]
+    dofs: NDArray[np.int64]
+    by_position: NDArray[np.float64]
 
 
 class Rigid(Contact):
@@ -356,7 +374,8 @@ class Rigid(Contact):
             if not (whole or memory.exact):
                 self._memory = memory = self._exact(memory)
             near = memory
-        return self._tractions.evaluated(near, self._reach.positions(near.facets), self._pose)
+        x = self._surface.positions(which=near.facets)
+        return self._tractions.evaluated(near, x, self._pose)
 
     def _known(self, trial: Memory) -> Memory:
         """Return the memory of the facets that were looked at in a trial."""
@@ -400,30 +419,46 @@ class Rigid(Contact):
         Args:
             secants: Whether points that have changed their slip take secants instead.
         """
-        assert self._trial is not None
-        trial, surface, tractions = self._trial, self._surface, self._tractions
-        memory = self._known(trial)
-        here, inside, flat = tractions.acting(trial, memory)
-        which = trial.numbers(here)
-        D = np.zeros((len(which), surface.nq, surface.gdim, surface.gdim))
-        if len(flat):
-            D[inside] = tractions.derivative(trial, memory, flat) / self._share
-        if secants:  # (also where nothing touches on this rank: it notes that)
-            D[inside] += tractions.secants(trial, memory, flat) / self._share
-        N, w = surface.shapes, surface.weights[which]
-        k = N.shape[1] * surface.gdim
-        blocks = np.einsum("mq,qa,qb,mqij->maibj", -w, N, N, D, optimize=True)
-        dofs = global_dofs(self.bodies[0].W, surface.nodes[which])
-        parts = [Blocks(which, dofs, dofs, blocks.reshape(-1, k, k))]
+        surface, tractions = self._surface, self._tractions
+        slopes = self._slopes(secants)
+        parts = [self._blocks_of(slopes)]
         if tractions.nitsche is None:
             K = self._matrix.of(parts)
             return {} if K is None else {(0, 0): K}
+        trial, flat = slopes.trial, slopes.acting.flat
+        memory = self._known(trial)
         along = (trial.normal @ trial.pose.Q.T).reshape(-1, surface.gdim)[flat]
         at = At(flat // surface.nq, flat % surface.nq, along)
         force = -surface.weights.ravel()[flat, None] * tractions.by_stress(trial, memory, flat)
         by_stress = tractions.nitsche.tangents(at, [Spread.over_facets(surface, at, force)])
         found = [K for K in (self._matrix.of(parts), *by_stress) if K is not None]
         return {(0, 0): self._sum.of(found)} if found else {}
+
+    def _slopes(self, secants: bool) -> Slopes:
+        """Return the derivatives of the tractions at points that touch.
+
+        Args:
+            secants: As for :meth:`_tangents`.
+        """
+        assert self._trial is not None
+        trial, surface, tractions = self._trial, self._surface, self._tractions
+        memory = self._known(trial)
+        acting = tractions.acting(trial, memory)
+        which, inside = trial.numbers(acting.here), acting.inside
+        D = np.zeros((len(which), surface.nq, surface.gdim, surface.gdim))
+        if len(acting.flat):
+            D[inside] = tractions.derivative(trial, memory, acting.flat) / self._share
+        if secants:  # (also where nothing touches on this rank: it notes that)
+            D[inside] += tractions.secants(trial, memory, acting.flat) / self._share
+        dofs = global_dofs(self.bodies[0].W, surface.nodes[which])
+        return Slopes(trial, acting, which, dofs, D)
+
+    def _blocks_of(self, slopes: Slopes) -> Blocks:
+        """Return the derivatives of forces on nodes by nodes."""
+        surface, (m, k) = self._surface, slopes.dofs.shape
+        N, w = surface.shapes, surface.weights[slopes.facets]
+        values = np.einsum("mq,qa,qb,mqij->maibj", -w, N, N, slopes.by_position, optimize=True)
+        return Blocks(slopes.facets, slopes.dofs, slopes.dofs, values.reshape(m, k, k))
 
     # -- What it remembers ------------------------------------------------------------------------
 

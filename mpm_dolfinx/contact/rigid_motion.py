@@ -57,7 +57,7 @@ class State(NamedTuple):
 
 
 class RigidMotion:
-    """How a rigid body moves.
+    """How a rigid body moves: where it was, and where a step leads to.
 
     Args:
         mass: Its mass, if it has one.
@@ -66,10 +66,16 @@ class RigidMotion:
         start: Centre of mass at the beginning, shape ``(gdim,)``.
         gravity: Acceleration by gravity, shape ``(gdim,)``.
         held: Which of its displacements and rotations follow a path.
+        still: How it begins.
 
     Attributes:
         held: As given.
         start: As given.
+        last: State at the last converged step.
+        trial: State at the end of the step that was tried last.
+        step: This step: displacement of the centre and Cayley vector, shape ``(gdim + nr,)``.
+        push: Force and moment on it at the end of the next step.
+        aim: Where it is to be then, in what is held.
         dt: Length of a step, ``None`` in equilibrium.
         whole: Whether forces are those of a step's middle.
     """
@@ -81,12 +87,17 @@ class RigidMotion:
         start: NDArray[np.float64],
         gravity: NDArray[np.float64],
         held: NDArray[np.bool_],
+        still: State,
     ) -> None:
         self.held, self.start, self._gravity = held, start, gravity
         self._gdim = len(start)
         self._m = 0.0 if mass is None else mass
         nr = len(held) - self._gdim
         self._J = np.zeros((nr, nr)) if inertia is None else inertia
+        self.last = self.trial = still
+        self.step = np.zeros(len(held))
+        self.push = still.force, still.moment
+        self.aim = Pose(np.zeros(self._gdim), np.zeros(nr))
         self.dt: float | None = None
         self.whole = False
 
@@ -96,64 +107,63 @@ class RigidMotion:
         mean = float(np.trace(self._J)) / len(self._J)
         return float(np.sqrt(mean / self._m)) if self._m > 0.0 and mean > 0.0 else None
 
-    # -- What it has in a state -----------------------------------------------------------------
+    # -- What it has at the last converged step ---------------------------------------------------
 
-    def centre(self, state: State) -> NDArray[np.float64]:
-        """Return the place of its centre, shape ``(gdim,)``."""
-        return np.asarray(self.start + state.place)
-
-    def kinetic_energy(self, state: State) -> float:
-        """Return its kinetic energy."""
+    @property
+    def kinetic_energy(self) -> float:
+        """Its kinetic energy."""
+        state = self.last
         turning = 0.5 * float(state.spin @ self._J @ state.spin)
         return 0.5 * self._m * float(state.velocity @ state.velocity) + turning
 
-    def potential_energy(self, state: State) -> float:
-        """Return its energy in the field of gravity, zero at the beginning."""
-        return -self._m * float(self._gravity @ state.place)
+    @property
+    def potential_energy(self) -> float:
+        """Its energy in the field of gravity, zero at the beginning."""
+        return -self._m * float(self._gravity @ self.last.place)
 
-    def momentum(self, state: State) -> NDArray[np.float64]:
-        """Return its momentum, shape ``(gdim,)``."""
-        return self._m * state.velocity
+    @property
+    def momentum(self) -> NDArray[np.float64]:
+        """Its momentum, shape ``(gdim,)``."""
+        return self._m * self.last.velocity
 
-    def angular_momentum(self, state: State) -> NDArray[np.float64]:
-        """Return its angular momentum about the origin, ``(1,)`` or ``(3,)``."""
-        turning = self._J @ state.spin
+    @property
+    def angular_momentum(self) -> NDArray[np.float64]:
+        """Its angular momentum about the origin, ``(1,)`` or ``(3,)``."""
+        turning = self._J @ self.last.spin
         if len(turning) == 3:
-            turning = state.Q @ turning
-        return np.asarray(turning + crossing(self.centre(state)).T @ self.momentum(state))
+            turning = self.last.Q @ turning
+        return np.asarray(turning + crossing(self.centres[0]).T @ self.momentum)
 
     # -- A step ---------------------------------------------------------------------------------
 
-    def guess(self, last: State, aim: Pose) -> NDArray[np.float64]:
-        """Return a step to begin with: as it moved before, or the way to go in what is held.
+    @property
+    def centres(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Places of its centre at the beginning and the end of the step, shape ``(gdim,)``."""
+        return self.start + self.last.place, self.start + self.trial.place
 
-        Args:
-            last: Where it begins.
-            aim: Where it is to be.
-        """
-        gdim = self._gdim
+    @property
+    def theta(self) -> NDArray[np.float64]:
+        """Cayley vector of the step."""
+        return self.step[self._gdim :]
+
+    def guess(self) -> NDArray[np.float64]:
+        """Return a step to begin with: as it moved before, or the way to go in what is held."""
+        gdim, last = self._gdim, self.last
         s = np.zeros(len(self.held))
         if self.dt is not None:
             s[:gdim] = self.dt * last.velocity
             s[gdim:] = self.dt * (last.spin if gdim == 2 else last.Q @ last.spin)
-        path = np.concatenate([aim.offset - last.place, s[gdim:]])
-        path[gdim:] = last.turn.cayley_to(Turn.of(aim.angle)) if self.held[-1] else 0.0
+        path = np.concatenate([self.aim.offset - last.place, s[gdim:]])
+        path[gdim:] = last.turn.cayley_to(Turn.of(self.aim.angle)) if self.held[-1] else 0.0
         return np.where(self.held, path, s)
 
-    def stepped(
-        self,
-        last: State,
-        s: NDArray[np.float64],
-        push: tuple[NDArray[np.float64], NDArray[np.float64]],
-    ) -> State:
+    def stepped(self, s: NDArray[np.float64]) -> State:
         """Return where a step leads to.
 
         Args:
-            last: Where it begins.
             s: The step: displacement of the centre and Cayley vector.
-            push: Force and moment on it at the step's end.
         """
-        gdim = self._gdim
+        gdim, last = self._gdim, self.last
         u, theta = s[:gdim], s[gdim:]
         velocity, spin = last.velocity, last.spin
         if self.dt is not None:
@@ -163,20 +173,27 @@ class RigidMotion:
             turn = Turn.none(gdim).turned(theta).angle if self.held[-1] else theta
             own = turn if gdim == 2 else last.Q.T @ turn
             spin = c[gdim:] * own / self.dt - (c[gdim:] - 1.0) * spin
-        return State(last.place + u, last.turn.turned(theta), velocity, spin, *push)
+        return State(last.place + u, last.turn.turned(theta), velocity, spin, *self.push)
 
-    def given(
-        self, last: State, push: tuple[NDArray[np.float64], NDArray[np.float64]]
-    ) -> NDArray[np.float64]:
-        """Return force and moment on it in a step, besides those of contact."""
-        force, moment = push
+    def go(self, s: NDArray[np.float64]) -> None:
+        """Try a step."""
+        self.step, self.trial = s, self.stepped(s)
+
+    def roll_back(self) -> None:
+        """Return to the last converged step."""
+        self.step, self.trial = np.zeros(len(self.held)), self.last
+
+    def given(self) -> NDArray[np.float64]:
+        """Return force and moment on it in the step, besides those of contact."""
+        force, moment = self.push
         if self.whole:
-            force = 0.5 * (force + last.force)
-            moment = 0.5 * (moment + last.moment)
+            force = 0.5 * (force + self.last.force)
+            moment = 0.5 * (moment + self.last.moment)
         return np.concatenate([force + self._m * self._gravity, moment])
 
-    def inertial(self, last: State, state: State) -> NDArray[np.float64]:
-        """Return the forces of inertia over a step."""
+    def inertial(self) -> NDArray[np.float64]:
+        """Return the forces of inertia over the step."""
+        last, state = self.last, self.trial
         if self.dt is None:
             return np.zeros(len(self.held))
         before, after = (self._J @ s.spin for s in (last, state))
@@ -185,15 +202,10 @@ class RigidMotion:
         linear = self._m * (state.velocity - last.velocity)
         return np.concatenate([linear, after - before]) / self.dt
 
-    def slopes(self, last: State, state: State, theta: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return their derivatives by the step.
-
-        Args:
-            last: Where it begins.
-            state: Where it ends.
-            theta: Cayley vector of the step.
-        """
-        gdim, nr = self._gdim, len(theta)
+    def slopes(self) -> NDArray[np.float64]:
+        """Return their derivatives by the step."""
+        gdim, theta, state = self._gdim, self.theta, self.trial
+        nr = len(theta)
         K = np.zeros((gdim + nr, gdim + nr))
         if self.dt is None:
             return K
@@ -204,14 +216,34 @@ class RigidMotion:
             return K
         Q, J = state.Q, self._J
         K[gdim:, gdim:] = crossing(Q @ J @ state.spin) @ cayley_variation(theta) / self.dt
-        K[gdim:, gdim:] += c * Q @ J @ last.Q.T / self.dt**2
+        K[gdim:, gdim:] += c * Q @ J @ self.last.Q.T / self.dt**2
         return K
 
-    def swing(self, last: State) -> float:
+    def swing(self) -> float:
         """Return the size of the forces of inertia that would stop it within a step."""
         if self.dt is None:
             return 0.0
-        return 2.0 / self.dt * self._m * float(np.linalg.norm(last.velocity))
+        return 2.0 / self.dt * self._m * float(np.linalg.norm(self.last.velocity))
+
+    # -- What is kept ---------------------------------------------------------------------------
+
+    def numbers(self) -> dict[str, Any]:
+        """Return where it is and how it moves, for a checkpoint."""
+        values = self.last._asdict() | {"turn": self.last.turn.values}
+        return {name: value.tolist() for name, value in values.items()} | {
+            "push": [part.tolist() for part in self.push],
+            "aim": [self.aim.offset.tolist(), self.aim.angle.tolist()],
+        }
+
+    def take(self, numbers: dict[str, Any]) -> None:
+        """Take what :meth:`numbers` returned."""
+        values = {name: np.array(numbers[name], dtype=np.float64) for name in State._fields}
+        turn = Turn(values.pop("turn"))
+        last = self.last = self.trial = State(turn=turn, **values)
+        force, moment = numbers.get("push", (last.force, last.moment))
+        self.push = np.array(force), np.array(moment)
+        offset, angle = numbers.get("aim", (last.place, last.turn.angle))
+        self.aim = Pose(np.array(offset), np.array(angle))
 
 
 def names_of(gdim: int) -> list[str]:

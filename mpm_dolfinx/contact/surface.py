@@ -412,18 +412,19 @@ class PointMatrix:
     """A matrix on W of bodies by dense blocks, whose pattern grows as blocks come up.
 
     Args:
-        rows: Space of its rows; or their number, if all are on the first rank; or the number of
-            those of this rank and of all.
-        columns: Space of its columns.
+        rows: Space of its rows, or the number of those of this rank and of all.
+        columns: Space of its columns, or their numbers.
+            One of both is a space.
     """
 
     def __init__(
-        self, rows: fem.FunctionSpace | int | tuple[int, int], columns: fem.FunctionSpace
+        self,
+        rows: fem.FunctionSpace | tuple[int, int],
+        columns: fem.FunctionSpace | tuple[int, int],
     ) -> None:
-        self._comm: MPI.Comm = columns.mesh.comm
-        if isinstance(rows, int):
-            rows = rows if self._comm.rank == 0 else 0, rows
-        self._sizes = rows if isinstance(rows, tuple) else sizes_of(rows), sizes_of(columns)
+        spaces = [space for space in (rows, columns) if not isinstance(space, tuple)]
+        self._comm: MPI.Comm = spaces[0].mesh.comm
+        self._sizes = tuple(s if isinstance(s, tuple) else sizes_of(s) for s in (rows, columns))
         self._matrix: PETSc.Mat | None = None
         self._places: dict[int, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
         self._size = 0

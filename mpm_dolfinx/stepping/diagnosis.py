@@ -27,6 +27,8 @@ __all__ = ["count_folded", "crossed", "placed"]
 ASTRAY = 0.5
 #: How often a particle begins or ceases to yield, late in a solve, that flips to and fro.
 FLIPS = 2
+#: Share of the forces on unknowns of a term's own above which they are out of balance.
+LEFT = 1e-9
 
 
 def crossed(bodies: Sequence[Particles]) -> MPMError | None:
@@ -75,6 +77,9 @@ def placed(
         if particles and dofs:
             text += f"; the residual is largest at dof {dofs[0]} of {space} near {where}"
             text += ", and at {particles}"
+        for own in reduced.own:
+            if own.advice and own.left() > LEFT:
+                text += f"; {own.advice.format(f'{own.left():.1e}')}"
     if isinstance(error, TRIAL_ERRORS):
         astray = max(map(_astray, reduced.fields), default=None)
         if astray is not None and astray.moves > 0.0:

@@ -14,5 +14,6 @@ scheme (:mod:`~mpm_dolfinx.system.schemes`). Each background space with the bodi
 
 and :mod:`~mpm_dolfinx.system.reduced` is the one system that Newton's method sees, in the unknowns
 of all fields (:mod:`~mpm_dolfinx.system.numbering`), with a first guess from the steps before
-(:mod:`~mpm_dolfinx.system.predictor`).
+(:mod:`~mpm_dolfinx.system.predictor`). Unknowns that a term has of its own
+(:mod:`~mpm_dolfinx.system.own`), as the motions of a rigid body, stand beside them.
 """

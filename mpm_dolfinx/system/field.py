@@ -148,6 +148,7 @@ class Field:
         free: The dofs that are unknowns; ``None`` until they are found.
         dofs: Their local numbers.
         touched: The nodes of V that bodies touch.
+        part: Where the unknowns are among this rank's.
         prescribes: Whether Dirichlet values change in the step that has begun.
         factor: Value on V of an unknown of size 1.
     """
@@ -246,7 +247,7 @@ class Field:
             numbers: Number of the unknown of each free dof.
             sizes: Number of all fields' unknowns of this rank and of all ranks.
         """
-        self._part_of_x, self._numbers, self._sizes = part, numbers, sizes
+        self.part, self._numbers, self._sizes = part, numbers, sizes
         self._prolongation: PETSc.Mat | None = None
 
     @property
@@ -265,7 +266,7 @@ class Field:
             return Restriction(self.touched, rows, every, slice(0, last - first)), self.u.getSizes()
         numbers = np.full(self._owned, -1, dtype=np.int32)
         numbers[self.dofs] = self._numbers
-        found = Restriction(self.touched, rows, numbers, self._part_of_x, self.factor)
+        found = Restriction(self.touched, rows, numbers, self.part, self.factor)
         return found, self._sizes
 
     @property
@@ -295,7 +296,7 @@ class Field:
         nodes, components = np.divmod(self.dofs, self._bs)
         gdim = self.V.mesh.geometry.dim
         points = self.free.collect(self.V.tabulate_dof_coordinates()[nodes, :gdim])
-        numbers = np.arange(self._part_of_x.start, self._part_of_x.stop)
+        numbers = np.arange(self.part.start, self.part.stop)
         return FieldDofs(numbers, points, self.free.collect(components), self._lines, self._bs)
 
     @cached_property
@@ -323,7 +324,7 @@ class Field:
     def _set(self, u: PETSc.Vec, x: PETSc.Vec, values: NDArray[np.float64]) -> None:
         """Set u to the unknowns x, and to values at other dofs; dofs that follow others do."""
         assert self.free is not None
-        values[self.dofs] = self.factor * self.free.spread(x.array_r[self._part_of_x])
+        values[self.dofs] = self.factor * self.free.spread(x.array_r[self.part])
         u.array_w[:] = values
         self._extend(u)
 
@@ -342,7 +343,7 @@ class Field:
     def collect(self, force: PETSc.Vec, F: PETSc.Vec) -> None:
         """Set the unknowns' part of F to a force on all dofs of V."""
         assert self.free is not None
-        F.array_w[self._part_of_x] = self.factor * self.free.collect(force.array_r[self.dofs])
+        F.array_w[self.part] = self.factor * self.free.collect(force.array_r[self.dofs])
 
     def residual_at_unknowns(self) -> PETSc.Vec | None:
         """Return the last residual at the free dofs, zero elsewhere, if these are known."""
@@ -401,7 +402,7 @@ class Field:
         fit = fit and all(body.shares_nodes for body in self.bodies)
         u = map_to_background([body.T for body in self.bodies], increments, fit)
         self._cure.stand_in(u)
-        x.array_w[self._part_of_x] = self.free.collect(u[self.dofs]) / self.factor
+        x.array_w[self.part] = self.free.collect(u[self.dofs]) / self.factor
 
     def reactions(self) -> float:
         """Return the norm of the last residual at Dirichlet conditions."""

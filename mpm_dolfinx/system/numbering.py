@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Any
+from typing import Any, Protocol
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -105,12 +105,35 @@ class FreeDofs:
         return [self.collect(motion.ravel()[self._free]) for motion in motions]
 
 
+class Unknowns(Protocol):
+    """Some unknowns, as their numbering must know them; see :class:`FreeDofs`."""
+
+    @property
+    def count(self) -> int:
+        """Number of unknowns of this rank."""
+
+    @property
+    def owners(self) -> NDArray[np.int64]:
+        """Rank of each unknown that this rank knows."""
+
+    @property
+    def places(self) -> NDArray[np.int64]:
+        """Place of each of these among its rank's."""
+
+    @property
+    def off_rank(self) -> NDArray[np.int64]:
+        """Numbers of what crosses ranks, shape ``(3,)``."""
+
+    def rigid_motions(self) -> list[NDArray[np.float64]]:
+        """Return the rigid motions at this rank's unknowns (collective)."""
+
+
 class Numbering:
     """Numbers of the unknowns of all fields: on each rank one field's after the other's.
 
     Args:
         comm: The ranks (collective).
-        fields: The free dofs of each field.
+        fields: The free dofs of each field, or unknowns that are no such.
 
     Attributes:
         sizes: Number of unknowns of this rank and of all ranks.
@@ -119,7 +142,7 @@ class Numbering:
         off_rank: Sum of :attr:`FreeDofs.off_rank`.
     """
 
-    def __init__(self, comm: MPI.Comm, fields: Sequence[FreeDofs]) -> None:
+    def __init__(self, comm: MPI.Comm, fields: Sequence[Unknowns]) -> None:
         self._comm, self._fields = comm, list(fields)
         self.off_rank = np.sum([free.off_rank for free in fields], axis=0)
         counts = np.array(comm.allgather([free.count for free in fields]))

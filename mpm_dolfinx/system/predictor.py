@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..parallel.totals import over_ranks
 
-__all__ = ["Predictor", "map_to_background"]
+__all__ = ["Predictor", "extrapolated", "map_to_background"]
 
 type Increments = list[NDArray[np.float64]]
 
@@ -84,15 +84,23 @@ class Predictor:
         """
         if not self._predicts or not self._past or size <= 0.0:
             return None
-        last, now = self._past[-1]
-        velocities = [d / last for d in now]
-        if len(self._past) == 2:
-            first, before = self._past[0]
-            ahead = (size + last) / (last + first)
-            velocities = [
-                v + ahead * (v - d / first) for v, d in zip(velocities, before, strict=True)
-            ]
-        return [size * v for v in velocities]
+        return extrapolated(self._past, size)
+
+
+def extrapolated(past: Sequence[tuple[float, Increments]], size: float) -> Increments:
+    """Return what follows on the increments of the last step or two.
+
+    Args:
+        past: Sizes of these steps, and their increments.
+        size: Size of the next one.
+    """
+    last, now = past[-1]
+    velocities = [d / last for d in now]
+    if len(past) == 2:
+        first, before = past[0]
+        ahead = (size + last) / (last + first)
+        velocities = [v + ahead * (v - d / first) for v, d in zip(velocities, before, strict=True)]
+    return [size * v for v in velocities]
 
 
 def map_to_background(

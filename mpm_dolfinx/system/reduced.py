@@ -38,6 +38,7 @@ from ..transfer.touched import TransferRows
 from .field import Field, Motion, ValueField
 from .hierarchy import interpolations
 from .numbering import Numbering
+from .own import OwnUnknowns
 from .predictor import Predictor
 from .term import Term
 
@@ -63,6 +64,7 @@ class ReducedSystem:
         fused: The tangents that the compiled loops reduce: one of all fields together, and one of
             each field in which dofs follow others.
         predictor: As given.
+        own: The unknowns that terms have of their own.
         mass_factor: How often tangents have the masses that :meth:`masses` has reduced.
     """
 
@@ -80,6 +82,14 @@ class ReducedSystem:
         self.fields = list(fields)
         self.predictor = predictor
         self._terms = list(terms)
+        self.own = [term.own for term in terms if term.own is not None]
+        moving = len(self.fields) - len(self._value_fields)
+        # In the order of the numbers of their unknowns.
+        self._blocks: list[Field | OwnUnknowns] = [
+            *self.fields[:moving],
+            *self.own,
+            *self.fields[moving:],
+        ]
         self._statistics = statistics
         self._comm: MPI.Comm = self.fields[0].V.mesh.comm
         motions = [(field, motion) for field in fields for motion in field.motions]
@@ -171,9 +181,8 @@ class ReducedSystem:
 
     @property
     def unknowns(self) -> list[slice]:
-        """Where each field's unknowns are among this rank's."""
-        assert self._numbering is not None
-        return self._numbering.parts
+        """Where each field's unknowns are among this rank's, and those of terms' own."""
+        return [block.part for block in self._blocks]
 
     @property
     def forces(self) -> list[PETSc.Vec]:
@@ -272,7 +281,7 @@ class ReducedSystem:
         diagonal = self.diagonal(self.tangent()).array_r
         sizes = [
             self._comm.allreduce(float(np.abs(diagonal[part]).max(initial=0.0)), MPI.MAX)
-            for part in self._numbering.parts
+            for part in (field.part for field in self.fields)
         ]
         given = [
             s for s, f in zip(sizes, self.fields, strict=True) if not isinstance(f, ValueField)
@@ -292,6 +301,8 @@ class ReducedSystem:
         """Take note of the increments; forget the unknowns, since the bodies have moved."""
         self.forget()
         self.predictor.record(self._size, self.increments())
+        for own in self.own:
+            own.record(self._size)
 
     def increments(self) -> list[NDArray[np.float64]]:
         """Return the last change of displacement of each body, on this rank's own dofs of W."""
@@ -324,12 +335,12 @@ class ReducedSystem:
             term.roll_back()
 
     def _find_unknowns(self) -> None:
-        free = [field.find() for field in self.fields]
+        free = [block.find() for block in self._blocks]
         numbering = self._numbering = Numbering(self._comm, free)
-        for field, part, numbers in zip(
-            self.fields, numbering.parts, numbering.numbers, strict=True
+        for block, part, numbers in zip(
+            self._blocks, numbering.parts, numbering.numbers, strict=True
         ):
-            field.number(part, numbers, numbering.sizes)
+            block.number(part, numbers, numbering.sizes)
         self._sum = MatrixSum()
         self._zeros_on_diagonal: PETSc.Mat | None = None
         self._products: dict[tuple[int, int, int], tuple[PETSc.Mat | None, ...]] = {}
@@ -337,11 +348,11 @@ class ReducedSystem:
         self._tangents: list[Tangents] = []
         self._sizes_of: dict[tuple[int, int, int], PETSc.Mat] = {}
         for fused, (group, _) in zip(self.fused, self._groups, strict=True):
-            found = [
+            reduced = [
                 field.restriction([_rows(field, body) for body in self._reduced_on(field)])
                 for field in group
             ]
-            fused.restrict([restriction for restriction, _ in found], found[0][1])
+            fused.restrict([restriction for restriction, _ in reduced], reduced[0][1])
         self._count(numbering)
 
     def _count(self, numbering: Numbering) -> None:
@@ -386,8 +397,8 @@ class ReducedSystem:
             MPMError: What any rank has met that no other x mends, as an error of a user's code.
             BaseException: What a user's code has raised on any rank to end the program.
         """
-        for field in self.fields:
-            field.spread(x)
+        for block in self._blocks:
+            block.spread(x)
         with self._statistics.phase("constitutive"):
             failure: BaseException | None = Interrupted() if noted() else None
             for _, motion in self._places:
@@ -413,6 +424,8 @@ class ReducedSystem:
                 field.gather_extended(field.force)
         for field in self.fields:
             field.collect(field.force, F)
+        for own in self.own:
+            own.collect(F)
         return None
 
     def _add_outer(self, term: Term) -> None:
@@ -597,8 +610,9 @@ class ReducedSystem:
         assert self._numbering is not None
         found = K.getDiagonal()
         values = found.array_w
-        for field, part in zip(self.fields, self._numbering.parts, strict=True):
-            if isinstance(field, ValueField):
+        for block in self._blocks:
+            part = block.part
+            if isinstance(block, ValueField):
                 values[part] -= self._schur(K, found, part)
             else:
                 values[part] = np.abs(values[part])
@@ -659,7 +673,7 @@ class ReducedSystem:
     def _product(self, term: Term, number: int, pair: tuple[int, int], K: PETSc.Mat) -> PETSc.Mat:
         """Return ``T_a^T K T_b`` in the unknowns, the same object for the same K."""
         key = (number, *pair)
-        T_a, T_b = (self._free_T(term.bodies[i]) for i in pair)
+        T_a, T_b = (self._transfer_to(term, i) for i in pair)
         known, half, result = self._products.get(key, (None, None, None))
         if known is not K:
             half = result = None
@@ -671,6 +685,13 @@ class ReducedSystem:
         self._products[key] = K, half, result
         return result
 
+    def _transfer_to(self, term: Term, place: int) -> PETSc.Mat:
+        """Return T of a body of a term in all unknowns, or that of the term's own."""
+        if place < len(term.bodies):
+            return self._free_T(term.bodies[place])
+        assert term.own is not None
+        return term.own.selection
+
     def _free_T(self, particles: Particles | CarriedField) -> PETSc.Mat:
         field, motion = self._place(particles)
         return motion.free_T(field.prolongation)
@@ -678,15 +699,19 @@ class ReducedSystem:
     def prediction(self) -> PETSc.Vec | None:
         """Return the unknowns to expect at the step's end, if a term or the past says any."""
         if self._start is not None:
-            return self._start.copy()
-        increments = self.predictor.increments(self._size)
-        if increments is None:
-            return None
-        assert self._numbering is not None
-        x = self._numbering.vector()
-        for field in self.fields:
-            own = [i for i, (its, _) in zip(increments, self._places, strict=True) if its is field]
-            field.predict(own, x, fit=not self.one_sided())
+            x = self._start.copy()
+        else:
+            increments = self.predictor.increments(self._size)
+            if increments is None:
+                return None
+            assert self._numbering is not None
+            x = self._numbering.vector()
+            for field in self.fields:
+                places = zip(increments, self._places, strict=True)
+                its = [increment for increment, (one, _) in places if one is field]
+                field.predict(its, x, fit=not self.one_sided())
+        for own in self.own:
+            own.predict(x, self._size)
         return x
 
     def rigid_motions(self) -> PETSc.NullSpace:
@@ -697,16 +722,14 @@ class ReducedSystem:
     def splits(self) -> Sequence[tuple[str, slice]]:
         """Return names of the fields, and where their unknowns are among this rank's.
 
-        All displacements are one; they come first.
+        All displacements are one, with terms' own unknowns; they come first.
         """
-        assert self._numbering is not None
-        moving = len(self.fields) - len(self._value_fields)
-        parts = self._numbering.parts
-        found = [("displacement", slice(0, parts[moving - 1].stop))] if moving else []
-        for field, part in zip(self._value_fields, parts[moving:], strict=True):
+        moving = len(self.fields) > len(self._value_fields)
+        found = [("displacement", slice(*self._kinds[0]))] if moving else []
+        for field in self._value_fields:
             name = field.carried[0].field.name
             taken = sum(known.split("_of_")[0] == name for known, _ in found)
-            found.append((f"{name}_of_{taken}" if taken else name, part))
+            found.append((f"{name}_of_{taken}" if taken else name, field.part))
         return found
 
     def interpolations(self, coarsest: int, values: bool = False) -> Sequence[PETSc.Mat]:
@@ -719,16 +742,15 @@ class ReducedSystem:
             values: Whether of those that are no displacements; either kind is numbered alone.
         """
         first, last = self._kinds[values]
-        dofs = [field.level() for field in self.fields if isinstance(field, ValueField) == values]
+        dofs = [one.level() for one in self._blocks if isinstance(one, ValueField) == values]
         alone = [one._replace(numbers=one.numbers - first) for one in dofs]
         return interpolations(self._comm, last - first, alone, coarsest)
 
     @property
     def _kinds(self) -> tuple[tuple[int, int], tuple[int, int]]:
         """Where displacements begin and end among this rank's unknowns, and where the rest does."""
-        assert self._numbering is not None
-        moving = len(self.fields) - len(self._value_fields)
-        first = self._numbering.parts[moving - 1].stop if moving else 0
+        moving = [block for block in self._blocks if not isinstance(block, ValueField)]
+        first = max((block.part.stop for block in moving), default=0)
         return (0, first), (first, self.sizes[0])
 
     def mass(self) -> PETSc.Mat:
@@ -765,13 +787,20 @@ class ReducedSystem:
             for number, field in enumerate(group):
                 if field.prescribes:
                     fused.multiply_add(number, field.u, forces[self.fields.index(field)])
+        on_own: list[tuple[OwnUnknowns, PETSc.Vec]] = []
         for term, tangents in zip(self._terms, self._tangents, strict=True):
+            count = len(term.bodies)
             for (a, b), K in tangents.items():
+                if b == count:
+                    continue
                 field, motion = self._place(term.bodies[b])
                 force = K.createVecLeft()
                 K.mult(motion.of(field.u), force)
-                target = forces[self.fields.index(self._place(term.bodies[a])[0])]
-                term.bodies[a].T.multTransposeAdd(force, target, target)
+                if a < count:
+                    target = forces[self.fields.index(self._place(term.bodies[a])[0])]
+                    term.bodies[a].T.multTransposeAdd(force, target, target)
+                elif term.own is not None:
+                    on_own.append((term.own, force))
         for term, coupled in zip(self._terms, self._coupled, strict=True):
             motions = [motion.of(field.u) for field, motion in map(self._place, term.bodies)]
             self._add(term, term.reduced_product(motions), forces)
@@ -779,7 +808,10 @@ class ReducedSystem:
                 self._add(term, term.stiffness_force(motions), forces)
         for field, force in zip(self.fields, forces, strict=True):
             field.gather_extended(force)
-        return self.restricted(forces)
+        reduced = self.restricted(forces)
+        for own, force in on_own:
+            own.selection.multTransposeAdd(force, reduced, reduced)
+        return reduced
 
     # -- Sizes ----------------------------------------------------------------------------
 
@@ -794,12 +826,13 @@ class ReducedSystem:
             field.factor * max(external, field.reactions(), outer, self._changed(field))
             for field, external, outer in zip(self.fields, self._external, self._outer, strict=True)
         ]
+        scales += [own.size for own in self.own]
         if len(scales) == 1:
             return scales[0]
         if F is None:
             return joint_norm(scales)
-        assert self._numbering is not None
-        sizes = [joint_norm(F.array_r[part], self._comm) for part in self._numbering.parts]
+        parts = [*(field.part for field in self.fields), *(own.part for own in self.own)]
+        sizes = [joint_norm(F.array_r[part], self._comm) for part in parts]
         if any(scale == 0.0 < size for size, scale in zip(sizes, scales, strict=True)):
             inner = self._internal_scales()
             scales = [scale or other for scale, other in zip(scales, inner, strict=True)]
@@ -824,6 +857,8 @@ class ReducedSystem:
                 for body, force in zip(term.bodies, term.absolute_product(changes), strict=True):
                     if self._place(body)[0] is field:
                         body.T.multTransposeAdd(force, total, total)
+            if term.own is not None:
+                continue  # (it acts on displacements alone)
             for (a, b), K in tangents.items():
                 its, motion = self._place(term.bodies[a])
                 if its is not field:
@@ -846,7 +881,8 @@ class ReducedSystem:
             totals = self._zeros()
             for term in self._terms:
                 self._add(term, term.absolute_contributions(), totals)
-            return [f.factor * norm(total) for f, total in zip(self.fields, totals, strict=True)]
+            sizes = [f.factor * norm(total) for f, total in zip(self.fields, totals, strict=True)]
+            return sizes + [own.size for own in self.own]
 
     def changes(self) -> list[NDArray[np.float64]]:
         """Return :meth:`Field.changes` of each field."""
@@ -891,6 +927,8 @@ class ReducedSystem:
             motions = []
             for field, motion in map(self._place, term.bodies):
                 motions.append(motion.of(increments[self.fields.index(field)]))
+            if term.own is not None:
+                motions.append(term.own.of(x))
             forces = term.stiffness_force(motions)
             for force, moved in zip(forces, motions, strict=False):
                 total += force.dot(moved)
@@ -898,7 +936,8 @@ class ReducedSystem:
 
     def motion(self, x: PETSc.Vec) -> float:
         """Return the size of the displacement that x causes on the bodies."""
-        return joint_norm([size for field in self.fields for size in field.on_bodies(x)])
+        sizes = [size for field in self.fields for size in field.on_bodies(x)]
+        return joint_norm([*sizes, *(norm(own.of(x)) for own in self.own)])
 
     def extent(self) -> float:
         """Return the size of the positions of all nodes."""

@@ -23,6 +23,7 @@ from ..errors import MPMError
 from ..io.snapshot import Kept
 from ..parallel.boundary import Hooked, by_itself
 from ..particles.particles import Particles
+from .own import OwnUnknowns
 
 __all__ = ["Hooks", "Motion", "PointMaterial", "Term", "Transfer", "UserTerm"]
 
@@ -121,6 +122,15 @@ class Term(Hooked):
     def follows_load(self) -> bool:
         """Whether what the load factor does depends on the displacement."""
         return False
+
+    @property
+    def own(self) -> OwnUnknowns | None:
+        """Unknowns of its own, besides its bodies' displacements; ``None``: none.
+
+        Then it sets their residual in :meth:`update`, and :meth:`tangents` has derivatives of
+        and by them too, in the place that comes after the bodies.
+        """
+        return None
 
     def come_after(self, gone: Sequence[Term]) -> None:
         """Take note that it comes to a problem that goes on, before :meth:`take_part` (collective).
@@ -277,15 +287,18 @@ class Term(Hooked):
         """Return the whole tangent times displacements on W of each body, or nothing.
 
         Args:
-            motions: The displacements.
+            motions: The displacements, and last the motion of its own unknowns, if it has any.
+
+        Returns:
+            Forces in the same places.
         """
-        forces: dict[int, PETSc.Vec] = {}
-        for (a, b), K in self.derivatives().items():
-            if a not in forces:
-                forces[a] = K.createVecLeft()
-                forces[a].set(0.0)
+        found = self.derivatives()
+        forces = [motion.duplicate() for motion in motions if found]
+        for force in forces:
+            force.set(0.0)
+        for (a, b), K in found.items():
             K.multAdd(motions[b], forces[a], forces[a])
-        return [forces[a] for a in range(len(self.bodies))] if forces else ()
+        return forces
 
     def absolute_product(self, changes: Sequence[NDArray[np.float64]]) -> Sequence[PETSc.Vec]:
         """Return the product of the absolute values of :attr:`coupling` and changes of each body.
