@@ -19,6 +19,7 @@ from .. import _compat
 
 __all__ = [
     "MatrixSum",
+    "absolute",
     "assemble_into",
     "assemble_matrix",
     "assembled",
@@ -143,3 +144,10 @@ class MatrixSum:
 def _num_entries(matrix: PETSc.Mat) -> float:
     """Return the number of entries of a matrix that have a place (collective)."""
     return float(matrix.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"])
+
+
+def absolute(matrix: PETSc.Mat) -> PETSc.Mat:
+    """Return a matrix with the absolute values of another (collective)."""
+    indptr, columns, values = matrix.getValuesCSR()
+    csr = indptr, columns, np.abs(values)
+    return PETSc.Mat().createAIJ(matrix.getSizes(), csr=csr, comm=matrix.comm)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
+from ..assembly.petsc import absolute
 from ..constitutive.points import MaterialPoints
 from ..constitutive.recovery import stress_errors
 from ..particles.particles import Particles
@@ -60,28 +61,31 @@ def estimated(
         reduced: Their system.
     """
     forces = reduced.nodal_forces()
+    reduced.evaluate()
     nodal, own, energy = [], [], 0.0
     for body, term, force in zip(bodies, terms, forces, strict=False):
         field = next(field for field in reduced.fields if any(b is body for b in field.bodies))
-        held = _prescribed(body, field.conditions)
-        nodal.append(nodal_errors(body, reduced.terms, force, held))
+        free = _unprescribed(body, field.conditions)
+        nodal.append(nodal_errors(body, reduced.terms, force, free))
         points = term.forms.internal
         if isinstance(points, MaterialPoints):
             own.append(stress_errors(body, points))
         else:
             own.append(np.zeros(body.num_local))
         energy += _energy(body, term, force)
+    reduced.roll_back()
     return Errors(nodal, own, bodies[0].mesh.comm.allreduce(energy))
 
 
-def _prescribed(body: Particles, conditions: Sequence[fem.DirichletBC]) -> NDArray[np.bool_]:
-    """Return which own dofs of W move by prescribed dofs of V alone, or not at all (collective)."""
-    weights, moved = body.T.createVecRight(), body.T.createVecLeft()
-    fixed = fixed_dofs(conditions, body.V)
-    # numbers of no pattern, whose sums with signed weights do not vanish
-    weights.array_w[:] = np.where(fixed, 0.0, 1.0 + np.modf(np.arange(len(fixed)) * np.pi)[0])
-    body.T.mult(weights, moved)
-    return np.asarray(moved.array_r == 0.0)
+def _unprescribed(body: Particles, conditions: Sequence[fem.DirichletBC]) -> NDArray[np.float64]:
+    """Return which share of the weights of own rows of T is on free dofs of V (collective)."""
+    T = absolute(body.T)
+    weights = T.createVecRight()
+    weights.set(1.0)
+    every = (T * weights).array_r
+    weights.array_w[:] = ~fixed_dofs(conditions, body.V)
+    free = (T * weights).array_r
+    return np.asarray(np.where(every > 0.0, free / np.where(every > 0.0, every, 1.0), 0.0))
 
 
 def _energy(body: Particles, term: BodyTerm, force: NDArray[np.float64]) -> float:

@@ -631,7 +631,8 @@ class ParticleProblem(Hooked):
             Energy norm of the error over that of the deformation.
 
         Raises:
-            MPMError: A motion, or a flow of water, which is in no equilibrium of its own.
+            MPMError: A motion, or a flow of water, which is in no equilibrium of its own, or
+                particles that do not hang together.
         """
         found = self._errors().total(self.bodies)
         steps = self.history.steps
@@ -662,6 +663,12 @@ class ParticleProblem(Hooked):
             raise MPMError(
                 f"A {type(self).__name__} is in no equilibrium of which an error could be told; "
                 "error() is for problems at rest."
+            )
+        alone = next((body for body in self.bodies if not body.shares_nodes), None)
+        if alone is not None:
+            raise MPMError(
+                f"Particles of method {alone.method!r} do not hang together, so that nothing tells "
+                "what their background cannot do; error() is for 'cpdi2' and finite elements."
             )
         self._require_governing()
         return estimated(self.bodies, self.body_terms, self.reduced)

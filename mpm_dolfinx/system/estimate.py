@@ -31,7 +31,7 @@ def nodal_errors(
     particles: Particles,
     terms: Sequence[Term],
     force: NDArray[np.float64],
-    held: NDArray[np.bool_],
+    free: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return ``R_I . K_II^-1 R_I`` of a body's nodes (collective).
 
@@ -44,18 +44,19 @@ def nodal_errors(
         particles: The body.
         terms: All that acts, as evaluated last.
         force: R on this rank's own dofs of W.
-        held: Which of these have a motion that is wholly prescribed, where R is a reaction.
+        free: Share of the motion of each of these that is not prescribed; the rest of R is a
+            reaction.
 
     Returns:
         Squares of energies, at this rank's own nodes, shape ``(N,)``.
     """
     bs = particles.W.dofmap.index_map_bs
-    free = ~held.reshape(-1, bs)
-    residual = np.where(free, force.reshape(-1, bs), 0.0)
-    blocks = np.zeros((*free.shape, bs))
+    residual = (force * free).reshape(-1, bs)
+    moves = free.reshape(-1, bs) > 0.0
+    blocks = np.zeros((*moves.shape, bs))
     for matrix in _tangents(particles, terms):
         _add_blocks(matrix, blocks)
-    blocks = 0.5 * (blocks + blocks.swapaxes(1, 2)) * (free[:, :, None] & free[:, None, :])
+    blocks = 0.5 * (blocks + blocks.swapaxes(1, 2)) * (moves[:, :, None] & moves[:, None, :])
     sizes, axes = np.linalg.eigh(blocks)
     largest = np.abs(sizes).max(axis=1, initial=0.0, keepdims=True)
     along = np.einsum("nij,ni->nj", axes, residual)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..assembly.body_forms import BodyForms
 from ..assembly.fused import Coupling, FusedTangent, Masses
-from ..assembly.petsc import MatrixSum
+from ..assembly.petsc import MatrixSum, absolute
 from ..errors import (
     TRIAL_ERRORS,
     ConvergenceError,
@@ -475,6 +475,16 @@ class ReducedSystem:
             vector.set(0.0)
         return vectors
 
+    def evaluate(self) -> None:
+        """Evaluate all terms, with their tangents, at the displacement that there is (collective).
+
+        Raises:
+            MPMError: A term cannot be evaluated.
+        """
+        failure = agreed(self._comm, self._updated())
+        if failure is not None:
+            raise failure
+
     def _updated(self) -> BaseException | None:
         """Update the terms; return the gravest failure."""
         return gravest([_updated(term) for term in self._terms])
@@ -865,7 +875,7 @@ class ReducedSystem:
                     continue
                 key = number, a, b
                 if key not in self._sizes_of:
-                    self._sizes_of[key] = _absolute(K)
+                    self._sizes_of[key] = absolute(K)
                 force, change = K.createVecLeft(), K.createVecRight()
                 change.array_w[:] = self._place(term.bodies[b])[1].change()
                 self._sizes_of[key].mult(change, force)
@@ -980,13 +990,6 @@ def _updated(term: Term) -> BaseException | None:
         return as_ours(error, term.evaluation)
     except BaseException as error:
         return error
-
-
-def _absolute(matrix: PETSc.Mat) -> PETSc.Mat:
-    """Return a matrix with the absolute values of another (collective)."""
-    indptr, columns, values = matrix.getValuesCSR()
-    csr = indptr, columns, np.abs(values)
-    return PETSc.Mat().createAIJ(matrix.getSizes(), csr=csr, comm=matrix.comm)
 
 
 def _rows(field: Field, particles: Particles | CarriedField) -> TransferRows:

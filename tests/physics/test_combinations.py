@@ -704,6 +704,39 @@ def test_a_feature_with_stages(feature):
         stages(FEATURES[feature])
 
 
+# -- The error ---------------------------------------------------------------------------
+
+#: Methods whose particles do not hang together.
+APART = ("gimp", "cpdi", "mpm")
+#: What changes the body's elements, and with them their error.
+OTHER_ELEMENTS = ("split",)
+
+
+@pytest.mark.parametrize(
+    "feature", all_but(("f_bar patch", "repartition", "gimp"), [f for f in FEATURES])
+)
+@pytest.mark.filterwarnings("ignore:The run is complete, but the domains")
+def test_a_feature_with_an_estimate_of_the_error(feature):
+    """It can be asked at any time, changes nothing, and what only moves data does not change it."""
+    scene = Scene(FEATURES[feature])
+    if feature in APART:
+        with pytest.raises(mpm.MPMError, match="do not hang together"):
+            scene.problem.error()
+        return
+    assert scene.problem.error() == 0.0
+    scene.problem.solve()
+    found = scene.problem.error()
+    assert 0.0 < found < 1.0 and scene.problem.error() == pytest.approx(found, rel=1e-12)
+    scene.change()
+    if feature not in OTHER_ELEMENTS:
+        assert scene.problem.error() == pytest.approx(found, rel=1e-5)
+    for _ in scene.steps():
+        assert 0.0 < scene.problem.error() < 1.0
+    shares = [scene.problem.error_of_particles(i) for i in range(len(scene.problem.bodies))]
+    whole = WORLD.allreduce(sum(float((own**2).sum()) for own in shares))
+    assert whole == pytest.approx(scene.problem.error() ** 2, rel=1e-9)
+
+
 # -- Equals ------------------------------------------------------------------------------
 
 

@@ -238,6 +238,21 @@ def test_it_does_not_disturb_a_run():
     np.testing.assert_allclose(ends[1], ends[0], rtol=0.0, atol=1e-13)
 
 
+def test_it_is_the_same_after_a_restart(mpi_tmp_path):
+    def made():
+        V = vectors(box([0, 0], [2, 2.25], [8, 9], QUADRILATERAL))
+        body = mpm.Particles(box([0.2, 0], [1.2, 2], [8, 16], QUADRILATERAL), V)
+        law = materials.VonMises(1e3, 0.3, rho_y=8.0)
+        own = mpm.Body(body, law, density=1.0, body_force=(0.0, -4.0), f_bar="patch")
+        return mpm.QuasiStaticProblem(own, bcs=[fix(V, at(1, 0.0))])
+
+    problem, again = made(), made()
+    problem.solve(3)
+    problem.save(mpi_tmp_path / "state")
+    again.restore(mpi_tmp_path / "state")
+    assert again.error() == pytest.approx(problem.error(), rel=1e-9)
+
+
 def test_a_motion_has_none():
     V = vectors(box([0, 0], [1, 1], [2, 2], QUADRILATERAL))
     body = mpm.Particles(box([0, 0], [1, 1], [4, 4], QUADRILATERAL), V)
