@@ -11,7 +11,7 @@ from scenes import QUADRILATERAL, TRIANGLE, WORLD, A, B, at, box, vectors
 from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.constitutive.averaging import deviation
+from mpm_dolfinx.constitutive.averaging import FREE, deviation, deviation_energy
 from mpm_dolfinx.materials import Hencky, ReturnMapping, VonMises, mandel
 
 WAVES = np.array([[3.0, 1.0, 2.0], [1.0, 4.0, 1.0], [2.0, 1.0, 3.0]])
@@ -339,3 +339,15 @@ def test_pressure_in_a_tube_whose_wall_thins(cell, offset, f_bar, degree, bound)
             compared += 1
             assert abs(float(particles.load.value) / exact - 1.0) < bound
     assert compared >= 8
+
+
+@pytest.mark.parametrize("kind", sorted(FREE))
+def test_energy_of_deviations_has_the_derivatives_that_act(kind):
+    free, whole = FREE[kind]
+    d = np.linspace(-2.0, 2.0, 161) + 1e-3  # (beside the ends of the parabola)
+    step = 1e-4
+    ends = [deviation_energy(d + i * step, free, whole) for i in (-1, 0, 1)]
+    force, slope = deviation(d, free, whole)
+    np.testing.assert_allclose((ends[2] - ends[0]) / (2.0 * step), force, atol=1e-7)
+    np.testing.assert_allclose((ends[2] - 2.0 * ends[1] + ends[0]) / step**2, slope, atol=1e-6)
+    assert np.all(ends[1][np.abs(d) <= free] == 0.0)
