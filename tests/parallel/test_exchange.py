@@ -5,7 +5,7 @@
 import numpy as np
 from scenes import WORLD
 
-from mpm_dolfinx.parallel.exchange import RowExchange
+from mpm_dolfinx.parallel.exchange import RowExchange, swap
 
 
 def test_rows_find_the_ranks_that_want_them():
@@ -22,3 +22,14 @@ def test_rows_find_the_ranks_that_want_them():
         assert rows.dtype == values.dtype and rows.shape == (len(want), *values.shape[1:])
         expected = np.where(want % 7 != 3, want, 0)
         assert np.array_equal(rows if rows.ndim == 1 else rows[:, 0], expected)
+
+
+def test_parts_go_to_the_ranks_that_they_are_for():
+    parts = [np.full((to + 1, 2), 10 * WORLD.rank + to) for to in range(WORLD.size)]
+    received = swap(WORLD, parts)
+    assert len(received) == WORLD.size
+    for sender, part in enumerate(received):
+        assert np.array_equal(part, np.full((WORLD.rank + 1, 2), 10 * sender + WORLD.rank))
+    # (what is sent may change then)
+    parts[WORLD.rank][:] = -1
+    assert received[WORLD.rank].min() >= 0
