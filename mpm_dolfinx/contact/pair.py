@@ -439,12 +439,12 @@ class Pair(Contact):
 
 
 def _both(one: dict[str, NDArray[Any]], other: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Return the columns of two contacts as one: the second has points that it alone has."""
+    """Return the columns of two contacts as one: what the second alone has, or touches."""
     found = {}
     for name, values in one.items():
         new = one["area"] == 0.0
         if name in MEMORY or name in OUTCOME.values():
-            new = new | (other["touches"] & ~one["touches"])
+            new = other["touches"] & ~one["touches"]
         found[name] = values
         if name in other and other[name].shape == values.shape:
             more = (1,) * (values.ndim - new.ndim)

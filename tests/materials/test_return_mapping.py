@@ -7,7 +7,7 @@ import pytest
 from marks import slow
 from materials.reference import moduli
 
-from mpm_dolfinx.errors import ConvergenceError
+from mpm_dolfinx.errors import ConvergenceError, DomainDistortionError
 from mpm_dolfinx.materials import ReturnMapping, SmallStrainVonMises, VonMises, check_tangent
 from mpm_dolfinx.materials.mandel import deviator, deviatoric_projector, identity, norm, trace
 
@@ -236,3 +236,17 @@ def test_a_yield_function_that_is_not_a_number_is_an_error():
 
     with pytest.raises(ConvergenceError, match="Broken"):
         Broken().integrate(random_strains(3, 4, 1e-2), none(3), True)
+
+
+def test_points_that_no_deformation_brings_there_are_named():
+    """Inverted, without a volume, crushed to round-off, or no numbers."""
+    H = np.zeros((6, 2, 2))
+    H[1, 0, 0] = -1.5
+    H[2, 1, 1] = -1.0
+    H[3, 0, 0] = -1.0 + 1e-12
+    H[4, 0, 1] = np.nan
+    for which in ([0, 1], [0, 2, 5], [3, 0], [4]):
+        with pytest.raises(DomainDistortionError) as caught:
+            Mises().update(H[which], Mises().initial_state(len(which), 2))
+        assert [which[p] for p in caught.value.particles] == [p for p in which if 0 < p < 5]
+    Mises().update(H[[0, 5]], Mises().initial_state(2, 2))
