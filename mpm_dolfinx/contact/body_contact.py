@@ -203,6 +203,7 @@ class BodyContact(Rigid):
         centres: tuple[NDArray[np.float64], ...],
         theta: NDArray[np.float64],
         per_unknown: NDArray[np.float64],
+        secants: bool,
     ) -> Coupled:
         """Return the tangents (collective).
 
@@ -210,8 +211,9 @@ class BodyContact(Rigid):
             centres: As for :meth:`total`.
             theta: Cayley vector of the step.
             per_unknown: Displacement and Cayley vector by each unknown, ``(gdim + nr, n)``.
+            secants: Whether points that have changed their slip take secants instead.
         """
-        slopes = self._slopes(False)
+        slopes = self._slopes(secants and not self.friction.smooth)
         rows, by_s, own = self._by_motion(slopes, centres, theta)
         N, w = self._surface.shapes, self._surface.weights[slopes.facets]
         m, k = slopes.dofs.shape

@@ -163,16 +163,20 @@ class RigidBalance:
 
     # -- Tangents ---------------------------------------------------------------------------------
 
-    def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        """Return the tangents of all contacts, with those of the unknowns (collective)."""
+    def tangents(self, secants: bool) -> Mapping[tuple[int, int], PETSc.Mat]:
+        """Return the tangents of all contacts, with those of the unknowns (collective).
+
+        Args:
+            secants: Whether points that have changed their slip take secants instead.
+        """
         if (unknowns := self.own) is None:
-            every = [contact.derivatives() for contact in self._contacts]
+            every = [c.tangents() if secants else c.derivatives() for c in self._contacts]
             return {(i, i): K for i, each in enumerate(every) for K in each.values()}
         last, motion = len(self._contacts), self._motion
         found: dict[tuple[int, int], PETSc.Mat | None] = {}
         own = np.zeros((unknowns.total, unknowns.total))
         for i, contact in enumerate(self._contacts):
-            part = contact.coupled(motion.centres, motion.theta, self._each)
+            part = contact.coupled(motion.centres, motion.theta, self._each, secants)
             found |= {(i, i): part.nodes, (last, i): part.of_motion, (i, last): part.by_motion}
             own += part.own
         found[last, last] = unknowns.matrix(self._firm(self._whole(own)))

@@ -247,7 +247,11 @@ class RigidBody(Driven):
 
     @override
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        return self._balance.tangents()
+        return self._balance.tangents(True)
+
+    @override
+    def derivatives(self) -> Mapping[tuple[int, int], PETSc.Mat]:
+        return self._balance.tangents(False)
 
     @override
     def commit(self) -> Callable[[], None]:
