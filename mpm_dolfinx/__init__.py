@@ -14,6 +14,7 @@ from .errors import (  # noqa: E402
     MPMError,
     ParticleOutsideError,
 )
+from .gradients.sensitivity import Sensitivity  # noqa: E402
 from .history import Energy, History, Loss, Stage, Statistics, Step  # noqa: E402
 from .meshes.regions import cell_tags, facet_tags, held, region  # noqa: E402
 from .particles.field import ParticleField  # noqa: E402
@@ -56,6 +57,7 @@ __all__ = [
     "QuasiStaticProblem",
     "Rates",
     "Scheme",
+    "Sensitivity",
     "Solver",
     "Stage",
     "Statistics",

@@ -132,6 +132,11 @@ def is_condition_on(bc: fem.DirichletBC, V: fem.FunctionSpace) -> bool:
     return bool(bc.function_space == own or own.contains(bc.function_space))
 
 
+def holds(bc: fem.DirichletBC, value: fem.Constant | fem.Function) -> bool:
+    """Return whether a Dirichlet condition has its values from a Constant or a Function."""
+    return bool(bc.g is value._cpp_object)
+
+
 def are_tags_of(tags: mesh.MeshTags, domain: mesh.Mesh) -> bool:
     """Return whether tags are of a mesh (whose topology is wrapped since 0.10)."""
     return bool(tags.topology == getattr(domain.topology, "_cpp_object", domain.topology))

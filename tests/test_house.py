@@ -29,6 +29,7 @@ FLOORS = (
     ("contact",),
     ("stepping",),
     ("problems",),
+    ("gradients",),
     ("",),  # the package's own face
 )
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}

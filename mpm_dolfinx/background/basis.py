@@ -115,9 +115,9 @@ class BackgroundBasis:
             points: This rank's points, shape ``(n, gdim)``, on which :meth:`at` has been.
 
         Returns:
-            The basis of the cells in each of m directions, of which several may be one, shapes
-            ``(n, m, ...)``; how far the point lies outside each, in reference coordinates, shape
-            ``(n, m)``, infinite where there is none.
+            The basis of the cells in each of m directions, of which several may be one, with
+            gradients, shapes ``(n, m, ...)``; how far the point lies outside each, in reference
+            coordinates, shape ``(n, m)``, infinite where there is none.
         """
         n, gdim = points.shape
         ways = np.array([way for way in product((-1, 0, 1), repeat=gdim) if any(way)])
@@ -125,7 +125,8 @@ class BackgroundBasis:
         if n > 0:
             size = np.ptp(self._cells.vertices[self._cells.locate(points)[0]], axis=1)
         probes = (points[:, None] + BESIDE * size[:, None] * ways).reshape(-1, gdim)
-        basis = self.at(probes)
+        basis = self.at(probes, gradients=True)
+        assert basis.gradients is not None
         cells, shape = self._cells, (n, len(ways))
         outside = np.full(n * len(ways), np.inf)
         if n > 0:
@@ -134,7 +135,10 @@ class BackgroundBasis:
             far = cells.violation(cell, reference)
             known = basis.found & np.isfinite(far)
             outside[known] = far[known]
-            basis.values[known] = _compat.tabulated(self._basis, 0, reference[known])[0]
+            table = _compat.tabulated(self._basis, 1, reference[known])
+            inverse = np.linalg.inv(cells.jacobians(cell[known], reference[known]))
+            basis.values[known] = table[0]
+            basis.gradients[known] = np.einsum("jpk,pji->pki", table[1:], inverse)
         basis = PointBasis._make(
             None if part is None else part.reshape(*shape, *part.shape[1:]) for part in basis
         )

@@ -153,15 +153,10 @@ class Support:
         """
         self._whole_step = self._has_whole_step(share)
         self._power = None
-        if not self._modulus or self._found is not None:
-            each = fem.Function(self._stiffness.function_space)
-            cells = each.function_space.dofmap.list[: self.particles.num_local, 0]
-            each.x.array[cells] = moduli()
-            if self._modulus:
-                self._compare(np.asarray(each.x.array, dtype=np.float64))
-            else:
-                self.scale(each)
-                self._found = np.array(each.x.array, dtype=np.float64)
+        if not self._modulus:
+            self._scale_by(moduli)
+        elif self._found is not None:
+            self._compare(np.asarray(self._each(moduli).x.array, dtype=np.float64))
         self.revolve(turn)
         return self.residual
 
@@ -180,6 +175,33 @@ class Support:
                 "its strain; give the support modulus=, that of the stiffest material.",
                 stacklevel=6,
             )
+
+    def follow(self, moduli: Callable[[], NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Choose the stiffness again, unless a modulus was given (collective).
+
+        Args:
+            moduli: As for :meth:`at_body`.
+
+        Returns:
+            The stiffness in each cell, to be set.
+        """
+        if self._found is not None:
+            self.forget_modulus()
+            self._scale_by(moduli)
+        return np.asarray(self._stiffness.x.array)
+
+    def _scale_by(self, moduli: Callable[[], NDArray[np.float64]]) -> None:
+        """Set the modulus of the material that is there first; see :meth:`at_body`."""
+        each = self._each(moduli)
+        self.scale(each)
+        self._found = np.array(each.x.array, dtype=np.float64)
+
+    def _each(self, moduli: Callable[[], NDArray[np.float64]]) -> fem.Function:
+        """Return the modulus of each domain as a Function."""
+        each = fem.Function(self._stiffness.function_space)
+        cells = each.function_space.dofmap.list[: self.particles.num_local, 0]
+        each.x.array[cells] = moduli()
+        return each
 
     def forget_modulus(self) -> None:
         """Take that of another problem's material, unless one was given."""

@@ -18,7 +18,7 @@ from dolfinx import fem, mesh
 
 from .. import _compat
 from ..errors import MPMError, agree
-from ..materials.base import Material, Refused, check_parameter
+from ..materials.base import Material, Parameter, Refused, check_parameter
 from ..particles.particles import Particles
 from .governed import Governed
 from .pressure import MeanStress, is_split, without_bulk
@@ -140,6 +140,13 @@ class Assignment:
                 self.governed[number] = self._taken(present, part.points)
                 changed = True
         return changed
+
+    def assume(self, law: Material, name: str, value: Parameter) -> None:
+        """Let a material, as it was given, have another number until the next call."""
+        for number, material in enumerate(self.given):
+            if material is law:
+                other = law.with_parameters(**{name: value})
+                self.governed[number] = self._governing(other, self.governed[number].points)
 
     def weaken(self, factor: float) -> None:
         """Divide the strength of all materials by a factor from now on, 1 at first (collective).

@@ -23,6 +23,7 @@ from .pressure import VolumeStrain
 __all__ = ["Answer", "Carried", "Governed"]
 
 FLOAT = np.dtype(np.float64)
+NO_TANGENT = np.zeros((0, 3, 3, 3, 3))
 #: What a law answers first of all.
 STRESS = "stress P"
 
@@ -112,24 +113,25 @@ class Governed:
         undeformed = np.zeros((len(self.points), self.dim, self.dim))
         return self.answer(undeformed, self.initial_state()).tangent
 
-    def answer(self, gradient: NDArray[np.float64], state: State) -> Answer:
+    def answer(self, gradient: NDArray[np.float64], state: State, tangent: bool = True) -> Answer:
         """Return the answer of the law, checked; the law cannot write into its input.
 
         Args:
             gradient: ``F - I``, shape ``(n, dim, dim)``.
             state: Of the last converged step.
+            tangent: Whether the tangent is needed; it is empty otherwise.
 
         Raises:
             MPMError: The law fails, or its answer is not finite or of another shape or type.
         """
         received = _read_only(gradient), _protected(state)
-        answer = self._asked(lambda: self.law.update(*received))
+        answer = self._asked(lambda: self.law.update(*received, tangent=tangent))
         if not isinstance(answer, Update):
             raise MPMError(
                 f"The update of {type(self.material).__name__} must return a materials.Update, not "
                 f"a {type(answer).__name__}."
             )
-        return self._checked(state, answer)
+        return self._checked(state, answer if tangent else answer._replace(tangent=None), tangent)
 
     def answer_at(
         self,
@@ -250,7 +252,7 @@ class Governed:
                 ours = MPMError(f"{ours.message}; a law must not write into what it receives.")
             raise ours from error
 
-    def _checked(self, state: State, answer: Update) -> Answer:
+    def _checked(self, state: State, answer: Update, tangent: bool = True) -> Answer:
         """Return the answer of a law if it is finite, of the right shape and of the right type.
 
         Raises:
@@ -258,8 +260,8 @@ class Governed:
         """
         n, dim = len(self.points), self.dim
         self._require(STRESS, answer.first_piola, (n, dim, dim))
-        self._require("tangent", answer.tangent, (n, dim, dim, dim, dim))
-        assert answer.tangent is not None
+        if tangent:
+            self._require("tangent", answer.tangent, (n, dim, dim, dim, dim))
         if not isinstance(answer.state, dict) or answer.state.keys() != state.keys():
             raise MPMError(
                 f"The update of {type(self.material).__name__} must return a state with the "
@@ -268,7 +270,8 @@ class Governed:
         for name, values in answer.state.items():
             before = state[name]
             self._require(f"state {name!r}", values, before.shape, before.dtype)
-        P, A = np.ascontiguousarray(answer.first_piola), np.ascontiguousarray(answer.tangent)
+        P = np.ascontiguousarray(answer.first_piola)
+        A = NO_TANGENT if answer.tangent is None else np.ascontiguousarray(answer.tangent)
         return Answer(P, A, answer.state)
 
     def _require(

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dolfinx import mesh
 
 from ..errors import MPMError, agree, as_ours
-from ..materials.base import Material, State, Update
+from ..materials.base import Material, Parameter, State, Update
 from ..meshes.remesh import Column
 from ..particles.field import ParticleField
 from .assignment import Assignment, Materials
@@ -24,7 +24,7 @@ from .pressure import MeanStress, VolumeStrain
 from .strain import Strain
 from .succession import Episode, states_after
 
-__all__ = ["MaterialPoints"]
+__all__ = ["Governing", "MaterialPoints"]
 
 
 class _Converged(NamedTuple):
@@ -47,6 +47,13 @@ class _Converged(NamedTuple):
     compliance: NDArray[np.float64]
     recovery: NDArray[np.float64] | float
     resisted: NDArray[np.float64]
+
+
+class Governing(NamedTuple):
+    """Materials at their points with their present numbers, and F-bar's modulus or ``None``."""
+
+    materials: list[Governed]
+    modulus: NDArray[np.float64] | None
 
 
 class MaterialPoints:
@@ -97,6 +104,7 @@ class MaterialPoints:
         self.first_piola = np.zeros(shape)
         self.tangent = np.zeros((*shape, self.dim, self.dim))
         self._trial, self._trial_gradient = states, self._last.gradient
+        self._asks_tangents = True
         self.averaging: VolumeAveraging | None = None
         if f_bar != "none":
             material = np.zeros(particles.num_local, dtype=np.int64)
@@ -130,6 +138,29 @@ class MaterialPoints:
             self.averaging.modulus = self._resistance()
 
     @property
+    def given(self) -> list[Material]:
+        """The materials as they were given."""
+        return self._assignment.given
+
+    def governing(self) -> Governing:
+        """Return the materials with the numbers that they have now, for :meth:`govern_by`."""
+        modulus = None if self.averaging is None else self.averaging.modulus
+        return Governing(list(self._governed), modulus)
+
+    def govern_by(self, governing: Governing) -> None:
+        """Let materials have the numbers again that they once had."""
+        self._assignment.governed = list(governing.materials)
+        if self.averaging is not None and governing.modulus is not None:
+            self.averaging.modulus = governing.modulus
+
+    def assume(self, law: Material, name: str, value: Parameter) -> None:
+        """Let a material, as it was given, have another number until the next call (collective)."""
+        with agree(self._particles.mesh.comm):
+            self._assignment.assume(law, name, value)
+        if self.averaging is not None:
+            self.averaging.modulus = self._resistance()
+
+    @property
     def weakening(self) -> float:
         """Factor that divides the strength of all materials."""
         return self._assignment.weakening
@@ -142,6 +173,15 @@ class MaterialPoints:
         """
         self._assignment.weaken(factor)
 
+    @contextmanager
+    def without_tangents(self) -> Iterator[None]:
+        """Let updates in the block be of stress and history alone, where that is enough."""
+        self._asks_tangents = self.averaging is not None or self.mean_stress is not None
+        try:
+            yield
+        finally:
+            self._asks_tangents = True
+
     def pace(self, duration: float) -> None:
         """Let updates be those of steps of a duration; without a call no time passes."""
         self._assignment.pace(duration)
@@ -152,6 +192,33 @@ class MaterialPoints:
         """Let the pressure be that of materials where nothing is strained yet (collective)."""
         assert self.mean_stress is not None
         self.mean_stress.begin_with(self.converged_pressure)
+
+    def begin_anew(self) -> None:
+        """Let the points, which have not moved, be as they were made (collective)."""
+        with agree(self._particles.mesh.comm):
+            states = [part.initial_state() for part in self._governed]
+        self.go_from(states)
+
+    def go_from(self, states: list[State]) -> None:
+        """Take states of the materials for those of the last converged step; all else stays."""
+        self._last = self._last._replace(states=states)
+        self._forget_trial()
+
+    def states(self, trial: bool = False) -> list[State]:
+        """Return the state of each material, converged or of the last update."""
+        return self._trial if trial else self._last.states
+
+    def seen_gradient(self, trial: bool = False) -> NDArray[np.float64]:
+        """Return ``F - I`` that the materials have seen, converged or in the last update."""
+        return self._trial_gradient if trial else self._last.gradient
+
+    def see(self, gradient: NDArray[np.float64]) -> None:
+        """Take ``F - I`` for what materials have seen at the last converged step (collective)."""
+        self._last = self._last._replace(gradient=gradient)
+        if self.averaging is not None:
+            average = self.strain.average(self.cauchy_stress())
+            recovery = self.averaging.recover(average) - average
+            self._last = self._last._replace(recovery=recovery)
 
     def begin_with(self, cauchy_stress: NDArray[np.float64]) -> None:
         """Let the points, which have not moved, carry a stress (collective).
@@ -467,7 +534,7 @@ class MaterialPoints:
             everywhere = len(part.points) == self._points
             its = gradient if everywhere else gradient[part.points]
             if self.mean_stress is None:
-                answer = part.answer(its, state)
+                answer = part.answer(its, state, self._asks_tangents)
             else:
                 answer, volume = self._at_pressure(self.mean_stress, part, its, state)
                 volumes.append((part.points, volume))
@@ -475,7 +542,8 @@ class MaterialPoints:
                 self.first_piola, self.tangent = answer.first_piola, answer.tangent
             else:
                 self.first_piola[part.points] = answer.first_piola
-                self.tangent[part.points] = answer.tangent
+                if self._asks_tangents:
+                    self.tangent[part.points] = answer.tangent
             trial.append(answer.state)
         self._trial, self._trial_gradient = trial, gradient
         if self.mean_stress is not None:

@@ -660,6 +660,21 @@ class Particles(MaterialDomains):
         """
         return self._background.beside(self._at_converged().positions[nodes])
 
+    def node_gradients(self) -> PointBasis:
+        """Return :attr:`node_basis` with gradients (collective)."""
+        rows = self.node_basis
+        if self.is_free:
+            return rows._replace(gradients=np.zeros((*rows.nodes.shape, self._geometry.gdim)))
+        basis = self._background.at(self.node_positions[: len(rows.nodes)], gradients=True)
+        assert basis.gradients is not None
+        other = np.flatnonzero((basis.nodes != rows.nodes).any(axis=1))
+        if self.mesh.comm.allreduce(len(other)) > 0:  # rows by carry_by
+            beside, _ = self.beside(other)
+            assert beside.gradients is not None
+            same = (beside.nodes == rows.nodes[other, None]).all(axis=2).argmax(axis=1)
+            basis.gradients[other] = beside.gradients[np.arange(len(other)), same]
+        return rows._replace(gradients=basis.gradients)
+
     def carry_by(self, nodes: NDArray[np.int64], rows: PointBasis) -> None:
         """Let nodes of W have other rows of T, until the body has moved (collective).
 

@@ -39,7 +39,7 @@ from ..solvers.newton import NewtonSolver
 from ..stepping.automatic import ErrorControl
 from ..stepping.diagnosis import crossed
 from ..stepping.displacement_control import DisplacementControl
-from ..stepping.loading import Mender, Stepper
+from ..stepping.loading import Mender, Recorder, Stepper
 from ..stepping.progress import with_bar
 from ..system.conditions import force_at
 from ..system.field import ValueField
@@ -760,6 +760,23 @@ class ParticleProblem(Hooked):
     def carried(self) -> list[CarriedField]:
         """The unknowns besides displacements, as the system moves them."""
         return [one for term in self._field_terms for one in term.fields]
+
+    def record(self, recorder: Recorder) -> None:
+        """Let something follow the steps of runs, as :class:`mpm_dolfinx.Sensitivity` does.
+
+        Args:
+            recorder: Called when a step is solved; it is not kept alive.
+        """
+        self._stepper.record(recorder)
+
+    def begin_anew(self) -> list[NDArray[np.float64]]:
+        """Let bodies that have not moved be what parameters make of them now (collective).
+
+        Returns:
+            Arrays that a run goes on with besides history, to be set: stiffness of supports, and
+            forces held back.
+        """
+        return []
 
     @collective()
     def keep(self, thing: Kept) -> None:

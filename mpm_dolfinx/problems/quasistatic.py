@@ -172,6 +172,18 @@ class QuasiStaticProblem(ParticleProblem):
     _gradual = True
 
     @override
+    def begin_anew(self) -> list[NDArray[np.float64]]:
+        self._held.let_go()
+        stiffness = []
+        for body, points in zip(self.bodies, self._stresses, strict=True):
+            points.follow_parameters()
+            points.begin_anew()
+            for support in self.setup.supports_of(body):
+                stiffness.append(support.follow(points.initial_modulus))
+        self._carry_stress([body.initial_stress for body in self.setup.given])
+        return [*stiffness, *self._held.held]
+
+    @override
     def _build(self) -> None:
         self.setup = self.setup.carried()
         present = self._functions()

@@ -42,6 +42,8 @@ LOOSE = 1e-3
 SETTLED = 1e-9
 #: What the norm of ``F - K y`` falls to, relative to F, where a step is refined.
 REFINED = 1e-6
+#: What it falls to where the solution itself is linearised.
+LINEARISED = 1e-10
 #: Iterations after which it is noted which particles yield, should a solve fail.
 LATE = 5
 #: Relative diagonal shifts tried in turn until a tangent is positive definite.
@@ -211,6 +213,20 @@ class NewtonSolver:
             np.count_nonzero(np.diff(np.array(each), axis=0), axis=0)
             for each in zip(*self._yielding, strict=True)
         ]
+
+    def linearise(self) -> Callable[[PETSc.Vec, PETSc.Vec], None]:
+        """Factorise the tangent at the solution (collective).
+
+        Returns:
+            A function of b and x that sets x to the solution of ``K x = b``, as far as K holds x.
+        """
+        self._set_tangent(self._problem.tangent())
+
+        def solve(b: PETSc.Vec, x: PETSc.Vec) -> None:
+            self._factor.solve(b, x)
+            self._factor.refine(b, x, LINEARISED)
+
+        return solve
 
     def forget(self) -> None:
         """Forget how the last attempt failed: what comes before the next one may fail too."""

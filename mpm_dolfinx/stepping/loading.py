@@ -38,7 +38,7 @@ from .diagnosis import count_folded, placed
 from .displacement_control import ControlledSystem, DisplacementControl
 from .leaving import may_stop, move_bodies
 
-__all__ = ["Mender", "Owner", "Stepper"]
+__all__ = ["Mender", "Owner", "Recorder", "Stepper"]
 
 type Path = Callable[[float], None]
 """A path of the user's: sets loads and conditions to their totals at t in (0, 1]."""
@@ -85,6 +85,23 @@ class Mender(Protocol):
         """Change what made the smallest step fail; return whether to go on."""
 
 
+class Recorder(Protocol):
+    """Follows the steps that a problem makes. All calls are collective."""
+
+    def solved(self, stepper: Stepper) -> Callable[[], None]:
+        """Look at a step that is solved, and not yet committed; leave all as it is.
+
+        Args:
+            stepper: What has solved it.
+
+        Returns:
+            What is called when the step is committed.
+
+        Raises:
+            MPMError: The step cannot be followed; it is taken back then, and the run ends.
+        """
+
+
 class Stepper:
     """Takes a problem from one converged step to the next.
 
@@ -108,6 +125,17 @@ class Stepper:
         self._mender = mender
         self.run: Run | None = None
         self._resumes = self._follows = self._begins = False
+        self._recorders: list[weakref.ref[Recorder]] = []
+
+    def record(self, recorder: Recorder) -> None:
+        """Let a recorder follow the steps from now on, as long as somebody keeps it."""
+        self._recorders.append(weakref.ref(recorder))
+
+    @property
+    def recorders(self) -> list[Recorder]:
+        """What follows the steps."""
+        self._recorders = [known for known in self._recorders if known() is not None]
+        return [found for known in self._recorders if (found := known()) is not None]
 
     def follow(self, reduced: ReducedSystem, newton: NewtonSolver, clean_up: Cleaner) -> None:
         """Take what the problem is solved by, and its present load for that of a converged step.
@@ -290,7 +318,7 @@ class Stepper:
                 update(t if run.end is None else run.time)
                 if grows:
                     self._look_at_loads(owner, run, before)
-            values = run.dirichlet_values(self._totals())
+            values = self.prescribed()
             step = self._advance(end, values, run, control)
         except Interrupted:
             self.go_back()
@@ -383,7 +411,7 @@ class Stepper:
                 load = float(owner.bodies[0].load.value)
                 self._release.aim(self._release.remaining)
                 self._set_load(load, self.converged.proportional)
-                step = self._advance(load, self._totals())
+                step = self._advance(load, self.prescribed())
                 assert step is not None
             except BaseException as error:
                 self.go_back()
@@ -491,6 +519,7 @@ class Stepper:
         if run is not None and self._reject(run, size, parameter):
             self.newton.experience = experience
             return None
+        taken = [recorder.solved(self) for recorder in self.recorders]
         if control is not None:
             parameter = float(owner.bodies[0].load.value)
         before = [body.converged_displacement for body in owner.bodies]
@@ -512,6 +541,8 @@ class Stepper:
             proportional = bool(owner.bodies[0].proportional.value)
             self.converged = Converged(load, parameter, prescribed, reactions, proportional)
             reduced.end()
+            for take in taken:
+                take()
             count_folded(owner.bodies, owner.history.statistics)
             self._clean_up()
         newton = self.newton
@@ -592,9 +623,13 @@ class Stepper:
         if self._mender is not None:
             self._mender.after_step()
 
-    def _totals(self) -> list[NDArray[np.float64]]:
-        """Return the present totals of the Dirichlet conditions, for each field."""
-        return [dirichlet_values(field.conditions, field.V) for field in self._reduced.fields]
+    def prescribed(self) -> list[NDArray[np.float64]]:
+        """Return the Dirichlet totals at the end of the step to try, for each field (collective).
+
+        They are those of the present values of the conditions.
+        """
+        totals = [dirichlet_values(field.conditions, field.V) for field in self._reduced.fields]
+        return totals if self.run is None else self.run.dirichlet_values(totals)
 
     def _set_load(self, load: float, proportional: bool) -> None:
         """Set the load factor, and whether supports move in proportion to it or to totals."""

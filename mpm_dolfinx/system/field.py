@@ -471,6 +471,15 @@ class Field:
         if self._cure.penalises:
             self._matrices(stiffness)[0].multAdd(u, force, force)
 
+    def penalty_force(self, moduli: Sequence[float]) -> PETSc.Vec:
+        """Return the force of the penalty at the last increment with shear moduli (collective)."""
+        force = self.u.duplicate()
+        force.set(0.0)
+        matrix = self._cure.penalty(moduli) if self._cure.penalises else None
+        if matrix is not None:
+            matrix.mult(self.u, force)
+        return force
+
     def _matrices(self, stiffness: Callable[[], list[float]]) -> tuple[PETSc.Mat, PETSc.Mat]:
         """Return the step's penalty on all dofs of V and in the unknowns."""
         if self._penalty is None:

@@ -399,6 +399,16 @@ class ReducedSystem:
         """
         for block in self._blocks:
             block.spread(x)
+        failure = self.evaluate_forces()
+        if failure is None:
+            for field in self.fields:
+                field.collect(field.force, F)
+            for own in self.own:
+                own.collect(F)
+        return failure
+
+    def evaluate_forces(self) -> MPMError | None:
+        """Evaluate the forces at the present displacements: as :meth:`residual` otherwise."""
         with self._statistics.phase("constitutive"):
             failure: BaseException | None = Interrupted() if noted() else None
             for _, motion in self._places:
@@ -420,12 +430,8 @@ class ReducedSystem:
             for number, field in enumerate(self.fields):
                 self._outer[number] += self._add_on_background(field)
             for field in self.fields:
-                field.add_residual(partial(self._stiffness, field))
+                field.add_residual(partial(self.shear_moduli, field))
                 field.gather_extended(field.force)
-        for field in self.fields:
-            field.collect(field.force, F)
-        for own in self.own:
-            own.collect(F)
         return None
 
     def _add_outer(self, term: Term) -> None:
@@ -457,17 +463,36 @@ class ReducedSystem:
         Returns:
             For each body, on this rank's own dofs of W.
         """
+
+        def force(term: Term) -> Sequence[PETSc.Vec]:
+            term.roll_back()
+            term.begin()
+            return term.residuals()
+
+        return self._on_nodes(force)
+
+    def last_nodal_forces(self) -> list[NDArray[np.float64]]:
+        """Return the forces of all terms in the last evaluation, as :meth:`nodal_forces`."""
+        return self._on_nodes(lambda term: term.residuals())
+
+    def _on_nodes(
+        self, force_of: Callable[[Term], Sequence[PETSc.Vec]]
+    ) -> list[NDArray[np.float64]]:
+        """Return sums of forces of all terms on this rank's own dofs of W of each body."""
         bodies = [motion.particles for _, motion in self._places]
         maps = [body.W.dofmap for body in bodies]
         totals = [np.zeros(m.index_map.size_local * m.index_map_bs) for m in maps]
         for term in self._terms:
-            term.roll_back()
-            term.begin()
-            forces = term.residuals()
+            forces = force_of(term)
             for body, force in zip(term.bodies if forces else (), forces, strict=True):
                 number = next(i for i, known in enumerate(bodies) if known is body)
                 totals[number] += force.array_r
         return totals
+
+    def renew_external(self) -> None:
+        """Let terms take over what their forces depend on besides displacements (collective)."""
+        for term in self._terms:
+            term.begin()
 
     def _zeros(self) -> list[PETSc.Vec]:
         vectors = [force.duplicate() for force in self.forces]
@@ -489,8 +514,8 @@ class ReducedSystem:
         """Update the terms; return the gravest failure."""
         return gravest([_updated(term) for term in self._terms])
 
-    def _stiffness(self, field: Field) -> list[float]:
-        """Return the shear modulus of each body of a field."""
+    def shear_moduli(self, field: Field) -> list[float]:
+        """Return the shear modulus of each body of a field (collective)."""
         return [
             sum(term.shear_modulus() for term in self._terms if term.bodies == (body,))
             for body in field.bodies
@@ -578,7 +603,7 @@ class ReducedSystem:
             ]
             parts += reduced
             for field in self.fields:
-                parts += field.tangents(partial(self._stiffness, field))
+                parts += field.tangents(partial(self.shear_moduli, field))
             if not self._has_diagonal:
                 parts.append(self._entries_on_diagonal)
             return self._sum.of(parts)
@@ -792,7 +817,7 @@ class ReducedSystem:
         """
         forces = self._zeros()
         for field, force in zip(self.fields, forces, strict=True):
-            field.add_product(field.lift(), force, partial(self._stiffness, field))
+            field.add_product(field.lift(), force, partial(self.shear_moduli, field))
         for fused, (group, _) in zip(self.fused, self._groups, strict=True):
             for number, field in enumerate(group):
                 if field.prescribes:
@@ -906,7 +931,7 @@ class ReducedSystem:
     def works(self) -> NDArray[np.float64]:
         """Return :meth:`Field.works` of all displacements."""
         found = [
-            field.works(partial(self._stiffness, field))
+            field.works(partial(self.shear_moduli, field))
             for field in self.fields
             if not isinstance(field, ValueField)
         ]
@@ -931,7 +956,7 @@ class ReducedSystem:
         for field, u in zip(self.fields, increments, strict=True):
             force = u.duplicate()
             force.set(0.0)
-            field.add_product(u, force, partial(self._stiffness, field))
+            field.add_product(u, force, partial(self.shear_moduli, field))
             total += force.dot(u)
         for term in self._terms:
             motions = []

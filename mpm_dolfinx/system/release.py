@@ -66,7 +66,7 @@ class Release(Term):
             spaces: Their backgrounds.
         """
         self.bodies, self._spaces = cast("tuple[Particles, ...]", tuple(bodies)), list(spaces)
-        self._let_go()
+        self.let_go()
 
     def left(self) -> list[Array]:
         """Return the forces held back now on this rank's own dofs of each background."""
@@ -77,7 +77,13 @@ class Release(Term):
             found.append(np.asarray(self.remaining * held))
         return found
 
-    def _let_go(self) -> None:
+    @property
+    def held(self) -> list[Array]:
+        """The forces held back in whole, at nodes of bodies and dofs of backgrounds, to be set."""
+        return [np.asarray(f.x.array) for f in (*self._nodal, *self._reactions)]
+
+    def let_go(self) -> None:
+        """Hold nothing back any more."""
         self.remaining = self._aim = self._factor = 0.0
         self._nodal, self._reactions = [], []
 
@@ -94,7 +100,7 @@ class Release(Term):
         if self.bodies[0].mesh.comm.allreduce(some):
             self.remaining = self._aim = self._factor = 1.0
         else:
-            self._let_go()
+            self.let_go()
 
     def aim(self, remaining: float) -> None:
         """Take a value of s for the end of the steps that begin from now on."""
@@ -139,7 +145,7 @@ class Release(Term):
 
         self.remaining = self._factor
         if self.remaining == 0.0:
-            self._let_go()
+            self.let_go()
         return undo
 
     @override
@@ -178,7 +184,7 @@ class Release(Term):
 
     def take(self, taken: Taken) -> None:
         """Take over what was once kept (collective)."""
-        self._let_go()
+        self.let_go()
         remaining = float(taken.numbers.get("remaining", 0.0))
         if remaining == 0.0:
             return

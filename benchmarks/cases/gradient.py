@@ -1,0 +1,168 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Derivatives of a run: a block on a rough base that slumps under its weight.
+
+`difference` is that of the derivative of the displacement from central differences of whole runs,
+relative and by the worst parameter, `taylor` the order of the remainder as all parameters change
+together, `trend` what the derivative by stiffness differs by from the slope of a parabola through
+runs within 10 %, with a ghost penalty, relative, and `seconds_ratio` CPU seconds of the
+derivatives over those of the run.
+"""
+
+import time
+
+from mpi4py import MPI
+
+import kit
+import numpy as np
+
+import ufl
+from dolfinx import fem, mesh
+
+import mpm_dolfinx as mpm
+
+KINDS = {
+    "elastic": {"young": 2e4, "poisson": 0.3, "weight": 1e3, "push": 300.0, "moved": 0.02},
+    "von-mises": {
+        "young": 5e4,
+        "yield_stress": 1.2e3,
+        "poisson": 0.3,
+        "hardening": 2e3,
+        "weight": 1e3,
+    },
+    "cam-clay": {
+        "shear_modulus": 2e4,
+        "compression": 0.1,
+        "swelling": 0.02,
+        "critical_ratio": 1.0,
+        "preconsolidation": 1.5e3,
+    },
+}
+#: What is given where it is no parameter.
+REST = {"weight": 1e3, "push": 0.0, "moved": 0.0}
+
+parser = kit.Parser("Derivatives of a run: a block that slumps.")
+parser.add_argument("--kind", choices=tuple(KINDS), default="von-mises", help="of the law")
+parser.add_argument("--parameters", type=kit.whole, default=5, help="how many, 5 at most")
+parser.add_argument("--mode", choices=("forward",), default="forward", help="of differentiation")
+parser.add_argument("--degree", type=int, choices=(1, 2), default=1, help="of the background")
+parser.add_argument("--cells", type=kit.whole, default=6, help="background cells over its width")
+parser.add_argument("--steps", type=kit.whole, default=10, help="load steps")
+args = parser.parse()
+if args.parameters > 5:
+    parser.error(f"argument --parameters: {args.parameters} is more than 5")
+
+comm, kind = MPI.COMM_WORLD, mesh.CellType.quadrilateral
+given = dict(list(KINDS[args.kind].items())[: args.parameters])
+first = next(iter(given))  # a stiffness
+
+
+def made(change=None, stabilisation="auto"):
+    """A problem with the parameters, by name, of which some are multiplied by `1 + change`."""
+    n = args.cells
+    grid = mesh.create_rectangle(comm, [[0, 0], [2, 2.5]], [2 * n, 5 * n // 2], kind)
+    V = fem.functionspace(grid, ("Lagrange", args.degree, (2,)))
+    body = mesh.create_rectangle(comm, [[0, 0], [1, 2]], [2 * n, 4 * n], kind)
+    points = 2 * args.degree
+    particles = mpm.Particles(body, V, degree=args.degree, quadrature_degree=points)
+    values = {**REST, **KINDS[args.kind]}
+    values |= {name: values[name] * (1.0 + part) for name, part in (change or {}).items()}
+    held = ("moved",)
+    named = {
+        name: fem.Constant(grid if name in held else body, value) for name, value in values.items()
+    }
+    of_law = {name: named[name] for name in KINDS[args.kind] if name not in REST}
+    if args.kind == "elastic":
+        law = mpm.materials.Hencky(**of_law)
+    elif args.kind == "von-mises":
+        law = mpm.materials.VonMises(**of_law)
+    else:
+        law = mpm.materials.ModifiedCamClay(**of_law, reference_pressure=1e3)
+        named["weight"].value = 500.0
+    tags = mpm.facet_tags(body, {1: mpm.region(y=2.0)})
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(
+            particles,
+            law,
+            body_force=ufl.as_vector([0.0, -named["weight"]]),
+            tractions=[(ufl.as_vector([named["push"], 0.0]), 1)],
+            facet_tags=tags,
+        ),
+        bcs=[
+            mpm.held(V, 0, x=0.0, value=named["moved"]),
+            mpm.held(V, 0, y=0.0, value=named["moved"]),
+            mpm.held(V, 1, y=0.0),
+        ],
+        solver=mpm.Solver(stabilisation=stabilisation, petsc_options={"snes_rtol": 1e-12}),
+    )
+    return problem, named
+
+
+def solved(change=None, stabilisation="auto"):
+    """Displacements of a run with other parameters."""
+    problem, _ = made(change, stabilisation)
+    problem.solve(args.steps)
+    return problem.particles.displacement.x.array.copy()
+
+
+def size(values):
+    """Norm over all ranks; nodes of several ranks count several times."""
+    return float(np.sqrt(kit.total(np.asarray(values) ** 2)))
+
+
+def differentiated(stabilisation="auto"):
+    """A run with its derivatives by the parameters, relative to them, and its CPU seconds."""
+    problem, named = made(None, stabilisation)
+    gradient = mpm.Sensitivity(problem, [named[name] for name in given])
+    start = time.process_time()
+    problem.solve(args.steps)
+    seconds = time.process_time() - start
+    pairs = zip(given.items(), gradient.displacement, strict=True)
+    return problem, {name: value * own.x.array for (name, value), own in pairs}, seconds
+
+
+plain = []
+failure, history, numbers = None, mpm.History(), {}
+try:
+    solved()  # forms are compiled
+    for _ in range(2):
+        problem, _ = made()
+        start = time.process_time()
+        problem.solve(args.steps)
+        plain.append(time.process_time() - start)
+    runs = [differentiated() for _ in range(2)]
+    problem, slopes, _ = runs[0]
+    history = problem.history
+    end = problem.particles.displacement.x.array.copy()
+    seconds = min(run[2] for run in runs)
+
+    gaps = []
+    for name, slope in slopes.items():
+        ends = [solved({name: sign * 2e-6}) for sign in (1.0, -1.0)]
+        difference = (ends[0] - ends[1]) / 4e-6
+        gaps.append(size(slope - difference) / size(difference))
+
+    changes, left = (8e-5, 4e-5), []
+    for change in changes:
+        other = solved(dict.fromkeys(given, change))
+        left.append(size(other - end - change * sum(slopes.values())))
+    rate = float(np.log(left[0] / left[1]) / np.log(changes[0] / changes[1]))
+
+    _, exact, _ = differentiated("ghost")
+    within = np.linspace(-0.1, 0.1, 11)
+    found = np.array([solved({first: change}, "ghost") for change in within])
+    fitted = np.polynomial.polynomial.polyfit(within, found, 2)[1]
+    numbers = {
+        "taylor": rate,
+        "difference": max(gaps),
+        "trend": size(exact[first] - fitted) / size(fitted),
+        "seconds_ratio": kit.total(seconds) / kit.total(min(plain)) - 1.0,
+    }
+except mpm.MPMError as error:
+    failure = error
+
+rows = [
+    ("parameters", ", ".join(given)),
+    *((name, f"{value:.3g}") for name, value in numbers.items()),
+]
+kit.report(args, {**kit.outcome(history, failure), **numbers}, rows, failure)

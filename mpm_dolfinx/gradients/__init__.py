@@ -1,0 +1,10 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Derivatives of runs by what problems are made of.
+
+:class:`~mpm_dolfinx.gradients.sensitivity.Sensitivity` follows the steps of a problem, and carries
+the derivative of its state along: displacements, histories and reactions. What the state depends
+on is changed a little (:mod:`~mpm_dolfinx.gradients.parameters`), forces and histories are
+evaluated beside the state (:mod:`~mpm_dolfinx.gradients.nearby`), and one linear solve with the
+tangent of the step gives the derivative at its end (:mod:`~mpm_dolfinx.gradients.forward`).
+"""

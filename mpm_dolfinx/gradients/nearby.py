@@ -1,0 +1,169 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""States of a problem beside the one it is in, and what differs between them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from ..constitutive.points import Governing
+from ..materials.base import State
+from ..problems.particle_problem import ParticleProblem
+from .parameters import Parameter
+
+__all__ = ["Nearby", "Rates", "varying"]
+
+type Array = NDArray[np.float64]
+
+
+@dataclass
+class Rates:
+    """Derivatives by one parameter at the last converged step.
+
+    Attributes:
+        displacement: Of each body.
+        states: Of what materials keep, for each body, in numbers that vary.
+        seen: Of ``F - I`` as materials see it, for each body.
+        kept: Of what a run goes on with besides.
+        prescribed: Of Dirichlet totals, on local dofs of V for each field.
+        base: The same at the beginning of the run.
+        reactions: Of the forces on own dofs of V, for each field.
+        moduli: Of shear moduli that scale a penalty, by the number of the field.
+    """
+
+    displacement: list[fem.Function]
+    states: list[list[State]]
+    seen: list[Array]
+    kept: list[Array]
+    prescribed: list[Array]
+    base: list[Array]
+    reactions: list[Array]
+    moduli: dict[int, Array]
+
+
+class Nearby:
+    """The state of a problem, and those beside it.
+
+    Args:
+        problem: The problem.
+        kept: Arrays that a run goes on with besides history.
+    """
+
+    def __init__(self, problem: ParticleProblem, kept: Sequence[Array]) -> None:
+        self._problem = problem
+        self._kept = [(array, array.copy()) for array in kept]
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold the present state, to which all comes back after the block (collective).
+
+        Displacements come back, and history as it was converged.
+        """
+        problem = self._problem
+        self._points = problem.material_points()
+        self._displacement: list[tuple[Array, Array]] = []
+        for body in problem.bodies:
+            values = np.asarray(body.displacement.x.array, dtype=np.float64)
+            self._displacement.append((values, values.copy()))
+        self._states = [points.states() for points in self._points]
+        self._seen = [points.seen_gradient() for points in self._points]
+        self._own = [points.governing() for points in self._points]
+        self._governing: dict[tuple[int, float], list[Governing]] = {}
+        self._moved: Parameter | None = None
+        try:
+            yield
+        finally:
+            self._back()
+
+    def _back(self) -> None:
+        for array, values in (*self._displacement, *self._kept):
+            array[:] = values
+        for points, states in zip(self._points, self._states, strict=True):
+            points.go_from(states)
+        self._restore()
+
+    def _restore(self) -> None:
+        """Give the parameter that was changed last its own value."""
+        if self._moved is not None:
+            self._shift(self._moved, 0.0)
+        self._moved = None
+
+    def _shift(self, parameter: Parameter, amount: float) -> None:
+        """Change a parameter by an amount; what materials make of that is kept (collective)."""
+        parameter.shift(amount)
+        if parameter.of_law:
+            key = id(parameter), amount
+            known = self._own if amount == 0.0 else self._governing.get(key)
+            if known is None:
+                for points in self._points:
+                    parameter.govern(points, amount)
+                self._governing[key] = [points.governing() for points in self._points]
+            else:
+                for points, governing in zip(self._points, known, strict=True):
+                    points.govern_by(governing)
+        if parameter.outside:
+            self._problem.reduced.renew_external()
+
+    def go(
+        self,
+        parameter: Parameter,
+        amount: float,
+        rates: Rates,
+        displacement: Sequence[NDArray[np.float64]] | None = None,
+    ) -> None:
+        """Go to the state beside that a change of a parameter would bring (collective).
+
+        Args:
+            parameter: The parameter.
+            amount: Its change.
+            rates: Derivatives of the state.
+            displacement: Those of the displacements, if others, on local dofs of W.
+        """
+        if self._moved is not parameter:
+            self._restore()
+        self._moved = parameter
+        motions = displacement or [function.x.array for function in rates.displacement]
+        arrays = zip((*self._displacement, *self._kept), (*motions, *rates.kept), strict=True)
+        for (array, values), rate in arrays:
+            array[:] = values + amount * rate
+        for points, states, own in zip(self._points, self._states, rates.states, strict=True):
+            points.go_from([_moved(*pair, amount) for pair in zip(states, own, strict=True)])
+        self._shift(parameter, amount)
+
+    @contextmanager
+    def shown(self, amount: float, rates: Rates, reactions: Sequence[Array]) -> Iterator[None]:
+        """Let stresses and reactions be those beside the state too, in the block (collective).
+
+        Args:
+            amount: Change of the parameter.
+            rates: Derivatives of the state.
+            reactions: Those of the problem, to be set.
+        """
+        before = [force.copy() for force in reactions]
+        try:
+            for points, seen, rate in zip(self._points, self._seen, rates.seen, strict=True):
+                points.see(seen + amount * rate)
+            for force, rate in zip(reactions, rates.reactions, strict=True):
+                force += amount * rate
+            yield
+        finally:
+            for force, values in zip(reactions, before, strict=True):
+                force[:] = values
+            for points, seen in zip(self._points, self._seen, strict=True):
+                points.see(seen)
+
+
+def varying(state: State) -> State:
+    """Return what of a state can vary little by little, in one order."""
+    return {name: values for name, values in sorted(state.items()) if values.dtype.kind == "f"}
+
+
+def _moved(state: State, rate: State, amount: float) -> State:
+    return state | {name: state[name] + amount * values for name, values in rate.items()}

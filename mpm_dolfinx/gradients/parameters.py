@@ -1,0 +1,203 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What the result of a run depends on: Constants, Functions, and numbers of laws."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, override
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from .. import _compat
+from ..constitutive.points import MaterialPoints
+from ..errors import MPMError, agree
+from ..materials.base import Material, State
+from ..problems.particle_problem import ParticleProblem
+from ..reals import as_reals
+
+__all__ = ["Parameter", "as_parameter"]
+
+type Array = NDArray[np.float64]
+
+#: Changes that differences are made of, relative to the parameter. Points between two branches of
+#: a law are the fewer the smaller it is; 1e-5 to 1e-7 give derivatives to ten digits.
+CHANGE = 1e-6
+
+
+class Parameter(ABC):
+    """Something that can be changed by an amount, along a direction.
+
+    Args:
+        name: What it is called in errors.
+        scale: An amount by which it matters.
+        of_law: Whether materials depend on it.
+        outside: Whether loads or conditions may depend on it.
+
+    Attributes:
+        name: As given.
+        change: The amount by which it is changed for differences.
+        of_law: As given.
+        outside: As given.
+    """
+
+    def __init__(self, name: str, scale: float, of_law: bool, outside: bool) -> None:
+        if not (np.isfinite(scale) and scale > 0.0):
+            raise MPMError(
+                f"{name} is zero, which says nothing of its size; give scales=, for each parameter "
+                "an amount by which it matters."
+            )
+        self.name, self.of_law, self.outside = name, of_law, outside
+        self.change = CHANGE * scale
+
+    def shift(self, amount: float) -> None:
+        """Change it by an amount from what it was at first; 0 makes it that."""
+
+    @abstractmethod
+    def govern(self, points: MaterialPoints, amount: float) -> None:
+        """Let materials at points follow, after :meth:`shift` (collective)."""
+
+    def require_unchanged(self) -> None:
+        """Raise an error where it is not what it was at first (not collective)."""
+
+    def slope(self, after: Array, before: Array) -> Array:
+        """Return the derivative of values that are known at its change, and at minus its change."""
+        return np.asarray((after - before) / (2.0 * self.change))
+
+    def rate(self, after: State, before: State) -> State:
+        """Return :meth:`slope` of all values of a state."""
+        return {name: self.slope(values, before[name]) for name, values in after.items()}
+
+
+class _Values(Parameter):
+    """Values of a Constant or Function.
+
+    Args:
+        values: The values, to be set.
+        direction: What they are changed by, of the same shape.
+        name: As for :class:`Parameter`.
+        scale: As for :class:`Parameter`.
+        of_law: As for :class:`Parameter`.
+        outside: As for :class:`Parameter`.
+    """
+
+    def __init__(
+        self,
+        values: Array,
+        direction: Array,
+        name: str,
+        scale: float,
+        of_law: bool,
+        outside: bool,
+    ) -> None:
+        super().__init__(name, scale, of_law, outside)
+        self._values, self._first, self._direction = values, values.copy(), direction
+
+    @override
+    def shift(self, amount: float) -> None:
+        self._values[...] = self._first + amount * self._direction if amount else self._first
+
+    @override
+    def govern(self, points: MaterialPoints, amount: float) -> None:
+        points.follow_parameters()
+
+    @override
+    def require_unchanged(self) -> None:
+        if not np.array_equal(self._values, self._first):
+            raise MPMError(
+                f"{self.name} has changed since the Sensitivity was made, so that its derivative "
+                "means nothing; let a path change something else, such as a factor of it."
+            )
+
+
+class _OfLaw(Parameter):
+    """A number of a law.
+
+    Args:
+        law: The law, as it was given.
+        name: Its parameter.
+        scale: As for :class:`Parameter`.
+    """
+
+    def __init__(self, law: Material, name: str, scale: float) -> None:
+        super().__init__(f"{name} of {type(law).__name__}", scale, True, False)
+        self._law, self._parameter = law, name
+
+    @override
+    def govern(self, points: MaterialPoints, amount: float) -> None:
+        value = self._law.parameters[self._parameter]
+        points.assume(self._law, self._parameter, value + amount if amount else value)
+
+
+def as_parameter(given: Any, problem: ParticleProblem, scale: float | None) -> Parameter:
+    """Return what a user names as a parameter (collective).
+
+    Args:
+        given: See :class:`Sensitivity`.
+        problem: The problem.
+        scale: Size of amounts by which it matters; ``None``: by its values.
+
+    Raises:
+        MPMError: It is nothing by which a result can be differentiated.
+    """
+    thing, direction = given if isinstance(given, tuple) and len(given) == 2 else (given, None)
+    if isinstance(thing, Material):
+        name = str(direction)
+        if name not in thing.parameters:
+            raise MPMError(
+                f"A {type(thing).__name__} has no parameter {direction!r}; there are "
+                f"{', '.join(sorted(thing.parameters))}."
+            )
+        value: Any = thing.parameters[name]
+        if isinstance(value, fem.Constant | fem.Function):
+            thing, direction = value, np.ones(1)
+        else:
+            size = _largest(np.abs(value), problem) if scale is None else scale
+            known = [law for points in problem.material_points() for law in points.given]
+            if all(law is not thing for law in known):
+                raise MPMError(f"{thing!r} is no material of this problem; name one as given.")
+            return _OfLaw(thing, name, size)
+    if not isinstance(thing, fem.Constant | fem.Function):
+        raise MPMError(
+            "A parameter is a Constant, a pair of a Constant or Function and a direction, or a "
+            f"pair of a material and the name of one of its numbers, not {given!r}."
+        )
+    return _along(thing, direction, problem, scale)
+
+
+def _along(
+    thing: fem.Constant | fem.Function, direction: Any, problem: ParticleProblem, scale: Any
+) -> Parameter:
+    """Return a Constant or Function along a direction as a parameter (collective)."""
+    function = isinstance(thing, fem.Function)
+    name = f"'{thing.name}'" if isinstance(thing, fem.Function) else f"a Constant {thing.value}"
+    values = thing.x.array if isinstance(thing, fem.Function) else thing.value
+    if direction is None:
+        if function or values.size != 1:
+            raise MPMError(f"{name} has many values; give a pair of it and a direction.")
+        direction = 1.0
+    along = direction.x.array if isinstance(direction, fem.Function) else as_reals(direction)
+    with agree(problem.bodies[0].mesh.comm):
+        try:
+            along = np.array(np.broadcast_to(along, values.shape), dtype=np.float64)
+        except ValueError:
+            raise MPMError(f"The direction of {name} must have its shape {values.shape}.") from None
+    if scale is None:
+        size = _largest(np.abs(along), problem)
+        scale = _largest(np.abs(values), problem) / size if size > 0.0 else 0.0
+    laws = [law for points in problem.material_points() for law in points.given]
+    numbers: list[Any] = [value for law in laws for value in law.parameters.values()]
+    of_law = any(value is thing for value in numbers)
+    elsewhere = any(load is thing for load in problem.loads())
+    outside = not of_law or elsewhere or any(_compat.holds(bc, thing) for bc in problem.bcs)
+    return _Values(values, along, name, scale, of_law, outside)
+
+
+def _largest(sizes: Any, problem: ParticleProblem) -> float:
+    comm: MPI.Comm = problem.bodies[0].mesh.comm
+    return float(comm.allreduce(float(np.max(sizes, initial=0.0)), MPI.MAX))

@@ -1,0 +1,275 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Derivatives of a run by a few parameters, carried along step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from ..errors import MPMError, agree
+from ..parallel.boundary import collective, of_user
+from ..parallel.given import require_same
+from ..problems.particle_problem import ParticleProblem
+from ..problems.quasistatic import QuasiStaticProblem
+from ..problems.through_time import TimeProblem
+from ..stepping.control import Run
+from ..stepping.loading import Stepper
+from .forward import StepDerivative
+from .nearby import Nearby, Rates, varying
+from .parameters import as_parameter
+
+__all__ = ["Sensitivity"]
+
+type Array = NDArray[np.float64]
+
+
+class Sensitivity:
+    """Derivatives of all that a run computes by a few parameters, as it goes on (collective).
+
+    It is made before the first step, and kept; each step of ``solve``, ``steps`` or ``step`` then
+    takes one linear solve and four evaluations of the forces for each parameter besides::
+
+        young = fem.Constant(body, 1e6)
+        law = mpm.materials.VonMises(young, 0.3, yield_stress=2e4)
+        problem = mpm.QuasiStaticProblem(mpm.Body(particles, law, ...), bcs)
+        gradient = mpm.Sensitivity(problem, [young, (law, "yield_stress")])
+        problem.solve(steps=20)
+        gradient.of(lambda: particles.stress)  # shape (n, 3, 3, 2)
+
+    The derivatives are those of the discrete run, with the history of its materials, its moving
+    domains and its stabilisation: those of the steps that were made. Where a point yields or a
+    node crosses a line of the background just there, a run has a kink.
+
+    Args:
+        problem: A :class:`QuasiStaticProblem` or :class:`ParticleProblem`.
+        parameters: By what to differentiate: Constants (of laws, loads, densities, residuals,
+            Dirichlet values, values of supports, an initial stress), pairs of a material and the
+            name of one of its numbers, ``(law, "young")``, and pairs of a Constant or Function of
+            many values and a direction in which they change together. Expressions follow what they
+            are made of; a ``modulus=`` given to a support is a number that it keeps.
+        scales: For each parameter an amount by which it matters, instead of its own value; needed
+            where that is zero.
+
+    Attributes:
+        problem: As given.
+        displacement: The derivative of ``particles.displacement`` by each parameter, a Function, or
+            a list of them where the problem was given a list of bodies.
+
+    Raises:
+        MPMError: Something that cannot be differentiated (yet), or a problem that has begun.
+    """
+
+    @collective("parameters")
+    def __init__(
+        self,
+        problem: ParticleProblem,
+        parameters: Sequence[Any],
+        scales: Sequence[float] | None = None,
+    ) -> None:
+        _require_followed(problem)
+        sizes = [None] * len(parameters) if scales is None else list(scales)
+        if len(sizes) != len(parameters):
+            raise MPMError(f"There are {len(sizes)} scales for {len(parameters)} parameters.")
+        self.problem = problem
+        self._parameters = [
+            as_parameter(given, problem, size)
+            for given, size in zip(parameters, sizes, strict=True)
+        ]
+        if not self._parameters:
+            raise MPMError("Name a parameter to differentiate by.")
+        require_same(problem.bodies[0].mesh.comm, names=[one.name for one in self._parameters])
+        self._reduced = problem.reduced
+        self._stepper: Stepper | None = None
+        self._run: Run | None = None
+        self._rates, self._nearby = self._beginning()
+        self._note()
+        problem.record(self)
+
+    # -- Results --------------------------------------------------------------------------
+
+    @property
+    def displacement(self) -> list[Any]:
+        """The derivative of the displacement by each parameter."""
+        many = isinstance(self.problem.particles, list | tuple)
+        found = [rates.displacement for rates in self._rates]
+        return [list(own) if many else own[0] for own in found]
+
+    @collective("function")
+    def of(self, function: Callable[[], Any]) -> Array:
+        """Return the derivative of what a function returns that looks at the problem (collective).
+
+        It is called in states beside the present one, in which the bodies have other displacements,
+        stresses and internal variables, the problem other reactions and the parameters other
+        values: ``lambda: problem.reaction(bc)``, ``lambda: particles.stress``, or the integral of
+        a form.
+
+        Args:
+            function: Returns a number or an array.
+
+        Returns:
+            One more axis than what it returns: the last one is that of parameters.
+        """
+        self._require_present()
+        look = of_user(self.problem.bodies[0].mesh.comm, function)
+        columns = []
+        with self._nearby.held():
+            for parameter, rates in zip(self._parameters, self._rates, strict=True):
+                sides = []
+                for sign in (1.0, -1.0):
+                    amount = sign * parameter.change
+                    self._nearby.go(parameter, amount, rates)
+                    with self._nearby.shown(amount, rates, self._reactions()):
+                        sides.append(np.array(look(), dtype=np.float64))
+                columns.append(parameter.slope(*sides))
+        return np.stack(columns, axis=-1)
+
+    def _reactions(self) -> list[Array]:
+        """Return the reactions of the last step, to be set."""
+        return [] if self._stepper is None else self._stepper.converged.reactions or []
+
+    # -- What follows the run --------------------------------------------------------------
+
+    def solved(self, stepper: Stepper) -> Callable[[], None]:
+        """Find the derivatives of a step that is solved; see :meth:`ParticleProblem.record`.
+
+        Raises:
+            MPMError: There are none.
+        """
+        self._require_followed(stepper)
+        reduced, newton = stepper.reduced, stepper.newton
+        rates = self._rates
+        if stepper.run is not None and stepper.run is not self._run:
+            for one in rates:
+                one.base = one.prescribed
+        with self._nearby.held():
+            step = StepDerivative(self.problem, stepper, self._nearby)
+            pairs = zip(self._parameters, rates, strict=True)
+            found = [step.by(parameter, one) for parameter, one in pairs]
+        reduced.renew_external()
+        assert newton.x is not None and newton.F is not None
+        if (failure := reduced.residual(newton.x, newton.F)) is not None:
+            raise MPMError(failure.message)
+
+        def take() -> None:
+            self._stepper, self._run, self._rates = stepper, stepper.run, found
+            self._note()
+
+        return take
+
+    def _beginning(self) -> tuple[list[Rates], Nearby]:
+        """Return the derivatives of what the bodies begin with, and the state (collective)."""
+        problem = self.problem
+        points, found = problem.material_points(), []
+        none = [np.zeros(len(f.bodies[0].increment.x.array)) for f in self._reduced.fields]
+        for parameter in self._parameters:
+            sides = []
+            for sign in (1.0, -1.0):
+                amount = sign * parameter.change
+                parameter.shift(amount)
+                for own in points:
+                    parameter.govern(own, amount)
+                kept = [array.copy() for array in problem.begin_anew()]
+                sides.append(([[varying(s) for s in p.states()] for p in points], kept))
+            parameter.shift(0.0)
+            for own in points:
+                parameter.govern(own, 0.0)
+            (after, more), (before, less) = sides
+            states = [
+                [parameter.rate(*pair) for pair in zip(*own, strict=True)]
+                for own in zip(after, before, strict=True)
+            ]
+            found.append(
+                Rates(
+                    [fem.Function(body.W) for body in problem.bodies],
+                    states,
+                    [np.zeros_like(p.seen_gradient()) for p in points],
+                    [parameter.slope(*pair) for pair in zip(more, less, strict=True)],
+                    none,
+                    none,
+                    [],
+                    {},
+                )
+            )
+        kept = problem.begin_anew()
+        if any(len(rates.kept) != len(kept) for rates in found):
+            raise MPMError(
+                "A parameter brings forces to a body that begins without any; begin with an "
+                "initial stress that is not zero."
+            )
+        return found, Nearby(problem, kept)
+
+    def _note(self) -> None:
+        """Take note of where the bodies are."""
+        self._places = [body.converged_displacement.copy() for body in self.problem.bodies]
+
+    def _require_present(self) -> None:
+        """Raise an error where the problem is in another state than that which was followed."""
+        bodies = self.problem.bodies
+        with agree(bodies[0].mesh.comm):
+            same = self._reduced is self.problem.reduced and all(
+                np.array_equal(body.converged_displacement, place)
+                for body, place in zip(bodies, self._places, strict=True)
+            )
+            if not same:
+                raise MPMError(
+                    "The problem has come to another state than by the steps that a Sensitivity "
+                    "follows (a stage, a checkpoint, other meshes); make a new problem and a "
+                    "new Sensitivity."
+                )
+            for parameter in self._parameters:
+                parameter.require_unchanged()
+
+    def _require_followed(self, stepper: Stepper) -> None:
+        """Raise an error where a step has what has no part in the derivative."""
+        self._require_present()
+        if stepper.run is not None and stepper.run.goal is not None:
+            raise MPMError(
+                "A Sensitivity does not follow displacement control, whose load factor depends on "
+                "the parameters too; apply a load."
+            )
+
+
+def _require_followed(problem: ParticleProblem) -> None:
+    """Raise an error unless the derivative of a problem's steps has all that acts in them.
+
+    Raises:
+        MPMError: Something acts that has no part in it yet.
+    """
+    if not isinstance(problem, ParticleProblem) or isinstance(problem, TimeProblem):
+        raise MPMError(
+            "A Sensitivity follows a QuasiStaticProblem or a ParticleProblem, not a "
+            f"{type(problem).__name__}."
+        )
+    what = next(iter(_not_in(problem)), None)
+    if what is not None:
+        raise MPMError(f"A Sensitivity does not follow {what} yet.")
+    if problem.history.steps or any(np.any(b.converged_displacement) for b in problem.bodies):
+        raise MPMError("A Sensitivity follows a problem from its first step on; make it before.")
+
+
+def _not_in(problem: ParticleProblem) -> list[str]:
+    """Return what of a problem has no part in the derivative, in words."""
+    bodies, kind = problem.bodies, type(problem)
+    hooks = ("evaluate", "commit", "roll_back")
+    mixed = isinstance(problem, QuasiStaticProblem) and problem.setup.mixed is not None
+    missing = {
+        "unknowns besides displacements (fields=, mixed=)": bool(problem.fields) or mixed,
+        "terms= (contact, ties)": bool(problem.terms),
+        "particles of other methods than 'cpdi2'": any(
+            not (b.method == "cpdi2" or b.is_free) for b in bodies
+        ),
+        "bodies whose particles may be deleted": any(b.deletion is not None for b in bodies),
+        "bodies whose domains are split": any(b.on_distortion == "split" for b in bodies),
+        "rebased bodies": any(b.rebased for b in bodies),
+        "hooks of a subclass (evaluate, commit, roll_back)": any(
+            getattr(kind, name) is not getattr(ParticleProblem, name) for name in hooks
+        ),
+        "Functions at quadrature points in a residual": bool(problem.data_at_points()),
+    }
+    return [name for name, present in missing.items() if present]
