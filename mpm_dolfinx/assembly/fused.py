@@ -22,7 +22,7 @@ from ..parallel.exchange import swap
 from ..parallel.totals import over_ranks
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
-from ..transfer.touched import TouchedNodes, TransferRows
+from ..transfer.touched import JointNodes, TouchedNodes, TransferRows
 from .body_forms import BodyForms, no_values
 
 __all__ = [
@@ -196,12 +196,13 @@ class Restriction(NamedTuple):
     Attributes:
         touched: The nodes that its bodies touch.
         rows: Their rows of T, of each part of the tangent.
-        numbers: For each own dof of V its number among all unknowns, or -1.
+        numbers: For each own dof of V, and of the spaces of free nodes, its number among all
+            unknowns, or -1.
         part: Where the field's unknowns are among this rank's.
         factor: Value on V of an unknown of size 1.
     """
 
-    touched: TouchedNodes
+    touched: TouchedNodes | JointNodes
     rows: Sequence[TransferRows]
     numbers: NDArray[np.int32]
     part: slice
@@ -331,7 +332,7 @@ class FusedTangent:
         """Return ``T^T K T``; the same object as long as the pattern lasts (collective).
 
         Args:
-            keep: Whether :meth:`multiply_add` will be called, for each field.
+            keep: Whether :meth:`multiply` will be called, for each field.
             factor: How often the masses of :meth:`weigh` are added, if there are any.
         """
         assert self._A is not None
@@ -344,17 +345,16 @@ class FusedTangent:
         self._A.assemble()
         return self._A
 
-    def multiply_add(self, field: int, u: PETSc.Vec, force: PETSc.Vec) -> None:
-        """Add a field's last ``T^T K T u`` on all active dofs, fixed ones too (collective).
+    def multiply(self, field: int, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a field's last ``T^T K T u`` on all active dofs, fixed ones too (collective).
 
         What couples it with other fields has no part in it.
 
         Args:
             field: Its number.
-            u: An increment of its V.
-            force: What it is added to.
+            u: An increment on this rank's own dofs of its spaces.
         """
-        self._blocks[field].multiply_add(u, force)
+        return self._blocks[field].multiply(u)
 
 
 def _stacked(
@@ -499,7 +499,7 @@ class _Block:
         self._loops = list(bodies)
         self._masses: NDArray[np.float64] | None = None
         self.bs = 1
-        self._touched: TouchedNodes | None = None
+        self._touched: TouchedNodes | JointNodes | None = None
         self.numbers: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
         self.num_touched = 0
         self.supports = [body.support for body in self._loops]
@@ -533,7 +533,7 @@ class _Block:
         self.bs = field.touched.block_size
         numbers = field.touched.spread(field.numbers.reshape(-1, self.bs)).ravel()
         same = bool(np.array_equal(numbers, self.numbers))
-        self.numbers, self.num_touched = numbers, len(field.touched.nodes)
+        self.numbers, self.num_touched = numbers, field.touched.count
         for support, rows in zip(self.supports, field.rows, strict=True):
             same &= support.find(rows)
         return same
@@ -640,7 +640,7 @@ class _Block:
         """Write the field's rows (collective).
 
         Args:
-            keep: Whether :meth:`multiply_add` will be called.
+            keep: Whether :meth:`multiply` will be called.
             factor: Of the masses.
         """
         if not self.supports:
@@ -671,13 +671,13 @@ class _Block:
         for pattern in self._patterns:
             pattern.values = no_values
 
-    def multiply_add(self, u: PETSc.Vec, force: PETSc.Vec) -> None:
-        """Add the last ``T^T K T u`` on all active dofs of V, fixed ones too (collective)."""
+    def multiply(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the last ``T^T K T u`` on all active dofs, fixed ones too (collective)."""
         if not self._loops:
-            return
+            return np.zeros_like(u)
         assert self._kept is not None and self._touched is not None
-        local = self._touched.spread(u.array_r.reshape(-1, self.bs))
+        local = self._touched.spread(u.reshape(-1, self.bs))
         result = np.empty_like(local)
         own = self.beside(self)
         loops.multiply(own.offsets, own.nodes, self.bs, self._kept, local, result)
-        force.array_w[:] += self._touched.collect(result).ravel()
+        return np.asarray(self._touched.collect(result).ravel())

@@ -55,7 +55,7 @@ def identity(problem: Identifiable) -> dict[str, Any]:
     It is that of the problem as it is now: see :class:`ProblemState` for what it was made as.
     """
     found: dict[str, Any] = {"the number of bodies": len(problem.bodies)}
-    spaces = spaces_of(problem.bodies)
+    spaces = [V for V in spaces_of(problem.bodies) if any(V is b.V for b in problem.bodies)]
     for i, V in enumerate(spaces):
         of = f" of field {i}" if i else ""
         element = V.ufl_element()

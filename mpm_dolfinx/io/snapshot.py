@@ -115,12 +115,26 @@ class Taken(NamedTuple):
 
 
 def spaces_of(bodies: Sequence[Particles]) -> list[fem.FunctionSpace]:
-    """Return the background spaces of bodies, in the order in which they come first."""
+    """Return the spaces of bodies' unknowns, in the order of the system's fields.
+
+    Background spaces come in the order of their first bodies, each before the spaces W of those of
+    its bodies that may have free nodes.
+    """
     spaces: list[fem.FunctionSpace] = []
     for body in bodies:
-        if all(body.V is not V for V in spaces):
-            spaces.append(body.V)
+        if any(body.V is V for V in spaces):
+            continue
+        group = [one for one in bodies if one.V is body.V]
+        spaces += [body.V, *(one.W for one in group if one.free_nodes is not None)]
     return spaces
+
+
+def _cells_of(V: fem.FunctionSpace, bodies: Sequence[Particles]) -> NDArray[np.int64]:
+    """Return the input indices of the cells of a space, as they are on any mesh of a body."""
+    for body in bodies:
+        if V.mesh is body.mesh:
+            return body.global_index
+    return _compat.input_cell_index(V.mesh)
 
 
 def capture(
@@ -145,7 +159,7 @@ def capture(
         values = {name: column.values for name, column in columns.items()}
         tables.append(Table(body.global_index, values, {name: c.at for name, c in columns.items()}))
     for number, V in enumerate(spaces_of(bodies) if spaces is None else spaces):
-        index = _compat.input_cell_index(V.mesh)
+        index = _cells_of(V, bodies)
         columns = _columns(things, (None, number), len(index), comm)
         some = np.zeros(len(index), dtype=bool)
         for column in columns.values():
@@ -198,7 +212,7 @@ def adopt(
             f"displacements and other fields, and this problem {len(spaces)}."
         )
     for V, table in zip(spaces, backgrounds, strict=True):
-        exchange = RowExchange(comm, table.rows, _compat.input_cell_index(V.mesh))
+        exchange = RowExchange(comm, table.rows, _cells_of(V, bodies))
         found.append({name: exchange(values) for name, values in table.columns.items()})
     keys = [thing.key for thing in things]
     taken = [

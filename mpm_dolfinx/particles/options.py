@@ -165,8 +165,12 @@ def validate_options(
     quadrature_degree: int | None,
     outside: str,
     domain_update: str,
+    free: bool,
 ) -> None:
-    """Raise an error unless method, degrees and policies go together."""
+    """Raise an error unless method, degrees and policies go together.
+
+    Those of :class:`Particles`, and whether some nodes have unknowns of their own.
+    """
     if not is_one_of(method, METHODS):
         raise MPMError(f"Unknown method {method!r}; choose one of {', '.join(map(repr, METHODS))}.")
     if METHODS[method].free != (V is None):
@@ -184,12 +188,13 @@ def validate_options(
         )
     if quadrature_degree is not None:
         require_whole("quadrature_degree", quadrature_degree, 30)  # 16 points each way
-    enough = default_degree(body.basix_cell().name, degree, V is None)
-    least = enough if V is None else 2 * degree - 2
-    if quadrature_degree is not None and quadrature_degree < least and (degree > 1 or V is None):
+    enough = default_degree(body.basix_cell().name, degree, free)
+    least = enough if free else 2 * degree - 2
+    if quadrature_degree is not None and quadrature_degree < least and (degree > 1 or free):
         raise MPMError(
             f"A rule of degree {quadrature_degree} does not see all strains of a domain of degree "
-            f"{degree}; use quadrature_degree={enough} or more."
+            f"{degree}; use quadrature_degree={enough} or more"
+            + (", as nodes with unknowns of their own need." if free else ".")
         )
     if not is_one_of(outside, ("error", "stop", "delete")):
         raise MPMError(f"Unknown policy outside={outside!r}; choose 'error', 'stop' or 'delete'.")
@@ -197,6 +202,16 @@ def validate_options(
         raise MPMError(f"Finite elements have no background to leave; omit outside={outside!r}.")
     if not is_one_of(domain_update, ("stretch", "fixed")):
         raise MPMError(f"Unknown domain_update={domain_update!r}; choose 'stretch' or 'fixed'.")
+
+
+def validate_free(V: fem.FunctionSpace | None, method: str, on_distortion: str) -> None:
+    """Raise an error unless some nodes may be free and the others carried."""
+    if V is None:
+        raise MPMError("Without V all nodes are free; omit free=.")
+    if method != "cpdi2":
+        raise MPMError(f"Free nodes are shared by neighbours; use method='cpdi2', not {method!r}.")
+    if on_distortion != "error":
+        raise MPMError("Domains with free nodes cannot be split; omit on_distortion=.")
 
 
 def validate_distortion(

@@ -24,6 +24,7 @@ from ..meshes.redistribution import Carrier, Redistribution, cell_centres
 from ..meshes.remesh import Column, Cuts, Remesh
 from ..meshes.trail import Trail
 from ..parallel.boundary import collective
+from ..parallel.given import require_same
 from ..reals import is_one_of
 from ..transfer.cpdi import CPDI2
 from ..transfer.elements import FiniteElements
@@ -32,11 +33,13 @@ from ..transfer.methods import METHODS
 from ..transfer.transfer import Transfer
 from ..transfer.weights import Weights, domain_weights, sum_by_particle
 from .field import ParticleField
+from .free import FreeNodes, chosen_nodes
 from .geometry import Geometry
 from .options import (
     Coordinates,
     validate_cells,
     validate_distortion,
+    validate_free,
     validate_options,
     validate_spaces,
 )
@@ -68,6 +71,11 @@ class Particles(MaterialDomains):
     the body is one of total Lagrangian finite elements, with Dirichlet conditions on ``W`` as in
     any DOLFINx script. It goes on as long as its mesh does.
 
+    With V and ``free=`` both kinds are in one body: nodes that are free have unknowns of their own,
+    the others are carried by the background. The elements between are those of the body's mesh, so
+    that nothing couples the two but what they share. Conditions on ``W`` hold free nodes; where a
+    condition on V holds all of the background around a free node, it holds the node too.
+
     Args:
         body: Undeformed body: triangles or quadrilaterals in the plane, tetrahedra or
             hexahedra in space. Its cells are the particles.
@@ -88,6 +96,10 @@ class Particles(MaterialDomains):
         on_distortion: What a problem with a material does about quadrilaterals that a step has
             made concave: ``"error"`` nothing, until one crosses itself; ``"split"`` cuts them into
             two triangles each.
+        free: Which nodes are free at the beginning: a function of undeformed coordinates, shape
+            ``(3, n)``, such as ``mpm.region(...)``; ``(cell_tags, tag)``, or with a list of tags:
+            all nodes of these cells; or local nodes of W, ``[]`` for none yet. ``None``: no node is
+            ever free.
 
     Attributes:
         mesh: The body mesh, undeformed: ``body``, or its copy with ``partition="background"``.
@@ -112,6 +124,7 @@ class Particles(MaterialDomains):
             split or the body rebased, otherwise ``None``.
         shares_nodes: Whether neighbours share their nodes, as with ``"cpdi2"``.
         rebases: How often the nodes of the mesh were moved.
+        free_nodes: The free nodes as the system moves them; ``None`` without ``free=``.
         origin: Undeformed positions of the nodes of W where the body was rebased, otherwise
             ``None``.
 
@@ -121,7 +134,7 @@ class Particles(MaterialDomains):
         DomainDistortionError: A cell of the body is degenerate.
     """
 
-    @collective()
+    @collective("free")
     def __init__(
         self,
         body: mesh.Mesh,
@@ -133,12 +146,17 @@ class Particles(MaterialDomains):
         domain_update: str = "stretch",
         partition: str = "given",
         on_distortion: str = "error",
+        free: Any = None,
     ) -> None:
         validate_spaces(body, V)
         if method is None:
             method = (FiniteElements if V is None else CPDI2).name
-        validate_options(body, V, method, degree, quadrature_degree, outside, domain_update)
+        require_same(body.comm, free=free is not None)
+        own = V is None or free is not None
+        validate_options(body, V, method, degree, quadrature_degree, outside, domain_update, own)
         validate_distortion(body, method, degree, quadrature_degree, on_distortion)
+        if free is not None:
+            validate_free(V, method, on_distortion)
         if not is_one_of(partition, ("given", "background")) or (
             V is None and partition != "given"
         ):
@@ -150,7 +168,7 @@ class Particles(MaterialDomains):
         self.method = method
         self.outside = outside
         self.on_distortion = on_distortion
-        if V is None:
+        if own:
             quadrature_degree = quadrature_degree or default_degree(
                 body.basix_cell().name, degree, free=True
             )
@@ -164,7 +182,12 @@ class Particles(MaterialDomains):
             ranks = ranks_of_background(self.V, self._background, cell_centres(body))
             self._trail.append(move := Redistribution(body, ranks))
             body = move.mesh
+        self._has_free = free is not None
         self._settle(body)
+        if self.free_nodes is not None:
+            if isinstance(free, tuple):
+                free = tuple(self.carry(part) for part in free)
+            self.free_nodes.choose(chosen_nodes(self.W, free))
         self._method.require(body, self.initial_domains, self.global_index)
         self._geometry.require_volume(self.quadrature)
         self.locate()
@@ -209,9 +232,10 @@ class Particles(MaterialDomains):
                 f"{self.num_global} {self.mesh.basix_cell().name} finite elements of degree "
                 f"{degree}, {points}"
             )
+        own = "" if self.free_nodes is None else ", some nodes free"
         return (
             f"{self.num_global} {self.mesh.basix_cell().name} domains ({self.method}, degree "
-            f"{degree}, {points}) in a background of {cells.index_map(cells.dim).size_global} "
+            f"{degree}, {points}{own}) in a background of {cells.index_map(cells.dim).size_global} "
             f"{kinds} of degree {self.V.ufl_element().degree}"
         )
 
@@ -226,6 +250,7 @@ class Particles(MaterialDomains):
         self.load = LoadFactor(body, 0.0)
         self.proportional = fem.Constant(body, 1.0)
         self._converged = np.zeros_like(self._geometry.nodes)
+        self.free_nodes = FreeNodes(self) if self._has_free else None
         self._transfer: Transfer | None = None
         self._vectors: tuple[fem.FunctionSpace, fem.FunctionSpace] | None = None
 
@@ -372,6 +397,30 @@ class Particles(MaterialDomains):
         return self._method.free
 
     @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which of this rank's nodes of W have unknowns of their own, ghosts too, shape ``(N,)``.
+
+        With ``free=`` it can be set between runs, to what that takes (collective): where a node is
+        carried from now on nothing changes, as what is in equilibrium stays so with fewer unknowns;
+        where one becomes free the next step finds a better equilibrium.
+        """
+        if self.free_nodes is not None:
+            return self.free_nodes.chosen.copy()
+        return np.full(len(self._geometry.nodes), self.is_free)
+
+    @free.setter
+    @collective("where")
+    def free(self, where: Any) -> None:
+        with agree(self.mesh.comm):
+            if self.free_nodes is None:
+                raise MPMError(
+                    "Nodes can be free where the particles were made so; make them with free=[] if "
+                    "none is to be free at first."
+                )
+        self.free_nodes.choose(chosen_nodes(self.W, where))
+        self._transfer = None
+
+    @property
     def moves_at_nodes(self) -> bool:
         """Whether the rows of T are values of the background at the domains' corners."""
         return self._method.at_nodes
@@ -385,7 +434,7 @@ class Particles(MaterialDomains):
         """
         if self._transfer is not None:
             return
-        rows = self._method.rows(self._at_converged(), self._background)
+        rows = self._rows()
         self._require_inside(
             rows,
             self._lost(rows),
@@ -425,6 +474,13 @@ class Particles(MaterialDomains):
         """Return where the domains are at the last converged step."""
         return self._state(self._converged, self.converged_gradient)
 
+    def _rows(self) -> CornerBasis:
+        """Return the rows of T at the last converged step, zero for free nodes (collective)."""
+        rows = self._method.rows(self._at_converged(), self._background)
+        if self.free_nodes is not None:
+            self.free_nodes.take(rows.basis)
+        return rows
+
     def _converged_corners(self) -> NDArray[np.float64]:
         """Return the positions of the domains' nodes, last converged, ``(n, k, gdim)``."""
         return np.asarray(self._geometry.corners + self._of_domains(self._converged))
@@ -441,6 +497,8 @@ class Particles(MaterialDomains):
             values[self.deletion.dead[: len(values)]] = 0.0
             if rows.corners is not None:
                 rows.corners[self.deleted] = self.converged_domains[self.deleted]
+            if self.free_nodes is not None:
+                self.free_nodes.leave(self.deletion.dead)
         return Transfer(rows, self.W, self.V)
 
     def _require_inside(
@@ -542,7 +600,7 @@ class Particles(MaterialDomains):
         if self.deletion is None or self.outside != "delete":
             self.locate()
             return np.zeros(0, dtype=np.int64)
-        rows = self._method.rows(self._at_converged(), self._background)
+        rows = self._rows()
         lost = self._lost(rows)
         left = self.num_local - int(self.deleted.sum()) - len(lost)
         if self.mesh.comm.allreduce(left) == 0:
@@ -578,7 +636,10 @@ class Particles(MaterialDomains):
 
     @property
     def T(self) -> PETSc.Mat:
-        """The transfer: all dofs of W by all dofs of V, at the last converged positions."""
+        """The transfer: all dofs of W by all dofs of V, at the last converged positions.
+
+        Rows of free nodes are zero.
+        """
         return self.transfer.T
 
     @property
@@ -696,12 +757,13 @@ class Particles(MaterialDomains):
     def quadrature_points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return positions ``(n nq, gdim)`` and volumes ``(n nq,)`` of the history's points.
 
-        They are those of the last converged step, without deleted particles.
+        They are those of the last converged step, without particles that are deleted or of which
+        no node is carried.
         """
         nodal, gradient = self._converged_corners(), self.converged_gradient()
         weights = self.quadrature.weights
-        if self.deletion is not None:
-            there = ~self.deleted
+        if self.deletion is not None or self.free_nodes is not None:
+            there = ~(self.deleted | self.free[self.domain_nodes].all(axis=1))
             nodal, gradient, weights = nodal[there], gradient[there], weights[there]
         points = np.einsum("qk,nki->nqi", self.quadrature.shapes, nodal)
         volumes = weights * volume_ratio(gradient)
@@ -715,12 +777,15 @@ class Particles(MaterialDomains):
             "quadrature_degree": self.quadrature_degree,
             "domain_update": self._domain_update,
             "delete": self.deletion is not None,
+            **({} if self.free_nodes is None else {"free": True}),
         }
 
     def converged_state(self) -> dict[str, Column]:
         """Return the last converged step cell by cell, for a checkpoint."""
         nodal = self._converged[self.domain_nodes]
         columns = {"displacement": Column(nodal, "nodes")}
+        if self.free_nodes is not None:
+            columns["free"] = Column(self.free[self.domain_nodes].astype(np.float64), "nodes")
         if self.deletion is not None:
             columns["deleted"] = Column(self.deletion.mask, "cells")
             columns["kept"] = Column(self.deletion.kept(nodal), "nodes")
@@ -736,6 +801,8 @@ class Particles(MaterialDomains):
         d = self.displacement.x
         d.array.reshape(-1, self._geometry.gdim)[self.domain_nodes] = arrays["displacement"]
         d.scatter_forward()
+        if self.free_nodes is not None:
+            self.free = np.unique(self.domain_nodes[arrays["free"] > 0.5])
         if self.deletion is not None:
             self.deletion.restore(np.zeros_like(self.deletion.mask), arrays["kept"])
             self.deletion.restore(arrays["deleted"], arrays["kept"])
@@ -760,3 +827,5 @@ class Particles(MaterialDomains):
         """Restore the converged displacement."""
         self.displacement.x.array[:] = self._converged.ravel()
         self.increment.x.array[:] = 0.0
+        if self.free_nodes is not None:
+            self.free_nodes.roll_back()

@@ -365,7 +365,7 @@ def as_conditions(bcs: Any, spaces: Sequence[fem.FunctionSpace]) -> list[fem.Dir
     if not all(any(_compat.is_condition_on(bc, V) for V in spaces) for bc in bcs):
         raise MPMError(
             "A Dirichlet condition is not on the background space V of the particles "
-            "or on a component of it (V.sub(i))."
+            "or on a component of it (V.sub(i)); one on W can hold free nodes alone."
         )
     return list(bcs)
 

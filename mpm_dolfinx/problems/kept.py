@@ -392,6 +392,8 @@ class Standing(Kept):
             "reactions": None if converged.reactions is None else converged.reactions[number],
             "base": None if run is None else run.base[number],
         }
+        if converged.followed and converged.followed[number] is not None:
+            totals["followed"] = converged.followed[number]
         return {
             name: Column(of_cells(_function(self._spaces[number], values)), "nodes")
             for name, values in totals.items()
@@ -418,6 +420,10 @@ class Standing(Kept):
             [np.asarray(f.x.array) for f in totals["prescribed"]],
             reactions,
             numbers.get("proportional", True),
+            [
+                _owned(_filled(V, columns["followed"])) if "followed" in columns else None
+                for V, columns in zip(self._spaces, taken.backgrounds, strict=True)
+            ],
         )
         run = None
         if numbers["run"] is not None:

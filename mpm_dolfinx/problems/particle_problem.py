@@ -606,13 +606,12 @@ class ParticleProblem(Hooked):
             return bc.reaction
         if not any(bc is known for known in self.bcs):
             raise MPMError("reaction(bc) needs one of the Dirichlet conditions of this problem.")
-        reactions = self._stepper.converged.reactions
         number, field = next(
             (number, field)
             for number, field in enumerate(self.reduced.fields)
             if any(bc is known for known in field.conditions)
         )
-        return force_at(bc, None if reactions is None else reactions[number], field.V)
+        return force_at(bc, self._stepper.converged.reaction(number), field.V)
 
     @collective()
     def error(self) -> float:

@@ -22,6 +22,7 @@ from ..particles.particles import Particles
 from ..stabilisation.choice import joints_of, stabilisation_of
 from ..system.body import BodyTerm, PointHistory, StepForce
 from ..system.field import Field
+from ..system.free_field import FreeField
 from ..system.values import FormsTerm
 from .arguments import by_space, require_background_fields, require_own_fields
 from .solver import Solver
@@ -152,7 +153,9 @@ class Parts:
         return found
 
     def displacement_fields(self, bcs: Sequence[fem.DirichletBC], joints: bool) -> list[Field]:
-        """Return the fields of displacement, one for each background space (collective).
+        """Return the fields of displacement (collective).
+
+        There is one for each background space, and after it one for the free nodes of each body.
 
         Args:
             bcs: Dirichlet conditions.
@@ -160,16 +163,18 @@ class Parts:
         """
         groups = by_space(self.moving)
         kind = self.solver.stabilisation
-        return [
-            Field(
+        found: list[Field] = []
+        for group, forms in zip(groups, self._on_backgrounds(groups), strict=True):
+            host = Field(
                 group,
                 bcs,
                 forms,
                 stabilisation_of(kind, group, forms is not None),
                 joints_of(kind, group) if joints else None,
             )
-            for group, forms in zip(groups, self._on_backgrounds(groups), strict=True)
-        ]
+            free = [body.free_nodes for body in group if body.free_nodes is not None]
+            found += [host, *(FreeField(nodes, host, bcs) for nodes in free)]
+        return found
 
     def _on_backgrounds(
         self, groups: Sequence[Sequence[Particles]]

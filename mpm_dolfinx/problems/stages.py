@@ -19,10 +19,11 @@ from dolfinx import fem
 
 from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree, as_ours
+from ..io.snapshot import spaces_of
 from ..particles.particles import Particles
 from ..system.reduced import ReducedSystem
 from ..system.term import Term
-from .arguments import as_bodies, as_conditions, as_terms, by_space
+from .arguments import as_bodies, as_conditions, as_terms
 from .body import Body
 from .initial_stress import initial_stress_at_points
 from .setup import Setup
@@ -107,8 +108,7 @@ class Given(_Change):
         self, problem: Staged, setup: Setup, bcs: Any, terms: Any, own: Sequence[Term] = ()
     ) -> None:
         super().__init__(problem)
-        spaces = [group[0].V for group in by_space(problem.bodies)]
-        self._bcs = as_conditions(bcs, spaces)
+        self._bcs = as_conditions(bcs, spaces_of(problem.bodies))
         given = as_terms(terms, problem.bodies)
         self._terms = [*own, *(term for term in given if all(term is not mine for mine in own))]
         self._setup = replace(setup, terms=tuple(self._terms))

@@ -24,7 +24,6 @@ from ..io.snapshot import belongs, merged
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..stepping.loading import Stepper
-from ..system.conditions import fixed_dofs
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
 from .state import ProblemState
@@ -193,7 +192,7 @@ class Staging:
             self._gathered(forces),
             self._release.left(),
             self._stepper.converged.reactions,
-            [fixed_dofs(field.conditions, field.V) for field in reduced.fields],
+            [field.held_now() for field in reduced.fields],
         )
 
     def _hold_difference(self, before: _Standing) -> None:
@@ -205,13 +204,14 @@ class Staging:
                 new -= before.forces[before.moved.index(known)]
             new *= one.shares_nodes
         for field, new in zip(self._problem.reduced.fields, freed, strict=True):
+            held = field.held_now()
             number = _number_of(field.V, before.spaces)
             if number is None:
                 continue
             new -= before.gathered[number]
             new += before.left[number]
             if before.reactions is not None:
-                dofs = before.fixed[number] & ~fixed_dofs(field.conditions, field.V)
+                dofs = before.fixed[number] & ~held
                 new[dofs] += before.reactions[number][dofs]
         self._release.hold(after, freed)
 

@@ -42,6 +42,11 @@ def stabilisation_of(
     simple = bodies[0].V.ufl_element().degree == 1
     if bodies[0].is_free or (simple and kind == "auto" and background):
         kind = None
+    if kind == "aggregate" and any(body.free_nodes is not None for body in bodies):
+        raise MPMError(
+            "stabilisation='aggregate' is for bodies that the background carries as a whole; use "
+            "'ghost' or 'auto' with free nodes."
+        )
     cure = _stabilisation(kind, bodies)
     return Cure() if cure is None else cure
 

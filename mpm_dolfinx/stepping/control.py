@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
@@ -177,6 +177,8 @@ class Converged:
         prescribed: Dirichlet values, on the local dofs of V, for each field.
         reactions: Residual on this rank's own dofs of V (at supports, their force), for each
             field; ``None`` where there was no step.
+        followed: What free nodes add to these, for each field, or ``None`` for none; see
+            :meth:`ReducedSystem.followed`.
         proportional: Whether supports have moved in proportion to the load, else to totals.
     """
 
@@ -185,6 +187,14 @@ class Converged:
     prescribed: list[NDArray[np.float64]]
     reactions: list[NDArray[np.float64]] | None = None
     proportional: bool = True
+    followed: Sequence[NDArray[np.float64] | None] = ()
+
+    def reaction(self, number: int) -> NDArray[np.float64] | None:
+        """Return the forces at supports on own dofs of V of a field, if any are known."""
+        if self.reactions is None:
+            return None
+        added = self.followed[number] if self.followed else None
+        return self.reactions[number] if added is None else self.reactions[number] + added
 
 
 @dataclass

@@ -18,6 +18,7 @@ from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
 from ..stabilisation.joints import HARDLY
 from ..system.field import Field, ValueField
+from ..system.free_field import FreeField
 from ..system.reduced import ReducedSystem
 
 __all__ = ["count_folded", "crossed", "placed"]
@@ -152,7 +153,13 @@ def _worst_dof(reduced: ReducedSystem) -> tuple[list[int], tuple[float, ...], st
     for number, field in enumerate(reduced.fields):
         best = max(best, (*_worst_of(field), number))
     _, dof, where, number = max(reduced.fields[0].V.mesh.comm.allgather(best))
-    space = "V" if len(reduced.fields) == 1 else f"the V of background {number}"
+    field = reduced.fields[number]
+    if isinstance(field, FreeField):
+        space = "W, where nodes are free,"
+    elif len([one for one in reduced.fields if not isinstance(one, FreeField)]) == 1:
+        space = "V"
+    else:
+        space = f"the V of background {number}"
     return ([dof] if dof >= 0 else []), where, space
 
 

@@ -539,7 +539,9 @@ class Stepper:
             reactions = [force.array_r.copy() for force in reduced.forces]
             prescribed = [total.copy() for total in values]
             proportional = bool(owner.bodies[0].proportional.value)
-            self.converged = Converged(load, parameter, prescribed, reactions, proportional)
+            self.converged = Converged(
+                load, parameter, prescribed, reactions, proportional, reduced.followed()
+            )
             reduced.end()
             for take in taken:
                 take()

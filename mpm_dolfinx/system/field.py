@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from itertools import combinations
-from typing import override
+from typing import Any, override
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -25,6 +25,7 @@ from ..meshes.boxes import BOX_CELLS
 from ..parallel.magnitudes import joint_norm, norm
 from ..parallel.totals import over_ranks
 from ..particles.field import CarriedField
+from ..particles.free import FreeNodes
 from ..particles.particles import Particles
 from ..solvers.linear import Coarsening
 from ..stabilisation.cure import Cure
@@ -48,36 +49,51 @@ RIGID = 1e-3
 
 
 class Motion:
-    """How one body follows its background: ``d = d_n + T u``.
+    """How one body follows its background: ``d = d_n + T u``; or its free nodes their unknowns.
 
     Args:
-        particles: The body.
+        moved: The body, or its free nodes.
 
     Attributes:
-        particles: As given.
+        particles: The body.
     """
 
-    def __init__(self, particles: Particles | CarriedField) -> None:
-        self.particles = particles
+    def __init__(self, moved: Particles | CarriedField | FreeNodes) -> None:
+        self._moved = moved
+        self.particles: Any = moved.particles if isinstance(moved, FreeNodes) else moved
+
+    @property
+    def T(self) -> PETSc.Mat:
+        """All dofs of W by all dofs of V."""
+        return self._moved.T
 
     def begin(self) -> None:
         """Take over the present transfer."""
-        self._work = self.particles.T.createVecLeft()
+        self._work = self.T.createVecLeft()
+        self._rows = self._own_rows()
         self._free_T: PETSc.Mat | None = None
+
+    def _own_rows(self) -> slice | NDArray[np.intp]:
+        """Return which of this rank's own dofs of W are moved by V, or as free ones."""
+        if isinstance(self._moved, FreeNodes):
+            return np.flatnonzero(self._moved.dofs)
+        if isinstance(self._moved, Particles) and self._moved.free_nodes is not None:
+            return np.flatnonzero(~self._moved.free_nodes.dofs)
+        return slice(None)
 
     def free_T(self, prolongation: PETSc.Mat) -> PETSc.Mat:
         """Return T times what gives u from the unknowns, made once a step (collective)."""
         if self._free_T is None:
-            self._free_T = self.particles.T.matMult(prolongation)
+            self._free_T = self.T.matMult(prolongation)
         return self._free_T
 
     def move(self, u: PETSc.Vec) -> None:
-        """Set ``d = d_n + T u``."""
-        self.particles.T.mult(u, self._work)
-        d = self.particles.displacement.x
-        rows = self._work.getLocalSize()
-        self._before = self.particles.converged_displacement[:rows]
-        d.array[:rows] = self._before + self._work.array_r
+        """Set ``d = d_n + T u`` in the rows that are u's."""
+        self.T.mult(u, self._work)
+        d, own = self.particles.displacement.x, self._work.getLocalSize()
+        self._before = self.particles.converged_displacement[:own]
+        moved = self._before + self._work.array_r
+        d.array[:own][self._rows] = moved[self._rows]
         d.scatter_forward()
 
     def increment(self) -> NDArray[np.float64]:
@@ -94,7 +110,7 @@ class Motion:
 
     def of(self, u: PETSc.Vec) -> PETSc.Vec:
         """Return ``T u``, in a vector that the next call changes."""
-        self.particles.T.mult(u, self._work)
+        self.T.mult(u, self._work)
         return self._work
 
     def extent(self) -> float:
@@ -103,10 +119,14 @@ class Motion:
         self._work.array_w[:] = self.particles.node_positions.ravel()[:rows]
         return norm(self._work)
 
-    def is_rigid(self, u: PETSc.Vec) -> bool:
-        """Return whether u moves the body as a rigid one, in small rotations (collective)."""
+    def is_rigid(self, motion: PETSc.Vec) -> bool:
+        """Return whether a motion of the body is a rigid one, in small rotations (collective).
+
+        Args:
+            motion: On W.
+        """
         gdim = self.particles.mesh.geometry.dim
-        moved = np.array(self.of(u).array_r).reshape(-1, gdim)
+        moved = np.array(motion.array_r).reshape(-1, gdim)
         x = self.particles.node_positions[: len(moved)]
         comm: MPI.Comm = self.particles.mesh.comm
         nodes = comm.allreduce(len(x))
@@ -131,7 +151,7 @@ class Field:
     """One background space with all bodies that it moves. All calls are collective.
 
     Args:
-        bodies: The bodies on this space.
+        bodies: The bodies on this space, or the free nodes of one.
         conditions: Dirichlet conditions, of which those on this space count.
         background: Terms on it.
         cure: What is done about dofs that the bodies support badly; ``None``: nothing.
@@ -157,7 +177,7 @@ class Field:
 
     def __init__(
         self,
-        bodies: Sequence[Particles | CarriedField],
+        bodies: Sequence[Particles | CarriedField | FreeNodes],
         conditions: Sequence[fem.DirichletBC] = (),
         background: BackgroundForms | None = None,
         cure: Cure | None = None,
@@ -205,11 +225,10 @@ class Field:
 
     def find(self) -> FreeDofs:
         """Find the unknowns: dofs with weight or a background term, and without a condition."""
-        self.touched = self._look() if self._joints is None else self._joints.touched()
+        self.look()
         supported = np.zeros(self._owned, dtype=bool)
         if self._background is not None:
             supported[self._background.support()] = True
-        self._fixed = self._held()
         free = self._cure.unknowns(self.touched, supported | self._fixed)
         free |= supported & ~self._cure.followers(self._owned)
         self.dofs = np.flatnonzero(free & ~self._fixed).astype(np.int32)
@@ -223,17 +242,30 @@ class Field:
         self._product: PETSc.Mat | None = None
         return self.free
 
-    def _look(self) -> TouchedNodes:
-        """Return the nodes of V that bodies touch."""
-        owned = [body.W.dofmap.index_map.size_local for body in self.bodies]
-        return TouchedNodes(self.V, [body.node_basis for body in self.bodies], owned)
+    def look(self) -> None:
+        """Find the nodes of V that bodies touch, and the dofs with a condition."""
+        if self._joints is not None:
+            self.touched = self._joints.touched()
+        else:
+            owned = [body.W.dofmap.index_map.size_local for body in self.bodies]
+            self.touched = TouchedNodes(self.V, [body.node_basis for body in self.bodies], owned)
+        self._fixed = self.held_now()
+
+    def held_now(self) -> NDArray[np.bool_]:
+        """Return which of this rank's own dofs of V conditions hold where the bodies are now."""
+        return self._held()
+
+    def rows_of(self, particles: Particles | CarriedField) -> TransferRows:
+        """Return the rows of T of one of the bodies."""
+        number = next(i for i, m in enumerate(self.motions) if m.particles is particles)
+        return self.touched.rows[number]
 
     def _held(self) -> NDArray[np.bool_]:
         """Return which of this rank's own dofs of V have a condition, looked up once for each."""
         conditions, known = self.conditions, self._looked_up
         if known is None or list(map(id, conditions)) != list(map(id, known)):
-            self._looked_up, self._fixed = conditions, fixed_dofs(conditions, self.V)
-        return self._fixed
+            self._looked_up, self._conditioned = conditions, fixed_dofs(conditions, self.V)
+        return self._conditioned
 
     def forget(self) -> None:
         """Forget the unknowns."""
@@ -400,7 +432,7 @@ class Field:
         """
         assert self.free is not None
         fit = fit and all(body.shares_nodes for body in self.bodies)
-        u = map_to_background([body.T for body in self.bodies], increments, fit)
+        u = map_to_background([motion.T for motion in self.motions], increments, fit)
         self._cure.stand_in(u)
         x.array_w[self.part] = self.free.collect(u[self.dofs]) / self.factor
 
@@ -432,11 +464,11 @@ class Field:
         ]
         return np.asarray(self._comm.allreduce(np.array(found)))
 
-    def resultant(self) -> float:
-        """Return the size of the sum of the last residual over the free dofs."""
+    def resultant(self) -> NDArray[np.float64]:
+        """Return the sum of the last residual over the free dofs, by component, as values."""
         free = self.force.array_r[self.dofs]
         sums = np.bincount(self.dofs % self._bs, weights=free, minlength=self._bs)
-        return joint_norm(np.asarray(self._comm.allreduce(sums)))
+        return np.asarray(self.factor * self._comm.allreduce(sums))
 
     # -- What acts on the background itself ---------------------------------------------------
 

@@ -11,7 +11,7 @@ rows of T in its column, as far as no rank gets more than its share.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import Any, Protocol
 
 from mpi4py import MPI
@@ -162,13 +162,21 @@ class Numbering:
         """Return a vector of all unknowns, zero (collective)."""
         return PETSc.Vec().createMPI(self.sizes, comm=self._comm)
 
-    def rigid_motions(self) -> PETSc.NullSpace:
-        """Return the rigid motions of each background in the unknowns (collective)."""
+    def rigid_motions(self, together: Sequence[int]) -> PETSc.NullSpace:
+        """Return the rigid motions of each background in the unknowns (collective).
+
+        Args:
+            together: How many fields, one after the other, move as one.
+        """
         found: list[PETSc.Vec] = []
-        for part, free in zip(self.parts, self._fields, strict=True):
-            for motion in free.rigid_motions():
+        ends = np.cumsum([0, *together])
+        pairs = list(zip(self.parts, self._fields, strict=True))
+        for first, end in pairwise(ends):
+            parts = [part for part, _ in pairs[first:end]]
+            for motion in zip(*(free.rigid_motions() for _, free in pairs[first:end]), strict=True):
                 vector = self.vector()
-                vector.array_w[part] = motion
+                for part, own in zip(parts, motion, strict=True):
+                    vector.array_w[part] = own
                 before = vector.norm()
                 # Twice is enough for orthogonality (Parlett 1980, section 6-9).
                 for other in found * 2:

@@ -34,8 +34,8 @@ from ..parallel.totals import over_ranks
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..solvers.linear import Coarsening
-from ..transfer.touched import TransferRows
 from .field import Field, Motion, ValueField
+from .free_field import FreeField, Subspace
 from .hierarchy import interpolations
 from .numbering import Numbering
 from .own import OwnUnknowns
@@ -53,7 +53,7 @@ class ReducedSystem:
 
     Args:
         bodies: All bodies, in the problem's order, then their other fields.
-        fields: The background spaces that move them.
+        fields: The background spaces that move them, each before those of free nodes of its bodies.
         terms: What acts on them.
         statistics: Where to count.
         predictor: Says what increment to expect.
@@ -96,15 +96,18 @@ class ReducedSystem:
         self._places = [
             next(place for place in motions if place[1].particles is body) for body in bodies
         ]
+        self._ways = [[way for way in motions if way[1].particles is body] for body in bodies]
+        self._subspaces = Subspace.all_of(fields)
+        self._free_Ts: dict[int, PETSc.Mat] = {}
         self._numbering: Numbering | None = None
         self._start: PETSc.Vec | None = None
-        groups = [[field for field in fields if not field.extends]]
-        groups += [[field] for field in fields if field.extends]
+        groups = [[one for one in self._subspaces if not one.extends]]
+        groups += [[one] for one in self._subspaces if one.extends]
         self._coupled = [self._is_fused(term.coupling) for term in terms]
         self._groups = [
             (group, pairs)
             for group in groups
-            if any(pairs := [self._fused_on(field) for field in group])
+            if any(pairs := [self._fused_on(one.host) for one in group])
         ]
         self.fused = [
             FusedTangent(self._comm, pairs, self._couplings_in(group), statistics)
@@ -127,14 +130,14 @@ class ReducedSystem:
         reduced = any(body is coupling.places[0] for body, _ in self._fused_on(moving))
         return reduced and not moving.extends and not other.extends
 
-    def _couplings_in(self, group: Sequence[Field]) -> list[tuple[int, int, Coupling]]:
+    def _couplings_in(self, group: Sequence[Subspace]) -> list[tuple[int, int, Coupling]]:
         """Return the couplings of fields in a group that compiled loops reduce, with numbers."""
-        found = []
+        found, hosts = [], [one.host for one in group]
         for term, coupled in zip(self._terms, self._coupled, strict=True):
             if coupled and term.coupling is not None:
                 i, j = (self._place(place)[0] for place in term.coupling.places)
-                if i in group:
-                    found.append((group.index(i), group.index(j), term.coupling))
+                if i in hosts:
+                    found.append((hosts.index(i), hosts.index(j), term.coupling))
         return found
 
     def _reduced_on(self, field: Field) -> list[Particles | CarriedField]:
@@ -148,8 +151,33 @@ class ReducedSystem:
         return bodies + [body for body in carried if self._place(body)[0] is field]
 
     def _place(self, particles: Particles | CarriedField) -> tuple[Field, Motion]:
-        """Return the field that moves a body, and how."""
+        """Return the field of the background that moves a body, and how."""
         return next(place for place in self._places if place[1].particles is particles)
+
+    def _ways_of(self, particles: Particles | CarriedField) -> list[tuple[Field, Motion]]:
+        """Return all fields that move a body, and how: each other nodes; none where it stays."""
+        found = (ways for ways in self._ways if ways[0][1].particles is particles)
+        return next(found, [])
+
+    def _moved(
+        self, particles: Particles | CarriedField, increments: Sequence[PETSc.Vec]
+    ) -> PETSc.Vec:
+        """Return how increments of the fields move a body, on its W.
+
+        Args:
+            particles: The body.
+            increments: On all dofs of each V.
+        """
+        moved = [
+            motion.of(increments[self.fields.index(field)])
+            for field, motion in self._ways_of(particles)
+        ]
+        if not moved:
+            moved.append(particles.T.createVecLeft())
+            moved[0].set(0.0)
+        for other in moved[1:]:
+            moved[0].axpy(1.0, other)
+        return moved[0]
 
     @property
     def softens(self) -> bool:
@@ -164,8 +192,9 @@ class ReducedSystem:
     @property
     def coarsening(self) -> Coarsening:
         """How well multigrid's boxes follow the tangent (collective)."""
-        found = [field.coarsening for field in self.fields]
-        if any(self._couples(term) for term in self._terms):
+        found = [one.host.coarsening for one in self._subspaces]
+        joint = len(self._subspaces) < len(self.fields)
+        if joint or any(self._couples(term) for term in self._terms):
             found.append(Coarsening.FAIR)  # each field has boxes of its own
         return max(found)
 
@@ -294,8 +323,10 @@ class ReducedSystem:
 
     def _prescribed(self, particles: Particles) -> PETSc.Vec | None:
         """Return how the step's Dirichlet values move a body, ``None``: not at all."""
-        field, motion = self._place(particles)
-        return motion.of(field.lift()).copy() if field.prescribes else None
+        ways = self._ways_of(particles)
+        if not any(field.prescribes for field, _ in ways):
+            return None
+        return self._moved(particles, [field.lift() for field in self.fields]).copy()
 
     def end(self) -> None:
         """Take note of the increments; forget the unknowns, since the bodies have moved."""
@@ -342,16 +373,14 @@ class ReducedSystem:
         ):
             block.number(part, numbers, numbering.sizes)
         self._sum = MatrixSum()
+        self._free_Ts = {}
         self._zeros_on_diagonal: PETSc.Mat | None = None
         self._products: dict[tuple[int, int, int], tuple[PETSc.Mat | None, ...]] = {}
         self._extended: list[PETSc.Mat | None] = [None] * len(self.fused)
         self._tangents: list[Tangents] = []
         self._sizes_of: dict[tuple[int, int, int], PETSc.Mat] = {}
         for fused, (group, _) in zip(self.fused, self._groups, strict=True):
-            reduced = [
-                field.restriction([_rows(field, body) for body in self._reduced_on(field)])
-                for field in group
-            ]
+            reduced = [one.restriction(self._reduced_on(one.host)) for one in group]
             fused.restrict([restriction for restriction, _ in reduced], reduced[0][1])
         self._count(numbering)
 
@@ -386,9 +415,9 @@ class ReducedSystem:
             return
         targets = self.forces if to is None else to
         for body, vector in zip(term.bodies, vectors, strict=True):
-            field, _ = self._place(body)
-            target = targets[self.fields.index(field)]
-            body.T.multTransposeAdd(vector, target, target)
+            for field, motion in self._ways_of(body):
+                target = targets[self.fields.index(field)]
+                motion.T.multTransposeAdd(vector, target, target)
 
     def residual(self, x: PETSc.Vec, F: PETSc.Vec) -> MPMError | None:
         """Evaluate the residual at x, or say by which of the ``TRIAL_ERRORS`` that cannot be.
@@ -433,6 +462,22 @@ class ReducedSystem:
                 field.add_residual(partial(self.shear_moduli, field))
                 field.gather_extended(field.force)
         return None
+
+    def followed(self) -> list[NDArray[np.float64] | None]:
+        """Return what the last :attr:`forces` leave out at supports (collective).
+
+        Returns:
+            For each field the forces on free nodes that follow its held dofs, counted as forces on
+            these, on own dofs of V; ``None`` where nothing follows them.
+        """
+        found: list[NDArray[np.float64] | None] = []
+        for field in self.fields:
+            total = field.force.duplicate()
+            total.set(0.0)
+            free = [one for one in self.fields if isinstance(one, FreeField) and one.host is field]
+            follows = [one.add_followed(total) for one in free]
+            found.append(total.array_r.copy() if any(follows) else None)
+        return found
 
     def _add_outer(self, term: Term) -> None:
         """Add a term's forces, and take note of their size."""
@@ -562,10 +607,10 @@ class ReducedSystem:
     def functional(self, particles: Particles, row: PETSc.Vec) -> PETSc.Vec:
         """Return the coefficients on the unknowns of a functional on a body's W (collective)."""
         totals = self._zeros()
-        field, _ = self._place(particles)
-        total = totals[self.fields.index(field)]
-        particles.T.multTranspose(row, total)
-        field.gather_extended(total)
+        for field, motion in self._ways_of(particles):
+            total = totals[self.fields.index(field)]
+            motion.T.multTranspose(row, total)
+            field.gather_extended(total)
         return self.restricted(totals)
 
     def restricted(self, forces: Sequence[PETSc.Vec]) -> PETSc.Vec:
@@ -676,10 +721,10 @@ class ReducedSystem:
 
     def _fused_tangent(self, number: int) -> PETSc.Mat:
         fused, (group, _) = self.fused[number], self._groups[number]
-        whole = fused.assemble([field.prescribes for field in group], self.mass_factor)
+        whole = fused.assemble([one.prescribes for one in group], self.mass_factor)
         if not group[0].extends:
             return whole
-        result = whole.ptap(group[0].prolongation, result=self._extended[number])
+        result = whole.ptap(group[0].host.prolongation, result=self._extended[number])
         self._extended[number] = result
         return result
 
@@ -701,7 +746,8 @@ class ReducedSystem:
             if not its:
                 continue
             whole = fused.weigh(its)
-            parts.append(whole.ptap(group[0].prolongation) if group[0].extends else whole)
+            host = group[0].host
+            parts.append(whole.ptap(host.prolongation) if host.extends else whole)
             known += [body for body, _ in its]
         return parts, known
 
@@ -728,8 +774,16 @@ class ReducedSystem:
         return term.own.selection
 
     def _free_T(self, particles: Particles | CarriedField) -> PETSc.Mat:
-        field, motion = self._place(particles)
-        return motion.free_T(field.prolongation)
+        first, *others = [
+            motion.free_T(field.prolongation) for field, motion in self._ways_of(particles)
+        ]
+        if not others:
+            return first
+        if id(particles) not in self._free_Ts:
+            for other in others:
+                first = first + other
+            self._free_Ts[id(particles)] = first
+        return self._free_Ts[id(particles)]
 
     def prediction(self) -> PETSc.Vec | None:
         """Return the unknowns to expect at the step's end, if a term or the past says any."""
@@ -741,9 +795,14 @@ class ReducedSystem:
                 return None
             assert self._numbering is not None
             x = self._numbering.vector()
+            bodies = [motion.particles for _, motion in self._places]
             for field in self.fields:
-                places = zip(increments, self._places, strict=True)
-                its = [increment for increment, (one, _) in places if one is field]
+                its = [
+                    increment
+                    for motion in field.motions
+                    for increment, body in zip(increments, bodies, strict=True)
+                    if body is motion.particles
+                ]
                 field.predict(its, x, fit=not self.one_sided())
         for own in self.own:
             own.predict(x, self._size)
@@ -752,7 +811,9 @@ class ReducedSystem:
     def rigid_motions(self) -> PETSc.NullSpace:
         """Return the rigid motions of each background in the unknowns (collective)."""
         assert self._numbering is not None
-        return self._numbering.rigid_motions()
+        moving = [one for one in self._subspaces if not isinstance(one.host, ValueField)]
+        others = len(self._blocks) - sum(len(one.fields) for one in moving)
+        return self._numbering.rigid_motions([*(len(one.fields) for one in moving), *[1] * others])
 
     def splits(self) -> Sequence[tuple[str, slice]]:
         """Return names of the fields, and where their unknowns are among this rank's.
@@ -777,7 +838,11 @@ class ReducedSystem:
             values: Whether of those that are no displacements; either kind is numbered alone.
         """
         first, last = self._kinds[values]
-        dofs = [one.level() for one in self._blocks if isinstance(one, ValueField) == values]
+        dofs = [
+            one.level() for one in self._subspaces if isinstance(one.host, ValueField) == values
+        ]
+        if not values:
+            dofs += [own.level() for own in self.own]
         alone = [one._replace(numbers=one.numbers - first) for one in dofs]
         return interpolations(self._comm, last - first, alone, coarsest)
 
@@ -819,25 +884,27 @@ class ReducedSystem:
         for field, force in zip(self.fields, forces, strict=True):
             field.add_product(field.lift(), force, partial(self.shear_moduli, field))
         for fused, (group, _) in zip(self.fused, self._groups, strict=True):
-            for number, field in enumerate(group):
-                if field.prescribes:
-                    fused.multiply_add(number, field.u, forces[self.fields.index(field)])
+            for number, one in enumerate(group):
+                if one.prescribes:
+                    product = one.split(fused.multiply(number, one.increment()))
+                    for field, part in zip(one.fields, product, strict=True):
+                        forces[self.fields.index(field)].array_w[:] += part
+        lifts = [field.u for field in self.fields]
         on_own: list[tuple[OwnUnknowns, PETSc.Vec]] = []
         for term, tangents in zip(self._terms, self._tangents, strict=True):
             count = len(term.bodies)
             for (a, b), K in tangents.items():
                 if b == count:
                     continue
-                field, motion = self._place(term.bodies[b])
                 force = K.createVecLeft()
-                K.mult(motion.of(field.u), force)
-                if a < count:
-                    target = forces[self.fields.index(self._place(term.bodies[a])[0])]
-                    term.bodies[a].T.multTransposeAdd(force, target, target)
-                elif term.own is not None:
+                K.mult(self._moved(term.bodies[b], lifts), force)
+                for field, motion in self._ways_of(term.bodies[a]) if a < count else ():
+                    target = forces[self.fields.index(field)]
+                    motion.T.multTransposeAdd(force, target, target)
+                if a == count and term.own is not None:
                     on_own.append((term.own, force))
         for term, coupled in zip(self._terms, self._coupled, strict=True):
-            motions = [motion.of(field.u) for field, motion in map(self._place, term.bodies)]
+            motions = [self._moved(body, lifts) for body in term.bodies]
             self._add(term, term.reduced_product(motions), forces)
             if coupled:
                 self._add(term, term.stiffness_force(motions), forces)
@@ -857,17 +924,20 @@ class ReducedSystem:
             F: The residual. Where there are several fields, its norm over what is returned is the
                 largest of the fields' own ratios, so that each has to converge by itself.
         """
-        scales = [
-            field.factor * max(external, field.reactions(), outer, self._changed(field))
-            for field, external, outer in zip(self.fields, self._external, self._outer, strict=True)
-        ]
+        sizes_of = zip(self.fields, self._external, self._outer, strict=True)
+        scales = self._by_subspace(
+            [
+                field.factor * np.array([external, field.reactions(), outer, self._changed(field)])
+                for field, external, outer in sizes_of
+            ]
+        )
         scales += [own.size for own in self.own]
         if len(scales) == 1:
             return scales[0]
         if F is None:
             return joint_norm(scales)
-        parts = [*(field.part for field in self.fields), *(own.part for own in self.own)]
-        sizes = [joint_norm(F.array_r[part], self._comm) for part in parts]
+        sizes = self._by_subspace([joint_norm(F.array_r[f.part], self._comm) for f in self.fields])
+        sizes += [joint_norm(F.array_r[own.part], self._comm) for own in self.own]
         if any(scale == 0.0 < size for size, scale in zip(sizes, scales, strict=True)):
             inner = self._internal_scales()
             scales = [scale or other for scale, other in zip(scales, inner, strict=True)]
@@ -875,6 +945,16 @@ class ReducedSystem:
             size / scale for size, scale in zip(sizes, scales, strict=True) if size > 0.0 < scale
         ]
         return norm(F) / max(ratios) if ratios else joint_norm(scales)
+
+    def _by_subspace(self, sizes: Sequence[NDArray[np.float64] | float]) -> list[float]:
+        """Return the largest joint size of each subspace.
+
+        Args:
+            sizes: Sizes of each field, a number or one of each kind.
+        """
+        ends = np.cumsum([len(one.fields) for one in self._subspaces])[:-1]
+        parts = np.split(np.array(sizes).reshape(len(self.fields), -1), ends)
+        return [float(np.linalg.norm(part, axis=0).max()) for part in parts]
 
     def _changed(self, field: Field) -> float:
         """Return the sizes of changes of a field's residual by those of all unknowns (collective).
@@ -917,7 +997,7 @@ class ReducedSystem:
             for term in self._terms:
                 self._add(term, term.absolute_contributions(), totals)
             sizes = [f.factor * norm(total) for f, total in zip(self.fields, totals, strict=True)]
-            return sizes + [own.size for own in self.own]
+            return self._by_subspace(sizes) + [own.size for own in self.own]
 
     def changes(self) -> list[NDArray[np.float64]]:
         """Return :meth:`Field.changes` of each field."""
@@ -925,8 +1005,8 @@ class ReducedSystem:
 
     def driven(self, particles: Particles, values: Sequence[NDArray[np.float64]]) -> PETSc.Vec:
         """Return how values at the fixed dofs of each V move a body (collective)."""
-        field, motion = self._place(particles)
-        return motion.of(field.driven(values[self.fields.index(field)])).copy()
+        driven = [field.driven(own) for field, own in zip(self.fields, values, strict=True)]
+        return self._moved(particles, driven).copy()
 
     def works(self) -> NDArray[np.float64]:
         """Return :meth:`Field.works` of all displacements."""
@@ -943,7 +1023,7 @@ class ReducedSystem:
         It is what loads and supports, as computed, differ by: the stress of a domain adds
         nothing to it, nor does round-off of the stress.
         """
-        return joint_norm([field.factor * field.resultant() for field in self.fields])
+        return joint_norm([one.resultant() for one in self._subspaces])
 
     def stiffness(self, x: PETSc.Vec) -> float:
         """Return ``x . K x``, summed domain by domain: nothing, for a rigid motion.
@@ -959,9 +1039,7 @@ class ReducedSystem:
             field.add_product(u, force, partial(self.shear_moduli, field))
             total += force.dot(u)
         for term in self._terms:
-            motions = []
-            for field, motion in map(self._place, term.bodies):
-                motions.append(motion.of(increments[self.fields.index(field)]))
+            motions = [self._moved(body, increments) for body in term.bodies]
             if term.own is not None:
                 motions.append(term.own.of(x))
             forces = term.stiffness_force(motions)
@@ -983,8 +1061,8 @@ class ReducedSystem:
         increments = [field.on_background(x) for field in self.fields]
         return all(
             [
-                motion.is_rigid(increments[self.fields.index(field)])
-                for field, motion in self._places
+                motion.is_rigid(self._moved(motion.particles, increments))
+                for _, motion in self._places
             ]
         )
 
@@ -1015,9 +1093,3 @@ def _updated(term: Term) -> BaseException | None:
         return as_ours(error, term.evaluation)
     except BaseException as error:
         return error
-
-
-def _rows(field: Field, particles: Particles | CarriedField) -> TransferRows:
-    """Return the rows of T of one of a field's bodies."""
-    number = next(i for i, body in enumerate(field.bodies) if body is particles)
-    return field.touched.rows[number]

@@ -17,7 +17,7 @@ from dolfinx import fem
 from ..background.basis import PointBasis
 from ..parallel.exchange import swap
 
-__all__ = ["TouchedNodes", "TransferRows"]
+__all__ = ["JointNodes", "TouchedNodes", "TransferRows", "joined_rows"]
 
 
 class TransferRows(NamedTuple):
@@ -76,6 +76,11 @@ class TouchedNodes:
             most[own[better]] = part[better, 1]
         self.active: NDArray[np.int32] = np.flatnonzero(most).astype(np.int32)
         self.homes: NDArray[np.int64] = homes[self.active]
+
+    @property
+    def count(self) -> int:
+        """Number of the touched nodes."""
+        return len(self.nodes)
 
     @property
     def has_weight(self) -> NDArray[np.bool_]:
@@ -181,6 +186,54 @@ class TouchedNodes:
             before = np.concatenate([[0], np.cumsum(off[row.nodes])])[row.offsets[: owned + 1]]
             rows += int(np.count_nonzero(np.diff(before)))
         return np.asarray(comm.allreduce(np.array([sum(self._owned), rows, off.sum()])))
+
+
+class JointNodes:
+    """The touched nodes of several spaces of the same block size, one after the other, as of one.
+
+    Args:
+        parts: Those of each space.
+
+    Attributes:
+        block_size: Number of dofs at a node.
+        count: Number of the touched nodes.
+    """
+
+    def __init__(self, parts: Sequence[TouchedNodes]) -> None:
+        self._parts = list(parts)
+        self.block_size = parts[0].block_size
+        self._ends = np.cumsum([part.count for part in parts])
+        self._own_ends = np.cumsum([part.num_own for part in parts])
+        self.count = int(self._ends[-1])
+
+    def spread(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return :meth:`TouchedNodes.spread` of the own nodes of all spaces (collective)."""
+        own = np.split(values, self._own_ends[:-1])
+        return np.concatenate([p.spread(v) for p, v in zip(self._parts, own, strict=True)])
+
+    def collect(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return :meth:`TouchedNodes.collect` of the touched nodes of all spaces (collective)."""
+        touched = np.split(values, self._ends[:-1])
+        return np.concatenate([p.collect(v) for p, v in zip(self._parts, touched, strict=True)])
+
+
+def joined_rows(rows: Sequence[TransferRows], starts: Sequence[int]) -> TransferRows:
+    """Return rows of T with the columns of several spaces beside each other.
+
+    Args:
+        rows: Those of the same nodes of W in each space.
+        starts: The number from which on the touched nodes of each space are counted.
+    """
+    counts = [np.diff(one.offsets) for one in rows]
+    offsets = np.concatenate([[0], np.cumsum(np.sum(counts, axis=0))]).astype(np.int64)
+    nodes = np.empty(offsets[-1], dtype=np.int32)
+    values = np.empty(offsets[-1])
+    first = offsets[:-1].copy()
+    for one, count, start in zip(rows, counts, starts, strict=True):
+        places = np.arange(len(one.nodes)) + np.repeat(first - one.offsets[:-1], count)
+        nodes[places], values[places] = one.nodes + start, one.values
+        first += count
+    return TransferRows(offsets, nodes, values)
 
 
 def _distinct(

@@ -40,6 +40,8 @@ RUNS = {
         "--degree 2 --offset 0.05 --steps 25",
         {"error": 3e-4, "iterations": 140, "cutbacks": 0},
     ),
+    "wall": ("wall", "", {"iterations": 1}),
+    "wall-degree-1": ("wall", "--degree 1", {"iterations": 1}),
     "consolidation": (
         "consolidation",
         "--settlement 0.3",
@@ -304,6 +306,7 @@ KEYS = {
     "free_body": {"difference", "seconds_ratio", "unknowns"},
     "lshape": {"error", "estimate", "unknowns", "error_all_free", "unknowns_carried"},
     "snap_through": {"limit", "valley", "crown", "error"},
+    "wall": {"head", "reference", "error", "unknowns", "unknowns_carried"},
 }
 
 
@@ -341,6 +344,10 @@ def test_numbers(case, capfd):
         assert numbers[key] <= bound, key
     if case == "compaction-mpm":
         assert numbers["error"] > 6e-2 and numbers["iterations"] <= 170
+    if name == "wall":
+        degree = 1 if "--degree 1" in arguments else 2
+        assert abs(numbers["error"]) < (0.012 if degree == 1 else 1e-3)
+        assert degree == 1 or numbers["unknowns"] < 1.25 * numbers["unknowns_carried"]
     if name == "block3d":
         assert abs(numbers["height"] - 1.2) < 1e-3
     if name in ("strength", "footing", "penetration") and numbers.get("ratio"):
@@ -474,6 +481,7 @@ def test_case_is_a_program(name, tmp_path):
         "penetration": "--cell 0.25 --depth 0.05 --steps 4",
         "lshape": "--cells 2",
         "free_body": "--size 2 --steps 2",
+        "wall": "--cell 1",
     }.get(name, "--elements 4 --steps 4")
     done = programs.run(CASES / f"{name}.py", *small.split(), "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

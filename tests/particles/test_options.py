@@ -108,10 +108,36 @@ PARTICLES = {
     "degree of no number": (vectors(degree="one"), r"1, 2 or 3, not 'one'"),
     "few points": (vectors(degree=2, quadrature_degree=1), r"degree 2; use quadrature_degree=2"),
     "method": (vectors(method="fdm"), r"Unknown method 'fdm'; choose one of 'cpdi2'"),
-    "method of no name": (vectors(method=None), r"Unknown method None"),
+    "method of no name": (vectors(method=3), r"Unknown method 3"),
     "negative rule": (vectors(quadrature_degree=-1), r"quadrature_degree.*not -1"),
     "broken rule": (vectors(quadrature_degree=1.5), r"quadrature_degree.*not 1\.5"),
     "policy": (vectors(outside="ignore"), r"outside='ignore'"),
+    "free, of points": (
+        vectors(method="mpm", free=[]),
+        r"shared by neighbours; use method='cpdi2'",
+    ),
+    "free, one point": (
+        on(
+            lambda: scenes.vectors(background()),
+            lambda: scenes.unit(2, scenes.QUADRILATERAL),
+            free=[],
+            quadrature_degree=1,
+        ),
+        r"use quadrature_degree=2 or more, as nodes with unknowns of their own need",
+    ),
+    "free nowhere": (vectors(free=mpm.region(x=99.0)), r"No node of the body is where free="),
+    "free, no place": (vectors(free="wall"), r"free= is a function of coordinates.*not 'wall'"),
+    "free, broken": (vectors(free=lambda x: x[5]), r"The function free= failed with IndexError"),
+    "free, one for all": (vectors(free=lambda x: True), r"shape \(n,\), not \(\)"),
+    "free, foreign tags": (
+        vectors(free=(scenes.cell_tags(scenes.unit(1, TRIANGLE), lambda x: x[:, 0]), 1)),
+        r"must be those of cells of the body mesh",
+    ),
+    "free, no such node": (vectors(free=[10**6]), r"none of the \d+ local ones"),
+    "free, no background": (
+        lambda: mpm.Particles(scenes.unit(2, TRIANGLE), free=[]),
+        r"Without V all nodes are free; omit free=",
+    ),
     "another communicator": (
         lambda: mpm.Particles(
             scenes.unit(2, TRIANGLE, MPI.COMM_SELF), scenes.vectors(background())

@@ -73,6 +73,7 @@ FEATURES = {
     "stabilised pressure": {"mixed": "stabilised pressure"},
     "RigidBody": {"contact": "rigid body"},
     "finite elements": {"method": "fem"},
+    "free nodes": {"method": "cpdi2", "free": True},
 }
 
 
@@ -179,6 +180,12 @@ class Scene:
         lower, upper = np.zeros(self.dim), np.ones(self.dim)
         lower[-1], upper[-1] = bottom, bottom + 1.0
         method = self.wanted.get("method", "cpdi2")
+
+        def free(x):
+            """Some nodes, of the first body also where it is held, but none where bodies meet."""
+            height = x[self.dim - 1] - bottom
+            return (x[0] > 0.4) & (height > (0.1 if bottom > 0.0 else -0.1)) & (height < 0.6)
+
         return mpm.Particles(
             scenes.box(lower, upper, [n] * self.dim, cell),
             None if method == "fem" else V,
@@ -186,6 +193,7 @@ class Scene:
             degree=self.degree,
             quadrature_degree=self.wanted.get("quadrature") if self.degree == 1 else None,
             outside="delete" if "delete" in self.wanted else "error",
+            free=free if "free" in self.wanted else None,
         )
 
     def base(self, V, bottom, value):

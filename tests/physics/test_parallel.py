@@ -150,3 +150,30 @@ def test_statistics_count_the_same_on_all_ranks():
     assert all(c == counters[0] for c in counters)
     free = WORLD.allreduce(len(problem.particles.active_dofs))
     assert 0 < counters[0]["free_dofs"] <= free
+
+
+def test_free_nodes():
+    # Free where the body is held on the background, and beside carried nodes.
+    def make(comm):
+        V = scenes.vectors(scenes.box([0.0, -0.5], [2.0, 1.5], [8, 8], QUADRILATERAL, comm))
+        body = scenes.box([0.0, 0.0], [1.0, 1.0], [6, 6], QUADRILATERAL, comm)
+        tags = scenes.facet_tags(body, scenes.at(0, 1.0))
+        particles = mpm.Particles(body, V, free=lambda x: (x[0] + x[1] < 0.7) | (x[0] > 0.9))
+        return mpm.QuasiStaticProblem(
+            mpm.Body(
+                particles,
+                VonMises(1e3, 0.3, rho_y=20.0, hardening=100.0),
+                density=1.0,
+                body_force=(0.0, -30.0),
+                tractions=[((20.0, 10.0), 1)],
+                facet_tags=tags,
+                f_bar="domain",
+            ),
+            bcs=[
+                scenes.fix(V, scenes.at(0, 0.0)),
+                scenes.fix(particles.W, scenes.at(0, 1.0), 0.0, 1),
+            ],
+        )
+
+    arrays = compare(make, 4)
+    assert arrays["plastic_strain 0"].max() > 1e-3

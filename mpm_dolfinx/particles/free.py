@@ -1,0 +1,215 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Nodes of a body that no background carries: each has an unknown of its own."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem, la, mesh
+
+from .. import _compat
+from ..background.basis import PointBasis
+from ..errors import MPMError, agree, as_ours
+from ..transfer.matrix import transfer_matrix
+
+__all__ = ["FreeNodes", "chosen_nodes"]
+
+
+class Body(Protocol):
+    """A body as its free nodes know it."""
+
+    @property
+    def mesh(self) -> mesh.Mesh:
+        """The body mesh."""
+
+    @property
+    def W(self) -> fem.FunctionSpace:
+        """Space of the displacement."""
+
+    @property
+    def shares_nodes(self) -> bool:
+        """Whether neighbours share their nodes."""
+
+    def locate(self) -> None:
+        """Find the background cells of all nodes (collective)."""
+
+
+class FreeNodes:
+    """The free nodes of a body, as the system moves them: T is the identity on W.
+
+    The other nodes are carried: they follow the background. A body's displacement is
+    ``d = d_n + T u + T_f w`` with T zero in the rows of free nodes and T_f in all others, so that
+    the elements between them are those of the body's mesh.
+
+    Args:
+        particles: The body, of which no node is free at first.
+
+    Attributes:
+        particles: As given.
+        V: Space of the unknowns: W.
+        W: The same.
+        increment: Their increment in the step being solved.
+        chosen: Which of this rank's nodes of W are free, ghosts too.
+    """
+
+    def __init__(self, particles: Body) -> None:
+        self.particles = particles
+        self.V = self.W = particles.W
+        self.increment = fem.Function(self.W, name="increment of free nodes")
+        self._beneath: PointBasis | None = None
+        layout = self.W.dofmap.index_map
+        local = np.arange(layout.size_local + layout.num_ghosts, dtype=np.int32)
+        self._nodes: NDArray[np.int64] = layout.local_to_global(local)
+        self.chosen = np.zeros(len(local), dtype=bool)
+        self._dead = np.zeros(len(local), dtype=bool)
+        self._basis: PointBasis | None = None
+        self._T: PETSc.Mat | None = None
+
+    @property
+    def mesh(self) -> mesh.Mesh:
+        """The body mesh."""
+        return self.particles.mesh
+
+    @property
+    def shares_nodes(self) -> bool:
+        """Whether neighbours share their nodes."""
+        return self.particles.shares_nodes
+
+    def choose(self, chosen: NDArray[np.bool_]) -> None:
+        """Let others of this rank's nodes of W, ghosts too, be free."""
+        self.chosen = chosen
+
+    def take(self, rows: PointBasis) -> None:
+        """Take the free nodes out of the rows of the background, in place.
+
+        Args:
+            rows: The background basis at the local nodes of W.
+        """
+        free = self.chosen
+        there = (free & rows.found)[:, None]
+        self._beneath = PointBasis(rows.nodes, np.where(there, rows.values, 0.0), rows.found)
+        rows.values[free] = 0.0
+        rows.found[free] = True
+        self._basis = self._T = None
+
+    def leave(self, dead: NDArray[np.bool_]) -> None:
+        """Leave nodes without weight.
+
+        Args:
+            dead: Which local nodes of W belong to deleted domains alone.
+        """
+        self._dead = dead[: len(self.chosen)].copy()
+        self._basis = self._T = None
+
+    @property
+    def beneath(self) -> PointBasis:
+        """What would carry the local free nodes: zero off the background, and where none is."""
+        assert self._beneath is not None
+        return self._beneath
+
+    @property
+    def dofs(self) -> NDArray[np.bool_]:
+        """Whether each of this rank's own dofs of W is free."""
+        dofmap = self.W.dofmap
+        return np.repeat(self.chosen[: dofmap.index_map.size_local], dofmap.index_map_bs)
+
+    @property
+    def node_basis(self) -> PointBasis:
+        """The rows of T at the local nodes of W: one entry each, zero where a node is carried."""
+        if self._basis is None:
+            weights = np.where(self.chosen & ~self._dead, 1.0, 0.0)[:, None]
+            found = np.ones(len(weights), dtype=bool)
+            self._basis = PointBasis(self._nodes[:, None].copy(), weights, found)
+        return self._basis
+
+    @property
+    def T(self) -> PETSc.Mat:
+        """All dofs of W by the same (collective)."""
+        if self._T is None:
+            self._T = transfer_matrix(self.node_basis, self.W, self.W)
+        return self._T
+
+    def roll_back(self) -> None:
+        """Return to no increment."""
+        self.increment.x.array[:] = 0.0
+
+
+def chosen_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.bool_]:
+    """Return which of this rank's nodes of W, ghosts too, are chosen (collective).
+
+    Args:
+        W: Space on the body mesh.
+        where: A function of undeformed coordinates, shape ``(3, n)``, such as ``mpm.region(...)``;
+            a pair of cell tags and a tag, or a list of tags: all nodes of these cells; or local
+            nodes of W, of which there may be none.
+
+    Raises:
+        MPMError: Something else, or a place where no node is.
+    """
+    layout = W.dofmap.index_map
+    marks = la.vector(layout, 1, dtype=np.float64)
+    with agree(W.mesh.comm):
+        marks.array[_local_nodes(W, where)] = 1.0
+    marks.scatter_reverse(la.InsertMode.add)
+    own = marks.array[: layout.size_local]
+    own[:] = own > 0.0
+    marks.scatter_forward()
+    chosen = np.asarray(marks.array > 0.5)
+    if not _is_listed(where) and not W.mesh.comm.allreduce(int(own.sum())):
+        raise MPMError("No node of the body is where free= asks for nodes of their own.")
+    return chosen
+
+
+def _is_listed(where: Any) -> bool:
+    """Return whether nodes are given one by one."""
+    try:
+        given = np.asarray(where)
+    except ValueError:
+        return False
+    return given.ndim == 1 and (given.size == 0 or given.dtype.kind in "iu")
+
+
+def _local_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.integer[Any]]:
+    """Return local nodes of W."""
+    layout = W.dofmap.index_map
+    count = layout.size_local + layout.num_ghosts
+    if callable(where):
+        x = W.tabulate_dof_coordinates()[:count].T
+        try:
+            inside = np.asarray(where(x), dtype=bool)
+        except Exception as error:
+            raise as_ours(error, "The function free=") from error
+        if inside.shape != (count,):
+            raise MPMError(
+                f"The function free= must return a bool for each of n points (3, n), shape (n,), "
+                f"not {inside.shape}."
+            )
+        inside[layout.size_local :] = False  # whose owners know
+        return np.flatnonzero(inside)
+    if _is_listed(where):
+        nodes = np.asarray(where, dtype=np.int64)
+        if len(nodes) and (nodes.min() < 0 or nodes.max() >= count):
+            raise MPMError(f"free= has nodes that are none of the {count} local ones of W.")
+        return nodes
+    if not (isinstance(where, tuple) and len(where) == 2 and isinstance(where[0], mesh.MeshTags)):
+        raise MPMError(
+            "free= is a function of coordinates such as mpm.region(...), (cell tags, tag), or a "
+            f"list of local nodes of W, not {where!r}."
+        )
+    tags, wanted = where
+    body = W.mesh
+    if tags.dim != body.topology.dim or not _compat.are_tags_of(tags, body):
+        raise MPMError("The tags in free=(tags, tag) must be those of cells of the body mesh.")
+    values = np.atleast_1d(np.asarray(wanted))
+    if values.dtype.kind not in "iu":
+        raise MPMError(
+            f"The tag in free=(tags, tag) is a whole number, or several, not {wanted!r}."
+        )
+    cells = tags.indices[np.isin(tags.values, values)]
+    return np.unique(W.dofmap.list[cells])

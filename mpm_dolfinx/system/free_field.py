@@ -1,0 +1,214 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Unknowns of free nodes, beside those of the background that carries the rest of their body."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import override
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from ..assembly.fused import Restriction
+from ..errors import MPMError, agree
+from ..parallel.totals import over_ranks
+from ..particles.field import CarriedField
+from ..particles.free import FreeNodes
+from ..particles.particles import Particles
+from ..transfer.matrix import transfer_matrix
+from ..transfer.touched import JointNodes, joined_rows
+from .field import Field
+from .hierarchy import FieldDofs
+
+__all__ = ["FreeField", "Subspace"]
+
+
+class FreeField(Field):
+    """The free nodes of a body as a field: its space is W, its unknowns are their dofs.
+
+    A component of a free node that the background would carry by held dofs alone follows these, as
+    a carried one does, and what holds it counts as a reaction of theirs. All calls are collective.
+
+    Args:
+        nodes: The free nodes.
+        host: The background space that carries the other nodes.
+        conditions: Dirichlet conditions, of which those on W count.
+
+    Attributes:
+        nodes: As given.
+        host: As given.
+
+    Raises:
+        MPMError: A condition on W holds nodes that are carried.
+    """
+
+    def __init__(
+        self, nodes: FreeNodes, host: Field, conditions: Sequence[fem.DirichletBC] = ()
+    ) -> None:
+        super().__init__([nodes], conditions)
+        self.nodes, self.host = nodes, host
+        self._beneath: PETSc.Mat | None = None
+        self._followers = np.zeros(self._owned, dtype=bool)
+        self._held()
+
+    @override
+    def begin(self, change: NDArray[np.float64], before: NDArray[np.float64] | None = None) -> None:
+        super().begin(change, before)
+        self.prescribes = self.prescribes or self.host.prescribes
+
+    @override
+    def _held(self) -> NDArray[np.bool_]:
+        fixed = super()._held()
+        carried = fixed & ~self.nodes.dofs
+        with agree(self._comm):
+            if carried.any():
+                node = int(np.flatnonzero(carried)[0]) // self._bs
+                where = self.V.tabulate_dof_coordinates()[node, : self.V.mesh.geometry.dim]
+                raise MPMError(
+                    "A Dirichlet condition on particles.W holds carried nodes, e.g. at "
+                    f"{tuple(float(f'{x:.6g}') for x in where)}; hold them by conditions on V or a "
+                    "support, or make them free."
+                )
+        return fixed
+
+    @override
+    def held_now(self) -> NDArray[np.bool_]:
+        fixed, held = self._held(), self.host.held_now()
+        self._followers = np.zeros(self._owned, dtype=bool)
+        self._beneath = None
+        if not over_ranks(self._comm, bool(held.any()), MPI.LOR):
+            return fixed
+        self.nodes.particles.locate()
+        rows = self.nodes.beneath
+        sizes = transfer_matrix(rows._replace(values=np.abs(rows.values)), self.V, self.host.V)
+        whole, loose = (sizes.createVecLeft() for _ in range(2))
+        weights = sizes.createVecRight()
+        weights.set(1.0)
+        sizes.mult(weights, whole)
+        weights.array_w[held] = 0.0
+        sizes.mult(weights, loose)
+        self._followers = (whole.array_r > 0.0) & (loose.array_r == 0.0) & ~fixed
+        if over_ranks(self._comm, bool(self._followers.any()), MPI.LOR):
+            self._beneath = transfer_matrix(rows, self.V, self.host.V)
+        return fixed | self._followers
+
+    @override
+    def _lifts(self) -> NDArray[np.float64]:
+        lifts = super()._lifts()
+        if self._beneath is not None:
+            given, taken = self._beneath.createVecs()
+            given.array_w[:] = self.host.changes()
+            self._beneath.mult(given, taken)
+            lifts[self._followers] = taken.array_r[self._followers]
+        return lifts
+
+    def add_followed(self, forces: PETSc.Vec) -> bool:
+        """Add the last forces on what follows held dofs of the background to those on these.
+
+        Args:
+            forces: On all dofs of the host's V.
+
+        Returns:
+            Whether anything follows them.
+        """
+        if self._beneath is None:
+            return False
+        own = self._beneath.createVecLeft()
+        own.array_w[self._followers] = self.force.array_r[self._followers]
+        self._beneath.multTransposeAdd(own, forces, forces)
+        return True
+
+
+class Subspace:
+    """A background space and the free nodes of its bodies, in which these move together.
+
+    Args:
+        fields: The field of the background, then those of free nodes, in the order of all fields.
+
+    Attributes:
+        fields: As given.
+        host: The first of them.
+    """
+
+    def __init__(self, fields: Sequence[Field]) -> None:
+        self.fields = list(fields)
+        self.host = fields[0]
+
+    @staticmethod
+    def all_of(fields: Sequence[Field]) -> list[Subspace]:
+        """Return the subspaces that fields make up, in their order."""
+        found: list[list[Field]] = []
+        for field in fields:
+            if isinstance(field, FreeField):
+                next(group for group in found if group[0] is field.host).append(field)
+            else:
+                found.append([field])
+        return [Subspace(group) for group in found]
+
+    @property
+    def extends(self) -> bool:
+        """Whether dofs follow others."""
+        return self.host.extends
+
+    @property
+    def prescribes(self) -> bool:
+        """Whether Dirichlet values change in the step that has begun."""
+        return any(field.prescribes for field in self.fields)
+
+    def restriction(
+        self, bodies: Sequence[Particles | CarriedField]
+    ) -> tuple[Restriction, tuple[int, int]]:
+        """Return where a tangent goes that is reduced by rows of T of bodies, and its size."""
+        host, free = self.host, self.fields[1:]
+        found, sizes = host.restriction([host.rows_of(body) for body in bodies])
+        if not free:
+            return found, sizes
+        starts = np.cumsum([0, *(field.touched.count for field in self.fields)]).tolist()
+        rows = []
+        for body, carried in zip(bodies, found.rows, strict=True):
+            number = next(
+                (n for n, field in enumerate(free) if field.motions[0].particles is body), None
+            )
+            if number is None:
+                rows.append(carried)
+            else:
+                both = [carried, free[number].rows_of(body)]
+                rows.append(joined_rows(both, [0, starts[1 + number]]))
+        others = [field.restriction([])[0] for field in free]
+        joint = found._replace(
+            touched=JointNodes([field.touched for field in self.fields]),
+            rows=rows,
+            numbers=np.concatenate([found.numbers, *(other.numbers for other in others)]),
+            part=slice(found.part.start, others[-1].part.stop),
+        )
+        return joint, sizes
+
+    def level(self) -> FieldDofs:
+        """Return this rank's unknowns as the finest level of multigrid, of the host's boxes."""
+        levels = [field.level() for field in self.fields]
+        if len(levels) == 1:
+            return levels[0]
+        numbers, points, components = (
+            np.concatenate([getattr(level, name) for level in levels])
+            for name in ("numbers", "points", "components")
+        )
+        return FieldDofs(numbers, points, components, levels[0].lines, levels[0].bs)
+
+    def increment(self) -> NDArray[np.float64]:
+        """Return the last increment on this rank's own dofs of all fields, one after the other."""
+        return np.concatenate([field.u.array_r for field in self.fields])
+
+    def split(self, values: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Return values on the own dofs of all fields by field."""
+        ends = np.cumsum([field.u.getLocalSize() for field in self.fields])
+        return np.split(values, ends[:-1])
+
+    def resultant(self) -> float:
+        """Return the size of the sum of the last residual over the free dofs."""
+        return float(np.linalg.norm(np.sum([field.resultant() for field in self.fields], axis=0)))
