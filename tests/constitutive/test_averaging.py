@@ -351,3 +351,5 @@ def test_energy_of_deviations_has_the_derivatives_that_act(kind):
     np.testing.assert_allclose((ends[2] - ends[0]) / (2.0 * step), force, atol=1e-7)
     np.testing.assert_allclose((ends[2] - 2.0 * ends[1] + ends[0]) / step**2, slope, atol=1e-6)
     assert np.all(ends[1][np.abs(d) <= free] == 0.0)
+    below, above = deviation_energy(np.array([whole - 1e-9, whole + 1e-9]), free, whole)
+    assert above == pytest.approx(below, abs=1e-8)

@@ -346,3 +346,21 @@ def test_ties_that_cannot_be():
     R = ufl.inner(ufl.grad(left.displacement), ufl.grad(ufl.TestFunction(left.W))) * left.dx
     with pytest.raises(mpm.MPMError, match="terms must be a list"):
         mpm.ParticleProblem(R, left, terms=tie)
+
+
+@pytest.mark.parametrize("n", [3, 6])
+def test_a_face_counts_once_on_any_number_of_ranks(n):
+    lower, upper = (
+        mpm.Particles(
+            scenes.box([0.0, y], [1.0, y + 1.0], [n, n], QUADRILATERAL),
+            scenes.vectors(scenes.box([-0.5, y - 0.5], [1.5, y + 1.5], [4, 4], QUADRILATERAL)),
+        )
+        for y in (0.0, 1.0)
+    )
+    # (also of ghosts)
+    tags = mpm.facet_tags(lower.mesh, {1: mpm.region(y=1.0)}, interior=True)
+    K = mpm.Tie(lower, upper, tags, 1, 3.0).tangents()[0, 0]
+    motion, force = K.createVecs()
+    motion.set(1.0)
+    K.mult(motion, force)
+    assert motion.dot(force) == pytest.approx(2 * 3.0)
