@@ -9,6 +9,8 @@ body half as wide; `--offset` moves the background by so many of its cells.
 The energy of the load tells the error, as nothing else does work: for linear elasticity the energy
 norm of the error is `sqrt(W - W_h)`, where the limit W is extrapolated from finite elements of
 degree 2 on three meshes.
+
+With `--adapt SHARE` so many of the body's nodes are freed once, those that the estimate names.
 """
 
 from mpi4py import MPI
@@ -20,12 +22,14 @@ import ufl
 from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.problems.errors import estimated
 
 parser = kit.Parser("L-shaped elastic body: the error, and its estimate.")
 parser.add_argument("--cells", type=kit.whole, default=8, help="background cells a unit length")
 parser.add_argument("--offset", type=float, default=0.0, help="of the background, in cells")
 parser.add_argument("--space", type=int, choices=(2, 3), default=2, help="dimensions")
 parser.add_argument("--steps", type=kit.whole, default=1, help="load steps")
+parser.add_argument("--adapt", type=kit.positive, help="share of the body's nodes to be freed")
 parser.add_order()
 args = parser.parse()
 
@@ -70,7 +74,17 @@ def solved(
         supports = [mpm.boundary.fixed(body, tags, 1)]
         problem = mpm.QuasiStaticProblem(given, supports=supports, solver=how)
     problem.solve(args.steps)
+    if body.free_nodes is not None:
+        body.free = worst_nodes(problem, args.adapt)
+        problem.step()
     return problem, work(problem, tags)
+
+
+def worst_nodes(problem: mpm.QuasiStaticProblem, share: float) -> np.ndarray:
+    """This rank's own nodes among those with a share of the body's that the background errs at."""
+    errors = estimated(problem.bodies, problem.body_terms, problem.reduced).nodal[0]
+    every = np.sort(np.concatenate(comm.allgather(errors)))
+    return np.flatnonzero(errors >= every[-max(1, round(share * len(every)))])
 
 
 # The limit, by finite elements of degree 2.
@@ -93,11 +107,13 @@ numbers: dict = {"unknowns": None, "error": None, "estimate": None, "error_all_f
 history = mpm.History()
 try:
     problem, found = solved(2 * args.cells, V, order)
-    history = problem.history
-    unknowns = int(history.statistics["free_dofs"])
+    history, carried = problem.history, problem
+    if args.adapt is not None:
+        problem, found = solved(2 * args.cells, V, {**order, "free": []})
+        history = problem.history
     numbers |= {
-        "unknowns": unknowns,
-        "unknowns_carried": unknowns,
+        "unknowns": int(history.statistics["free_dofs"]),
+        "unknowns_carried": int(carried.history.statistics["free_dofs"]),
         "error": float(np.sqrt(1.0 - found / limit)),
         "estimate": problem.error(),
         "error_all_free": float(np.sqrt(1.0 - solved(2 * args.cells, None, order)[1] / limit)),

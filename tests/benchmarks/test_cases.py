@@ -41,6 +41,11 @@ RUNS = {
         {"error": 3e-4, "iterations": 140, "cutbacks": 0},
     ),
     "wall": ("wall", "", {"iterations": 1}),
+    "lshape-adapt": (
+        "lshape",
+        "--cells 8 --offset 0.37 --degree 2 --adapt 0.02",
+        {"error": 0.0585, "error_all_free": 0.0585, "unknowns": 2070, "iterations": 2},
+    ),
     "wall-degree-1": ("wall", "--degree 1", {"iterations": 1}),
     "consolidation": (
         "consolidation",
