@@ -109,7 +109,7 @@ class FreeNodes:
 
     @property
     def beneath(self) -> PointBasis:
-        """What would carry the local free nodes: zero off the background, and where none is."""
+        """The rows that the local free nodes would have: zero off the background, and of others."""
         assert self._beneath is not None
         return self._beneath
 

@@ -464,11 +464,12 @@ class ReducedSystem:
         return None
 
     def followed(self) -> list[NDArray[np.float64] | None]:
-        """Return what the last :attr:`forces` leave out at supports (collective).
+        """Return the forces on free nodes that follow held dofs, as forces on these (collective).
+
+        The last :attr:`forces` leave them out.
 
         Returns:
-            For each field the forces on free nodes that follow its held dofs, counted as forces on
-            these, on own dofs of V; ``None`` where nothing follows them.
+            For each field on own dofs of V; ``None`` where nothing follows its held dofs.
         """
         found: list[NDArray[np.float64] | None] = []
         for field in self.fields:

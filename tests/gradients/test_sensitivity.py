@@ -6,6 +6,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+import scenes
 from gradients.runs import (
     LOADS,
     VON_MISES,
@@ -306,3 +307,14 @@ def test_problems_that_are_not_followed(kind):
     scene = Slump(von_mises, VON_MISES, **options)
     with pytest.raises(mpm.MPMError, match="A Sensitivity"):
         mpm.Sensitivity(scene.problem, [scene.named["young"]])
+
+
+def test_free_nodes_are_not_followed():
+    body = scenes.unit(2, scenes.QUADRILATERAL)
+    V = scenes.vectors(scenes.box([-0.5, -0.5], [1.5, 1.5], [4, 4], scenes.QUADRILATERAL))
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(mpm.Particles(body, V, free=[]), materials.Hencky(1e3, 0.3)),
+        bcs=[mpm.held(V, y=0.0)],
+    )
+    with pytest.raises(mpm.MPMError, match="does not follow bodies with free nodes"):
+        mpm.Sensitivity(problem, [(problem.points[0].given[0], "young")])
