@@ -38,6 +38,7 @@ __all__ = [
     "one_for_each",
     "require_background_fields",
     "require_entity_maps",
+    "require_no_conditions_on_bodies",
     "require_own_fields",
     "residuals_of",
 ]
@@ -368,6 +369,21 @@ def as_conditions(bcs: Any, spaces: Sequence[fem.FunctionSpace]) -> list[fem.Dir
             "or on a component of it (V.sub(i)); one on W can hold free nodes alone."
         )
     return list(bcs)
+
+
+def require_no_conditions_on_bodies(
+    bcs: Sequence[fem.DirichletBC], bodies: Sequence[Particles], consequence: str
+) -> None:
+    """Raise an error where conditions hold free nodes of bodies that are to have other meshes.
+
+    Args:
+        bcs: Dirichlet conditions.
+        bodies: The bodies.
+        consequence: Says what cannot be.
+    """
+    free = [body.W for body in bodies if body.free_nodes is not None]
+    if any(_compat.is_condition_on(bc, W) for bc in bcs for W in free):
+        raise MPMError(f"Dirichlet conditions on W lie on the present body mesh, so {consequence}.")
 
 
 def carried(particles: Particles, assignment: Any) -> Any:

@@ -35,7 +35,7 @@ from ..system.pressure import PressureTerm
 from ..system.smoothing import PressureSmoothing
 from ..system.term import Term
 from ..system.values import FieldTerm
-from .arguments import as_bodies, as_supports, as_terms
+from .arguments import as_bodies, as_supports, as_terms, require_no_conditions_on_bodies
 from .body import INITIAL, Body, as_given
 from .initial_stress import initial_stress_at_points
 from .particle_problem import Law, ParticleProblem
@@ -523,6 +523,7 @@ class QuasiStaticProblem(ParticleProblem):
         if not is_number(threshold) or not 0.0 <= threshold <= 1.0:
             raise MPMError(f"threshold must be a share from 0 to 1, not {threshold!r}.")
         self.setup.require_movable()
+        require_no_conditions_on_bodies(self.bcs, self.bodies, "the particles cannot move")
         ranks = [body.ranks_of_background() for body in self.bodies]
         leaving = sum(int(np.count_nonzero(r != self._comm.rank)) for r in ranks)
         share = self._comm.allreduce(leaving) / sum(body.num_global for body in self.bodies)

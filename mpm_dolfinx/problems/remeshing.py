@@ -19,6 +19,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dolfinx import fem
+
 from .. import _compat
 from ..errors import MPMError, agree
 from ..history import History
@@ -28,6 +30,7 @@ from ..parallel.exchange import RowExchange
 from ..particles.options import validate_distortion
 from ..particles.particles import Particles
 from ..particles.reference import Reference
+from .arguments import require_no_conditions_on_bodies
 from .setup import Setup
 
 __all__ = ["Remeshable", "Remeshing", "as_indices"]
@@ -43,11 +46,13 @@ class Remeshable(Protocol):
 
     Attributes:
         bodies: The bodies.
+        bcs: Dirichlet conditions.
         history: What was computed.
         setup: What the user has given.
     """
 
     bodies: list[Particles]
+    bcs: list[fem.DirichletBC]
     history: History
     setup: Setup
 
@@ -266,6 +271,7 @@ class Remeshing:
         for given in setup.bodies:
             given.require_movable_nodes(consequence)
         setup.require_no_supports(consequence)
+        require_no_conditions_on_bodies(problem.bcs, problem.bodies, consequence)
         for term in setup.terms:
             term.require_remeshable(consequence)
         for body in problem.bodies:

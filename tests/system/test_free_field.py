@@ -265,6 +265,15 @@ def test_conditions_on_carried_nodes_are_refused():
         problem.solve(1)
 
 
+def test_conditions_on_free_nodes_do_not_follow_to_another_mesh():
+    own = mpm.Particles(body_in(QUADRILATERAL), around(), free=right)
+    hold = scenes.fix(own.W, at(0, 1.0))
+    problem = mpm.QuasiStaticProblem(mpm.Body(own, Hencky(YOUNG, POISSON)), bcs=[hold])
+    for move in (problem.repartition, problem.rebase):
+        with pytest.raises(mpm.MPMError, match="conditions on W lie on the present body mesh"):
+            move()
+
+
 def test_dofs_that_follow_others_are_refused_beside_free_nodes():
     own = mpm.Particles(body_in(QUADRILATERAL), around(), free=right)
     with pytest.raises(mpm.MPMError, match="'ghost' or 'auto' with free nodes"):
