@@ -178,6 +178,13 @@ class Domains:
             shapes, slopes, weights = self.fine
             turn = 2.0 * np.pi * np.einsum("qk,nk->nq", shapes, r)
             self.fine = shapes, slopes, weights * turn
+            if len(self.shapes) == 1 and len(basix.geometry(cell)) == 4:
+                # a quadrilateral's one point has means over the volume around the axis
+                whole = self.fine[2].sum(axis=1)
+                mean = np.einsum("nq,nqki->nki", self.fine[2], slopes) / whole[:, None, None]
+                around = np.einsum("nq,qk->nk", 2.0 * np.pi * weights, shapes) / whole[:, None]
+                self.slopes, self.hoop = mean[:, None], around[:, None]
+                self.weights = whole[:, None]
         self.turned = self.fine[2].sum()
 
     def _at(self, element, points, weights):
