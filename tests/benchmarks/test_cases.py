@@ -269,6 +269,11 @@ RUNS = {
         {"difference": 1e-9, "iterations": 12, "cutbacks": 0},
     ),
     "lshape": ("lshape", "--offset 0.37", {"error": 0.21, "estimate": 0.21, "iterations": 1}),
+    "gradient": (
+        "gradient",
+        "--parameters 2 --steps 4",
+        {"difference": 1e-6, "trend": 0.02, "cutbacks": 0},
+    ),
     "column": ("column_dynamic", "--time 0.4", {"cutbacks": 0, "balance_error": 1e-12}),
 }
 #: Cases that go through time, whose load is that.
@@ -310,6 +315,7 @@ KEYS = {
     "hertz": {"force", "error_force", "error_radius", "error_pressure", "error_most"},
     "free_body": {"difference", "seconds_ratio", "unknowns"},
     "lshape": {"error", "estimate", "unknowns", "error_all_free", "unknowns_carried"},
+    "gradient": {"taylor", "difference", "trend", "seconds_ratio"},
     "snap_through": {"limit", "valley", "crown", "error"},
     "wall": {"head", "reference", "error", "unknowns", "unknowns_carried"},
 }
@@ -341,7 +347,7 @@ def test_numbers(case, capfd):
     numbers = json.loads(out)
     assert COMMON | KEYS[name] <= numbers.keys()
     timed = {key for key in numbers if "time" in key or "seconds" in key}
-    assert timed == ({"seconds_ratio"} if name == "free_body" else set())
+    assert timed == ({"seconds_ratio"} if name in ("free_body", "gradient") else set())
     assert numbers["completed"] == 1 and numbers["failure"] is None
     assert numbers["load"] == 1.0 or name in {"snap_through", "expansion", *IN_TIME}
     assert (numbers["iterations"] > 0) == (name != "domain_distortion")  # there all is prescribed
@@ -357,6 +363,8 @@ def test_numbers(case, capfd):
         assert abs(numbers["height"] - 1.2) < 1e-3
     if name in ("strength", "footing", "penetration") and numbers.get("ratio"):
         assert numbers["ratio"] > 0.9
+    if name == "gradient":
+        assert abs(numbers["taylor"] - 2.0) < 0.05
     if name == "sand_column":
         assert numbers["ratio"] > 0.85
     if name in ("compaction", "column_roller") and "--elements 8" in arguments:
