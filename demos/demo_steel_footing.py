@@ -48,32 +48,22 @@ def rectangle(lower, upper, n):
 # heave, and the block on it. The cells are a little higher than two domains, so that no line of
 # the background lies on the clay's surface.
 
-room = 6  # cells
-rows = round(depth / h) + room
-columns = round(width / h)
-bottom = -depth
-background = rectangle([0.0, bottom], [width, bottom + 1.0125 * rows * h], [columns, rows])
+columns, rows, room = round(width / h), round(depth / h), 6
+top = 1.0125 * h * (rows + room) - depth
+background = rectangle([0.0, -depth], [width, top], [columns, rows + room])
 V = fem.functionspace(background, ("Lagrange", 1, (2,)))
-ground = rectangle([0.0, -depth], [width, 0.0], [2 * columns, 2 * round(depth / h)])
+ground = rectangle([0.0, -depth], [width, 0.0], [2 * columns, 2 * rows])
 clay = mpm.Particles(ground, V, quadrature_degree=2)
 steel = mpm.Particles(rectangle([0.0, 0.0], [b, 0.5], [5, 5]))  # finite elements
 
 # Conditions of the clay are on the background, those of the block on its own space.
 
 down = mpm.held(steel.W, value=(0.0, -settlement), y=0.5)
-bcs = [
-    mpm.held(V, 0, x=0.0),
-    mpm.held(V, 0, x=width),
-    mpm.held(V, y=bottom),
-    down,
-]
+bcs = [mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=width), mpm.held(V, y=-depth), down]
 soil = mpm.materials.VonMises(young, 0.49, rho_y=np.sqrt(2.0) * cohesion)
 problem = mpm.QuasiStaticProblem(
-    [
-        mpm.Body(clay, soil, f_bar="patch"),
-        mpm.Body(steel, mpm.materials.Hencky(2e8, 0.3)),
-    ],
-    bcs=bcs,
+    [mpm.Body(clay, soil, f_bar="patch"), mpm.Body(steel, mpm.materials.Hencky(2e8, 0.3))],
+    bcs,
     terms=[mpm.contact.Pair(steel, clay, friction=0.3)],
 )
 
