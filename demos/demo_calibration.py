@@ -44,7 +44,7 @@ rollers = [mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=5.0), mpm.held(V, 1, y=-3.0)]
 
 
 def settlements(values):
-    """Settlements at all loads of one run, and their derivatives by the values."""
+    """Settlements of one run at all loads, and their derivatives."""
     clay = mesh.create_rectangle(comm, [[0.0, -3.0], [5.0, 0.0]], [40, 24], quadrilateral)
     particles = mpm.Particles(clay, V, quadrature_degree=2)
     strip = mpm.facet_tags(clay, {1: lambda x: np.isclose(x[1], 0.0) & (x[0] < 1.0 + 1e-9)})
