@@ -142,7 +142,7 @@ try:
         difference = (ends[0] - ends[1]) / 4e-6
         gaps.append(size(slope - difference) / size(difference))
 
-    changes, left = (8e-5, 4e-5), []
+    changes, left = (4e-6, 2e-6), []  # below most kinks, above round-off
     for change in changes:
         other = solved(dict.fromkeys(given, change))
         left.append(size(other - end - change * sum(slopes.values())))
