@@ -1,10 +1,10 @@
 // Copyright (C) 2026 the mpm-dolfinx authors
 // SPDX-License-Identifier: LGPL-3.0-or-later
 //
-// Hencky elasticity and laws of plasticity in logarithmic strain, point by point.
+// Elasticity and laws of plasticity in logarithmic strain, point by point.
 //
-// The same algorithms as mpm_dolfinx.materials (kinematics, von_mises, mohr_coulomb,
-// drucker_prager, mu_i, cam_clay), which are their oracles. All are isotropic, so stress and strain
+// The same algorithms as mpm_dolfinx.materials (kinematics, neo_hooke, von_mises,
+// mohr_coulomb, drucker_prager, mu_i, cam_clay), which are their oracles. All are isotropic, so stress and strain
 // share the axes of the trial elastic b, and tangents have 8 (plane) or 21 (space) entries other
 // than zero in that frame.
 
@@ -171,6 +171,31 @@ struct Hencky
   void operator()(const std::array<double, 3>& strain, double, Response& r) const
   {
     answer_elastic(strain, bulk, shear, r);
+  }
+};
+
+// tau = G (b - 1) + lambda ln J; see mpm_dolfinx.materials.neo_hooke.
+struct NeoHooke
+{
+  double lame, shear;
+  explicit NeoHooke(const double* p) : lame(p[0]), shear(p[1]) {}
+
+  void operator()(const std::array<double, 3>& strain, double, Response& r) const
+  {
+    const double sum = lame * (strain[0] + strain[1] + strain[2]);
+    r.plastic = false;
+    r.elastic_strain = strain;
+    for (int a = 0; a < 3; ++a)
+    {
+      r.stress[a] = sum + shear * std::expm1(2.0 * strain[a]);
+      for (int b = 0; b < 3; ++b)
+      {
+        const double gap = strain[a] - strain[b];
+        const double mean = 2.0 * shear * std::exp(strain[a] + strain[b]);
+        r.shear[a][b] = mean * (gap == 0.0 ? 1.0 : std::sinh(gap) / gap);
+        r.normal[a][b] = lame + (a == b ? mean : 0.0);
+      }
+    }
   }
 };
 
@@ -1054,6 +1079,8 @@ HOT_LOOP std::vector<std::int64_t> core::update_logarithmic(const Update& update
 {
   switch (update.law)
   {
+  case Law::neo_hooke:
+    return update_all<NeoHooke>(update, dim);
   case Law::von_mises:
     return update_all<VonMises>(update, dim);
   case Law::mohr_coulomb:

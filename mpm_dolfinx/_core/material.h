@@ -19,6 +19,7 @@ struct Parameter
 
 enum class Law {
   hencky,         // bulk, shear
+  neo_hooke,      // Lame's first constant, shear
   von_mises,      // bulk, shear, rho_y, hardening
   mohr_coulomb,   // bulk, shear, sin(phi), sin(psi), 2 c cos(phi), cut-off, volume correction
   drucker_prager, // bulk, shear, eta, eta_psi, xi c, largest mean stress, volume correction
@@ -35,6 +36,7 @@ constexpr std::size_t num_parameters(Law law)
   switch (law)
   {
   case Law::hencky:
+  case Law::neo_hooke:
     return 2;
   case Law::von_mises:
     return 4;
@@ -48,7 +50,7 @@ constexpr std::size_t num_parameters(Law law)
 }
 constexpr std::size_t num_variables(Law law)
 {
-  return law == Law::hencky ? 0 : law == Law::cam_clay ? 2 : 1;
+  return law <= Law::neo_hooke ? 0 : law == Law::cam_clay ? 2 : 1;
 }
 
 // What takes the place of the mean stress at each point, and what comes of it: a pressure, the

@@ -230,6 +230,8 @@ Law law_of(const std::string& name)
 {
   if (name == "hencky")
     return Law::hencky;
+  if (name == "neo_hooke")
+    return Law::neo_hooke;
   if (name == "cam_clay")
     return Law::cam_clay;
   if (name == "von_mises")
@@ -550,22 +552,25 @@ NB_MODULE(_loops, m)
         "gradients"_a, "transfers"_a, "offsets"_a, "positions"_a, "values"_a.noconvert(),
         "Add the reduced element tensors of a compiled form on cells or (cell, local facet).");
 
-  m.def("update_hencky",
-        [](Reals gradient, Reals bulk, Reals shear, RealsOut P, RealsOut A, RealsOut stress) {
+  m.def("update_elastic",
+        [](const std::string& law, Reals gradient, const std::vector<Reals>& parameters, RealsOut P,
+           RealsOut A, RealsOut stress) {
     require(gradient.ndim() == 3, "displacement gradients (n, dim, dim)");
     Update u{};
-    u.law = Law::hencky;
+    u.law = law_of(law);
+    require(num_variables(u.law) == 0 && parameters.size() == num_parameters(u.law),
+            "an elastic law and its parameters");
     u.count = gradient.shape(0);
     u.gradient = gradient.data();
-    u.parameters[0] = parameter_of(bulk, u.count);
-    u.parameters[1] = parameter_of(shear, u.count);
+    for (std::size_t k = 0; k < parameters.size(); ++k)
+      u.parameters[k] = parameter_of(parameters[k], u.count);
     u.P = P.data();
     u.A = A.size() > 0 ? A.data() : nullptr;
     u.stress = stress.data();
     return to_numpy(update_logarithmic(u, static_cast<int>(gradient.shape(2))));
-  }, "gradient"_a, "bulk"_a, "shear"_a, "P"_a.noconvert(), "A"_a.noconvert(),
+  }, "law"_a, "gradient"_a, "parameters"_a, "P"_a.noconvert(), "A"_a.noconvert(),
         "stress"_a.noconvert(),
-        "Update Hencky's law; return the points whose domains are inverted.");
+        "Update an elastic law; return the points whose domains are inverted.");
 
   m.def("update_plastic",
         [](const std::string& law, Reals gradient, Reals old_gradient, Reals old_c,

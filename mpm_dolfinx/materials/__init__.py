@@ -19,6 +19,7 @@ from .drucker_prager import DruckerPrager
 from .elastic import Hencky, IsotropicElastic, LinearElastic
 from .mohr_coulomb import FrictionalMaterial, MohrCoulomb, Tresca
 from .mu_i import MuIRheology
+from .neo_hooke import NeoHooke
 from .return_mapping import ReturnMapping
 from .von_mises import SmallStrainVonMises, VonMises
 
@@ -33,6 +34,7 @@ __all__ = [
     "ModifiedCamClay",
     "MohrCoulomb",
     "MuIRheology",
+    "NeoHooke",
     "Parameter",
     "ReturnMapping",
     "SmallStrainVonMises",

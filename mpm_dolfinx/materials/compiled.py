@@ -50,7 +50,7 @@ class CompiledMaterial(StrainMaterial):
             new, invalid = self._with_history(loop, parameters, H, state, P, A)
         else:
             new = {"stress": np.empty((n, num_components(dim)))}
-            invalid = loops.update_hencky(H, *parameters, P, A, new["stress"])
+            invalid = loops.update_elastic(loop, H, parameters, P, A, new["stress"])
         valid = np.ones(n, dtype=bool)
         valid[invalid] = False
         require_valid(valid)

@@ -15,10 +15,11 @@ from mpm_dolfinx.constitutive.points import MaterialPoints
 from mpm_dolfinx.constitutive.step_stress import StepStress
 from mpm_dolfinx.constitutive.strain import strain_of
 from mpm_dolfinx.errors import ConvergenceError
-from mpm_dolfinx.materials import Hencky, LinearElastic, ModifiedCamClay, VonMises
+from mpm_dolfinx.materials import Hencky, LinearElastic, ModifiedCamClay, NeoHooke, VonMises
 
 LAWS = {
     "Hencky": Hencky(10.0, 0.3),
+    "neo-Hooke": NeoHooke(10.0, 0.3),
     "von Mises": VonMises(10.0, 0.3, rho_y=0.4),
     "linear": LinearElastic(10.0, 0.3),
 }
@@ -78,6 +79,7 @@ def law_of(name):
 CASES = [
     (TRIANGLE, "Hencky", True, 0.0, False),
     (QUADRILATERAL, "Hencky", True, 0.2, True),
+    (QUADRILATERAL, "neo-Hooke", True, 0.0, False),
     (HEXAHEDRON, "Hencky", True, 0.0, False),
     (QUADRILATERAL, "Hencky", False, 0.2, False),
     (TRIANGLE, "von Mises", True, 0.0, False),
@@ -159,7 +161,7 @@ def test_a_singular_gradient_is_an_error_of_the_step(f_bar):
 
 
 @pytest.mark.parametrize("cell", [TRIANGLE, QUADRILATERAL, HEXAHEDRON])
-@pytest.mark.parametrize("law", ["Hencky", "linear", "strong"])
+@pytest.mark.parametrize("law", ["Hencky", "neo-Hooke", "linear", "strong"])
 def test_the_work_of_an_elastic_body_is_its_energy(cell, law):
     # (the strong one is of a law that yields, and does not)
     _, _, stress, put = stepped(cell, {**LAWS, "strong": VonMises(10.0, 0.3, rho_y=99.0)}[law])

@@ -20,7 +20,8 @@ class Whole(SmallStrainVonMises):
     """A law of small strains that does not say that a pressure can replace its mean stress."""
 
 
-SOILS = {name: law for name, law in LAWS.items() if not name.startswith(("hencky", "perfect"))}
+OTHERS = "hencky", "neo-hooke", "perfect"
+SOILS = {name: law for name, law in LAWS.items() if not name.startswith(OTHERS)}
 SMALL = Whole(1e3, 0.3, yield_stress=2.0, hardening=50.0)
 
 

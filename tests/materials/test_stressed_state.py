@@ -19,6 +19,7 @@ from mpm_dolfinx.materials import (
     Hencky,
     LinearElastic,
     Material,
+    NeoHooke,
     SmallStrainVonMises,
     VonMises,
     check_tangent,
@@ -28,6 +29,7 @@ from mpm_dolfinx.materials import (
 LAWS = {
     "linear": LinearElastic(1e4, 0.3),
     "hencky": Hencky(1e4, 0.3),
+    "neo-hooke": NeoHooke(1e4, 0.3),
     "von mises": VonMises(1e4, 0.3, rho_y=20.0),
     "small von mises": SmallStrainVonMises(1e4, 0.3, rho_y=20.0),
     "return mapping": HessianMises(rho_y=20.0),

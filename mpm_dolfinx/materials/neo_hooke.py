@@ -1,0 +1,149 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""A neo-Hookean solid."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import ClassVar, override
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .base import Field, Integration, Parameter, State, check_parameter, per_row
+from .compiled import CompiledMaterial
+from .mandel import identity, to_tensor, to_vector, trace
+
+__all__ = ["NeoHooke"]
+
+type Array = NDArray[np.float64]
+
+#: Newton steps for the volume of a given stress: far more than any takes.
+MOST = 60
+
+
+class NeoHooke(CompiledMaterial):
+    """Rubber and other soft solids: tau = G (b - I) + lambda ln J I, with b = F F^T.
+
+    The stored energy is G/2 (tr b - 3) - G ln J + lambda/2 (ln J)^2 (Simo & Pister 1984), that of
+    DOLFINx's own demo of hyperelasticity. With ``mixed="pressure"`` it goes to the incompressible
+    limit.
+    """
+
+    symmetric = True
+    limits: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType(
+        {"young": {"above": 0.0}, "poisson": {"least": 0.0, "below": 0.5}}
+    )
+    _loop: ClassVar[str] = "neo_hooke"
+
+    def __init__(self, young: ArrayLike | Field, poisson: ArrayLike | Field) -> None:
+        """Set the elastic constants of small strains.
+
+        Args:
+            young: Young's modulus, in units of stress.
+            poisson: Poisson's ratio. Below 0 the solid would soften without end as it is pressed.
+
+        Raises:
+            MPMError: Not ``young > 0`` or not ``0 <= poisson < 0.5``.
+        """
+        self.parameters = {
+            "young": check_parameter("young", young, **self.limits["young"]),
+            "poisson": check_parameter("poisson", poisson, **self.limits["poisson"]),
+        }
+
+    @property
+    def shear(self) -> Parameter:
+        """Shear modulus G."""
+        return self.parameters["young"] / (2.0 * (1.0 + self.parameters["poisson"]))
+
+    @property
+    def lame(self) -> Parameter:
+        """Lame's first constant lambda."""
+        poisson = self.parameters["poisson"]
+        return self.shear * 2.0 * poisson / (1.0 - 2.0 * poisson)
+
+    @override
+    def _constants(self) -> tuple[Parameter, ...]:
+        return self.lame, self.shear
+
+    @override
+    def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
+        m = trial_strain.shape[1]
+        strains, axes = np.linalg.eigh(to_tensor(trial_strain))
+        stress = per_row(self.shear) * _spectral(np.expm1(2.0 * strains), axes, m)
+        stress[:, :3] += (self.lame * trace(trial_strain))[:, None]
+        D = None
+        if tangent:
+            shear, lame = (np.reshape(p, (-1, 1, 1)) for p in (self.shear, self.lame))
+            D = 2.0 * shear * _slopes(strains, axes, m) + lame * np.outer(identity(m), identity(m))
+        return Integration(stress, D, trial_strain, variables)
+
+    @override
+    def elastic_strain(self, stress: Array) -> Array:
+        tau, axes = np.linalg.eigh(to_tensor(stress))
+        shear, lame = per_row(self.shear), per_row(self.lame)
+        with np.errstate(all="ignore"):
+            strains = _strains(tau / shear, np.broadcast_to(lame / shear, (len(tau), 1)))
+        return _spectral(strains, axes, stress.shape[1])
+
+    def strain_energy(self, state: State) -> Array:
+        """Stored energy per undeformed volume."""
+        strain = self.elastic_strain(state["stress"])
+        volume = trace(strain)
+        growth = np.expm1(2.0 * np.linalg.eigvalsh(to_tensor(strain))).sum(axis=1)
+        return np.asarray(self.shear * (0.5 * growth - volume) + 0.5 * self.lame * volume**2)
+
+
+def _strains(tau: Array, ratio: Array) -> Array:
+    """Logarithmic strains of principal stresses.
+
+    With x = ln J, ``b_a = 1 + tau_a - ratio x``, and x is the root of ``1/2 sum ln b_a = x``. The
+    difference of both sides is concave, so that Newton's method comes down to the root from beyond
+    it; a step out of the interval in which the root must be is halved.
+
+    Args:
+        tau: Stresses over the shear modulus, shape ``(n, 3)``.
+        ratio: lambda/G, shape ``(n, 1)``.
+
+    Returns:
+        Shape ``(n, 3)``; not a number where no strain has this stress.
+    """
+    beyond = 0.5 * np.log1p(np.maximum(tau, 0.0)).sum(axis=1, keepdims=True)
+    end = np.where(ratio > 0.0, (1.0 + tau.min(axis=1, keepdims=True)) / ratio, np.inf)
+    low, high = np.full_like(end, -np.inf), end
+    x = np.where(beyond < end, beyond, end - 0.5 * (1.0 + np.abs(end)))
+    for _ in range(MOST):
+        growth = tau - ratio * x
+        wrong = 0.5 * np.log1p(growth).sum(axis=1, keepdims=True) - x
+        low, high = np.where(wrong > 0.0, x, low), np.where(wrong < 0.0, x, high)
+        after = x + wrong / (1.0 + 0.5 * (ratio / (1.0 + growth)).sum(axis=1, keepdims=True))
+        x = np.where((after >= low) & (after <= high), after, 0.5 * (x + high))
+    return np.asarray(0.5 * np.log1p(tau - ratio * x))
+
+
+def _spectral(values: Array, axes: Array, m: int) -> Array:
+    """Mandel vectors, shape ``(n, m)``, of principal values ``(n, 3)`` and axes ``(n, 3, 3)``."""
+    tensor = np.einsum("nia,na,nja->nij", axes, values, axes)
+    return to_vector(tensor, 2 if m == 4 else 3)
+
+
+def _slopes(strains: Array, axes: Array, m: int) -> Array:
+    """Half the derivative of exp(2 eps) by eps, shape ``(n, m, m)``.
+
+    Args:
+        strains: Principal values of eps, shape ``(n, 3)``.
+        axes: Their directions as columns, shape ``(n, 3, 3)``.
+        m: Number of components.
+    """
+    result = np.zeros((len(strains), m, m))
+    for a in range(3):
+        for b in range(a, 3):
+            pair = np.einsum("ni,nj->nij", axes[:, :, a], axes[:, :, b])
+            scale = 0.5 if a == b else np.sqrt(0.5)
+            vector = to_vector(scale * (pair + pair.swapaxes(1, 2)), 2 if m == 4 else 3)
+            gap = strains[:, a] - strains[:, b]
+            ratio = np.where(gap == 0.0, 1.0, np.sinh(gap) / np.where(gap == 0.0, 1.0, gap))
+            factor = np.exp(strains[:, a] + strains[:, b]) * ratio
+            result += factor[:, None, None] * np.einsum("ni,nj->nij", vector, vector)
+    return result
