@@ -171,7 +171,7 @@ def whole(count: float) -> dict[str, float]:
 
     def step() -> None:
         scene.particles.restore(scene.particles.displacement.x.array.reshape(-1, 2).copy())
-        problem.reduced.forget()
+        problem.reduced.unknowns.forget()
         problem.reduced.begin([np.zeros_like(problem.bodies[0].increment.x.array)], 1.0)
         for _ in range(5):
             problem.body_terms[0].update()

@@ -109,7 +109,7 @@ def tangent(problem: mpm.QuasiStaticProblem) -> dict[str, Any]:
     """Return what multigrid takes for a tangent of the body where it is."""
     change = [np.zeros_like(problem.particles.increment.x.array)]
     problem.reduced.begin(change, 1.0)
-    x = PETSc.Vec().createMPI(problem.reduced.sizes, comm=COMM)
+    x = PETSc.Vec().createMPI(problem.reduced.unknowns.sizes, comm=COMM)
     F = x.duplicate()
     problem.particles.load.value = float(problem.particles.load.value) + 0.25
     problem.reduced.residual(x, F)
@@ -120,7 +120,7 @@ def tangent(problem: mpm.QuasiStaticProblem) -> dict[str, Any]:
 
     def make() -> None:
         if not made:
-            levels = problem.reduced.interpolations(600)
+            levels = problem.reduced.levels.interpolations(600)
             made.append(Multigrid(ksp.getPC(), levels, True))
         ksp.setOperators(K, K)
         made[0].set(K)

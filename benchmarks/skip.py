@@ -50,7 +50,7 @@ def elastic(**options: Any) -> mpm.materials.Material:
 def run(problem: mpm.QuasiStaticProblem, steps: int, rebuild: bool = False) -> None:
     for _ in problem.steps(steps):
         if rebuild:
-            for tangent in problem.reduced.fused:
+            for tangent in problem.reduced.tangent.loops:
                 tangent.forget()
 
 

@@ -82,13 +82,13 @@ def error_of_blocks(problem, step=1e-5, size=1e-3):
     reduced = problem.reduced
     none = [np.zeros(len(field.bodies[0].increment.x.array)) for field in reduced.fields]
     reduced.begin(none, 1.0)
-    x = reduced.restricted(reduced.forces)
+    x = reduced.unknowns.restricted(reduced.unknowns.forces)
     places = np.arange(*x.getOwnershipRange())
     x.array_w[:] = size * np.sin(37.0 * places)
     F, G, direction = x.duplicate(), x.duplicate(), x.duplicate()
     direction.array_w[:] = np.cos(23.0 * places)
     worst = 0.0
-    for moved in reduced.unknowns:
+    for moved in reduced.unknowns.parts:
         along = direction.duplicate()
         along.set(0.0)
         along.array_w[moved] = direction.array_r[moved]
@@ -99,7 +99,7 @@ def error_of_blocks(problem, step=1e-5, size=1e-3):
         reduced.tangent()  # the first one of an attempt has secants where points slip
         product = reduced.tangent() * along
         whole = scenes.largest(product.array_r)
-        for part in reduced.unknowns:
+        for part in reduced.unknowns.parts:
             own = max(scenes.largest(product.array_r[part]), 1e-6 * whole)
             error = scenes.largest(product.array_r[part] - differences.array_r[part])
             worst = max(worst, error / own)

@@ -74,7 +74,7 @@ class StepDerivative:
         self._solve = stepper.newton.linearise()
         self._size = self._reduced.scale()
         self._y = [field.u.copy() for field in self._fields]
-        self._r = self._reduced.last_nodal_forces()
+        self._r = self._reduced.terms.last_nodal_forces()
         self._bases = [body.node_gradients() for body in problem.bodies]
 
     def by(self, parameter: Parameter, rates: Rates) -> Rates:
@@ -96,7 +96,7 @@ class StepDerivative:
             sides = [self._beside(parameter, sign, rates, motion) for sign in (1.0, -1.0)]
             forces = self._forces(parameter, sides)
             self._add_background(forces, held, y_rate)
-            rest = self._reduced.restricted(forces)
+            rest = self._reduced.unknowns.restricted(forces)
             size = norm(rest)
             first = first or size
             small = max(SOLVED * first, NOISE * self._size * CHANGE / parameter.change)
@@ -193,8 +193,8 @@ class StepDerivative:
             self._nearby.go(parameter, sign * parameter.change, rates)
             for body, offset in zip(bodies, offsets, strict=True):
                 body.displacement.x.array[:] += offset
-            self._require(self._reduced.evaluate_forces(), parameter)
-            return [np.array(self._reduced.shear_moduli(self._fields[n])) for n in new]
+            self._require(self._reduced.balance.evaluate(), parameter)
+            return [np.array(self._reduced.terms.shear_moduli(self._fields[n])) for n in new]
 
         pairs = zip(moduli(1.0), moduli(-1.0), strict=True)
         found = [parameter.slope(*pair) for pair in pairs]
@@ -233,9 +233,9 @@ class StepDerivative:
         with ExitStack() as blocks:
             for own in points:
                 blocks.enter_context(own.without_tangents())
-            self._require(self._reduced.evaluate_forces(), parameter)
+            self._require(self._reduced.balance.evaluate(), parameter)
         return _Side(
-            [force.array_r.copy() for force in self._reduced.forces],
+            [force.array_r.copy() for force in self._reduced.unknowns.forces],
             [[varying(state) for state in own.states(trial=True)] for own in points],
             [own.seen_gradient(trial=True) for own in points],
         )
@@ -255,7 +255,7 @@ class StepDerivative:
         """Add to derivatives of forces what does not come of the bodies' motion."""
         for field, force, known, rate in zip(self._fields, forces, held, y_rate, strict=True):
             more = known.copy()
-            field.add_product(rate, more, partial(self._reduced.shear_moduli, field))
+            field.add_product(rate, more, partial(self._reduced.terms.shear_moduli, field))
             field.gather_extended(more)
             force.axpy(1.0, more)
 

@@ -109,7 +109,7 @@ class Nearby:
                 for points, governing in zip(self._points, known, strict=True):
                     points.govern_by(governing)
         if parameter.outside:
-            self._problem.reduced.renew_external()
+            self._problem.reduced.terms.renew_external()
 
     def go(
         self,

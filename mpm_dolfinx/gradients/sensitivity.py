@@ -151,7 +151,7 @@ class Sensitivity:
             step = StepDerivative(self.problem, stepper, self._nearby)
             pairs = zip(self._parameters, rates, strict=True)
             found = [step.by(parameter, one) for parameter, one in pairs]
-        reduced.renew_external()
+        reduced.terms.renew_external()
         assert newton.x is not None and newton.F is not None
         if (failure := reduced.residual(newton.x, newton.F)) is not None:
             raise MPMError(failure.message)

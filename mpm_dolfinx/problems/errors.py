@@ -60,8 +60,9 @@ def estimated(
         terms: What each is made of and loaded by.
         reduced: Their system.
     """
-    forces = reduced.nodal_forces()
-    reduced.evaluate()
+    forces = reduced.terms.nodal_forces()
+    if (failure := reduced.terms.update()) is not None:
+        raise failure
     nodal, own, energy = [], [], 0.0
     for body, term, force in zip(bodies, terms, forces, strict=False):
         field = next(field for field in reduced.fields if any(b is body for b in field.bodies))
@@ -73,7 +74,7 @@ def estimated(
         else:
             own.append(np.zeros(body.num_local))
         energy += _energy(body, term, force)
-    reduced.roll_back()
+    reduced.terms.roll_back()
     return Errors(nodal, own, bodies[0].mesh.comm.allreduce(energy))
 
 

@@ -222,7 +222,7 @@ class Values(Kept):
 
     @override
     def numbers(self) -> dict[str, Any]:
-        return {"units": self._reduced.units}
+        return {"units": [field.unit for field in self._reduced.unknowns.values]}
 
     @override
     def columns(self, body: int | None) -> dict[str, Column]:
@@ -235,7 +235,9 @@ class Values(Kept):
             for one in own:
                 fill(one.field.previous, columns[one.field.name])
                 one.roll_back()
-        self._reduced.units = taken.numbers.get("units") or self._reduced.units
+        fields = self._reduced.unknowns.values
+        for field, unit in zip(fields, taken.numbers.get("units") or (), strict=False):
+            field.unit = unit
 
 
 class Increments(Kept):
@@ -322,7 +324,7 @@ class Past(Kept):
     def numbers(self) -> dict[str, Any]:
         history = self._history
         return {
-            "moduli": self._reduced.moduli,
+            "moduli": self._reduced.unknowns.moduli,
             "steps": [
                 [s.load, s.iterations, s.residuals, s.displacement, s.time, s.output]
                 for s in history.steps
@@ -343,7 +345,7 @@ class Past(Kept):
     @override
     def restore(self, taken: Taken) -> None:
         numbers, history = taken.numbers, self._history
-        self._reduced.moduli = numbers["moduli"]
+        self._reduced.unknowns.moduli = numbers["moduli"]
         history.steps[:] = _steps(numbers["steps"])
         history.cutbacks = numbers["cutbacks"]
         history.failed_iterations = numbers["failed_iterations"]

@@ -83,24 +83,24 @@ class MovingProblem(TimeProblem):
                 term.pace(self.inertia.dt, self.inertia.scheme.share)
 
     def _reduced_masses(self, masses: Masses) -> tuple[list[PETSc.Mat], list[Particles]]:
-        """Return :meth:`ReducedSystem.masses` (collective)."""
-        return self.reduced.masses(masses)
+        """Return :meth:`.Tangent.masses` (collective)."""
+        return self.reduced.tangent.masses(masses)
 
     def _weigh(self, factor: float) -> None:
         """Say how often tangents have the masses that the compiled loops have reduced."""
-        self.reduced.mass_factor = factor
+        self.reduced.tangent.mass_factor = factor
 
     def _works(self) -> NDArray[np.float64]:
         """Return the works of the last increment on the backgrounds (collective)."""
-        return self.reduced.works()
+        return self.reduced.balance.works()
 
     def _changes(self) -> list[NDArray[np.float64]]:
         """Return the changes of Dirichlet values in the step, on own dofs of each background."""
-        return self.reduced.changes()
+        return [field.changes() for field in self.reduced.fields]
 
     def _driven(self, particles: Particles, values: Sequence[NDArray[np.float64]]) -> PETSc.Vec:
         """Return how Dirichlet values move a body (collective)."""
-        return self.reduced.driven(particles, values)
+        return self.reduced.unknowns.driven(particles, values)
 
     def _stored(self) -> tuple[float, float]:
         """Return elastic energy, and the work done against stress in the last step (collective).

@@ -116,7 +116,7 @@ class Given(_Change):
             set(new.changed_from(old))
             for new, old in zip(setup.given, problem.setup.given, strict=True)
         ]
-        self._points, self._moduli = list(problem.points), problem.reduced.moduli
+        self._points, self._moduli = list(problem.points), problem.reduced.unknowns.moduli
 
     @override
     def make(self) -> None:
@@ -134,7 +134,7 @@ class Given(_Change):
                 points.take_over(before)
                 factors[id(body)] = points.shear_modulus() / before.shear_modulus()
         if self._moduli is not None:
-            problem.reduced.moduli = [
+            problem.reduced.unknowns.moduli = [
                 None if modulus is None else modulus * factors.get(id(moved), 1.0)
                 for moved, modulus in zip(problem.reduced.bodies, self._moduli, strict=True)
             ]

@@ -175,16 +175,16 @@ class Staging:
         reduced = self._problem.reduced
         V = [field.V.dofmap for field in reduced.fields]
         none = [np.zeros(m.index_map.size_local * m.index_map_bs) for m in V]
-        self._release.hold(reduced.nodal_forces(), none)
+        self._release.hold(reduced.terms.nodal_forces(), none)
 
     def _moved(self) -> list[Particles | CarriedField]:
-        """Return all that has unknowns, in the order of :meth:`ReducedSystem.nodal_forces`."""
+        """Return all that has unknowns, in the order of :meth:`.Terms.nodal_forces`."""
         return [*self._problem.bodies, *self._problem.carried]
 
     def _standing_forces(self) -> _Standing:
         """Return the forces of the last converged state (collective)."""
         reduced = self._problem.reduced
-        forces = reduced.nodal_forces()
+        forces = reduced.terms.nodal_forces()
         return _Standing(
             [_identity(one) for one in self._moved()],
             forces,
@@ -197,7 +197,7 @@ class Staging:
 
     def _hold_difference(self, before: _Standing) -> None:
         """Hold back what the forces are other now than before a stage (collective)."""
-        after = self._problem.reduced.nodal_forces()
+        after = self._problem.reduced.terms.nodal_forces()
         freed = self._gathered(after)
         for one, new in zip(self._moved(), after, strict=True):
             if (known := _identity(one)) in before.moved:

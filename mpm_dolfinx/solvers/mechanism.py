@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import ConvergenceError, MPMError
 from ..parallel.magnitudes import norm
-from .linear import ShiftedFactor
+from .linear import Levels, ShiftedFactor
 
 __all__ = ["Resisting", "mechanism", "not_held"]
 
@@ -24,10 +24,11 @@ INVERSE_ITERATIONS = 100
 
 
 class Resisting(Protocol):
-    """System, as the search for mechanisms must know it. All calls are collective."""
+    """What resists motions, as the search for mechanisms must know it; calls are collective."""
 
-    def rigid_motions(self) -> PETSc.NullSpace:
-        """Return the rigid motions in the unknowns."""
+    @property
+    def one_sided(self) -> bool:
+        """Whether something may let bodies go and hold them again, as contact does."""
 
     def stiffness(self, x: PETSc.Vec) -> float:
         """Return ``x . K x`` for the last tangent, without cancellation in rigid motions."""
@@ -35,8 +36,11 @@ class Resisting(Protocol):
     def is_rigid(self, x: PETSc.Vec) -> bool:
         """Return whether x moves each body as a rigid one."""
 
-    def one_sided(self) -> bool:
-        """Return whether something may let bodies go and hold them again, as contact does."""
+    def motion(self, x: PETSc.Vec) -> float:
+        """Return the size of the displacement that x causes on the bodies."""
+
+    def extent(self) -> float:
+        """Return the size of the positions of the bodies, in the same norm."""
 
 
 def mechanism(system: Resisting, factor: ShiftedFactor, y: PETSc.Vec) -> PETSc.Vec | None:
@@ -73,7 +77,9 @@ def mechanism(system: Resisting, factor: ShiftedFactor, y: PETSc.Vec) -> PETSc.V
     return None
 
 
-def not_held(system: Resisting, factor: ShiftedFactor, mode: PETSc.Vec, share: float) -> MPMError:
+def not_held(
+    system: Resisting, levels: Levels, factor: ShiftedFactor, mode: PETSc.Vec, share: float
+) -> MPMError:
     """Return the error that says that forces act on a motion without stiffness.
 
     A rigid motion has none whatever the step, unless something one-sided comes to hold it.
@@ -82,19 +88,20 @@ def not_held(system: Resisting, factor: ShiftedFactor, mode: PETSc.Vec, share: f
 
     Args:
         system: What resists.
+        levels: The unknowns.
         factor: The factor of its tangent.
         mode: The motion.
         share: Share of the forces that act on it.
     """
-    if not (system.is_rigid(mode) or _all_move_rigidly(system, factor)):
+    if not (system.is_rigid(mode) or _all_move_rigidly(system, levels, factor)):
         return _not_resisted(share)
-    return _let_go(share) if system.one_sided() else _unsupported(share)
+    return _let_go(share) if system.one_sided else _unsupported(share)
 
 
-def _all_move_rigidly(system: Resisting, factor: ShiftedFactor) -> bool:
+def _all_move_rigidly(system: Resisting, levels: Levels, factor: ShiftedFactor) -> bool:
     """Whether all bodies of a background can move as one rigid body."""
     assert factor.K is not None and factor.D is not None
-    motions = system.rigid_motions().getVecs()
+    motions = levels.rigid_motions().getVecs()
     forces = [factor.K * motion for motion in motions]
     held = [motion * factor.D for motion in motions]
     K = np.array([[motion.dot(force) for force in forces] for motion in motions])

@@ -50,18 +50,55 @@ LATE = 5
 DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 
 
-class ReducedProblem(Levels, Resisting, Protocol):
+class Histories(Protocol):
+    """Histories of what acts on bodies."""
+
+    def smooth(self) -> bool:
+        """Return whether no history changes in the last residual, nor contact (collective)."""
+
+    def yielding(self) -> list[NDArray[np.bool_]]:
+        """Return whether each particle yields in the last residual, for each body."""
+
+
+class Sizes(Protocol):
+    """Sizes of forces of the last residual. All calls are collective."""
+
+    def internal_scale(self) -> float:
+        """Return the size of the absolute internal contributions."""
+
+    def resultant(self) -> float:
+        """Return the size of the sum of the residual over the unknowns."""
+
+
+class ReducedProblem(Protocol):
     """Problem, as the solver asks for it. All calls are collective."""
 
     @property
     def softens(self) -> bool:
         """Whether tangents may be indefinite where ``constrain`` permits no such direction."""
 
+    @property
+    def levels(self) -> Levels:
+        """The unknowns, as a linear solver must know them."""
+
+    @property
+    def resistance(self) -> Resisting:
+        """How unknowns move bodies, and what resists."""
+
+    @property
+    def terms(self) -> Histories:
+        """What acts on the bodies."""
+
+    @property
+    def balance(self) -> Sizes:
+        """The sizes of its forces."""
+
+    @property
+    def tangent(self) -> Callable[[], PETSc.Mat]:
+        """Returns the tangent at the x of the last residual, always the same object."""
+
     def residual(self, x: PETSc.Vec, F: PETSc.Vec) -> MPMError | None:
         """Evaluate the residual at x, or say why that cannot be."""
-
-    def tangent(self) -> PETSc.Mat:
-        """Return the tangent at the x of the last residual, always the same object."""
 
     def constrain(
         self, y: PETSc.Vec, x: PETSc.Vec | None, solve: Callable[[PETSc.Vec, PETSc.Vec], None]
@@ -71,12 +108,6 @@ class ReducedProblem(Levels, Resisting, Protocol):
         ``solve`` solves with the factor that gave y. Returns how many negative eigenvalues the
         tangent has where it is positive definite in all directions that are permitted.
         """
-
-    def smooth(self) -> bool:
-        """Return whether no history changes in the last residual, nor contact."""
-
-    def yielding(self) -> list[NDArray[np.bool_]]:
-        """Return whether each particle yields in the last residual, for each body."""
 
     def prediction(self) -> PETSc.Vec | None:
         """Return unknowns to expect at the step's end, if the past says any."""
@@ -89,18 +120,6 @@ class ReducedProblem(Levels, Resisting, Protocol):
 
     def scale(self, F: PETSc.Vec | None = None) -> float:
         """Return the size of external forces and reactions, by which a residual F is judged."""
-
-    def internal_scale(self) -> float:
-        """Return the size of the absolute internal contributions at the last residual."""
-
-    def resultant(self) -> float:
-        """Return the size of the sum of the last residual over the unknowns."""
-
-    def motion(self, x: PETSc.Vec) -> float:
-        """Return the size of the displacement that x causes on the body."""
-
-    def extent(self) -> float:
-        """Return the size of the positions of the body, in the same norm."""
 
     def has_potential(self) -> bool:
         """Return whether a symmetric K means that equilibrium makes a potential least."""
@@ -274,7 +293,7 @@ class NewtonSolver:
             self.has_another_way = not potential
             self._hurries = self.gives_up_early and shorten and not potential
             self._search.begin(potential, self._hurries, again)
-        self._factor.begin(sizes[1], problem, self.lets_go)
+        self._factor.begin(sizes[1], problem.levels, self.lets_go)
         # What an iterative solve that fails means is for _pre_check to say.
         self.snes.setMaxLinearSolveFailures(1000 if self._factor.iterates else 1)
         self._tolerance = 0.0
@@ -470,7 +489,7 @@ class NewtonSolver:
             self._stalled = True
         if self._stalled or scale == 0.0:
             if scale < 1e-5 * self._internal:
-                self._internal = self._problem.internal_scale()
+                self._internal = self._problem.balance.internal_scale()
             if scale < 1e-6 * self._internal:
                 scale = self._internal
         self._norm = size
@@ -478,7 +497,7 @@ class NewtonSolver:
         self.residuals.append(size / scale if scale > 0 else size)
         tell(self._comm, NEWTON, "  iteration %d: residual %.2e", iteration, self.residuals[-1])
         if iteration > LATE:
-            self._yielding.append(self._problem.yielding())
+            self._yielding.append(self._problem.terms.yielding())
         self._tolerance = tolerance = max(rtol * scale, atol)
         small = size <= tolerance
         if small or (
@@ -515,7 +534,7 @@ class NewtonSolver:
     def _is_round_off(self, step: float, whole: float) -> bool:
         """Whether a step's motion is round-off of the whole motion or, after a stall, of places."""
         return step <= ROUND_OFF * whole or bool(
-            self._stalled and step <= 4 * np.finfo(float).eps * self._problem.extent()
+            self._stalled and step <= 4 * np.finfo(float).eps * self._problem.resistance.extent()
         )
 
     def _is_at_floor(self, step: float, whole: float) -> bool:
@@ -524,7 +543,9 @@ class NewtonSolver:
 
     def _is_settled(self, y: PETSc.Vec, x: PETSc.Vec) -> bool:
         """Whether a refined step is too small for the residual to judge it."""
-        return self._refines and self._problem.motion(y) <= SETTLED * self._problem.motion(x)
+        return self._refines and self._problem.resistance.motion(
+            y
+        ) <= SETTLED * self._problem.resistance.motion(x)
 
     def _release(self, x: PETSc.Vec, tolerance: float) -> float:
         """Let go what the proximal term holds back, except where next to nothing moves.
@@ -573,22 +594,18 @@ class NewtonSolver:
         self._factor.solve(self.F, step)
         rest = self._factor.refine(self.F, step, self._refined)
         self._problem.constrain(step, x, self._solve)
-        moved, whole = self._problem.motion(step), self._problem.motion(x)
-        balanced = self._problem.resultant() <= np.sqrt(step.getSize()) * tolerance
+        moved, whole = self._problem.resistance.motion(step), self._problem.resistance.motion(x)
+        balanced = self._problem.balance.resultant() <= np.sqrt(step.getSize()) * tolerance
         if self._is_round_off(moved, whole) or (self._is_at_floor(moved, whole) and balanced):
             return "round-off"
         forces = max(scale, self._first)
         if rest <= 0.5 and self._goes_on < 5:
             self._goes_on += 1
             return "go on"
-        if left > FROZEN * forces and left > FROZEN * self._problem.internal_scale():
+        if left > FROZEN * forces and left > FROZEN * self._problem.balance.internal_scale():
             share = left / forces if forces > 0.0 else np.inf
-            loose = mechanism(self._problem, self._factor, step)
-            self._failure = (
-                _unbalanced(share)
-                if loose is None
-                else not_held(self._problem, self._factor, loose, share)
-            )
+            loose = mechanism(self._problem.resistance, self._factor, step)
+            self._failure = _unbalanced(share) if loose is None else self._not_held(loose, share)
             return "failed"
         return "frozen"
 
@@ -611,7 +628,7 @@ class NewtonSolver:
         self.F.copy(self._R)
 
     def _set_tangent(self, K: PETSc.Mat, damping: float = 0.0) -> None:
-        if self._factor.set(K, self._problem, damping):
+        if self._factor.set(K, self._problem.levels, damping):
             self.snes.setJacobian(self._callback(self._jacobian), K, self._factor.P)
 
     def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
@@ -653,7 +670,10 @@ class NewtonSolver:
             changed = False
             self._trial.waxpy(-1.0, y, x)
             self._evaluate(self._trial)
-        self._motion = (self._problem.motion(y), self._problem.motion(self._trial))
+        self._motion = (
+            self._problem.resistance.motion(y),
+            self._problem.resistance.motion(self._trial),
+        )
         self._shrinks = self._motion[0] <= 0.25 * before[0]
         self._known = True
         return changed or self._refines
@@ -688,7 +708,11 @@ class NewtonSolver:
         )
 
     def _smooth(self) -> bool:
-        return self._problem.smooth()
+        return self._problem.terms.smooth()
+
+    def _not_held(self, mode: PETSc.Vec, share: float) -> MPMError:
+        problem = self._problem
+        return not_held(problem.resistance, problem.levels, self._factor, mode, share)
 
     def _is_loose(self, y: PETSc.Vec, force: float) -> bool:
         """Whether a first step moves a body that nothing holds, which is a failure then."""
@@ -698,9 +722,9 @@ class NewtonSolver:
         share = norm(y * self._factor.D) / scale
         if share <= LOOSE:
             return False
-        loose = mechanism(self._problem, self._factor, y)
+        loose = mechanism(self._problem.resistance, self._factor, y)
         if loose is not None:
-            self._failure = not_held(self._problem, self._factor, loose, share)
+            self._failure = self._not_held(loose, share)
             return True
         self._refine()
         return False

@@ -74,7 +74,7 @@ def error_of_step(reduced: ReducedSystem, size: float, comm: MPI.Comm) -> StepEr
     """
     past = reduced.predictor
     bodies = [i for i, moved in enumerate(reduced.bodies) if isinstance(moved, Particles)]
-    every = reduced.increments()
+    every = reduced.unknowns.increments()
     increments = [every[i] for i in bodies]
     error = [0.5 * u for u in increments]
     if past.past:
@@ -89,9 +89,9 @@ def error_of_step(reduced: ReducedSystem, size: float, comm: MPI.Comm) -> StepEr
     gdim = reduced.bodies[bodies[0]].W.mesh.geometry.dim
     nodes = comm.allreduce(sum(len(u) for u in increments)) / gdim
     rms = [joint_norm(np.concatenate(values), comm) / math.sqrt(nodes) for values in (error, moved)]
-    smooth = reduced.smooth()
-    touches = not smooth and reduced.one_sided()
-    return StepError(rms[0], rms[1], smooth, touches, touches and reduced.is_driven())
+    smooth = reduced.terms.smooth()
+    touches = not smooth and reduced.terms.one_sided
+    return StepError(rms[0], rms[1], smooth, touches, touches and reduced.terms.is_driven())
 
 
 class ErrorControl:

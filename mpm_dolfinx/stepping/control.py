@@ -178,7 +178,7 @@ class Converged:
         reactions: Residual on this rank's own dofs of V (at supports, their force), for each
             field; ``None`` where there was no step.
         followed: What free nodes add to these, for each field, or ``None`` for none; see
-            :meth:`ReducedSystem.followed`.
+            :meth:`.Balance.followed`.
         proportional: Whether supports have moved in proportion to the load, else to totals.
     """
 

@@ -78,7 +78,7 @@ def placed(
         if particles and dofs:
             text += f"; the residual is largest at dof {dofs[0]} of {space} near {where}"
             text += ", and at {particles}"
-        for own in reduced.own:
+        for own in reduced.unknowns.own:
             if own.advice and own.left() > LEFT:
                 text += f"; {own.advice.format(f'{own.left():.1e}')}"
     if isinstance(error, TRIAL_ERRORS):

@@ -25,7 +25,6 @@ from ..parallel.given import is_number
 from ..particles.geometry import RING
 from ..particles.particles import Particles
 from ..reals import as_reals
-from ..solvers.linear import Coarsening
 from ..system.reduced import ReducedSystem
 
 __all__ = ["ControlledSystem", "DisplacementControl"]
@@ -222,10 +221,16 @@ class ControlledSystem:
         goal: Its value at the end of the step.
         bodies: All bodies of the problem.
 
+    Attributes:
+        terms, tangent, balance, levels, resistance: Those of the reduced system.
+        softens: Whether tangents may be indefinite: they are, where the load falls.
+
     Raises:
         MPMError: Nothing in the residual scales with the load, or more than linearly, or no
             unknown moves what is prescribed.
     """
+
+    softens = True
 
     def __init__(
         self,
@@ -235,11 +240,13 @@ class ControlledSystem:
         bodies: list[Particles],
     ) -> None:
         self._reduced = reduced
+        self.terms, self.tangent, self.balance = reduced.terms, reduced.tangent, reduced.balance
+        self.levels, self.resistance = reduced.levels, reduced.resistance
         self._bodies = bodies
         self._start = float(bodies[0].load.value)
         self._size = float(control.row().norm())
-        self._row = reduced.functional(control.particles, control.row())
-        if reduced.prescribes:
+        self._row = reduced.unknowns.functional(control.particles, control.row())
+        if any(field.prescribes for field in reduced.fields):
             raise MPMError(
                 "Under displacement control Dirichlet values stay as they are, but some differ "
                 "from those of the last step; move them before, by problem.step() or a path."
@@ -250,7 +257,7 @@ class ControlledSystem:
                 "No unknown of the background moves the controlled displacement; control that of "
                 "a point that is not held."
             )
-        curvature, size = reduced.load_derivative(order=2)
+        curvature, size = reduced.balance.load_derivative(order=2)
         if _norm(curvature) > AFFINE * size:
             raise MPMError(
                 "Displacement control needs a residual that is affine in particles.load, such as "
@@ -265,23 +272,8 @@ class ControlledSystem:
 
     def _find_slope(self) -> None:
         """Take the derivative of the residual by the load factor at the present displacement."""
-        self._on_all, _ = self._reduced.load_derivative()
-        self._slope = self._reduced.restricted(self._on_all)
-
-    @property
-    def softens(self) -> bool:
-        """Whether tangents may be indefinite: they are, where the load falls."""
-        return True
-
-    @property
-    def constrained(self) -> bool:
-        """Whether there are unknowns besides displacements."""
-        return self._reduced.constrained
-
-    @property
-    def coarsening(self) -> Coarsening:
-        """How well multigrid's boxes follow the tangent (collective)."""
-        return self._reduced.coarsening
+        self._on_all, _ = self._reduced.balance.load_derivative()
+        self._slope = self._reduced.unknowns.restricted(self._on_all)
 
     @property
     def load(self) -> float:
@@ -298,11 +290,11 @@ class ControlledSystem:
         failure = self._reduced.residual(x, F)
         if failure is not None:
             return failure
-        if self._reduced.follows_load:
+        if self._reduced.terms.follow_load:
             self._find_slope()
         change = -F.dot(self._slope) / self._slope.dot(self._slope)
         F.axpy(change, self._slope)
-        for force, part in zip(self._reduced.forces, self._on_all, strict=True):
+        for force, part in zip(self._reduced.unknowns.forces, self._on_all, strict=True):
             force.axpy(change, part)
         self._set_load(self._start + change)
         return None
@@ -327,29 +319,13 @@ class ControlledSystem:
         w = self._slope.duplicate()
         solve(self._slope, w)
         moved = self._row.dot(w)
-        if abs(moved) <= UNMOVED * self._size * self._reduced.motion(w):
+        if abs(moved) <= UNMOVED * self._size * self._reduced.resistance.motion(w):
             raise MPMError(
                 "The load does not move the controlled displacement; control another one."
             )
         wanted = (0.0 if x is None else self._row.dot(x)) - self._gap
         y.axpy((wanted - self._row.dot(y)) / moved, w)
         return int(moved < 0.0)
-
-    def tangent(self) -> PETSc.Mat:
-        """Return the tangent at the x and the load factor of the last residual."""
-        return self._reduced.tangent()
-
-    def diagonal(self, K: PETSc.Mat) -> PETSc.Vec:
-        """Return sizes of the diagonal of a tangent, with signs that make a shift regularise it."""
-        return self._reduced.diagonal(K)
-
-    def smooth(self) -> bool:
-        """Return whether no history changes in the last residual, nor contact."""
-        return self._reduced.smooth()
-
-    def yielding(self) -> list[NDArray[np.bool_]]:
-        """Return whether each particle yields in the last residual, for each body."""
-        return self._reduced.yielding()
 
     def prediction(self) -> PETSc.Vec | None:
         """Return unknowns to expect, with the prescribed displacement, if the past says any."""
@@ -378,53 +354,9 @@ class ControlledSystem:
         """Return the size of external forces and reactions, by which a residual is judged."""
         return max(self._reduced.scale(F), abs(self.load) * _norm(self._on_all))
 
-    def internal_scale(self) -> float:
-        """Return the size of the absolute internal contributions at the last residual."""
-        return self._reduced.internal_scale()
-
-    def motion(self, x: PETSc.Vec) -> float:
-        """Return the size of the displacement that x causes on the bodies."""
-        return self._reduced.motion(x)
-
-    def resultant(self) -> float:
-        """Return the size of the sum of the last residual over the free dofs."""
-        return self._reduced.resultant()
-
-    def stiffness(self, x: PETSc.Vec) -> float:
-        """Return ``x . K x``, summed domain by domain."""
-        return self._reduced.stiffness(x)
-
-    def rigid_motions(self) -> PETSc.NullSpace:
-        """Return the rigid motions in the unknowns."""
-        return self._reduced.rigid_motions()
-
-    def splits(self) -> Sequence[tuple[str, slice]]:
-        """Return names of the fields, and where their unknowns are among this rank's."""
-        return self._reduced.splits()
-
-    def interpolations(self, coarsest: int, values: bool = False) -> Sequence[PETSc.Mat]:
-        """Return the interpolations between levels of the unknowns without the load factor."""
-        return self._reduced.interpolations(coarsest, values)
-
-    def mass(self) -> PETSc.Mat:
-        """Return the mass matrix of the unknowns without the load factor."""
-        return self._reduced.mass()
-
-    def extent(self) -> float:
-        """Return the size of the positions of all nodes."""
-        return self._reduced.extent()
-
-    def is_rigid(self, x: PETSc.Vec) -> bool:
-        """Return whether x moves each body as a rigid one."""
-        return self._reduced.is_rigid(x)
-
     def has_potential(self) -> bool:
         """Return that the residual is no gradient, since the load factor follows the unknowns."""
         return False
-
-    def one_sided(self) -> bool:
-        """Return whether something may let bodies go and hold them again."""
-        return self._reduced.one_sided()
 
 
 def _norm(vectors: Sequence[PETSc.Vec]) -> float:

@@ -192,7 +192,7 @@ class Stepper:
         """
         self.converged = progress.converged
         self.newton.experience = progress.experience
-        self._reduced.forget()
+        self._reduced.unknowns.forget()
         self.go_back()
 
     def resume(self, run: Run | None) -> None:
@@ -439,7 +439,7 @@ class Stepper:
         for body in self.owner.bodies:
             body.roll_back()
         self._set_load(self.converged.load, self.converged.proportional)
-        self._reduced.roll_back()
+        self._reduced.terms.roll_back()
         self._follow_back(update)
 
     def _follow_back(self, update: Path | None) -> None:
@@ -529,18 +529,18 @@ class Stepper:
         move_bodies(owner.bodies, owner.history, owner.masses, parameter, last)
         with owner.history.statistics.phase("commit"):
             try:
-                reduced.commit()
+                reduced.terms.commit()
             except BaseException:
                 for body, converged in zip(owner.bodies, before, strict=True):
                     body.restore(converged.reshape(-1, body.mesh.geometry.dim))
                 self.newton.experience = experience
                 raise
             load = float(owner.bodies[0].load.value)
-            reactions = [force.array_r.copy() for force in reduced.forces]
+            reactions = [force.array_r.copy() for force in reduced.unknowns.forces]
             prescribed = [total.copy() for total in values]
             proportional = bool(owner.bodies[0].proportional.value)
             self.converged = Converged(
-                load, parameter, prescribed, reactions, proportional, reduced.followed()
+                load, parameter, prescribed, reactions, proportional, reduced.balance.followed()
             )
             reduced.end()
             for take in taken:
@@ -585,7 +585,7 @@ class Stepper:
             if control is not None:
                 system = ControlledSystem(reduced, control, goal, self.owner.bodies)
             try:
-                newton.solve(system, reduced.sizes, self.run is not None, again)
+                newton.solve(system, reduced.unknowns.sizes, self.run is not None, again)
                 return
             except TRIAL_ERRORS:
                 if again or not newton.has_another_way:
@@ -597,7 +597,7 @@ class Stepper:
                 body.roll_back()
             if control is not None:
                 self._set_load(self.converged.load, self.converged.proportional)
-            reduced.roll_back()
+            reduced.terms.roll_back()
 
     def _look_at_loads(self, owner: Owner, run: Run, before: Sequence[NDArray[np.float64]]) -> None:
         """Warn where a path has set loads that the load factor multiplies besides (collective).

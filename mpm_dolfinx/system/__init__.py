@@ -16,4 +16,11 @@ and :mod:`~mpm_dolfinx.system.reduced` is the one system that Newton's method se
 of all fields (:mod:`~mpm_dolfinx.system.numbering`), with a first guess from the steps before
 (:mod:`~mpm_dolfinx.system.predictor`). Unknowns that a term has of its own
 (:mod:`~mpm_dolfinx.system.own`), as the motions of a rigid body, stand beside them.
+
+The system is made of parts, each of which knows those before it alone: the unknowns and how they
+move bodies (:mod:`~mpm_dolfinx.system.unknowns`), all terms with their histories
+(:mod:`~mpm_dolfinx.system.terms`), their tangent (:mod:`~mpm_dolfinx.system.tangent`), their forces
+and the sizes of these (:mod:`~mpm_dolfinx.system.balance`), what a linear solver must know of the
+unknowns (:mod:`~mpm_dolfinx.system.levels`) and what resists them
+(:mod:`~mpm_dolfinx.system.resistance`). Callers are given the part that they need.
 """

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 from petsc4py import PETSc
 
@@ -29,7 +29,7 @@ SOFTEST = 1e-6
 
 def nodal_errors(
     particles: Particles,
-    terms: Sequence[Term],
+    terms: Iterable[Term],
     force: NDArray[np.float64],
     free: NDArray[np.float64],
 ) -> NDArray[np.float64]:
@@ -67,7 +67,7 @@ def nodal_errors(
     )
 
 
-def _tangents(particles: Particles, terms: Sequence[Term]) -> list[PETSc.Mat]:
+def _tangents(particles: Particles, terms: Iterable[Term]) -> list[PETSc.Mat]:
     """Return the parts of the derivative of a body's forces by its own displacement, on W."""
     W = particles.W
     layout, bs = W.dofmap.index_map, W.dofmap.index_map_bs

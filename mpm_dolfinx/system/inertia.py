@@ -49,7 +49,7 @@ __all__ = ["Followed", "Inertia"]
 type DomainMasses = Callable[[int], NDArray[np.float64]]
 """Returns the consistent mass of each owned domain of a body, ``(n, k, k)``, by its number."""
 type ReducedMasses = Callable[[Masses], tuple[list[PETSc.Mat], list[Particles]]]
-"""Reduces masses of domains by compiled loops; see :meth:`ReducedSystem.masses`."""
+"""Reduces masses of domains by compiled loops; see :meth:`.Tangent.masses`."""
 type Works = Callable[[], NDArray[np.float64]]
 """Returns the works of the last increment on the backgrounds; see :meth:`Field.works`."""
 type Changes = Callable[[], list[NDArray[np.float64]]]

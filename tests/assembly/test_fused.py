@@ -72,8 +72,8 @@ def evaluated(make, symmetric):
     for body in problem.bodies:
         body.load.value = 1.0
     system.begin([change], 1.0)
-    first, local = system.sizes[1], system.sizes[0]
-    problem._stepper.newton._start(system.sizes)
+    first, local = system.unknowns.sizes[1], system.unknowns.sizes[0]
+    problem._stepper.newton._start(system.unknowns.sizes)
     x, F = problem._stepper.newton.x, problem._stepper.newton.F
     assert system.residual(x, F) is None
     system.tangent()
@@ -89,7 +89,7 @@ def evaluated(make, symmetric):
         skew.transpose()
         skew.axpy(-1.0, K)
         assert skew.norm() < 1e-13 * K.norm()
-    return F.copy(), K.copy(), lift, system.motion(x), modulus, first
+    return F.copy(), K.copy(), lift, system.resistance.motion(x), modulus, first
 
 
 def compare(make, symmetric=False):

@@ -127,12 +127,12 @@ def test_another_law_carries_the_stress(law, other):
 def test_another_law_is_in_the_balance_of_before(way, half):
     """All forces stay, those on pressures too: no average and no pressure is lost."""
     problem = pressed(LAWS["hencky"], half=half, **WAYS[way])
-    before = problem.reduced.nodal_forces()
+    before = problem.reduced.terms.nodal_forces()
     # (the stabilisation of a pressure is scaled by the shear modulus)
     young = E if way == "stabilised pressure" else 3 * E
     other = MohrCoulomb(young, NU, 1e4, 30.0)
     staged(problem, material={1: LAWS["hencky"], 2: other} if half else other)
-    for one, two in zip(problem.reduced.nodal_forces(), before, strict=True):
+    for one, two in zip(problem.reduced.terms.nodal_forces(), before, strict=True):
         assert scenes.largest(np.abs(one - two)) < 2e-6 * scenes.largest(np.abs(two))
 
 

@@ -245,13 +245,13 @@ def refuse_after(term, done, number):
 
 def test_an_error_in_a_call_of_petsc_comes_out_as_itself():
     whole, problem = slump(), slump()
-    smooth, problem.reduced.smooth = problem.reduced.smooth, divide
+    smooth, problem.reduced.terms.smooth = problem.reduced.terms.smooth, divide
     kept = interrupts.whole_state(problem)
     with pytest.raises(ZeroDivisionError):
         for _ in problem.steps(1):
             kept = interrupts.whole_state(problem)
     scenes.assert_same_state(kept, interrupts.whole_state(problem))
-    problem.reduced.smooth = smooth
+    problem.reduced.terms.smooth = smooth
     problem.solve(3)
     whole.solve(3)
     gap = problem.particles.displacement.x.array - whole.particles.displacement.x.array

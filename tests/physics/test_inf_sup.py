@@ -39,10 +39,10 @@ def inf_sup(cell, n, offset, degree=2, smooth=False):
     problem = mpm.ParticleProblem([R_u, R_p], particles, fields=[p], symmetric=True)
     reduced = problem.reduced
     reduced.begin([np.zeros(len(f.bodies[0].increment.x.array)) for f in reduced.fields], 1.0)
-    x = reduced.restricted(reduced.forces)
+    x = reduced.unknowns.restricted(reduced.unknowns.forces)
     assert reduced.residual(x, x.duplicate()) is None
     K = reduced.tangent().convert("dense").getDenseArray().copy()
-    own, others = reduced.unknowns
+    own, others = reduced.unknowns.parts
     A, B, M = K[own, own], K[others, own], -K[others, others]
     size = 1.0 / np.sqrt(A.diagonal())
     A, B = A * size * size[:, None], B * size
@@ -71,13 +71,13 @@ def smoothing(particles, reduced, unit):
     problem = mpm.QuasiStaticProblem(mpm.Body(particles, law), mixed="stabilised pressure")
     own = problem.reduced
     own.begin([np.zeros(len(f.bodies[0].increment.x.array)) for f in own.fields], 1.0)
-    x = own.restricted(own.forces)
+    x = own.unknowns.restricted(own.unknowns.forces)
     assert own.residual(x, x.duplicate()) is None
     K = own.tangent().convert("dense").getDenseArray().copy()
-    _, others = own.unknowns
-    volumes = own.mass().convert("dense").getDenseArray()  # int p q dX in the system's units
+    _, others = own.unknowns.parts
+    volumes = own.levels.mass().convert("dense").getDenseArray()  # int p q dX in the system's units
     whole = -K[others, others] - volumes / law.bulk
-    theirs = reduced.mass().convert("dense").getDenseArray()
+    theirs = reduced.levels.mass().convert("dense").getDenseArray()
     return whole * (theirs[0, 0] / volumes[0, 0]) * unit * unit[:, None]
 
 

@@ -208,14 +208,16 @@ def test_the_tangent_by_both_routes(make, take):
                 bc.set(end)
         reduced.begin(ends, 1.0)
         reduced.impose()
-        x = reduced.restricted(reduced.forces)
+        x = reduced.unknowns.restricted(reduced.unknowns.forces)
         x.array_w[:] = 1e-3 * np.sin(37.0 * np.arange(*x.getOwnershipRange()))
         force = x.duplicate()
         assert reduced.residual(x, force) is None
         reduced.scale(force)  # before there is a tangent
         K = reduced.tangent()
         scale, lift = reduced.scale(force), reduced.lift()
-        found.append((K * x, reduced.diagonal(K), lift, reduced.stiffness(x), scale))
+        found.append(
+            (K * x, reduced.levels.diagonal(K), lift, reduced.resistance.stiffness(x), scale)
+        )
     for one, other in zip(*found, strict=True):
         if isinstance(one, float):
             assert one == pytest.approx(other, rel=1e-10)
@@ -613,12 +615,12 @@ def test_soil_in_a_stage(name, mpi_tmp_path):
         elif way == "file":
             problem.restore(mpi_tmp_path / "soil")
         elif way == "failure":
-            forces = problem.reduced.nodal_forces()
+            forces = problem.reduced.terms.nodal_forces()
             problem.particles.load.value = 1e4
             with pytest.raises(mpm.MPMError):
                 problem.step()
             problem.particles.load.value = 1.0
-            for now, then in zip(problem.reduced.nodal_forces(), forces, strict=True):
+            for now, then in zip(problem.reduced.terms.nodal_forces(), forces, strict=True):
                 np.testing.assert_array_equal(now, then)
         if way == "plain":
             problem.step()

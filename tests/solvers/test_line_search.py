@@ -130,9 +130,9 @@ def test_response_is_smooth_where_nothing_yields(strain):
     problem.particles.displacement.interpolate(lambda x: (strain * x[1], 0.0 * x[0]))
     (term,) = problem.body_terms
     assert term.update() is None
-    assert problem.reduced.smooth() == (strain < 1e-2)
-    problem.reduced.roll_back()
-    assert problem.reduced.smooth()
+    assert problem.reduced.terms.smooth() == (strain < 1e-2)
+    problem.reduced.terms.roll_back()
+    assert problem.reduced.terms.smooth()
 
 
 def test_histories_and_contact_are_not_smooth():
@@ -145,14 +145,14 @@ def test_histories_and_contact_are_not_smooth():
         def commit(self):
             pass
 
-    assert problem.reduced.smooth()
-    assert mpm.ParticleProblem(R, particles, bcs=problem.bcs).reduced.smooth()
-    assert not WithHistory(R, particles, bcs=problem.bcs).reduced.smooth()
+    assert problem.reduced.terms.smooth()
+    assert mpm.ParticleProblem(R, particles, bcs=problem.bcs).reduced.terms.smooth()
+    assert not WithHistory(R, particles, bcs=problem.bcs).reduced.terms.smooth()
     wall = mpm.boundary.plane(particles, (1.5, 0.0), (-1.0, 0.0))
     touching = mpm.QuasiStaticProblem(
         mpm.Body(particles, mpm.materials.Hencky(1e3, 0.3)), bcs=problem.bcs, supports=[wall]
     )
-    assert not touching.reduced.smooth()
+    assert not touching.reduced.terms.smooth()
 
 
 def nearly_incompressible(**options):

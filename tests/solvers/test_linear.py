@@ -60,10 +60,10 @@ def test_multigrid_knows_the_rigid_motions():
     )
     problem.bcs.clear()
     problem.reduced.begin([np.zeros_like(problem.particles.increment.x.array)], 1.0)
-    x = PETSc.Vec().createMPI(problem.reduced.sizes, comm=WORLD)
+    x = PETSc.Vec().createMPI(problem.reduced.unknowns.sizes, comm=WORLD)
     problem.reduced.residual(x, x.duplicate())
     K = problem.reduced.tangent()
-    motions = problem.reduced.rigid_motions().getVecs()
+    motions = problem.reduced.levels.rigid_motions().getVecs()
     assert len(motions) == 3
     for number, motion in enumerate(motions):
         assert abs(motion.norm() - 1.0) < 1e-14

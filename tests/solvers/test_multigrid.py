@@ -287,7 +287,7 @@ def test_what_coarsens_badly_is_for_multigrid_later(monkeypatch, n, options, lea
     run.solve(steps=1)
     assert 700 < run.history.statistics["free_dofs"] < 2000
     assert (run.history.statistics["krylov_iterations"] > 0) == (least == 700)
-    assert run.reduced.coarsening == [700, 2000, 3000].index(least)
+    assert run.reduced.levels.coarsening == [700, 2000, 3000].index(least)
 
 
 def test_backgrounds_that_a_tie_couples_are_for_multigrid_later(monkeypatch):
@@ -296,7 +296,7 @@ def test_backgrounds_that_a_tie_couples_are_for_multigrid_later(monkeypatch):
     run.solve(steps=1)
     assert run.history.statistics["free_dofs"] > 700
     assert run.history.statistics["krylov_iterations"] == 0
-    assert run.reduced.coarsening is linear.Coarsening.FAIR
+    assert run.reduced.levels.coarsening is linear.Coarsening.FAIR
 
 
 def test_a_factorisation_goes_on_where_multigrid_takes_longer(monkeypatch):

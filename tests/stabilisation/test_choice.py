@@ -66,7 +66,7 @@ def test_auto_acts_for_degree_2_and_where_a_cut_is_small():
     problem = cantilever(0.1, "auto", degree=1)
     problem.solve(steps=1)
     assert problem.history.statistics["ghost_facets"] == 0
-    assert problem.reduced.moduli is None
+    assert problem.reduced.unknowns.moduli is None
     problem = cantilever(0.05, "auto")
     problem.solve(steps=1)
     assert problem.history.statistics["ghost_facets"] > 0
@@ -79,7 +79,7 @@ def test_auto_acts_for_degree_2_and_where_a_cut_is_small():
     )
     problem.solve(steps=1)
     assert problem.history.statistics["ghost_facets"] == 0
-    assert np.isclose(problem.reduced.moduli[0], 1e3 / 2.6, rtol=1e-6)
+    assert np.isclose(problem.reduced.unknowns.moduli[0], 1e3 / 2.6, rtol=1e-6)
 
 
 def test_modulus_and_answer_do_not_depend_on_units():
@@ -95,7 +95,7 @@ def test_modulus_and_answer_do_not_depend_on_units():
             R, particles, bcs=problem.bcs, solver=mpm.Solver(stabilisation="ghost")
         )
         mine.solve(steps=2)
-        assert np.isclose(mine.reduced.moduli[0], unit * 1e3 / 2.6)
+        assert np.isclose(mine.reduced.unknowns.moduli[0], unit * 1e3 / 2.6)
         tips.append(scenes.in_order(particles, particles.centroid))
     assert np.abs(tips[1] - tips[0]).max() < 1e-9
 
@@ -132,7 +132,7 @@ def test_penalty_knows_neither_supports_nor_the_origin(axisymmetric, degree):
         assert problem.history.statistics["ghost_facets"] > 0
         shapes.append(scenes.in_order(problem.particles, problem.particles.volume))
         around = 2.0 * np.pi * 0.6 if axisymmetric else 1.0
-        assert np.isclose(problem.reduced.moduli[0], around * 1e3 / 2.6, rtol=2e-2)
+        assert np.isclose(problem.reduced.unknowns.moduli[0], around * 1e3 / 2.6, rtol=2e-2)
     assert np.abs(shapes[1] / shapes[0] - 1.0).max() < 1e-8
 
 
@@ -145,7 +145,7 @@ def test_modulus_of_a_residual_knows_neither_supports_nor_the_origin():
         R += problem.setup.supports[0].residual
         mine = mpm.ParticleProblem(R, particles, solver=mpm.Solver(stabilisation="ghost"))
         mine.solve(steps=1)
-        assert np.isclose(mine.reduced.moduli[0], 1e3 / 2.6, rtol=1e-8)
+        assert np.isclose(mine.reduced.unknowns.moduli[0], 1e3 / 2.6, rtol=1e-8)
 
 
 def test_half_filled_cells_are_no_matter_of_round_off():

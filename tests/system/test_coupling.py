@@ -174,11 +174,11 @@ def test_tangent_and_lift_of_a_tie_by_finite_differences():
             bc.set(change, None, 1.0)
         changes.append(change)
     system.begin(changes, 1.0)
-    x = PETSc.Vec().createMPI(system.sizes, comm=WORLD)
+    x = PETSc.Vec().createMPI(system.unknowns.sizes, comm=WORLD)
     F, ahead, behind, p = (x.duplicate() for _ in range(4))
     start = x.getOwnershipRange()[0]
-    p.array_w[:] = np.sin(1.7 * (start + np.arange(system.sizes[0])))
-    x.array_w[:] = 0.005 * np.cos(0.9 * (start + np.arange(system.sizes[0])))
+    p.array_w[:] = np.sin(1.7 * (start + np.arange(system.unknowns.sizes[0])))
+    x.array_w[:] = 0.005 * np.cos(0.9 * (start + np.arange(system.unknowns.sizes[0])))
     assert system.residual(x, F) is None
     K = system.tangent()
     product = F.duplicate()

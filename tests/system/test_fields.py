@@ -240,10 +240,10 @@ def test_the_tangent_is_one_object_within_a_step(options, take):
     problem = posed(mpm.QuasiStaticProblem, bodies, LAWS[1], bcs=bcs, **options)
     system = problem.reduced
     system.begin([np.zeros(len(p.increment.x.array)) for p in bodies], 1.0)
-    x = PETSc.Vec().createMPI(system.sizes, comm=scenes.WORLD)
+    x = PETSc.Vec().createMPI(system.unknowns.sizes, comm=scenes.WORLD)
     found = []
     for size in (0.0, 1e-3):
-        x.array_w[:] = size * np.sin(np.arange(system.sizes[0]))
+        x.array_w[:] = size * np.sin(np.arange(system.unknowns.sizes[0]))
         assert system.residual(x, x.duplicate()) is None
         found.append((system.tangent(), system.tangent().copy()))
     assert found[0][0] is found[1][0]

@@ -119,7 +119,7 @@ def test_equilibrium_in_the_larger_space_is_that_of_dense_algebra(degree):
     d = scenes.gather(scenes.own(own.displacement))
     inside = space @ np.linalg.lstsq(space, d, rcond=None)[0]
     assert np.abs(inside - d).max() < 1e-11 * np.abs(d).max()
-    force = scenes.gather(problem.reduced.nodal_forces()[0])
+    force = scenes.gather(problem.reduced.terms.nodal_forces()[0])
     assert np.abs(space.T @ force).max() < 1e-8 < 1e-3 * np.abs(force).max()
 
 

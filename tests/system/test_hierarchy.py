@@ -46,16 +46,16 @@ def test_linear_displacements_are_on_all_levels(cell, degree, n):
     problem = begun(cell, degree, n, stabilisation=None)
     points, components = places(problem)
     field = problem.reduced.fields[0].level()
-    found = interpolations(WORLD, problem.reduced.sizes[0], [field], coarsest=20)
+    found = interpolations(WORLD, problem.reduced.unknowns.sizes[0], [field], coarsest=20)
     assert len(found) >= 2
-    sizes = [problem.reduced.sizes[1]] + [P.getSize()[1] for P in found]
+    sizes = [problem.reduced.unknowns.sizes[1]] + [P.getSize()[1] for P in found]
     assert [P.getSize() for P in found] == list(pairwise(sizes))
     assert all(coarse <= 0.7 * fine for fine, coarse in pairwise(sizes))
     # The coarse dofs' places, from which a linear function is interpolated: least squares finds
     # values that give it, exactly.
     gradient = np.array([[0.3, -1.0, 0.4], [2.0, 0.7, -0.2], [0.1, 0.5, 1.0]])
     exact = np.einsum("ni,ni->n", points, gradient[components, : points.shape[1]]) + components
-    x = PETSc.Vec().createMPI(problem.reduced.sizes, comm=WORLD)
+    x = PETSc.Vec().createMPI(problem.reduced.unknowns.sizes, comm=WORLD)
     x.array_w[:] = exact
     values, P = scenes.gather(exact), scenes.dense(found[0])
     for other in found[1:]:
@@ -88,4 +88,4 @@ def test_fields_have_levels_of_their_own():
 
 
 def test_few_unknowns_have_no_levels():
-    assert begun(QUADRILATERAL, 1, 4).reduced.interpolations(600) == []
+    assert begun(QUADRILATERAL, 1, 4).reduced.levels.interpolations(600) == []

@@ -1,0 +1,317 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The reduced tangent: compiled loops reduce what is of domains, products of matrices the rest."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+from petsc4py import PETSc
+
+import numpy as np
+
+from ..assembly.body_forms import BodyForms
+from ..assembly.fused import Coupling, FusedTangent, Masses
+from ..assembly.petsc import MatrixSum, absolute
+from ..history import Statistics
+from ..parallel.magnitudes import norm
+from ..particles.field import CarriedField
+from ..particles.particles import Particles
+from .field import Field
+from .free_field import Subspace
+from .own import OwnUnknowns
+from .term import Term
+from .terms import Terms
+from .unknowns import Unknowns
+
+__all__ = ["Tangent"]
+
+type Pair = tuple[int, int]
+type Products = tuple[PETSc.Mat | None, PETSc.Mat | None, PETSc.Mat | None]
+
+
+class _Group(NamedTuple):
+    """Subspaces that the compiled loops reduce together.
+
+    Attributes:
+        subspaces: Where the bodies move.
+        bodies: The bodies.
+        loops: What reduces forms on these.
+    """
+
+    subspaces: list[Subspace]
+    bodies: list[Particles]
+    loops: FusedTangent
+
+
+@dataclass
+class _Made:
+    """Matrices for the present unknowns, which numbers are put into again.
+
+    Attributes:
+        extended: The tangent of each group where dofs follow others.
+        products: A matrix of a term, ``K T`` and ``T^T K T``, by the term's number and places.
+        matrices: All matrices of terms, by the same; they are those of the last tangent.
+        sizes: Their absolute values, as far as asked for.
+        zeros: Zeros on the diagonal, where a shift has its place though a block may be empty.
+        total: Their sum.
+    """
+
+    extended: list[PETSc.Mat | None]
+    products: dict[tuple[int, Pair], Products] = dataclasses.field(default_factory=dict)
+    matrices: list[Mapping[Pair, PETSc.Mat]] = dataclasses.field(default_factory=list)
+    sizes: dict[tuple[int, Pair], PETSc.Mat] = dataclasses.field(default_factory=dict)
+    zeros: PETSc.Mat | None = None
+    total: MatrixSum = dataclasses.field(default_factory=MatrixSum)
+
+
+class Tangent:
+    """The tangent of all terms in the unknowns. All calls are collective.
+
+    Args:
+        unknowns: The unknowns.
+        terms: The terms.
+        statistics: Where to count.
+
+    Attributes:
+        mass_factor: How often tangents have the masses that :meth:`masses` has reduced.
+    """
+
+    def __init__(self, unknowns: Unknowns, terms: Terms, statistics: Statistics) -> None:
+        self._unknowns, self._terms, self._statistics = unknowns, terms, statistics
+        self.mass_factor = 0.0
+        self._coupled = [self._is_fused(term.coupling) for term in terms]
+        groups = [[one for one in unknowns.subspaces if not one.extends]]
+        groups += [[one] for one in unknowns.subspaces if one.extends]
+        self._groups = [
+            _Group(
+                group,
+                [body for own in pairs for body, _ in own],
+                FusedTangent(unknowns.comm, pairs, self._couplings_in(group), statistics),
+            )
+            for group in groups
+            if any(pairs := [self._fused_on(one.host) for one in group])
+        ]
+        self._made = _Made([])
+
+    @property
+    def loops(self) -> list[FusedTangent]:
+        """Of all fields together, and of each in which dofs follow others."""
+        return [group.loops for group in self._groups]
+
+    # -- What the compiled loops reduce -----------------------------------------------------------
+
+    def _fused_on(self, field: Field) -> list[tuple[Particles, BodyForms]]:
+        """Return the forms on bodies of a field that the compiled loops reduce."""
+        every = [pair for term in self._terms for pair in term.fused]
+        return [pair for pair in every if any(pair[0] is body for body in field.bodies)]
+
+    def _is_fused(self, coupling: Coupling | None) -> bool:
+        """Return whether the compiled loops reduce what couples a body and a field on it.
+
+        Not where dofs follow others: then the tangent of a displacement is made by itself.
+        """
+        if coupling is None:
+            return False
+        moving, other = (self._unknowns.place(place)[0] for place in coupling.places)
+        reduced = any(body is coupling.places[0] for body, _ in self._fused_on(moving))
+        return reduced and not moving.extends and not other.extends
+
+    @property
+    def _couplings(self) -> list[Coupling]:
+        """What couples a body and a field on it and is reduced by compiled loops."""
+        pairs = zip(self._terms, self._coupled, strict=True)
+        return [term.coupling for term, coupled in pairs if coupled and term.coupling is not None]
+
+    def _couplings_in(self, group: Sequence[Subspace]) -> list[tuple[int, int, Coupling]]:
+        """Return the couplings of fields in a group that compiled loops reduce, with numbers."""
+        found, hosts = [], [one.host for one in group]
+        for coupling in self._couplings:
+            i, j = (self._unknowns.place(place)[0] for place in coupling.places)
+            if i in hosts:
+                found.append((hosts.index(i), hosts.index(j), coupling))
+        return found
+
+    def _reduced_on(self, field: Field) -> list[Particles | CarriedField]:
+        """Return the bodies of a field with rows of T that the compiled loops take."""
+        carried = [coupling.places[1] for coupling in self._couplings]
+        bodies: list[Particles | CarriedField] = [body for body, _ in self._fused_on(field)]
+        return bodies + [body for body in carried if self._unknowns.place(body)[0] is field]
+
+    def renew(self) -> None:
+        """Take over the present unknowns."""
+        self._made = _Made([None] * len(self._groups))
+        for group in self._groups:
+            reduced = [one.restriction(self._reduced_on(one.host)) for one in group.subspaces]
+            group.loops.restrict([restriction for restriction, _ in reduced], reduced[0][1])
+
+    def masses(self, masses: Masses) -> tuple[list[PETSc.Mat], list[Particles]]:
+        """Reduce the mass of bodies by the compiled loops, as far as these know them.
+
+        From now on, in this step, tangents have it :attr:`mass_factor` times.
+
+        Args:
+            masses: Of domains.
+
+        Returns:
+            Matrices of all unknowns, of which the sum is the reduced mass, and the bodies of which.
+        """
+        parts, known = [], []
+        for group in self._groups:
+            its = [(body, own) for body, own in masses if any(body is b for b in group.bodies)]
+            if not its:
+                continue
+            whole = group.loops.weigh(its)
+            host = group.subspaces[0].host
+            parts.append(whole.ptap(host.prolongation) if host.extends else whole)
+            known += [body for body, _ in its]
+        return parts, known
+
+    # -- The tangent ------------------------------------------------------------------------------
+
+    def __call__(self) -> PETSc.Mat:
+        """Return the tangent at the last residual, one object within a step."""
+        unknowns, made = self._unknowns, self._made
+        with self._statistics.phase("assemble"):
+            reduced = [K for term in self._terms for K in term.reduced_tangents(unknowns.transfer)]
+            parts = [self._of_group(number) for number in range(len(self._groups))]
+            made.matrices = [
+                {} if coupled else term.tangents()
+                for term, coupled in zip(self._terms, self._coupled, strict=True)
+            ]
+            made.sizes = {}
+            parts += [
+                self._product(term, number, pair, K)
+                for number, (term, matrices) in enumerate(
+                    zip(self._terms, made.matrices, strict=True)
+                )
+                for pair, K in matrices.items()
+            ]
+            parts += reduced
+            for field in unknowns.fields:
+                parts += field.tangents(partial(self._terms.shear_moduli, field))
+            if not self._has_diagonal:
+                made.zeros = made.zeros or self._zeros_on_diagonal()
+                parts.append(made.zeros)
+            return made.total.of(parts)
+
+    def _of_group(self, number: int) -> PETSc.Mat:
+        subspaces, _, loops = self._groups[number]
+        whole = loops.assemble([one.prescribes for one in subspaces], self.mass_factor)
+        if not subspaces[0].extends:
+            return whole
+        extended = self._made.extended
+        extended[number] = whole.ptap(subspaces[0].host.prolongation, result=extended[number])
+        return extended[number]
+
+    @property
+    def _has_diagonal(self) -> bool:
+        """Whether the compiled loops have places on the diagonal for all unknowns of values."""
+        own = [carried for field in self._unknowns.values for carried in field.carried]
+        return all(
+            any(body is one for body in self._reduced_on(self._unknowns.place(one)[0]))
+            for one in own
+        )
+
+    def _zeros_on_diagonal(self) -> PETSc.Mat:
+        count, whole = self._unknowns.sizes
+        start = self._unknowns.vector().getOwnershipRange()[0]
+        csr = (
+            np.arange(count + 1, dtype=PETSc.IntType),
+            np.arange(start, start + count, dtype=PETSc.IntType),
+            np.zeros(count),
+        )
+        sizes = ((count, whole), (count, whole))
+        return PETSc.Mat().createAIJ(sizes, csr=csr, comm=self._unknowns.comm)
+
+    def _product(self, term: Term, number: int, pair: Pair, K: PETSc.Mat) -> PETSc.Mat:
+        """Return ``T_a^T K T_b`` in the unknowns, the same object for the same K."""
+        T_a, T_b = (self._transfer_to(term, i) for i in pair)
+        known, half, result = self._made.products.get((number, pair), (None, None, None))
+        if known is not K:
+            half = result = None
+        if pair[0] == pair[1]:
+            result = K.ptap(T_a, result=result)
+        else:
+            half = K.matMult(T_b, result=half)
+            result = T_a.transposeMatMult(half, result=result)
+        self._made.products[number, pair] = K, half, result
+        return result
+
+    def _transfer_to(self, term: Term, place: int) -> PETSc.Mat:
+        """Return T of a body of a term in all unknowns, or that of the term's own."""
+        if place < len(term.bodies):
+            return self._unknowns.transfer(term.bodies[place])
+        assert term.own is not None
+        return term.own.selection
+
+    # -- Its products -----------------------------------------------------------------------------
+
+    def lift(self) -> PETSc.Vec:
+        """Return the linearised forces of the step's Dirichlet values, by the last tangent."""
+        unknowns = self._unknowns
+        fields, forces = unknowns.fields, unknowns.zeros()
+        for field, force in zip(fields, forces, strict=True):
+            field.add_product(field.lift(), force, partial(self._terms.shear_moduli, field))
+        for subspaces, _, loops in self._groups:
+            for number, one in enumerate(subspaces):
+                if one.prescribes:
+                    product = one.split(loops.multiply(number, one.increment()))
+                    for field, part in zip(one.fields, product, strict=True):
+                        forces[fields.index(field)].array_w[:] += part
+        lifts = [field.u for field in fields]
+        on_own: list[tuple[OwnUnknowns, PETSc.Vec]] = []
+        for term, matrices in zip(self._terms, self._made.matrices, strict=True):
+            count = len(term.bodies)
+            for (a, b), K in matrices.items():
+                if b == count:
+                    continue
+                force = K.createVecLeft()
+                K.mult(unknowns.moved(term.bodies[b], lifts), force)
+                if a < count:
+                    unknowns.add([term.bodies[a]], [force], forces)
+                elif term.own is not None:
+                    on_own.append((term.own, force))
+        for term, coupled in zip(self._terms, self._coupled, strict=True):
+            motions = [unknowns.moved(body, lifts) for body in term.bodies]
+            unknowns.add(term.bodies, term.reduced_product(motions), forces)
+            if coupled:
+                unknowns.add(term.bodies, term.stiffness_force(motions), forces)
+        for field, force in zip(fields, forces, strict=True):
+            field.gather_extended(force)
+        reduced = unknowns.restricted(forces)
+        for own, force in on_own:
+            own.selection.multTransposeAdd(force, reduced, reduced)
+        return reduced
+
+    def size_of_changes(self, field: Field) -> float:
+        """Return the size of what the last changes of all unknowns do to a field's residual.
+
+        The sum is one of absolute values.
+        """
+        place, made = self._unknowns.place, self._made
+        total = field.force.duplicate()
+        total.set(0.0)
+        for number, (term, matrices) in enumerate(zip(self._terms, made.matrices, strict=False)):
+            if self._coupled[number]:
+                changes = [place(body)[1].change() for body in term.bodies]
+                for body, force in zip(term.bodies, term.absolute_product(changes), strict=True):
+                    if place(body)[0] is field:
+                        body.T.multTransposeAdd(force, total, total)
+            if term.own is not None:
+                continue  # (it acts on displacements alone)
+            for (a, b), K in matrices.items():
+                its, motion = place(term.bodies[a])
+                if its is not field:
+                    continue
+                if (number, (a, b)) not in made.sizes:
+                    made.sizes[number, (a, b)] = absolute(K)
+                force, change = K.createVecLeft(), K.createVecRight()
+                change.array_w[:] = place(term.bodies[b])[1].change()
+                made.sizes[number, (a, b)].mult(change, force)
+                motion.particles.T.multTransposeAdd(force, total, total)
+        return norm(total)
