@@ -120,6 +120,12 @@ class NearFacets:
         place = np.minimum(np.searchsorted(self.number, numbers), len(self.number) - 1)
         return np.where(self.number[place] == numbers, place, -1)
 
+    def numbers(self, facet: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return numbers of facets by their places, -1 where there is none."""
+        numbers = np.full(len(facet), -1, dtype=np.int64)
+        numbers[facet >= 0] = self.number[facet[facet >= 0]]
+        return numbers
+
     def tabulate(
         self, place: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

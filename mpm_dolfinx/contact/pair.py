@@ -31,6 +31,7 @@ from ..particles.particles import Particles
 from ..system.term import PointMaterial
 from .contact import Contact, Outcome, stiffness
 from .law import Friction, as_friction
+from .meeting import Meeting
 from .nitsche import Nitsche, require_stress
 from .one_pass import Pass
 from .pair_matrices import PairMatrices
@@ -117,7 +118,7 @@ class Pair(Contact):
         rubs = as_friction(friction)
         super().__init__([a, b], rubs, axisymmetric, law)
         self._moduli = [None if m is None else as_positive(m, "modulus") for m in moduli]
-        penalties = (
+        self._penalties = (
             as_positive(penalty, "penalty"),
             as_positive(tangential_penalty, "tangential_penalty"),
         )
@@ -126,10 +127,8 @@ class Pair(Contact):
             Surface(body, some, tag, degree, axisymmetric, "A Pair")
             for body, some, tag in zip((a, b), facet_tags, tags, strict=True)
         ]
-        self._passes = [
-            Pass(self._surfaces[i], self._surfaces[1 - i], rubs, penalties) for i in range(passes)
-        ]
-        self._made, self._begins = False, True
+        self._count, self._begins = passes, True
+        self._passes: list[Pass] = []
 
     # -- The term -------------------------------------------------------------------------------
 
@@ -142,7 +141,7 @@ class Pair(Contact):
     ) -> None:
         super().take_part(number, bodies, materials)
         if self._nitsche:
-            for material, _ in zip(self._materials, self._passes, strict=False):
+            for material in self._materials[: self._count]:
                 require_stress(material, "a Pair")
         self._settle(self._joins)
         self._take_stress()
@@ -163,13 +162,14 @@ class Pair(Contact):
             columns = [before.columns(place) for place in self._places]
             own = [{name: column.values for name, column in one.items()} for one in columns]
             alike = [one["area"].shape[2] for one in own] == [s.nq for s in self._surfaces]
-            if alike and all("anchor" in one for one in own[: len(self._passes)]):
+            if alike and all("anchor" in one for one in own[: self._count]):
                 every = [_both(*pair) for pair in zip(every, own, strict=True)] if every else own
         if not every:
             return
         self._take_over(every)
         for each, surface, mine in zip(self._passes, self._surfaces, every, strict=False):
-            each.outcome = replace(each.outcome, **_told(surface, mine))
+            told = replace(each.state.outcome, **_told(surface, mine))
+            each.state = each.state._replace(outcome=told)
 
     def _take_over(self, every: Sequence[dict[str, NDArray[Any]]]) -> None:
         """Take areas, and where points stick (collective).
@@ -195,11 +195,19 @@ class Pair(Contact):
                 self._surfaces, self._moduli, self._materials, strict=True
             )
         ]
-        shares = self._shares()
-        for i, each in enumerate(self._passes):
-            each.settle(k[i], k[1 - i], shares[i])
-            each.begin_anew()
-        self._made = True
+        shares, surfaces = self._shares(), self._surfaces
+        self._passes = [
+            Pass(
+                surfaces[i],
+                surfaces[1 - i],
+                self.friction,
+                self._penalties,
+                (k[i], k[1 - i]),
+                shares[i],
+            )
+            for i in range(self._count)
+        ]
+        self._begins = True
         self._take_stress()
         self._new_pattern()
 
@@ -233,7 +241,7 @@ class Pair(Contact):
         Points on facets of a size h see kinks of the other body's shape functions with an error of
         the order of h^2, so that the points of facets that are much finer bear more.
         """
-        if len(self._passes) == 1:
+        if self._count == 1:
             return [1.0]
         squares = [
             float(np.median(np.concatenate(self._comm.allgather(surface.sizes)))) ** 2
@@ -302,35 +310,40 @@ class Pair(Contact):
 
     @override
     def residuals(self) -> Sequence[PETSc.Vec]:
-        if self._begins or any(each.stencil is None for each in self._passes):
+        if self._begins or any(each.meeting is None for each in self._passes):
             self._look()
             for each in self._passes:
                 each.evaluate()
-        first, second = self._passes[0].forces()
-        for each in self._passes[1:]:
-            on_b, on_a = each.forces()
+        (first, second), *others = [meeting.forces() for meeting in self._meetings]
+        for on_b, on_a in others:
             first.axpy(1.0, on_a)
             second.axpy(1.0, on_b)
         for force in (first, second):
             force.scale(-1.0 / self._share)
         return [first, second]
 
+    @property
+    def _meetings(self) -> list[Meeting]:
+        """The last evaluation of each pass."""
+        return [each.meeting for each in self._passes if each.meeting is not None]
+
     @override
     def _works(self) -> tuple[float, float]:
-        normal, shear = np.sum([each.works for each in self._passes], axis=0)
+        normal, shear = np.sum([meeting.works for meeting in self._meetings], axis=0)
         return float(normal), float(shear)
 
     @override
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
         if self._learned != [each.learned for each in self._passes]:
             self._new_pattern()
-        groups = self._matrices.groups([each.met() for each in self._passes])
-        for each, (group, positions) in zip(self._passes, groups, strict=True):
-            each.add_tangents(1.0 / self._share, group, positions, self._matrices.values)
+        meetings = self._meetings
+        groups = self._matrices.groups([meeting.met() for meeting in meetings])
+        for meeting, (group, positions) in zip(meetings, groups, strict=True):
+            meeting.add_tangents(1.0 / self._share, group, positions, self._matrices.values)
         found = {place: [K] for place, K in self._matrices.assembled().items()}
-        for own, each in enumerate(self._passes):
+        for own, (each, meeting) in enumerate(zip(self._passes, meetings, strict=True)):
             if each.stress is not None:
-                parts = each.stress.tangents(*each.by_stress(1.0 / self._share))
+                parts = each.stress.tangents(*meeting.by_stress(1.0 / self._share))
                 for row, K in enumerate(parts if own == 0 else parts[::-1]):
                     if K is not None:
                         found.setdefault((row, own), []).append(K)
@@ -352,32 +365,33 @@ class Pair(Contact):
             )
         if (failure := agreed(self._comm, failure)) is not None:
             raise failure
-        before = [(each.memory, each.outcome) for each in self._passes]
-        for each in self._passes:
-            each.memory, each.outcome = each.after()
+        passes = self._passes
+        before = [each.state for each in passes]
+        for each in passes:
+            each.state = each.after()
 
         def undo() -> None:
-            for each, (memory, outcome) in zip(self._passes, before, strict=True):
-                each.memory, each.outcome = memory, outcome
+            for each, state in zip(passes, before, strict=True):
+                each.state = state
 
         return undo
 
     def _outcome(self) -> tuple[Surface, Outcome]:
         """Return the outcome at the points of a: with two passes they bear their share alone."""
-        if not self._made:
+        if not self._passes:
             raise MPMError("A contact belongs to no problem yet; give it as terms=[contact].")
-        told, share = self._passes[0].outcome, self._passes[0].share
+        told, share = self._passes[0].state.outcome, self._passes[0].share
         return self._surfaces[0], replace(
             told, pressure=told.pressure / share, traction=told.traction / share
         )
 
     def _forces(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
         """Return positions of all points, and the forces there on a."""
-        if not self._made:
+        if not self._passes:
             raise MPMError("A contact belongs to no problem yet; give it as terms=[contact].")
         found = []
         for number, each in enumerate(self._passes):
-            outcome, surface, sign = each.outcome, each.source, 1.0 - 2.0 * number
+            outcome, surface, sign = each.state.outcome, each.source, 1.0 - 2.0 * number
             force = sign * surface.weights[:, :, None] * outcome.traction
             gdim = surface.gdim
             found.append((outcome.positions.reshape(-1, gdim), force.reshape(-1, gdim)))
@@ -388,9 +402,7 @@ class Pair(Contact):
     def friction_memory(self) -> NDArray[np.float64]:
         """Memory of the law of friction at the points of a."""
         self._outcome()
-        memory = self._passes[0].memory
-        assert memory is not None
-        return memory.friction
+        return self._passes[0].state.memory.friction
 
     @property
     def reaction(self) -> NDArray[np.float64]:
@@ -411,8 +423,7 @@ class Pair(Contact):
         surface = self._surfaces[number]
         columns = surface.columns()
         if number < len(self._passes):
-            memory, outcome = self._passes[number].memory, self._passes[number].outcome
-            assert memory is not None
+            memory, outcome = self._passes[number].state
             shape = outcome.inside.shape
             columns["anchor"] = surface.column(memory.anchors.reshape(*shape, surface.gdim))
             columns["touches"] = surface.column(memory.touched.reshape(shape))
@@ -431,11 +442,12 @@ class Pair(Contact):
         self._take_over(every)
         self.update()
         for each, surface, columns in zip(self._passes, self._surfaces, every, strict=False):
-            each.outcome = replace(each.after()[1], **_told(surface, columns))
+            told = replace(each.after().outcome, **_told(surface, columns))
+            each.state = each.state._replace(outcome=told)
 
     @override
     def known_by(self) -> list[Any]:
-        return [type(self).__name__, self._places, len(self._passes)]
+        return [type(self).__name__, self._places, self._count]
 
 
 def _both(one: dict[str, NDArray[Any]], other: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

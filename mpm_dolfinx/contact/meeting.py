@@ -1,0 +1,194 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Evaluations of what acts where points of one body meet facets of another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import _compat
+from .approach import Approach
+from .behind import At
+from .contact import Outcome
+from .facets import Closest
+from .law import Friction
+from .nitsche import Spread
+from .pair_matrices import Met
+from .pass_memory import State, no_memory, spread
+from .stencil import Stencil, Sums, add_tangents, by_stress, remembered
+from .surface import Surface, global_nodes
+
+__all__ = ["Meeting", "untouched"]
+
+
+@dataclass(frozen=True, slots=True)
+class Meeting:
+    """An evaluation of a pass.
+
+    Attributes:
+        law: Friction.
+        share: Share of the pass of what bears.
+        approach: The points and facets.
+        found: Which meet which.
+        within: Which points are behind their facets.
+        offset: Gap at which they begin to be pressed.
+        stencil: The points where something acts.
+        facet: The facets that these meet.
+        anchor: Those of their anchors.
+        outcome: What acts on the points.
+        shear: By friction, where something acts, shape ``(n, gdim)``.
+        reaction: What acts on the nodes of facets there, shape ``(n, k, gdim)``.
+        works: Work against pressure and against friction in a step of a motion.
+        of_step: Whether forces are those of a whole step of a motion.
+        frozen: Whether points have stayed with facets of earlier evaluations.
+    """
+
+    law: Friction
+    share: float
+    approach: Approach
+    found: Closest
+    within: NDArray[np.bool_]
+    offset: NDArray[np.float64]
+    stencil: Stencil
+    facet: NDArray[np.int64]
+    anchor: NDArray[np.int64]
+    outcome: Outcome
+    shear: NDArray[np.float64]
+    reaction: NDArray[np.float64]
+    works: tuple[float, float]
+    of_step: bool
+    frozen: bool
+
+    def forces(self) -> tuple[PETSc.Vec, PETSc.Vec]:
+        """Return the forces on the nodes of both bodies (collective)."""
+        around = self.approach.around
+        first = around.sides.source.force(self.outcome.traction, which=around.facets)
+        second = _compat.create_vector(around.sides.target.particles.W)
+        values = around.weights[self.stencil.which][:, None, None] * self.reaction
+        dofs = around.near.dofs[self.facet].astype(PETSc.IntType)
+        second.setValues(dofs.ravel(), values.ravel(), addv=PETSc.InsertMode.ADD_VALUES)
+        second.assemble()
+        return first, second
+
+    def met(self) -> Met:
+        """Return the facets that meet at the points where something acts."""
+        around, near = self.approach.around, self.approach.around.near
+        source = around.sides.source
+        own = around.facets[self.stencil.which // source.nq]
+        bs = source.particles.W.dofmap.index_map_bs
+        others = [self.facet] if self.law.smooth else [self.facet, self.anchor]
+        nodes = [near.dofs[facet][:, ::bs] // bs for facet in others]
+        mine = global_nodes(source.particles.W, source.nodes[own])
+        return Met(np.stack([own, *others], axis=1), (mine, *nodes))
+
+    def add_tangents(
+        self,
+        factor: float,
+        group: NDArray[np.int64],
+        positions: NDArray[np.int32],
+        values: NDArray[np.float64],
+    ) -> None:
+        """Add the forces' derivatives to blocks.
+
+        Args:
+            factor: What they are multiplied by.
+            group: See :class:`Sums`.
+            positions: As there.
+            values: As there.
+        """
+        which, around = self.stencil.which, self.approach.around
+        shapes = around.sides.source.shapes
+        sums = Sums(
+            -factor * around.weights[which], shapes[which % len(shapes)], group, positions, values
+        )
+        sides = around.sides
+        add_tangents(self.law, self.stencil, sides.touch, sides.target.extent, sums)
+
+    def by_stress(self, factor: float) -> tuple[At, Sequence[Spread]]:
+        """Return points with normals, and how forces on both bodies grow with the stress behind.
+
+        Args:
+            factor: As for :meth:`add_tangents`.
+        """
+        around, near = self.approach.around, self.approach.around.near
+        source, which = around.sides.source, self.stencil.which
+        normals, forces = by_stress(self.law, self.stencil, around.sides.touch)
+        w = -factor * self.share * around.weights[which]
+        forces = w[:, None, None] * forces
+        at = At(around.facets[which // source.nq], which % source.nq, normals)
+        numbers, dofs = near.number[self.facet], near.dofs[self.facet]
+        others = Spread.over_met(at, numbers, dofs, forces[:, 1:], len(source.cells))
+        return at, [Spread.over_facets(source, at, forces[:, 0]), others]
+
+    def state(self, friction: NDArray[np.float64]) -> State:
+        """Return the state of all points, if this is the evaluation of a step.
+
+        Args:
+            friction: What the law of friction has remembered of all points.
+        """
+        approach, around, last = self.approach, self.approach.around, self.approach.last
+        near, nodes, sides = around.near, approach.nodes, around.sides
+        trial, found, offset = self.outcome, self.found, self.offset
+        if self.of_step:
+            found, offset = approach.returned(found, self.within, offset, self.frozen)
+        inside = trial.inside.ravel()
+        place, numbers = found.place.copy(), near.numbers(found.facet)
+        which = self.stencil.which
+        if not self.law.smooth and len(which):
+            slips = trial.slips.ravel()[which]
+            k = self.stencil.points.tangential
+            stays = inside[which] & ~slips & self.stencil.points.touched
+            stays &= near.find(last.facet[which]) >= 0
+            moves = inside[which] & ~stays
+            # anchors that moved are beside the foot, and belong to the facet that is there
+            X = nodes[self.facet[moves]]
+            N, _, _ = near.tabulate(self.stencil.place[moves])
+            lag = self.shear[moves] / np.where(k[moves] > 0.0, k[moves], 1.0)[:, None]
+            foot = np.einsum("nk,nki->ni", N, X) + lag
+            at, s = approach.located(foot, self.facet[moves])
+            numbers[which[stays]] = last.facet[which[stays]]
+            place[which[stays]] = last.place[which[stays]]
+            numbers[which[moves]] = near.number[at]
+            place[which[moves]] = s
+        anchors = approach.x.copy()
+        at = near.find(numbers)
+        N, _, _ = near.tabulate(place[at >= 0])
+        anchors[at >= 0] = np.einsum("nk,nki->ni", N, nodes[at[at >= 0]])
+        rubbed = last.friction.copy()
+        if self.law.memory:
+            rubbed[which] = remembered(self.law, self.stencil, sides.touch, sides.target.extent)
+        own = last._replace(
+            touched=inside,
+            facet=numbers,
+            place=place,
+            closest=near.numbers(found.facet),
+            gap=found.gap,
+            within=self.within,
+            offset=offset,
+            points=approach.x,
+            anchors=anchors,
+            friction=rubbed,
+        )
+        x = sides.source.positions()
+        rest = no_memory(self.law, x.reshape(-1, x.shape[2]))._replace(friction=friction)
+        base = untouched(sides.source, x)
+        outcome = Outcome(
+            *(
+                spread(getattr(trial, field.name), around.facets, getattr(base, field.name))
+                for field in fields(Outcome)
+            )
+        )
+        return State(rest.with_some(around.which, own), outcome)
+
+
+def untouched(source: Surface, x: NDArray[np.float64]) -> Outcome:
+    """Return the outcome without contact, at positions ``(m, nq, gdim)`` of a surface's points."""
+    shape = len(source.cells), source.nq
+    place, zero, none = x.reshape(*shape, x.shape[-1]), np.zeros(shape), np.zeros(shape, bool)
+    return Outcome(place, np.full(shape, np.inf), zero, np.zeros_like(place), none, none)
