@@ -193,3 +193,8 @@ def close(one, other, bound=1e-9):
     for key in one:
         size = np.abs(one[key]).max(initial=1e-300)
         assert np.abs(one[key] - other[key]).max(initial=0.0) <= bound * size, key
+
+
+def wall(particles, point, normal, **options):
+    """Return contact with a smooth plane that hardly gives way."""
+    return contact.Rigid(particles, contact.plane(point, normal), **{"penalty": 1e3, **options})

@@ -11,9 +11,9 @@ the facet's area), so that ``penalty`` is a number without unit. The term is sym
 error, a gap of ``strain h / penalty``, is far below that of the domains' displacement.
 """
 
-from .supports import Support, dashpot, fixed, plane, roller
+from .supports import Support, dashpot, fixed, roller
 
-__all__ = ["Support", "dashpot", "fixed", "plane", "roller"]
+__all__ = ["Support", "dashpot", "fixed", "roller"]
 
 
 def __dir__() -> list[str]:

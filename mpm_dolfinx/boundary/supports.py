@@ -32,18 +32,16 @@ from ..parallel.compilation import compiled_form
 from ..parallel.given import as_positive
 from ..particles.particles import Particles
 
-__all__ = ["Dashpot", "Plane", "Support", "dashpot", "fixed", "plane", "roller"]
+__all__ = ["Dashpot", "Support", "dashpot", "fixed", "roller"]
 
 #: Stiffness of a support in units of the modulus over the thickness of a domain.
 PENALTY = 1e3
 #: Ratio of moduli from which a support is too soft for a material that came later.
 STIFFER = 10.0
-#: Gap, relative to the body's coordinates, at which a plane is touched: their round-off.
-TOUCH = 1e-14
 
 
 class Support:
-    """A support on facets of a body, made by :func:`roller`, :func:`fixed` or :func:`plane`.
+    """A support on facets of a body, made by :func:`roller` or :func:`fixed`.
 
     Give it to ``QuasiStaticProblem(..., supports=[...])``, or add ``support.residual`` to a
     residual of your own.
@@ -58,11 +56,7 @@ class Support:
 
     Attributes:
         particles: The body.
-        one_sided: Whether the body may lift off.
     """
-
-    one_sided = False
-    stiffness_name = "stiffness of a support"
 
     def __init__(
         self,
@@ -88,7 +82,7 @@ class Support:
                 "ds", domain=body, subdomain_data=facet_tags, subdomain_id=tag, metadata=metadata
             )
         self._stiffness = fem.Function(
-            fem.functionspace(body, ("Discontinuous Lagrange", 0)), name=self.stiffness_name
+            fem.functionspace(body, ("Discontinuous Lagrange", 0)), name="stiffness of a support"
         )
         self._penalty = as_positive(penalty, "penalty")
         self._modulus = modulus is not None
@@ -277,70 +271,6 @@ class Support:
         return np.asarray(self.particles.mesh.comm.allreduce(mine))
 
 
-class Plane(Support):
-    """A one-sided support, made by :func:`plane`.
-
-    In a motion its force over a step is the discrete gradient of its energy,
-    ``(W(g_1) - W(g_0)) / (g_1 - g_0)`` with ``W = k/2 min(g, 0)^2`` of the gap g at the step's ends
-    (Gonzalez 2000), so that impacts neither add energy nor take any. The mean of the forces at the
-    ends would add much.
-
-    Args:
-        particles: The body.
-        gap: How far the boundary is off the plane, UFL; negative beyond it.
-        normal: The plane's normal, UFL, shape ``(gdim,)``.
-        facet_tags: As for :class:`Support`.
-        tag: As for :class:`Support`.
-        modulus: As for :func:`roller`.
-        penalty: As for :func:`roller`.
-    """
-
-    one_sided = True
-    stiffness_name = "stiffness of a one-sided support"
-
-    def __init__(
-        self,
-        particles: Particles,
-        gap: Any,
-        normal: Any,
-        facet_tags: Any,
-        tag: int | None,
-        modulus: Any,
-        penalty: float,
-    ) -> None:
-        self._gap, self._normal = gap, normal
-        self._touch = TOUCH * _extent(particles)
-        super().__init__(particles, self._within(gap) * normal, facet_tags, tag, modulus, penalty)
-        self._start = _Start()
-
-    def _within(self, gap: Any) -> Any:
-        """Return a gap where the plane is touched, or 0."""
-        return ufl.conditional(ufl.le(gap, self._touch), gap, 0.0)
-
-    def _has_whole_step(self, share: float | None) -> bool:
-        return share is not None and share < 1.0
-
-    def _of_step(self) -> Any:
-        gap = self._gap
-        start = self._start.of(gap)
-        ends = [self._within(g) for g in (start, gap)]
-        touched = [ufl.le(g, self._touch) for g in (start, gap)]
-        change = ufl.conditional(ufl.And(*touched), 1.0, (ends[1] - ends[0]) / (gap - start))
-        some = ufl.conditional(ufl.Or(*touched), 0.5 * (ends[0] + ends[1]) * change, 0.0)
-        return -self._stiffness * some * self._normal
-
-    @override
-    def settle(self) -> None:
-        self._start.settle()
-
-    @override
-    def step_work(self) -> tuple[float, float]:
-        if not self._whole_step:
-            return 0.0, 0.0
-        d = self.particles.displacement
-        return self._step_power(d - self._start.of(d)), 0.0
-
-
 class Dashpot(Support):
     """A quiet boundary, made by :func:`dashpot`.
 
@@ -429,12 +359,6 @@ class _Start:
                 np.copyto(before.value, value.value)
 
 
-def is_one_sided(form: Any) -> bool:
-    """Return whether a form has the traction of a one-sided support, or of a dashpot."""
-    found = form.coefficients() if isinstance(form, ufl.Form) else ()
-    return any(coefficient.name == Plane.stiffness_name for coefficient in found)
-
-
 def _copy_of(value: Any) -> Any:
     """Return a Function or Constant that has another's values now."""
     if isinstance(value, fem.Function):
@@ -515,47 +439,6 @@ def fixed(
 
 
 @collective()
-def plane(
-    particles: Particles,
-    point: Any,
-    normal: Any,
-    value: Any = 0.0,
-    facet_tags: Any = None,
-    tag: int | None = None,
-    *,
-    modulus: Any = None,
-    penalty: float = PENALTY,
-) -> Support:
-    """Keep the boundary of a body on one side of a smooth line or plane, which may move.
-
-    The boundary may touch it, slide on it and lift off: ``n . (X + d - point) >= value``.
-
-    Args:
-        particles: The body.
-        point: A point of the plane before it moves, numbers or UFL, shape ``(gdim,)``.
-        normal: Its normal, towards the body, as for :func:`roller`.
-        value: How far the plane has moved along its normal, as for :func:`roller`.
-        facet_tags: Tags of the body's facets, where not all of its boundary may touch.
-        tag: The tag of those that may.
-        modulus: As for :func:`roller`.
-        penalty: As for :func:`roller`.
-
-    Returns:
-        The support.
-
-    Raises:
-        MPMError: Tags, directions or numbers that make no sense.
-    """
-    n = _unit(normal, particles)
-    gdim = particles.mesh.geometry.dim
-    origin = as_expression(point, particles, "point", (gdim,))
-    g = as_expression(value, particles, "value", ())
-    x = ufl.SpatialCoordinate(particles.mesh) + particles.displacement
-    gap = ufl.dot(n, x - origin) - _reached(particles) * g
-    return Plane(particles, gap, n, facet_tags, tag, modulus, penalty)
-
-
-@collective()
 def dashpot(
     particles: Particles,
     facet_tags: Any,
@@ -591,12 +474,6 @@ def dashpot(
             raise MPMError(f"{name} must not be negative, not {value!r}.")
         resistances.append(as_expression(value, particles, name, ()))
     return Dashpot(particles, facet_tags, tag, *resistances)
-
-
-def _extent(particles: Particles) -> float:
-    """Return the largest coordinate of the undeformed body on all ranks (collective)."""
-    x = particles.initial_domains
-    return float(particles.mesh.comm.allreduce(np.abs(x).max(initial=0.0), MPI.MAX))
 
 
 def _reached(particles: Particles) -> Any:

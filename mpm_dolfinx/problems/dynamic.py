@@ -14,7 +14,7 @@ import ufl
 from dolfinx import fem
 
 from ..assembly.inputs import Density
-from ..boundary.supports import Support, is_one_sided
+from ..boundary.supports import Support
 from ..constitutive.points import MaterialPoints
 from ..constitutive.step_stress import StepStress
 from ..errors import MPMError, warn
@@ -276,12 +276,6 @@ class DynamicParticleProblem(MovingProblem):
                 f"scheme={rule.name!r} needs the stress at points, which a residual in UFL does "
                 "not tell; write the law as a material, and make a DynamicProblem."
             )
-        residuals = R if isinstance(R, list | tuple) else [R]
-        if any(is_one_sided(form) for form in residuals):
-            raise MPMError(
-                "R has a one-sided support or a dashpot, which act over a step as a whole in a "
-                "motion; give it as supports=[...] instead."
-            )
         self._supports = as_supports(supports, bodies)
         start = initial_velocities(velocity, particles)
         given = density if isinstance(density, list) else [density] * len(bodies)
@@ -311,7 +305,6 @@ class DynamicParticleProblem(MovingProblem):
         return given._replace(
             residual=form if given.residual is None else given.residual + form,
             tangent=None if given.tangent is None else given.tangent + ufl.derivative(form, d),
-            contact=any(support.one_sided for support in supports),
             of_step=tuple(supports),
         )
 

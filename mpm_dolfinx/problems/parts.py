@@ -40,7 +40,6 @@ class Contribution(NamedTuple):
         low_rank: What the tangent has besides forms and the pointwise one, or ``None``.
         symmetric: Whether the tangent is symmetric.
         material: The material at its points, if the above hold one.
-        contact: Whether the forms have one-sided supports.
         of_step: What among its forces may be of a whole step in time.
         static: Whether the body is in equilibrium at each step's end, in a motion of others.
     """
@@ -51,7 +50,6 @@ class Contribution(NamedTuple):
     low_rank: Linearised | None
     symmetric: bool
     material: PointHistory | None = None
-    contact: bool = False
     of_step: Sequence[StepForce] = ()
     static: bool = False
 
@@ -123,7 +121,6 @@ class Parts:
                     **self._form_options,
                 ),
                 given.material,
-                given.contact,
                 given.of_step,
                 given.static,
             )

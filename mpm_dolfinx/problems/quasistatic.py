@@ -431,7 +431,6 @@ class QuasiStaticProblem(ParticleProblem):
             acting.grouped,
             symmetric,
             acting,
-            any(support.one_sided for support in supports),
             of_step,
         )
 

@@ -67,7 +67,6 @@ class BodyTerm(Term):
         particles: The body.
         forms: Its residual and tangent.
         material: Its material, if the forms hold one.
-        contact: Whether one-sided supports act on it.
         of_step: What among its forces may be of a whole step.
         static: Whether, in a motion of others, the body is in equilibrium at each step's end: its
             forces there count for the whole step.
@@ -78,13 +77,13 @@ class BodyTerm(Term):
     """
 
     from_outside = False
+    one_sided = False
 
     def __init__(
         self,
         particles: Particles,
         forms: BodyForms,
         material: PointHistory | None = None,
-        contact: bool = False,
         of_step: Sequence[StepForce] = (),
         static: bool = False,
     ) -> None:
@@ -94,14 +93,8 @@ class BodyTerm(Term):
         self.particles = particles
         self.forms = forms
         self._material = material
-        self._contact = contact
         self._T: PETSc.Mat | None = None
         self._low_rank: ReducedLowRank | None = None
-
-    @property
-    def one_sided(self) -> bool:
-        """Whether it may let its bodies go: see :attr:`Term.one_sided`."""
-        return self._contact
 
     @property
     @override
@@ -160,7 +153,7 @@ class BodyTerm(Term):
     @override
     def smooth(self) -> bool:
         """Whether all points are smooth; it may differ between ranks."""
-        return not self._contact and (self._material is None or self._material.elastic())
+        return self._material is None or self._material.elastic()
 
     @override
     def yielding(self) -> NDArray[np.bool_] | None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from marks import slow
+from obstacles import wall
 from posed import posed
 from scenes import QUADRILATERAL, TRIANGLE, WORLD
 
@@ -17,7 +18,7 @@ from dolfinx import fem
 from dolfinx.fem.petsc import LinearProblem
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.boundary.supports import fixed, plane, roller
+from mpm_dolfinx.boundary.supports import fixed, roller
 from mpm_dolfinx.materials import Hencky, LinearElastic, VonMises
 
 
@@ -154,16 +155,13 @@ def test_a_moving_plane_squeezes_a_block(angle):
     # Confined between smooth walls: Cauchy's stress is M ln(stretch) / stretch.
     markers = scenes.at(1, 0.0), scenes.at(0, 0.0, 1.0), scenes.at(1, 2.0)
     p, tags, Q = turned(angle, [0.0, 0.0], [1.0, 2.0], [4, 8], TRIANGLE, markers, 0.3)
-    top = fem.Constant(p.mesh, 0.0)
-    supports = [
-        roller(p, tags, 1, Q @ [0, 1]),
-        roller(p, tags, 2, Q @ [1, 0]),
-        plane(p, Q @ [0, 2.0], Q @ [0, -1], top, tags, 3),
-    ]
-    problem = mpm.QuasiStaticProblem(mpm.Body(p, Hencky(1e4, 0.25)), supports=supports)
+    top = wall(p, Q @ [0, 2.0], Q @ [0, -1], facet_tags=tags, tag=3)
+    supports = [roller(p, tags, 1, Q @ [0, 1]), roller(p, tags, 2, Q @ [1, 0])]
+    body = mpm.Body(p, Hencky(1e4, 0.25))
+    problem = mpm.QuasiStaticProblem(body, supports=supports, terms=[top])
 
     def path(t):
-        top.value = 0.8 * t
+        top.move(Q @ [0.0, -0.8 * t])
         p.load.value = 1.0
 
     for step in problem.steps(5, update=path):
@@ -171,14 +169,14 @@ def test_a_moving_plane_squeezes_a_block(angle):
         M = 1.2e4
         expected = M * np.log(stretch) / stretch
         np.testing.assert_allclose(
-            problem.reaction(supports[2]) @ Q, [0.0, expected], rtol=4e-3, atol=1e-6 * M
+            problem.reaction(top) @ Q, [0.0, expected], rtol=4e-3, atol=1e-6 * M
         )
         np.testing.assert_allclose(
-            problem.reaction(supports[0]) + problem.reaction(supports[2]), 0.0, atol=1e-5 * M
+            problem.reaction(supports[0]) + problem.reaction(top), 0.0, atol=1e-5 * M
         )
     # It goes back, and farther than the body follows.
-    problem.solve(steps=5, update=lambda t: (path(1.0 - t), top.value.fill(0.8 - t))[0])
-    assert scenes.largest(problem.reaction(supports[2])) < 1e-6 * M
+    problem.solve(steps=5, update=lambda t: top.move(Q @ [0.0, t - 0.8]))
+    assert scenes.largest(problem.reaction(top)) < 1e-6 * M
     assert scenes.largest(p.displacement.x.array) < 1e-6
 
 
@@ -188,7 +186,7 @@ def slump(angle, h=1.0, g0=20e3, comm=WORLD):
     p, tags, Q = turned(
         angle, [0.0, 0.0], [4.0, 8.0], [8, 16], TRIANGLE, markers, h, comm=comm, far=(11.0, 0.0)
     )
-    supports = [roller(p, tags, 1, Q @ [1, 0]), plane(p, (0.0, 0.0), Q @ [0, 1])]
+    side, floor = roller(p, tags, 1, Q @ [1, 0]), wall(p, (0.0, 0.0), Q @ [0, 1])
     problem = mpm.QuasiStaticProblem(
         mpm.Body(
             p,
@@ -196,9 +194,10 @@ def slump(angle, h=1.0, g0=20e3, comm=WORLD):
             density=1000.0,
             body_force=tuple(Q @ [0.0, -g0 / 1000.0]),
         ),
-        supports=supports,
+        supports=[side],
+        terms=[floor],
     )
-    return problem, supports, Q
+    return problem, [side, floor], Q
 
 
 @pytest.mark.slow

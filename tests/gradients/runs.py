@@ -141,10 +141,8 @@ class Loaded:
         up, lifted = (0.1, 1.0), named["lifted"]
         if support == "fixed":
             rest = mpm.boundary.fixed(particles, tags, 3, ufl.as_vector([0.0, lifted]))
-        elif support == "roller":
-            rest = mpm.boundary.roller(particles, tags, 3, up, lifted)
         else:
-            rest = mpm.boundary.plane(particles, (0.0, 0.0), up, lifted, tags, 3)
+            rest = mpm.boundary.roller(particles, tags, 3, up, lifted)
         given = mpm.Body(
             particles,
             von_mises(named["young"], 2.5e3),

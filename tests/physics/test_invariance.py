@@ -238,12 +238,8 @@ def supported(frame, kind, floor=0.1, **options):
     tags = scenes.facet_tags(body.mesh, scene.on(1, floor))
     if kind == "fixed":
         support = mpm.boundary.fixed(body, tags, 1)
-    elif kind == "roller":
-        support = mpm.boundary.roller(body, tags, 1, frame.vector(0.0, -1.0))
     else:
-        support = mpm.boundary.plane(
-            body, frame.point([0.0, floor + 0.01]), frame.vector(0.0, 1.0), facet_tags=tags, tag=1
-        )
+        support = mpm.boundary.roller(body, tags, 1, frame.vector(0.0, -1.0))
     scene.problem(supports=[support], **options).solve(2)
     return scene
 
@@ -476,11 +472,11 @@ SCENES = {
     "aggregation": kept(stabilisation="aggregate"),
     "reference": by_reference,
     "loads": loaded,
-    **{kind: of(supported, kind) for kind in ("fixed", "roller", "plane")},
+    **{kind: of(supported, kind) for kind in ("fixed", "roller")},
     # (as over an edge)
     **{
         f"{kind} on a grid line": of(supported, kind, 0.0, stabilisation="ghost")
-        for kind in ("fixed", "roller", "plane")
+        for kind in ("fixed", "roller")
     },
     "cpdi over an edge": over_an_edge,
     "Rigid, penalty": of(obstacle, "penalty", "plane"),

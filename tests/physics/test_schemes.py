@@ -5,11 +5,11 @@
 import numpy as np
 import pytest
 from compare import EXACT, raises
+from obstacles import wall
 from posed import posed
 from scenes import QUADRILATERAL, WORLD, anywhere, box, in_order, largest, vectors
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.boundary import plane
 from mpm_dolfinx.materials import LinearElastic, VonMises
 
 
@@ -92,11 +92,11 @@ def test_bdf2_is_of_second_order_and_its_account_closes(uneven):
     assert errors[1] < 0.1 * error_of(euler)
 
 
-def bouncing(scheme, on_plane=True, **options):
+def bouncing(scheme, on_plane=True, terms=(), **options):
     """Return a square that spins, falls (on a plane) and yields."""
     V = vectors(box([0.0, 0.0], [3.0, 3.0], [12, 12], QUADRILATERAL))
     particles = mpm.Particles(box([1.03, 1.01], [2.03, 2.01], [8, 8], QUADRILATERAL), V)
-    floor = plane(particles, (0.0, 0.95), (0.0, 1.0))
+    floor = [wall(particles, (0.0, 0.95), (0.0, 1.0))] if on_plane else []
     return posed(
         mpm.DynamicProblem,
         particles,
@@ -104,7 +104,7 @@ def bouncing(scheme, on_plane=True, **options):
         2.0,
         velocity=lambda x: np.stack([-(x[1] - 1.51), x[0] - 1.53 - 1.0]),
         body_force=(0.0, -1.0),
-        supports=[floor] if on_plane else [],
+        terms=[*floor, *terms],
         scheme=scheme,
         petsc_options={"snes_rtol": 1e-12},
         **options,

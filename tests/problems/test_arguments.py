@@ -440,10 +440,6 @@ PROBLEMS = {
     "support on no facet": (held("fixed", tag=9), r"no facet tag 9; there are \[1\]"),
     "support without tags": (held("fixed", facet_tags=None), r"Supports need facet_tags="),
     "support on cells": (held("fixed", facet_tags=tags_of_cells), r"Supports need facet_tags="),
-    "point of a plane in words": (
-        held("plane", point="origin", normal=(0.0, 1.0)),
-        r"point must be numbers",
-    ),
     "complex force": (problem(body_force=(0.0, 1j)), r"body_force must be numbers or"),
     "force of UFL of several shapes": (
         problem(body_force=lambda p: (0.0, fem.Constant(p.mesh, np.ones(2)))),

@@ -148,10 +148,12 @@ def test_histories_and_contact_are_not_smooth():
     assert problem.reduced.terms.smooth()
     assert mpm.ParticleProblem(R, particles, bcs=problem.bcs).reduced.terms.smooth()
     assert not WithHistory(R, particles, bcs=problem.bcs).reduced.terms.smooth()
-    wall = mpm.boundary.plane(particles, (1.5, 0.0), (-1.0, 0.0))
+    end = scenes.WORLD.allreduce(particles.node_positions[:, 0].max(initial=0.0), scenes.MPI.MAX)
+    wall = mpm.contact.Rigid(particles, mpm.contact.plane((end, 0.0), (-1.0, 0.0)))
     touching = mpm.QuasiStaticProblem(
-        mpm.Body(particles, mpm.materials.Hencky(1e3, 0.3)), bcs=problem.bcs, supports=[wall]
+        mpm.Body(particles, mpm.materials.Hencky(1e3, 0.3)), bcs=problem.bcs, terms=[wall]
     )
+    assert touching.reduced.terms.update() is None
     assert not touching.reduced.terms.smooth()
 
 

@@ -50,9 +50,9 @@ def test_a_body_that_what_only_pushes_may_let_go():
     V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
     particles = mpm.Particles(scenes.unit(4, TRIANGLE), V)
     bcs = [scenes.fix(V, scenes.at(1, 0.0), component=1)]
-    wall = mpm.boundary.plane(particles, (1.2, 0.0), (-1.0, 0.0))
+    wall = mpm.contact.Rigid(particles, mpm.contact.plane((1.2, 0.0), (-1.0, 0.0)))
     problem = mpm.QuasiStaticProblem(
-        mpm.Body(particles, Hencky(1e3, 0.3), body_force=(1.0, 0.0)), bcs=bcs, supports=[wall]
+        mpm.Body(particles, Hencky(1e3, 0.3), body_force=(1.0, 0.0)), bcs=bcs, terms=[wall]
     )
     raises(lambda: problem.solve(steps=1), mpm.ConvergenceError, r"what only pushes has let")
     assert problem.history.cutbacks == 10
