@@ -16,6 +16,7 @@ from .errors import (  # noqa: E402
 )
 from .gradients.sensitivity import Sensitivity  # noqa: E402
 from .history import Energy, History, Loss, Stage, Statistics, Step  # noqa: E402
+from .meshes.grid import grid, grid_lines  # noqa: E402
 from .meshes.regions import cell_tags, facet_tags, held, region  # noqa: E402
 from .particles.field import ParticleField  # noqa: E402
 from .particles.particles import Particles  # noqa: E402
@@ -72,6 +73,8 @@ __all__ = [
     "contact",
     "facet_tags",
     "geostatic",
+    "grid",
+    "grid_lines",
     "held",
     "materials",
     "plot",

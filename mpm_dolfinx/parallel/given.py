@@ -31,7 +31,7 @@ PACKAGE = __name__.partition(".")[0]
 KINDS = ("symmetric", "kinematics", "inelastic")
 
 
-def require_same(comm: MPI.Comm, **given: Any) -> None:
+def require_same(comm: MPI.Comm, /, **given: Any) -> None:
     """Raise an error unless all ranks were given the same (collective).
 
     Arrays of a material's parameters, or of more than two dimensions, Functions and tags are a

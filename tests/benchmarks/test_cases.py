@@ -132,6 +132,26 @@ RUNS = {
     ),
     "slope": ("strength", "--case slope --cell 0.2", {"ratio": 1.06}),
     "vertical-cut": ("strength", "--case vertical_cut --cell 0.125", {"ratio": 1.08}),
+    "embankment": (
+        "embankment",
+        "--lifts 2 --tolerance 0.2",
+        {"most_solves": 8, "cutbacks": 0, "factor": 2.4},
+    ),
+    "circle-recommended": (
+        "strength",
+        "--case circle --recommended --halvings 2 --steps 8",
+        {"ratio": 1.02, "cutbacks": 0, "iterations": 96},
+    ),
+    "footing-recommended": (
+        "strength",
+        "--case footing --recommended --halvings 2 --steps 8",
+        {"ratio": 1.02, "cutbacks": 0, "iterations": 96},
+    ),
+    "weight-recommended": (
+        "strength",
+        "--case footing_weight --recommended --halvings 2 --steps 20",
+        {"ratio": 1.035, "cutbacks": 0, "iterations": 240},
+    ),
     "footing-friction": (
         "strength",
         "--case footing --cell 0.25 --degree 2 --steps 10",
@@ -297,6 +317,7 @@ KEYS = {
         for method in ("mpm", "gimp", "cpdi", "cpdi2")
     },
     "cylinder": {"error_axisymmetric", "error_plane", "rate"},
+    "embankment": {"built", "factor", "reason"},
     "expansion": {"radius", "error_early", "error", "particles"},
     "cell_crossing": {f"scatter_{method}" for method in ("mpm", "gimp", "cpdi", "cpdi2")},
     "block3d": {"height", "barrel", "volume_error", "reaction"},
@@ -363,6 +384,8 @@ def test_numbers(case, capfd):
         assert abs(numbers["height"] - 1.2) < 1e-3
     if name in ("strength", "footing", "penetration") and numbers.get("ratio"):
         assert numbers["ratio"] > 0.9
+    if name == "embankment":
+        assert numbers["built"] == 1 and numbers["factor"] > 1.9
     if name == "gradient":
         assert abs(numbers["taylor"] - 2.0) < 0.05
     if name == "sand_column":
@@ -482,6 +505,7 @@ def test_case_is_a_program(name, tmp_path):
         "consolidation": "--cells 4 --steps 2",
         "expansion": "--cells 2 --steps 4 --widest 2",
         "strength": "--cell 0.5",
+        "embankment": "--lifts 1 --line 2 --tolerance 0.5",
         "gmsh_body": "--size 0.3 --body-size 0.3 --steps 2",
         "snap_through": "--cell 1 --steps 4",
         "flying_bar": "--steps 4",

@@ -1,0 +1,119 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""An embankment that is built in lifts on soft clay, and how safe it is then.
+
+Half of a bank 2 m high, 4 m wide from its axis to its shoulder and with slopes of 1:2, on 6 m of
+clay with an undrained strength of 15 kPa that carries its own weight. The fill is placed in lifts,
+each in three steps, and after the last one the strength of all soil is reduced until no equilibrium
+is found. `built` says whether all lifts stand, `factor` is the factor of safety, and `reason` why
+the reduction ended. All by defaults, with averages over patches.
+"""
+
+from itertools import pairwise
+
+from mpi4py import MPI
+
+import kit
+import numpy as np
+
+from dolfinx import fem, mesh
+
+import mpm_dolfinx as mpm
+
+parser = kit.Parser("An embankment in lifts on soft clay, and its factor of safety.")
+parser.add_argument("--cohesion", type=kit.positive, default=2.0, help="of the fill, kPa")
+parser.add_argument("--dilation-angle", type=float, default=0.0, help="of the fill, degrees")
+parser.add_argument("--lifts", type=kit.whole, default=4, help="number of lifts")
+parser.add_argument("--line", type=kit.positive, default=1.0, help="distance of grid lines, m")
+parser.add_argument("--cell", type=kit.positive, help="size of domains, m; half that distance")
+parser.add_argument("--steps", type=kit.whole, default=3, help="steps of each lift")
+parser.add_argument("--tolerance", type=kit.positive, default=0.02, help="of the factor of safety")
+parser.add_argument(
+    "--limit", type=kit.positive, default=0.3, help="displacement that stands in the reduction, m"
+)
+args = parser.parse()
+
+comm, quadrilateral = MPI.COMM_WORLD, mesh.CellType.quadrilateral
+width, depth, height, crest, run, gravity = 26.0, 6.0, 2.0, 4.0, 2.0, (0.0, -10.0)  # m, m/s^2
+cell = args.cell or 0.5 * args.line
+
+# The grid reaches a line beyond the ground's side, which is held on the ground's own boundary.
+
+counts = [int(np.ceil(length / args.line - 1e-9)) + 1 for length in (width, depth + height)]
+grid = mesh.create_rectangle(
+    comm, [[0.0, 0.0], [args.line * count for count in counts]], counts, quadrilateral
+)
+V = fem.functionspace(grid, ("Lagrange", 1, (2,)))
+
+
+def block(low: float, high: float, right: float) -> mesh.Mesh:
+    """A rectangle from the axis of the bank."""
+    cells = [max(1, round(length / cell)) for length in (right, high - low)]
+    return mesh.create_rectangle(comm, [[0.0, low], [right, high]], cells, quadrilateral)
+
+
+def lift(low: float, high: float) -> mesh.Mesh:
+    """A lift between two levels, as wide as the slope leaves it."""
+    domain = block(low, high, reach(low))
+    x = domain.geometry.x
+    x[:, 0] *= reach(x[:, 1]) / reach(low)
+    return domain
+
+
+def reach(level: float) -> float:
+    """From the axis to the slope."""
+    return crest + run * (depth + height - level)
+
+
+ground = mpm.Particles(block(0.0, depth, width), V)
+tags = mpm.facet_tags(ground.mesh, {1: mpm.region(x=width)})
+fill = mpm.materials.MohrCoulomb(2e4, 0.3, args.cohesion, 32.0, args.dilation_angle)
+problem = mpm.QuasiStaticProblem(
+    mpm.Body(
+        ground,
+        mpm.materials.Tresca(4500.0, 0.49, cohesion=15.0),
+        density=1.6,
+        body_force=gravity,
+        f_bar="patch",
+        initial_stress=mpm.geostatic(depth, 1.6, 0.8, gravity),
+    ),
+    bcs=[mpm.held(V, 0, x=0.0), mpm.held(V, y=0.0)],
+    supports=[mpm.boundary.roller(ground, tags, 1, normal=(1.0, 0.0))],
+    solver=mpm.Solver(petsc_options_prefix="embankment_"),
+)
+
+failure, factor, reason, standing, most = None, np.nan, None, 0, 0
+try:
+    problem.solve()
+    levels = depth + height * np.arange(args.lifts + 1) / args.lifts
+    for number, (low, high) in enumerate(pairwise(levels), 1):
+        placed = mpm.Particles(lift(float(low), float(high)), V)
+        body = mpm.Body(placed, fill, density=1.9, body_force=gravity, f_bar="patch")
+        problem.add(body, f"lift {number}")
+        for step in kit.progress(problem.steps(args.steps), args.steps, args):
+            most = max(most, step.iterations)
+        standing = number
+    found = mpm.strength_reduction(problem, tolerance=args.tolerance, displacement=args.limit)
+    factor, reason = found.factor, found.reason
+except mpm.MPMError as error:
+    failure = error
+
+numbers = {
+    **kit.outcome(problem.history, failure),
+    "built": int(standing == args.lifts),
+    "factor": factor,
+    "reason": reason,
+    "most_solves": most,
+}
+rows = [
+    ("lifts that stand", f"{standing} of {args.lifts}"),
+    ("linear solves", f"{numbers['iterations']}, {numbers['cutbacks']} cutbacks"),
+    ("most in a step of building", f"{most}"),
+    ("factor of safety", f"{factor:.3f}, ended by {reason}"),
+]
+if args.plot:
+    fig, axes = kit.figure(11.0, 4.0)
+    for body in problem.bodies:
+        mpm.plot.domains(body, body.plastic_strain, ax=axes["main"], cmap="YlGnBu", vmin=0.0)
+    kit.save(fig, args)
+kit.report(args, numbers, rows, failure)
