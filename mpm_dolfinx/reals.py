@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Input of users, taken for real numbers."""
+"""Input of users, taken for real or whole numbers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem
 
-__all__ = ["as_reals", "holds_ufl", "is_one_of"]
+__all__ = ["as_reals", "as_wholes", "holds_ufl", "is_one_of"]
 
 
 def as_reals(value: Any) -> NDArray[np.float64]:
@@ -27,12 +27,25 @@ def as_reals(value: Any) -> NDArray[np.float64]:
     if holds_ufl(value, fem.Constant):
         raise TypeError("UFL is no number")
     array = np.asarray(value)
-    if array.dtype.kind in "cb":
+    if array.dtype.kind in "cb" or _holds(value, (bool, np.bool_)):
         raise TypeError("complex numbers, or truths")
     try:
         return np.array(array, dtype=np.float64)
     except OverflowError as error:
         raise ValueError("too large a number") from error
+
+
+def as_wholes(value: Any) -> NDArray[np.int64]:
+    """Return whole numbers, such as indices or tags, as a new array.
+
+    Raises:
+        TypeError: Truths, or something else that are none.
+        ValueError: Lists of different lengths.
+    """
+    array = np.asarray(value)
+    if array.size and (array.dtype.kind not in "iu" or _holds(value, (bool, np.bool_))):
+        raise TypeError("no whole numbers")
+    return array.astype(np.int64)
 
 
 def holds_ufl(value: Any, *besides: type) -> bool:
@@ -42,9 +55,14 @@ def holds_ufl(value: Any, *besides: type) -> bool:
         value: Anything.
         *besides: Kinds of UFL that do not count.
     """
+    return _holds(value, (ufl.core.expr.Expr,), besides)
+
+
+def _holds(value: Any, kinds: tuple[type, ...], besides: tuple[type, ...] = ()) -> bool:
+    """Return whether a value is of some kinds, or a list that holds such values."""
     if isinstance(value, list | tuple):
-        return any(holds_ufl(part, *besides) for part in value)
-    return isinstance(value, ufl.core.expr.Expr) and not isinstance(value, besides)
+        return any(_holds(part, kinds, besides) for part in value)
+    return isinstance(value, kinds) and not isinstance(value, besides)
 
 
 def is_one_of(value: Any, names: Collection[str]) -> bool:

@@ -11,7 +11,7 @@ import ufl
 from dolfinx import fem
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.reals import as_reals, is_one_of
+from mpm_dolfinx.reals import as_reals, as_wholes, is_one_of
 
 
 def test_numbers_and_constants():
@@ -44,6 +44,23 @@ def test_ufl_without_a_value():
     wall = mpm.contact.Rigid(mpm.Particles(body, V), mpm.contact.plane((0.0, 0.0), (0.0, 1.0)))
     with pytest.raises(mpm.MPMError, match="An obstacle moves by an offset"):
         wall.move((0.0, scalar))
+
+
+def test_truths_are_no_numbers_among_others_either():
+    for value in ((True, 0.0), [[1.0, np.False_]], (np.True_,), True):
+        with pytest.raises(TypeError):
+            as_reals(value)
+        with pytest.raises(TypeError):
+            as_wholes(value)
+
+
+def test_whole_numbers():
+    assert as_wholes([3, 1]).dtype == np.int64 and as_wholes([]).size == 0
+    given = np.arange(3)
+    assert not np.shares_memory(as_wholes(given), given)
+    for value in ([1.0], "a", 1.5, None, [[1], [1, 2]], lambda: 1):
+        with pytest.raises((TypeError, ValueError)):
+            as_wholes(value)
 
 
 def test_names():

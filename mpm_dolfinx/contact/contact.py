@@ -18,9 +18,8 @@ from ..errors import MPMError, agree
 from ..io.identity import same
 from ..io.snapshot import Kept, Taken
 from ..meshes.remesh import Column
-from ..parallel.given import require_truth
 from ..particles.particles import Particles
-from ..reals import is_one_of
+from ..reals import as_reals, is_one_of
 from ..system.term import PointMaterial, Term
 from .law import Friction
 from .surface import Surface
@@ -70,7 +69,6 @@ class Contact(Term):
     ) -> None:
         if not is_one_of(law, LAWS):
             raise MPMError(f"law must be one of {', '.join(map(repr, LAWS))}, not {law!r}.")
-        require_truth("axisymmetric", axisymmetric)
         super().__init__(bodies)
         self._nitsche = law == "nitsche"
         self.friction = friction
@@ -293,8 +291,11 @@ class Contact(Term):
     ) -> NDArray[np.float64]:
         """Return the moment of forces at points of this rank, summed over ranks (collective)."""
         gdim = self.bodies[0].mesh.geometry.dim
-        centre = np.asarray(about, dtype=np.float64)
-        if centre.shape != (gdim,):
+        try:
+            centre = as_reals(about)
+        except (TypeError, ValueError):
+            centre = np.zeros(0)
+        if centre.shape != (gdim,) or not np.isfinite(centre).all():
             raise MPMError(f"A moment is about {gdim} coordinates, not {about!r}.")
         parts = [cross(x - centre, f).sum(axis=0) for x, f in zip(points, forces, strict=True)]
         return np.asarray(self._comm.allreduce(np.atleast_1d(np.sum(parts, axis=0))))

@@ -120,7 +120,7 @@ class Obstacle(Contact):
         Raises:
             MPMError: No points of this dimension.
         """
-        points = np.asarray(x, dtype=np.float64)
+        points = as_reals(x)
         if points.ndim != 2 or points.shape[1] != self.shape.dim:
             raise MPMError(f"Points have the shape (n, {self.shape.dim}), not {points.shape}.")
         return self.placed().distance(points)

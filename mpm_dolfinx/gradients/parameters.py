@@ -181,15 +181,22 @@ def _along(
         if function or values.size != 1:
             raise MPMError(f"{name} has many values; give a pair of it and a direction.")
         direction = 1.0
-    along = direction.x.array if isinstance(direction, fem.Function) else as_reals(direction)
     with agree(problem.bodies[0].mesh.comm):
         try:
-            along = np.array(np.broadcast_to(along, values.shape), dtype=np.float64)
-        except ValueError:
-            raise MPMError(f"The direction of {name} must have its shape {values.shape}.") from None
+            way = direction.x.array if isinstance(direction, fem.Function) else as_reals(direction)
+            along = np.array(np.broadcast_to(way, values.shape), dtype=np.float64)
+        except (TypeError, ValueError):
+            raise MPMError(
+                f"The direction of {name} must be numbers of its shape {values.shape}, not "
+                f"{direction!r}."
+            ) from None
+        if not np.isfinite(along).all():
+            raise MPMError(f"The direction of {name} must be finite.")
+    size = _largest(np.abs(along), problem)
+    if size == 0.0:
+        raise MPMError(f"The direction of {name} must not be zero.")
     if scale is None:
-        size = _largest(np.abs(along), problem)
-        scale = _largest(np.abs(values), problem) / size if size > 0.0 else 0.0
+        scale = _largest(np.abs(values), problem) / size
     laws = [law for points in problem.material_points() for law in points.given]
     numbers: list[Any] = [value for law in laws for value in law.parameters.values()]
     of_law = any(value is thing for value in numbers)

@@ -14,7 +14,7 @@ from dolfinx import fem
 
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective, of_user
-from ..parallel.given import require_same
+from ..parallel.given import as_positive, require_same
 from ..problems.particle_problem import ParticleProblem
 from ..problems.quasistatic import QuasiStaticProblem
 from ..problems.through_time import TimeProblem
@@ -73,7 +73,9 @@ class Sensitivity:
         scales: Sequence[float] | None = None,
     ) -> None:
         _require_followed(problem)
-        sizes = [None] * len(parameters) if scales is None else list(scales)
+        sizes: list[float | None] = [None] * len(parameters)
+        if scales is not None:
+            sizes = [as_positive(scale, "scales of Sensitivity()") for scale in scales]
         if len(sizes) != len(parameters):
             raise MPMError(f"There are {len(sizes)} scales for {len(parameters)} parameters.")
         self.problem = problem

@@ -16,7 +16,6 @@ from dolfinx import fem, mesh
 
 from ..errors import MPMError, agree, as_ours
 from ..parallel.boundary import collective
-from ..parallel.given import require_truth
 from ..reals import as_reals
 
 __all__ = ["cell_tags", "facet_tags", "held", "region"]
@@ -134,7 +133,6 @@ def facet_tags(domain: mesh.Mesh, where: Mapping[int, Where], interior: bool = F
     """
     dim = domain.topology.dim - 1
     domain.topology.create_connectivity(dim, dim + 1)
-    require_truth("interior", interior)
     locate = mesh.locate_entities if interior else mesh.locate_entities_boundary
     return _tags(domain, dim, where, lambda inside: locate(domain, dim, inside), "facet")
 

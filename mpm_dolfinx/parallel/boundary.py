@@ -20,7 +20,7 @@ from mpi4py import MPI
 
 from ..errors import agree, called_last, forget
 from .given import require_same
-from .kinds import explained
+from .kinds import explained, require_truths
 
 __all__ = ["Hooked", "asked", "by_itself", "collective", "hooks_of", "is_collective", "of_user"]
 
@@ -62,6 +62,7 @@ def collective[**P, R](*own: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
             with _entered(comm), explained(function, args, given):
                 if comm.size > 1:
                     require_same(comm, **_named(signature, own, args, given))
+                require_truths(function, args, given)
                 result = function(*args, **given)
             return cast(R, _together(result, comm)) if isinstance(result, Generator) else result
 

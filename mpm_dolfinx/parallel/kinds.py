@@ -1,12 +1,17 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Arguments of another kind than a call asks for, named where it breaks down on them."""
+"""Arguments of another kind than a call asks for.
+
+Truths are looked at before a call, as Python takes anything for one; all else where the call breaks
+down on it.
+"""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from functools import cache
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeAliasType, Union, get_args, get_origin, get_type_hints
 
@@ -14,16 +19,25 @@ import numpy as np
 
 from ..errors import MPMError
 
-__all__ = ["explained"]
+__all__ = ["explained", "require_truths"]
 
 #: What Python and NumPy raise about an object that cannot do what is asked of it.
-CONFUSED = (TypeError, ValueError, AttributeError, LookupError, ArithmeticError)
+CONFUSED = (
+    TypeError,
+    ValueError,
+    AttributeError,
+    LookupError,
+    ArithmeticError,
+    NotImplementedError,  # UFL of no length
+)
 #: What is taken for a number or a truth.
 NUMBERS: dict[Any, tuple[type, ...]] = {
     bool: (bool, np.bool_),
     int: (int, np.integer),
     float: (int, float, np.integer, np.floating),
 }
+#: What truths are called in a message.
+TRUTHS: dict[Any, str] = {bool: "True or False", bool | None: "True, False or None"}
 
 
 @contextmanager
@@ -41,27 +55,63 @@ def explained(function: Callable[..., Any], args: Any, given: Any) -> Iterator[N
     try:
         yield
     except CONFUSED as error:
-        told = _misfit(function, args, given)
-        if told is None:
+        if (told := _misfit(function, args, given)) is None:
             raise
         raise MPMError(told) from error
 
 
-def _misfit(function: Callable[..., Any], args: Any, given: Any) -> str | None:
-    """Return a sentence about the first argument that is not of its kind, if there is one."""
+def require_truths(function: Callable[..., Any], args: Any, given: Any) -> None:
+    """Raise an error unless arguments are truths that are to be.
+
+    Args:
+        function: What is called, with annotations.
+        args: Its arguments.
+        given: Those by name.
+    """
+    if (told := _misfit(function, args, given, among=TRUTHS)) is not None:
+        raise MPMError(told)
+
+
+def _misfit(
+    function: Callable[..., Any], args: Any, given: Any, among: Collection[Any] | None = None
+) -> str | None:
+    """Return a sentence about the first argument that is not of its kind, if there is one.
+
+    Args:
+        function: What is called.
+        args: Its arguments.
+        given: Those by name.
+        among: Annotations of those that count; ``None``: of any.
+    """
+    kinds = _kinds_of(function)
+    if among is not None:
+        kinds = {name: kind for name, kind in kinds.items() if kind in among}
+    if not kinds:
+        return None
     signature = inspect.signature(function)
     try:
         arguments = signature.bind(*args, **given).arguments
-        kinds = get_type_hints(function)
-    except (TypeError, NameError):  # Python's own sentence says what is missing
+    except TypeError:  # Python's own sentence says what is missing
         return None
-    for name, value in arguments.items():
-        parameter = signature.parameters[name]
-        several = parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
-        if name != "self" and not several and not _fits(value, kinds.get(name, Any)):
-            called = function.__qualname__.removesuffix(".__init__").rpartition(".")[2]
-            return f"{name} of {called}() must be {parameter.annotation}, not {value!r}."
+    for name, kind in kinds.items():
+        if name not in arguments or _fits(arguments[name], kind):
+            continue
+        called = function.__qualname__.removesuffix(".__init__").rpartition(".")[2]
+        wanted = TRUTHS.get(kind, signature.parameters[name].annotation)
+        return f"{name} of {called}() must be {wanted}, not {arguments[name]!r}."
     return None
+
+
+@cache
+def _kinds_of(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the annotations of a function's arguments by their names, as far as they are known."""
+    try:
+        kinds = get_type_hints(function)
+    except (TypeError, NameError):
+        return {}
+    several = inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL
+    parameters = inspect.signature(function).parameters.values()
+    return {p.name: kinds[p.name] for p in parameters if p.name in kinds and p.kind not in several}
 
 
 def _fits(value: Any, kind: Any) -> bool:

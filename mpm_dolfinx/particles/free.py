@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -16,6 +17,7 @@ from dolfinx import fem, la, mesh
 from .. import _compat
 from ..background.basis import PointBasis
 from ..errors import MPMError, agree, as_ours
+from ..reals import as_wholes
 from ..transfer.matrix import transfer_matrix
 
 __all__ = ["FreeNodes", "chosen_nodes"]
@@ -156,6 +158,8 @@ def chosen_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.bool_]:
     marks = la.vector(layout, 1, dtype=np.float64)
     with agree(W.mesh.comm):
         marks.array[_local_nodes(W, where)] = 1.0
+    if isinstance(where, tuple) and not _is_listed(where):
+        _require_tags(W.mesh.comm, *where)
     marks.scatter_reverse(la.InsertMode.add)
     own = marks.array[: layout.size_local]
     own[:] = own > 0.0
@@ -169,10 +173,18 @@ def chosen_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.bool_]:
 def _is_listed(where: Any) -> bool:
     """Return whether nodes are given one by one."""
     try:
-        given = np.asarray(where)
-    except ValueError:
+        return as_wholes(where).ndim == 1
+    except (TypeError, ValueError):
         return False
-    return given.ndim == 1 and (given.size == 0 or given.dtype.kind in "iu")
+
+
+def _require_tags(comm: MPI.Comm, tags: mesh.MeshTags, wanted: Any) -> None:
+    """Raise an error where no cell has a tag that is asked for (collective)."""
+    known: set[int] = set().union(*comm.allgather(set(tags.values.tolist())))
+    if missing := set(as_wholes(wanted).ravel().tolist()) - known:
+        raise MPMError(
+            f"No cell has the tag {min(missing)} of free=(tags, tag); there are {sorted(known)}."
+        )
 
 
 def _local_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.integer[Any]]:
@@ -193,7 +205,7 @@ def _local_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.integer[Any]]:
         inside[layout.size_local :] = False  # whose owners know
         return np.flatnonzero(inside)
     if _is_listed(where):
-        nodes = np.asarray(where, dtype=np.int64)
+        nodes = as_wholes(where)
         if len(nodes) and (nodes.min() < 0 or nodes.max() >= count):
             raise MPMError(f"free= has nodes that are none of the {count} local ones of W.")
         return nodes
@@ -206,10 +218,11 @@ def _local_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.integer[Any]]:
     body = W.mesh
     if tags.dim != body.topology.dim or not _compat.are_tags_of(tags, body):
         raise MPMError("The tags in free=(tags, tag) must be those of cells of the body mesh.")
-    values = np.atleast_1d(np.asarray(wanted))
-    if values.dtype.kind not in "iu":
+    try:
+        values = as_wholes(wanted).ravel()
+    except (TypeError, ValueError):
         raise MPMError(
             f"The tag in free=(tags, tag) is a whole number, or several, not {wanted!r}."
-        )
+        ) from None
     cells = tags.indices[np.isin(tags.values, values)]
     return np.unique(W.dofmap.list[cells])

@@ -16,7 +16,7 @@ from dolfinx import fem
 
 from ..errors import MPMError, agree
 from ..particles.particles import Particles
-from ..reals import as_reals
+from .outlines import owned_values
 
 __all__ = ["LABELS", "bodies_of", "values_of"]
 
@@ -37,7 +37,8 @@ def bodies_of(problem: Any) -> list[Particles]:
     if isinstance(problem, Particles):
         return [problem]
     bodies = getattr(problem, "bodies", problem)
-    if not isinstance(bodies, list | tuple) or not all(isinstance(b, Particles) for b in bodies):
+    known = isinstance(bodies, list | tuple) and all(isinstance(b, Particles) for b in bodies)
+    if not known or not bodies:
         raise MPMError(
             f"Pictures are of a problem, of particles or of a list of them, not of {problem!r}."
         )
@@ -79,13 +80,7 @@ def _given(body: Particles, values: Any) -> NDArray[np.float64]:
         if values.function_space.mesh is not body.mesh:
             raise MPMError(f"The Function {values.name!r} is not on the mesh of its body.")
         return _of_function(body, values)
-    array = as_reals(values)
-    if array.shape != (body.num_local,):
-        raise MPMError(
-            f"values must have the shape ({body.num_local},), one value for each particle "
-            f"of the rank, not {array.shape}."
-        )
-    return array
+    return owned_values(body, values)
 
 
 def _of_function(body: Particles, function: fem.Function) -> NDArray[np.float64]:

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
+from ..parallel.given import as_positive, require_whole
 from .fields import LABELS, Field, bodies_of
 from .outlines import imported
-from .scenes import Look, Shot, corners, draw, framed, new_figure, take
+from .scenes import Look, Shot, corners, draw, ends_of, framed, new_figure, take
 
 __all__ = ["movie"]
 
@@ -73,14 +74,15 @@ def movie(
     with agree(comm):
         if Path(path).suffix not in (".gif", ".webp"):
             raise MPMError(f"A movie is a file that ends in .gif or .webp, not {str(path)!r}.")
-        if every < 1 or fps <= 0:
-            raise MPMError("every must be at least 1, and fps positive.")
-        shown = corners(box, bodies[0].mesh.geometry.dim)
+        require_whole("every", every, least=1)
+        as_positive(fps, "fps")
+        as_positive(dpi, "dpi")
+        shown, between = corners(box, bodies[0].mesh.geometry.dim), ends_of(limits)
     figures = imported("matplotlib.figure", comm)
     imported("PIL.Image", comm)
     name = field if isinstance(field, str) else ""
     look = Look(LABELS.get(name, name.replace("_", " ")) if label is None else label)
-    look = replace(look, cmap=cmap, limits=limits, camera=camera, box=shown)
+    look = replace(look, cmap=cmap, limits=between, camera=camera, box=shown)
 
     def shot() -> tuple[float, Shot | None]:
         now = field() if callable(field) else field

@@ -19,10 +19,22 @@ from dolfinx import fem, mesh
 from .. import _compat
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
+from ..parallel.given import is_number
 from ..particles.particles import Particles
 from ..reals import as_reals
 
-__all__ = ["background", "domains", "edges", "grid", "imported", "outlines", "surface_algorithm"]
+__all__ = [
+    "background",
+    "domains",
+    "edges",
+    "grid",
+    "imported",
+    "outlines",
+    "owned_values",
+    "require_axes",
+    "require_finite",
+    "surface_algorithm",
+]
 
 
 @collective("values", "ax")
@@ -69,13 +81,11 @@ def domains(
     """
     comm: MPI.Comm = particles.mesh.comm
     _require_plane(particles.mesh)
-    shown = None if values is None else as_reals(values)
     with agree(comm):
-        if shown is not None and shown.shape != (particles.num_local,):
-            raise MPMError(
-                f"values must have the shape ({particles.num_local},), one value for each particle "
-                f"of the rank, not {shown.shape}."
-            )
+        shown = None if values is None else owned_values(particles, values)
+        ends = {"vmin": vmin, "vmax": vmax}
+        given = {name: value for name, value in ends.items() if value is not None}
+        require_finite(warp=warp, linewidth=linewidth, **given)
     collections = imported("matplotlib.collections", comm)
     present = ~particles.deleted
     index = comm.gather(particles.global_index[present])
@@ -124,6 +134,8 @@ def background(
     grid_mesh = V if isinstance(V, mesh.Mesh) else V.mesh
     comm: MPI.Comm = grid_mesh.comm
     _require_plane(grid_mesh)
+    with agree(comm):
+        require_finite(linewidth=linewidth)
     collections = imported("matplotlib.collections", comm)
     cells = edges(grid_mesh)
     if cells is None:
@@ -237,7 +249,41 @@ def surface_algorithm(pyvista: Any) -> dict[str, Any]:
     return {"algorithm": "dataset_surface"} if "algorithm" in known else {}
 
 
+def owned_values(particles: Particles, values: Any) -> NDArray[np.float64]:
+    """Return values that a user has given, one for each particle that this rank owns.
+
+    Raises:
+        MPMError: They are something else.
+    """
+    try:
+        array = as_reals(values)
+    except (TypeError, ValueError):
+        raise MPMError(
+            f"values must be numbers, one for each particle of the rank, not {values!r}."
+        ) from None
+    if array.shape != (particles.num_local,):
+        raise MPMError(
+            f"values must have the shape ({particles.num_local},), one value for each particle "
+            f"of the rank, not {array.shape}."
+        )
+    return array
+
+
+def require_finite(**numbers: Any) -> None:
+    """Raise an error unless values, by their names, are finite numbers."""
+    for name, value in numbers.items():
+        if not is_number(value) or not abs(value) < np.inf:
+            raise MPMError(f"{name} must be a finite number, not {value!r}.")
+
+
+def require_axes(ax: Any) -> None:
+    """Raise an error unless something is axes of matplotlib, or ``None``."""
+    if ax is not None and not isinstance(ax, import_module("matplotlib.axes").Axes):
+        raise MPMError(f"ax must be axes of matplotlib, such as plt.gca(), not {ax!r}.")
+
+
 def _added(artist: Any, ax: Any) -> Any:
+    require_axes(ax)
     if ax is None:
         ax = import_module("matplotlib.pyplot").gca()
     ax.add_collection(artist)

@@ -18,11 +18,21 @@ from numpy.typing import NDArray
 
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
+from ..parallel.given import is_number
 from ..particles.particles import Particles
+from ..reals import as_reals
 from .fields import LABELS, Field, bodies_of, values_of
-from .outlines import edges, grid, imported, outlines, surface_algorithm
+from .outlines import (
+    edges,
+    grid,
+    imported,
+    outlines,
+    require_axes,
+    require_finite,
+    surface_algorithm,
+)
 
-__all__ = ["Look", "Shot", "corners", "draw", "framed", "new_figure", "scene", "take"]
+__all__ = ["Look", "Shot", "corners", "draw", "ends_of", "framed", "new_figure", "scene", "take"]
 
 #: Room around the bodies, relative to their extent, and pixels of the longer side in space.
 MARGIN, PIXELS = 0.04, 1500
@@ -146,15 +156,18 @@ def scene(
     comm: MPI.Comm = bodies[0].mesh.comm
     with agree(comm):
         shown = corners(box, bodies[0].mesh.geometry.dim)
+        between = ends_of(limits)
+        require_finite(warp=warp)
     figures = imported("matplotlib.figure", comm)
     name = field if isinstance(field, str) else ""
     look = Look(LABELS.get(name, name.replace("_", " ")) if label is None else label)
-    look = replace(look, cmap=cmap, limits=limits, lines=lines, camera=camera, title=title)
+    look = replace(look, cmap=cmap, limits=between, lines=lines, camera=camera, title=title)
     look = replace(look, box=shown)
     shot = take(problem, bodies, field, warp, background)
     with agree(comm):
         if shot is None:
             return None
+        require_axes(ax)
         figure = ax.figure if ax is not None else new_figure(figures, shot, look)
         draw(shot, look, figure.add_subplot() if ax is None else ax)
         if path is not None:
@@ -171,7 +184,7 @@ def corners(box: Any, gdim: int) -> NDArray[np.float64] | None:
     if box is None:
         return None
     try:
-        given = np.array(box, dtype=np.float64)
+        given = as_reals(box)
     except (TypeError, ValueError):
         given = np.zeros(0)
     if given.shape != (2, gdim) or not np.isfinite(given).all() or (given[0] >= given[1]).any():
@@ -180,6 +193,23 @@ def corners(box: Any, gdim: int) -> NDArray[np.float64] | None:
             f"each, not {box!r}."
         )
     return given
+
+
+def ends_of(limits: Any) -> tuple[float | None, float | None] | None:
+    """Return the first and the last value of colours that a user gives.
+
+    Raises:
+        MPMError: They are none.
+    """
+    if limits is None:
+        return None
+    given = list(limits) if isinstance(limits, list | tuple | np.ndarray) else []
+    if len(given) != 2 or not all(v is None or (is_number(v) and abs(v) < np.inf) for v in given):
+        raise MPMError(
+            "limits must be the first and the last value of the colours, each a number or None, "
+            f"not {limits!r}."
+        )
+    return given[0], given[1]
 
 
 def framed(extent: NDArray[np.float64], around: NDArray[np.float64] | None) -> NDArray[np.float64]:

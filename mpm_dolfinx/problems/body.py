@@ -16,7 +16,7 @@ from dolfinx import mesh
 from ..constitutive.averaging import F_BARS
 from ..errors import MPMError
 from ..parallel.boundary import collective
-from ..parallel.given import require_same
+from ..parallel.given import is_number, require_same
 from ..particles.particles import Particles
 from ..reals import is_one_of
 from .arguments import as_pairs, carried, holds
@@ -64,13 +64,14 @@ class PoreFluid:
             object.__setattr__(self, name, as_pairs(name, getattr(self, name)))
         for name, least in (("permeability", True), ("storage", False), ("density", False)):
             value = getattr(self, name)
-            known = isinstance(value, float | int | np.number) and not isinstance(value, bool)
-            if name == "density" and not known:
+            if name == "density" and not is_number(value):
                 raise MPMError(f"density of a PoreFluid must be a number, not {value!r}.")
-            if value is None or (known and not (value > 0.0 if least else value >= 0.0)):
+            if value is not None and not is_number(value):
+                continue  # left to the problem, which knows the mesh
+            if value is None or not (value > 0.0 if least else value >= 0.0):
                 how = "positive" if least else "not negative"
                 raise MPMError(f"{name} of a PoreFluid must be {how}, not {value!r}.")
-            if known and not np.isfinite(value):
+            if value == np.inf:
                 raise MPMError(f"{name} of a PoreFluid must be finite, not {value!r}.")
 
 

@@ -19,7 +19,7 @@ from ..constitutive.points import MaterialPoints
 from ..constitutive.step_stress import StepStress
 from ..errors import MPMError, warn
 from ..parallel.boundary import collective
-from ..parallel.given import require_same
+from ..parallel.given import is_number, require_same
 from ..particles.particles import Particles
 from ..system.body import StepForce
 from ..system.inertia import Inertia
@@ -268,7 +268,9 @@ class DynamicParticleProblem(MovingProblem):
         **options: Any,
     ) -> None:
         bodies = as_bodies(particles)
-        rayleigh = rayleigh_of((damping, 0.0))
+        if not is_number(damping) or not 0.0 <= damping < np.inf:
+            raise MPMError(f"damping must be a number that is not negative, not {damping!r}.")
+        rayleigh = float(damping), 0.0
         require_motion("DynamicParticleProblem", options)
         rule = as_scheme(scheme, out_of_range)
         if rule.stress_of_step:

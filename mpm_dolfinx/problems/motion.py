@@ -267,8 +267,19 @@ def initial_velocity(value: Any, body: Particles) -> fem.Function:
 
 def _interpolate(velocity: fem.Function, value: Any) -> None:
     """Interpolate a Function, or a function of coordinates."""
+
+    def shaped(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        values = as_reals(value(x))
+        wanted = velocity.function_space.dofmap.index_map_bs, x.shape[1]
+        if values.shape != wanted:
+            raise MPMError(
+                f"The function that gives velocity must return values of the shape {wanted} for "
+                f"coordinates {x.shape}, not {values.shape}."
+            )
+        return values
+
     try:
-        velocity.interpolate(value)
+        velocity.interpolate(value if isinstance(value, fem.Function) else shaped)
     except MPMError:
         raise
     except Exception as error:

@@ -31,7 +31,7 @@ from ..io.series import Output
 from ..io.snapshot import Kept, spaces_of
 from ..parallel.boundary import Hooked, by_itself, collective
 from ..parallel.garbage import Cleaner
-from ..parallel.given import require_same, require_truth
+from ..parallel.given import is_number, require_same
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
 from ..solvers.linear import chosen
@@ -387,7 +387,6 @@ class ParticleProblem(Hooked):
         self._require_governing()
         if not isinstance(name, str):
             raise MPMError(f"The name of a stage must be a string, not {name!r}.")
-        require_truth("sudden", sudden)
         self._staging.begin(name, change, bool(sudden))
 
     @property
@@ -695,7 +694,7 @@ class ParticleProblem(Hooked):
         self._require_governing()
         moment = self.history.time if time is None else time
         with agree(self._comm):
-            if not isinstance(moment, float | int | np.number) or not np.isfinite(moment):
+            if not is_number(moment) or not abs(moment) < np.inf:
                 raise MPMError(f"time must be a finite number, not {time!r}.")
         self._output.write(as_path(path), self.bodies, float(moment), len(self.history.steps))
 
@@ -750,7 +749,7 @@ class ParticleProblem(Hooked):
         """Return the state at the last converged step, for :meth:`return_to` (collective)."""
         return self._state.capture()
 
-    @collective()
+    @collective("snapshot")
     def return_to(self, snapshot: checkpoint.Snapshot) -> None:
         """Return to a state of this problem on the present meshes (collective)."""
         self._state.adopt(snapshot)

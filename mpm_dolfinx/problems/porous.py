@@ -32,7 +32,7 @@ from ..constitutive.strain import Strain
 from ..errors import MPMError, agree, as_ours
 from ..materials.base import Material
 from ..parallel.boundary import collective
-from ..parallel.given import require_same
+from ..parallel.given import is_number, require_same
 from ..particles.field import ParticleField
 from ..particles.particles import Particles
 from ..reals import as_reals
@@ -521,9 +521,9 @@ def _begin_with(field: ParticleField, value: Any) -> None:
         MPMError: It is neither a number nor a function of coordinates, or not finite.
     """
     with agree(field.W.mesh.comm):
-        if isinstance(value, float | int | np.number):
+        if is_number(value):
             values: Any = float(value)
-        elif callable(value):
+        elif callable(value) and not isinstance(value, Expr):
             x = field.W.tabulate_dof_coordinates().T
             try:
                 values = as_reals(value(x))

@@ -26,7 +26,7 @@ from ..errors import DomainDistortionError, MPMError, agree, agreed, warn
 from ..io.checkpoint import Snapshot
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
-from ..parallel.given import is_number, require_truth
+from ..parallel.given import is_number
 from ..particles.domains import separate_nodes
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
@@ -330,7 +330,6 @@ class QuasiStaticProblem(ParticleProblem):
 
     def _go_on(self, name: str | None, change: Any, sudden: bool) -> None:
         """Begin a stage."""
-        require_truth("sudden", sudden)
         known = self._parameters
         number = len(self.history.stages) + 1
         self.begin_stage(

@@ -30,6 +30,7 @@ from ..parallel.exchange import RowExchange
 from ..particles.options import validate_distortion
 from ..particles.particles import Particles
 from ..particles.reference import Reference
+from ..reals import as_wholes
 from .arguments import require_no_conditions_on_bodies
 from .setup import Setup
 
@@ -79,14 +80,11 @@ def as_indices(particles: Any) -> NDArray[np.int64]:
         MPMError: They are no whole numbers.
     """
     try:
-        array = np.asarray(particles)
-    except ValueError:
-        array = np.array(None)
-    if array.size and not np.issubdtype(array.dtype, np.integer):
+        return as_wholes(particles).ravel()
+    except (TypeError, ValueError):
         raise MPMError(
             f"Particles to be split are global indices, whole numbers, not {particles!r}."
-        )
-    return array.astype(np.int64).ravel()
+        ) from None
 
 
 class Remeshing:

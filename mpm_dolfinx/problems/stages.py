@@ -21,6 +21,7 @@ from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree, as_ours
 from ..io.snapshot import spaces_of
 from ..particles.particles import Particles
+from ..reals import as_wholes
 from ..system.reduced import ReducedSystem
 from ..system.term import Term
 from .arguments import as_bodies, as_conditions, as_terms
@@ -247,12 +248,13 @@ def chosen_cells(particles: Particles, which: Any, tags: Any, cell_tags: Any) ->
         elif callable(which):
             chosen, unknown = _where(particles, which), []
         else:
-            indices = np.asarray(which).ravel()
-            if indices.size and not np.issubdtype(indices.dtype, np.integer):
+            try:
+                indices = as_wholes(which).ravel()
+            except (TypeError, ValueError):
                 raise MPMError(
                     "particles= are global indices, whole numbers, or a function of coordinates, "
                     f"not {which!r}."
-                )
+                ) from None
             chosen = np.isin(particles.global_index, indices)
             lost = (indices < 0) | (indices >= particles.num_global)
             unknown = np.unique(indices[lost]).tolist()
@@ -272,9 +274,10 @@ def _tagged(particles: Particles, tags: Any, cell_tags: Any) -> tuple[NDArray[np
     """Return which domains have a tag, and the tags that none has on this rank."""
     if cell_tags is None:
         raise MPMError("tags= are of cell_tags=, and the problem has none; give particles=.")
-    wanted = np.atleast_1d(np.asarray(tags))
-    if not np.issubdtype(wanted.dtype, np.integer):
-        raise MPMError(f"tags= are whole numbers, not {tags!r}.")
+    try:
+        wanted = np.atleast_1d(as_wholes(tags))
+    except (TypeError, ValueError):
+        raise MPMError(f"tags= are whole numbers, not {tags!r}.") from None
     own = cell_tags.indices < particles.num_local
     chosen = np.zeros(particles.num_local, dtype=bool)
     chosen[cell_tags.indices[own & np.isin(cell_tags.values, wanted)]] = True

@@ -21,7 +21,7 @@ from ..assembly.inputs import is_tag, known_tags
 from ..background.basis import BackgroundBasis
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
-from ..parallel.given import as_positive, require_truth, require_whole
+from ..parallel.given import as_positive, require_whole
 from ..particles.particles import Particles
 from .term import Term
 
@@ -84,7 +84,6 @@ class Tie(Term):
         self._tags, self._tag = facet_tags, tag
         degree = 2 * a.W.ufl_element().degree if quadrature_degree is None else quadrature_degree
         require_whole("quadrature_degree of a Tie", degree, 100)  # 51 points each way
-        require_truth("axisymmetric", axisymmetric)
         self._degree, self.axisymmetric = int(degree), axisymmetric
         self._spaces: tuple[fem.FunctionSpace, ...] = ()
         self._held: NDArray[np.bool_] = np.zeros(0, dtype=bool)

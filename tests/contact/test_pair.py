@@ -382,7 +382,7 @@ def test_narrow_blocks_of_one_width_stand_on_each_other(cell):
         ({"friction": -1.0}, "friction must be a number from 0"),
         ({"passes": 3}, "has 1 or 2 passes"),
         ({"passes": True}, "has 1 or 2 passes, not True"),
-        ({"axisymmetric": 0}, "axisymmetric must be True or False, not 0"),
+        ({"axisymmetric": 0}, r"axisymmetric of Pair\(\) must be True or False, not 0"),
         ({"tags": 1}, "tags of a Pair must be two"),
         ({"moduli": (1.0, -1.0)}, "modulus must be a positive number"),
         ({"penalty": 0}, "penalty must be a positive number"),

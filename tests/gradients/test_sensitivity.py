@@ -265,13 +265,18 @@ def test_what_is_not_followed_is_refused():
         ([3.0], "A parameter is"),
         ([(law, "cohesion")], "no parameter 'cohesion'"),
         ([(materials.Hencky(1.0, 0.3), "young")], "no material of this problem"),
-        ([(young, [1.0, 2.0])], "must have its shape"),
+        ([(young, [1.0, 2.0])], "must be numbers of its shape"),
+        ([(young, "up")], "must be numbers of its shape"),
+        ([(young, 0.0)], "must not be zero"),
+        ([(young, np.inf)], "must be finite"),
         ([scene.particles.displacement], "many values"),
     ):
         with pytest.raises(mpm.MPMError, match=words):
             mpm.Sensitivity(problem, wrong)
     with pytest.raises(mpm.MPMError, match="2 scales for 1"):
         mpm.Sensitivity(problem, [young], scales=[1.0, 2.0])
+    with pytest.raises(mpm.MPMError, match=r"scales .* must be a positive number, not True"):
+        mpm.Sensitivity(problem, [young], scales=[True])
     gradient = mpm.Sensitivity(problem, [young])
     control = mpm.DisplacementControl(scene.particles, -0.01, (0.0, 2.0), (0.0, 1.0))
     with pytest.raises(mpm.MPMError, match="displacement control"):

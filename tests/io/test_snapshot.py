@@ -287,3 +287,18 @@ def test_keys_of_what_is_kept():
             problem.keep(other)
     with pytest.raises(mpm.MPMError, match=r"needs an heir of mpm_dolfinx\.io\.Kept"):
         problem.keep({"velocity": 1})
+
+
+def test_a_captured_state_is_come_back_to_and_gone_on_from_on_any_ranks():
+    problem = made()
+    problem.solve(2)
+    captured, before = problem.capture(), scenes.state(problem)
+    problem.particles.load.value = 1.2
+    problem.step()
+    after = scenes.state(problem)
+    problem.return_to(captured)
+    scenes.assert_same_state(before, scenes.state(problem))
+    problem.particles.load.value = 1.2
+    problem.step()
+    again = scenes.state(problem)
+    assert np.abs(again["stress"] - after["stress"]).max(initial=0.0) <= 1e-9 * 30.0

@@ -30,6 +30,7 @@ CLASSES = (
     mpm.Particles,
     mpm.ParticleField,
     mpm.DisplacementControl,
+    mpm.Sensitivity,
     mpm.Tie,
     contact.Pair,
     contact.Rigid,
@@ -290,6 +291,22 @@ WRONG = {
     "no tags": lambda: mpm.facet_tags(particles().mesh, differing({1: mpm.region(x=0.0)}, {})),
     "no problem": lambda: mpm.strength_reduction(differing(made(), None)),
     "no shape": lambda: contact.Rigid(particles(), differing(contact.disc((0.5, 2.0), 0.3), None)),
+    "no truth": lambda: made().solve(progress=differing(False, None)),
+    "half a truth": lambda: made().solve(progress=None if LAST else 0),
+    "no free nodes": lambda: mpm.Particles(
+        particles().mesh, particles().V, free=differing([0], "wall")
+    ),
+    "no parameter": lambda: mpm.Sensitivity(made(), differing([], [3.0])),
+    "no scale": lambda: mpm.Sensitivity(made(), [1.0], differing([1.0], [np.inf])),
+    "no picture": lambda: plot.scene(made(), differing("displacement", object())),
+    "no movie": lambda: plot.movie(made(), [], "unwritten.gif", fps=differing(10.0, -1.0)),
+    "no fluid": lambda: mpm.Body(
+        particles(), Hencky(1e3, 0.3), pore_fluid=differing(mpm.PoreFluid(1.0), 1.0)
+    ),
+    "no solver": lambda: made(solver=differing(mpm.Solver(), "direct")),
+    "no number of a body": lambda: made().error_of_particles(differing(0, 1)),
+    "nothing to keep": lambda: made().keep(differing(Kept(), None)),
+    "no condition": lambda: made().reaction(differing(None, "left")),
     "time": lambda: made().write("unwritten.pvd", time=differing(1.0, 2.0)),
 }
 

@@ -27,6 +27,17 @@ def vectors(**options):
     return on(lambda: scenes.vectors(background()), **options)
 
 
+def tagged(wanted):
+    """Return a function that makes particles with nodes free by tags of cells that are all 1."""
+
+    def build():
+        domain = body()
+        tags = scenes.cell_tags(domain, lambda x: np.ones(len(x)))
+        return mpm.Particles(domain, scenes.vectors(background()), free=(tags, wanted))
+
+    return build
+
+
 def same_mesh():
     domain = body()
     return mpm.Particles(domain, scenes.vectors(domain))
@@ -133,6 +144,11 @@ PARTICLES = {
         vectors(free=(scenes.cell_tags(scenes.unit(1, TRIANGLE), lambda x: x[:, 0]), 1)),
         r"must be those of cells of the body mesh",
     ),
+    "free, no such tag": (
+        tagged((1, 7)),
+        r"No cell has the tag 7 of free=\(tags, tag\); there are \[1\]",
+    ),
+    "free, a tag that is true": (tagged(True), r"a whole number, or several, not True"),
     "free, no such node": (vectors(free=[10**6]), r"none of the \d+ local ones"),
     "free, no background": (
         lambda: mpm.Particles(scenes.unit(2, TRIANGLE), free=[]),

@@ -1511,7 +1511,8 @@ def test_what_a_residual_in_ufl_cannot_do_in_motion_is_refused():
     for sentence, form, options in (
         ("needs the stress at points", R, {"scheme": "conserving"}),
         ("needs modulus=", R, {"supports": [fixed(particles, tags, 1)]}),
-        ("rayleigh must have finite numbers", R, {"damping": -1.0}),
+        ("damping must be a number that", R, {"damping": -1.0}),
+        ("damping must be a number that", R, {"damping": True}),
         ("a list of 2 densities", R, {"density": [1.0, 1.0]}),
         ("has displacements alone", R, {"fields": [None]}),
     ):
@@ -1541,6 +1542,8 @@ def test_what_does_not_go_with_inertia_is_refused():
     refused("velocity has the shape", velocity=(1.0, 2.0, 3.0))
     refused("velocity must be finite", velocity=lambda x: np.full((2, x.shape[1]), np.inf))
     refused("function that gives velocity failed", velocity=lambda x: x[5])
+    refused("velocity must return values of the shape", velocity=lambda x: 0.0)
+    refused("velocity must return values of the shape", velocity=lambda x: x)
     particles = square()
     other = fem.Function(square().W)
     refused("velocity lives on another mesh", particles=particles, velocity=other)

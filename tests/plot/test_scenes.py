@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 import scenes
+from ranks import fails
 from scenes import HEXAHEDRON, TRIANGLE, WORLD, at, block, box, fix, vectors
 
 from dolfinx import fem
@@ -94,6 +95,43 @@ def test_what_is_not_there_is_refused_in_one_sentence(solved):
         mpm.plot.movie(solved, [], "run.avi")
     with pytest.raises(mpm.MPMError, match="no step yet"):
         mpm.plot.history(block())
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"field": object()}, "values must be numbers, one for each particle"),
+        ({"field": True}, "values must be numbers"),
+        ({"ax": "left"}, "ax must be axes of matplotlib, .* not 'left'"),
+        ({"warp": np.inf}, "warp must be a finite number, not inf"),
+        ({"warp": 1j}, "warp must be a finite number, not 1j"),
+        ({"limits": (0.0, 1.0, 2.0)}, "limits must be the first and the last value"),
+        ({"limits": (np.nan, 1.0)}, "limits must be .* a number or None"),
+        ({"background": None}, r"background of scene\(\) must be True or False, not None"),
+        ({"lines": "few"}, r"lines of scene\(\) must be True, False or None"),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
+)
+def test_how_a_scene_is_drawn_is_looked_at(solved, options, sentence):
+    fails(lambda: mpm.plot.scene(solved, **options), sentence)
+
+
+def test_pictures_of_nothing_and_in_ufl(solved):
+    # NumPy would take a scalar of UFL for a sequence of sequences without end
+    scalar = fem.Function(fem.functionspace(solved.particles.mesh, ("DG", 0)))
+    refused = {
+        "of a problem, of particles": lambda: mpm.plot.scene([]),
+        "box must be": lambda: mpm.plot.scene(solved, box=scalar),
+        "values must be numbers": lambda: mpm.plot.domains(solved.particles, scalar),
+        "vmin must be": lambda: mpm.plot.domains(solved.particles, vmin="least"),
+        "linewidth must be": lambda: mpm.plot.background(solved.particles.V, linewidth="thin"),
+        "every must be a whole": lambda: mpm.plot.movie(solved, [], "run.gif", every=1.5),
+        "fps must be a positive": lambda: mpm.plot.movie(solved, [], "run.gif", fps=np.inf),
+        "dpi must be a positive": lambda: mpm.plot.movie(solved, [], "run.gif", dpi=-1.0),
+        "limits must be": lambda: mpm.plot.movie(solved, [], "run.gif", limits=1.0),
+    }
+    for sentence, call in refused.items():
+        fails(call, sentence)
 
 
 def test_scene_in_space_is_rendered_without_a_word(tmp_path, recwarn, capfd):

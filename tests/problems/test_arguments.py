@@ -255,12 +255,44 @@ PROBLEMS = {
     "checkpoint without name": (lambda: scenes.block().save(None), r"path must be .* not None"),
     "checkpoint of a number": (lambda: scenes.block().restore(1.0), r"path must be .* not 1\.0"),
     "stage of no name": (lambda: scenes.block().stage([]), r"name of a stage must be a string"),
-    "half sudden": (lambda: scenes.block().stage(sudden=0), r"sudden must be True or False, not 0"),
+    "half sudden": (lambda: scenes.block().stage(sudden=0), r"sudden of stage\(\) .* not 0"),
     "body of many": (
         lambda: scenes.block().remove([0], body=np.ones(2)),
         r"There is no body array",
     ),
     "steps that are true": (run(steps=True), r"steps must be a whole number .*not True"),
+    "a bar of nothing": (
+        run(progress=None),
+        r"progress of solve\(\) must be True or False, not None",
+    ),
+    "half symmetric": (
+        ufl_problem(work, symmetric=lambda p: "yes"),
+        r"symmetric of ParticleProblem\(\) must be True or False, not 'yes'",
+    ),
+    "half a run": (
+        lambda: scenes.block().restore("run.ckpt", resume=1),
+        r"resume of restore\(\) must be True or False, not 1",
+    ),
+    "a time that is true": (
+        lambda: scenes.block().write("run.pvd", time=True),
+        r"time must be a finite number, not True",
+    ),
+    "a huge whole number of permeability": (
+        lambda: mpm.PoreFluid(-(10**30)),
+        r"permeability of a PoreFluid must be positive",
+    ),
+    "a storage that is true, among others": (
+        problem(body_force=(True, -1.0)),
+        r"body_force must be numbers",
+    ),
+    "indices that are true": (
+        lambda: scenes.block().split([True]),
+        r"global indices, whole numbers, not \[True\]",
+    ),
+    "removed by truths": (
+        lambda: scenes.block().remove([True, False]),
+        r"whole numbers, or a function of coordinates, not \[True, False\]",
+    ),
     "half a truth": (
         lambda: scenes.block().repartition(True),
         r"threshold must be a share from 0 to 1, not True",
@@ -286,7 +318,7 @@ PROBLEMS = {
     ),
     "facets inside in words": (
         lambda: mpm.facet_tags(body(), {1: mpm.region(x=0.0)}, interior="no"),
-        r"interior must be True or False, not 'no'",
+        r"interior of facet_tags\(\) must be True or False, not 'no'",
     ),
     "field of a kind that is an array": (
         lambda: (p := particles()).field(scenes.vectors(p.V.mesh), kind=np.ones(2)),
@@ -310,7 +342,7 @@ PROBLEMS = {
         r"of a Tie must be .* not -2",
     ),
     "a tie of half a degree": (tie(quadrature_degree=1.5), r"of a Tie must be .* not 1\.5"),
-    "a tie around a word": (tie(axisymmetric="r"), r"axisymmetric must be True or False, not 'r'"),
+    "a tie around a word": (tie(axisymmetric="r"), r"axisymmetric of Tie\(\) .* not 'r'"),
     "ordering of no kind": (
         lambda: scenes.block(
             petsc_options={
@@ -454,7 +486,7 @@ PROBLEMS = {
         r"pressures must be a list of pairs.*not <generator",
     ),
     "tags in words": (problem(cell_tags="sand"), r"cell_tags must be dolfinx MeshTags, not str"),
-    "an axis in words": (problem(axisymmetric="no"), r"axisymmetric must be True or False"),
+    "an axis in words": (problem(axisymmetric="no"), r"axisymmetric of .* must be True or False"),
     "averages in an array": (problem(f_bar=np.zeros(2)), r"Unknown f_bar=array"),
     "background in words": (problem(background="soft"), r"background must be UFL forms, not str"),
     "traction is no pair": (
@@ -578,6 +610,6 @@ def test_density_that_becomes_negative(kind):
 def test_a_path_or_a_stage_of_another_kind():
     made = held("fixed")()
     raises(lambda: made.solve(2, update=5), mpm.MPMError, r"update= is a function of t, not 5")
-    raises(lambda: made.stage(sudden="no"), mpm.MPMError, r"sudden must be True or False")
+    raises(lambda: made.stage(sudden="no"), mpm.MPMError, r"sudden of .* must be True or False")
     raises(lambda: made.stage(name=5), mpm.MPMError, r"name of a stage must be a string")
     assert not made.history.stages
