@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1] / PACKAGE
 #: Folders (and the files beside them) from the ground up; none imports what stands in its own line
 #: or above.
 FLOORS = (
-    ("errors", "_compat", "_core", "log", "reals"),
+    ("errors", "_compat", "_core", "log", "reals", "tolerances"),
     ("parallel",),
     ("meshes", "materials", "history"),
     ("background", "solvers"),

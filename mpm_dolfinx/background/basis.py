@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from .. import _compat
-from .cells import BLOCK, DROP, TOLERANCE, Cells, CellTable
+from ..tolerances import BLOCK, ROUND_OFF
+from .cells import TOLERANCE, Cells, CellTable
 from .tiles import Tiles
 
 __all__ = ["BackgroundBasis", "PointBasis"]
@@ -96,7 +97,7 @@ class BackgroundBasis:
             table = _compat.tabulated(self._basis, int(gradients), reference)
             found[part] = violation <= TOLERANCE
             inside = found[part, None]
-            values[part] = np.where((np.abs(table[0]) >= DROP) & inside, table[0], 0.0)
+            values[part] = np.where((np.abs(table[0]) >= ROUND_OFF) & inside, table[0], 0.0)
             if slopes is not None:
                 inverse = np.linalg.inv(cells.jacobians(cell, reference))
                 own = np.einsum("jpk,pji->pki", table[1:], inverse)

@@ -17,19 +17,14 @@ from dolfinx import fem, mesh
 
 from .. import _compat
 from .._core import loops
+from ..tolerances import BLOCK, EQUAL
 
-__all__ = ["COORDINATES", "DROP", "TOLERANCE", "CellTable", "Cells", "cell_volumes"]
+__all__ = ["COORDINATES", "TOLERANCE", "CellTable", "Cells", "cell_volumes"]
 
 #: Reference distance within which a point outside a cell counts as on its boundary.
 TOLERANCE = 1e-10
-#: Reference distance within which a point is on a facet; the cell first in the input takes it.
-FACET = 1e-12
 #: Error of coordinates, relative to them: some units in the last place.
 COORDINATES = 4.0 * np.finfo(float).eps
-#: Points looked for at once, so that what is known of them stays in the cache.
-BLOCK = 1 << 14
-#: Basis values below this are no weight.
-DROP = 1e-13
 
 
 class CellTable(NamedTuple):
@@ -183,7 +178,7 @@ class Cells:
         low = -reference.min(axis=1, initial=0.0)
         high = reference.sum(axis=1) - 1 if self.simplex else reference.max(axis=1) - 1
         worst = np.maximum(low, high)
-        near = np.maximum(FACET, self.slack[cells])
+        near = np.maximum(EQUAL, self.slack[cells])
         return np.where(np.isnan(worst), np.inf, np.where(worst <= near, 0.0, worst))
 
     def clip(self, cells: NDArray[np.int64], reference: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -239,7 +234,7 @@ class Cells:
             self._centres,
             self.middle,
             self.slack,
-            (COORDINATES, FACET),
+            (COORDINATES, EQUAL),
             points,
             cell,
             reference,

@@ -16,13 +16,12 @@ import basix
 from dolfinx import fem
 
 from .. import _compat
+from ..tolerances import NEGLIGIBLE
 
 __all__ = ["box_weights", "cell_lines", "coarser", "grid_lines"]
 
 #: Slabs across a background in which the size of its cells is looked at.
 SLABS = 256
-#: Share of the whole within which coordinates are the same.
-SAME = 1e-9
 
 
 def cell_lines(V: fem.FunctionSpace) -> list[NDArray[np.float64]]:
@@ -82,7 +81,7 @@ def _distinct(values: NDArray[np.float64]) -> NDArray[np.float64]:
     if len(values) == 0:
         return values
     gap = np.diff(values, prepend=-np.inf)
-    return np.asarray(values[gap > SAME * (values[-1] - values[0])])
+    return np.asarray(values[gap > NEGLIGIBLE * (values[-1] - values[0])])
 
 
 def _by_size(
@@ -128,7 +127,7 @@ def box_weights(
         share = (points[:, axis] - line[place]) / (line[place + 1] - line[place])
         whole = np.round(share)
         places[axis] = place
-        shares[axis] = np.clip(np.where(np.abs(share - whole) < SAME, whole, share), 0.0, 1.0)
+        shares[axis] = np.clip(np.where(np.abs(share - whole) < NEGLIGIBLE, whole, share), 0.0, 1.0)
     shape = tuple(len(line) for line in lines)
     numbers = np.empty((n, 2**gdim), dtype=np.int64)
     values = np.ones((n, 2**gdim))

@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
+from ..parallel.balance import SLACK
 from ..parallel.bisection import bisect
 from .basis import BackgroundBasis
 
 __all__ = ["ranks_of_background"]
-
-#: How many particles more than an even share a rank may have, relatively.
-SLACK = 0.05
 
 
 def ranks_of_background(

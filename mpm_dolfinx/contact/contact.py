@@ -24,10 +24,12 @@ from ..system.term import PointMaterial, Term
 from .law import Friction
 from .surface import Surface
 
-__all__ = ["Contact", "Outcome", "stiffness"]
+__all__ = ["OVERLAP", "Contact", "Outcome", "stiffness"]
 
 #: What the pressure is made of.
 LAWS = ("penalty", "nitsche")
+#: Most penetration, over the thickness of the domain behind, of bodies as they are given.
+OVERLAP = 0.1
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What drives a rigid body, and what it tells of its motion."""
+"""Drives of a rigid body, and the account of its motion."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ class Neighbourhood:
         return bool(comm.allreduce(float(sum(moved)), MPI.MAX) > sides.reach)
 
     def taken_over(self, paired: Closest, before: Neighbourhood) -> Closest:
-        """Return what points were paired with in the neighbourhood of before."""
+        """Return the facets that points were paired with in the neighbourhood of before."""
         facet = self.near.find(before.near.numbers(paired.facet))
         paired = paired._replace(facet=facet, near=paired.near & (facet >= 0))
         source = self.sides.source

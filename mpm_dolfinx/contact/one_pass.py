@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import basix
 
 from .approach import Approach, OverStep
-from .contact import Outcome
+from .contact import OVERLAP, Outcome
 from .facets import Closest
 from .law import Friction, Points
 from .meeting import Meeting, untouched
@@ -30,8 +30,6 @@ __all__ = ["Pass"]
 REACH = 2.0
 #: Residuals of an attempt after which points stay with their facets.
 FREEZE = 12
-#: Penetration, over the thickness of the domain behind, of bodies as they are given.
-OVERLAP = 0.1
 
 
 class Pass:
@@ -196,7 +194,7 @@ class Pass:
         self._approach = Approach(around, last, x, corners)
 
     def evaluate(self) -> Meeting:
-        """Return what acts there (not collective)."""
+        """Return the forces and tractions there (not collective)."""
         approach, sides, source = self._approach, self._sides, self.source
         around, x = approach.around, approach.x
         self._evaluations += 1
@@ -269,7 +267,7 @@ class Pass:
         behind: NDArray[np.float64] | None,
         step: OverStep | None,
     ) -> tuple[Stencil, NDArray[np.int64]]:
-        """Return what tractions at some points depend on, and the facets of their anchors."""
+        """Return the quantities that tractions at points depend on, and the anchors' facets."""
         approach, memory = self._approach, self._approach.last
         around, near = approach.around, approach.around.near
         x, nodes = approach.x, approach.nodes

@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
+from ..tolerances import NEGLIGIBLE
 from .shapes import as_direction
 
-__all__ = ["SAME", "edges_of", "facet_normals", "oriented"]
-
-#: Distance, relative to the extent, below which two corners are one.
-SAME = 1e-9
+__all__ = ["edges_of", "facet_normals", "oriented"]
 
 
 def facet_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -114,7 +112,7 @@ def _open_outwards(
             "outside=, or close it."
         )
     whole = area_vectors(x[facets]) @ as_direction(outside, "outside", dim)
-    if abs(whole.sum()) <= SAME * np.abs(whole).sum():
+    if abs(whole.sum()) <= NEGLIGIBLE * np.abs(whole).sum():
         raise MPMError(f"outside={outside!r} does not tell the sides of the surface apart.")
     return bool(whole.sum() > 0.0)
 
@@ -136,7 +134,7 @@ def _closed_outwards(
     middle = x.mean(axis=0)
     volumes = (area_vectors(corners) * (corners[:, 0] - middle)).sum(axis=1)
     volume = volumes.sum()
-    if abs(volume) <= SAME * np.ptp(x, axis=0).max() ** dim:
+    if abs(volume) <= NEGLIGIBLE * np.ptp(x, axis=0).max() ** dim:
         raise MPMError(f"{what} encloses nothing.")
     turned = _inside_out(x, facets, np.sign(volume) * volumes)
     if turned:

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What is remembered of points of one body that may meet facets of another."""
+"""Memory of points of one body that may meet facets of another."""
 
 from __future__ import annotations
 

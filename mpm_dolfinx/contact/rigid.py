@@ -21,6 +21,7 @@ from ..parallel.given import as_positive, require_same
 from ..particles.particles import Particles
 from ..system.term import PointMaterial
 from .behind import At
+from .contact import OVERLAP
 from .law import Friction, as_friction
 from .memory import Memory
 from .nitsche import Spread, require_stress
@@ -35,8 +36,6 @@ from .ways import OPPOSITE, passes
 
 __all__ = ["Rigid"]
 
-#: Penetration, over the thickness of the domain behind, of a body that is given in an obstacle.
-OVERLAP = 0.1
 #: Most that an obstacle turns in a step at whose end points rub against it: friction is along the
 #: chord of their way in its frame.
 MOST_TURN = 0.5 * np.pi

@@ -113,7 +113,7 @@ class RigidBalance:
             own.expected, own.advice = self._unknowns(guess), ""
 
     def _unknowns(self, step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what of a step is unknown, in the units of displacements."""
+        """Return the unknowns of a step, in the units of displacements."""
         return np.asarray(step[self._free] / self._each.sum(axis=0))
 
     def update(self) -> MPMError | None:

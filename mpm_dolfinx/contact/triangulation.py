@@ -23,16 +23,13 @@ from ..errors import MPMError, agree, as_ours
 from ..parallel.given import as_positive
 from ..plot.outlines import surface_algorithm
 from ..reals import as_reals
+from ..tolerances import NEGLIGIBLE, ROUND_OFF
 from .nearest import FacetTree
-from .orientation import SAME, edges_of, facet_normals, oriented
+from .orientation import edges_of, facet_normals, oriented
 from .shapes import Shape, as_point, as_radius
 
 __all__ = ["polyline", "read_surface", "terrain", "triangulated"]
 
-#: Difference of unit normals below which facets are one plane.
-FLAT = 1e-9
-#: Distance, relative to the extent, below which a place is on an edge or a corner.
-ON = 1e-13
 #: Least product of the normals of a facet before and after its corners were moved inwards.
 KEPT = 0.5
 
@@ -82,7 +79,7 @@ class _Faceted(Shape):
         super().__init__(points.shape[1], pivot)
         self.points, self.facets = points, facets
         self._radius, self._outline = radius, outline
-        self._on = ON * float(np.abs(points).max(initial=0.0))
+        self._on = ROUND_OFF * float(np.abs(points).max(initial=0.0))
         corners = points[facets]
         self._normals = facet_normals(corners)
         self._tree = FacetTree(corners)
@@ -97,7 +94,7 @@ class _Faceted(Shape):
             np.add.at(self._at_edge, self._of_facet[:, k], self._normals)
         # both normals of a flat edge are the same, and their sum is twice as long
         length = np.linalg.norm(self._at_edge, axis=1)
-        self._flat_edge = (count == 2) & (length > 2.0 - FLAT**2)
+        self._flat_edge = (count == 2) & (length > 2.0 - NEGLIGIBLE**2)
         self._end_edge = count < 2
         self._end_corner[keys[self._end_edge].ravel()] = True
 
@@ -175,7 +172,7 @@ def _corner_normals(
     unit = total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None]
     flat = np.ones(len(points), dtype=bool)
     for k in range(dim):
-        bent = np.linalg.norm(unit[facets[:, k]] - normals, axis=1) > FLAT
+        bent = np.linalg.norm(unit[facets[:, k]] - normals, axis=1) > NEGLIGIBLE
         flat[facets[bent, k]] = False
     if dim == 2:
         flat &= np.bincount(facets.ravel(), minlength=len(points)) == 2
@@ -393,7 +390,7 @@ def _merged(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return corners with one number for each place, and facets that have different ones."""
     used = np.unique(facets)
-    step = SAME * max(float(np.ptp(x[used], axis=0).max()), 1e-300)
+    step = NEGLIGIBLE * max(float(np.ptp(x[used], axis=0).max()), 1e-300)
     number = np.full(len(x), -1)
     keys = np.round((x[used] - x[used].min(axis=0)) / step).astype(np.int64)
     order = np.lexsort(keys.T)

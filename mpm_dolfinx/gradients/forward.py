@@ -226,7 +226,7 @@ class StepDerivative:
     def _beside(
         self, parameter: Parameter, sign: float, rates: Rates, motion: Sequence[fem.Function]
     ) -> _Side:
-        """Return what is evaluated on one side of the state, in the direction of a motion."""
+        """Return an evaluation on one side of the state, in the direction of a motion."""
         points = self._problem.material_points()
         arrays = [function.x.array for function in motion]
         self._nearby.go(parameter, sign * parameter.change, rates, arrays)

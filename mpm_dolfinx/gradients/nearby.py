@@ -161,7 +161,7 @@ class Nearby:
 
 
 def varying(state: State) -> State:
-    """Return what of a state can vary little by little, in one order."""
+    """Return the parts of a state that can vary little by little, in one order."""
     return {name: values for name, values in sorted(state.items()) if values.dtype.kind == "f"}
 
 

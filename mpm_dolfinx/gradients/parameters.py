@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What the result of a run depends on: Constants, Functions, and numbers of laws."""
+"""Parameters that the result of a run depends on: Constants, Functions, and numbers of laws."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ class _OfLaw(Parameter):
 
 
 def as_parameter(given: Any, problem: ParticleProblem, scale: float | None) -> Parameter:
-    """Return what a user names as a parameter (collective).
+    """Return the parameter that a user names (collective).
 
     Args:
         given: See :class:`Sensitivity`.

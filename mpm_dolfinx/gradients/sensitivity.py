@@ -256,7 +256,7 @@ def _require_followed(problem: ParticleProblem) -> None:
 
 
 def _not_in(problem: ParticleProblem) -> list[str]:
-    """Return what of a problem has no part in the derivative, in words."""
+    """Return the parts of a problem that have none in the derivative, in words."""
     bodies, kind = problem.bodies, type(problem)
     hooks = ("evaluate", "commit", "roll_back")
     mixed = isinstance(problem, QuasiStaticProblem) and problem.setup.mixed is not None

@@ -18,13 +18,11 @@ from .. import _compat
 from ..errors import MPMError, agree
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
+from ..tolerances import EQUAL
 from .checkpoint import Snapshot
 from .snapshot import spaces_of
 
 __all__ = ["Identifiable", "identity", "require_same", "same"]
-
-#: Relative difference up to which numbers of two problems count as the same.
-SAME = 1e-12
 
 
 def require_same(present: dict[str, Any], snapshot: Snapshot, source: str, comm: MPI.Comm) -> None:
@@ -124,5 +122,5 @@ def same(one: Any, two: Any) -> bool:
     if isinstance(one, list | tuple) and isinstance(two, list | tuple):
         return len(one) == len(two) and all(map(same, one, two))
     if isinstance(one, float) and isinstance(two, float):
-        return math.isclose(one, two, rel_tol=SAME) or (math.isnan(one) and math.isnan(two))
+        return math.isclose(one, two, rel_tol=EQUAL) or (math.isnan(one) and math.isnan(two))
     return bool(one == two)

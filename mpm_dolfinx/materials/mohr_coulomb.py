@@ -358,7 +358,7 @@ AVERAGES = {
     "compression": np.array([[0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.0, 0.0, 1.0]]),
     "extension": np.array([[1.0, 0.0, 0.0], [0.0, 0.5, 0.5], [0.0, 0.5, 0.5]]),
 }
-"""What a plane and the two edges make of principal values: on an edge two of them are equal."""
+"""Principal values on a plane and on the two edges, where two of them are equal."""
 
 
 class _Law(NamedTuple):

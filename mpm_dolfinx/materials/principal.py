@@ -13,14 +13,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..tolerances import EQUAL
 from .tensors import eigen, pack, unpack
 
 __all__ = ["axes_in_order", "from_axes", "shear_quotients", "tangent_from_axes"]
 
 Array = NDArray[np.float64]
-
-EQUAL = 1e-12
-"""Difference of two principal strains, over the largest, at which they count as equal."""
 
 
 def axes_in_order(strain: Array) -> tuple[Array, Array]:

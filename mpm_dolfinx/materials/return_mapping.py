@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConvergenceError
+from ..tolerances import ROUND_OFF
 from .base import Integration, State
 from .derivatives import difference_by_stress, slope_by_plastic_strain, slope_by_stress
 from .elastic import IsotropicElastic
@@ -20,8 +21,6 @@ from .mandel import norm
 
 __all__ = ["ReturnMapping"]
 
-YIELD_TOLERANCE = 1e-13
-"""Excess of the trial stress, relative to its size, that counts as round-off."""
 TOLERANCE = 1e-15
 """Norm of the residual, relative to the trial strain, at which a point is done."""
 FLOOR = 1e-10
@@ -149,7 +148,7 @@ class ReturnMapping(IsotropicElastic):
         f = self.yield_function(stress, plastic_strain)
         (points,) = np.nonzero(~(f <= 0.0))
         slope = norm(self.at(points).yield_gradient(stress[points], plastic_strain[points]))
-        excess = f[points] > YIELD_TOLERANCE * slope * norm(stress[points])
+        excess = f[points] > ROUND_OFF * slope * norm(stress[points])
         return np.asarray(points[excess | ~np.isfinite(slope)])
 
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 import basix
 
+from ..tolerances import NEGLIGIBLE
+
 __all__ = ["JacobianBound"]
 
 #: Halvings of a domain after which a Jacobian that may vanish counts as vanishing.
 HALVINGS = 4
-#: Share of the largest coefficient below which one is round-off.
-ROUNDOFF = 1e-9
 
 
 class JacobianBound:
@@ -130,8 +130,8 @@ class JacobianBound:
         open_ = values * (sign / np.maximum(size, np.finfo(float).tiny))[:, None]
         result, cell = np.zeros(len(nodes), dtype=bool), np.arange(len(nodes))
         for _ in range(HALVINGS + 1):
-            result[cell[(open_[:, self._corners] < -ROUNDOFF).any(axis=1)]] = True
-            unsure = (open_ < -ROUNDOFF).any(axis=1) & ~result[cell]
+            result[cell[(open_[:, self._corners] < -NEGLIGIBLE).any(axis=1)]] = True
+            unsure = (open_ < -NEGLIGIBLE).any(axis=1) & ~result[cell]
             cell, open_ = cell[unsure], open_[unsure]
             if len(cell) == 0:
                 break

@@ -14,6 +14,7 @@ from dolfinx import mesh
 
 from .. import _compat
 from .._core import loops
+from ..tolerances import BLOCK
 
 __all__ = [
     "DomainQuadrature",
@@ -27,9 +28,6 @@ __all__ = [
     "volumes_and_averages",
     "with_hoop",
 ]
-
-#: Domains of which values at points are made at a time.
-BLOCK = 1 << 14
 
 
 def exact_degree(cell: str, degree: int) -> int:

@@ -17,14 +17,11 @@ from dolfinx import fem, mesh
 from ..errors import MPMError, agree, as_ours
 from ..parallel.boundary import collective
 from ..reals import as_reals
+from ..tolerances import NEGLIGIBLE
 
 __all__ = ["cell_tags", "facet_tags", "held", "region"]
 
 type Where = Callable[[NDArray[np.float64]], Any]
-
-#: Distance to a plane over the largest coordinate, within which a point lies on it: grid lines that
-#: are computed in different ways differ by round-off.
-ON = 1e-9
 
 
 def region(
@@ -69,7 +66,7 @@ def region(
         places = np.asarray(points, dtype=np.float64)
         sizes = [np.abs(places).max(initial=0.0)]
         sizes += [abs(b) for bound in bounds if bound is not None for b in bound if np.isfinite(b)]
-        near = ON * max(sizes)
+        near = NEGLIGIBLE * max(sizes)
         found = np.ones(places.shape[1], dtype=bool)
         for along, bound in zip(places, bounds, strict=False):
             if bound is not None:

@@ -9,7 +9,10 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["even", "imbalance"]
+__all__ = ["SLACK", "even", "imbalance"]
+
+#: How much more than an even share a rank may have for the sake of locality.
+SLACK = 0.05
 
 
 def imbalance(comm: MPI.Comm, count: int) -> float:
@@ -18,7 +21,7 @@ def imbalance(comm: MPI.Comm, count: int) -> float:
     return float(max(counts) * len(counts) / max(sum(counts), 1))
 
 
-def even(comm: MPI.Comm, homes: NDArray[np.int64], slack: float) -> NDArray[np.int64]:
+def even(comm: MPI.Comm, homes: NDArray[np.int64], slack: float = SLACK) -> NDArray[np.int64]:
     """Return a rank for each item, its home unless that has its share already (collective).
 
     Args:

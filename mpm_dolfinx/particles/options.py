@@ -24,6 +24,7 @@ from ..meshes.quadrature import default_degree
 from ..parallel.exchange import swap
 from ..parallel.given import require_whole
 from ..reals import is_one_of
+from ..tolerances import BLOCK
 from ..transfer.methods import METHODS
 
 __all__ = [
@@ -35,8 +36,6 @@ __all__ = [
 ]
 
 DEGREES = (1, 2, 3)
-#: Curved cells looked at together.
-BLOCK = 1 << 14
 
 
 class Coordinates:

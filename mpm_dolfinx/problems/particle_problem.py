@@ -34,19 +34,19 @@ from ..parallel.garbage import Cleaner
 from ..parallel.given import is_number, require_same
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
-from ..solvers.linear import chosen
 from ..solvers.newton import NewtonSolver
+from ..solvers.strategies import chosen
 from ..stepping.automatic import ErrorControl
 from ..stepping.diagnosis import crossed
 from ..stepping.displacement_control import DisplacementControl
 from ..stepping.loading import Mender, Recorder, Stepper
 from ..stepping.progress import with_bar
 from ..system.conditions import force_at
-from ..system.field import ValueField
 from ..system.predictor import Predictor
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
 from ..system.term import PointMaterial, Term, UserTerm
+from ..system.value_field import ValueField
 from ..system.values import FieldTerm
 from .arguments import (
     as_bodies,

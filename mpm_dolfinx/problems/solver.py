@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import MPMError
 from ..parallel.given import require_truth
 from ..reals import is_one_of
-from ..solvers.linear import LINEAR_SOLVERS
+from ..solvers.strategies import LINEAR_SOLVERS
 from ..stabilisation.choice import STABILISATIONS
 
 __all__ = ["Solver", "as_solver"]

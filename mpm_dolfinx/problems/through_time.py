@@ -15,14 +15,12 @@ from ..history import History, Step
 from ..parallel.boundary import collective, of_user
 from ..parallel.given import as_positive
 from ..stepping.progress import with_bar
+from ..tolerances import NEGLIGIBLE
 from .particle_problem import ParticleProblem
 
 __all__ = ["TimeProblem"]
 
 type Path_ = Callable[[float], None]
-
-#: How much shorter than asked for, relative to it, a last step may be that is not taken apart.
-SHORT = 1e-9
 
 
 class TimeProblem(ParticleProblem):
@@ -162,7 +160,7 @@ class TimeProblem(ParticleProblem):
             self._stepper.resume(None)
             self._begin_run(now)
         for end in ends:
-            count, began = max(1, math.ceil((end - now) / dt * (1.0 - SHORT))), now
+            count, began = max(1, math.ceil((end - now) / dt * (1.0 - NEGLIGIBLE))), now
             if resumes and interrupted is not None:
                 count, began = interrupted.control.steps, interrupted.began
                 resumes = False

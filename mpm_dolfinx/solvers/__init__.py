@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Newton's method, its line search, and the linear solver; no particle is known here.
 
-:mod:`~mpm_dolfinx.solvers.newton` solves a problem that is given by a protocol,
-:mod:`~mpm_dolfinx.solvers.linear` factorises the shifted tangent, or lets
-:mod:`~mpm_dolfinx.solvers.multigrid` stand for the factor,
+:mod:`~mpm_dolfinx.solvers.newton` solves a problem that is given by protocols
+(:mod:`~mpm_dolfinx.solvers.problem`), :mod:`~mpm_dolfinx.solvers.linear` factorises the shifted
+tangent, or lets :mod:`~mpm_dolfinx.solvers.multigrid` stand for the factor, by a table of how many
+unknowns are for which (:mod:`~mpm_dolfinx.solvers.strategies`),
 :mod:`~mpm_dolfinx.solvers.line_search` shortens its steps, and
 :mod:`~mpm_dolfinx.solvers.mechanism` finds motions that nothing holds.
 """

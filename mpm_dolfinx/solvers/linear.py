@@ -7,8 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from enum import IntEnum
-from typing import Any, Protocol
+from typing import Any
 
 from petsc4py import PETSc
 
@@ -16,65 +15,31 @@ import numpy as np
 
 from ..errors import MPMError
 from ..history import Statistics
-from ..parallel.magnitudes import unit_sized
 from ..parallel.totals import over_ranks
+from ..tolerances import ROUND_OFF
 from .multigrid import SHIFT, Multigrid
-from .saddle import Fields, SaddleMultigrid
+from .problem import Levels
+from .refinement import KRYLOV, Refinement
+from .refusals import options_refused, require_factor
+from .saddle import SaddleMultigrid
+from .strategies import STRATEGIES, mumps_options
 
-__all__ = ["LINEAR_SOLVERS", "Coarsening", "Indefinite", "Levels", "ShiftedFactor", "chosen"]
+__all__ = ["Indefinite", "ShiftedFactor"]
 
-#: Values of ``linear_solver``.
-LINEAR_SOLVERS = ("auto", "direct", "multigrid")
 #: Most unknowns of the coarsest level of multigrid, which is factorised.
 COARSEST = 600
-
-
-class Coarsening(IntEnum):
-    """How well the boxes of multigrid follow a tangent."""
-
-    GOOD = 0  # backgrounds are grids, of degree 1 or of boxes
-    FAIR = 1  # of degree 1 and no grid, or a term couples two backgrounds
-    POOR = 2  # of a higher degree, of simplices or no grid
-
-
-#: Unknowns from which on multigrid takes less time than a factorisation, by dimension of space.
-CROSSOVER = {
-    2: dict.fromkeys(Coarsening, 40000),
-    3: {Coarsening.GOOD: 3000, Coarsening.FAIR: 8000, Coarsening.POOR: 50000},
-}
-#: The same in a motion, where the mass takes it three times the iterations.
-CROSSOVER_IN_MOTION = {2: 40000, 3: 5000}
-
-#: Degree of the background up to which it may be chosen.
-HIGHEST = 2
-
 #: Values of MUMPS's INFOG(1) that more workspace cures.
 OUT_OF_WORKSPACE = (-8, -9)
 FACTORS = ("lu", "cholesky")
-#: Most unknowns, by dimension of space, whose tangent PETSc's own Cholesky factorises: of so few
-#: MUMPS takes more to set a factor up than to compute it. Their order, and the pivot, relative to
-#: its row, that counts as none: those of the shift are as small as round-off.
-FEW, ORDER, NO_PIVOT = {2: 400, 3: 150}, "nd", 0.0
-#: Most iterations of a refinement, and how often it begins anew.
-KRYLOV, REFINEMENTS = 60, 4
-#: Options of MUMPS unless others are given: K scaled by its diagonal, as the shift is.
-MUMPS = {"mat_mumps_icntl_8": 1, "mg_coarse_mat_mumps_icntl_8": 1}
-#: The same where the diagonal says nothing of the size of a row: rows and columns in turn.
-SADDLE = {"mat_mumps_icntl_8": 7}
-#: PORD orders plane graphs three times as fast as METIS and no worse, in space worse; from that
-#: many unknowns on, as it ends the process where all unknowns are neighbours of each other.
-PORD, PORD_FROM = {"mat_mumps_icntl_7": 4}, 10000
-#: Blocks of low rank of MUMPS's factors, to what share of their size, and unknowns in space from
-#: which on they are used; and the relative residual to which such a factor is iterated with.
-LOW_RANK, LOW_RANK_FROM = {"mat_mumps_icntl_35": 1, "mat_mumps_cntl_7": 1e-4}, 20000
+#: Order of PETSc's own Cholesky, and the pivot, relative to its row, that counts as none: those of
+#: the shift are as small as round-off.
+ORDER, NO_PIVOT = "nd", 0.0
+#: Relative residual to which a factor with blocks of low rank is iterated with.
 COMPRESSED = 1e-10
-#: Iterations for a decade of the residual above which ``"auto"`` factorises from then on: with n
-#: unknowns ``n / 450`` in space, where operations of a factor grow as n², ``n^0.5 / 30`` in the
-#: plane; and how many times as many a solve may have.
-BEARABLE, MOST_BEARABLE = {2: (0.5, 30.0), 3: (1.0, 450.0)}, 2.0
-#: Unknowns up to which a factorisation takes over where multigrid comes to nothing, and steps in
-#: a row in which it may before no step begins with multigrid.
-TAKEN_OVER, ENDURED = {2: 500000, 3: 50000}, 3
+#: How many times as many iterations as cost as much as a factor a solve by multigrid may have.
+MOST_BEARABLE = 2.0
+#: Steps in a row in which a factorisation may take over before no step begins with multigrid.
+ENDURED = 3
 #: Relative residual of what multigrid solves besides Newton's steps, and its most iterations.
 ACCURATE, ITERATIONS = 1e-6, 200
 #: Relative residuals of the first and the roughest of Newton's steps by multigrid (Eisenstat &
@@ -82,8 +47,6 @@ ACCURATE, ITERATIONS = 1e-6, 200
 FIRST, ROUGHEST, FINAL = 1e-2, 0.1, 0.2
 #: Tries of a step that end where a tangent is indefinite, before it is solved with all the same.
 PATIENCE = 3
-#: Relative shift of a tangent with zeros on its diagonal, where no other is asked for.
-TINY = 1e-13
 #: By which conjugate gradients say that a tangent is not positive definite.
 INDEFINITE = (
     PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT,
@@ -94,37 +57,10 @@ SINGULAR = (
     PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC,
     PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED,
 )
-#: PETSc's error numbers for what an option asks for: not supported, out of range, an unknown
-#: type, and a package that is missing.
-REFUSALS = (56, 63, 86, 92)
-
-
-def chosen(linear_solver: str, degree: int) -> str:
-    """Return the linear solver of backgrounds of a degree.
-
-    From degree 3 on rows have so many entries that a factorisation is cheaper up to ten thousand
-    unknowns and more, and ``"auto"`` means that.
-    """
-    return "direct" if linear_solver == "auto" and degree > HIGHEST else linear_solver
 
 
 class Indefinite(Exception):
     """A tangent is not positive definite, for which a smaller step is the best cure."""
-
-
-class Levels(Fields, Protocol):
-    """Unknowns, as a linear solver must know them. All calls are collective."""
-
-    @property
-    def constrained(self) -> bool:
-        """Whether there are unknowns besides displacements."""
-
-    @property
-    def coarsening(self) -> Coarsening:
-        """How well multigrid's boxes follow the tangent."""
-
-    def rigid_motions(self) -> PETSc.NullSpace:
-        """Return the rigid motions in the unknowns."""
 
 
 class ShiftedFactor:
@@ -185,17 +121,17 @@ class ShiftedFactor:
         self.num_negative = 0
         self._symmetric = symmetric
         self._statistics = statistics
-        self._refining: PETSc.KSP | None = None
+        self._refining: Refinement | None = None
         self._ksp = ksp = snes.getKSP()
         ksp.setType("preonly")
         pc = ksp.getPC()
         pc.setType("cholesky" if symmetric else "lu")
         pc.setFactorSolverType("mumps")
         self._options = {prefix + key: value for key, value in options.items()}
-        self._prefix, self._dim = prefix, dim
+        self._prefix, self._dim, self._strategy = prefix, dim, STRATEGIES[dim]
         given = {*PETSc.Options(prefix).getAll(), *options}
         said = any(key.startswith(("ksp_", "pc_", "mat_")) for key in given)
-        with _options_refused(), self._own_options() as database:
+        with options_refused(), self._own_options() as database:
             snes.setFromOptions()
             own = database.hasName(f"{prefix}pc_factor_mat_solver_type")
             self._own_rtol = database.hasName(f"{prefix}ksp_rtol")
@@ -208,18 +144,17 @@ class ShiftedFactor:
             if pc.getType() in FACTORS:
                 if not own:
                     pc.setFactorSolverType("mumps")  # changing the type had dropped it
-                _require_factor(pc)
+                require_factor(pc)
         self._direct = ksp.getType(), pc.getType(), pc.getFactorSolverType()
         suits = symmetric and shift > 0.0 and not said and snes.comm.size == 1
-        self._few = FEW.get(dim, 0) if suits else 0
+        self._few = self._strategy.few if suits else 0
 
     @contextmanager
     def _own_options(self, size: int = 0) -> Iterator[PETSc.Options]:
         """Put the options into PETSc's database, for what reads them inside the block."""
         database = PETSc.Options()
-        plane = self._dim == 2 and size >= PORD_FROM
-        chosen: dict[str, Any] = {**(SADDLE if self.num_negative else MUMPS)}
-        chosen |= (PORD if plane else {}) | (LOW_RANK if self._compresses(size) else {})
+        saddle, compresses = self.num_negative > 0, self._compresses(size)
+        chosen = mumps_options(self._strategy, size, saddle, compresses)
         defaults = {self._prefix + k: v for k, v in chosen.items()}
         options = {k: v for k, v in defaults.items() if not database.hasName(k)} | self._options
         for key, value in options.items():
@@ -263,7 +198,8 @@ class ShiftedFactor:
 
     def _compresses(self, size: int) -> bool:
         """Return whether factors have blocks of low rank."""
-        if self._dim < 3 or size < LOW_RANK_FROM or self._own_type:
+        least = self._strategy.compressed
+        if least is None or size < least or self._own_type:
             return False
         _, factor, package = self._direct
         return factor in FACTORS and package == "mumps"
@@ -286,17 +222,20 @@ class ShiftedFactor:
             return False
         if self._linear_solver != "auto":
             return self._linear_solver == "multigrid"
-        least = CROSSOVER.get(self._dim, {})
-        if not self._symmetric or self._constrained or size < min(least.values(), default=np.inf):
+        least = self._strategy.crossover
+        if least is None or not self._symmetric or self._constrained:
             return False
-        moving = CROSSOVER_IN_MOTION[self._dim] if in_motion else 0
+        if size < min(least.values()):
+            return False
+        moving = self._strategy.in_motion if in_motion else 0
         return size >= max(least[levels.coarsening], moving)
 
     def _bearable(self, size: int) -> float:
         """Return the iterations for a decade of the residual that cost as much as a factor."""
-        if self._linear_solver != "auto" or self._dim not in BEARABLE:
+        bearable = self._strategy.bearable
+        if self._linear_solver != "auto" or bearable is None:
             return np.inf
-        power, share = BEARABLE[self._dim]
+        power, share = bearable
         return float(size**power / share)
 
     def _choose(self, iterates: bool) -> None:
@@ -312,7 +251,7 @@ class ShiftedFactor:
             ksp.setTolerances(rtol=ACCURATE, atol=0.0, max_it=ITERATIONS)
             ksp.setGMRESRestart(KRYLOV)
             pc.setType("mg")
-            with _options_refused(), self._own_options():
+            with options_refused(), self._own_options():
                 ksp.setFromOptions()
             self._longest = ksp.getTolerances()[3]
             return
@@ -386,7 +325,7 @@ class ShiftedFactor:
                 self._ksp.setUp()  # numbers alone, which reads no options
                 if not self._lacks_workspace():
                     return
-            with self._own_options(K.getSize()[0]), _options_refused():
+            with self._own_options(K.getSize()[0]), options_refused():
                 self._ksp.setUp()  # where the factor is made, which reads options of its own
                 self._give_workspace()
 
@@ -403,7 +342,7 @@ class ShiftedFactor:
             size = part.stop - part.start
             where = PETSc.IS().createStride(size, first=first + part.start, comm=self.P.comm)
             pc.setFieldSplitIS((name, where))
-        with _options_refused(), self._own_options():
+        with options_refused(), self._own_options():
             pc.setFromOptions()
 
     def _make_levels(self, K: PETSc.Mat, levels: Levels, damping: float) -> None:
@@ -411,7 +350,7 @@ class ShiftedFactor:
         known = self.K is K
         damped = damping > self.shift
         matrix = K
-        with self._statistics.phase("factorise"), self._own_options(), _options_refused():
+        with self._statistics.phase("factorise"), self._own_options(), options_refused():
             if not known:
                 self._refining = self._flexible = self._shifted = None
                 pc, symmetric = self._ksp.getPC(), self._symmetric
@@ -423,7 +362,7 @@ class ShiftedFactor:
                     self._multigrid = Multigrid(pc, interpolations, symmetric)
                     pc.setFromOptions()
             assert self._multigrid is not None
-            relative = damping if damped else SHIFT if self._shifts else TINY
+            relative = damping if damped else SHIFT if self._shifts else ROUND_OFF
             if damped or self._shifts or not self._multigrid.levels or _has_zeros(K):
                 matrix = self._shifted_copy(K, relative * levels.diagonal(K))
             if self._symmetric:
@@ -517,7 +456,7 @@ class ShiftedFactor:
                 self._assess(self._flexible, b)
                 return True
             self.give_up(shorten)
-        if K.getSize()[0] > TAKEN_OVER.get(self._dim, 0):
+        if K.getSize()[0] > self._strategy.taken_over:
             return False
         self._failures += 1
         self._dear = self._linear_solver == "auto"
@@ -617,10 +556,6 @@ class ShiftedFactor:
     def refine(self, b: PETSc.Vec, x: PETSc.Vec, tolerance: float) -> float:
         """Improve a solution of ``(K + D) x = b`` to one of ``K x = b`` (collective).
 
-        The last factor is the preconditioner. Where K is many times D nothing is left to do;
-        where it is smaller, in what moves easily beside the stiffness at its nodes, the factor
-        alone would leave most of b to D.
-
         Args:
             b: The right-hand side.
             x: The solution by the last factor; replaced.
@@ -630,36 +565,10 @@ class ShiftedFactor:
             That norm in the end, relative to b's.
         """
         assert self.K is not None
-        scaled, exponent = unit_sized(b)
-        size = scaled.norm()
-        if size == 0.0 or not np.isfinite(size):
-            return 0.0
         if self._refining is None:
-            self._refining = ksp = PETSc.KSP().create(b.comm)
-            ksp.setType("fgmres")
-            ksp.setGMRESRestart(KRYLOV)
-            ksp.setPC(self._ksp.getPC())
-        ksp = self._refining
-        ksp.setOperators(self.K, self.P)
-        ksp.setTolerances(rtol=1e-15, atol=0.5 * tolerance * size, max_it=KRYLOV)
-        rest, step = b.duplicate(), x.duplicate()
-        best = np.inf
+            self._refining = Refinement(self._ksp.getPC())
         with self._statistics.phase("solve"):
-            for _ in range(REFINEMENTS):
-                _product(self.K, x, exponent, rest)
-                rest.aypx(-1.0, scaled)
-                left = rest.norm() / size
-                if not left < 0.5 * best:
-                    break
-                best = left
-                kept = x.copy()
-                if left <= tolerance:
-                    break
-                ksp.solve(rest, step)
-                step.array_w[:] = np.ldexp(step.array_r, exponent)
-                x.axpy(1.0, step)
-            kept.copy(x)
-        return float(best)
+            return self._refining(self.K, self.P, b, x, tolerance)
 
     def negative_pivots(self) -> int:
         """Return how many pivots of the last factor are negative, where it says so.
@@ -677,51 +586,8 @@ class ShiftedFactor:
         return int(pc.getFactorMatrix().getMumpsInfog(12)) if package == "mumps" else 0
 
 
-@contextmanager
-def _options_refused() -> Iterator[None]:
-    """Tell in a sentence where PETSc refuses an option inside the block, as it does on all ranks.
-
-    Raises:
-        MPMError: It does.
-    """
-    try:
-        yield
-    except PETSc.Error as error:
-        if error.ierr not in REFUSALS:
-            raise
-        told = str(error).splitlines()[-1].partition("] ")[2].rstrip(". ")
-        raise MPMError(
-            f"PETSc refuses an option of the problem: {told}; correct petsc_options=, or what the "
-            "program's command line sets."
-        ) from error
-
-
-def _require_factor(pc: PETSc.PC) -> None:
-    """Let PETSc raise its error where it has not the factorisation that is asked for.
-
-    It would say so at the first step only.
-    """
-    one = PETSc.Mat().createAIJ(((1, None), (1, None)), nnz=1, comm=pc.comm)
-    one.assemble()
-    trial = PETSc.PC().create(pc.comm)
-    trial.setType(pc.getType())
-    trial.setFactorSolverType(pc.getFactorSolverType())
-    trial.setOperators(one, one)
-    trial.setFactorSetUpSolverType()
-
-
 def _has_zeros(K: PETSc.Mat) -> bool:
     """Return whether the diagonal of a matrix has zeros (collective)."""
     diagonal = K.getDiagonal()
     diagonal.abs()
     return bool(diagonal.min()[1] == 0.0)
-
-
-def _product(K: PETSc.Mat, x: PETSc.Vec, exponent: int, result: PETSc.Vec) -> None:
-    """Set a vector to ``K x`` over a power of two (collective)."""
-    if exponent == 0:
-        K.mult(x, result)
-        return
-    scaled = x.copy()
-    scaled.array_w[:] = np.ldexp(x.array_r, -exponent)
-    K.mult(scaled, result)

@@ -4,43 +4,22 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 from petsc4py import PETSc
 
 import numpy as np
 
 from ..errors import ConvergenceError, MPMError
 from ..parallel.magnitudes import norm
-from .linear import Levels, ShiftedFactor
+from .linear import ShiftedFactor
+from .problem import Levels, Resisting
 
-__all__ = ["Resisting", "mechanism", "not_held"]
+__all__ = ["mechanism", "not_held"]
 
 #: Stiffness along a motion, relative to that of its unknowns one by one and to the shift, up to
 #: which nothing holds it.
 MECHANISM = 1e-5
 #: Most inverse iterations that look for such a motion.
 INVERSE_ITERATIONS = 100
-
-
-class Resisting(Protocol):
-    """What resists motions, as the search for mechanisms must know it; calls are collective."""
-
-    @property
-    def one_sided(self) -> bool:
-        """Whether something may let bodies go and hold them again, as contact does."""
-
-    def stiffness(self, x: PETSc.Vec) -> float:
-        """Return ``x . K x`` for the last tangent, without cancellation in rigid motions."""
-
-    def is_rigid(self, x: PETSc.Vec) -> bool:
-        """Return whether x moves each body as a rigid one."""
-
-    def motion(self, x: PETSc.Vec) -> float:
-        """Return the size of the displacement that x causes on the bodies."""
-
-    def extent(self) -> float:
-        """Return the size of the positions of the bodies, in the same norm."""
 
 
 def mechanism(system: Resisting, factor: ShiftedFactor, y: PETSc.Vec) -> PETSc.Vec | None:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -20,14 +20,14 @@ from ..log import NEWTON, tell
 from ..parallel.garbage import weakly
 from ..parallel.magnitudes import norm, sign_of_product
 from ..parallel.totals import over_ranks
+from ..tolerances import ROUND_OFF
 from .line_search import LineSearch, stalled
-from .linear import Indefinite, Levels, ShiftedFactor
-from .mechanism import Resisting, mechanism, not_held
+from .linear import Indefinite, ShiftedFactor
+from .mechanism import mechanism, not_held
+from .problem import ReducedProblem
 
-__all__ = ["NewtonSolver", "ReducedProblem"]
+__all__ = ["NewtonSolver"]
 
-#: Newton increment, relative to the step's, at which round-off is reached.
-ROUND_OFF = 1e-13
 #: First residual of a prediction that is kept, over that of a start from zero; from 1 on as long
 #: as it saves linear solves.
 KEPT = 2.0
@@ -48,81 +48,6 @@ LINEARISED = 1e-10
 LATE = 5
 #: Relative diagonal shifts tried in turn until a tangent is positive definite.
 DAMPINGS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
-
-
-class Histories(Protocol):
-    """Histories of what acts on bodies."""
-
-    def smooth(self) -> bool:
-        """Return whether no history changes in the last residual, nor contact (collective)."""
-
-    def yielding(self) -> list[NDArray[np.bool_]]:
-        """Return whether each particle yields in the last residual, for each body."""
-
-
-class Sizes(Protocol):
-    """Sizes of forces of the last residual. All calls are collective."""
-
-    def internal_scale(self) -> float:
-        """Return the size of the absolute internal contributions."""
-
-    def resultant(self) -> float:
-        """Return the size of the sum of the residual over the unknowns."""
-
-
-class ReducedProblem(Protocol):
-    """Problem, as the solver asks for it. All calls are collective."""
-
-    @property
-    def softens(self) -> bool:
-        """Whether tangents may be indefinite where ``constrain`` permits no such direction."""
-
-    @property
-    def levels(self) -> Levels:
-        """The unknowns, as a linear solver must know them."""
-
-    @property
-    def resistance(self) -> Resisting:
-        """How unknowns move bodies, and what resists."""
-
-    @property
-    def terms(self) -> Histories:
-        """What acts on the bodies."""
-
-    @property
-    def balance(self) -> Sizes:
-        """The sizes of its forces."""
-
-    @property
-    def tangent(self) -> Callable[[], PETSc.Mat]:
-        """Returns the tangent at the x of the last residual, always the same object."""
-
-    def residual(self, x: PETSc.Vec, F: PETSc.Vec) -> MPMError | None:
-        """Evaluate the residual at x, or say why that cannot be."""
-
-    def constrain(
-        self, y: PETSc.Vec, x: PETSc.Vec | None, solve: Callable[[PETSc.Vec, PETSc.Vec], None]
-    ) -> int:
-        """Amend a Newton step y from x (``None``: zero) so that ``x - y`` is permitted.
-
-        ``solve`` solves with the factor that gave y. Returns how many negative eigenvalues the
-        tangent has where it is positive definite in all directions that are permitted.
-        """
-
-    def prediction(self) -> PETSc.Vec | None:
-        """Return unknowns to expect at the step's end, if the past says any."""
-
-    def impose(self) -> bool:
-        """Impose the step's Dirichlet values from now on; return whether there are any."""
-
-    def lift(self) -> PETSc.Vec:
-        """Return the linearised forces of the step's Dirichlet values."""
-
-    def scale(self, F: PETSc.Vec | None = None) -> float:
-        """Return the size of external forces and reactions, by which a residual F is judged."""
-
-    def has_potential(self) -> bool:
-        """Return whether a symmetric K means that equilibrium makes a potential least."""
 
 
 class NewtonSolver:

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..background.basis import PointBasis
-from ..background.cells import DROP
 from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
+from ..tolerances import ROUND_OFF
 from ..transfer.touched import TouchedNodes
 
 __all__ = ["HARDLY", "Joints"]
@@ -90,7 +90,7 @@ class Joints:
             rows = PointBasis._make(
                 None if part is None else part[row, best][found] for part in basis
             )
-            rows.values[np.abs(rows.values) < DROP] = 0.0
+            rows.values[np.abs(rows.values) < ROUND_OFF] = 0.0
             body.carry_by(nodes[found], rows)
             done[nodes[found]] = True
             changed |= bool(found.any())

@@ -17,9 +17,11 @@ from ..history import Statistics
 from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
 from ..stabilisation.joints import HARDLY
-from ..system.field import Field, ValueField
+from ..system.field import Field
 from ..system.free_field import FreeField
 from ..system.reduced import ReducedSystem
+from ..system.value_field import ValueField
+from ..tolerances import NEGLIGIBLE
 
 __all__ = ["count_folded", "crossed", "placed"]
 
@@ -28,8 +30,6 @@ __all__ = ["count_folded", "crossed", "placed"]
 ASTRAY = 0.5
 #: How often a particle begins or ceases to yield, late in a solve, that flips to and fro.
 FLIPS = 2
-#: Share of the forces on unknowns of a term's own above which they are out of balance.
-LEFT = 1e-9
 
 
 def crossed(bodies: Sequence[Particles]) -> MPMError | None:
@@ -79,7 +79,7 @@ def placed(
             text += f"; the residual is largest at dof {dofs[0]} of {space} near {where}"
             text += ", and at {particles}"
         for own in reduced.unknowns.own:
-            if own.advice and own.left() > LEFT:
+            if own.advice and own.left() > NEGLIGIBLE:
                 text += f"; {own.advice.format(f'{own.left():.1e}')}"
     if isinstance(error, TRIAL_ERRORS):
         astray = max(map(_astray, reduced.fields), default=None)

@@ -26,13 +26,12 @@ from ..particles.geometry import RING
 from ..particles.particles import Particles
 from ..reals import as_reals
 from ..system.reduced import ReducedSystem
+from ..tolerances import NEGLIGIBLE
 
 __all__ = ["ControlledSystem", "DisplacementControl"]
 
 #: Share of the motion under load that is the controlled displacement, below which it is none.
 UNMOVED = 1e-12
-#: Relative deviation from a straight line up to which a residual is affine in the load factor.
-AFFINE = 1e-9
 
 
 class DisplacementControl:
@@ -201,7 +200,7 @@ class DisplacementControl:
         linear = float(row @ d.x.array[: len(row)])
         whole, linear = comm.allreduce(np.array([whole, linear]))
         size = comm.allreduce(float(np.abs(row) @ np.abs(d.x.array[: len(row)])))
-        if abs(whole - linear) > AFFINE * size:
+        if abs(whole - linear) > NEGLIGIBLE * size:
             raise MPMError("functional must vanish where the displacement does.")
         return row
 
@@ -258,7 +257,7 @@ class ControlledSystem:
                 "a point that is not held."
             )
         curvature, size = reduced.balance.load_derivative(order=2)
-        if _norm(curvature) > AFFINE * size:
+        if _norm(curvature) > NEGLIGIBLE * size:
             raise MPMError(
                 "Displacement control needs a residual that is affine in particles.load, such as "
                 "loads that are proportional to it."

@@ -28,7 +28,8 @@ from ..parallel.garbage import Cleaner
 from ..parallel.interruption import Hold, Interrupted, held, interrupted, settle
 from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
-from ..solvers.newton import NewtonSolver, ReducedProblem
+from ..solvers.newton import NewtonSolver
+from ..solvers.problem import ReducedProblem
 from ..system.conditions import dirichlet_values
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
@@ -133,7 +134,7 @@ class Stepper:
 
     @property
     def recorders(self) -> list[Recorder]:
-        """What follows the steps."""
+        """Those that follow the steps."""
         self._recorders = [known for known in self._recorders if known() is not None]
         return [found for known in self._recorders if (found := known()) is not None]
 

@@ -17,11 +17,12 @@ from ..errors import TRIAL_ERRORS, DomainDistortionError, MPMError, agreed
 from ..history import Statistics
 from ..parallel.interruption import Interrupted, noted
 from ..parallel.magnitudes import joint_norm, norm
-from .field import Field, ValueField
+from .field import Field
 from .free_field import FreeField
 from .tangent import Tangent
 from .terms import Terms
 from .unknowns import Unknowns
+from .value_field import ValueField
 
 __all__ = ["Balance"]
 

@@ -23,12 +23,10 @@ from ..errors import MPMError, agree
 from ..parallel.boundary import collective
 from ..parallel.given import as_positive, require_whole
 from ..particles.particles import Particles
+from ..tolerances import NEGLIGIBLE
 from .term import Term
 
 __all__ = ["Tie"]
-
-#: Share of a point's displacement from nodes of deleted domains, from which it is gone with them.
-GONE = 1e-9
 
 
 class Tie(Term):
@@ -144,7 +142,7 @@ class Tie(Term):
             dim = body.mesh.geometry.dim
             nodes.array_w[:] = np.repeat(body.deletion.dead, dim)[: nodes.getLocalSize()]
             rows.mult(nodes, points)
-            held &= np.abs(points.array_r) < GONE
+            held &= np.abs(points.array_r) < NEGLIGIBLE
         return held
 
     def _multiply(self) -> None:

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..parallel.totals import over_ranks
-from ..solvers.linear import Coarsening
-from .field import ValueField
+from ..solvers.strategies import Coarsening
 from .hierarchy import interpolations
 from .terms import Terms
 from .unknowns import Unknowns
+from .value_field import ValueField
 
 __all__ = ["Levels"]
 

@@ -28,9 +28,6 @@ from ..transfer.touched import TouchedNodes
 
 __all__ = ["FreeDofs", "Numbering"]
 
-#: How much more than an even share a rank may have for the sake of locality.
-SLACK = 0.05
-
 
 class FreeDofs:
     """The free dofs of one V with ranks of their own, and values that move between these and V's.
@@ -63,7 +60,7 @@ class FreeDofs:
             return
         homes = np.full(touched.num_own, comm.rank, dtype=np.int64)
         homes[touched.active] = touched.homes
-        self.owners = even(comm, homes[free // bs], SLACK)
+        self.owners = even(comm, homes[free // bs])
         owner = np.full(touched.num_own, -1, dtype=np.int64)
         owner[free // bs] = self.owners
         self.off_rank = touched.off_rank(owner) * (1, 1, bs)

@@ -88,7 +88,7 @@ class Predictor:
 
 
 def extrapolated(past: Sequence[tuple[float, Increments]], size: float) -> Increments:
-    """Return what follows on the increments of the last step or two.
+    """Return the increments that follow on those of the last step or two.
 
     Args:
         past: Sizes of these steps, and their increments.

@@ -13,6 +13,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from ..errors import ConvergenceError
+from ..tolerances import ROUND_OFF
 
 __all__ = ["Projection"]
 
@@ -24,8 +25,6 @@ BEYOND = 0.01
 AT_ROUND_OFF = 1e-10
 #: How often what the shift holds back is let go.
 RELEASES = 3
-#: Diagonal shift in a projection, relative to the diagonal.
-SHIFT = 1e-13
 #: What is added to it in turn where the factor is at round-off.
 RAISES = (0.0, 1e-12, 1e-11, 1e-10)
 
@@ -46,7 +45,7 @@ class Projection:
         shifted.diagonalScale(scale, scale)
         diagonal = shifted.getDiagonal()
         values = diagonal.array_w
-        values[:] = np.where(values > 0.0, SHIFT, 1.0)
+        values[:] = np.where(values > 0.0, ROUND_OFF, 1.0)
         shifted.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
         self._shifted, self._held = shifted, diagonal
         self._incomplete: PETSc.KSP | None = None

@@ -19,7 +19,7 @@ from ..parallel.balance import imbalance
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from .balance import Balance
-from .field import Field, ValueField
+from .field import Field
 from .levels import Levels
 from .predictor import Predictor
 from .resistance import Resistance
@@ -27,6 +27,7 @@ from .tangent import Tangent
 from .term import Term
 from .terms import Terms
 from .unknowns import Unknowns
+from .value_field import ValueField
 
 __all__ = ["ReducedSystem"]
 

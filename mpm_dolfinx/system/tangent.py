@@ -123,7 +123,7 @@ class Tangent:
 
     @property
     def _couplings(self) -> list[Coupling]:
-        """What couples a body and a field on it and is reduced by compiled loops."""
+        """Couplings of a body and a field on it that the compiled loops reduce."""
         pairs = zip(self._terms, self._coupled, strict=True)
         return [term.coupling for term, coupled in pairs if coupled and term.coupling is not None]
 

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
-from .field import Field, Motion, ValueField
+from .field import Field, Motion
 from .free_field import Subspace
 from .numbering import Numbering
 from .own import OwnUnknowns
+from .value_field import ValueField
 
 __all__ = ["Unknowns"]
 

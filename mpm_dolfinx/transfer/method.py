@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dolfinx import fem, mesh
 
 from ..background.basis import BackgroundBasis, PointBasis
-from ..background.cells import DROP
+from ..tolerances import ROUND_OFF
 
 __all__ = ["CornerBasis", "DomainState", "Method", "ParticleState", "affine"]
 
@@ -166,7 +166,7 @@ def affine(state: DomainState, arms: NDArray[np.float64], particle: PointBasis) 
     """
     assert particle.gradients is not None
     rows = np.einsum("nji,nki->nkj", particle.gradients, arms) + particle.values[:, None]
-    rows = np.where(np.abs(rows) < DROP, 0.0, rows)
+    rows = np.where(np.abs(rows) < ROUND_OFF, 0.0, rows)
     k = arms.shape[1]
     nodes = np.broadcast_to(particle.nodes[:, None], rows.shape)
     size = state.domains.size

@@ -12,7 +12,8 @@ from scenes import QUADRILATERAL, TRIANGLE, WORLD
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import Hencky
-from mpm_dolfinx.solvers import linear
+from mpm_dolfinx.solvers import linear, strategies
+from mpm_dolfinx.solvers.strategies import STRATEGIES as TABLE
 
 
 def test_results_do_not_depend_on_the_direct_solver():
@@ -97,7 +98,7 @@ class Alone:
     """What a factor asks about unknowns that are displacements alone."""
 
     constrained = False
-    coarsening = linear.Coarsening.GOOD
+    coarsening = strategies.Coarsening.GOOD
 
     def diagonal(self, K):
         diagonal = K.getDiagonal()
@@ -110,7 +111,7 @@ class Alone:
 def test_negative_pivots_are_the_negative_eigenvalues(few, negative, monkeypatch):
     n = 40
     if not few:
-        monkeypatch.setattr(linear, "FEW", {})
+        monkeypatch.setitem(TABLE, 2, TABLE[2]._replace(few=0))
     random = np.random.default_rng(negative)
     basis = np.linalg.qr(random.standard_normal((n, n)))[0]
     eigenvalues = random.uniform(1.0, 100.0, n)
@@ -139,7 +140,7 @@ def test_few_unknowns_are_factorised_by_petsc_with_the_same_result(monkeypatch):
     # Unknowns of the column become more as it spreads over the cells: packages change on the way.
     moved, packages = [], []
     for few in (0, 80, 10000):
-        monkeypatch.setattr(linear, "FEW", {2: few})
+        monkeypatch.setitem(TABLE, 2, TABLE[2]._replace(few=few))
         problem = scenes.slump(TRIANGLE, 15e3, h=1.0)
         used = set()
         for _ in problem.steps(10):
@@ -156,4 +157,4 @@ def test_what_options_say_of_the_factor_holds_for_few_unknowns_too():
     problem = scenes.block(petsc_options={"mat_mumps_icntl_14": 30})
     problem.solve(steps=1)
     assert problem.solver.getKSP().getPC().getFactorSolverType() == "mumps"
-    assert problem.history.statistics["free_dofs"] <= linear.FEW[2]
+    assert problem.history.statistics["free_dofs"] <= TABLE[2].few

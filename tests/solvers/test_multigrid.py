@@ -14,7 +14,7 @@ from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE
 import mpm_dolfinx as mpm
 from mpm_dolfinx.errors import MPMError
 from mpm_dolfinx.materials import Hencky, LinearElastic, MohrCoulomb, VonMises
-from mpm_dolfinx.solvers import linear
+from mpm_dolfinx.solvers import linear, strategies
 
 TIGHT = {"snes_rtol": 1e-12}
 PLASTIC = VonMises(1e6, 0.3, rho_y=20e3)
@@ -112,11 +112,17 @@ def test_several_ranks_take_the_same_way(n, options):
     same_run(outcome(several), outcome(one), 1e-9)
 
 
+def change(monkeypatch, dim=2, **numbers):
+    """Let solvers take turns at other numbers of unknowns."""
+    table = strategies.STRATEGIES
+    monkeypatch.setitem(table, dim, table[dim]._replace(**numbers))
+
+
 def test_factors_of_low_rank_give_the_same(monkeypatch):
     full = heavy(5, cell=HEXAHEDRON, linear_solver="direct")
     full.solve(steps=2)
-    monkeypatch.setattr(linear, "LOW_RANK_FROM", 100)
-    monkeypatch.setattr(linear, "LOW_RANK", {"mat_mumps_icntl_35": 1, "mat_mumps_cntl_7": 1e-2})
+    change(monkeypatch, 3, compressed=100)
+    monkeypatch.setattr(strategies, "LOW_RANK", {"mat_mumps_icntl_35": 1, "mat_mumps_cntl_7": 1e-2})
     run = heavy(5, cell=HEXAHEDRON, linear_solver="direct")
     run.solve(steps=2)
     a, b = scenes.own(full.particles.displacement), scenes.own(run.particles.displacement)
@@ -247,12 +253,12 @@ def test_a_factorisation_takes_over_where_multigrid_comes_to_nothing():
 
 def from_on(*unknowns):
     """Return the unknowns from which on multigrid is chosen, the same or by kind of coarsening."""
-    kinds = linear.Coarsening
-    return {2: dict(zip(kinds, unknowns * (len(kinds) // len(unknowns)), strict=True))}
+    kinds = strategies.Coarsening
+    return dict(zip(kinds, unknowns * (len(kinds) // len(unknowns)), strict=True))
 
 
 def test_many_unknowns_are_for_multigrid(monkeypatch):
-    monkeypatch.setattr(linear, "CROSSOVER", from_on(700))
+    change(monkeypatch, crossover=from_on(700))
     for n, used in ((12, False), (20, True)):
         run = heavy(n, linear_solver="auto")
         run.solve(steps=1)
@@ -260,8 +266,8 @@ def test_many_unknowns_are_for_multigrid(monkeypatch):
     run = heavy(20, linear_solver="auto", petsc_options={"pc_type": "lu"})
     run.solve(steps=1)
     assert run.history.statistics["krylov_iterations"] == 0
-    for crossover, used in (({2: 2000}, False), ({2: 700}, True)):
-        monkeypatch.setattr(linear, "CROSSOVER_IN_MOTION", crossover)
+    for crossover, used in ((2000, False), (700, True)):
+        change(monkeypatch, in_motion=crossover)
         still = heavy(20)
         motion = posed(
             mpm.DynamicProblem, still.particles, PLASTIC, 1.0, body_force=(0.0, -8e3), bcs=still.bcs
@@ -282,7 +288,7 @@ def test_many_unknowns_are_for_multigrid(monkeypatch):
     ],
 )
 def test_what_coarsens_badly_is_for_multigrid_later(monkeypatch, n, options, least):
-    monkeypatch.setattr(linear, "CROSSOVER", from_on(700, 2000, 3000))
+    change(monkeypatch, crossover=from_on(700, 2000, 3000))
     run = heavy(n, linear_solver="auto", **options)
     run.solve(steps=1)
     assert 700 < run.history.statistics["free_dofs"] < 2000
@@ -291,19 +297,19 @@ def test_what_coarsens_badly_is_for_multigrid_later(monkeypatch, n, options, lea
 
 
 def test_backgrounds_that_a_tie_couples_are_for_multigrid_later(monkeypatch):
-    monkeypatch.setattr(linear, "CROSSOVER", from_on(700, 10**6, 10**6))
+    change(monkeypatch, crossover=from_on(700, 10**6, 10**6))
     run = tied("auto")
     run.solve(steps=1)
     assert run.history.statistics["free_dofs"] > 700
     assert run.history.statistics["krylov_iterations"] == 0
-    assert run.reduced.levels.coarsening is linear.Coarsening.FAIR
+    assert run.reduced.levels.coarsening is strategies.Coarsening.FAIR
 
 
 def test_a_factorisation_goes_on_where_multigrid_takes_longer(monkeypatch):
-    monkeypatch.setattr(linear, "CROSSOVER", from_on(700))
+    change(monkeypatch, crossover=from_on(700))
     counts = []
     for bearable in (1e9, 0.6):
-        monkeypatch.setattr(linear, "BEARABLE", {2: (0.0, 1.0 / bearable)})
+        change(monkeypatch, bearable=(0.0, 1.0 / bearable))
         run = heavy(20, linear_solver="auto")
         run.solve(steps=3)
         counts.append(run.history.statistics["krylov_iterations"])
@@ -314,7 +320,7 @@ def test_a_factorisation_goes_on_where_multigrid_takes_longer(monkeypatch):
 
 
 def test_a_background_of_degree_3_is_factorised(monkeypatch):
-    monkeypatch.setattr(linear, "CROSSOVER", from_on(100))
+    change(monkeypatch, crossover=from_on(100))
     for degree, used in ((2, True), (3, False)):
         run = heavy(24 // degree, degree=degree, linear_solver="auto")
         run.solve(steps=1)

@@ -1,0 +1,103 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Which solver takes the tangents of how many unknowns, as timed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+__all__ = ["LINEAR_SOLVERS", "STRATEGIES", "Coarsening", "Strategy", "chosen", "mumps_options"]
+
+#: Values of ``linear_solver``.
+LINEAR_SOLVERS = ("auto", "direct", "multigrid")
+#: Degree of the background up to which multigrid may be chosen.
+HIGHEST = 2
+
+
+class Coarsening(IntEnum):
+    """How well the boxes of multigrid follow a tangent."""
+
+    GOOD = 0  # backgrounds are grids, of degree 1 or of boxes
+    FAIR = 1  # of degree 1 and no grid, or a term couples two backgrounds
+    POOR = 2  # of a higher degree, of simplices or no grid
+
+
+class Strategy(NamedTuple):
+    """Numbers of unknowns at which solvers take turns, in one dimension of space.
+
+    Attributes:
+        few: Most whose tangent PETSc's own Cholesky factorises: of so few MUMPS takes more to set
+            a factor up than to compute it.
+        ordered: Least from which PORD orders MUMPS's factors: plane graphs three times as fast as
+            METIS and no worse, in space worse. It ends the process where all unknowns are
+            neighbours of each other, as few may be.
+        compressed: Least from which MUMPS's factors have blocks of low rank.
+        crossover: Least from which on multigrid takes less time than a factorisation.
+        in_motion: The same in a motion, where the mass takes it three times the iterations.
+        bearable: Power p and divisor d: with n unknowns ``n^p / d`` iterations for a decade of the
+            residual cost as much as a factor, whose operations grow as n^2 in space.
+        taken_over: Most up to which a factorisation takes over where multigrid comes to nothing.
+    """
+
+    few: int = 0
+    ordered: int | None = None
+    compressed: int | None = None
+    crossover: Mapping[Coarsening, int] | None = None
+    in_motion: int = 0
+    bearable: tuple[float, float] | None = None
+    taken_over: int = 0
+
+
+#: Blocks of low rank of MUMPS's factors, to a share of their size.
+LOW_RANK = {"mat_mumps_icntl_35": 1, "mat_mumps_cntl_7": 1e-4}
+
+#: By dimension of space; each number where two solvers took the same time on one machine.
+STRATEGIES = {
+    1: Strategy(),
+    2: Strategy(
+        few=400,
+        ordered=10000,
+        crossover=dict.fromkeys(Coarsening, 40000),
+        in_motion=40000,
+        bearable=(0.5, 30.0),
+        taken_over=500000,
+    ),
+    3: Strategy(
+        few=150,
+        compressed=20000,
+        crossover={Coarsening.GOOD: 3000, Coarsening.FAIR: 8000, Coarsening.POOR: 50000},
+        in_motion=5000,
+        bearable=(1.0, 450.0),
+        taken_over=50000,
+    ),
+}
+
+
+def chosen(linear_solver: str, degree: int) -> str:
+    """Return the linear solver of backgrounds of a degree.
+
+    From degree 3 on rows have so many entries that a factorisation is cheaper up to ten thousand
+    unknowns and more, and ``"auto"`` means that.
+    """
+    return "direct" if linear_solver == "auto" and degree > HIGHEST else linear_solver
+
+
+def mumps_options(strategy: Strategy, size: int, saddle: bool, compressed: bool) -> dict[str, Any]:
+    """Return the options of MUMPS unless others are given.
+
+    Args:
+        strategy: What suits the dimension.
+        size: Number of unknowns.
+        saddle: Whether the diagonal says nothing of the size of a row: rows and columns are scaled
+            in turn then, else by the diagonal, as the shift is.
+        compressed: Whether factors have blocks of low rank.
+    """
+    if saddle:
+        options = {"mat_mumps_icntl_8": 7}
+    else:
+        options = {"mat_mumps_icntl_8": 1, "mg_coarse_mat_mumps_icntl_8": 1}
+    if strategy.ordered is not None and size >= strategy.ordered:
+        options["mat_mumps_icntl_7"] = 4
+    return {**options, **(LOW_RANK if compressed else {})}

@@ -1,0 +1,18 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Numbers that are the same wherever something is compared or done in parts."""
+
+from __future__ import annotations
+
+__all__ = ["BLOCK", "EQUAL", "NEGLIGIBLE", "ROUND_OFF"]
+
+#: Share of what something is compared with that counts as nothing. Errors of sums and quotients of
+#: computed numbers are below it, and what users tell apart is above.
+NEGLIGIBLE = 1e-9
+#: Relative difference of numbers that are equal but for their last places.
+EQUAL = 1e-12
+#: What is left, relative to its parts, of a sum that vanishes: some hundred times the last place.
+ROUND_OFF = 1e-13
+#: Most points or domains that are looked at together, so that what is known of them stays in the
+#: cache of a core.
+BLOCK = 1 << 14
