@@ -21,6 +21,7 @@ from ..parallel.garbage import weakly
 from ..parallel.magnitudes import norm, sign_of_product
 from ..parallel.totals import over_ranks
 from ..tolerances import ROUND_OFF
+from .attempt import Attempt, Predictions
 from .line_search import LineSearch, stalled
 from .linear import Indefinite, ShiftedFactor
 from .mechanism import mechanism, not_held
@@ -28,9 +29,6 @@ from .problem import ReducedProblem
 
 __all__ = ["NewtonSolver"]
 
-#: First residual of a prediction that is kept, over that of a start from zero; from 1 on as long
-#: as it saves linear solves.
-KEPT = 2.0
 #: Share of the residual that the proximal term may go on to hold back where it is released.
 HELD = 0.1
 #: Residual, relative to the forces, that may stay where next to nothing moves.
@@ -125,17 +123,13 @@ class NewtonSolver:
         self.residuals: list[float] = []
         self.iterations = 0
         self.gave_up = self.has_another_way = False
-        self._yielding: list[list[NDArray[np.bool_]]] = []
+        self._attempt: Attempt | None = None
+        self._predictions = Predictions()
         self.x: PETSc.Vec | None = None
         self.F: PETSc.Vec | None = None
-        self.lets_go = self.gives_up_early = self._hurries = self._misled = False
-        self._centre: PETSc.Vec | None = None
-        self._failure: MPMError | None = None
+        self.lets_go = self.gives_up_early = False
         self._asked: tuple[PETSc.Mat, ...] = ()
         self._raised: BaseException | None = None
-        self._known = self._fresh = False
-        self._kept = KEPT
-        self._from_zero = 0
         self.snes = PETSc.SNES().create(comm)
         self.snes.setOptionsPrefix(prefix)
         self.snes.setType("newtonls")
@@ -144,6 +138,17 @@ class NewtonSolver:
         self._factor = ShiftedFactor(
             self.snes, prefix, options, symmetric, shift, dim, statistics, linear_solver
         )
+
+    @property
+    def _now(self) -> Attempt:
+        """The present attempt."""
+        assert self._attempt is not None
+        return self._attempt
+
+    @property
+    def _problem(self) -> ReducedProblem:
+        """The present problem."""
+        return self._now.problem
 
     @property
     def K(self) -> PETSc.Mat | None:
@@ -155,7 +160,7 @@ class NewtonSolver:
         """How often each particle began or ceased to yield, late in the last attempt, by body."""
         return [
             np.count_nonzero(np.diff(np.array(each), axis=0), axis=0)
-            for each in zip(*self._yielding, strict=True)
+            for each in zip(*([] if self._attempt is None else self._attempt.yielding), strict=True)
         ]
 
     def linearise(self) -> Callable[[PETSc.Vec, PETSc.Vec], None]:
@@ -174,7 +179,9 @@ class NewtonSolver:
 
     def forget(self) -> None:
         """Forget how the last attempt failed: what comes before the next one may fail too."""
-        self.gave_up, self._yielding = False, []
+        self.gave_up = False
+        if self._attempt is not None:
+            self._attempt.yielding = []
 
     def solve(
         self,
@@ -200,38 +207,26 @@ class NewtonSolver:
             MPMError: Why there is none; ``x`` and ``F`` are the last evaluated then.
             BaseException: What a user's code has raised inside a call of PETSc's, as it is.
         """
-        self._problem, self._shorten = problem, shorten
-        self.residuals = []
-        self.iterations = 0
-        self._motion = (0.0, 0.0)
-        self._stalled = self._ended = self._refines = False
-        self._goes_on = 0
-        self._shrinks = True
-        self._norm = self._internal = np.inf  # the size of internal forces, once it is known
-        self._first = 0.0
-        self._norms: list[float] = []
-        self.forget()
-        self.has_another_way = False
-        self._predicts = not (again or self._misled)
+        self.residuals, self.iterations = [], 0
+        self.gave_up = self.has_another_way = False
+        now = self._attempt = Attempt(problem, shorten, not again and self._predictions.lead)
         if self._search is not None:
             potential = self._symmetric and problem.has_potential()
             self.has_another_way = not potential
-            self._hurries = self.gives_up_early and shorten and not potential
-            self._search.begin(potential, self._hurries, again)
+            now.hurries = self.gives_up_early and shorten and not potential
+            self._search.begin(potential, now.hurries, again)
         self._factor.begin(sizes[1], problem.levels, self.lets_go)
         # What an iterative solve that fails means is for _pre_check to say.
         self.snes.setMaxLinearSolveFailures(1000 if self._factor.iterates else 1)
-        self._tolerance = 0.0
-        self._centre = None
         x = self._start(sizes)
         if sizes[1] == 0:
             problem.impose()
         self._evaluate(x)
-        if self._failure is None and sizes[1] > 0:
+        if self._now.failure is None and sizes[1] > 0:
             self._iterate(x)
-        if self._failure is not None:
-            raise self._failure
-        self._misled = False
+        if self._now.failure is not None:
+            raise self._now.failure
+        self._predictions.lead = True
         self._factor.end()
 
     def _start(self, sizes: tuple[int, int]) -> PETSc.Vec:
@@ -260,38 +255,38 @@ class NewtonSolver:
             forces = self._problem.lift()
             forces.axpy(1.0, self.F)
         start = self.F if forces is None else forces
-        self._first = norm(start)
-        predicted = self._predicts and self._predict(x, start)
-        self.has_another_way = self.has_another_way or (predicted and not self._shorten)
-        self._misled = predicted
-        self._centre = x.copy()
+        self._now.first = norm(start)
+        predicted = self._now.predicts and self._predict(x, norm(start))
+        self.has_another_way = self.has_another_way or (predicted and not self._now.shorten)
+        self._predictions.lead = not predicted
+        self._now.centre = x.copy()
         self._set_tangent(self._problem.tangent() if predicted or K is None else K)
-        self._fresh = forces is None or predicted
+        self._now.fresh = forces is None or predicted
         if forces is not None and not predicted:
             self._factor.solve(forces, x)
-            self._negative = self._problem.constrain(x, None, self._solve)
-            if self._is_loose(x, self._first):
+            self._now.negative = self._problem.constrain(x, None, self._solve)
+            if self._is_loose(x, self._now.first):
                 return
-            if self._refines:
+            if self._now.refines:
                 self._solve(forces, x)
-                self._negative = self._problem.constrain(x, None, self._solve)
+                self._now.negative = self._problem.constrain(x, None, self._solve)
             x.scale(-1.0)
             self.iterations += 1
-            self._known = False
+            self._now.known = False
         else:
             x.copy(self._trial)
-            self._known = True
+            self._now.known = True
         with self.statistics.phase("solve"):
             self._run_snes(x)
         reason = self.snes.getConvergedReason()
-        if self._failure is None and reason > 0 and not self._ended:
-            self._failure = MPMError(
+        if self._now.failure is None and reason > 0 and not self._now.ended:
+            self._now.failure = MPMError(
                 f"PETSc's SNES {self.snes.getType()!r} ended by a test of its own "
                 f"({_reason(reason)}), not where the residual is small; use snes_type 'newtonls'."
             )
-        elif self._failure is None and reason > 0:
-            self._judge(predicted)
-        elif self._failure is None:
+        elif self._now.failure is None and reason > 0:
+            self._predictions.judge(predicted, self.iterations)
+        elif self._now.failure is None:
             residual = self.residuals[-1] if self.residuals else np.nan
             if reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
                 why = "as a linear solve failed"
@@ -302,7 +297,7 @@ class NewtonSolver:
             else:
                 why = _reason(reason)
                 self.gave_up = True
-            self._failure = ConvergenceError(
+            self._now.failure = ConvergenceError(
                 f"Newton's method stopped after {self.iterations} linear solves at a relative "
                 f"residual of {residual:.1e} ({why})"
             )
@@ -339,16 +334,14 @@ class NewtonSolver:
         if self._raised is None:
             self._raised = error
 
-    def _predict(self, x: PETSc.Vec, start: PETSc.Vec) -> bool:
+    def _predict(self, x: PETSc.Vec, start: float) -> bool:
         """Move x from zero to the prediction unless its residual is too far above the start's."""
         assert self.F is not None
         guess = self._problem.prediction()
         if guess is None:
             return False
-        size = norm(start)
-        if self._evaluate(guess) is None and norm(self.F) < self._kept * size:
+        if self._evaluate(guess) is None and self._predictions.are_near(norm(self.F), start):
             guess.copy(x)
-            self._risky = norm(self.F) >= size
             self.statistics.count("predictions")
             return True
         self.statistics.count("rejected_predictions")
@@ -358,23 +351,16 @@ class NewtonSolver:
     @property
     def experience(self) -> tuple[float, int]:
         """Success of predictions in earlier steps, for a checkpoint."""
-        return self._kept, self._from_zero
+        return self._predictions.kept, self._predictions.from_zero
 
     @experience.setter
     def experience(self, values: tuple[float, int]) -> None:
-        self._kept, self._from_zero = values
-
-    def _judge(self, predicted: bool) -> None:
-        """Keep only sure predictions from now on, if a doubtful one has saved no linear solve."""
-        if not predicted:
-            self._from_zero = self.iterations
-        elif self._risky and self.iterations >= self._from_zero:
-            self._kept = 1.0
+        self._predictions.kept, self._predictions.from_zero = values
 
     def _function(self, snes: PETSc.SNES, x: PETSc.Vec, F: PETSc.Vec) -> None:
-        if not (self._known and self._same(x, self._trial)):
+        if not (self._now.known and self._same(x, self._trial)):
             self._evaluate(x)
-        self._known = False
+        self._now.known = False
         self._R.copy(F)
 
     def _same(self, a: PETSc.Vec, b: PETSc.Vec) -> bool:
@@ -390,12 +376,12 @@ class NewtonSolver:
                 failure = ConvergenceError("The residual is not finite")
         else:
             failure = ConvergenceError("The linear solve broke down on a singular matrix")
-        self._failure = failure
+        self._now.failure = failure
         if failure is not None:
             self.F.set(np.nan)
         self.F.copy(self._R)
-        if failure is None and self._factor.D is not None and self._centre is not None:
-            gap = x - self._centre
+        if failure is None and self._factor.D is not None and self._now.centre is not None:
+            gap = x - self._now.centre
             gap.pointwiseMult(gap, self._factor.D)
             self._R.axpy(1.0, gap)
         return failure
@@ -410,24 +396,24 @@ class NewtonSolver:
         size = norm(self._R)  # as that of SNES, but of small numbers too
         rtol, atol, _, _ = snes.getTolerances()
         scale = self._problem.scale(self._R)
-        if iteration >= 2 and size > max(0.25 * self._norm, rtol * scale):
-            self._stalled = True
-        if self._stalled or scale == 0.0:
-            if scale < 1e-5 * self._internal:
-                self._internal = self._problem.balance.internal_scale()
-            if scale < 1e-6 * self._internal:
-                scale = self._internal
-        self._norm = size
-        self._norms.append(size)
+        if iteration >= 2 and size > max(0.25 * self._now.norm, rtol * scale):
+            self._now.stalled = True
+        if self._now.stalled or scale == 0.0:
+            if scale < 1e-5 * self._now.internal:
+                self._now.internal = self._problem.balance.internal_scale()
+            if scale < 1e-6 * self._now.internal:
+                scale = self._now.internal
+        self._now.norm = size
+        self._now.norms.append(size)
         self.residuals.append(size / scale if scale > 0 else size)
         tell(self._comm, NEWTON, "  iteration %d: residual %.2e", iteration, self.residuals[-1])
         if iteration > LATE:
-            self._yielding.append(self._problem.terms.yielding())
-        self._tolerance = tolerance = max(rtol * scale, atol)
+            self._now.yielding.append(self._problem.terms.yielding())
+        self._now.tolerance = tolerance = max(rtol * scale, atol)
         small = size <= tolerance
         if small or (
             iteration > 0
-            and (self._is_round_off(*self._motion) or self._is_at_floor(*self._motion))
+            and (self._is_round_off(*self._now.motion) or self._is_at_floor(*self._now.motion))
         ):
             left = self._release(snes.getSolution(), tolerance)
             if left > tolerance:
@@ -437,7 +423,7 @@ class NewtonSolver:
                 if verdict == "go on":
                     self._refine()
                     return None
-            self._ended = True
+            self._now.ended = True
             if small:
                 frozen = left / scale if scale > 0.0 else 0.0
                 self.statistics["frozen_residual"] = max(self.statistics["frozen_residual"], frozen)
@@ -445,11 +431,11 @@ class NewtonSolver:
             self.statistics.count("converged_at_round_off")
             return reasons.CONVERGED_SNORM_RELATIVE
         if self._search is not None and stalled(
-            self._norms, self._hurries and not self._search.trusts
+            self._now.norms, self._now.hurries and not self._search.trusts
         ):
             self.gave_up = True
             lowest = min(self.residuals)
-            self._failure = ConvergenceError(
+            self._now.failure = ConvergenceError(
                 f"Newton's method makes no headway: in {self.iterations} linear solves the "
                 f"relative residual did not stay below {lowest:.1e}"
             )
@@ -459,16 +445,17 @@ class NewtonSolver:
     def _is_round_off(self, step: float, whole: float) -> bool:
         """Whether a step's motion is round-off of the whole motion or, after a stall, of places."""
         return step <= ROUND_OFF * whole or bool(
-            self._stalled and step <= 4 * np.finfo(float).eps * self._problem.resistance.extent()
+            self._now.stalled
+            and step <= 4 * np.finfo(float).eps * self._problem.resistance.extent()
         )
 
     def _is_at_floor(self, step: float, whole: float) -> bool:
         """Whether a refined step's motion is small, and no longer falls from one to the next."""
-        return self._refines and not self._shrinks and step <= SETTLED * whole
+        return self._now.refines and not self._now.shrinks and step <= SETTLED * whole
 
     def _is_settled(self, y: PETSc.Vec, x: PETSc.Vec) -> bool:
         """Whether a refined step is too small for the residual to judge it."""
-        return self._refines and self._problem.resistance.motion(
+        return self._now.refines and self._problem.resistance.motion(
             y
         ) <= SETTLED * self._problem.resistance.motion(x)
 
@@ -519,37 +506,42 @@ class NewtonSolver:
         self._factor.solve(self.F, step)
         rest = self._factor.refine(self.F, step, self._refined)
         self._problem.constrain(step, x, self._solve)
-        moved, whole = self._problem.resistance.motion(step), self._problem.resistance.motion(x)
+        moved, whole = (
+            self._problem.resistance.motion(step),
+            self._problem.resistance.motion(x),
+        )
         balanced = self._problem.balance.resultant() <= np.sqrt(step.getSize()) * tolerance
         if self._is_round_off(moved, whole) or (self._is_at_floor(moved, whole) and balanced):
             return "round-off"
-        forces = max(scale, self._first)
-        if rest <= 0.5 and self._goes_on < 5:
-            self._goes_on += 1
+        forces = max(scale, self._now.first)
+        if rest <= 0.5 and self._now.goes_on < 5:
+            self._now.goes_on += 1
             return "go on"
         if left > FROZEN * forces and left > FROZEN * self._problem.balance.internal_scale():
             share = left / forces if forces > 0.0 else np.inf
             loose = mechanism(self._problem.resistance, self._factor, step)
-            self._failure = _unbalanced(share) if loose is None else self._not_held(loose, share)
+            self._now.failure = (
+                _unbalanced(share) if loose is None else self._not_held(loose, share)
+            )
             return "failed"
         return "frozen"
 
     def _solve(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Solve with the last factor, and for the tangent itself where the shift matters."""
         self._factor.solve(b, x)
-        if self._refines:
+        if self._now.refines:
             self._factor.refine(b, x, self._refined)
 
     @property
     def _refined(self) -> float:
         """How far a step is refined: a residual of round-off hides what the soft parts lack."""
-        return REFINED**2 if self._stalled else REFINED
+        return REFINED**2 if self._now.stalled else REFINED
 
     def _refine(self) -> None:
         """Solve for the tangent itself from now on, and let go what the proximal term holds."""
         assert self.F is not None
-        self._refines = True
-        self._centre = None
+        self._now.refines = True
+        self._now.centre = None
         self.F.copy(self._R)
 
     def _set_tangent(self, K: PETSc.Mat, damping: float = 0.0) -> None:
@@ -559,27 +551,27 @@ class NewtonSolver:
     def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, A: PETSc.Mat, P: PETSc.Mat) -> None:
         # SNES notes x at these when this returns, also where it has been given others by then.
         self._asked = A, P
-        if not self._fresh:
+        if not self._now.fresh:
             self._set_tangent(self._problem.tangent())
-        self._fresh = False
-        self._factor.aim(self._norms, self._tolerance)
+        self._now.fresh = False
+        self._factor.aim(self._now.norms, self._now.tolerance)
         self.iterations += 1
 
     def _pre_check(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
-        before, self._motion = self._motion, (0.0, 0.0)
-        self._origin = x
-        self._failure = self._finished(y)
-        if self._failure is not None:
+        before, self._now.motion = self._now.motion, (0.0, 0.0)
+        self._now.origin = x
+        self._now.failure = self._finished(y)
+        if self._now.failure is not None:
             return self._fail(x, y)
-        refined = self._refines
+        refined = self._now.refines
         if refined:
             self._solve(self._R, y)
-        self._negative = self._problem.constrain(y, x, self._solve)
+        self._now.negative = self._problem.constrain(y, x, self._solve)
         if self.iterations == 1 and self._is_loose(y, norm(self._R)):
             return self._fail(x, y)
-        if self._refines and not refined:
+        if self._now.refines and not refined:
             self._solve(self._R, y)
-            self._negative = self._problem.constrain(y, x, self._solve)
+            self._now.negative = self._problem.constrain(y, x, self._solve)
         if not np.isfinite(norm(y)):
             if self._search is None or not self._search.trusts:
                 return False  # the evaluation at x - y says so
@@ -589,25 +581,25 @@ class NewtonSolver:
             try:
                 changed = self._search(x, y, self._R, self._trial)
             except Indefinite:
-                self._failure = self._not_definite()
+                self._now.failure = self._not_definite()
                 return self._fail(x, y)
         else:
             changed = False
             self._trial.waxpy(-1.0, y, x)
             self._evaluate(self._trial)
-        self._motion = (
+        self._now.motion = (
             self._problem.resistance.motion(y),
             self._problem.resistance.motion(self._trial),
         )
-        self._shrinks = self._motion[0] <= 0.25 * before[0]
-        self._known = True
-        return changed or self._refines
+        self._now.shrinks = self._now.motion[0] <= 0.25 * before[0]
+        self._now.known = True
+        return changed or self._now.refines
 
     def _fail(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Let SNES end, as the step to ``x - y`` cannot be taken; return that y is as it was."""
         self._trial.waxpy(-1.0, y, x)
         self._R.set(np.nan)
-        self._known = True
+        self._now.known = True
         return False
 
     def _not_definite(self) -> ConvergenceError:
@@ -618,7 +610,7 @@ class NewtonSolver:
     @property
     def _shortens(self) -> bool:
         """Whether a smaller step is the best cure of a tangent that is not positive definite."""
-        return self._shorten and not self._problem.softens
+        return self._now.shorten and not self._problem.softens
 
     def _finished(self, y: PETSc.Vec) -> MPMError | None:
         """Finish a linear solve of SNES; return why that cannot be."""
@@ -649,7 +641,7 @@ class NewtonSolver:
             return False
         loose = mechanism(self._problem.resistance, self._factor, y)
         if loose is not None:
-            self._failure = self._not_held(loose, share)
+            self._now.failure = self._not_held(loose, share)
             return True
         self._refine()
         return False
@@ -658,7 +650,7 @@ class NewtonSolver:
         """Return whether a step for the residual F is not that of a positive definite tangent."""
         if not self._symmetric or self._factor.shift == 0.0:
             return False
-        expected = self._negative + self._factor.num_negative
+        expected = self._now.negative + self._factor.num_negative
         uphill = self._factor.num_negative == 0 and sign_of_product(F, y) <= 0.0
         return uphill or self._factor.negative_pivots() > expected
 
@@ -677,7 +669,7 @@ class NewtonSolver:
         for damping in DAMPINGS:
             self._set_tangent(self.K, damping)
             self._factor.solve(F, y)
-            self._negative = self._problem.constrain(y, self._origin, self._factor.solve)
+            self._now.negative = self._problem.constrain(y, self._now.origin, self._factor.solve)
             self.iterations += 1
             if not self._uphill(F, y):
                 return
