@@ -206,8 +206,7 @@ else:
         )
         body, V = ground([across, up], 1)
         young, path = 1e8, 2.0
-        far = {"footing_weight": 18.0, "footing_surcharge": 16.0}.get(args.case, 8.0)
-        settlement = far * np.nan_to_num(exact, nan=30.0) * height / young
+        settlement = (18.0 if weight else 8.0) * np.nan_to_num(exact, nan=30.0) * height / young
         settlement *= weight * height if weight else 1.0
         bcs = [held(V, 0, 0.0, size_x), *floor(V)]
     else:

@@ -24,12 +24,30 @@ WEIGHT = (
 )
 
 
+#: Columns of the weight.
+RECOMMENDED = ("$N_\\gamma$ smooth", "$N_\\gamma$ rough")
+
+
 def strip(options: str) -> list[str]:
     found = []
     for n in (4, 8, 16):
         command = f"--degree 2 --steps 12 --cell {1 / n} --case {options}"
         r = run("strength", *command.split())
         found += [share(r, f"{r['ratio']:.3f}"), f"{100 * r['plateau']:.2f} %", r["iterations"]]
+    return found
+
+
+def recommended(angle: int) -> list[str]:
+    """The row of an angle of friction: ratio and solves a step of N_c, N_q and N_gamma."""
+    found = []
+    for case, steps in (("footing", 30), ("footing_surcharge", 30), *(("footing_weight", 50),) * 2):
+        rough = ["--rough"] if len(found) == 6 else []
+        if angle == 0 and case != "footing":
+            found += ["", ""]
+            continue
+        given = ["--case", case, "--friction-angle", angle, "--recommended", *rough]
+        r = run("strength", *given)
+        found += [share(r, f"{r['ratio']:.3f}"), f"{r['iterations'] / steps:.0f}"]
     return found
 
 
@@ -42,14 +60,20 @@ def tables() -> dict[str, Table]:
         "vertical cut, Tresca, $\\gamma H/c$": ("vertical_cut", "3.775 to 3.786"),
     }
     return {
-        "limit-loads/safety": Table(
+        "limit-loads/recommended": Table(
             "limit-loads",
+            ["", *(t for n in ("$N_c$", "$N_q$", *RECOMMENDED) for t in (n, "solves"))],
+            {f"{angle}°": partial(recommended, angle) for angle in (0, 20, 25, 30, 35)},
+            cases=["strength"],
+        ),
+        "limit-loads-measured/safety": Table(
+            "limit-loads-measured",
             ["", "cells of H/10", "solves", "H/20", "solves", "known"],
             {label: partial(factors, *asked) for label, asked in rows.items()},
             cases=["strength"],
         ),
-        "limit-loads/strips": Table(
-            "limit-loads",
+        "limit-loads-measured/strips": Table(
+            "limit-loads-measured",
             ["", *(text for n in (4, 8, 16) for text in (f"cells of b/{n}", "rise", "solves"))],
             {
                 "$N_c$, 20°, smooth": partial(strip, "footing"),
