@@ -93,13 +93,15 @@ class Behind:
         body = particles.mesh
         cell, gdim = body.basix_cell(), surface.gdim
         self.surface = surface
-        self._cells = surface.cells
-        self.nodes: NDArray[np.int64] = particles.domain_nodes[surface.cells].astype(np.int64)
+        self._cells = surface.layout.cells
+        self.nodes: NDArray[np.int64] = particles.domain_nodes[surface.layout.cells].astype(
+            np.int64
+        )
         rule, _ = quadrature_rule(cell, particles.quadrature_degree)
         degree = int(particles.W.ufl_element().degree)
         taken = np.zeros((len(self._cells), surface.nq, len(rule)))
         for side, places in enumerate(surface.reference_points):
-            here = surface.facets == side
+            here = surface.layout.facets == side
             taken[here] = extrapolation(cell, rule, places, degree)
         self._weights = taken[:, :, :, None] * surface.undeformed_normals()[:, :, None, :]
         # What was cut has a gradient of its own, not that of its corners; it is the same everywhere

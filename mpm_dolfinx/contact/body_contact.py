@@ -112,7 +112,7 @@ class BodyContact(Rigid):
     @property
     def extent(self) -> float:
         """Largest coordinate of the undeformed body."""
-        return self._surface.extent
+        return self._surface.layout.extent
 
     def span(self) -> float:
         """Return the largest length of the undeformed body along an axis (collective)."""

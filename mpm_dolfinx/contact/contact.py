@@ -159,9 +159,9 @@ class Contact(Term):
         by the modulus alone, a gap would be left there, and closed under another pressure.
         """
         if not (self._nitsche and self._masses and dt > 0.0):
-            return np.zeros(len(surface.cells))
+            return np.zeros(len(surface.layout.cells))
         area = surface.weights.sum(axis=1)
-        mass = surface.narrowing * self._masses[body][surface.cells]
+        mass = surface.layout.narrowing * self._masses[body][surface.layout.cells]
         degree = surface.particles.W.ufl_element().degree
         behind = np.where(area > 0.0, mass / np.where(area > 0.0, area, 1.0), 0.0)
         return np.asarray(behind / (degree * dt) ** 2)
@@ -367,10 +367,10 @@ def stiffness(
             "confined modulus (lambda + 2 mu) or its like."
         )
     if modulus is not None:
-        moduli = np.full(len(surface.cells), modulus)
+        moduli = np.full(len(surface.layout.cells), modulus)
     else:
         assert material is not None
-        moduli = material.initial_modulus()[surface.cells]
+        moduli = material.initial_modulus()[surface.layout.cells]
     with agree(surface.particles.mesh.comm):
         if not (np.isfinite(moduli).all() and (moduli > 0.0).all()):
             raise MPMError(f"{what} needs a positive modulus of the material at all its facets.")

@@ -86,18 +86,18 @@ class NearFacets:
         low = np.append(points, empty, axis=0).min(axis=0) - around
         high = np.append(points, -empty, axis=0).max(axis=0) + around
         boxes = np.array(self._comm.allgather([low, high]))
-        x = nodes[surface.own]
+        x = nodes[surface.layout.own]
         lower, upper = x.min(axis=1, initial=np.inf), x.max(axis=1, initial=-np.inf)
         self._given = [
             np.flatnonzero((upper >= box[0]).all(axis=1) & (lower <= box[1]).all(axis=1))
             for box in boxes
         ]
         W = surface.particles.W
-        dofs = global_dofs(W, surface.nodes)
+        dofs = global_dofs(W, surface.layout.nodes)
         there = (surface.weights > 0.0).any(axis=1)
         whole = np.column_stack([number, dofs, there])
         told = np.concatenate(swap(self._comm, [whole[which] for which in self._given]))
-        outward = swap(self._comm, [surface.outward[which] for which in self._given])
+        outward = swap(self._comm, [surface.layout.outward[which] for which in self._given])
         self._order = np.argsort(told[:, 0], kind="stable")
         told = told[self._order]
         self.number, self.dofs, self.present = told[:, 0], told[:, 1:-1], told[:, -1] > 0
@@ -109,7 +109,7 @@ class NearFacets:
         Args:
             x: Positions of the surface's own nodes, shape ``(N, gdim)``.
         """
-        mine = x[self._surface.own]
+        mine = x[self._surface.layout.own]
         parts = swap(self._comm, [mine[which] for which in self._given])
         return np.concatenate(parts)[self._order]
 

@@ -84,7 +84,7 @@ class Meeting:
         bs = source.particles.W.dofmap.index_map_bs
         others = [self.facet] if self.law.smooth else [self.facet, self.anchor]
         nodes = [near.dofs[facet][:, ::bs] // bs for facet in others]
-        mine = global_nodes(source.particles.W, source.nodes[own])
+        mine = global_nodes(source.particles.W, source.layout.nodes[own])
         return Met(np.stack([own, *others], axis=1), (mine, *nodes))
 
     def add_tangents(
@@ -108,7 +108,7 @@ class Meeting:
             -factor * around.weights[which], shapes[which % len(shapes)], group, positions, values
         )
         sides = around.sides
-        add_tangents(self.law, self.stencil, sides.touch, sides.target.extent, sums)
+        add_tangents(self.law, self.stencil, sides.touch, sides.target.layout.extent, sums)
 
     def by_stress(self, factor: float) -> tuple[At, Sequence[Spread]]:
         """Return points with normals, and how forces on both bodies grow with the stress behind.
@@ -123,7 +123,7 @@ class Meeting:
         forces = w[:, None, None] * forces
         at = At(around.facets[which // source.nq], which % source.nq, normals)
         numbers, dofs = near.number[self.facet], near.dofs[self.facet]
-        others = Spread.over_met(at, numbers, dofs, forces[:, 1:], len(source.cells))
+        others = Spread.over_met(at, numbers, dofs, forces[:, 1:], len(source.layout.cells))
         return at, [Spread.over_facets(source, at, forces[:, 0]), others]
 
     def state(self, friction: NDArray[np.float64]) -> State:
@@ -162,7 +162,9 @@ class Meeting:
         anchors[at >= 0] = np.einsum("nk,nki->ni", N, nodes[at[at >= 0]])
         rubbed = last.friction.copy()
         if self.law.memory:
-            rubbed[which] = remembered(self.law, self.stencil, sides.touch, sides.target.extent)
+            rubbed[which] = remembered(
+                self.law, self.stencil, sides.touch, sides.target.layout.extent
+            )
         own = last._replace(
             touched=inside,
             facet=numbers,
@@ -189,6 +191,6 @@ class Meeting:
 
 def untouched(source: Surface, x: NDArray[np.float64]) -> Outcome:
     """Return the outcome without contact, at positions ``(m, nq, gdim)`` of a surface's points."""
-    shape = len(source.cells), source.nq
+    shape = len(source.layout.cells), source.nq
     place, zero, none = x.reshape(*shape, x.shape[-1]), np.zeros(shape), np.zeros(shape, bool)
     return Outcome(place, np.full(shape, np.inf), zero, np.zeros_like(place), none, none)

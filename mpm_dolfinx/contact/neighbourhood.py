@@ -69,7 +69,7 @@ class Neighbourhood:
     ) -> None:
         source, target, reach = sides.source, sides.target, sides.reach
         self.sides, self._start = sides, (mine, nodes)
-        x = source.shapes @ mine[source.own]
+        x = source.shapes @ mine[source.layout.own]
         near = self.near = NearFacets(
             target, sides.number, x.reshape(-1, source.gdim), 3.0 * reach, nodes
         )
@@ -107,6 +107,6 @@ class Neighbourhood:
         facet = self.near.find(before.near.numbers(paired.facet))
         paired = paired._replace(facet=facet, near=paired.near & (facet >= 0))
         source = self.sides.source
-        whole = nothing_near(len(source.cells) * source.nq, source.gdim - 1)
+        whole = nothing_near(len(source.layout.cells) * source.nq, source.gdim - 1)
         parts = zip(paired, whole, strict=True)
         return Closest(*(spread(part, before.which, base)[self.which] for part, base in parts))

@@ -76,7 +76,7 @@ class Spread(NamedTuple):
     def over_facets(cls, surface: Surface, at: At, forces: Array) -> Spread:
         """Return forces by units at points of a surface, shape ``(n, gdim)``, on its nodes."""
         facets, block = np.unique(at.facets, return_inverse=True)
-        dofs = global_dofs(surface.particles.W, surface.nodes[facets])
+        dofs = global_dofs(surface.particles.W, surface.layout.nodes[facets])
         on_nodes = surface.shapes[at.places][:, :, None] * forces[:, None]
         return cls(facets, facets, dofs, block, on_nodes.reshape(len(block), dofs.shape[1]))
 
@@ -212,7 +212,7 @@ class ThroughGroups:
             matrix.of([_row_blocks(every, number, self._dofs, self._averaging.nodal(part))])
             for matrix, part in zip(self._right, (gamma, right), strict=True)
         ]
-        cells, found = self._behind.surface.cells, []
+        cells, found = self._behind.surface.layout.cells, []
         for i, (K, spread) in enumerate(zip(matrices, spreads, strict=True)):
             parts = []
             for j, (left, factor, other) in enumerate(

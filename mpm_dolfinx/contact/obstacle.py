@@ -333,7 +333,7 @@ class Obstacle(Contact):
             return surface.of_column(before.surface.column(values).values)
 
         n = memory.normal @ memory.pose.Q.T
-        there = np.abs(seen(before.gap) - memory.gap) <= SAME * surface.extent
+        there = np.abs(seen(before.gap) - memory.gap) <= SAME * surface.layout.extent
         whole = surface.column(there & there.all(axis=1)[:, None]).values
         known = before.surface.columns().items()
         surface.restore({name: np.where(whole, c.values, 0.0) for name, c in known})

@@ -231,7 +231,7 @@ class ObstacleTractions:
         n = memory.normal.reshape(y.shape).copy()
         acts = (before <= surface.touch) | (gap <= surface.touch)
         n[acts] = self._shape.distance(middle[acts])[1]
-        gradient, factor = corrected(n, change, change, gap - before, surface.extent)
+        gradient, factor = corrected(n, change, change, gap - before, surface.layout.extent)
         pressure = mean_pressure(points.stiffness, before, gap, surface.touch)
         return Step(change, middle, n, gradient, factor, before, pressure)
 

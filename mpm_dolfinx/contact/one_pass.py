@@ -75,7 +75,7 @@ class Pass:
         )
         body = target.particles
         facets = len(basix.topology(body.mesh.basix_cell())[target.gdim - 1])
-        number = body.global_index[target.cells] * facets + target.facets
+        number = body.global_index[target.layout.cells] * facets + target.layout.facets
         self._sides = Sides(source, target, number, reach, self._law.by_area)
         self.of_step = False
         self.stress: Nitsche | None = None
@@ -168,7 +168,7 @@ class Pass:
         deep = (-outcome.gap > bound) & (source.weights > 0.0) & ~outcome.inside
         if not deep.any():
             return None
-        cells = source.cells[deep.any(axis=1)]
+        cells = source.layout.cells[deep.any(axis=1)]
         return source.particles.global_index[cells], float(-outcome.gap[deep].min())
 
     # -- A step ---------------------------------------------------------------------------------
@@ -189,7 +189,7 @@ class Pass:
             if self._paired is not None:
                 self._paired = self._around.taken_over(self._paired, before)
         around = self._around
-        x = (source.shapes @ mine[source.own[around.facets]]).reshape(-1, source.gdim)
+        x = (source.shapes @ mine[source.layout.own[around.facets]]).reshape(-1, source.gdim)
         last, corners = memory.of(around.which), around.near.positions(nodes)
         self._approach = Approach(around, last, x, corners)
 
@@ -221,7 +221,7 @@ class Pass:
         shape = (len(around.facets), source.nq)
         force = np.zeros_like(x)
         pressure, slips = np.zeros(len(x)), np.zeros(len(x), dtype=bool)
-        pushes, rubs, acts = acting(self._law, stencil, sides.touch, sides.target.extent)
+        pushes, rubs, acts = acting(self._law, stencil, sides.touch, sides.target.layout.extent)
         both = pushes + rubs
         force[which], pressure[which], slips[which] = both[:, 0], acts.pressure, acts.slips
         if behind is not None:

@@ -185,7 +185,7 @@ class Rigid(Obstacle):
             if deep.any():
                 place = np.unravel_index(np.argmax(np.where(deep, depth, 0.0)), depth.shape)
                 where = tuple(float(f"{x:.6g}") for x in memory.outcome.positions[place])
-                index = self.bodies[0].global_index[surface.cells[deep.any(axis=1)]]
+                index = self.bodies[0].global_index[surface.layout.cells[deep.any(axis=1)]]
                 raise MPMError(
                     f"The body begins within the obstacle of a Rigid: {{particles}} are up to "
                     f"{-float(memory.gap[place]):.3g} deep in it, at {where}; move one of them "
@@ -298,7 +298,7 @@ class Rigid(Obstacle):
             D[inside] = tractions.derivative(trial, memory, acting.flat) / self._share
         if secants:  # (also where nothing touches on this rank: it notes that)
             D[inside] += tractions.secants(trial, memory, acting.flat) / self._share
-        dofs = global_dofs(self.bodies[0].W, surface.nodes[which])
+        dofs = global_dofs(self.bodies[0].W, surface.layout.nodes[which])
         return Slopes(trial, acting, which, dofs, D)
 
     def _blocks_of(self, slopes: Slopes) -> Blocks:

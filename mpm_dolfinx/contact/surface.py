@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -26,6 +27,7 @@ from ..particles.particles import Particles
 __all__ = [
     "Blocks",
     "Facets",
+    "Layout",
     "PointMatrix",
     "Surface",
     "global_dofs",
@@ -104,6 +106,41 @@ def _marked(domain: mesh.Mesh, facets: NDArray[Any]) -> NDArray[np.int32]:
     return np.flatnonzero(marks.array > 0.0).astype(np.int32)
 
 
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Facets of a body on one mesh.
+
+    Attributes:
+        cells: Owned cell of each facet, shape ``(m,)``.
+        facets: Its local number in the cell, shape ``(m,)``.
+        nodes: Local nodes of W of each facet, shape ``(m, k)``.
+        own: Their places among :meth:`Surface.own_nodes`.
+        outward: Whether the normal that the facet's order of nodes gives points outwards, as
+            1 or -1, shape ``(m,)``.
+        narrowing: The dimension where the domain behind narrows to a point, as triangles, halves of
+            quadrilaterals and tetrahedra do, elsewhere 1, shape ``(m,)``.
+        extent: Largest coordinate of the undeformed body.
+        distinct: The nodes of all facets, each once, shape ``(n,)``.
+        positions: Where they are in the mesh, shape ``(n, gdim)``.
+        edges: Derivatives of positions at the points, shape ``(m, nq, gdim, gdim - 1)``.
+        in_mesh: Area of each point in the mesh, shape ``(m, nq)``.
+        around: Length of the way around the axis of a body of revolution, elsewhere 1.
+    """
+
+    cells: NDArray[np.int64]
+    facets: NDArray[np.int64]
+    nodes: NDArray[np.int64]
+    own: NDArray[np.int64]
+    outward: NDArray[np.float64]
+    narrowing: NDArray[np.int64]
+    extent: float
+    distinct: NDArray[np.int64]
+    positions: NDArray[np.float64]
+    edges: NDArray[np.float64]
+    in_mesh: NDArray[np.float64]
+    around: NDArray[np.float64]
+
+
 class Surface:
     """Quadrature points on facets of a body, in its undeformed shape and as it is displaced.
 
@@ -122,22 +159,13 @@ class Surface:
         particles: As given.
         axisymmetric: As given.
         nq: Number of points on each facet.
-        cells: Owned cell of each facet, shape ``(m,)``.
-        facets: Its local number in the cell, shape ``(m,)``.
-        nodes: Local nodes of W of each facet, shape ``(m, k)``.
-        own: Their places among :meth:`own_nodes`.
         element: The basix element of a facet.
         shapes: Its shape functions at the points, shape ``(nq, k)``.
         slopes: Their derivatives, shape ``(gdim - 1, nq, k)``.
         weights: Undeformed area of each point, all around the axis of a body of revolution,
             shape ``(m, nq)``; 0 where deleted.
         thickness: Undeformed height of the domain behind each facet, shape ``(m,)``: volume over
-            area, times :attr:`narrowing`.
-        narrowing: The dimension where that domain narrows to a point, as triangles, halves of
-            quadrilaterals and tetrahedra do, elsewhere 1, shape ``(m,)``.
-        outward: Whether the normal that the facet's order of nodes gives points outwards, as
-            1 or -1, shape ``(m,)``.
-        extent: Largest coordinate of the undeformed body.
+            area, times :attr:`Layout.narrowing`.
     """
 
     def __init__(
@@ -155,8 +183,38 @@ class Surface:
         self.particles = particles
         self.axisymmetric = axisymmetric
         self._where = Facets(particles, facet_tags, tag, what)
-        self._degree = int(degree)
         self._space: fem.FunctionSpace | None = None
+        body, whole = particles.mesh, particles.W.ufl_element().basix_element
+        cell, dim = body.basix_cell(), body.topology.dim - 1
+        self.gdim: int = body.geometry.dim
+        kind = basix.cell.subentity_types(cell)[dim][0]
+        points, weights = map(np.asarray, basix.make_quadrature(kind, int(degree)))
+        self.nq, self._rule = len(weights), weights
+        self.element: Any = basix.create_element(
+            basix.ElementFamily.P, kind, whole.degree, whole.lagrange_variant
+        )
+        table = np.asarray(self.element.tabulate(1, points), dtype=np.float64)[:, :, :, 0]
+        self.shapes: NDArray[np.float64] = table[0]
+        self.slopes: NDArray[np.float64] = table[1:]
+        corners = [basix.geometry(cell)[side] for side in basix.topology(cell)[dim]]
+        self._places = [at[0] + points @ (at[1 : dim + 1] - at[0]) for at in corners]
+        # (places of a facet's nodes among those of a cell, by its number there)
+        self._nodes = [
+            np.linalg.norm(
+                (at[0] + self.element.points @ (at[1 : dim + 1] - at[0]))[:, None] - whole.points,
+                axis=2,
+            ).argmin(axis=1)
+            for at in corners
+        ]
+        self._layout: Layout | None = None
+        self._areas = self.weights = np.zeros((0, self.nq))
+        self.thickness = np.zeros(0)
+
+    @property
+    def layout(self) -> Layout:
+        """The facets on the present mesh."""
+        assert self._layout is not None
+        return self._layout
 
     def settle(self) -> bool:
         """Take the present mesh of the body; return whether it is another one (collective)."""
@@ -164,66 +222,50 @@ class Surface:
         if self._space is W:
             return False
         self._space = W
-        self.gdim = body.geometry.dim
-        self.cells, self.facets = self._where.settle()
-        element = self.particles.W.ufl_element().basix_element
-        cell, dim = body.basix_cell(), body.topology.dim - 1
-        corners, sides = basix.geometry(cell), basix.topology(cell)[dim]
-        count = len(sides)
-        kind = basix.cell.subentity_types(cell)[dim][0]
-        points, weights = map(np.asarray, basix.make_quadrature(kind, self._degree))
-        self.nq = len(weights)
+        cells, facets = self._where.settle()
         x = W.tabulate_dof_coordinates()[:, : self.gdim].copy()
-        self.element: Any = basix.create_element(
-            basix.ElementFamily.P, kind, element.degree, element.lagrange_variant
-        )
-        table = np.asarray(self.element.tabulate(1, np.asarray(points)), dtype=np.float64)[
-            :, :, :, 0
-        ]
-        m, k = len(self.cells), self.element.dim
-        self.nodes = np.zeros((m, k), dtype=np.int64)
-        self.shapes: NDArray[np.float64] = table[0]
-        self.slopes: NDArray[np.float64] = table[1:]
-        for side in range(count):
-            here = self.facets == side
-            at = corners[sides[side]]
-            places = at[0] + self.element.points @ (at[1 : dim + 1] - at[0])
-            own = np.linalg.norm(places[:, None] - element.points, axis=2).argmin(axis=1)
-            self.nodes[here] = W.dofmap.list[self.cells[here]][:, own]
-        self._distinct, places = np.unique(self.nodes, return_inverse=True)
-        self.own = places.reshape(self.nodes.shape)
-        self._own_mesh = x[self._distinct]
+        nodes = np.zeros((len(cells), self.element.dim), dtype=np.int64)
+        for side, own in enumerate(self._nodes):
+            here = facets == side
+            nodes[here] = W.dofmap.list[cells[here]][:, own]
+        distinct, places = np.unique(nodes, return_inverse=True)
         origin = self.particles.origin
         X = x if origin is None else origin.x.array.reshape(-1, self.gdim)
-        edges, undeformed = (np.einsum("jqk,mki->mqij", self.slopes, y[self.nodes]) for y in (x, X))
-        self._in_mesh, self._plain = (
-            np.linalg.norm(normals(part), axis=2) * weights for part in (edges, undeformed)
+        edges, undeformed = (np.einsum("jqk,mki->mqij", self.slopes, y[nodes]) for y in (x, X))
+        in_mesh, self._areas = (
+            np.linalg.norm(normals(part), axis=2) * self._rule for part in (edges, undeformed)
         )
-        self._edges, self._places = edges, []
-        for side in range(count):
-            at = corners[sides[side]]
-            self._places.append(at[0] + np.asarray(points) @ (at[1 : dim + 1] - at[0]))
-        middle = x[W.dofmap.list[self.cells]].mean(axis=1)
-        centre = (self.shapes @ x[self.nodes]).mean(axis=1)
+        middle = x[W.dofmap.list[cells]].mean(axis=1)
+        centre = (self.shapes @ x[nodes]).mean(axis=1)
         n = normals(edges).mean(axis=1)
-        self.outward = np.where(((centre - middle) * n).sum(axis=1) < 0.0, -1.0, 1.0)
-        narrows = (cell in SIMPLICES) | self.particles.halves[self.cells]
-        self.narrowing = np.where(narrows, self.gdim, 1)
-        self.thickness = (
-            self.narrowing * self.particles.initial_volume[self.cells] / self._plain.sum(axis=1)
-        )
+        narrows = (body.basix_cell() in SIMPLICES) | self.particles.halves[cells]
         extent = float(np.abs(self.particles.initial_domains).max(initial=0.0))
-        self.extent = float(body.comm.allreduce(extent, MPI.MAX))
-        self._around = np.ones_like(self._plain)
+        around = np.ones_like(self._areas)
         if self.axisymmetric:
-            self._around = 2.0 * np.pi * (self.shapes @ X[self.nodes])[:, :, 0]
+            around = 2.0 * np.pi * (self.shapes @ X[nodes])[:, :, 0]
+        layout = self._layout = Layout(
+            cells,
+            facets,
+            nodes,
+            places.reshape(nodes.shape),
+            np.where(((centre - middle) * n).sum(axis=1) < 0.0, -1.0, 1.0),
+            np.where(narrows, self.gdim, 1),
+            float(body.comm.allreduce(extent, MPI.MAX)),
+            distinct,
+            x[distinct],
+            edges,
+            in_mesh,
+            around,
+        )
+        volume = self.particles.initial_volume[cells]
+        self.thickness = layout.narrowing * volume / self._areas.sum(axis=1)
         self.look_at_deleted()
         return True
 
     def look_at_deleted(self) -> None:
         """Take the weight from facets of domains that are deleted."""
-        there = ~self.particles.deleted[self.cells]
-        self.weights = self._plain * self._around * there[:, None]
+        there = ~self.particles.deleted[self.layout.cells]
+        self.weights = self._areas * self.layout.around * there[:, None]
 
     @property
     def spread(self) -> float:
@@ -233,7 +275,7 @@ class Surface:
     @property
     def touch(self) -> float:
         """Gap at which points touch."""
-        return TOUCH * self.extent
+        return TOUCH * self.layout.extent
 
     @property
     def reference_points(self) -> list[NDArray[np.float64]]:
@@ -243,7 +285,7 @@ class Surface:
     @property
     def mesh_area_ratio(self) -> NDArray[np.float64]:
         """Area in the present mesh over that of the undeformed body, shape ``(m, nq)``."""
-        return np.asarray(self._in_mesh / self._plain)
+        return np.asarray(self.layout.in_mesh / self._areas)
 
     def stretch(
         self, counts: bool = True, which: NDArray[np.int64] | None = None
@@ -256,18 +298,18 @@ class Surface:
         """
         some = slice(None) if which is None else which
         if not counts:
-            return np.ones_like(self._plain[some])
-        x = self.own_nodes(converged=True)[self.own[some]]
+            return np.ones_like(self._areas[some])
+        x = self.own_nodes(converged=True)[self.layout.own[some]]
         now = normals(np.einsum("jqk,mki->mqij", self.slopes, x))
-        mesh_size = np.linalg.norm(normals(self._edges[some]), axis=2)
+        mesh_size = np.linalg.norm(normals(self.layout.edges[some]), axis=2)
         ratio = np.linalg.norm(now, axis=2) / mesh_size * self.mesh_area_ratio[some]
         if self.axisymmetric:
-            ratio = ratio * (2.0 * np.pi) * (self.shapes @ x)[:, :, 0] / self._around[some]
+            ratio = ratio * (2.0 * np.pi) * (self.shapes @ x)[:, :, 0] / self.layout.around[some]
         return np.asarray(ratio)
 
     def mesh_normals(self) -> NDArray[np.float64]:
         """Return outward unit normals in the present mesh, shape ``(m, nq, gdim)``."""
-        n = self.outward[:, None, None] * normals(self._edges)
+        n = self.layout.outward[:, None, None] * normals(self.layout.edges)
         return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
 
     def undeformed_normals(self) -> NDArray[np.float64]:
@@ -275,8 +317,8 @@ class Surface:
         origin = self.particles.origin
         if origin is None:
             return self.mesh_normals()
-        x = origin.x.array.reshape(-1, self.gdim)[self.nodes]
-        n = self.outward[:, None, None] * normals(np.einsum("jqk,mki->mqij", self.slopes, x))
+        x = origin.x.array.reshape(-1, self.gdim)[self.layout.nodes]
+        n = self.layout.outward[:, None, None] * normals(np.einsum("jqk,mki->mqij", self.slopes, x))
         return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
 
     def positions(
@@ -288,28 +330,28 @@ class Surface:
             converged: Whether those at the last converged step are meant.
             which: Numbers of facets; ``None``: all.
         """
-        places = self.own if which is None else self.own[which]
+        places = self.layout.own if which is None else self.layout.own[which]
         return np.asarray(self.shapes @ self.own_nodes(converged)[places])
 
     def own_nodes(self, converged: bool = False) -> NDArray[np.float64]:
         """Return positions of the nodes of all facets, each once, shape ``(n, gdim)``."""
         body = self.particles
         d = body.converged_displacement if converged else body.displacement.x.array
-        return np.asarray(self._own_mesh + d.reshape(-1, self.gdim)[self._distinct])
+        return np.asarray(self.layout.positions + d.reshape(-1, self.gdim)[self.layout.distinct])
 
     @property
     def sizes(self) -> NDArray[np.float64]:
         """Size of each undeformed facet, shape ``(m,)``."""
-        return np.asarray(self._plain.sum(axis=1) ** (1.0 / (self.gdim - 1)))
+        return np.asarray(self._areas.sum(axis=1) ** (1.0 / (self.gdim - 1)))
 
     def normals(
         self, converged: bool = False, which: NDArray[np.int64] | None = None
     ) -> NDArray[np.float64]:
         """Return outward unit normals at the points, as the body is displaced, as positions."""
         chosen: Any = slice(None) if which is None else which
-        x = self.own_nodes(converged)[self.own[chosen]]
+        x = self.own_nodes(converged)[self.layout.own[chosen]]
         edges = np.moveaxis(self.slopes[:, None] @ x, 0, -1)
-        n = self.outward[chosen, None, None] * normals(edges)
+        n = self.layout.outward[chosen, None, None] * normals(edges)
         return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
 
     def force(
@@ -328,7 +370,7 @@ class Surface:
         here = np.flatnonzero(tractions.any(axis=(1, 2)))
         acting = here if which is None else which[here]
         forces = self.shapes.T @ (sign * self.weights[acting, :, None] * tractions[here])
-        return nodal_vector(self.particles.W, self.nodes[acting], forces)
+        return nodal_vector(self.particles.W, self.layout.nodes[acting], forces)
 
     # -- What is kept ---------------------------------------------------------------------------
 
@@ -338,23 +380,23 @@ class Surface:
         count = len(basix.topology(body.basix_cell())[body.topology.dim - 1])
         shape = (self.particles.num_local, count, *values.shape[1:])
         whole = np.zeros(shape, dtype=values.dtype)
-        whole[self.cells, self.facets] = values
+        whole[self.layout.cells, self.layout.facets] = values
         return Column(whole, "facets")
 
     def of_column(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return the values at points that :meth:`column` was given."""
-        return np.asarray(values[self.cells, self.facets])
+        return np.asarray(values[self.layout.cells, self.layout.facets])
 
     def columns(self) -> dict[str, Column]:
         """Return undeformed areas and thicknesses, which another mesh does not show."""
         thickness = np.repeat(self.thickness[:, None], self.nq, axis=1)
-        return {"area": self.column(self._plain), "thickness": self.column(thickness)}
+        return {"area": self.column(self._areas), "thickness": self.column(thickness)}
 
     def restore(self, columns: dict[str, NDArray[Any]]) -> None:
         """Take the undeformed areas and thicknesses of before, where there are any."""
         area = self.of_column(columns["area"])
         known = area > 0.0
-        self._plain = np.where(known, area, self._plain)
+        self._areas = np.where(known, area, self._areas)
         thickness = self.of_column(columns["thickness"])[:, 0]
         self.thickness = np.where(known.all(axis=1), thickness, self.thickness)
         self.look_at_deleted()

@@ -26,11 +26,11 @@ def near_a_body(kind, degree=1):
     nodes = surface.own_nodes()
     nodes = nodes + 0.03 * np.sin(5.0 * nodes[:, ::-1])
     rng = np.random.default_rng(1)
-    x = nodes[surface.own].mean(axis=1)[rng.integers(0, len(surface.cells), 300)]
+    x = nodes[surface.layout.own].mean(axis=1)[rng.integers(0, len(surface.layout.cells), 300)]
     x = x + rng.uniform(-0.15, 0.15, x.shape)
     inner = -rng.normal(size=x.shape)
     inner /= np.linalg.norm(inner, axis=1)[:, None]
-    number = np.arange(len(surface.cells))
+    number = np.arange(len(surface.layout.cells))
     known = facets.NearFacets(surface, number, x, 3.0 * REACH, nodes)
     return known, known.positions(nodes), x, inner
 
@@ -87,7 +87,7 @@ def test_points_beside_the_end_of_a_surface_touch_nothing(kind):
     x = np.full((400, dim), 0.4)
     x[:, 0] = np.linspace(-0.1, 1.1, len(x))
     x[:, -1] = 1.0 + 2e-4 * np.array([1.0, -1.0, 1e-12, -1e-12])[np.arange(len(x)) % 4]
-    known = facets.NearFacets(surface, np.arange(len(surface.cells)), x, 3.0 * REACH, nodes)
+    known = facets.NearFacets(surface, np.arange(len(surface.layout.cells)), x, 3.0 * REACH, nodes)
     found = known.closest(x, None, known.positions(nodes), REACH)
     assert (found.facet >= 0).all()
     assert np.array_equal(found.near, (x[:, 0] >= 0.0) & (x[:, 0] <= 1.0))
@@ -113,6 +113,6 @@ def test_points_over_the_edges_of_a_bent_surface_face_it():
     angle = np.linspace(-0.66, 0.66, 400)
     radius = 1.0 + np.array([0.05, 1e-3, 1e-6])[np.arange(len(angle)) % 3]
     x = radius[:, None] * np.column_stack([np.sin(angle), np.cos(angle)])
-    known = facets.NearFacets(surface, np.arange(len(surface.cells)), x, 3.0 * REACH, nodes)
+    known = facets.NearFacets(surface, np.arange(len(surface.layout.cells)), x, 3.0 * REACH, nodes)
     found = known.closest(x, None, known.positions(nodes), REACH)
     assert found.near.all() and (found.beside > 0.0).any()
