@@ -124,6 +124,28 @@ class GroupedTangent(NamedTuple):
     right: Array
 
 
+class _Averaged(NamedTuple):
+    """Averages of displacement gradients, at points ``(n, nq)``.
+
+    Attributes:
+        deviation: Of ln J from its average.
+        group_size: Present volume of the group of each domain, shape ``(n,)``.
+        counted: Undeformed volume that counts in it.
+        J: Determinant of F.
+        F: The deformation gradient, ``(n, nq, dim, dim)``.
+        Z: The transpose of its inverse.
+        s: Scale of F that the material sees.
+    """
+
+    deviation: Array
+    group_size: Array
+    counted: Array
+    J: Array
+    F: Array
+    Z: Array
+    s: Array
+
+
 class Linearised(Protocol):
     """Source of the low-rank part of a body's tangent."""
 
@@ -173,6 +195,13 @@ class VolumeAveraging:
         self.kind = kind
         self._grouped_tangent: GroupedTangent | None = None
         self._low_rank: LowRankTerm | None = None
+        self._last: _Averaged | None = None
+
+    @property
+    def _averaged(self) -> _Averaged:
+        """The last averages."""
+        assert self._last is not None
+        return self._last
 
     @property
     def _weights(self) -> Array:
@@ -206,15 +235,19 @@ class VolumeAveraging:
         group_volume = np.where(present, sums[:, 0], volume)
         of_group = np.where(present, sums[:, 1], of_domain)
         ln_group = np.log1p(of_group / group_volume)[:, None]
-        self._deviation = np.log1p(excess) - ln_group
-        change = -a * self._deviation
-        self._group_size = group_volume + of_group
-        self._counted = weights * present[:, None]
-        self._J = 1.0 + excess
-        self._F = np.eye(self._dim) + gradient
-        self._Z = np.linalg.inv(self._F).swapaxes(2, 3)
-        self._s = np.exp(change)
-        scale = self._s[:, :, None, None]
+        change_of_ln_J = np.log1p(excess) - ln_group
+        change = -a * change_of_ln_J
+        F = np.eye(self._dim) + gradient
+        last = self._last = _Averaged(
+            change_of_ln_J,
+            group_volume + of_group,
+            weights * present[:, None],
+            1.0 + excess,
+            F,
+            np.linalg.inv(F).swapaxes(2, 3),
+            np.exp(change),
+        )
+        scale = last.s[:, :, None, None]
         return np.asarray(np.expm1(change)[:, :, None, None] * np.eye(self._dim) + scale * gradient)
 
     def abandon(self) -> None:
@@ -233,7 +266,8 @@ class VolumeAveraging:
         Returns:
             Arrays of the same shapes.
         """
-        a, s, F, Z, J = 1.0 / self._dim, self._s, self._F, self._Z, self._J
+        a, last = 1.0 / self._dim, self._averaged
+        s, F, Z, J = last.s, last.F, last.Z, last.J
         s2 = s[:, :, None, None]
         left = P + s2 * np.einsum("nqiJkL,nqkL->nqiJ", A, F)
         right = left
@@ -241,20 +275,20 @@ class VolumeAveraging:
             right = P + s2 * np.einsum("nqiJ,nqiJkL->nqkL", F, A)
         p = s * np.einsum("nqiJ,nqiJ->nq", P, F)
         stiffness = s * np.einsum("nqiJ,nqiJ->nq", left, F)
-        in_domain = a * (self._counted * p).sum(axis=1)
-        H = a**2 * (self._counted * stiffness).sum(axis=1)
+        in_domain = a * (self._averaged.counted * p).sum(axis=1)
+        H = a**2 * (self._averaged.counted * stiffness).sum(axis=1)
         force, stiffening = self._resistance()
         sums = self.groups.sum(
             np.stack(
                 [
-                    in_domain - (self._counted * force).sum(axis=1),
-                    H + (self._counted * stiffening).sum(axis=1),
+                    in_domain - (self._averaged.counted * force).sum(axis=1),
+                    H + (self._averaged.counted * stiffening).sum(axis=1),
                 ],
                 axis=1,
             )
         )
         B = sums[:, 0]
-        beta = (B / self._group_size)[:, None] * J
+        beta = (B / self._averaged.group_size)[:, None] * J
 
         factor = (beta + force - a * p)[:, :, None, None]
         stress = s2 * P + factor * Z
@@ -267,7 +301,7 @@ class VolumeAveraging:
         projected = (a**2 * stiffness + stiffening)[:, :, None, None] * Z
         left = a * s2 * left - projected
         right = left if self._symmetric else a * s2 * right - projected
-        gamma = (J / self._group_size[:, None])[:, :, None, None] * Z
+        gamma = (J / self._averaged.group_size[:, None])[:, :, None, None] * Z
         self._grouped_tangent = GroupedTangent(sums[:, 1] - B, gamma, left, right)
         self._low_rank = None
         return stress, tangent
@@ -288,22 +322,22 @@ class VolumeAveraging:
 
     def energy(self) -> Array:
         """Return the energy per volume of deviations in the last evaluation, shape ``(n, nq)``."""
-        cost = deviation_energy(self._deviation, *FREE[self.kind])
+        cost = deviation_energy(self._averaged.deviation, *FREE[self.kind])
         return np.asarray(self.modulus[:, None] * cost)
 
     def _resistance(self) -> tuple[Array, Array]:
         """Return force and stiffness, per volume, against deviations at the points."""
         modulus = self.modulus[:, None]
-        force, stiffness = deviation(self._deviation, *FREE[self.kind])
+        force, stiffness = deviation(self._averaged.deviation, *FREE[self.kind])
         return modulus * force, modulus * stiffness
 
     def counted(self) -> Array:
         """Return the volume of each point that counts in its group, shape ``(n, nq)``."""
-        return self._counted
+        return self._averaged.counted
 
     def nodal(self, stress: Array) -> Array:
         """Return the integrals of ``stress : grad N`` over each domain, ``(n, k, gdim)``."""
-        return self._strain.nodal(stress, self._counted)
+        return self._strain.nodal(stress, self._averaged.counted)
 
     # -- Output ---------------------------------------------------------------------------
 

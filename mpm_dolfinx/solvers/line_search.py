@@ -68,6 +68,14 @@ class _Step(NamedTuple):
         return self._replace(work=0.5 * self.work)
 
 
+class _Rules(NamedTuple):
+    """Rules of a search in one solve; see :meth:`LineSearch.begin`."""
+
+    potential: bool
+    hurries: bool
+    by_norm: bool
+
+
 class LineSearch:
     """Shortens a Newton step, in another direction where its own leads uphill.
 
@@ -110,9 +118,11 @@ class LineSearch:
         self._redirect = redirect
         self._smooth = smooth
         self._statistics = statistics
-        self.begin()
+        self._rules = _Rules(False, False, False)
+        self._trusted: _Step | None = None
+        self._since, self._may_trust = 0, True
 
-    def begin(self, potential: bool = False, hurries: bool = False, by_norm: bool = False) -> None:
+    def begin(self, potential: bool, hurries: bool, by_norm: bool) -> None:
         """Begin a solve.
 
         Args:
@@ -121,11 +131,8 @@ class LineSearch:
             by_norm: Whether steps are judged by the residual's norm alone where there is no
                 potential, so that its work on them means nothing.
         """
-        self._potential, self._hurries = potential, hurries
-        self._by_norm = by_norm and not potential
-        self._trusted: _Step | None = None
-        self._since = 0  # iterations
-        self._may_trust = True
+        self._rules = _Rules(potential, hurries, by_norm and not potential)
+        self._trusted, self._since, self._may_trust = None, 0, True
 
     def __call__(self, x: PETSc.Vec, y: PETSc.Vec, F: PETSc.Vec, trial: PETSc.Vec) -> bool:
         """Choose the step to ``x - y`` (collective).
@@ -196,7 +203,7 @@ class LineSearch:
         trial.waxpy(-1.0, step.y, step.x)
         if self._evaluate(trial) is not None:
             return False
-        if self._by_norm:
+        if self._rules.by_norm:
             return norm(F) <= (1.0 - LEAST) * step.norm
         work = abs(F.dot(step.direction))
         return bool(work <= SUFFICIENT * abs(step.work) or norm(F) <= step.norm)
@@ -209,7 +216,7 @@ class LineSearch:
             if self._reduces(step, F, trial):
                 self._sharpen(step, 2.0 ** (halvings + 1), F, trial)
                 break
-            if self._hurries and halvings + 1 >= FEW_HALVINGS and np.isfinite(norm(F)):
+            if self._rules.hurries and halvings + 1 >= FEW_HALVINGS and np.isfinite(norm(F)):
                 break
 
     def _sharpen(self, step: _Step, longest: float, F: PETSc.Vec, trial: PETSc.Vec) -> bool:
@@ -226,7 +233,7 @@ class LineSearch:
         """
         work = F.dot(step.direction)
         far = abs(work) > SHARP * abs(step.work)
-        if not (self._potential and far and step.work > 0.0 and self._trusted is None):
+        if not (self._rules.potential and far and step.work > 0.0 and self._trusted is None):
             return False
         if self._smooth():
             return False

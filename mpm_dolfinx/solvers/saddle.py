@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from petsc4py import PETSc
 
@@ -39,6 +39,30 @@ class Fields(Protocol):
             coarsest: Number of unknowns below which no coarser level is made.
             values: Whether of those that are no displacements, numbered alone.
         """
+
+
+class _Parts(NamedTuple):
+    """Parts of a tangent; see :class:`SaddleMultigrid`.
+
+    Attributes:
+        places: Rows and columns of A, B and D.
+        blocks: These.
+        u: A vector of displacements.
+        f: Another.
+        p: A vector of values.
+        g: Another.
+        M: ``c r M r``.
+        S: The Schur complement.
+    """
+
+    places: list[tuple[PETSc.IS, PETSc.IS]]
+    blocks: list[PETSc.Mat]
+    u: PETSc.Vec
+    f: PETSc.Vec
+    p: PETSc.Vec
+    g: PETSc.Vec
+    M: PETSc.Mat
+    S: PETSc.Mat
 
 
 class SaddleMultigrid:
@@ -77,28 +101,28 @@ class SaddleMultigrid:
         ]
         self.levels = max(cycle.levels for cycle in self._cycles)
         self._first: int = fields.splits()[0][1].stop
-        self._blocks: list[PETSc.Mat] = []
+        self._parts: _Parts | None = None
         pc.reset()
         pc.setType("python")
         pc.setPythonContext(self)
 
     def set(self, K: PETSc.Mat) -> None:
         """Take over the values of a tangent (collective)."""
-        if not self._blocks:
-            self._begin(K)
+        if self._parts is None:
+            self._parts = self._parted(K)
         else:
-            for (rows, columns), block in zip(self._places, self._blocks, strict=True):
+            for (rows, columns), block in zip(self._parts.places, self._parts.blocks, strict=True):
                 K.createSubMatrix(rows, columns, block)
-            self._soften()
-        self._S.zeroEntries()
-        self._S.axpy(1.0, self._blocks[2], PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        self._S.axpy(-1.0, self._M, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        self._take(0, self._blocks[0])
-        self._take(1, self._S)
+            self._soften(self._parts.blocks[0])
+        blocks, S = self._parts.blocks, self._parts.S
+        S.zeroEntries()
+        S.axpy(1.0, blocks[2], PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        S.axpy(-1.0, self._parts.M, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        self._take(0, blocks[0])
+        self._take(1, S)
 
-    def _soften(self) -> None:
+    def _soften(self, A: PETSc.Mat) -> None:
         """Add to the diagonal of A as much as its smallest eigenvalues are."""
-        A = self._blocks[0]
         diagonal = A.getDiagonal()
         diagonal.abs()
         diagonal.scale(SOFT * (A.getSize()[0] / self._dim) ** (-2.0 / self._dim))
@@ -110,54 +134,56 @@ class SaddleMultigrid:
         self._cycles[number].set(matrix)
         pc.setUp()
 
-    def _begin(self, K: PETSc.Mat) -> None:
+    def _parted(self, K: PETSc.Mat) -> _Parts:
         """Part the unknowns, and find the size of the Schur complement."""
         start, stop = K.getOwnershipRange()
         moving, values = (
             PETSc.IS().createStride(b - a, first=a, step=1, comm=K.comm)
             for a, b in ((start, start + self._first), (start + self._first, stop))
         )
-        self._places = [(moving, moving), (moving, values), (values, values)]
-        self._blocks = [K.createSubMatrix(rows, columns) for rows, columns in self._places]
-        self._soften()
-        A, B, D = self._blocks
-        self._u, self._f = B.createVecLeft(), B.createVecLeft()
-        self._p, self._g = D.createVecRight(), D.createVecRight()
+        places = [(moving, moving), (moving, values), (values, values)]
+        A, B, D = blocks = [K.createSubMatrix(rows, columns) for rows, columns in places]
+        self._soften(A)
+        u, f = B.createVecLeft(), B.createVecLeft()
+        p, g = D.createVecRight(), D.createVecRight()
         M = self._fields.mass()
         diagonal = M.getDiagonal().array_r
         size = D.getDiagonal().array_r - self._fields.diagonal(K).array_r[self._first :]
-        root = self._p.duplicate()
+        root = p.duplicate()
         known = diagonal > 0.0
         root.array_w[:] = np.sqrt(np.abs(size) / np.where(known, diagonal, 1.0)) * known
         M.diagonalScale(L=root, R=root)
         self._take(0, A)
-        M.scale(self._modulus(K, M, start + self._first))
-        self._M, self._S = M, M + D
+        parts = _Parts(places, blocks, u, f, p, g, M, M + D)
+        M.scale(self._modulus(K, parts, start + self._first))
+        return parts
 
-    def _modulus(self, K: PETSc.Mat, M: PETSc.Mat, first: int) -> float:
+    def _modulus(self, K: PETSc.Mat, parts: _Parts, first: int) -> float:
         """Return c."""
         whole, force = K.createVecRight(), K.createVecLeft()
-        p = self._p
+        p, g = parts.p, parts.g
         p.array_w[:] = np.sin(1.0 + 1.7 * (first + np.arange(p.getLocalSize())))
-        M.mult(p, self._g)
-        expected = p.dot(self._g)
-        self._blocks[1].mult(p, self._f)
-        self._pcs[0].apply(self._f, self._u)
+        parts.M.mult(p, g)
+        expected = p.dot(g)
+        parts.blocks[1].mult(p, parts.f)
+        self._pcs[0].apply(parts.f, parts.u)
         whole.set(0.0)
-        whole.array_w[: self._first] = self._u.array_r
+        whole.array_w[: self._first] = parts.u.array_r
         K.mult(whole, force)
-        self._g.array_w[:] = force.array_r[self._first :]
-        found = p.dot(self._g)
+        g.array_w[:] = force.array_r[self._first :]
+        found = p.dot(g)
         return float(found / expected) if expected > 0.0 else 0.0
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Apply the preconditioner (collective)."""
+        assert self._parts is not None
         first, residual = self._first, x.array_r
-        self._g.array_w[:] = residual[first:]
-        self._pcs[1].apply(self._g, self._p)
-        self._blocks[1].mult(self._p, self._u)
-        self._f.array_w[:] = residual[:first] - self._u.array_r
-        self._pcs[0].apply(self._f, self._u)
+        _, blocks, u, f, p, g, _, _ = self._parts
+        g.array_w[:] = residual[first:]
+        self._pcs[1].apply(g, p)
+        blocks[1].mult(p, u)
+        f.array_w[:] = residual[:first] - u.array_r
+        self._pcs[0].apply(f, u)
         values = y.array_w
-        values[:first] = self._u.array_r
-        values[first:] = self._p.array_r
+        values[:first] = u.array_r
+        values[first:] = p.array_r
