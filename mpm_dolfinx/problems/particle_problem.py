@@ -619,7 +619,8 @@ class ParticleProblem(Hooked):
         In equilibrium the background sees no force: ``T^T R = 0``. R itself, on the bodies' own
         nodes, is what it could not balance; its energy, node by node, tells how far the bodies'
         own finite elements are from here. It is kept as ``error`` of the last of
-        ``history.steps``.
+        ``history.steps``. Loads, conditions and obstacles count as they are set now, so ask before
+        they are changed for the next step.
 
         Not seen is what these elements cannot do themselves (shear or volumetric locking, a mesh
         too coarse for the load), nor the error of load steps, for which ``steps="auto"`` has a

@@ -58,11 +58,6 @@ class FreeField(Field):
         self._held()
 
     @override
-    def begin(self, change: NDArray[np.float64], before: NDArray[np.float64] | None = None) -> None:
-        super().begin(change, before)
-        self.prescribes = self.prescribes or self.host.prescribes
-
-    @override
     def _held(self) -> NDArray[np.bool_]:
         fixed = super()._held()
         carried = fixed & ~self.nodes.dofs

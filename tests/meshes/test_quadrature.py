@@ -4,8 +4,12 @@
 
 import numpy as np
 import pytest
+import scenes
+from scenes import QUADRILATERAL
 
-from mpm_dolfinx.meshes.quadrature import volume_ratio, with_hoop
+import basix
+
+from mpm_dolfinx.meshes.quadrature import DomainQuadrature, volume_ratio, with_hoop
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -23,3 +27,20 @@ def test_hoop_strains_stand_beside_those_in_the_plane():
     around = [[hoop[n, q] @ nodal[n, :, 0] for q in range(2)] for n in range(4)]
     np.testing.assert_allclose(whole[:, :, 2, 2], around, rtol=1e-14)
     assert not whole[:, :, 2, :2].any() and not whole[:, :, :2, 2].any()
+
+
+@pytest.mark.parametrize("unit", [1e-15, 1.0, 1e15])
+@pytest.mark.parametrize("height", [1.0, 1e-9])
+def test_a_domain_is_flat_in_no_unit_unless_it_has_no_volume(unit, height):
+    body = scenes.box([0.0, 0.0], [1.0, 1.0], [3, 2], QUADRILATERAL)
+    body.geometry.x[:] *= unit * np.array([1.0, height, 1.0])
+    rule = DomainQuadrature(body, bilinear(), 2)
+    assert not rule.flat.any()
+    whole = scenes.WORLD.allreduce(float(rule.weights.sum()))
+    assert whole == pytest.approx(height * unit**2)
+    body.geometry.x[:, 1] = 0.0
+    assert DomainQuadrature(body, bilinear(), 2).flat.all()
+
+
+def bilinear():
+    return basix.ufl.element("Lagrange", "quadrilateral", 1).basix_element

@@ -318,3 +318,37 @@ def test_a_stage_lets_go_of_free_nodes_that_a_condition_on_the_background_held(m
     for mine, other in zip(one, two, strict=True):
         assert scenes.largest(mine - other) < 1e-9
     assert np.abs(force - its).max() < 1e-8 * np.abs(force).max()
+
+
+@pytest.mark.parametrize("end", [0.1, 0.0])
+def test_conditions_on_free_nodes_move_them_as_those_of_finite_elements(end):
+    # and where one on the background holds a node too, its own counts
+    mesh, runs = body_in(QUADRILATERAL), []
+    V = around(shift=0.0)
+    for own in (mpm.Particles(mesh), mpm.Particles(mesh, V, free=every)):
+        moved = scenes.fix(own.W, at(0, 1.0), end)
+        held = mpm.held(V, x=1.0) if own.V is V else None
+        conditions = [scenes.fix(own.W, at(0, 0.0)), moved, *([held] if held else [])]
+        problem = mpm.QuasiStaticProblem(
+            mpm.Body(own, Hencky(YOUNG, POISSON), body_force=(0.0, -20.0)), bcs=conditions
+        )
+        problem.solve(2)
+        runs.append((own, problem.reaction(moved), problem.history.total_iterations))
+    (one, force, count), (two, its, its_count) = runs
+    assert difference(one, two) < 1e-10
+    assert np.abs(force - its).max() < 1e-9 * np.abs(force).max()
+    assert count == its_count
+
+
+def test_free_nodes_of_removed_cells_alone_are_no_unknowns():
+    mesh = body_in(QUADRILATERAL, 2)
+    own = mpm.Particles(mesh, around(), outside="delete", free=every)
+    hold = scenes.fix(own.W, at(0, 0.0))
+    body = mpm.Body(own, Hencky(YOUNG, POISSON), body_force=(0.0, -20.0))
+    problem = mpm.QuasiStaticProblem(body, bcs=[hold])
+    problem.solve(1)
+    assert problem.history.statistics["free_dofs"] == 2 * (5 - 1) * 3
+    problem.remove(lambda x: x[0] > 0.75)  # two cells, which have three nodes by themselves
+    problem.solve(1)
+    assert problem.history.statistics["free_dofs"] == 2 * (4 - 1) * 3
+    assert np.isfinite(own.displacement.x.array).all()
