@@ -12,8 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, override
+from typing import Any, NamedTuple, override
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -46,6 +47,20 @@ DEGREES = {2: 9, 3: 5}
 #: Columns of what points remember, and of what acted, by its names there.
 MEMORY = ("touches", "anchor", "offset", "friction")
 OUTCOME = {"inside": "touches", "slips": "slips", "pressure": "pressure", "traction": "traction"}
+
+
+class _Pattern(NamedTuple):
+    """Matrices whose blocks are those of facets that have met.
+
+    Attributes:
+        matrices: Of forces on one body by nodes of the other, and of each by its own.
+        sums: Of these and of those by the stress behind points.
+        learned: How often each pass had learned of other facets.
+    """
+
+    matrices: PairMatrices
+    sums: dict[tuple[int, int], MatrixSum]
+    learned: list[int]
 
 
 class Pair(Contact):
@@ -129,6 +144,8 @@ class Pair(Contact):
         ]
         self._count, self._begins = passes, True
         self._passes: list[Pass] = []
+        self._stiffnesses: list[NDArray[np.float64]] = []
+        self._pattern: _Pattern | None = None
 
     # -- The term -------------------------------------------------------------------------------
 
@@ -148,7 +165,7 @@ class Pair(Contact):
         if self._joins:
             gone = [contact for contact in self._gone if isinstance(contact, Pair)]
             self._stand_in([one for one in gone if set(one.bodies) == set(self.bodies)])
-            self._require_apart()
+            _require_apart(self._comm, self._passes)
             self._joins, self._gone = False, []
 
     def _stand_in(self, gone: Sequence[Pair]) -> None:
@@ -195,7 +212,7 @@ class Pair(Contact):
                 self._surfaces, self._moduli, self._materials, strict=True
             )
         ]
-        shares, surfaces = self._shares(), self._surfaces
+        shares, surfaces = _shares(self._surfaces, self._count), self._surfaces
         self._passes = [
             Pass(
                 surfaces[i],
@@ -235,41 +252,15 @@ class Pair(Contact):
             spaces = spaces[::-1]
         self._begins = True
 
-    def _shares(self) -> list[float]:
-        """Return the share of the load that each pass bears (collective).
-
-        Points on facets of a size h see kinks of the other body's shape functions with an error of
-        the order of h^2, so that the points of facets that are much finer bear more.
-        """
-        if self._count == 1:
-            return [1.0]
-        squares = [
-            float(np.median(np.concatenate(self._comm.allgather(surface.sizes)))) ** 2
-            for surface in self._surfaces
-        ]
-        if max(squares) < ALIKE**2 * min(squares):
-            return [0.5, 0.5]
-        first = float(np.clip(squares[1] / sum(squares), LEAST, 1.0 - LEAST))
-        return [first, 1.0 - first]
-
     def _new_pattern(self) -> None:
-        self._matrices = PairMatrices([body.W for body in self.bodies])
-        self._sums = {(i, j): MatrixSum() for i in (0, 1) for j in (0, 1)}
-        self._learned = [each.learned for each in self._passes]
+        self._pattern = _Pattern(
+            PairMatrices([body.W for body in self.bodies]),
+            {(i, j): MatrixSum() for i in (0, 1) for j in (0, 1)},
+            [each.learned for each in self._passes],
+        )
         for each in self._passes:
             if each.stress is not None:
                 each.stress.new_pattern()
-
-    def _require_apart(self) -> None:
-        for each in self._passes:
-            deep = each.overlap()
-            with agree(self._comm):
-                if deep is not None:
-                    raise MPMError(
-                        f"The bodies of a Pair overlap at the beginning: {{particles}} are up to "
-                        f"{deep[1]:.3g} deep in the other body; move the bodies apart.",
-                        deep[0],
-                    )
 
     @override
     def begin(self) -> Sequence[PETSc.Vec]:
@@ -334,20 +325,22 @@ class Pair(Contact):
 
     @override
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        if self._learned != [each.learned for each in self._passes]:
+        if self._pattern is None or self._pattern.learned != [e.learned for e in self._passes]:
             self._new_pattern()
+        assert self._pattern is not None
+        matrices, sums, _ = self._pattern
         meetings = self._meetings
-        groups = self._matrices.groups([meeting.met() for meeting in meetings])
+        groups = matrices.groups([meeting.met() for meeting in meetings])
         for meeting, (group, positions) in zip(meetings, groups, strict=True):
-            meeting.add_tangents(1.0 / self._share, group, positions, self._matrices.values)
-        found = {place: [K] for place, K in self._matrices.assembled().items()}
+            meeting.add_tangents(1.0 / self._share, group, positions, matrices.values)
+        found = {place: [K] for place, K in matrices.assembled().items()}
         for own, (each, meeting) in enumerate(zip(self._passes, meetings, strict=True)):
             if each.stress is not None:
                 parts = each.stress.tangents(*meeting.by_stress(1.0 / self._share))
                 for row, K in enumerate(parts if own == 0 else parts[::-1]):
                     if K is not None:
                         found.setdefault((row, own), []).append(K)
-        return {place: self._sums[place].of(parts) for place, parts in found.items()}
+        return {place: sums[place].of(parts) for place, parts in found.items()}
 
     # -- What it remembers ----------------------------------------------------------------------
 
@@ -467,3 +460,34 @@ def _both(one: dict[str, NDArray[Any]], other: dict[str, NDArray[Any]]) -> dict[
 def _told(surface: Surface, columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Return the outcome at the points of a surface, from columns."""
     return {name: surface.of_column(columns[column]) for name, column in OUTCOME.items()}
+
+
+def _shares(surfaces: Sequence[Surface], count: int) -> list[float]:
+    """Return the share of the load that each pass bears (collective).
+
+    Points on facets of a size h see kinks of the other body's shape functions with an error of the
+    order of h^2, so that the points of facets that are much finer bear more.
+    """
+    if count == 1:
+        return [1.0]
+    comm: MPI.Comm = surfaces[0].particles.mesh.comm
+    squares = [
+        float(np.median(np.concatenate(comm.allgather(surface.sizes)))) ** 2 for surface in surfaces
+    ]
+    if max(squares) < ALIKE**2 * min(squares):
+        return [0.5, 0.5]
+    first = float(np.clip(squares[1] / sum(squares), LEAST, 1.0 - LEAST))
+    return [first, 1.0 - first]
+
+
+def _require_apart(comm: MPI.Comm, passes: Sequence[Pass]) -> None:
+    """Raise an error where bodies overlap at the beginning (collective)."""
+    for each in passes:
+        deep = each.overlap()
+        with agree(comm):
+            if deep is not None:
+                raise MPMError(
+                    f"The bodies of a Pair overlap at the beginning: {{particles}} are up to "
+                    f"{deep[1]:.3g} deep in the other body; move the bodies apart.",
+                    deep[0],
+                )

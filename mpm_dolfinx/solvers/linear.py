@@ -23,14 +23,12 @@ from .refinement import KRYLOV, Refinement
 from .refusals import options_refused, require_factor
 from .saddle import SaddleMultigrid
 from .strategies import STRATEGIES, mumps_options
+from .workspace import FACTORS, give_workspace, lacks_workspace
 
 __all__ = ["Indefinite", "ShiftedFactor"]
 
 #: Most unknowns of the coarsest level of multigrid, which is factorised.
 COARSEST = 600
-#: Values of MUMPS's INFOG(1) that more workspace cures.
-OUT_OF_WORKSPACE = (-8, -9)
-FACTORS = ("lu", "cholesky")
 #: Order of PETSc's own Cholesky, and the pivot, relative to its row, that counts as none: those of
 #: the shift are as small as round-off.
 ORDER, NO_PIVOT = "nd", 0.0
@@ -323,11 +321,11 @@ class ShiftedFactor:
         with self._statistics.phase("factorise"):
             if not (new or failed or split) and self._ksp.getPC().getType() in FACTORS:
                 self._ksp.setUp()  # numbers alone, which reads no options
-                if not self._lacks_workspace():
+                if not lacks_workspace(self._ksp.getPC()):
                     return
             with self._own_options(K.getSize()[0]), options_refused():
                 self._ksp.setUp()  # where the factor is made, which reads options of its own
-                self._give_workspace()
+                give_workspace(self._ksp, self.K, self.P, self._statistics)
 
     def _split(self, splits: Sequence[tuple[str, slice]]) -> None:
         """Tell a PC of type fieldsplit where the unknowns of each field are, by name (collective).
@@ -512,26 +510,6 @@ class ShiftedFactor:
         self._statistics["krylov_iterations"] += ksp.getIterationNumber()
         return bool(ksp.getConvergedReason() > 0)
 
-    def _lacks_workspace(self) -> bool:
-        """Return whether MUMPS ran out of workspace."""
-        pc = self._ksp.getPC()
-        if pc.getType() not in FACTORS or pc.getFactorSolverType() != "mumps":
-            return False
-        return pc.getFactorMatrix().getMumpsInfog(1) in OUT_OF_WORKSPACE
-
-    def _give_workspace(self) -> None:
-        """Factorise again with more workspace where MUMPS ran out of it."""
-        pc = self._ksp.getPC()
-        for percent in (100, 200, 400, 800):
-            if not self._lacks_workspace():
-                return
-            pc.reset()
-            self._ksp.setOperators(self.K, self.P)
-            pc.setFactorSetUpSolverType()
-            pc.getFactorMatrix().setMumpsIcntl(14, percent)
-            self._ksp.setUp()
-            self._statistics.count("workspace_retries")
-
     def solve(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Solve with the last factor, or to a relative residual of 1e-6 (collective)."""
         with self._statistics.phase("solve"):
@@ -542,16 +520,13 @@ class ShiftedFactor:
             self._ksp.setTolerances(max_it=self._longest)
             if not self._own_rtol:
                 self._ksp.setTolerances(rtol=ACCURATE)
-            if self._negative or not self._solved(b, x):
+            if not self._negative:
+                self._ksp.solve(b, x)
+                self._statistics["krylov_iterations"] += self._ksp.getIterationNumber()
+                self._negative = self._ksp.getConvergedReason() in INDEFINITE
+            if self._negative:
                 self._solve_indefinite(b, x, self._ksp.getTolerances()[0])
             self._ksp.setTolerances(rtol=before)
-
-    def _solved(self, b: PETSc.Vec, x: PETSc.Vec) -> bool:
-        """Solve; return whether the tangent is not found to be indefinite."""
-        self._ksp.solve(b, x)
-        self._statistics["krylov_iterations"] += self._ksp.getIterationNumber()
-        self._negative = self._ksp.getConvergedReason() in INDEFINITE
-        return not self._negative
 
     def refine(self, b: PETSc.Vec, x: PETSc.Vec, tolerance: float) -> float:
         """Improve a solution of ``(K + D) x = b`` to one of ``K x = b`` (collective).
