@@ -28,6 +28,7 @@ from .problems.porous import PorousProblem  # noqa: E402
 from .problems.quasistatic import QuasiStaticProblem  # noqa: E402
 from .problems.solver import Solver  # noqa: E402
 from .problems.strength import StrengthReduction, strength_reduction  # noqa: E402
+from .problems.water_table import WaterTable  # noqa: E402
 from .stepping.displacement_control import DisplacementControl  # noqa: E402
 from .system.coupling import Tie  # noqa: E402
 from .system.schemes import Kinematics, Rates, Scheme  # noqa: E402
@@ -66,6 +67,7 @@ __all__ = [
     "StrengthReduction",
     "Term",
     "Tie",
+    "WaterTable",
     "Weights",
     "__version__",
     "boundary",

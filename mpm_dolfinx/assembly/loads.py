@@ -45,6 +45,13 @@ class VirtualWork:
         work: ufl.Form = density * self._strain.turn * ufl.inner(b, self._v) * self._body.dx_exact
         return self._at_load([work])
 
+    def seepage(self, pressure: Any) -> ufl.Form:
+        """Return the virtual work of the gradient of a pore pressure, in the undeformed body."""
+        p = as_expression(pressure, self._body, "pore_pressure", ())
+        force = -ufl.grad(p) * self._body.mass_ratio
+        work: ufl.Form = self._strain.turn * ufl.inner(force, self._v) * self._body.dx_exact
+        return self._at_load([work])
+
     def tractions(self, loads: Sequence[tuple[Any, int]], tags: Any) -> ufl.Form:
         """Return the virtual work of dead tractions."""
         ds = facet_measure(self._body, tags, loads, "tractions")

@@ -106,6 +106,11 @@ class Body:
         velocity: At the beginning, in a :class:`DynamicProblem`: a tuple, a function of coordinates
             ``(3, n)`` that returns ``(gdim, n)``, a Function, or a UFL expression on the body mesh.
         pore_fluid: The water in its pores, in a :class:`PorousProblem`.
+        pore_pressure: A pore pressure that is known, at full load: a :class:`WaterTable`, UFL on
+            the body mesh such as a Function of steady seepage, or a function that makes it from
+            the mesh. The material is then the law of the effective stress, the density that of soil
+            and water together, and the pressure acts by its gradient in the undeformed body: as
+            buoyancy and seepage. On its boundary it is held, or open water has the same pressure.
 
     Raises:
         MPMError: Something that is none of these, or differs between ranks.
@@ -123,6 +128,7 @@ class Body:
     initial_stress: Any = None
     velocity: Any = None
     pore_fluid: PoreFluid | None = None
+    pore_pressure: Any = None
 
     @collective()
     def __post_init__(self) -> None:
@@ -146,6 +152,10 @@ class Body:
         if self.pore_fluid is not None and not isinstance(self.pore_fluid, PoreFluid):
             raise MPMError(
                 f"pore_fluid must be an mpm.PoreFluid, not a {type(self.pore_fluid).__name__}."
+            )
+        if self.pore_fluid is not None and self.pore_pressure is not None:
+            raise MPMError(
+                "A body has a pore_fluid=, whose pressure is found, or a pore_pressure=."
             )
 
     def replace(self, **changes: Any) -> Body:
@@ -176,7 +186,7 @@ class Body:
             if loads:
                 acts.append(counted(len(loads), noun))
         more = [] if self.f_bar == "none" else [f"F-bar over each {self.f_bar}"]
-        more += [] if self.pore_fluid is None else ["water"]
+        more += [] if self.pore_fluid is None and self.pore_pressure is None else ["water"]
         return "; ".join([words, ", ".join(acts) or "no loads", *more])
 
     def carried(self) -> Body:
@@ -197,7 +207,7 @@ class Body:
         Raises:
             MPMError: Something lives on its present mesh.
         """
-        for name in ("density", "body_force", "tractions", "pressures"):
+        for name in ("density", "body_force", "tractions", "pressures", "pore_pressure"):
             if holds(getattr(self, name), ufl.core.expr.Expr):
                 raise MPMError(
                     f"{name} is written on the present body mesh, so {consequence}; give a "
@@ -220,7 +230,7 @@ class Body:
     def require_movable_nodes(self, consequence: str) -> None:
         """Raise an error unless the nodes of the body's mesh can be moved; see above."""
         self.require_movable(consequence)
-        for name in ("density", "body_force", "tractions", "pressures"):
+        for name in ("density", "body_force", "tractions", "pressures", "pore_pressure"):
             if holds(getattr(self, name), Callable):
                 raise MPMError(
                     f"{name} is a function of the mesh, whose nodes move, so {consequence}."

@@ -20,6 +20,7 @@ from ..meshes.quadrature import quadrature_rule
 from ..parallel.compilation import compiled_expression
 from ..particles.particles import Particles
 from ..reals import as_reals
+from .water_table import WaterTable
 
 __all__ = ["geostatic", "initial_stress_at_points"]
 
@@ -38,6 +39,7 @@ class _Geostatic:
         densities: Of each layer.
         ratios: K0 of each layer.
         loads: Vertical pressure where each begins.
+        water: The water in it, which carries a share of the stress, and may stand on it.
     """
 
     surface: float
@@ -47,6 +49,7 @@ class _Geostatic:
     densities: Array
     ratios: Array
     loads: Array
+    water: WaterTable | None
 
     def require_for(self, gdim: int) -> None:
         """Raise an error where gravity does not lie in a body's plane."""
@@ -61,6 +64,9 @@ class _Geostatic:
         layer = np.clip(np.searchsorted(self.tops, depth, side="right") - 1, 0, None)
         unit = self.densities[layer] * self.strength
         vertical = self.loads[layer] + unit * (depth - self.tops[layer])
+        if self.water is not None:
+            standing = self.water.on(self.surface, x)
+            vertical = vertical + standing - self.water.on(-(self.down @ x), x)
         vertical = np.where(depth >= 0.0, vertical, 0.0)
         along = np.outer(self.down, self.down)
         return np.asarray(
@@ -75,6 +81,7 @@ def geostatic(
     K0: float | Sequence[float],
     gravity: Sequence[float],
     surcharge: float = 0.0,
+    water: WaterTable | None = None,
 ) -> Callable[[Array], Array]:
     """Return the stress of level ground under its own weight, for ``initial_stress=``.
 
@@ -89,6 +96,8 @@ def geostatic(
         K0: Horizontal over vertical stress, a number or one for each layer.
         gravity: Force per mass, a vector, as it is given for ``body_force``.
         surcharge: Pressure on the surface.
+        water: Water in the ground: the stress is the effective one then, densities are those of
+            soil and water together, and K0 is that of effective stresses.
 
     Returns:
         A function of coordinates, shape ``(3, n)``, that returns Cauchy stresses ``(3, 3, n)``;
@@ -120,7 +129,10 @@ def geostatic(
         raise MPMError("geostatic needs gravity that is not zero.")
     weights = np.cumsum(densities[:-1] * np.diff(tops)) * strength
     loads = float(surcharge) + np.concatenate([[0.0], weights])
-    return _Geostatic(float(surface), strength, g / strength, tops, densities, ratios, loads)
+    if water is not None and not isinstance(water, WaterTable):
+        raise MPMError(f"water= of geostatic is an mpm.WaterTable, not a {type(water).__name__}.")
+    down = g / strength
+    return _Geostatic(float(surface), strength, down, tops, densities, ratios, loads, water)
 
 
 def initial_stress_at_points(value: Any, particles: Particles) -> Array:

@@ -405,6 +405,8 @@ class QuasiStaticProblem(ParticleProblem):
         loads: list[ufl.Form] = []
         if given.body_force is not None:
             loads.append(-work.body_force(mass, given.body_force))
+        if given.pore_pressure is not None:
+            loads.append(-work.seepage(given.pore_pressure))
         if given.tractions:
             loads.append(-work.tractions(given.tractions, given.facet_tags))
             symmetric = symmetric and not depends_on(loads[-1], body.displacement)
