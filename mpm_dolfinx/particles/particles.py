@@ -276,6 +276,10 @@ class Particles(MaterialDomains):
         Raises:
             MPMError: Shapes that do not fit, or lengths that are not positive.
         """
+        if not isinstance(V, fem.FunctionSpace):
+            raise MPMError(
+                f"V must be a dolfinx FunctionSpace on the background, not {type(V).__name__}."
+            )
         body = mesh_of_boxes(V.mesh.comm, points, lengths, V.mesh.geometry.dim)
         return cls(body, V, method=method, **options)
 

@@ -136,6 +136,10 @@ PARTICLES = {
         ),
         r"use quadrature_degree=2 or more, as nodes with unknowns of their own need",
     ),
+    "points without a background": (
+        lambda: mpm.Particles.from_points(np.full((1, 2), 0.5), 0.1, None),
+        r"V must be a dolfinx FunctionSpace on the background, not NoneType",
+    ),
     "free nowhere": (vectors(free=mpm.region(x=99.0)), r"No node of the body is where free="),
     "free, no place": (vectors(free="wall"), r"free= is a function of coordinates.*not 'wall'"),
     "free, broken": (vectors(free=lambda x: x[5]), r"The function free= failed with IndexError"),
