@@ -38,6 +38,10 @@ class Body(Protocol):
     def shares_nodes(self) -> bool:
         """Whether neighbours share their nodes."""
 
+    @property
+    def frees_by_itself(self) -> bool:
+        """Whether nodes are free as long as the domains around them are good."""
+
     def locate(self) -> None:
         """Find the background cells of all nodes (collective)."""
 
@@ -148,8 +152,8 @@ def chosen_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.bool_]:
     Args:
         W: Space on the body mesh.
         where: A function of undeformed coordinates, shape ``(3, n)``, such as ``mpm.region(...)``;
-            a pair of cell tags and a tag, or a list of tags: all nodes of these cells; or local
-            nodes of W, of which there may be none.
+            a pair of cell tags and a tag, or a list of tags: all nodes of these cells; local
+            nodes of W, of which there may be none; or ``"auto"``: all nodes.
 
     Raises:
         MPMError: Something else, or a place where no node is.
@@ -191,6 +195,8 @@ def _local_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.integer[Any]]:
     """Return local nodes of W."""
     layout = W.dofmap.index_map
     count = layout.size_local + layout.num_ghosts
+    if isinstance(where, str) and where == "auto":
+        return np.arange(count)
     if callable(where):
         x = W.tabulate_dof_coordinates()[:count].T
         try:
@@ -211,8 +217,8 @@ def _local_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.integer[Any]]:
         return nodes
     if not (isinstance(where, tuple) and len(where) == 2 and isinstance(where[0], mesh.MeshTags)):
         raise MPMError(
-            "free= is a function of coordinates such as mpm.region(...), (cell tags, tag), or a "
-            f"list of local nodes of W, not {where!r}."
+            "free= is 'auto', a function of coordinates such as mpm.region(...), (cell tags, tag), "
+            f"or a list of local nodes of W, not {where!r}."
         )
     tags, wanted = where
     body = W.mesh

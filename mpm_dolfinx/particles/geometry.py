@@ -208,6 +208,23 @@ class Geometry:
         """
         return self.orientation[:, None] * _determinants(self._corner_slopes, domains)
 
+    def quality(self, domains: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the mean ratio of the deformation of domains at their worst corner, ``(n,)``.
+
+        It is 1 where nothing changes shape, and 0 where a corner is flat or turned inside out
+        (Knupp 2001).
+
+        Args:
+            domains: Nodes of the owned domains, shape ``(n, k, gdim)``.
+        """
+        before, after = (
+            np.einsum("jqk,nki->nqij", self._corner_slopes, x) for x in (self.corners, domains)
+        )
+        F = after @ np.linalg.inv(before)
+        volume = np.maximum(np.linalg.det(F), 0.0)
+        ratio = self.gdim * volume ** (2.0 / self.gdim) / (F**2).sum(axis=(2, 3))
+        return np.asarray(ratio.min(axis=1, initial=1.0))
+
 
 def _determinants(slopes: NDArray[np.float64], domains: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return det dx/dxi of domains by derivatives of their shape functions, shape ``(n, nq)``."""

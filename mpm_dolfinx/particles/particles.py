@@ -98,8 +98,9 @@ class Particles(MaterialDomains):
             two triangles each.
         free: Which nodes are free at the beginning: a function of undeformed coordinates, shape
             ``(3, n)``, such as ``mpm.region(...)``; ``(cell_tags, tag)``, or with a list of tags:
-            all nodes of these cells; or local nodes of W, ``[]`` for none yet. ``None``: no node is
-            ever free.
+            all nodes of these cells; or local nodes of W, ``[]`` for none yet. ``"auto"``: all are,
+            each until the domains around it are distorted or about to leave the background.
+            ``None``: no node is ever free.
 
     Attributes:
         mesh: The body mesh, undeformed: ``body``, or its copy with ``partition="background"``.
@@ -125,6 +126,7 @@ class Particles(MaterialDomains):
         shares_nodes: Whether neighbours share their nodes, as with ``"cpdi2"``.
         rebases: How often the nodes of the mesh were moved.
         free_nodes: The free nodes as the system moves them; ``None`` without ``free=``.
+        frees_by_itself: Whether nodes are free as long as the domains around them are good.
         origin: Undeformed positions of the nodes of W where the body was rebased, otherwise
             ``None``.
 
@@ -182,7 +184,7 @@ class Particles(MaterialDomains):
             ranks = ranks_of_background(self.V, self._background, cell_centres(body))
             self._trail.append(move := Redistribution(body, ranks))
             body = move.mesh
-        self._has_free = free is not None
+        self._has_free, self.frees_by_itself = free is not None, _is_auto(free)
         self._settle(body)
         if self.free_nodes is not None:
             if isinstance(free, tuple):
@@ -421,8 +423,22 @@ class Particles(MaterialDomains):
                     "Nodes can be free where the particles were made so; make them with free=[] if "
                     "none is to be free at first."
                 )
-        self.free_nodes.choose(chosen_nodes(self.W, where))
+        self.frees_by_itself = _is_auto(where)
+        self.choose_free(chosen_nodes(self.W, where))
+
+    def choose_free(self, chosen: NDArray[np.bool_]) -> None:
+        """Let others of this rank's nodes of W, ghosts too, be free from the next step on."""
+        assert self.free_nodes is not None
+        self.free_nodes.choose(chosen)
         self._transfer = None
+
+    def quality(self, domains: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how little the shape of this rank's own domains has changed, shape ``(n,)``.
+
+        Args:
+            domains: Their nodes, shape ``(n, k, gdim)``.
+        """
+        return self._geometry.quality(domains)
 
     @property
     def moves_at_nodes(self) -> bool:
@@ -806,7 +822,8 @@ class Particles(MaterialDomains):
         d.array.reshape(-1, self._geometry.gdim)[self.domain_nodes] = arrays["displacement"]
         d.scatter_forward()
         if self.free_nodes is not None:
-            self.free = np.unique(self.domain_nodes[arrays["free"] > 0.5])
+            nodes = np.unique(self.domain_nodes[arrays["free"] > 0.5])
+            self.choose_free(chosen_nodes(self.W, nodes))
         if self.deletion is not None:
             self.deletion.restore(np.zeros_like(self.deletion.mask), arrays["kept"])
             self.deletion.restore(arrays["deleted"], arrays["kept"])
@@ -833,3 +850,8 @@ class Particles(MaterialDomains):
         self.increment.x.array[:] = 0.0
         if self.free_nodes is not None:
             self.free_nodes.roll_back()
+
+
+def _is_auto(free: Any) -> bool:
+    """Return whether nodes are to be free as long as the domains around them are good."""
+    return isinstance(free, str) and free == "auto"

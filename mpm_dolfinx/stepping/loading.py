@@ -37,6 +37,7 @@ from .automatic import ErrorControl, error_of_step
 from .control import Control, Converged, Progress, Run, StepControl
 from .diagnosis import count_folded, placed
 from .displacement_control import ControlledSystem, DisplacementControl
+from .freeing import carried_after, relieve
 from .leaving import may_stop, move_bodies
 
 __all__ = ["Mender", "Owner", "Recorder", "Stepper"]
@@ -326,6 +327,8 @@ class Stepper:
             self._leave(update)
         except TRIAL_ERRORS as error:
             self._take_back(run.size, end, str(error))
+            if relieve(owner.bodies, error):
+                return None
             gave_up = self.newton.gave_up
             if run.control.cut_back(gave_up):
                 owner.history.cutbacks += 1
@@ -410,10 +413,16 @@ class Stepper:
             self.run, self.converged.parameter = None, self.converged.load
             try:
                 load = float(owner.bodies[0].load.value)
-                self._release.aim(self._release.remaining)
-                self._set_load(load, self.converged.proportional)
-                step = self._advance(load, self.prescribed())
-                assert step is not None
+                step = None
+                while step is None:
+                    self._release.aim(self._release.remaining)
+                    self._set_load(load, self.converged.proportional)
+                    try:
+                        step = self._advance(load, self.prescribed())
+                    except TRIAL_ERRORS as error:
+                        self.go_back()
+                        if not relieve(owner.bodies, error):
+                            raise
             except BaseException as error:
                 self.go_back()
                 reached = self.converged.parameter
@@ -517,6 +526,11 @@ class Stepper:
         self._find_equilibrium(values, size, control, parameter)
         if (failure := owner.improper()) is not None:
             raise failure
+        carried = carried_after(owner.bodies)
+        if carried.too_late:
+            self._take_back(size, parameter, "free nodes left the background")
+            carried.apply()
+            return None
         if run is not None and self._reject(run, size, parameter):
             self.newton.experience = experience
             return None
@@ -546,6 +560,7 @@ class Stepper:
             reduced.end()
             for take in taken:
                 take()
+            carried.apply()
             count_folded(owner.bodies, owner.history.statistics)
             self._clean_up()
         newton = self.newton

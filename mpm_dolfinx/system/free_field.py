@@ -62,6 +62,11 @@ class FreeField(Field):
         fixed = super()._held()
         carried = fixed & ~self.nodes.dofs
         with agree(self._comm):
+            if fixed.any() and self.nodes.particles.frees_by_itself:
+                raise MPMError(
+                    "A Dirichlet condition on particles.W holds nodes that free='auto' may let the "
+                    "background carry; hold them by conditions on V or a support."
+                )
             if carried.any():
                 node = int(np.flatnonzero(carried)[0]) // self._bs
                 where = self.V.tabulate_dof_coordinates()[node, : self.V.mesh.geometry.dim]

@@ -115,6 +115,7 @@ class ReducedSystem:
         with self._statistics.phase("locate"):
             for _, motion in unknowns.places:
                 motion.particles.locate()
+        unknowns.follow()
         if unknowns.numbering is None:
             with self._statistics.phase("transfer"):
                 self._find_unknowns()

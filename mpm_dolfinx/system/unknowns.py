@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -63,6 +64,7 @@ class Unknowns:
         self.subspaces = Subspace.all_of(fields)
         self.numbering: Numbering | None = None
         self._transfers: dict[int, PETSc.Mat] = {}
+        self._found_by: list[Any] = []
 
     # -- Bodies -----------------------------------------------------------------------------------
 
@@ -137,11 +139,23 @@ class Unknowns:
         for block, part, numbers in parts:
             block.number(part, numbers, numbering.sizes)
         self._transfers = {}
+        self._found_by = self._by
         return numbering
+
+    @property
+    def _by(self) -> list[Any]:
+        return [motion.particles.transfer for _, motion in self.places]
+
+    def follow(self) -> None:
+        """Forget the unknowns where they were found by other transfers than the present ones."""
+        pairs = zip(self._found_by, self._by, strict=False)
+        if self.numbering is not None and any(one is not other for one, other in pairs):
+            self.forget()
 
     def forget(self) -> None:
         """Forget the unknowns."""
         self.numbering = None
+        self._found_by = []
         for field in self.fields:
             field.forget()
 

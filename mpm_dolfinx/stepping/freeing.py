@@ -1,0 +1,127 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Nodes that are free as long as the domains around them are good."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import MPMError
+from ..particles.free import chosen_nodes
+from ..particles.particles import Particles
+from ..transfer.matrix import transfer_matrix
+
+__all__ = ["Carried", "carried_after", "relieve"]
+
+#: Mean ratio of the deformation (1 undeformed, 0 flat) below which a domain is distorted: that of a
+#: simple shear by 2.4 in the plane, where finite elements begin to stiffen.
+LEAST_QUALITY = 0.25
+
+
+class Carried(NamedTuple):
+    """Nodes that the background carries from now on.
+
+    Attributes:
+        free: Bodies, and which of this rank's nodes of each stay free.
+        too_late: Whether a free node has left the background, which should have carried it.
+    """
+
+    free: Sequence[tuple[Particles, NDArray[np.bool_]]]
+    too_late: bool
+
+    def apply(self) -> None:
+        """Carry them."""
+        for body, free in self.free:
+            body.choose_free(free)
+
+
+def carried_after(bodies: Sequence[Particles]) -> Carried:
+    """Return the nodes that are to be carried after a solved step (collective).
+
+    They are those of domains that are distorted, or will be if the next step is like this one, and
+    those that are about to leave the background, with all that the background moves together with
+    them: a node that it carries alone is as free as before. What is carried stays so.
+
+    Args:
+        bodies: All bodies, not yet committed.
+    """
+    found, too_late = [], False
+    for body in bodies:
+        if not (body.frees_by_itself and _any(body, body.free)):
+            continue
+        free, moved = body.free, body.displacement.x.array.reshape(len(body.free), -1)
+        before = body.node_positions
+        after = before + moved - body.converged_displacement.reshape(moved.shape)
+        ahead = 2.0 * after - before
+        nodes = np.flatnonzero(free)
+        points = np.concatenate([x[nodes] for x in (before, after, ahead)])
+        was, stays, remains = body.background_basis.at(points).found.reshape(3, -1)
+        left = _any(body, was & ~stays)
+        too_late = too_late or left
+        here = before if left else after
+        seeds = np.zeros(len(free), dtype=bool)
+        seeds[nodes] = was & ~stays if left else stays & ~remains
+        quality = np.minimum(*(body.quality(x[body.domain_nodes]) for x in (after, ahead)))
+        seeds[body.domain_nodes[(quality < LEAST_QUALITY) & ~body.deleted]] = True
+        if (rest := _without(body, seeds & free, here)) is not None:
+            found.append((body, rest))
+    return Carried(found, too_late)
+
+
+def relieve(bodies: Sequence[Particles], error: MPMError) -> bool:
+    """Carry the free nodes of domains that an error names; return whether any are (collective).
+
+    Args:
+        bodies: All bodies, at their last converged step.
+        error: Why a step has failed.
+    """
+    found = []
+    for body in bodies:
+        if body.frees_by_itself:
+            named = np.isin(body.global_index, error.particles)
+            seeds = np.zeros(len(body.free), dtype=bool)
+            seeds[body.domain_nodes[named]] = True
+            if (rest := _without(body, seeds & body.free, body.node_positions)) is not None:
+                found.append((body, rest))
+    Carried(found, False).apply()
+    return bool(found)
+
+
+def _any(body: Particles, mask: NDArray[np.bool_]) -> bool:
+    """Return whether a mask is true anywhere on any rank (collective)."""
+    return bool(body.mesh.comm.allreduce(int(mask.any())))
+
+
+def _without(
+    body: Particles, seeds: NDArray[np.bool_], positions: NDArray[np.float64]
+) -> NDArray[np.bool_] | None:
+    """Return what stays free as nodes and what moves with them are carried (collective).
+
+    Args:
+        body: The body.
+        seeds: This rank's nodes that are to be carried.
+        positions: Where the nodes are.
+
+    Returns:
+        ``None`` where nothing changes.
+    """
+    if not _any(body, seeds):
+        return None
+    rows = body.background_basis.at(positions)
+    T = transfer_matrix(rows._replace(values=np.abs(rows.values)), body.W, body.V)
+    one, together = T.createVecLeft(), T.createVecRight()
+    bs = body.W.dofmap.index_map_bs
+    own = body.W.dofmap.index_map.size_local
+    # of seeds that another rank alone knows, too
+    one.array_w[:] = np.repeat(chosen_nodes(body.W, np.flatnonzero(seeds))[:own], bs)
+    T.multTranspose(one, together)
+    T.mult(together, one)
+    moved = (one.array_r > 0.0).reshape(-1, bs).any(axis=1)
+    carried = chosen_nodes(body.W, np.flatnonzero(moved)) & rows.found & body.free
+    for thing in (T, one, together):
+        thing.destroy()
+    return body.free & ~carried if _any(body, carried) else None

@@ -1,0 +1,150 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Nodes that are free until the domains around them are distorted or leave the background."""
+
+from contextlib import suppress
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import scenes
+from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD, at
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.materials import NeoHooke
+
+STEPS = 20
+
+
+def column(free="auto", cell=QUADRILATERAL, n=1, comm=WORLD, weight=1e4, f_bar=None):
+    """A column of rubber that sags under its weight, and rolls onto its base (half of it)."""
+    dim = 3 if cell == HEXAHEDRON else 2
+    thin = [0.25, n][: dim - 2]
+    body = scenes.box(
+        [0.0] * dim, [2.0, 4.0, *thin[:1]], [8 * n, 16 * n, *([1] * (dim - 2))], cell, comm
+    )
+    grid = scenes.box(
+        [0.0] * dim, [6.0, 5.0, *thin[:1]], [12 * n, 10 * n, *([1] * (dim - 2))],
+        HEXAHEDRON if dim == 3 else QUADRILATERAL, comm,
+    )  # fmt: skip
+    V = scenes.vectors(grid)
+    if free == "elements":
+        own = mpm.Particles(body)
+    else:
+        own = mpm.Particles(body, V, free=free, quadrature_degree=1 if cell == TRIANGLE else 2)
+    bcs = [mpm.held(own.V, 0, x=0.0), mpm.held(own.V, y=0.0)]
+    if dim == 3:
+        bcs += [mpm.held(own.V, 2, z=0.0), mpm.held(own.V, 2, z=0.25)]
+    options = {} if f_bar is None else {"f_bar": f_bar}
+    force = (0.0, -weight, 0.0)[:dim]
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(own, NeoHooke(1.5e4, 0.3), density=1.0, body_force=force, **options),
+        bcs=bcs,
+        solver=mpm.Solver(petsc_options={"snes_rtol": 1e-10}),
+    )
+    return problem, own
+
+
+def top(own):
+    """Height of the column."""
+    return own.mesh.comm.allreduce(own.domains[:, :, 1].max(initial=-np.inf), MPI.MAX)
+
+
+def lowest(own):
+    """Height of its lowest node."""
+    return own.mesh.comm.allreduce(own.domains[:, :, 1].min(initial=np.inf), MPI.MIN)
+
+
+def share_free(own):
+    """Share of the nodes that are free."""
+    chosen = scenes.gather(own.free[: own.W.dofmap.index_map.size_local].astype(float))
+    return float(chosen.mean())
+
+
+@pytest.mark.parametrize("cell", [QUADRILATERAL, TRIANGLE, HEXAHEDRON], ids=str)
+def test_a_run_goes_on_where_finite_elements_end(cell):
+    problem, own = column("elements", cell)
+    with suppress(mpm.MPMError):
+        problem.solve(STEPS)
+    assert lowest(own) < -0.01  # through the base
+    assert (problem.history.load[-1] < 1.0) == (cell != TRIANGLE)
+
+    problem, own = column("auto", cell)
+    assert share_free(own) == 1.0
+    problem.solve(STEPS)
+    assert problem.history.cutbacks == 0
+    assert 0.5 < share_free(own) < 1.0
+    assert lowest(own) > -1e-9
+    reaction = problem.reaction(problem.bcs[1])[1]
+    weight = 1e4 * scenes.total(own, own.initial_volume)
+    assert reaction == pytest.approx(weight, rel=1e-8)
+
+
+def test_without_distortion_it_is_a_body_of_finite_elements():
+    ends = []
+    for free in ("elements", "auto"):
+        problem, own = column(free, weight=1e3)
+        problem.solve(2)
+        ends.append(scenes.in_order(own, own.centroid))
+    assert share_free(own) == 1.0
+    np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-10)
+
+
+def test_any_number_of_ranks_carries_the_same_nodes():
+    found = []
+    for comm in (WORLD, MPI.COMM_SELF):
+        problem, own = column(comm=comm)
+        problem.solve(STEPS)
+        found.append((top(own), problem.history.total_iterations))
+    assert abs(found[0][0] - found[-1][0]) < 1e-8 and found[0][1] == found[-1][1]
+
+
+@pytest.mark.skip_in_parallel
+def test_single_steps_and_one_that_is_made_again():
+    problem, own = column(n=2)
+    for load in np.linspace(0.05, 1.0, 20):
+        own.load.value = load
+        problem.step()
+        assert lowest(own) > -1e-9 and float(own.load.value) == load
+    reasons = [attempt.reason for attempt in problem.history.taken_back]
+    assert reasons == ["free nodes left the background"]
+
+
+def test_a_run_goes_on_from_a_checkpoint_as_it_was(mpi_tmp_path):
+    whole, own = column()
+    steps = whole.steps(STEPS)
+    while share_free(own) == 1.0:
+        next(steps)
+    whole.save(mpi_tmp_path / "state")
+    for _ in steps:
+        pass
+    again, other = column()
+    again.restore(mpi_tmp_path / "state")
+    again.solve(STEPS)
+    assert np.array_equal(own.free, other.free)
+    scenes.assert_same_state(scenes.state(whole), scenes.state(again))
+
+
+def test_nodes_that_a_failed_step_left_may_be_freed():
+    """What is unknown follows the nodes that are free, after a step that was taken back too."""
+    ends = []
+    for fails in (False, True):
+        problem, own = column([], weight=2e3)
+        problem.solve(2)
+        if fails:
+            own.load.value = 1e3
+            with pytest.raises(mpm.MPMError):
+                problem.step()
+            own.load.value = 1.0
+        own.free = mpm.region(y=(-1.0, 2.0))
+        problem.step()
+        ends.append(scenes.in_order(own, own.centroid))
+    np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-8)
+
+
+def test_conditions_on_its_own_nodes_are_refused():
+    _, own = column()
+    body = mpm.Body(own, NeoHooke(1.0, 0.3))
+    with pytest.raises(mpm.MPMError, match="free='auto' may let the background carry"):
+        mpm.QuasiStaticProblem(body, bcs=[scenes.fix(own.W, at(1, 0.0))])
