@@ -144,10 +144,10 @@ class Unknowns:
 
     @property
     def _by(self) -> list[Any]:
-        return [motion.particles.transfer for _, motion in self.places]
+        return [motion.particles.node_basis for _, motion in self.places]
 
     def follow(self) -> None:
-        """Forget the unknowns where they were found by other transfers than the present ones."""
+        """Forget the unknowns where they were found by other rows of T than the present ones."""
         pairs = zip(self._found_by, self._by, strict=False)
         if self.numbering is not None and any(one is not other for one, other in pairs):
             self.forget()
