@@ -141,7 +141,10 @@ PARTICLES = {
         r"V must be a dolfinx FunctionSpace on the background, not NoneType",
     ),
     "free nowhere": (vectors(free=mpm.region(x=99.0)), r"No node of the body is where free="),
-    "free, no place": (vectors(free="wall"), r"free= is 'auto', a function of coordinates.*not 'wall'"),
+    "free, no place": (
+        vectors(free="wall"),
+        r"free= is 'auto', a function of coordinates.*not 'wall'",
+    ),
     "free, broken": (vectors(free=lambda x: x[5]), r"The function free= failed with IndexError"),
     "free, one for all": (vectors(free=lambda x: True), r"shape \(n,\), not \(\)"),
     "free, foreign tags": (
