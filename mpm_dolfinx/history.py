@@ -28,6 +28,8 @@ COUNTERS = (
     "predictions",
     "rejected_predictions",
     "second_attempts",
+    "alternations",
+    "field_solves",
     "rejected_steps",
     "factorisations",
     "krylov_iterations",
@@ -64,12 +66,12 @@ class Statistics(dict[str, float]):
     ``residuals`` and
     ``factorisations`` (or levels of multigrid made for a tangent), ``krylov_iterations`` (of solves
     with multigrid), ``multigrid_failures`` (how often a factorisation took over),
-    ``predictions`` (steps that began at the extrapolated increment) and
-    ``rejected_predictions``, ``second_attempts`` (at steps whose first one failed, from their
-    beginning), ``rejected_steps`` (which converged, and were taken back for their
-    error), ``halvings`` (of Newton steps by the line search), ``trusted_steps``
-    (series of them taken although the residual grew) and ``withdrawn_steps`` (where that came to
-    nothing),
+    ``predictions`` (steps that began at the extrapolated increment) and ``rejected_predictions``,
+    ``second_attempts`` (at steps whose first one failed, from their beginning), ``alternations``
+    (how often equations of fields were solved in turn with the displacements) and ``field_solves``
+    (linear solves for these), ``rejected_steps`` (which converged, and were taken back for their
+    error), ``halvings`` (of Newton steps by the line search), ``trusted_steps`` (series of them
+    taken although the residual grew) and ``withdrawn_steps`` (where that came to nothing),
     ``redirections`` (of Newton steps that a tangent which is not positive definite led uphill),
     ``converged_at_round_off`` (steps that ended at the floor of round-off),
     ``workspace_retries`` (factorisations that MUMPS repeated with more workspace),
@@ -144,6 +146,7 @@ class Step:
         output: Whether it ends at one of the levels that were asked for (``output_at``), or at the
             end of the run.
         error: What :meth:`ParticleProblem.error` found at its end, ``None`` where it was not asked.
+        alternations: How often equations of fields were solved in turn with the displacements.
     """
 
     load: float
@@ -153,6 +156,7 @@ class Step:
     time: float = 0.0
     output: bool = False
     error: float | None = None
+    alternations: int = 0
 
 
 @dataclass(frozen=True)

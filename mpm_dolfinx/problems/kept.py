@@ -326,7 +326,10 @@ class Past(Kept):
         return {
             "moduli": self._reduced.unknowns.moduli,
             "steps": [
-                [s.load, s.iterations, s.residuals, s.displacement, s.time, s.output]
+                [
+                    *(s.load, s.iterations, s.residuals, s.displacement),
+                    *(s.time, s.output, s.error, s.alternations),
+                ]
                 for s in history.steps
             ],
             "taken_back": [vars(attempt) for attempt in history.taken_back],

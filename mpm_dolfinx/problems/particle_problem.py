@@ -224,6 +224,7 @@ class ParticleProblem(Hooked):
             self._background,
             how,
             self._entity_maps,
+            [field for term in self.terms for field in term.solves],
         )
         parts.require_own_fields()
         self.body_terms = parts.body_terms()
@@ -258,7 +259,8 @@ class ParticleProblem(Hooked):
         )
         self._stepper.follow(reduced, newton, clean_up)
         for body in self.bodies:
-            body.attach_unknowns([one for one in self.fields if one.particles is body])
+            known = [*self.fields, *parts.alternating]
+            body.attach_unknowns([one for one in known if one.particles is body])
         self._constants, self._data = parts.constants(), parts.data_at_points()
 
     def _contributions(self) -> list[Contribution]:

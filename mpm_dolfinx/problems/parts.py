@@ -66,6 +66,7 @@ class Parts:
         background: Forms on the backgrounds, one, several or ``None``.
         solver: How the problem is solved.
         entity_maps: How body meshes are related to others that forms have Functions on.
+        alternating: Fields that terms solve for in turn with these unknowns.
     """
 
     bodies: Sequence[Particles]
@@ -75,6 +76,12 @@ class Parts:
     background: Any
     solver: Solver
     entity_maps: Any = None
+    alternating: Sequence[ParticleField] = ()
+
+    @property
+    def _known(self) -> list[ParticleField]:
+        """All fields whose changes the forms of bodies feel."""
+        return [*self.fields, *self.alternating]
 
     @property
     def _form_options(self) -> dict[str, Any]:
@@ -91,7 +98,7 @@ class Parts:
         mapped = self.entity_maps is not None
         for number, given in enumerate(self.contributions):
             for form, what in ((given.residual, "residual R"), (given.tangent, "tangent J")):
-                require_own_fields(form, number, self.bodies, what, self.fields, mapped)
+                require_own_fields(form, number, self.bodies, what, self._known, mapped)
 
     def _moves(self, given: Contribution) -> bool:
         """Return whether the displacement of a body is an unknown."""
@@ -117,7 +124,7 @@ class Parts:
                     body,
                     given.internal,
                     given.low_rank,
-                    [field for field in self.fields if field.particles is body],
+                    [field for field in self._known if field.particles is body],
                     **self._form_options,
                 ),
                 given.material,
@@ -222,5 +229,5 @@ class Parts:
 
     def data_at_points(self) -> set[fem.Function]:
         """Return Functions at quadrature points in the forms, without unknowns."""
-        own = {function for field in self.fields for function in (field, field.previous)}
+        own = {function for field in self._known for function in (field, field.previous)}
         return set().union(*map(data_at_points, self._forms)) - own

@@ -229,6 +229,43 @@ class NewtonSolver:
         self._predictions.lead = True
         self._factor.end()
 
+    def unbalanced(self) -> float:
+        """Return the relative residual at the last solution, evaluated anew (collective).
+
+        Raises:
+            MPMError: It cannot be evaluated.
+        """
+        assert self.x is not None and self.F is not None
+        self._evaluate(self.x)
+        if self._now.failure is not None:
+            raise self._now.failure
+        size, scale = norm(self.F), self._problem.scale(self.F)
+        return size / scale if scale > 0.0 else size
+
+    def go_on(self) -> None:
+        """Find a root from the last solution on, as what the residual depends on has changed.
+
+        The last evaluation must be there (:meth:`unbalanced`). Linear solves are counted on.
+
+        Raises:
+            MPMError: Why there is none.
+        """
+        assert self.x is not None and self.F is not None
+        last = self._now
+        now = self._attempt = Attempt(last.problem, last.shorten, False)
+        if self._search is not None:
+            self._search.begin(self._symmetric and now.problem.has_potential(), False, False)
+        self._factor.begin(self.x.getSize(), now.problem.levels, self.lets_go)
+        now.centre, now.first = self.x.copy(), norm(self.F)
+        self._set_tangent(now.problem.tangent())
+        now.fresh = now.known = True
+        self.x.copy(self._trial)
+        self.F.copy(self._R)
+        if not self._run(self.x):
+            assert now.failure is not None
+            raise now.failure
+        self._factor.end()
+
     def _start(self, sizes: tuple[int, int]) -> PETSc.Vec:
         """Return the zero vector of unknowns, with vectors and SNES of its size."""
         same = self.x is not None and self.x.getSizes() == sizes
@@ -276,6 +313,11 @@ class NewtonSolver:
         else:
             x.copy(self._trial)
             self._now.known = True
+        if self._run(x):
+            self._predictions.judge(predicted, self.iterations)
+
+    def _run(self, x: PETSc.Vec) -> bool:
+        """Let SNES iterate from x; return whether it has converged, else say why in the attempt."""
         with self.statistics.phase("solve"):
             self._run_snes(x)
         reason = self.snes.getConvergedReason()
@@ -284,9 +326,7 @@ class NewtonSolver:
                 f"PETSc's SNES {self.snes.getType()!r} ended by a test of its own "
                 f"({_reason(reason)}), not where the residual is small; use snes_type 'newtonls'."
             )
-        elif self._now.failure is None and reason > 0:
-            self._predictions.judge(predicted, self.iterations)
-        elif self._now.failure is None:
+        elif self._now.failure is None and reason <= 0:
             residual = self.residuals[-1] if self.residuals else np.nan
             if reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
                 why = "as a linear solve failed"
@@ -301,6 +341,7 @@ class NewtonSolver:
                 f"Newton's method stopped after {self.iterations} linear solves at a relative "
                 f"residual of {residual:.1e} ({why})"
             )
+        return self._now.failure is None
 
     def _run_snes(self, x: PETSc.Vec) -> None:
         """Let SNES iterate; an exception in a callback comes out as itself, not as PETSc's."""

@@ -18,11 +18,12 @@ from dolfinx import fem
 
 from ..errors import (
     TRIAL_ERRORS,
+    ConvergenceError,
     MPMError,
     ParticleOutsideError,
 )
 from ..history import Attempt, History, Step
-from ..log import STEPS, tell
+from ..log import NEWTON, STEPS, tell
 from ..parallel.boundary import of_user
 from ..parallel.garbage import Cleaner
 from ..parallel.interruption import Hold, Interrupted, held, interrupted, settle
@@ -41,6 +42,11 @@ from .freeing import carried_after, relieve
 from .leaving import may_stop, move_bodies
 
 __all__ = ["Mender", "Owner", "Recorder", "Stepper"]
+
+#: Residual of the displacements, relative to the forces, at which a step that alternates ends.
+ALTERNATED = 1e-6
+#: Alternations after which a step is given up.
+MOST_ALTERNATIONS = 5000
 
 type Path = Callable[[float], None]
 """A path of the user's: sets loads and conditions to their totals at t in (0, 1]."""
@@ -523,7 +529,7 @@ class Stepper:
             size = abs(parameter - control.present())
         displacement = None if control is None else parameter
         experience = self.newton.experience
-        self._find_equilibrium(values, size, control, parameter)
+        alternations = self._find_equilibrium(values, size, control, parameter)
         if (failure := owner.improper()) is not None:
             raise failure
         carried = carried_after(owner.bodies)
@@ -565,7 +571,15 @@ class Stepper:
             self._clean_up()
         newton = self.newton
         residuals = list(newton.residuals)
-        step = Step(parameter, newton.iterations, residuals, displacement, time, output)
+        step = Step(
+            parameter,
+            newton.iterations,
+            residuals,
+            displacement,
+            time,
+            output,
+            alternations=alternations,
+        )
         owner.history.steps.append(step)
         tell(
             self._comm,
@@ -584,12 +598,15 @@ class Stepper:
         size: float,
         control: DisplacementControl | None,
         goal: float,
-    ) -> None:
+    ) -> int:
         """Solve one step from where it is expected to end, or else from where it begins.
 
         A prediction from which Newton's method fails is not the start of a second attempt, nor is
         the step made smaller for it: most of what fails is near a solution that the prediction is
         far from.
+
+        Returns:
+            How often equations of terms were solved in turn with the displacements.
         """
         reduced, newton, again = self._reduced, self.newton, False
         before = self.converged.prescribed
@@ -602,7 +619,7 @@ class Stepper:
                 system = ControlledSystem(reduced, control, goal, self.owner.bodies)
             try:
                 newton.solve(system, reduced.unknowns.sizes, self.run is not None, again)
-                return
+                return self._alternate()
             except TRIAL_ERRORS:
                 if again or not newton.has_another_way:
                     raise
@@ -614,6 +631,30 @@ class Stepper:
             if control is not None:
                 self._set_load(self.converged.load, self.converged.proportional)
             reduced.terms.roll_back()
+
+    def _alternate(self) -> int:
+        """Solve equations of terms in turn with the displacements, until all hold together.
+
+        Returns:
+            How often it did.
+        """
+        terms, newton = self._reduced.terms, self.newton
+        if not terms.alternates:
+            return 0
+        for number in range(1, MOST_ALTERNATIONS + 1):
+            with self.owner.history.statistics.phase("solve"):
+                self.owner.history.statistics["field_solves"] += terms.take_turns()
+            self.owner.history.statistics.count("alternations")
+            left = newton.unbalanced()
+            tell(self._comm, NEWTON, "  alternation %d: residual %.2e", number, left)
+            if left <= ALTERNATED:
+                newton.residuals.append(left)
+                return number
+            newton.go_on()
+        raise ConvergenceError(
+            f"Displacements and other fields were not in equilibrium with each other after "
+            f"{MOST_ALTERNATIONS} alternations: {left:.1e} of the forces were left"
+        )
 
     def _look_at_loads(self, owner: Owner, run: Run, before: Sequence[NDArray[np.float64]]) -> None:
         """Warn where a path has set loads that the load factor multiplies besides (collective).

@@ -22,6 +22,7 @@ from ..constitutive.pressure import MeanStress
 from ..errors import MPMError
 from ..io.snapshot import Kept
 from ..parallel.boundary import Hooked, by_itself
+from ..particles.field import ParticleField
 from ..particles.particles import Particles
 from .own import OwnUnknowns
 
@@ -122,6 +123,25 @@ class Term(Hooked):
     def follows_load(self) -> bool:
         """Whether what the load factor does depends on the displacement."""
         return False
+
+    @property
+    def solves(self) -> Sequence[ParticleField]:
+        """The fields that :meth:`alternate` finds."""
+        return ()
+
+    def alternate(self) -> int:
+        """Solve its own equations at the displacements of the last evaluation.
+
+        It is called in turn with Newton's method for the displacements until these are in
+        equilibrium with what it has found: see :class:`mpm_dolfinx.FieldEquation`.
+
+        Returns:
+            The linear solves that it took.
+
+        Raises:
+            ConvergenceError: It does not converge, on all ranks; a smaller step is tried.
+        """
+        return 0
 
     @property
     def own(self) -> OwnUnknowns | None:

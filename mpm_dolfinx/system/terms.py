@@ -48,6 +48,15 @@ class Terms:
         """Whether a term may let bodies go and hold them again."""
         return any(term.one_sided for term in self._terms)
 
+    @property
+    def alternates(self) -> bool:
+        """Whether a term has equations that are solved in turn with the displacements."""
+        return any(term.solves for term in self._terms)
+
+    def take_turns(self) -> int:
+        """Let such terms solve their equations; return the linear solves that it took."""
+        return sum(term.alternate() for term in self._terms if term.solves)
+
     # -- Histories --------------------------------------------------------------------------------
 
     def update(self) -> BaseException | None:

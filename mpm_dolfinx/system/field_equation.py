@@ -1,0 +1,272 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Equations of fields on a body's own mesh, solved in turn with the displacements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, override
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ufl
+from dolfinx import fem
+
+from ..assembly.field_forms import FieldForms
+from ..errors import ConvergenceError, MPMError, agree
+from ..io.snapshot import Kept, Taken, fill, of_cells
+from ..meshes.remesh import Column
+from ..parallel.boundary import collective
+from ..parallel.given import is_number
+from ..parallel.totals import over_ranks
+from ..particles.field import ParticleField
+from ..particles.particles import Particles
+from .term import PointMaterial, Term
+
+__all__ = ["FieldEquation"]
+
+type Bound = float | fem.Function | str | None
+"""A number, a Function on the field's W, ``"previous"``, or none."""
+
+#: Step of Jacobi's method, relative to the largest value, below which an equation is solved.
+SOLVED = 1e-10
+#: Residual that the method of conjugate gradients leaves, relative to that before.
+LINEAR = 1e-13
+#: Solves with other sets of active bounds after which a solution is given up.
+MOST = 200
+
+
+class FieldEquation(Term):
+    """Equation of a field on a body's own mesh, which steps solve in turn with the displacements.
+
+    Give it to a problem among its ``terms``. The residual may depend on the displacement, on
+    ``field.previous`` and on any data; its derivative by the field must be symmetric and
+    positive, as that of an energy that has a minimum. Within each step the displacements are found
+    with the field as it is and the field with the displacements as they are, in turn, until both
+    hold together.
+
+    With bounds the energy is made least between them: the residual vanishes where the field is
+    between its bounds, and points into the bound where it is at one (a primal-dual active set:
+    Hintermüller, Ito & Kunisch 2002, SIAM J. Optim. 13).
+
+    Args:
+        field: The field, made by ``particles.field(Q, at="nodes", kind="body")``.
+        residual: Its residual, with a test function of ``field.W``.
+        lower: Least value: a number, a Function on ``field.W``, or ``"previous"``: the field never
+            falls below its values at the last converged step.
+        upper: Largest value, likewise.
+
+    Attributes:
+        field: As given.
+        lower: As given.
+        upper: As given.
+
+    Raises:
+        MPMError: A field of another kind, or bounds that make no sense.
+    """
+
+    from_outside = False
+    evaluation = "alternate()"
+
+    @collective()
+    def __init__(
+        self,
+        field: ParticleField,
+        residual: ufl.Form,
+        *,
+        lower: Bound = None,
+        upper: Bound = None,
+    ) -> None:
+        if not isinstance(field, ParticleField):
+            raise MPMError(f"A field equation is that of a field, not of {field!r}.")
+        body = field.particles
+        if not isinstance(body, Particles) or field.kind != "body" or field.at != "nodes":
+            raise MPMError(
+                f"The field '{field.name}' cannot be solved for in turn with the displacements; "
+                "make it by particles.field(Q, at='nodes', kind='body')."
+            )
+        super().__init__([body])
+        self.field, self.lower, self.upper = field, lower, upper
+        for bound in (lower, upper):
+            self._require_bound(bound)
+        self._forms = FieldForms(body, [field], None, [residual])
+        self._own = field.W.dofmap.index_map.size_local * field.W.dofmap.index_map_bs
+        self._comm: MPI.Comm = body.mesh.comm
+        self._number = self._body_number = 0
+        self._ksp = PETSc.KSP().create(self._comm)
+        self._ksp.setType("cg")
+        self._ksp.getPC().setType("jacobi")
+        self._ksp.setTolerances(rtol=LINEAR, max_it=10000)
+
+    def _require_bound(self, bound: Any) -> None:
+        known = bound is None or bound == "previous" or is_number(bound)
+        if isinstance(bound, fem.Function):
+            known = bound.function_space is self.field.W
+        if not known:
+            raise MPMError(
+                f"A bound of the field '{self.field.name}' must be a number, a Function on its W "
+                f"or 'previous', not {bound!r}."
+            )
+
+    # -- What a problem asks ---------------------------------------------------------------------
+
+    @property
+    @override
+    def symmetric(self) -> bool:
+        """It adds nothing to the tangent of the displacements."""
+        return True
+
+    @property
+    @override
+    def one_sided(self) -> bool:
+        return False
+
+    @property
+    @override
+    def solves(self) -> Sequence[ParticleField]:
+        return [self.field]
+
+    @override
+    def take_part(
+        self,
+        number: int,
+        bodies: Sequence[Particles],
+        materials: Sequence[PointMaterial | None],
+    ) -> None:
+        self._number = number
+        self._body_number = next(i for i, one in enumerate(bodies) if one is self.bodies[0])
+        with agree(self._comm):
+            if self.field.W.mesh is not self.bodies[0].mesh:
+                raise MPMError(
+                    f"The field '{self.field.name}' lives on a mesh that its body has left."
+                )
+
+    @override
+    def alternate(self) -> int:
+        self._forms.assemble_external()
+        p, own = self.field.x, self._own
+        lower, upper = self._bounds()
+        matrix: PETSc.Mat | None = None
+        for solves in range(MOST):
+            (residual,) = self._forms.assemble_residuals()
+            matrix = self._forms.assemble_tangents()[1, 1]
+            diagonal = matrix.getDiagonal().array_r
+            if over_ranks(self._comm, bool(np.any(diagonal <= 0.0)), MPI.LOR):
+                raise self._indefinite()
+            step = residual.array_r / diagonal
+            values = p.array[:own]
+            low, high = values - step <= lower, values - step >= upper
+            change = np.where(low, lower - values, np.where(high, upper - values, 0.0))
+            missed = np.where(low | high, np.abs(change), np.abs(step))
+            size = float(np.abs(values + change).max(initial=0.0))
+            missing, size = (
+                over_ranks(self._comm, number, MPI.MAX)
+                for number in (float(missed.max(initial=0.0)), size)
+            )
+            if not np.isfinite(missing):
+                break
+            if missing <= SOLVED * size:
+                p.array[:own] = np.clip(values, lower, upper)
+                p.scatter_forward()
+                return solves
+            p.array[:own] += self._solved(matrix, residual, low | high, change)
+            p.scatter_forward()
+        raise ConvergenceError(
+            f"The equation of the field '{self.field.name}' was not solved in {MOST} solves"
+        )
+
+    def _bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the least and the largest values of this rank's own dofs."""
+
+        def values(bound: Bound, none: float) -> NDArray[np.float64]:
+            if bound is None:
+                return np.full(self._own, none)
+            if isinstance(bound, str):
+                return np.array(self.field.previous.x.array[: self._own])
+            if isinstance(bound, fem.Function):
+                return np.array(bound.x.array[: self._own])
+            return np.full(self._own, float(bound))
+
+        lower, upper = values(self.lower, -np.inf), values(self.upper, np.inf)
+        return lower, np.maximum(lower, upper)
+
+    def _solved(
+        self,
+        matrix: PETSc.Mat,
+        residual: PETSc.Vec,
+        active: NDArray[np.bool_],
+        change: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Return Newton's step with the changes of active dofs given, on this rank's own dofs."""
+        x, b = matrix.createVecs()
+        x.array_w[:] = np.where(active, change, 0.0)
+        b.array_w[:] = -residual.array_r
+        first = matrix.getOwnershipRange()[0]
+        rows = (first + np.flatnonzero(active)).astype(PETSc.IntType)
+        matrix.zeroRowsColumns(rows, 1.0, x, b)
+        self._ksp.setOperators(matrix)
+        self._ksp.solve(b, x)
+        if self._ksp.getConvergedReason() < 0:
+            raise self._indefinite()
+        return np.where(active, change, x.array_r)
+
+    def _indefinite(self) -> ConvergenceError:
+        return ConvergenceError(
+            f"The tangent of the field '{self.field.name}' is not positive definite, as that of an "
+            "energy with a minimum is"
+        )
+
+    # -- History ---------------------------------------------------------------------------------
+
+    @override
+    def commit(self) -> Callable[[], None]:
+        before = self.field.previous.x.array.copy()
+        self.field.previous.x.array[:] = self.field.x.array
+
+        def undo() -> None:
+            self.field.previous.x.array[:] = before
+
+        return undo
+
+    @override
+    def roll_back(self) -> None:
+        self.field.x.array[:] = self.field.previous.x.array
+
+    @override
+    def kept(self) -> Sequence[Kept]:
+        return [_Values(self, self.name or f"equation{self._number}")]
+
+    def columns(self, body: int | None) -> dict[str, Column]:
+        """Return what is kept on a body, by its number in the problem."""
+        if body != self._body_number:
+            return {}
+        return {self.field.name: Column(of_cells(self.field.previous), "nodes")}
+
+    def take(self, taken: Taken) -> None:
+        """Take what was kept (collective)."""
+        fill(self.field.previous, taken.columns[self._body_number][self.field.name])
+        self.roll_back()
+
+
+class _Values(Kept):
+    """The converged values of a field.
+
+    Args:
+        equation: Its equation.
+        key: See :class:`Kept`.
+    """
+
+    def __init__(self, equation: FieldEquation, key: str) -> None:
+        self._equation, self.key = equation, key
+
+    @override
+    def columns(self, body: int | None) -> dict[str, Column]:
+        return self._equation.columns(body)
+
+    @override
+    def restore(self, taken: Taken) -> None:
+        self._equation.take(taken)
