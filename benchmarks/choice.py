@@ -245,7 +245,6 @@ GMSH_2 = {"background": partial(unstructured, 8.0, 0.8), "body": TETRAHEDRON, "d
 SCENES = [
     Scene("hexahedra", heavy, 9),
     Scene("ghost penalty", partial(heavy, stabilisation="ghost"), 9),
-    Scene("aggregation", partial(heavy, stabilisation="aggregate"), 10),
     Scene("elastic", partial(heavy, law=ELASTIC), 9),
     Scene("small strain", partial(heavy, law=SMALL), 9),
     Scene("Poisson's ratio 0.49", partial(heavy, law=NEARLY), 9),

@@ -42,7 +42,6 @@ COUNTERS = (
     "workspace_retries",
     "frozen_residual",
     "ghost_facets",
-    "aggregated_dofs",
     "joint_nodes",
     "folded_domains",
     "split_domains",
@@ -77,12 +76,11 @@ class Statistics(dict[str, float]):
     ``workspace_retries`` (factorisations that MUMPS repeated with more workspace),
     ``frozen_residual`` (the largest relative residual that a step left, nearly all in unknowns
     that move next to nothing),
-    ``ghost_facets`` and ``aggregated_dofs`` (facets with a ghost penalty, and dofs that follow
-    others, in the last step), ``joint_nodes`` (nodes of bodies that bear on another one and
-    follow the cell beside theirs, in the last step), ``folded_domains`` (the most after any step;
-    curved ones only), ``split_domains`` (quadrilaterals cut in two) and ``lost_particles``,
-    ``lost_volume`` (undeformed) and ``lost_mass`` (0 where no density is known), the sums over
-    ``history.losses``.
+    ``ghost_facets`` (with a ghost penalty, in the last step), ``joint_nodes`` (nodes of bodies
+    that bear on another one and follow the cell beside theirs, in the last step),
+    ``folded_domains`` (the most after any step; curved ones only), ``split_domains``
+    (quadrilaterals cut in two) and ``lost_particles``, ``lost_volume`` (undeformed) and
+    ``lost_mass`` (0 where no density is known), the sums over ``history.losses``.
     """
 
     def __init__(self) -> None:

@@ -77,7 +77,7 @@ class Parser(argparse.ArgumentParser):
         """Add the cures of badly supported dofs."""
         self.add_argument(
             "--stabilisation",
-            choices=("auto", "ghost", "aggregate", "none"),
+            choices=("auto", "ghost", "none"),
             default="auto",
             help="of badly supported dofs",
         )

@@ -163,7 +163,6 @@ CONDITIONS: dict[str, tuple[int, str | None, float]] = {
     "ghost penalty, $\\gamma = 10^{-6}$": (2, "ghost", 1e-6),
     "ghost penalty, $\\gamma = 10^{-5}$": (2, "ghost", 1e-5),
     "**ghost penalty, $\\gamma = 10^{-4}$**": (2, "ghost", 1e-4),
-    "aggregation": (2, "aggregate", 0.0),
     "degree 3, ghost penalty, $\\gamma = 10^{-4}$": (3, "ghost", 1e-4),
 }
 FRONTS: dict[str, tuple[Any, ...]] = {

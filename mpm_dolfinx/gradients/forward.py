@@ -256,7 +256,6 @@ class StepDerivative:
         for field, force, known, rate in zip(self._fields, forces, held, y_rate, strict=True):
             more = known.copy()
             field.add_product(rate, more, partial(self._reduced.terms.shear_moduli, field))
-            field.gather_extended(more)
             force.axpy(1.0, more)
 
     def _move(self, motion: Sequence[fem.Function], changes: Sequence[PETSc.Vec]) -> None:

@@ -82,7 +82,7 @@ class MovingProblem(TimeProblem):
             if term is not self.inertia:
                 term.pace(self.inertia.dt, self.inertia.scheme.share)
 
-    def _reduced_masses(self, masses: Masses) -> tuple[list[PETSc.Mat], list[Particles]]:
+    def _reduced_masses(self, masses: Masses) -> tuple[PETSc.Mat | None, list[Particles]]:
         """Return :meth:`.Tangent.masses` (collective)."""
         return self.reduced.tangent.masses(masses)
 

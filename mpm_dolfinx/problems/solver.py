@@ -42,7 +42,7 @@ class Solver:
             the residual there is not above twice that of a start from zero. Steps of a motion or
             of a consolidation start from the velocities or from rest.
         stabilisation: What is done about background dofs that the body supports badly:
-            ``"ghost"`` penalty, ``"aggregate"``, ``None``, or ``"auto"``, a ghost penalty where a
+            ``"ghost"`` penalty, ``None``, or ``"auto"``, a ghost penalty where a
             cut is small, on backgrounds of degree 2 or more and, on those of degree 1, while
             the bodies have hardly more nodes than the background (not beside ``background=``);
             with degree 1 ``"auto"`` also keeps joints between bodies shut

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The choice among cures of badly supported dofs."""
+"""The choice of what holds badly supported dofs."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from collections.abc import Sequence
 
 from ..errors import MPMError
 from ..particles.particles import Particles
-from .aggregation import Aggregation
-from .cure import Cure
 from .ghost_penalty import GhostPenalty
 from .joints import Joints
 
@@ -19,19 +17,19 @@ __all__ = ["STABILISATIONS", "joints_of", "stabilisation_of"]
 #: needs a penalty.
 CROWDED = 0.9
 #: Values of ``stabilisation`` besides ``None``.
-STABILISATIONS = ("auto", "ghost", "aggregate")
+STABILISATIONS = ("auto", "ghost")
 
 
 def stabilisation_of(
     kind: str | None, bodies: Sequence[Particles], background: bool = False
-) -> Cure:
-    """Return the cure of badly supported dofs.
+) -> GhostPenalty | None:
+    """Return the penalty on badly supported dofs, if there is one.
 
     Args:
-        kind: ``"ghost"``, ``"aggregate"``, ``None`` (nothing) or ``"auto"``: a ghost penalty
-            for a background of degree 2 or more; for degree 1 only while the bodies have hardly
-            more nodes than the background, for methods that move particles at their nodes, and
-            where there are no terms on the background.
+        kind: ``"ghost"``, ``None`` (nothing) or ``"auto"``: a ghost penalty for a background of
+            degree 2 or more; for degree 1 only while the bodies have hardly more nodes than the
+            background, for methods that move particles at their nodes, and where there are no
+            terms on the background.
         bodies: The bodies on one background space.
         background: Whether there are terms on the background.
 
@@ -42,13 +40,18 @@ def stabilisation_of(
     simple = bodies[0].V.ufl_element().degree == 1
     if bodies[0].is_free or (simple and kind == "auto" and background):
         kind = None
-    if kind == "aggregate" and any(body.free_nodes is not None for body in bodies):
-        raise MPMError(
-            "stabilisation='aggregate' is for bodies that the background carries as a whole; use "
-            "'ghost' or 'auto' with free nodes."
-        )
-    cure = _stabilisation(kind, bodies)
-    return Cure() if cure is None else cure
+    if kind is None:
+        return None
+    least = CROWDED if kind == "auto" and simple else 0.0
+    for body in bodies:
+        if not body.moves_at_nodes:
+            if least > 0.0:
+                return None
+            raise MPMError(
+                f"stabilisation={kind!r} is for the methods 'cpdi2' and 'cpdi', not for "
+                f"{body.method!r}; use stabilisation=None."
+            )
+    return GhostPenalty(bodies, least)
 
 
 def joints_of(kind: str | None, bodies: Sequence[Particles]) -> Joints | None:
@@ -61,18 +64,3 @@ def joints_of(kind: str | None, bodies: Sequence[Particles]) -> Joints | None:
     simple = bodies[0].V.ufl_element().degree == 1
     acts = kind == "auto" and simple and len(bodies) > 1
     return Joints(bodies) if acts and all(body.shares_nodes for body in bodies) else None
-
-
-def _stabilisation(kind: str | None, bodies: Sequence[Particles]) -> Cure | None:
-    if kind is None:
-        return None
-    least = CROWDED if kind == "auto" and bodies[0].V.ufl_element().degree == 1 else 0.0
-    for body in bodies:
-        if not body.moves_at_nodes:
-            if least > 0.0:
-                return None
-            raise MPMError(
-                f"stabilisation={kind!r} is for the methods 'cpdi2' and 'cpdi', not for "
-                f"{body.method!r}; use stabilisation=None."
-            )
-    return Aggregation(bodies) if kind == "aggregate" else GhostPenalty(bodies, least)

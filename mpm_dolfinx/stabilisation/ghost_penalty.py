@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import override
 
 from petsc4py import PETSc
 
@@ -20,7 +19,6 @@ from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
 from ..transfer.touched import TouchedNodes
 from .cell_fill import CellFill, poorly_filled
-from .cure import Cure
 
 __all__ = ["GhostPenalty"]
 
@@ -30,7 +28,7 @@ PENALTY = 1e-4
 MOST_SHAPES = 1000
 
 
-class GhostPenalty(Cure):
+class GhostPenalty:
     """Each badly filled cell is tied to the polynomials of its neighbours (Burman 2010).
 
     On facets between two cells that a body reaches into, of which one is filled below one
@@ -43,14 +41,18 @@ class GhostPenalty(Cure):
         bodies: The bodies (collective).
         least: Number of background nodes with weight over that of the bodies' nodes, below which
             there is no penalty.
+
+    Attributes:
+        acts: Whether there is a penalty where the bodies are now.
+        counts: Number of facets with a penalty, by the name of the statistics.
     """
 
     def __init__(self, bodies: Sequence[Particles], least: float = 0.0) -> None:
-        super().__init__()
         self._bodies = list(bodies)
         self._V = bodies[0].V
         self._least = least * sum(_num_nodes(body) for body in bodies)
-        self._acts = False
+        self.acts = False
+        self.counts: dict[str, int] = {}
         self._known: dict[bytes, NDArray[np.float64]] = {}
         self._chosen = np.zeros((0, 2), dtype=np.int64)
         self._unit: NDArray[np.float64] | None = None  # matrices of the pairs that are chosen
@@ -63,21 +65,23 @@ class GhostPenalty(Cure):
     def _polynomials(self) -> CellPolynomials:
         return CellPolynomials(self._V)
 
-    @property
-    @override
-    def penalises(self) -> bool:
-        return self._acts
+    def tie(self, touched: TouchedNodes) -> NDArray[np.bool_]:
+        """Tie cells together where the bodies are at the last converged step (collective).
 
-    @override
-    def unknowns(self, touched: TouchedNodes, held: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return the unknowns, with all dofs of cells that are tied together."""
+        Args:
+            touched: The nodes of V that they touch.
+
+        Returns:
+            Which of this rank's own nodes of V are unknowns: those with weight, and all of cells
+            that are tied together.
+        """
         active = touched.has_weight
-        self._acts = over_ranks(self._V.mesh.comm, len(touched.active)) >= self._least
-        if self._acts:
+        self.acts = over_ranks(self._V.mesh.comm, len(touched.active)) >= self._least
+        if self.acts:
             self._choose()
             active = active | self._marked
-        self.counts = {"ghost_facets": self._num_chosen if self._acts else 0}
-        return touched.on_dofs(active)
+        self.counts = {"ghost_facets": self._num_chosen if self.acts else 0}
+        return active
 
     def _choose(self) -> None:
         """Find the pairs of cells that are tied together."""
@@ -93,10 +97,12 @@ class GhostPenalty(Cure):
         self._marked = marked(self._V, cells.nodes[chosen])
         self._num_chosen: int = over_ranks(self._V.mesh.comm, len(chosen))
 
-    @override
-    def penalty(self, moduli: Sequence[float]) -> PETSc.Mat | None:
-        if not self._acts:
-            return None
+    def penalty(self, moduli: Sequence[float]) -> PETSc.Mat:
+        """Return the addition to the tangent on all dofs of V; its product is one to the residual.
+
+        Args:
+            moduli: Shear modulus of each body.
+        """
         chosen, cells, bs = self._chosen, self._cells, self._V.dofmap.index_map_bs
         body = np.asarray(moduli)
         total = self._shares.sum(axis=1)

@@ -107,7 +107,6 @@ class Balance:
             self._external = _External(self._external.staying, outer)
             for field in unknowns.fields:
                 field.add_residual(partial(self._terms.shear_moduli, field))
-                field.gather_extended(field.force)
         return None
 
     def _add_on_background(self, field: Field) -> float:
@@ -144,8 +143,6 @@ class Balance:
                 parts, size = term.load_derivative(order)
                 self._unknowns.add(term.bodies, parts, totals)
                 whole += size
-            for field, total in zip(self._unknowns.fields, totals, strict=True):
-                field.gather_extended(total)
             return totals, whole
 
     def works(self) -> NDArray[np.float64]:

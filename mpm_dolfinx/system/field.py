@@ -28,7 +28,7 @@ from ..particles.field import CarriedField
 from ..particles.free import FreeNodes
 from ..particles.particles import Particles
 from ..solvers.strategies import Coarsening
-from ..stabilisation.cure import Cure
+from ..stabilisation.ghost_penalty import GhostPenalty
 from ..stabilisation.joints import Joints
 from ..transfer.touched import TouchedNodes, TransferRows
 from .conditions import fixed_dofs
@@ -152,7 +152,7 @@ class Field:
         bodies: The bodies on this space, or the free nodes of one.
         conditions: Dirichlet conditions, of which those on this space count.
         background: Terms on it.
-        cure: What is done about dofs that the bodies support badly; ``None``: nothing.
+        ghosts: Penalty on dofs that the bodies support badly; ``None``: nothing.
         joints: What keeps the joints between bodies shut; ``None``: nothing.
 
     Attributes:
@@ -178,7 +178,7 @@ class Field:
         bodies: Sequence[Particles | CarriedField | FreeNodes],
         conditions: Sequence[fem.DirichletBC] = (),
         background: BackgroundForms | None = None,
-        cure: Cure | None = None,
+        ghosts: GhostPenalty | None = None,
         joints: Joints | None = None,
     ) -> None:
         self.bodies = list(bodies)
@@ -190,7 +190,7 @@ class Field:
         self._looked_up: list[fem.DirichletBC] | None = None
         self._lines: list[NDArray[np.float64]] | None = None
         self._background = background
-        self._cure = Cure() if cure is None else cure
+        self._ghosts = ghosts
         self._joints = joints
         self._comm: MPI.Comm = V.mesh.comm
         self._bs = V.dofmap.index_map_bs
@@ -205,7 +205,8 @@ class Field:
     def counts(self) -> dict[str, int]:
         """Numbers of badly supported dofs and of joints, by the names of the statistics."""
         joints = {} if self._joints is None else {"joint_nodes": self._joints.count}
-        return self._cure.counts | joints
+        ghosts = {} if self._ghosts is None else self._ghosts.counts
+        return ghosts | joints
 
     def begin(self, change: NDArray[np.float64], before: NDArray[np.float64] | None = None) -> None:
         """Take over the Dirichlet values of a step, on the local dofs of V.
@@ -224,16 +225,15 @@ class Field:
     def find(self) -> FreeDofs:
         """Find the unknowns: dofs with weight or a background term, and without a condition."""
         self.look()
-        supported = np.zeros(self._owned, dtype=bool)
+        ghosts = self._ghosts
+        active = self.touched.has_weight if ghosts is None else ghosts.tie(self.touched)
+        free = self.touched.on_dofs(active)
         if self._background is not None:
-            supported[self._background.support()] = True
-        free = self._cure.unknowns(self.touched, supported | self._fixed)
-        free |= supported & ~self._cure.followers(self._owned)
+            free[self._background.support()] = True
         self.dofs = np.flatnonzero(free & ~self._fixed).astype(np.int32)
         self.free = FreeDofs(self.V, self.dofs, self.touched)
-        self._extension = self._cure.extension(self._fixed)
         T = self.bodies[0].T
-        self.u, self.force, self._part = (T.createVecRight() for _ in range(3))
+        self.u, self.force = T.createVecRight(), T.createVecRight()
         for motion in self.motions:
             motion.begin()
         self._penalty: tuple[PETSc.Mat, PETSc.Mat] | None = None
@@ -280,20 +280,8 @@ class Field:
         self.part, self._numbers, self._sizes = part, numbers, sizes
         self._prolongation: PETSc.Mat | None = None
 
-    @property
-    def extends(self) -> bool:
-        """Whether dofs follow others."""
-        return self._cure.extends
-
     def restriction(self, rows: Sequence[TransferRows]) -> tuple[Restriction, tuple[int, int]]:
-        """Return where a tangent goes that is reduced by rows of T, and its size.
-
-        These are the unknowns or, where dofs follow others, all dofs of V.
-        """
-        if self.extends:
-            first, last = self.u.getOwnershipRange()
-            every = np.arange(first, last, dtype=np.int32)
-            return Restriction(self.touched, rows, every, slice(0, last - first)), self.u.getSizes()
+        """Return where a tangent goes that is reduced by rows of T, and its size."""
         numbers = np.full(self._owned, -1, dtype=np.int32)
         numbers[self.dofs] = self._numbers
         found = Restriction(self.touched, rows, numbers, self.part, self.factor)
@@ -311,10 +299,7 @@ class Field:
                 np.full(len(self.dofs), self.factor),
             )
             sizes = (self.u.getSizes(), self._sizes)
-            matrix = PETSc.Mat().createAIJ(sizes, csr=csr, comm=self._comm)
-            if self._extension is not None:
-                matrix = self._extension.matMult(matrix)
-            self._prolongation = matrix
+            self._prolongation = PETSc.Mat().createAIJ(sizes, csr=csr, comm=self._comm)
         return self._prolongation
 
     def level(self) -> FieldDofs:
@@ -352,23 +337,10 @@ class Field:
             motion.move(self.u)
 
     def _set(self, u: PETSc.Vec, x: PETSc.Vec, values: NDArray[np.float64]) -> None:
-        """Set u to the unknowns x, and to values at other dofs; dofs that follow others do."""
+        """Set u to the unknowns x, and to values at other dofs."""
         assert self.free is not None
         values[self.dofs] = self.factor * self.free.spread(x.array_r[self.part])
         u.array_w[:] = values
-        self._extend(u)
-
-    def _extend(self, u: PETSc.Vec) -> None:
-        """Give dofs that follow others their values."""
-        if self._extension is not None:
-            self._extension.mult(u, self._part)
-            self._part.copy(u)
-
-    def gather_extended(self, force: PETSc.Vec) -> None:
-        """Move what dofs feel that follow others to those that they follow."""
-        if self._extension is not None:
-            self._extension.multTranspose(force, self._part)
-            self._part.copy(force)
 
     def collect(self, force: PETSc.Vec, F: PETSc.Vec) -> None:
         """Set the unknowns' part of F to a force on all dofs of V."""
@@ -405,7 +377,6 @@ class Field:
     def driven(self, values: NDArray[np.float64]) -> PETSc.Vec:
         """Return the increment with values at the fixed dofs, on own dofs of V, and no unknowns."""
         self.u.array_w[:] = np.where(self._fixed, values, 0.0)
-        self._extend(self.u)
         return self.u
 
     def on_background(self, x: PETSc.Vec) -> PETSc.Vec:
@@ -431,7 +402,6 @@ class Field:
         assert self.free is not None
         fit = fit and all(body.shares_nodes for body in self.bodies)
         u = map_to_background([motion.T for motion in self.motions], increments, fit)
-        self._cure.stand_in(u)
         x.array_w[self.part] = self.free.collect(u[self.dofs]) / self.factor
 
     def reactions(self) -> float:
@@ -478,7 +448,7 @@ class Field:
         """
         if self._background is not None:
             self.force.axpy(1.0, self._background.assemble_residual())
-        if self._cure.penalises and self._sizes[1] > 0 and norm(self.u) > 0.0:
+        if self._penalised and self._sizes[1] > 0 and norm(self.u) > 0.0:
             self._matrices(stiffness)[0].multAdd(self.u, self.force, self.force)
 
     def tangents(self, stiffness: Callable[[], list[float]]) -> list[PETSc.Mat]:
@@ -488,7 +458,7 @@ class Field:
             whole = self._background.assemble_tangent()
             self._product = whole.ptap(self.prolongation, result=self._product)
             found.append(self._product)
-        if self._cure.penalises:
+        if self._penalised:
             found.append(self._matrices(stiffness)[1])
         return found
 
@@ -498,16 +468,19 @@ class Field:
         """Add the product of these tangents on all dofs of V with an increment."""
         if self._background is not None:
             self._background.assemble_tangent().multAdd(u, force, force)
-        if self._cure.penalises:
+        if self._penalised:
             self._matrices(stiffness)[0].multAdd(u, force, force)
+
+    @property
+    def _penalised(self) -> bool:
+        return self._ghosts is not None and self._ghosts.acts
 
     def penalty_force(self, moduli: Sequence[float]) -> PETSc.Vec:
         """Return the force of the penalty at the last increment with shear moduli (collective)."""
         force = self.u.duplicate()
         force.set(0.0)
-        matrix = self._cure.penalty(moduli) if self._cure.penalises else None
-        if matrix is not None:
-            matrix.mult(self.u, force)
+        if self._ghosts is not None and self._ghosts.acts:
+            self._ghosts.penalty(moduli).mult(self.u, force)
         return force
 
     def _matrices(self, stiffness: Callable[[], list[float]]) -> tuple[PETSc.Mat, PETSc.Mat]:
@@ -515,7 +488,7 @@ class Field:
         if self._penalty is None:
             if self.moduli is None:
                 self.moduli = stiffness()
-            matrix = self._cure.penalty(self.moduli)
-            assert matrix is not None
+            assert self._ghosts is not None
+            matrix = self._ghosts.penalty(self.moduli)
             self._penalty = matrix, matrix.ptap(self.prolongation)
         return self._penalty

@@ -152,11 +152,6 @@ class Subspace:
         return [Subspace(group) for group in found]
 
     @property
-    def extends(self) -> bool:
-        """Whether dofs follow others."""
-        return self.host.extends
-
-    @property
     def prescribes(self) -> bool:
         """Whether Dirichlet values change in the step that has begun."""
         return any(field.prescribes for field in self.fields)

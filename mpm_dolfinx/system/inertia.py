@@ -48,7 +48,7 @@ __all__ = ["Followed", "Inertia"]
 
 type DomainMasses = Callable[[int], NDArray[np.float64]]
 """Returns the consistent mass of each owned domain of a body, ``(n, k, k)``, by its number."""
-type ReducedMasses = Callable[[Masses], tuple[list[PETSc.Mat], list[Particles]]]
+type ReducedMasses = Callable[[Masses], tuple[PETSc.Mat | None, list[Particles]]]
 """Reduces masses of domains by compiled loops; see :meth:`.Tangent.masses`."""
 type Works = Callable[[], NDArray[np.float64]]
 """Returns the works of the last increment on the backgrounds; see :meth:`Field.works`."""
@@ -459,7 +459,7 @@ def _reduced(mass: NodalMass, transfers: list[PETSc.Mat], by_loops: ReducedMasse
     apart = [all(body is not one for one in bodies) for body in mass.bodies]
     others = [M.ptap(T) for M, T, own in zip(mass.matrices, transfers, apart, strict=True) if own]
     left = _sum(others) if others else None
-    projection = Projection(_sum([*known, *([] if left is None else [left])]))
+    projection = Projection(_sum([one for one in (known, left) if one is not None]))
     return _Reduced(transfers, apart, left, None if left is None else left.copy(), projection)
 
 

@@ -5,10 +5,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 from petsc4py import PETSc
 
@@ -22,7 +21,6 @@ from ..parallel.magnitudes import norm
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from .field import Field
-from .free_field import Subspace
 from .own import OwnUnknowns
 from .term import Term
 from .terms import Terms
@@ -34,26 +32,11 @@ type Pair = tuple[int, int]
 type Products = tuple[PETSc.Mat | None, PETSc.Mat | None, PETSc.Mat | None]
 
 
-class _Group(NamedTuple):
-    """Subspaces that the compiled loops reduce together.
-
-    Attributes:
-        subspaces: Where the bodies move.
-        bodies: The bodies.
-        loops: What reduces forms on these.
-    """
-
-    subspaces: list[Subspace]
-    bodies: list[Particles]
-    loops: FusedTangent
-
-
 @dataclass
 class _Made:
     """Matrices for the present unknowns, which numbers are put into again.
 
     Attributes:
-        extended: The tangent of each group where dofs follow others.
         products: A matrix of a term, ``K T`` and ``T^T K T``, by the term's number and places.
         matrices: All matrices of terms, by the same; they are those of the last tangent.
         sizes: Their absolute values, as far as asked for.
@@ -61,7 +44,6 @@ class _Made:
         total: Their sum.
     """
 
-    extended: list[PETSc.Mat | None]
     products: dict[tuple[int, Pair], Products] = dataclasses.field(default_factory=dict)
     matrices: list[Mapping[Pair, PETSc.Mat]] = dataclasses.field(default_factory=list)
     sizes: dict[tuple[int, Pair], PETSc.Mat] = dataclasses.field(default_factory=dict)
@@ -85,23 +67,13 @@ class Tangent:
         self._unknowns, self._terms, self._statistics = unknowns, terms, statistics
         self.mass_factor = 0.0
         self._coupled = [self._is_fused(term.coupling) for term in terms]
-        groups = [[one for one in unknowns.subspaces if not one.extends]]
-        groups += [[one] for one in unknowns.subspaces if one.extends]
-        self._groups = [
-            _Group(
-                group,
-                [body for own in pairs for body, _ in own],
-                FusedTangent(unknowns.comm, pairs, self._couplings_in(group), statistics),
-            )
-            for group in groups
-            if any(pairs := [self._fused_on(one.host) for one in group])
-        ]
-        self._made = _Made([])
-
-    @property
-    def loops(self) -> list[FusedTangent]:
-        """Of all fields together, and of each in which dofs follow others."""
-        return [group.loops for group in self._groups]
+        pairs = [self._fused_on(one.host) for one in unknowns.subspaces]
+        self.loops = (
+            FusedTangent(unknowns.comm, pairs, self._numbered_couplings(), statistics)
+            if any(pairs)
+            else None
+        )
+        self._made = _Made()
 
     # -- What the compiled loops reduce -----------------------------------------------------------
 
@@ -111,15 +83,11 @@ class Tangent:
         return [pair for pair in every if any(pair[0] is body for body in field.bodies)]
 
     def _is_fused(self, coupling: Coupling | None) -> bool:
-        """Return whether the compiled loops reduce what couples a body and a field on it.
-
-        Not where dofs follow others: then the tangent of a displacement is made by itself.
-        """
+        """Return whether the compiled loops reduce what couples a body and a field on it."""
         if coupling is None:
             return False
-        moving, other = (self._unknowns.place(place)[0] for place in coupling.places)
-        reduced = any(body is coupling.places[0] for body, _ in self._fused_on(moving))
-        return reduced and not moving.extends and not other.extends
+        moving = self._unknowns.place(coupling.places[0])[0]
+        return any(body is coupling.places[0] for body, _ in self._fused_on(moving))
 
     @property
     def _couplings(self) -> list[Coupling]:
@@ -127,13 +95,13 @@ class Tangent:
         pairs = zip(self._terms, self._coupled, strict=True)
         return [term.coupling for term, coupled in pairs if coupled and term.coupling is not None]
 
-    def _couplings_in(self, group: Sequence[Subspace]) -> list[tuple[int, int, Coupling]]:
-        """Return the couplings of fields in a group that compiled loops reduce, with numbers."""
-        found, hosts = [], [one.host for one in group]
+    def _numbered_couplings(self) -> list[tuple[int, int, Coupling]]:
+        """Return :attr:`_couplings` with the numbers of their subspaces."""
+        hosts = [one.host for one in self._unknowns.subspaces]
+        found = []
         for coupling in self._couplings:
-            i, j = (self._unknowns.place(place)[0] for place in coupling.places)
-            if i in hosts:
-                found.append((hosts.index(i), hosts.index(j), coupling))
+            i, j = (hosts.index(self._unknowns.place(place)[0]) for place in coupling.places)
+            found.append((i, j, coupling))
         return found
 
     def _reduced_on(self, field: Field) -> list[Particles | CarriedField]:
@@ -144,12 +112,13 @@ class Tangent:
 
     def renew(self) -> None:
         """Take over the present unknowns."""
-        self._made = _Made([None] * len(self._groups))
-        for group in self._groups:
-            reduced = [one.restriction(self._reduced_on(one.host)) for one in group.subspaces]
-            group.loops.restrict([restriction for restriction, _ in reduced], reduced[0][1])
+        self._made = _Made()
+        if self.loops is not None:
+            subspaces = self._unknowns.subspaces
+            reduced = [one.restriction(self._reduced_on(one.host)) for one in subspaces]
+            self.loops.restrict([restriction for restriction, _ in reduced], reduced[0][1])
 
-    def masses(self, masses: Masses) -> tuple[list[PETSc.Mat], list[Particles]]:
+    def masses(self, masses: Masses) -> tuple[PETSc.Mat | None, list[Particles]]:
         """Reduce the mass of bodies by the compiled loops, as far as these know them.
 
         From now on, in this step, tangents have it :attr:`mass_factor` times.
@@ -158,18 +127,14 @@ class Tangent:
             masses: Of domains.
 
         Returns:
-            Matrices of all unknowns, of which the sum is the reduced mass, and the bodies of which.
+            The reduced mass, ``None`` without any, and the bodies of which it is.
         """
-        parts, known = [], []
-        for group in self._groups:
-            its = [(body, own) for body, own in masses if any(body is b for b in group.bodies)]
-            if not its:
-                continue
-            whole = group.loops.weigh(its)
-            host = group.subspaces[0].host
-            parts.append(whole.ptap(host.prolongation) if host.extends else whole)
-            known += [body for body, _ in its]
-        return parts, known
+        subspaces = self._unknowns.subspaces
+        fused = [body for one in subspaces for body, _ in self._fused_on(one.host)]
+        its = [(body, own) for body, own in masses if any(body is one for one in fused)]
+        if self.loops is None or not its:
+            return None, []
+        return self.loops.weigh(its), [body for body, _ in its]
 
     # -- The tangent ------------------------------------------------------------------------------
 
@@ -178,7 +143,10 @@ class Tangent:
         unknowns, made = self._unknowns, self._made
         with self._statistics.phase("assemble"):
             reduced = [K for term in self._terms for K in term.reduced_tangents(unknowns.transfer)]
-            parts = [self._of_group(number) for number in range(len(self._groups))]
+            parts = []
+            if self.loops is not None:
+                keep = [one.prescribes for one in unknowns.subspaces]
+                parts.append(self.loops.assemble(keep, self.mass_factor))
             made.matrices = [
                 {} if coupled else term.tangents()
                 for term, coupled in zip(self._terms, self._coupled, strict=True)
@@ -198,15 +166,6 @@ class Tangent:
                 made.zeros = made.zeros or self._zeros_on_diagonal()
                 parts.append(made.zeros)
             return made.total.of(parts)
-
-    def _of_group(self, number: int) -> PETSc.Mat:
-        subspaces, _, loops = self._groups[number]
-        whole = loops.assemble([one.prescribes for one in subspaces], self.mass_factor)
-        if not subspaces[0].extends:
-            return whole
-        extended = self._made.extended
-        extended[number] = whole.ptap(subspaces[0].host.prolongation, result=extended[number])
-        return extended[number]
 
     @property
     def _has_diagonal(self) -> bool:
@@ -257,12 +216,12 @@ class Tangent:
         fields, forces = unknowns.fields, unknowns.zeros()
         for field, force in zip(fields, forces, strict=True):
             field.add_product(field.lift(), force, partial(self._terms.shear_moduli, field))
-        for subspaces, _, loops in self._groups:
-            for number, one in enumerate(subspaces):
-                if one.prescribes:
-                    product = one.split(loops.multiply(number, one.increment()))
-                    for field, part in zip(one.fields, product, strict=True):
-                        forces[fields.index(field)].array_w[:] += part
+        loops = self.loops
+        for number, one in enumerate(unknowns.subspaces):
+            if loops is not None and one.prescribes:
+                product = one.split(loops.multiply(number, one.increment()))
+                for field, part in zip(one.fields, product, strict=True):
+                    forces[fields.index(field)].array_w[:] += part
         lifts = [field.u for field in fields]
         on_own: list[tuple[OwnUnknowns, PETSc.Vec]] = []
         for term, matrices in zip(self._terms, self._made.matrices, strict=True):
@@ -281,8 +240,6 @@ class Tangent:
             unknowns.add(term.bodies, term.reduced_product(motions), forces)
             if coupled:
                 unknowns.add(term.bodies, term.stiffness_force(motions), forces)
-        for field, force in zip(fields, forces, strict=True):
-            field.gather_extended(force)
         reduced = unknowns.restricted(forces)
         for own, force in on_own:
             own.selection.multTransposeAdd(force, reduced, reduced)

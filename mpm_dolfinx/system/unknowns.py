@@ -234,6 +234,4 @@ class Unknowns:
         """Return the coefficients on the unknowns of a functional on a body's W."""
         totals = self.zeros()
         self.add([body], [row], totals)
-        for field, total in zip(self.fields, totals, strict=True):
-            field.gather_extended(total)
         return self.restricted(totals)

@@ -87,7 +87,6 @@ KINDS = {
     "axisymmetric patch": {"axisymmetric": True, "f_bar": "patch"},
     "degree 2": {"degree": 2, "quadrature_degree": 4},
     "ghost": {"stabilisation": "ghost"},
-    "aggregate": {"stabilisation": "aggregate"},
     "finite elements": {"free": True},
     "space": {"gdim": 3, "cell": HEXAHEDRON},
     "space patch": {"gdim": 3, "cell": HEXAHEDRON, "f_bar": "patch", "stabilisation": "ghost"},

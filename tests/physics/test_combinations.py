@@ -57,7 +57,6 @@ FEATURES = {
     "DruckerPrager": {"law": DruckerPrager(YOUNG, POISSON, 4.0, 30.0)},
     "ModifiedCamClay": {"law": ModifiedCamClay(0.02, 0.004, 2.5, 400.0, 5.0, 1.0)},
     "ghost": {"stabilisation": "ghost"},
-    "aggregate": {"stabilisation": "aggregate"},
     "path": {"stage": "path"},
     "control": {"stage": "control"},
     "split": {"split": True},

@@ -469,7 +469,6 @@ SCENES = {
     "space": kept(scene={"dim": 3}),
     "tetrahedra": kept(scene={"dim": 3, "cell": TETRAHEDRON}, f_bar="patch"),
     "ghost penalty": kept(stabilisation="ghost"),
-    "aggregation": kept(stabilisation="aggregate"),
     "reference": by_reference,
     "loads": loaded,
     **{kind: of(supported, kind) for kind in ("fixed", "roller")},

@@ -189,11 +189,10 @@ def two_lifts(**options):
         driven,
         two_lifts,
         lambda: beam(cell=TETRAHEDRON),
-        lambda: beam(stabilisation="aggregate"),
         lambda: shell(cells=2),
         lambda: turning("midpoint"),
     ],
-    ids=["driven", "two lifts", "in space", "aggregate", "revolution", "motion"],
+    ids=["driven", "two lifts", "in space", "revolution", "motion"],
 )
 def test_the_tangent_by_both_routes(make, take):
     """What the compiled loops add up domain by domain are products of matrices, to round-off."""

@@ -69,7 +69,6 @@ def assert_same(direct, multigrid, failures=0):
         (20, {"cell": TRIANGLE}),
         (20, {"bent": 0.004, "stabilisation": "ghost"}),
         (20, {"stabilisation": None}),
-        (20, {"stabilisation": "aggregate"}),
         (9, {"degree": 2}),
         (9, {"degree": 2, "cell": TRIANGLE}),
         (6, {"degree": 3}),

@@ -31,12 +31,11 @@ def polynomial(V, degree):
     return u
 
 
-def look(cure, particles):
-    """Let a cure look at one body; return which own dofs are unknowns."""
+def look(ghosts, particles):
+    """Tie cells of one body together; return which own nodes are unknowns."""
     owned = particles.W.dofmap.index_map.size_local
     touched = TouchedNodes(particles.V, [particles.node_basis], [owned])
-    held = np.zeros(len(scenes.own(particles.increment)), dtype=bool)
-    return cure.unknowns(touched, held)
+    return ghosts.tie(touched)
 
 
 def vector(matrix, function):

@@ -355,7 +355,7 @@ def high_order(rng: Random, index: int) -> Scene:
         degree=degree,
         domain_degree=degree,
         weight=down(between(rng, 1e-4, 5e-3)),
-        options={"stabilisation": pick(rng, "auto", "ghost", "aggregate")},
+        options={"stabilisation": pick(rng, "auto", "ghost")},
         steps=2,
         limit=120.0,
     )
@@ -463,7 +463,7 @@ def flow_high_order(rng: Random, index: int) -> Scene:
         domain_degree=2,
         weight=down(between(rng, 1.0, 4.0) * rho_y),
         support="roll",
-        options={"stabilisation": pick(rng, "auto", "aggregate", None)},
+        options={"stabilisation": pick(rng, "auto", "ghost", None)},
         steps=10,
         limit=300.0,
     )

@@ -104,11 +104,10 @@ def load(problem, bcs):
     [
         {},
         {"route": "reference"},
-        {"stabilisation": "aggregate"},
         {"stabilisation": "ghost"},
         {"predictor": False, "line_search": False},
     ],
-    ids=["loops", "reference", "aggregate", "ghost", "plain"],
+    ids=["loops", "reference", "ghost", "plain"],
 )
 def test_bodies_on_backgrounds_of_their_own_do_not_know_of_each_other(options, take):
     options = dict(options)
@@ -215,12 +214,11 @@ def test_bodies_of_one_problem_share_space_and_ranks():
     [
         {},
         {"route": "reference"},
-        {"stabilisation": "aggregate"},
         {"background": True},
         {"f_bar": "patch"},
         {"f_bar": "patch", "route": "reference"},
     ],
-    ids=["loops", "reference", "aggregate", "background", "patch", "patch by reference"],
+    ids=["loops", "reference", "background", "patch", "patch by reference"],
 )
 def test_the_tangent_is_one_object_within_a_step(options, take):
     options = dict(options)

@@ -274,14 +274,6 @@ def test_conditions_on_free_nodes_do_not_follow_to_another_mesh():
             move()
 
 
-def test_dofs_that_follow_others_are_refused_beside_free_nodes():
-    own = mpm.Particles(body_in(QUADRILATERAL), around(), free=right)
-    with pytest.raises(mpm.MPMError, match="'ghost' or 'auto' with free nodes"):
-        mpm.QuasiStaticProblem(
-            mpm.Body(own, Hencky(YOUNG, POISSON)), solver=mpm.Solver(stabilisation="aggregate")
-        )
-
-
 def test_a_stage_lets_go_of_free_nodes_that_a_condition_on_the_background_held(mpi_tmp_path):
     # They hang on a wall on a grid line; it is taken away over four steps.
     def made(free):
