@@ -279,22 +279,21 @@ def test_both_routes_conserve_alike():
 
 
 @pytest.mark.parametrize(
-    ("cell", "degree", "stabilisation", "method"),
+    ("cell", "degree", "method"),
     [
-        (QUADRILATERAL, 1, None, "cpdi2"),
-        (TRIANGLE, 1, "ghost", "cpdi2"),
-        (QUADRILATERAL, 1, None, "gimp"),
-        (QUADRILATERAL, 2, "ghost", "cpdi2"),
-        (TRIANGLE, 3, "ghost", "cpdi2"),
-        (HEXAHEDRON, 1, None, "cpdi2"),
+        (QUADRILATERAL, 1, "cpdi2"),
+        (TRIANGLE, 1, "cpdi2"),
+        (QUADRILATERAL, 1, "gimp"),
+        (QUADRILATERAL, 2, "cpdi2"),
+        (TRIANGLE, 3, "cpdi2"),
+        (HEXAHEDRON, 1, "cpdi2"),
     ],
 )
-def test_masses_reduced_domain_by_domain_are_those_of_stock_forms(
-    cell, degree, stabilisation, method, take
-):
+def test_masses_reduced_domain_by_domain_are_those_of_stock_forms(cell, degree, method, take):
     # A linear body takes one solve if its tangent is exact; that of the reference route is made of
     # sparse products.
     gdim = 3 if cell == HEXAHEDRON else 2
+    lows, size = ((0.31, 1.17), 0.5) if degree == 1 else ((0.02, 1.22), 0.76)  # (no slivers)
     runs = []
     for route in ROUTES:
         take(route)
@@ -303,12 +302,12 @@ def test_masses_reduced_domain_by_domain_are_those_of_stock_forms(
             V = vectors(V.mesh, degree)
         bodies = [
             mpm.Particles(
-                box([low] * gdim, [low + 0.5] * gdim, [3] * gdim, cell),
+                box([low] * gdim, [low + size] * gdim, [3] * gdim, cell),
                 V,
                 degree=degree,
                 method=method,
             )
-            for low in (0.31, 1.17)
+            for low in lows
         ]
         problem = posed(
             mpm.DynamicProblem,
@@ -316,7 +315,7 @@ def test_masses_reduced_domain_by_domain_are_those_of_stock_forms(
             LinearElastic(10.0, 0.3),
             [1.0 + ufl.SpatialCoordinate(body.mesh)[0] for body in bodies],
             velocity=lambda x: np.stack([np.sin(7 * x[i] + i) for i in range(gdim)]),
-            stabilisation=stabilisation,
+            stabilisation=None,
         )
         problem.solve(0.02, 0.01)
         assert [step.iterations for step in problem.history.steps] == [1, 1]
