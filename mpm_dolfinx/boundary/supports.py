@@ -170,18 +170,19 @@ class Support:
                 stacklevel=6,
             )
 
-    def follow(self, moduli: Callable[[], NDArray[np.float64]]) -> NDArray[np.float64]:
+    def follow(self, moduli: Callable[[], NDArray[np.float64]]) -> None:
         """Choose the stiffness again, unless a modulus was given (collective).
 
         Args:
             moduli: As for :meth:`at_body`.
-
-        Returns:
-            The stiffness in each cell, to be set.
         """
         if self._found is not None:
             self.forget_modulus()
             self._scale_by(moduli)
+
+    @property
+    def stiffness(self) -> NDArray[np.float64]:
+        """The stiffness in each cell, to be set."""
         return np.asarray(self._stiffness.x.array)
 
     def _scale_by(self, moduli: Callable[[], NDArray[np.float64]]) -> None:
@@ -240,6 +241,14 @@ class Support:
 
     def settle(self) -> None:
         """Take the present state for the beginning of the next step (collective)."""
+
+    def beginning(self) -> list[NDArray[np.float64]]:
+        """Return the arrays of :meth:`settle`, to be set."""
+        return []
+
+    def at_end(self) -> list[NDArray[np.float64]]:
+        """Return what :meth:`settle` would make of them."""
+        return []
 
     def step_work(self) -> tuple[float, float]:
         """Return this rank's work done in the last step against the traction of the whole step.
@@ -326,6 +335,14 @@ class Dashpot(Support):
         self._start.settle()
 
     @override
+    def beginning(self) -> list[NDArray[np.float64]]:
+        return self._start.copies()
+
+    @override
+    def at_end(self) -> list[NDArray[np.float64]]:
+        return self._start.present()
+
+    @override
     def step_work(self) -> tuple[float, float]:
         d = self.particles.displacement
         self._last = super().reaction
@@ -350,6 +367,14 @@ class _Start:
                 self._copies.append((value, _copy_of(value)))
         return ufl.replace(expression, dict(self._copies))
 
+    def copies(self) -> list[NDArray[np.float64]]:
+        """Return the values at the beginning, to be set."""
+        return [_values_of(before) for _, before in self._copies]
+
+    def present(self) -> list[NDArray[np.float64]]:
+        """Return the values now."""
+        return [_values_of(value).copy() for value, _ in self._copies]
+
     def settle(self) -> None:
         """Take the present values."""
         for value, before in self._copies:
@@ -357,6 +382,11 @@ class _Start:
                 before.x.array[:] = value.x.array
             else:
                 np.copyto(before.value, value.value)
+
+
+def _values_of(value: Any) -> NDArray[np.float64]:
+    """Return the values of a Function or Constant, to be set."""
+    return np.asarray(value.x.array if isinstance(value, fem.Function) else value.value)
 
 
 def _copy_of(value: Any) -> Any:

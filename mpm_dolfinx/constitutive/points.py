@@ -182,6 +182,16 @@ class MaterialPoints:
         finally:
             self._asks_tangents = True
 
+    @contextmanager
+    def in_no_time(self) -> Iterator[None]:
+        """Let no time pass in updates in the block."""
+        duration = self._assignment.duration
+        self.pace(0.0)
+        try:
+            yield
+        finally:
+            self.pace(duration)
+
     def pace(self, duration: float) -> None:
         """Let updates be those of steps of a duration; without a call no time passes."""
         self._assignment.pace(duration)
@@ -282,13 +292,11 @@ class MaterialPoints:
         The update that asks for their stress takes no time: what flows goes on to.
         """
         self._last = self._last._replace(states=states)
-        duration = self._assignment.duration
-        self.pace(0.0)
-        try:
-            with agree(self._particles.mesh.comm) if self.averaging is None else nullcontext():
-                self.update()
-        finally:
-            self.pace(duration)
+        with (
+            self.in_no_time(),
+            agree(self._particles.mesh.comm) if self.averaging is None else nullcontext(),
+        ):
+            self.update()
         self._trial = states
         self._make_last(states, self.first_piola.copy())
 
@@ -539,11 +547,13 @@ class MaterialPoints:
                 answer, volume = self._at_pressure(self.mean_stress, part, its, state)
                 volumes.append((part.points, volume))
             if everywhere:
-                self.first_piola, self.tangent = answer.first_piola, answer.tangent
+                self.first_piola = answer.first_piola
             else:
                 self.first_piola[part.points] = answer.first_piola
-                if self._asks_tangents:
-                    self.tangent[part.points] = answer.tangent
+            if self._asks_tangents and everywhere:
+                self.tangent = answer.tangent
+            elif self._asks_tangents:
+                self.tangent[part.points] = answer.tangent
             trial.append(answer.state)
         self._trial, self._trial_gradient = trial, gradient
         if self.mean_stress is not None:

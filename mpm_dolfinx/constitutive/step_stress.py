@@ -73,6 +73,13 @@ class _Beginning(NamedTuple):
     volume: _Volume | None
     undeformed: Array | None
 
+    def arrays(self, conserving: bool) -> list[Array]:
+        """Return what the stress of a step depends on, in which it is conserving or not."""
+        whole = [self.stress, self.potential] if conserving else []
+        if self.undeformed is not None:
+            whole.append(self.undeformed)
+        return [self.gradient, *whole] if whole else []
+
 
 @dataclass(frozen=True)
 class _Evaluation:
@@ -313,17 +320,31 @@ class StepStress:
         """Take the last converged step for the beginning of the next."""
         self._begin, self._found = self._settled(self._found)
 
-    def _settled(self, found: _Evaluation) -> tuple[_Beginning, _Evaluation]:
-        """Return the beginning of the next step, and the last evaluation as it is seen then."""
-        points, part, H, volume = self._points, self._part, _gradient(self._points), None
-        stress, potential = points.first_piola.copy(), points.potential()
+    def beginning(self) -> list[Array]:
+        """Return the arrays of :meth:`settle` that stress depends on, to be set."""
+        return self._begin.arrays(self._conserving)
+
+    def at_end(self) -> list[Array]:
+        """Return what :meth:`settle` would make of them after the last update (collective)."""
+        return self._settled(self._found, trial=True)[0].arrays(self._conserving)
+
+    def _settled(self, found: _Evaluation, trial: bool = False) -> tuple[_Beginning, _Evaluation]:
+        """Return the beginning of the next step, and the last evaluation as it is seen then.
+
+        Args:
+            found: The last evaluation.
+            trial: Whether that is of a step which is not committed.
+        """
+        points, part, volume = self._points, self._part, None
+        H = _gradient(points).copy()  # (which is that of the points until they are strained again)
+        stress, potential = points.first_piola.copy(), points.potential(trial)
         if part is not None:
             p, volume = part.converged, part.volume(H)
             potential = potential - part.stored(p)
             stress -= p[:, None, None] * volume.slope
             slope = volume.slope / self._share
             found = replace(found, own=stress, slope=slope, by_pressure=slope)
-        energy, reference = points.strain_energy(), _reference(points)
+        energy, reference = points.strain_energy(trial), _reference(points)
         # (a body that was rebased or split learns what its mesh is strained by after that)
         undeformed = points.undeformed_tangent() if self._viscosity > 0.0 else None
         return _Beginning(reference, H, stress, energy, potential, volume, undeformed), found

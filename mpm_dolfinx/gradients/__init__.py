@@ -6,5 +6,7 @@
 the derivative of its state along: displacements, histories and reactions. What the state depends
 on is changed a little (:mod:`~mpm_dolfinx.gradients.parameters`), forces and histories are
 evaluated beside the state (:mod:`~mpm_dolfinx.gradients.nearby`), and one linear solve with the
-tangent of the step gives the derivative at its end (:mod:`~mpm_dolfinx.gradients.forward`).
+tangent of the step gives the derivative at its end (:mod:`~mpm_dolfinx.gradients.forward`). What
+a step in time takes over of the velocities before is differentiated in
+:mod:`~mpm_dolfinx.gradients.velocities`.
 """

@@ -34,12 +34,15 @@ from dolfinx import fem
 from ..errors import MPMError
 from ..materials.base import State
 from ..parallel.magnitudes import norm
-from ..particles.particles import Particles
+from ..particles.field import CarriedField
+from ..problems.motion import MovingProblem
 from ..problems.particle_problem import ParticleProblem
 from ..stepping.loading import Stepper
+from ..system.value_field import ValueField
 from ..transfer.matrix import transfer_matrix
-from .nearby import Nearby, Rates, varying
+from .nearby import Nearby, Rates, followed, varying
 from .parameters import CHANGE, Parameter
+from .velocities import TakenVelocities, driven_on
 
 __all__ = ["StepDerivative"]
 
@@ -51,11 +54,33 @@ SOLVED, NOISE, MOST, LEFT = 1e-10, 1e-8, 6, 1e-3
 
 
 class _Side(NamedTuple):
-    """Forces on own dofs of each V, what laws answer and what they have seen, beside the state."""
+    """The end of a step beside the state.
+
+    Attributes:
+        forces: On own dofs of each V.
+        states: What laws answer.
+        seen: What they have seen.
+        kept: What the next step begins with besides.
+    """
 
     forces: list[Array]
     states: list[list[State]]
     seen: list[Array]
+    kept: list[Array]
+
+
+class _Change(NamedTuple):
+    """Derivatives of what a motion takes over: see :meth:`.MovingProblem.after_motion`.
+
+    Attributes:
+        changes: Of Dirichlet values, on own dofs of each background.
+        taken: Of the velocities that the step's background can follow, if it follows them.
+        background: The same on the backgrounds.
+    """
+
+    changes: list[Array]
+    taken: list[PETSc.Vec] | None = None
+    background: list[PETSc.Vec] | None = None
 
 
 class StepDerivative:
@@ -74,8 +99,25 @@ class StepDerivative:
         self._solve = stepper.newton.linearise()
         self._size = self._reduced.scale()
         self._y = [field.u.copy() for field in self._fields]
+        self._z = [y.copy() for y in self._y]
+        for z, field in zip(self._z, self._fields, strict=True):
+            if isinstance(field, ValueField):
+                z.axpy(1.0, field.start)
         self._r = self._reduced.terms.last_nodal_forces()
-        self._bases = [body.node_gradients() for body in problem.bodies]
+        self._things = self._reduced.bodies
+        self._bases = [thing.node_gradients() for thing in self._things]
+        places = followed(problem)
+        self._numbers = [
+            next(n for n, one in enumerate(places) if one is thing) for thing in self._things
+        ]
+        self._of_fields = [
+            self._fields.index(self._reduced.unknowns.place(thing)[0]) for thing in self._things
+        ]
+        self._moving = problem if isinstance(problem, MovingProblem) else None
+        projected = None if self._moving is None else self._moving.inertia.projected
+        self._velocities: TakenVelocities | None = None
+        if self._moving is not None and projected is not None:
+            self._velocities = TakenVelocities(self._moving, projected, nearby)
 
     def by(self, parameter: Parameter, rates: Rates) -> Rates:
         """Return the derivatives at the end of the step from those at its beginning.
@@ -83,17 +125,23 @@ class StepDerivative:
         Raises:
             MPMError: There is no state beside that of the step, or no solution.
         """
-        prescribed, moduli = self._prescribed(parameter, rates), self._moduli(parameter, rates)
+        prescribed = self._prescribed(parameter, rates)
         turns = [self._turn(number, rates) for number in range(len(self._bases))]
+        change = self._change(parameter, rates, turns, prescribed)
+        moduli = self._moduli(parameter, rates, turns, change)
         y_rate = self._lifts(prescribed, rates.prescribed)
-        motion = [_copy(function) for function in rates.displacement]
-        for body, function, turn in zip(self._problem.bodies, motion, turns, strict=True):
-            _add(function, turn, self._y[self._field_of(body)])
+        motion = [_copy(function) for function in rates.motion]
+        for thing, number, field, turn in zip(
+            self._things, self._numbers, self._of_fields, turns, strict=True
+        ):
+            if isinstance(thing, CarriedField) and thing.total:
+                motion[number].x.array[:] = 0.0
+            _add(motion[number], turn, self._z[field])
         self._move(motion, y_rate)
         held = self._held(parameter, moduli, turns)
         first, last = 0.0, np.inf
         for tried in range(MOST + 1):
-            sides = [self._beside(parameter, sign, rates, motion) for sign in (1.0, -1.0)]
+            sides = [self._beside(parameter, s, rates, motion, change) for s in (1.0, -1.0)]
             forces = self._forces(parameter, sides)
             self._add_background(forces, held, y_rate)
             rest = self._reduced.unknowns.restricted(forces)
@@ -106,10 +154,10 @@ class StepDerivative:
             step = rest.duplicate()
             self._solve(rest, step)
             step.scale(-1.0)
-            changes = [field.on_background(step) for field in self._fields]
-            for total, change in zip(y_rate, changes, strict=True):
-                total.axpy(1.0, change)
-            self._move(motion, changes)
+            more = [field.on_background(step) for field in self._fields]
+            for total, part in zip(y_rate, more, strict=True):
+                total.axpy(1.0, part)
+            self._move(motion, more)
         if size > max(small, LEFT * first):
             raise MPMError(
                 f"The derivative by {parameter.name} was not found: {size / first:.1e} of its "
@@ -119,31 +167,45 @@ class StepDerivative:
         after, before = sides
         return replace(
             rates,
-            displacement=motion,
+            motion=motion,
             states=[
                 [parameter.rate(*pair) for pair in zip(*own, strict=True)]
                 for own in zip(after.states, before.states, strict=True)
             ],
             seen=[parameter.slope(*pair) for pair in zip(after.seen, before.seen, strict=True)],
+            kept=[parameter.slope(*pair) for pair in zip(after.kept, before.kept, strict=True)],
             prescribed=prescribed,
             reactions=[force.array_r.copy() for force in forces],
             moduli=moduli,
         )
 
-    def _field_of(self, body: Particles) -> int:
-        """Return the number of the field that moves a body."""
-        every = enumerate(self._fields)
-        return next(n for n, field in every if any(one is body for one in field.bodies))
-
     # -- What the step's beginning and its conditions change -------------------------------
 
     def _turn(self, number: int, rates: Rates) -> PETSc.Mat:
-        """Return D of a body: how T changes as its nodes move."""
-        body, basis = self._problem.bodies[number], self._bases[number]
+        """Return D of a body or a field on it: how T changes as its nodes move."""
+        thing, basis = self._things[number], self._bases[number]
         assert basis.gradients is not None
-        motion = rates.displacement[number].x.array.reshape(-1, basis.gradients.shape[2])
+        body = thing.field.particles if isinstance(thing, CarriedField) else thing
+        place = next(n for n, one in enumerate(self._problem.bodies) if one is body)
+        motion = thing.carried_by(rates.motion[place].x.array)
         values = np.einsum("nki,ni->nk", basis.gradients, motion[: len(basis.nodes)])
-        return transfer_matrix(basis._replace(values=values), body.W, body.V)
+        return transfer_matrix(basis._replace(values=values), thing.W, thing.V)
+
+    def _change(
+        self,
+        parameter: Parameter,
+        rates: Rates,
+        turns: Sequence[PETSc.Mat],
+        prescribed: Sequence[Array],
+    ) -> _Change:
+        """Return derivatives of what a motion takes over."""
+        if self._moving is None:
+            return _Change([])
+        pairs = zip(prescribed, rates.prescribed, self._y, strict=True)
+        changes = [(now - before)[: y.getLocalSize()] for now, before, y in pairs]
+        if self._velocities is None:
+            return _Change(changes)
+        return _Change(changes, *self._velocities.by(parameter, rates, turns, changes))
 
     def _prescribed(self, parameter: Parameter, rates: Rates) -> list[Array]:
         """Return the derivative of the Dirichlet totals at the step's end."""
@@ -171,13 +233,18 @@ class StepDerivative:
     def _lifts(self, now: Sequence[Array], before: Sequence[Array]) -> list[PETSc.Vec]:
         """Return increments of the backgrounds by changes of Dirichlet totals."""
         found = []
-        for field, y, *totals in zip(self._fields, self._y, now, before, strict=True):
-            change = (totals[0] - totals[1])[: y.getLocalSize()]
-            found.append(field.driven(change).copy())
-            y.copy(field.u)
+        for field, total, last in zip(self._fields, now, before, strict=True):
+            whole = isinstance(field, ValueField) and field.carried[0].total
+            found.append(driven_on(field, total if whole else total - last))
         return found
 
-    def _moduli(self, parameter: Parameter, rates: Rates) -> dict[int, Array]:
+    def _moduli(
+        self,
+        parameter: Parameter,
+        rates: Rates,
+        turns: Sequence[PETSc.Mat],
+        change: _Change,
+    ) -> dict[int, Array]:
         """Return derivatives of the moduli of penalties, which are those of their first step."""
         new = [
             number
@@ -188,9 +255,13 @@ class StepDerivative:
             return rates.moduli
         bodies = self._problem.bodies
         offsets = [body.converged_displacement - body.displacement.x.array for body in bodies]
+        motion = [_copy(function) for function in rates.motion]
+        for number in new:
+            self._add_first_increment(number, offsets, motion, turns, change)
 
         def moduli(sign: float) -> list[Array]:
-            self._nearby.go(parameter, sign * parameter.change, rates)
+            arrays = [function.x.array for function in motion]
+            self._nearby.go(parameter, sign * parameter.change, rates, arrays)
             for body, offset in zip(bodies, offsets, strict=True):
                 body.displacement.x.array[:] += offset
             self._require(self._reduced.balance.evaluate(), parameter)
@@ -200,6 +271,31 @@ class StepDerivative:
         found = [parameter.slope(*pair) for pair in pairs]
         return rates.moduli | dict(zip(new, found, strict=True))
 
+    def _add_first_increment(
+        self,
+        number: int,
+        offsets: Sequence[Array],
+        motion: Sequence[fem.Function],
+        turns: Sequence[PETSc.Mat],
+        change: _Change,
+    ) -> None:
+        """Add to displacements and their derivatives the increment with a field's moduli."""
+        u = self._fields[number].moduli_at
+        assert u is not None
+        if u.norm() == 0.0:
+            return
+        if self._velocities is None or change.background is None:
+            raise MPMError("A Sensitivity needs a ghost penalty that was made in a step's start.")
+        rate = change.background[number].copy()
+        rate.scale(self._velocities.share_of(number, u))
+        for n, (body, turn) in enumerate(zip(self._problem.bodies, turns, strict=True)):
+            if self._of_fields[n] == number:
+                moved = fem.Function(body.W)
+                _add(moved, body.T, u)
+                offsets[n][:] += moved.x.array
+                _add(motion[n], body.T, rate)
+                _add(motion[n], turn, u)
+
     def _held(
         self, parameter: Parameter, moduli: dict[int, Array], turns: Sequence[PETSc.Mat]
     ) -> list[PETSc.Vec]:
@@ -207,8 +303,8 @@ class StepDerivative:
         found = [y.duplicate() for y in self._y]
         for force in found:
             force.set(0.0)
-        for body, turn, r in zip(self._problem.bodies, turns, self._r, strict=True):
-            nodal, force = turn.createVecLeft(), found[self._field_of(body)]
+        for number, turn, r in zip(self._of_fields, turns, self._r, strict=True):
+            nodal, force = turn.createVecLeft(), found[number]
             nodal.array_w[:] = r
             turn.multTransposeAdd(nodal, force, force)
         for number, rate in moduli.items():
@@ -224,7 +320,12 @@ class StepDerivative:
     # -- The solution -----------------------------------------------------------------------
 
     def _beside(
-        self, parameter: Parameter, sign: float, rates: Rates, motion: Sequence[fem.Function]
+        self,
+        parameter: Parameter,
+        sign: float,
+        rates: Rates,
+        motion: Sequence[fem.Function],
+        change: _Change,
     ) -> _Side:
         """Return an evaluation on one side of the state, in the direction of a motion."""
         points = self._problem.material_points()
@@ -234,11 +335,27 @@ class StepDerivative:
             for own in points:
                 blocks.enter_context(own.without_tangents())
             self._require(self._reduced.balance.evaluate(), parameter)
-        return _Side(
-            [force.array_r.copy() for force in self._reduced.unknowns.forces],
-            [[varying(state) for state in own.states(trial=True)] for own in points],
-            [own.seen_gradient(trial=True) for own in points],
-        )
+        forces = [force.array_r.copy() for force in self._reduced.unknowns.forces]
+        # (what follows may ask the laws again, which may answer in the same arrays)
+        states = [[_copies(varying(one)) for one in own.states(trial=True)] for own in points]
+        seen = [own.seen_gradient(trial=True).copy() for own in points]
+        kept = [array.copy() for array in self._kept(sign * parameter.change, change)]
+        return _Side(forces, states, seen, kept)
+
+    def _kept(self, amount: float, change: _Change) -> list[Array]:
+        """Return what the next step begins with besides, beside the state."""
+        if self._moving is None:
+            return self._problem.at_end()
+        pairs = zip(self._fields, change.changes, strict=True)
+        changes = [field.changes() + amount * rate for field, rate in pairs]
+        if change.taken is None:
+            return self._moving.after_motion(changes)
+        projected = self._moving.inertia.projected
+        assert projected is not None
+        taken = [v.copy() for v in projected.velocity]
+        for velocity, rate in zip(taken, change.taken, strict=True):
+            velocity.axpy(amount, rate)
+        return self._moving.after_motion(changes, taken)
 
     def _forces(self, parameter: Parameter, sides: Sequence[_Side]) -> list[PETSc.Vec]:
         """Return derivatives of forces."""
@@ -260,14 +377,18 @@ class StepDerivative:
 
     def _move(self, motion: Sequence[fem.Function], changes: Sequence[PETSc.Vec]) -> None:
         """Add to a motion of the bodies that of the backgrounds."""
-        for body, function in zip(self._problem.bodies, motion, strict=True):
-            _add(function, body.T, changes[self._field_of(body)])
+        for thing, number, field in zip(self._things, self._numbers, self._of_fields, strict=True):
+            _add(motion[number], thing.T, changes[field])
 
     @staticmethod
     def _require(failure: MPMError | None, parameter: Parameter) -> None:
         """Raise an error where there is no state beside that of the step."""
         if failure is not None:
             raise MPMError(f"There is no derivative by {parameter.name} at this step: {failure}")
+
+
+def _copies(state: State) -> State:
+    return {name: values.copy() for name, values in state.items()}
 
 
 def _copy(function: fem.Function) -> fem.Function:

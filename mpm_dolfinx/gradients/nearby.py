@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,10 +15,14 @@ from dolfinx import fem
 
 from ..constitutive.points import Governing
 from ..materials.base import State
+from ..particles.field import CarriedField
+from ..particles.particles import Particles
+from ..problems.motion import MovingProblem
 from ..problems.particle_problem import ParticleProblem
+from ..system.mass import NodalMass
 from .parameters import Parameter
 
-__all__ = ["Nearby", "Rates", "varying"]
+__all__ = ["Nearby", "Rates", "followed", "varying"]
 
 type Array = NDArray[np.float64]
 
@@ -28,17 +32,17 @@ class Rates:
     """Derivatives by one parameter at the last converged step.
 
     Attributes:
-        displacement: Of each body.
+        motion: Of displacements and values of fields, in the order of :func:`followed`.
         states: Of what materials keep, for each body, in numbers that vary.
         seen: Of ``F - I`` as materials see it, for each body.
-        kept: Of what a run goes on with besides.
+        kept: Of what the next step begins with besides.
         prescribed: Of Dirichlet totals, on local dofs of V for each field.
         base: The same at the beginning of the run.
         reactions: Of the forces on own dofs of V, for each field.
         moduli: Of shear moduli that scale a penalty, by the number of the field.
     """
 
-    displacement: list[fem.Function]
+    motion: list[fem.Function]
     states: list[list[State]]
     seen: list[Array]
     kept: list[Array]
@@ -48,46 +52,62 @@ class Rates:
     moduli: dict[int, Array]
 
 
+def followed(problem: ParticleProblem) -> list[Particles | CarriedField]:
+    """Return what a problem moves: its bodies, then their other fields."""
+    return [*problem.bodies, *problem.carried]
+
+
 class Nearby:
     """The state of a problem, and those beside it.
 
     Args:
         problem: The problem.
-        kept: Arrays that a run goes on with besides history.
     """
 
-    def __init__(self, problem: ParticleProblem, kept: Sequence[Array]) -> None:
+    def __init__(self, problem: ParticleProblem) -> None:
         self._problem = problem
-        self._kept = [(array, array.copy()) for array in kept]
+        self._moving = problem if isinstance(problem, MovingProblem) else None
+        # whether forces that stay through a step depend on what it begins with
+        self._has_past = self._moving is not None or bool(problem.fields)
+        self._masses: dict[tuple[int, float], NodalMass] = {}
+        self._of_mass: NodalMass | None = None
 
     @contextmanager
     def held(self) -> Iterator[None]:
         """Hold the present state, to which all comes back after the block (collective).
 
-        Displacements come back, and history as it was converged.
+        Displacements and fields come back, and history as it was converged.
         """
         problem = self._problem
         self._points = problem.material_points()
-        self._displacement: list[tuple[Array, Array]] = []
-        for body in problem.bodies:
-            values = np.asarray(body.displacement.x.array, dtype=np.float64)
-            self._displacement.append((values, values.copy()))
+        present = [np.asarray(one.displacement.x.array) for one in followed(problem)]
+        arrays = [*present, *problem.beginning()]
+        self._arrays = [(values, values.copy()) for values in arrays]
+        self._from = [body.converged_displacement.copy() for body in problem.bodies]
         self._states = [points.states() for points in self._points]
         self._seen = [points.seen_gradient() for points in self._points]
         self._own = [points.governing() for points in self._points]
         self._governing: dict[tuple[int, float], list[Governing]] = {}
         self._moved: Parameter | None = None
-        try:
-            yield
-        finally:
-            self._back()
+        with ExitStack() as blocks:
+            if self._moving is not None:
+                blocks.enter_context(self._moving.inertia.held())
+                if self._of_mass is not self._moving.inertia.mass():
+                    self._of_mass, self._masses = self._moving.inertia.mass(), {}
+            try:
+                yield
+            finally:
+                self._back()
 
     def _back(self) -> None:
-        for array, values in (*self._displacement, *self._kept):
-            array[:] = values
+        for array, values in self._arrays:
+            array[...] = values
+        for body, values in zip(self._problem.bodies, self._from, strict=True):
+            body.begin_from(values)
         for points, states in zip(self._points, self._states, strict=True):
             points.go_from(states)
         self._restore()
+        self._problem.renew_external()
 
     def _restore(self) -> None:
         """Give the parameter that was changed last its own value."""
@@ -108,15 +128,26 @@ class Nearby:
             else:
                 for points, governing in zip(self._points, known, strict=True):
                     points.govern_by(governing)
-        if parameter.outside:
-            self._problem.reduced.terms.renew_external()
+        if parameter.outside and self._moving is not None and self._of_mass is not None:
+            self._weigh(self._moving, self._of_mass, (id(parameter), amount))
+        if parameter.outside and not self._has_past:
+            self._problem.renew_external()
+
+    def _weigh(self, problem: MovingProblem, own: NodalMass, key: tuple[int, float]) -> None:
+        """Let bodies have the mass that they have with a changed parameter (collective)."""
+        if key[1] == 0.0:
+            problem.inertia.assume(own)
+            return
+        if key not in self._masses:
+            self._masses[key] = problem.inertia.weighed()
+        problem.inertia.assume(self._masses[key])
 
     def go(
         self,
         parameter: Parameter,
         amount: float,
         rates: Rates,
-        displacement: Sequence[NDArray[np.float64]] | None = None,
+        motion: Sequence[NDArray[np.float64]] | None = None,
     ) -> None:
         """Go to the state beside that a change of a parameter would bring (collective).
 
@@ -124,18 +155,25 @@ class Nearby:
             parameter: The parameter.
             amount: Its change.
             rates: Derivatives of the state.
-            displacement: Those of the displacements, if others, on local dofs of W.
+            motion: Those of displacements and values of fields, if others, on local dofs of W.
         """
         if self._moved is not parameter:
             self._restore()
         self._moved = parameter
-        motions = displacement or [function.x.array for function in rates.displacement]
-        arrays = zip((*self._displacement, *self._kept), (*motions, *rates.kept), strict=True)
+        motions = motion or [function.x.array for function in rates.motion]
+        # (forces that were held back are last, and gone where they have been let go)
+        arrays = zip(self._arrays, (*motions, *rates.kept), strict=False)
         for (array, values), rate in arrays:
-            array[:] = values + amount * rate
+            array[...] = values + amount * rate
+        for body, values, function in zip(
+            self._problem.bodies, self._from, rates.motion, strict=False
+        ):
+            body.begin_from(values + amount * function.x.array)
         for points, states, own in zip(self._points, self._states, rates.states, strict=True):
             points.go_from([_moved(*pair, amount) for pair in zip(states, own, strict=True)])
         self._shift(parameter, amount)
+        if self._has_past:
+            self._problem.renew_external()
 
     @contextmanager
     def shown(self, amount: float, rates: Rates, reactions: Sequence[Array]) -> Iterator[None]:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,13 @@ from dolfinx import fem
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective, of_user
 from ..parallel.given import as_positive, require_same
+from ..problems.motion import MovingProblem
 from ..problems.particle_problem import ParticleProblem
 from ..problems.quasistatic import QuasiStaticProblem
-from ..problems.through_time import TimeProblem
 from ..stepping.control import Run
 from ..stepping.loading import Stepper
 from .forward import StepDerivative
-from .nearby import Nearby, Rates, varying
+from .nearby import Nearby, Rates, followed, varying
 from .parameters import as_parameter
 
 __all__ = ["Sensitivity"]
@@ -47,12 +48,14 @@ class Sensitivity:
     node crosses a line of the background just there, a run has a kink.
 
     Args:
-        problem: A :class:`QuasiStaticProblem` or :class:`ParticleProblem`.
+        problem: A :class:`QuasiStaticProblem`, :class:`DynamicProblem`, :class:`PorousProblem`,
+            or a :class:`ParticleProblem` or :class:`DynamicParticleProblem` in UFL.
         parameters: By what to differentiate: Constants (of laws, loads, densities, residuals,
-            Dirichlet values, values of supports, an initial stress), pairs of a material and the
-            name of one of its numbers, ``(law, "young")``, and pairs of a Constant or Function of
-            many values and a direction in which they change together. Expressions follow what they
-            are made of; a ``modulus=`` given to a support is a number that it keeps.
+            Dirichlet values, values of supports, an initial stress or velocity), pairs of a
+            material and the name of one of its numbers, ``(law, "young")``, and pairs of a Constant
+            or Function of many values and a direction in which they change together. Expressions
+            follow what they are made of; a ``modulus=`` given to a support is a number that it
+            keeps.
         scales: For each parameter an amount by which it matters, instead of its own value; needed
             where that is zero.
 
@@ -99,7 +102,7 @@ class Sensitivity:
     def displacement(self) -> list[Any]:
         """The derivative of the displacement by each parameter."""
         many = isinstance(self.problem.particles, list | tuple)
-        found = [rates.displacement for rates in self._rates]
+        found = [rates.motion[: len(self.problem.bodies)] for rates in self._rates]
         return [list(own) if many else own[0] for own in found]
 
     @collective("function")
@@ -149,11 +152,11 @@ class Sensitivity:
         if stepper.run is not None and stepper.run is not self._run:
             for one in rates:
                 one.base = one.prescribed
+        problem = self.problem
         with self._nearby.held():
-            step = StepDerivative(self.problem, stepper, self._nearby)
+            step = StepDerivative(problem, stepper, self._nearby)
             pairs = zip(self._parameters, rates, strict=True)
             found = [step.by(parameter, one) for parameter, one in pairs]
-        reduced.terms.renew_external()
         assert newton.x is not None and newton.F is not None
         if (failure := reduced.residual(newton.x, newton.F)) is not None:
             raise MPMError(failure.message)
@@ -163,6 +166,29 @@ class Sensitivity:
             self._note()
 
         return take
+
+    def begins(self) -> None:
+        """Find the derivatives of the forces that a motion begins with.
+
+        Raises:
+            MPMError: There are none.
+        """
+        self._require_present()
+        problem, points = self.problem, self.problem.material_points()
+        assert isinstance(problem, MovingProblem)
+        with self._nearby.held():
+            for parameter, rates in zip(self._parameters, self._rates, strict=True):
+                sides = []
+                for sign in (1.0, -1.0):
+                    self._nearby.go(parameter, sign * parameter.change, rates)
+                    with ExitStack() as blocks:
+                        for own in points:
+                            blocks.enter_context(own.in_no_time())
+                        if (failure := problem.reduced.terms.update()) is not None:
+                            raise failure
+                        sides.append([array.copy() for array in problem.before_motion()])
+                rates.kept = [parameter.slope(*pair) for pair in zip(*sides, strict=True)]
+        problem.reduced.terms.roll_back()
 
     def _beginning(self) -> tuple[list[Rates], Nearby]:
         """Return the derivatives of what the bodies begin with, and the state (collective)."""
@@ -176,7 +202,8 @@ class Sensitivity:
                 parameter.shift(amount)
                 for own in points:
                     parameter.govern(own, amount)
-                kept = [array.copy() for array in problem.begin_anew()]
+                problem.begin_anew()
+                kept = [array.copy() for array in problem.beginning()]
                 sides.append(([[varying(s) for s in p.states()] for p in points], kept))
             parameter.shift(0.0)
             for own in points:
@@ -188,7 +215,7 @@ class Sensitivity:
             ]
             found.append(
                 Rates(
-                    [fem.Function(body.W) for body in problem.bodies],
+                    [fem.Function(thing.W) for thing in followed(problem)],
                     states,
                     [np.zeros_like(p.seen_gradient()) for p in points],
                     [parameter.slope(*pair) for pair in zip(more, less, strict=True)],
@@ -198,13 +225,13 @@ class Sensitivity:
                     {},
                 )
             )
-        kept = problem.begin_anew()
-        if any(len(rates.kept) != len(kept) for rates in found):
+        problem.begin_anew()
+        if any(len(rates.kept) != len(problem.beginning()) for rates in found):
             raise MPMError(
                 "A parameter brings forces to a body that begins without any; begin with an "
                 "initial stress that is not zero."
             )
-        return found, Nearby(problem, kept)
+        return found, Nearby(problem)
 
     def _note(self) -> None:
         """Take note of where the bodies are."""
@@ -243,11 +270,8 @@ def _require_followed(problem: ParticleProblem) -> None:
     Raises:
         MPMError: Something acts that has no part in it yet.
     """
-    if not isinstance(problem, ParticleProblem) or isinstance(problem, TimeProblem):
-        raise MPMError(
-            "A Sensitivity follows a QuasiStaticProblem or a ParticleProblem, not a "
-            f"{type(problem).__name__}."
-        )
+    if not isinstance(problem, ParticleProblem):
+        raise MPMError(f"A Sensitivity follows a problem, not a {type(problem).__name__}.")
     what = next(iter(_not_in(problem)), None)
     if what is not None:
         raise MPMError(f"A Sensitivity does not follow {what} yet.")
@@ -260,9 +284,10 @@ def _not_in(problem: ParticleProblem) -> list[str]:
     bodies, kind = problem.bodies, type(problem)
     hooks = ("evaluate", "commit", "roll_back")
     mixed = isinstance(problem, QuasiStaticProblem) and problem.setup.mixed is not None
+    own = problem.inertia if isinstance(problem, MovingProblem) else None
     missing = {
-        "unknowns besides displacements (fields=, mixed=)": bool(problem.fields) or mixed,
-        "terms= (contact, ties)": bool(problem.terms),
+        "a pressure in place of the mean stress (mixed=)": mixed,
+        "terms= (contact, ties)": any(term is not own for term in problem.terms),
         "particles of other methods than 'cpdi2'": any(
             not (b.method == "cpdi2" or b.is_free) for b in bodies
         ),

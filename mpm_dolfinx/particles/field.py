@@ -93,6 +93,14 @@ class Body(Protocol):
     def converged_nodes(self, W: fem.FunctionSpace) -> NDArray[np.float64]:
         """Return positions of the nodes of a Lagrange space, last converged, ``(N, gdim)``."""
 
+    def motion_at_points(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a motion of the body's nodes at its points, ``(n, nq, gdim)``."""
+
+    def motion_at_nodes(
+        self, W: fem.FunctionSpace, motion: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return a motion of the body's nodes at those of a Lagrange space, ``(N, gdim)``."""
+
 
 class ParticleField(fem.Function):
     """An unknown on a body, such as a pressure or a temperature; :meth:`Particles.field` makes it.
@@ -299,19 +307,13 @@ class CarriedField:
             ParticleOutsideError: A point is outside the mesh of the background space.
         """
         body = self.field.particles
-        if self._rows is not None and (self.field.kind == "body" or self._at is body.transfer):
+        if self._rows is not None and (self.is_frozen or self._at is body.transfer):
             return
         self._at = body.transfer
-        frozen = self.field.kind == "body"
-        count = self.W.dofmap.index_map.size_local
+        rows = self._basis.at(self._positions())
+        gone = np.zeros(len(rows.nodes), dtype=bool)
         if self.field.at == "points":
-            points = self._undeformed_points() if frozen else body.converged_points()
-            rows = self._basis.at(points.reshape(-1, points.shape[-1]))
             gone = np.repeat(body.deleted, body.num_points)
-        else:
-            x = self.W.tabulate_dof_coordinates()[:, : self.mesh.geometry.dim]
-            rows = self._basis.at((x if frozen else body.converged_nodes(self.W))[:count])
-            gone = np.zeros(count, dtype=bool)
         lost = ~rows.found & ~gone
         with agree(self.mesh.comm):
             if lost.any():
@@ -322,6 +324,43 @@ class CarriedField:
                 )
         rows.values[gone] = 0.0
         self._rows, self._T = rows, None
+
+    @property
+    def is_frozen(self) -> bool:
+        """Whether the background knows the undeformed body, so that T does not change."""
+        return self.field.kind == "body"
+
+    def _positions(self) -> NDArray[np.float64]:
+        """Return where this rank's own values live, shape ``(N, gdim)`` (collective)."""
+        body, gdim = self.field.particles, self.mesh.geometry.dim
+        if self.field.at == "points":
+            points = self._undeformed_points() if self.is_frozen else body.converged_points()
+            return points.reshape(-1, gdim)
+        if self.is_frozen:
+            x = self.W.tabulate_dof_coordinates()[:, :gdim]
+        else:
+            x = body.converged_nodes(self.W)
+        return np.asarray(x[: self.W.dofmap.index_map.size_local])
+
+    def node_gradients(self) -> PointBasis:
+        """Return :attr:`node_basis` with gradients, zero where T does not change (collective)."""
+        rows = self.node_basis
+        basis = self._basis.at(self._positions(), gradients=True)
+        assert basis.gradients is not None
+        gradients = 0.0 * basis.gradients if self.is_frozen else basis.gradients
+        return rows._replace(gradients=gradients)
+
+    def carried_by(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how the values' places move with the body, shape ``(N, gdim)`` (collective).
+
+        Args:
+            motion: On the local dofs of the body's W.
+        """
+        body = self.field.particles
+        if self.field.at == "points":
+            moved = body.motion_at_points(motion)
+            return moved.reshape(-1, moved.shape[-1])
+        return body.motion_at_nodes(self.W, motion)
 
     def _undeformed_points(self) -> NDArray[np.float64]:
         """Return the undeformed positions of the history's points, ``(n, nq, gdim)``."""

@@ -565,7 +565,21 @@ class Particles(MaterialDomains):
 
         The point of a triangle that was cut from a quadrilateral is its centroid.
         """
-        corners = self._converged_corners()
+        return self._at_points(self._converged_corners())
+
+    def motion_at_points(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a motion of the nodes at the points of :meth:`converged_points`.
+
+        Args:
+            motion: On the local dofs of W.
+
+        Returns:
+            Shape ``(n, nq, gdim)``.
+        """
+        return self._at_points(self._of_domains(motion.reshape(self._converged.shape)))
+
+    def _at_points(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return values at the domains' nodes, ``(n, k, gdim)``, at the history's points."""
         points = np.asarray(np.einsum("qk,nki->nqi", self.quadrature.shapes, corners))
         cut = self.triangular
         if cut.any():
@@ -581,13 +595,26 @@ class Particles(MaterialDomains):
         Returns:
             Positions of its local nodes, shape ``(N, gdim)``.
         """
-        gdim = self._geometry.gdim
-        before, moved = fem.Function(self.W), fem.Function(self._vectors_on(W))
-        before.x.array[:] = self._converged.ravel()
-        moved.interpolate(before)
+        x = W.tabulate_dof_coordinates()[:, : self._geometry.gdim]
+        return np.asarray(x + self.motion_at_nodes(W, self._converged.ravel()))
+
+    def motion_at_nodes(
+        self, W: fem.FunctionSpace, motion: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return a motion of the body's nodes at those of :meth:`converged_nodes` (collective).
+
+        Args:
+            W: As there.
+            motion: On the local dofs of the body's own W.
+
+        Returns:
+            Shape ``(N, gdim)``.
+        """
+        own, moved = fem.Function(self.W), fem.Function(self._vectors_on(W))
+        own.x.array[:] = motion
+        moved.interpolate(own)
         moved.x.scatter_forward()
-        x = W.tabulate_dof_coordinates()[:, :gdim]
-        return np.asarray(x + moved.x.array.reshape(-1, gdim))
+        return np.asarray(moved.x.array.reshape(-1, self._geometry.gdim))
 
     def _vectors_on(self, W: fem.FunctionSpace) -> fem.FunctionSpace:
         """Return the space of vectors with the nodes of a space, made once for each."""
@@ -756,6 +783,10 @@ class Particles(MaterialDomains):
             basis.gradients[other] = beside.gradients[np.arange(len(other)), same]
         return rows._replace(gradients=basis.gradients)
 
+    def carried_by(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a motion on the local dofs of W as one of nodes, shape ``(N, gdim)``."""
+        return motion.reshape(self._converged.shape)
+
     def carry_by(self, nodes: NDArray[np.int64], rows: PointBasis) -> None:
         """Let nodes of W have other rows of T, until the body has moved (collective).
 
@@ -843,6 +874,10 @@ class Particles(MaterialDomains):
         """Set the converged displacement, shape ``(N, gdim)`` at the local nodes of W."""
         self._converged = converged
         self._transfer = None
+
+    def begin_from(self, displacement: NDArray[np.float64]) -> None:
+        """Let a step begin from a displacement on the local dofs of W; T stays as it is."""
+        self._converged[...] = displacement.reshape(self._converged.shape)
 
     def roll_back(self) -> None:
         """Restore the converged displacement."""

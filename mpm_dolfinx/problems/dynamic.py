@@ -111,7 +111,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
                 "With mixed='stabilised pressure' a motion with out_of_range='reflect' may gain "
                 "energy, as points come into other cells; use out_of_range='project'.",
             )
-        start = [initial_velocity(body.velocity, body.particles) for body in given]
+        start = _at_first(given)
         self._energies = []
         self.inertia = Inertia(particles, start, rule, damping, self._energies, static)
         own = as_terms(terms, particles)
@@ -163,6 +163,10 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
                 raise MPMError(f"after= is a problem with {name}={its_own!r}; give the same here.")
 
     _further = ("velocity",)
+
+    @override
+    def _initial_velocities(self) -> list[fem.Function]:
+        return _at_first(self.setup.given)
 
     @override
     def _require_given(self, bodies: Sequence[Body]) -> None:
@@ -279,6 +283,7 @@ class DynamicParticleProblem(MovingProblem):
                 "not tell; write the law as a material, and make a DynamicProblem."
             )
         self._supports = as_supports(supports, bodies)
+        self._velocity = velocity
         start = initial_velocities(velocity, particles)
         given = density if isinstance(density, list) else [density] * len(bodies)
         if len(given) != len(bodies):
@@ -297,6 +302,10 @@ class DynamicParticleProblem(MovingProblem):
             self._with_supports(given, [s for s in self._supports if s.particles is body])
             for given, body in zip(super()._contributions(), self.bodies, strict=True)
         ]
+
+    @override
+    def _initial_velocities(self) -> list[fem.Function]:
+        return initial_velocities(self._velocity, self.particles)
 
     def _with_supports(self, given: Contribution, supports: list[Support]) -> Contribution:
         """Return a body's contribution with those of its supports (collective)."""
@@ -320,6 +329,11 @@ class DynamicParticleProblem(MovingProblem):
         super().begin_step()
         for density in self._densities:
             density.require()
+
+
+def _at_first(bodies: Sequence[Body]) -> list[fem.Function]:
+    """Return the velocities that bodies begin with, on W of each (collective)."""
+    return [initial_velocity(body.velocity, body.particles) for body in bodies]
 
 
 def _static_among(

@@ -129,6 +129,67 @@ class MovingProblem(TimeProblem):
         n, k = body.domain_nodes.shape
         return np.array(matrix.data[: n * k * k].reshape(n, k, k))
 
+    # -- What steps begin with ----------------------------------------------------------------
+
+    @abstractmethod
+    def _initial_velocities(self) -> list[fem.Function]:
+        """Return the velocities that bodies begin with, by what is given now (collective)."""
+
+    @override
+    def begin_anew(self) -> None:
+        super().begin_anew()
+        for own, start in zip(self.inertia.velocities, self._initial_velocities(), strict=True):
+            own.x.array[:] = start.x.array
+
+    @override
+    def renew_external(self) -> None:
+        if self.inertia.dt > 0.0:
+            super().renew_external()
+            return
+        for term in self.body_terms:  # at a run's beginning, where no step is on its way
+            term.begin()
+
+    @override
+    def beginning(self) -> list[NDArray[np.float64]]:
+        of_step = [array for term in self.body_terms for array in term.beginning()]
+        return [*super().beginning(), *of_step, *self.inertia.beginning()]
+
+    @override
+    def at_end(self) -> list[NDArray[np.float64]]:
+        return self.after_motion(self._changes())
+
+    def after_motion(
+        self, changes: Sequence[NDArray[np.float64]], taken: Sequence[PETSc.Vec] | None = None
+    ) -> list[NDArray[np.float64]]:
+        """Return :meth:`at_end` with other Dirichlet values, and velocities (collective).
+
+        Args:
+            changes: Of Dirichlet values in the step, on own dofs of each background.
+            taken: See :meth:`.Inertia.at_end`.
+        """
+        of_step = [array for term in self.body_terms for array in term.at_end()]
+        forces = self._forces_at_end()
+        return [*super().at_end(), *of_step, *self.inertia.at_end(forces, changes, taken)]
+
+    def before_motion(self) -> list[NDArray[np.float64]]:
+        """Return :meth:`beginning` of a run's first step, after an update (collective)."""
+        of_step = [array for term in self.body_terms for array in term.at_end()]
+        forces = self._forces_at_end()
+        return [*super().beginning(), *of_step, *self.inertia.beginning(forces)]
+
+    def _forces_at_end(self) -> list[NDArray[np.float64]]:
+        """Return forces of all bodies after the last update, on local dofs of W (collective)."""
+        found = []
+        for body in self.bodies:
+            total = fem.Function(body.W)
+            for term in self.body_terms:
+                if term.particles is body:
+                    for force in term.forces_at_end():
+                        total.x.array[: force.getLocalSize()] += force.array_r
+            total.x.scatter_forward()
+            found.append(np.asarray(total.x.array, dtype=np.float64))
+        return found
+
     # -- Velocities ---------------------------------------------------------------------------
 
     @property
@@ -167,6 +228,8 @@ class MovingProblem(TimeProblem):
     @override
     def _begin_run(self, now: float) -> None:
         self.inertia.begin_run(now)
+        for recorder in self._stepper.recorders:
+            recorder.begins()
 
     @override
     def _resume_run(self) -> None:

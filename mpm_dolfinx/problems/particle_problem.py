@@ -770,14 +770,24 @@ class ParticleProblem(Hooked):
         """
         self._stepper.record(recorder)
 
-    def begin_anew(self) -> list[NDArray[np.float64]]:
-        """Let bodies that have not moved be what parameters make of them now (collective).
+    def begin_anew(self) -> None:
+        """Let bodies that have not moved be what parameters make of them now (collective)."""
 
-        Returns:
-            Arrays that a run goes on with besides history, to be set: stiffness of supports, and
-            forces held back.
+    def beginning(self) -> list[NDArray[np.float64]]:
+        """Return the arrays that a step begins with besides displacements and history, to be set.
+
+        They are values of fields, stiffness of supports, forces held back; of a motion velocities,
+        forces, and what stresses of a whole step begin with.
         """
-        return []
+        return [np.asarray(field.previous.x.array) for field in self.fields]
+
+    def at_end(self) -> list[NDArray[np.float64]]:
+        """Return what :meth:`beginning` will be after the last evaluation (collective)."""
+        return [np.asarray(field.x.array) for field in self.fields]
+
+    def renew_external(self) -> None:
+        """Let forces take over what they depend on besides displacements (collective)."""
+        self.reduced.terms.renew_external()
 
     @collective()
     def keep(self, thing: Kept) -> None:

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from typing import Any, override
 
 import numpy as np
+from numpy.typing import NDArray
 
 import ufl
 from dolfinx import fem
@@ -145,6 +146,16 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
     def pore_pressure(self) -> list[ParticleField]:
         """The pore pressure of each body with water; new Functions after a repartition."""
         return [filled.field for filled in self._filled]
+
+    @override
+    def beginning(self) -> list[NDArray[np.float64]]:
+        before = [np.asarray(f.before.x.array, np.float64) for f in self._filled]
+        return [*super().beginning(), *before]
+
+    @override
+    def at_end(self) -> list[NDArray[np.float64]]:
+        moved = [np.asarray(f.particles.displacement.x.array, np.float64) for f in self._filled]
+        return [*super().at_end(), *moved]
 
     # -- The system -----------------------------------------------------------------------
 

@@ -172,16 +172,28 @@ class QuasiStaticProblem(ParticleProblem):
     _gradual = True
 
     @override
-    def begin_anew(self) -> list[NDArray[np.float64]]:
+    def begin_anew(self) -> None:
+        super().begin_anew()
         self._held.let_go()
-        stiffness = []
         for body, points in zip(self.bodies, self._stresses, strict=True):
             points.follow_parameters()
             points.begin_anew()
             for support in self.setup.supports_of(body):
-                stiffness.append(support.follow(points.initial_modulus))
+                support.follow(points.initial_modulus)
         self._carry_stress([body.initial_stress for body in self.setup.given])
-        return [*stiffness, *self._held.held]
+
+    @override
+    def beginning(self) -> list[NDArray[np.float64]]:
+        return [*super().beginning(), *self._constant_arrays()]
+
+    @override
+    def at_end(self) -> list[NDArray[np.float64]]:
+        return [*super().at_end(), *self._constant_arrays()]
+
+    def _constant_arrays(self) -> list[NDArray[np.float64]]:
+        """Return the stiffness of supports and, as long as there are any, the forces held back."""
+        supports = [one for body in self.bodies for one in self.setup.supports_of(body)]
+        return [*(support.stiffness for support in supports), *self._held.held]
 
     @override
     def _build(self) -> None:

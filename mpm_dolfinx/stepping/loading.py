@@ -96,6 +96,9 @@ class Mender(Protocol):
 class Recorder(Protocol):
     """Follows the steps that a problem makes. All calls are collective."""
 
+    def begins(self) -> None:
+        """Look at the state that the run of a motion begins from, with its loads as they are."""
+
     def solved(self, stepper: Stepper) -> Callable[[], None]:
         """Look at a step that is solved, and not yet committed; leave all as it is.
 

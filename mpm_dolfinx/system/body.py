@@ -56,6 +56,12 @@ class StepForce(Protocol):
     def settle(self) -> None:
         """Take the present state for the beginning of the next step."""
 
+    def beginning(self) -> list[NDArray[np.float64]]:
+        """Return the arrays of :meth:`settle` that forces depend on, to be set."""
+
+    def at_end(self) -> list[NDArray[np.float64]]:
+        """Return what :meth:`settle` would make of them after the last update (collective)."""
+
     def step_work(self) -> tuple[float, float]:
         """Return this rank's work in the last step, internal and damping."""
 
@@ -125,13 +131,29 @@ class BodyTerm(Term):
             for part in self._of_step:
                 part.settle()
             return ()
+        found = self.forces_at_end()
+        for part in self._of_step:
+            part.settle()
+        return found
+
+    def forces_at_end(self) -> Sequence[PETSc.Vec]:
+        """Return :meth:`end_forces` of the last update, and leave the beginning as it is."""
+        if self._static:
+            return ()
         for part in self._of_step:
             part.mute(True)
         force = self.forms.assemble_residual().copy()
         for part in self._of_step:
             part.mute(False)
-            part.settle()
         return [force]
+
+    def beginning(self) -> list[NDArray[np.float64]]:
+        """Return the arrays that forces of a whole step begin with, to be set."""
+        return [array for part in self._of_step for array in part.beginning()]
+
+    def at_end(self) -> list[NDArray[np.float64]]:
+        """Return :meth:`beginning` of the next step after the last update (collective)."""
+        return [array for part in self._of_step for array in part.at_end()]
 
     @override
     def step_work(self) -> tuple[float, float]:

@@ -161,6 +161,7 @@ class Field:
         motions: How each body follows.
         moduli: Shear modulus of each body at the first step with a penalty, which is scaled by
             them; ``None`` before.
+        moduli_at: The increment at which they were found.
         u: The increment of the last residual, on this rank's own dofs of V.
         force: The residual on all dofs of V that was evaluated last: at supports, their force.
         free: The dofs that are unknowns; ``None`` until they are found.
@@ -186,6 +187,7 @@ class Field:
         self._conditions = conditions
         self.motions = [Motion(body) for body in bodies]
         self.moduli: list[float] | None = None
+        self.moduli_at: PETSc.Vec | None = None
         self.free: FreeDofs | None = None
         self._looked_up: list[fem.DirichletBC] | None = None
         self._lines: list[NDArray[np.float64]] | None = None
@@ -487,7 +489,7 @@ class Field:
         """Return the step's penalty on all dofs of V and in the unknowns."""
         if self._penalty is None:
             if self.moduli is None:
-                self.moduli = stiffness()
+                self.moduli, self.moduli_at = stiffness(), self.u.copy()
             assert self._ghosts is not None
             matrix = self._ghosts.penalty(self.moduli)
             self._penalty = matrix, matrix.ptap(self.prolongation)

@@ -22,7 +22,8 @@ Dirichlet values move.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple, override
 
 from mpi4py import MPI
@@ -44,7 +45,7 @@ from .schemes import Factors, Kinematics, Rates, Scheme, rates_of
 from .term import Motion, Term, Transfer
 from .velocities import Velocities
 
-__all__ = ["Followed", "Inertia"]
+__all__ = ["Followed", "Inertia", "Projected"]
 
 type DomainMasses = Callable[[int], NDArray[np.float64]]
 """Returns the consistent mass of each owned domain of a body, ``(n, k, k)``, by its number."""
@@ -123,6 +124,22 @@ class _Reduced(NamedTuple):
     projection: Projection
 
 
+class Projected(NamedTuple):
+    """The part of the velocities at a step's beginning that its background can follow.
+
+    Attributes:
+        solve: Returns the unknowns y of ``T^T M (v - T y) = 0`` from ``T^T M v`` (collective).
+        unknowns: Those of the velocities, but for what Dirichlet values drive.
+        driven: Rates of these, on own dofs of each background.
+        velocity: On W of each body.
+    """
+
+    solve: Callable[[PETSc.Vec], PETSc.Vec]
+    unknowns: PETSc.Vec
+    driven: list[NDArray[np.float64]]
+    velocity: list[PETSc.Vec]
+
+
 class Inertia(Term):
     """The inertia of all bodies of a problem. See the module for the formulas.
 
@@ -168,8 +185,9 @@ class Inertia(Term):
         self._mass: NodalMass | None = None
         self._reduced: _Reduced | None = None
         self._beginning: _Beginning | None = None
-        self._projected: list[PETSc.Vec] | None = None
+        self._projected: Projected | None = None
         self._increments: list[PETSc.Vec] = []  # of displacement, in the last residuals
+        self._is_held = False
 
     def is_static(self, body: Particles) -> bool:
         """Return whether a body has no inertia."""
@@ -257,7 +275,8 @@ class Inertia(Term):
             before.abs()
             size.axpy((1.0 - share) / share, before)
         self._beginning = _Beginning(mass, rates, fields, float(factors[0]), staying, sizes)
-        self._reduced = self._projected = None
+        if not self._is_held:
+            self._reduced = self._projected = None
         return staying
 
     @property
@@ -278,7 +297,8 @@ class Inertia(Term):
         reduced, step = self._reduce(transfer), self._step
         if self.scheme.reflects:
             return None
-        driven = _driven(self.bodies, self._rest, self._state.driven(self._rest.changes(), self.dt))
+        rates = self.driven(self._rest.changes())
+        driven = _driven(self.bodies, self._rest, rates)
         v = [v.copy() for v in step.fields[0]]
         for part, own in zip(v, driven or (), strict=False):
             part.axpy(-1.0, own)
@@ -289,12 +309,91 @@ class Inertia(Term):
         if not taken and right.norm() == 0.0:
             return None
         y = reduced.projection.solve(right) if right.getSize() > 0 else right
-        if taken:
-            self._projected = [v.duplicate() for v in v] if driven is None else driven
-            for T, part in zip(reduced.transfers, self._projected, strict=True):
-                T.multAdd(y, part, part) if driven else T.mult(y, part)
+        moved = [v.duplicate() for v in v] if driven is None else driven
+        for T, part in zip(reduced.transfers, moved, strict=True):
+            T.multAdd(y, part, part) if driven else T.mult(y, part)
+        self._projected = Projected(reduced.projection.solve, y.copy(), rates, moved)
         y.scale(self.dt)
         return y
+
+    # -- Beside the state -----------------------------------------------------------------------
+
+    @property
+    def projected(self) -> Projected | None:
+        """What the step's background can follow of the velocities; ``None``: not asked for."""
+        return self._projected
+
+    def driven(self, changes: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+        """Return rates of Dirichlet values at the step's beginning by their changes in it."""
+        return self._state.driven(changes, self.dt)
+
+    def beginning(
+        self, forces: Sequence[NDArray[np.float64]] | None = None
+    ) -> list[NDArray[np.float64]]:
+        """Return the arrays that a step begins with, to be set; see :meth:`.Velocities.beginning`.
+
+        Args:
+            forces: Of all other terms, in place of those that are kept.
+        """
+        return self._state.beginning(forces)
+
+    def at_end(
+        self,
+        forces: Sequence[NDArray[np.float64]],
+        changes: Sequence[NDArray[np.float64]],
+        taken: Sequence[PETSc.Vec] | None,
+    ) -> list[NDArray[np.float64]]:
+        """Return :meth:`beginning` of the next step after the last residuals (collective).
+
+        Args:
+            forces: Of all other terms at its end, on the local dofs of W of each body.
+            changes: Of Dirichlet values in it.
+            taken: What it has of the velocities before, in place of :attr:`projected`.
+        """
+        moved, step = self._kinematics(taken), self._step
+        parts = [moved.increment, *step.fields]
+        fields = [moved.after, *(_combined(factors, parts) for factors in step.rates.kept)]
+        values = []
+        for vectors in fields:
+            for body, vector in zip(self.bodies, vectors, strict=True):
+                function = fem.Function(body.W)
+                function.x.array[: vector.getLocalSize()] = vector.array_r
+                function.x.scatter_forward()
+                values.append(np.asarray(function.x.array, dtype=np.float64))
+        return [*values, *forces, *(change / self.dt for change in changes)]
+
+    def not_followed(self, velocity: Sequence[PETSc.Vec]) -> list[PETSc.Vec]:
+        """Return M times what velocities at the step's beginning differ by from others."""
+        rest = self._step.mass.vectors(self.velocities)
+        for vector, other in zip(rest, velocity, strict=True):
+            vector.axpy(-1.0, other)
+        return self._step.mass.times(rest)
+
+    def weighed(self) -> NodalMass:
+        """Return the mass by what densities are now (collective)."""
+        known = self.mass()
+        domains = [
+            None if self.is_static(body) else self._rest.mass(number)
+            for number, body in enumerate(self.bodies)
+        ]
+        return nodal_mass(self.bodies, domains, known.deleted)
+
+    def assume(self, mass: NodalMass) -> None:
+        """Let the mass be another one in :meth:`held`."""
+        self._mass = mass
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold the step as it is now, to which all comes back after the block."""
+        known = self._mass, self._beginning, self._increments
+        self._is_held = True
+        try:
+            yield
+        finally:
+            self._is_held = False
+            self._mass, self._beginning, self._increments = known
+
+    # -- A residual -----------------------------------------------------------------------------
 
     def _reduce(self, transfer: Transfer) -> _Reduced:
         """Return the mass reduced by T of all bodies, anew where they are others."""
@@ -365,15 +464,21 @@ class Inertia(Term):
         account.note(self._end, self._rest.stored()[0])
         return undo
 
-    def _kinematics(self) -> Kinematics:
-        """Return the motion in the step that has converged (collective)."""
+    def _kinematics(self, projected: Sequence[PETSc.Vec] | None = None) -> Kinematics:
+        """Return the motion in the step that has converged (collective).
+
+        Args:
+            projected: See :attr:`projected`; ``None``: that.
+        """
         mass, rates, (before, *kept) = self._step.mass, self._step.rates, self._step.fields
         w, taken = self._increments, before
         if rates.velocity[1] == 0.0:
             taken = _combined(np.zeros(1), [before])
         elif not self.scheme.reflects:
-            assert self._projected is not None
-            taken = self._projected
+            if projected is None:
+                assert self._projected is not None
+                projected = self._projected.velocity
+            taken = list(projected)
         after = _combined(rates.velocity, [w, taken, *kept])
         for body, v, own in zip(self.bodies, after, w, strict=True):
             if self.is_static(body):

@@ -41,6 +41,8 @@ class ValueField(Field):
     Attributes:
         carried: As given as ``bodies``.
         unit: The factor, ``None`` until it is known.
+        start: The values of V that the step starts from, on this rank's own dofs; zero where the
+            background has changes.
     """
 
     def __init__(
@@ -59,6 +61,8 @@ class ValueField(Field):
     def find(self) -> FreeDofs:
         """Look for the values that the step starts from."""
         found = super().find()
+        self.start = self.force.duplicate()
+        self.start.set(0.0)
         for carried in self.carried:
             carried.converged_displacement = carried.field.previous.x.array.copy()
         if self.carried[0].total:
@@ -67,7 +71,7 @@ class ValueField(Field):
 
     def _start(self) -> None:
         """Let values start from those of the background that fit them best (collective)."""
-        start = self.force.duplicate()
+        start = self.start
         start.array_w[:] = np.where(self._fixed, self._totals, 0.0)
         scaled, right = [], start.duplicate()
         right.set(0.0)

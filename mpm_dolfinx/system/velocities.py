@@ -94,6 +94,18 @@ class Velocities(Kept):
 
     # -- Steps ------------------------------------------------------------------------------------
 
+    def beginning(
+        self, forces: Sequence[NDArray[np.float64]] | None = None
+    ) -> list[NDArray[np.float64]]:
+        """Return all that a step begins with, to be set: velocities, what is kept, forces, rates.
+
+        Args:
+            forces: Others in place of those.
+        """
+        moved = [one.x.array for functions in (self.velocities, *self.kept) for one in functions]
+        own = [one.x.array for one in self.forces] if forces is None else forces
+        return [np.asarray(values) for values in (*moved, *own, *self._rates)]
+
     def note_forces(self, terms: Sequence[Term], balanced: bool = False) -> None:
         """Keep the forces of all other terms, as they are now (collective).
 

@@ -300,14 +300,13 @@ def test_what_is_not_followed_is_refused():
         other.problem.solve(1)
 
 
-@pytest.mark.parametrize("kind", ["mixed", "contact", "method", "delete", "motion"])
+@pytest.mark.parametrize("kind", ["mixed", "contact", "method", "delete"])
 def test_problems_that_are_not_followed(kind):
     options = {
         "mixed": {"mixed": "stabilised pressure"},
         "contact": {"lid": True},
         "method": {"method": "gimp", "quadrature_degree": 1},
         "delete": {"outside": "delete"},
-        "motion": {"problem": mpm.DynamicProblem, "density": 1.0},
     }[kind]
     scene = Slump(von_mises, VON_MISES, **options)
     with pytest.raises(mpm.MPMError, match="A Sensitivity"):
