@@ -31,6 +31,7 @@ from .problems.strength import StrengthReduction, strength_reduction  # noqa: E4
 from .problems.water_table import WaterTable  # noqa: E402
 from .stepping.displacement_control import DisplacementControl  # noqa: E402
 from .system.coupling import Tie  # noqa: E402
+from .system.damage import Damage  # noqa: E402
 from .system.field_equation import FieldEquation  # noqa: E402
 from .system.schemes import Kinematics, Rates, Scheme  # noqa: E402
 from .system.term import Term  # noqa: E402
@@ -42,6 +43,7 @@ __all__ = [
     "AveragedVolumeRatio",
     "Body",
     "ConvergenceError",
+    "Damage",
     "DisplacementControl",
     "DomainDistortionError",
     "DynamicParticleProblem",

@@ -718,11 +718,27 @@ class MaterialPoints:
         """Accumulated plastic strain of the last converged step, shape ``(n, nq)``."""
         return self.variable("plastic_strain")
 
-    def variable(self, name: str) -> NDArray[np.float64]:
+    def suppose(self, name: str, values: NDArray[np.float64]) -> None:
+        """Let an internal variable that comes from outside have other values; all else stays.
+
+        Args:
+            name: Key of the materials' states; those without it are left as they are.
+            values: At all points, shape ``(n, nq)``.
+        """
+        flat = values.reshape(self._points)
+        self.go_from(
+            [
+                state | {name: flat[part.points]} if name in state else state
+                for part, state in zip(self._governed, self._last.states, strict=True)
+            ]
+        )
+
+    def variable(self, name: str, trial: bool = False) -> NDArray[np.float64]:
         """Return an internal variable of the last converged step, zero where there is none.
 
         Args:
             name: Key of the materials' states.
+            trial: Whether it is that of the last update.
 
         Returns:
             Its values, shape ``(n, nq, ...)``.
@@ -736,7 +752,8 @@ class MaterialPoints:
                 shapes = {()}
             else:
                 raise MPMError(f"No material of these particles has a variable {name!r}.")
-        return self._collect(shapes.pop(), lambda _, state: state.get(name, 0.0))
+        states = self._trial if trial else None
+        return self._collect(shapes.pop(), lambda _, state: state.get(name, 0.0), states=states)
 
     def yield_function(self) -> NDArray[np.float64]:
         """Yield function of the last converged step, shape ``(n, nq)``; -1 where elastic."""
@@ -750,9 +767,16 @@ class MaterialPoints:
 
         return self._collect((), value, "yield_function")
 
-    def _collect(self, shape: tuple[int, ...], value: Any, what: str = "") -> NDArray[np.float64]:
+    def _collect(
+        self,
+        shape: tuple[int, ...],
+        value: Any,
+        what: str = "",
+        states: list[State] | None = None,
+    ) -> NDArray[np.float64]:
         result = np.zeros((self._points, *shape))
-        for part, state in zip(self._governed, self._last.states, strict=True):
+        states = self._last.states if states is None else states
+        for part, state in zip(self._governed, states, strict=True):
             try:
                 result[part.points] = value(part, state)
             except MPMError:

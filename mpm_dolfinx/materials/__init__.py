@@ -17,6 +17,7 @@ from .cam_clay import ModifiedCamClay
 from .check import check_tangent
 from .drucker_prager import DruckerPrager
 from .elastic import Hencky, IsotropicElastic, LinearElastic
+from .fracture import Fracture
 from .mohr_coulomb import FrictionalMaterial, MohrCoulomb, Tresca
 from .mu_i import MuIRheology
 from .neo_hooke import NeoHooke
@@ -25,6 +26,7 @@ from .von_mises import SmallStrainVonMises, VonMises
 
 __all__ = [
     "DruckerPrager",
+    "Fracture",
     "FrictionalMaterial",
     "Hencky",
     "Integration",

@@ -366,6 +366,17 @@ class StrainMaterial(Material):
             tangent: Whether the tangent is asked for.
         """
 
+    def stored_energy(self, elastic_strain: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the elastic energy per undeformed volume of elastic strains.
+
+        Args:
+            elastic_strain: Shape ``(n, m)``.
+
+        Returns:
+            Shape ``(n,)``.
+        """
+        raise MPMError(f"{type(self).__name__} does not know its stored energy of a strain.")
+
     @property
     def _kinematics(self) -> type[Kinematics]:
         """The strain measure at work."""

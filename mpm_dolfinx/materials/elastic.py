@@ -74,8 +74,12 @@ class IsotropicElastic(CompiledMaterial):
 
     def strain_energy(self, state: State) -> NDArray[np.float64]:
         """Return the elastic energy per undeformed volume, ``1/2 stress : strain``."""
-        stress = state["stress"]
-        return np.asarray(0.5 * np.einsum("nm,nm->n", stress, self.elastic_strain(stress)))
+        return self.stored_energy(self.elastic_strain(state["stress"]))
+
+    @override
+    def stored_energy(self, elastic_strain: NDArray[np.float64]) -> NDArray[np.float64]:
+        stress = self.elastic_stress(elastic_strain)
+        return np.asarray(0.5 * np.einsum("nm,nm->n", stress, elastic_strain))
 
     def elastic_tangent(self, n: int, m: int) -> NDArray[np.float64]:
         """Return the elastic stiffness of ``n`` points, shape ``(n, m, m)``, read-only."""

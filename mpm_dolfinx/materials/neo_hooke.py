@@ -89,9 +89,12 @@ class NeoHooke(CompiledMaterial):
 
     def strain_energy(self, state: State) -> Array:
         """Stored energy per undeformed volume."""
-        strain = self.elastic_strain(state["stress"])
-        volume = trace(strain)
-        growth = np.expm1(2.0 * np.linalg.eigvalsh(to_tensor(strain))).sum(axis=1)
+        return self.stored_energy(self.elastic_strain(state["stress"]))
+
+    @override
+    def stored_energy(self, elastic_strain: Array) -> Array:
+        volume = trace(elastic_strain)
+        growth = np.expm1(2.0 * np.linalg.eigvalsh(to_tensor(elastic_strain))).sum(axis=1)
         return np.asarray(self.shear * (0.5 * growth - volume) + 0.5 * self.lame * volume**2)
 
 

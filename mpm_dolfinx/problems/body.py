@@ -15,6 +15,7 @@ from dolfinx import mesh
 
 from ..constitutive.averaging import F_BARS
 from ..errors import MPMError
+from ..materials.fracture import Fracture
 from ..parallel.boundary import collective
 from ..parallel.given import is_number, require_same
 from ..particles.particles import Particles
@@ -157,6 +158,12 @@ class Body:
             raise MPMError(
                 "A body has a pore_fluid=, whose pressure is found, or a pore_pressure=."
             )
+
+    @property
+    def may_crack(self) -> bool:
+        """Whether a law of it is a :class:`mpm_dolfinx.materials.Fracture`."""
+        laws = self.material.values() if isinstance(self.material, Mapping) else [self.material]
+        return any(isinstance(law, Fracture) for law in laws)
 
     def replace(self, **changes: Any) -> Body:
         """Return the same body with some things changed, such as ``tractions=[...]`` for a stage.

@@ -163,6 +163,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
                 raise MPMError(f"after= is a problem with {name}={its_own!r}; give the same here.")
 
     _further = ("velocity",)
+    _may_crack = False
 
     @override
     def _initial_velocities(self) -> list[fem.Function]:
@@ -189,7 +190,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
 
     @override
     def _own_terms(self) -> list[Term]:
-        return [self.inertia]
+        return [*super()._own_terms(), self.inertia]
 
     @override
     def _in_time(

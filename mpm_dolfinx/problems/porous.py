@@ -99,6 +99,7 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
     _gradual = False
 
     _further = ("pore_fluid",)
+    _may_crack = False
 
     @collective()
     def __init__(

@@ -31,6 +31,7 @@ from ..particles.domains import separate_nodes
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
 from ..system.body import StepForce
+from ..system.damage import Damage
 from ..system.pressure import PressureTerm
 from ..system.smoothing import PressureSmoothing
 from ..system.term import Term
@@ -79,6 +80,8 @@ class QuasiStaticProblem(ParticleProblem):
 
     Attributes:
         particles: The particles of the body, or of each in a list.
+        damage: The :class:`mpm_dolfinx.Damage` of each body whose law is a
+            :class:`mpm_dolfinx.materials.Fracture`.
         pressure: With ``mixed``, the pressure of each body: a :class:`mpm_dolfinx.ParticleField` at
             its points. It is the mean of the laws' own stress, positive in tension.
 
@@ -104,9 +107,11 @@ class QuasiStaticProblem(ParticleProblem):
         listed = [body.particles for body in given]
         particles = as_bodies(listed if isinstance(bodies, list | tuple) else listed[0])
         supports = as_supports(supports, particles)
-        setup = Setup(
-            tuple(given), tuple(supports), tuple(as_terms(terms, particles)), axisymmetric, mixed
-        )
+        terms = as_terms(terms, particles)
+        setup = Setup(tuple(given), tuple(supports), tuple(terms), axisymmetric, mixed)
+        self.damage = self._damages(setup)
+        terms = [*terms, *self.damage]
+        setup = replace(setup, terms=tuple(terms))
         if any(body.on_distortion == "split" for body in particles):
             setup.require_divisible()
         for body in particles:
@@ -125,6 +130,35 @@ class QuasiStaticProblem(ParticleProblem):
         self._carry_stress([body.initial_stress for body in given])
         for body in particles:
             _warn_of_hourglass(body)
+
+    def _damages(self, setup: Setup) -> list[Damage]:
+        """Return the damage of each body that may crack (collective)."""
+        found = []
+        for body in setup.given:
+            if not body.may_crack:
+                continue
+            self._require_for_cracks(body, setup)
+            found.append(Damage(body.particles, body.material, body.cell_tags))
+        return found
+
+    def _require_for_cracks(self, body: Body, setup: Setup) -> None:
+        """Raise an error where a body that may crack has what does not go with that."""
+        refused = {
+            "mixed=": setup.mixed is not None,
+            "f_bar=": body.f_bar != "none",
+            "axisymmetric=True": setup.axisymmetric,
+            "initial_stress=": body.initial_stress is not None,
+            f"method={body.particles.method!r}": not body.particles.shares_nodes,
+            "outside='delete'": body.particles.deletion is not None,
+            "on_distortion='split'": body.particles.on_distortion == "split",
+            f"a {type(self).__name__}": not self._may_crack,
+        }
+        for what, given in refused.items():
+            if given:
+                raise MPMError(f"Fracture does not go with {what}.")
+
+    #: Whether bodies may crack.
+    _may_crack = True
 
     #: What bodies may have besides, which is for some problems alone.
     _further: tuple[str, ...] = ()
@@ -271,6 +305,9 @@ class QuasiStaticProblem(ParticleProblem):
         other = [name for name in INITIAL if getattr(body, name) is not getattr(before, name)]
         for name in [*other, *(["f_bar"] if body.f_bar != before.f_bar else [])]:
             raise MPMError(f"{name} cannot change in a stage; a body begins with it.")
+        same = body.material is before.material and body.cell_tags is before.cell_tags
+        if not same and (body.may_crack or before.may_crack):
+            raise MPMError("A law of fracture cannot come or go in a stage; a body begins with it.")
 
     @collective("particles")
     def remove(
@@ -300,6 +337,8 @@ class QuasiStaticProblem(ParticleProblem):
         """
         if not isinstance(body, int | np.integer) or body not in range(len(self.bodies)):
             raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
+        if self.setup.bodies[body].may_crack:
+            raise MPMError("Cells cannot be removed from a body with a law of fracture.")
         own = self.setup.bodies[body]
         cells = chosen_cells(self.bodies[body], particles, tags, own.cell_tags)
         self._go_on(name, Removal(self, body, cells), sudden)
@@ -323,6 +362,8 @@ class QuasiStaticProblem(ParticleProblem):
         """
         (given,) = as_given(body)
         self._require_given([given])
+        if given.may_crack:
+            raise MPMError("A body with a law of fracture cannot be added; begin with it.")
         particles = given.particles
         if particles.on_distortion == "split":
             replace(
@@ -338,7 +379,7 @@ class QuasiStaticProblem(ParticleProblem):
 
     def _own_terms(self) -> list[Term]:
         """Return the terms that the problem itself has."""
-        return []
+        return list(self.damage)
 
     def _go_on(self, name: str | None, change: Any, sudden: bool) -> None:
         """Begin a stage."""

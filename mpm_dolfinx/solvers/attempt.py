@@ -30,6 +30,7 @@ class Attempt:
         shorten: As there.
         predicts: Whether it may begin at a prediction.
         hurries: Whether it is given up soon where it makes no headway.
+        enough: Norm of a residual that is small enough, however large the forces are.
         centre: Where the proximal term holds; ``None``: nowhere.
         failure: Why the last evaluation, or all, has failed.
         first: Norm of the first residual, with linearised forces of Dirichlet values.
@@ -54,6 +55,7 @@ class Attempt:
     shorten: bool
     predicts: bool
     hurries: bool = False
+    enough: float = 0.0
     centre: PETSc.Vec | None = None
     failure: MPMError | None = None
     first: float = 0.0

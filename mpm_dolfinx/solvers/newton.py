@@ -242,10 +242,13 @@ class NewtonSolver:
         size, scale = norm(self.F), self._problem.scale(self.F)
         return size / scale if scale > 0.0 else size
 
-    def go_on(self) -> None:
-        """Find a root from the last solution on, as what the residual depends on has changed.
+    def go_on(self, share: float) -> None:
+        """Come nearer to a root from the last solution on, as what the residual depends on changed.
 
         The last evaluation must be there (:meth:`unbalanced`). Linear solves are counted on.
+
+        Args:
+            share: What part of the residual may stay.
 
         Raises:
             MPMError: Why there is none.
@@ -257,6 +260,7 @@ class NewtonSolver:
             self._search.begin(self._symmetric and now.problem.has_potential(), False, False)
         self._factor.begin(self.x.getSize(), now.problem.levels, self.lets_go)
         now.centre, now.first = self.x.copy(), norm(self.F)
+        now.enough = share * now.first
         self._set_tangent(now.problem.tangent())
         now.fresh = now.known = True
         self.x.copy(self._trial)
@@ -450,7 +454,7 @@ class NewtonSolver:
         tell(self._comm, NEWTON, "  iteration %d: residual %.2e", iteration, self.residuals[-1])
         if iteration > LATE:
             self._now.yielding.append(self._problem.terms.yielding())
-        self._now.tolerance = tolerance = max(rtol * scale, atol)
+        self._now.tolerance = tolerance = max(rtol * scale, atol, self._now.enough)
         small = size <= tolerance
         if small or (
             iteration > 0

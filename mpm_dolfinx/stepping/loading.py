@@ -45,6 +45,8 @@ __all__ = ["Mender", "Owner", "Recorder", "Stepper"]
 
 #: Residual of the displacements, relative to the forces, at which a step that alternates ends.
 ALTERNATED = 1e-6
+#: What an alternation may leave of the residual that it begins with.
+INEXACT = 0.1
 #: Alternations after which a step is given up.
 MOST_ALTERNATIONS = 5000
 
@@ -653,7 +655,7 @@ class Stepper:
             if left <= ALTERNATED:
                 newton.residuals.append(left)
                 return number
-            newton.go_on()
+            newton.go_on(INEXACT)
         raise ConvergenceError(
             f"Displacements and other fields were not in equilibrium with each other after "
             f"{MOST_ALTERNATIONS} alternations: {left:.1e} of the forces were left"

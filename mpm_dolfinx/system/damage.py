@@ -1,0 +1,226 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Damage of a body whose law is one of fracture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, override
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ufl
+from dolfinx import fem, mesh
+
+from ..constitutive.groups import background_cells
+from ..constitutive.points import MaterialPoints
+from ..errors import MPMError, agree, warn
+from ..materials.base import Material
+from ..materials.fracture import Fracture
+from ..parallel.boundary import collective
+from ..parallel.compilation import compiled_form
+from ..parallel.totals import over_ranks
+from ..particles.particles import Particles
+from .field_equation import FieldEquation
+from .term import PointMaterial
+
+__all__ = ["Damage"]
+
+#: Damage from which on a crack runs through a domain.
+CRACKED = 0.9
+
+
+class Damage(FieldEquation):
+    """Phase field of the cracks in a body, between its values before and 1 (collective).
+
+    A problem makes one of each body whose law is a :class:`mpm_dolfinx.materials.Fracture`:
+    ``problem.damage``.
+
+    Args:
+        particles: The body.
+        materials: Its law, or one for each tag of ``cell_tags``; what is no ``Fracture`` does not
+            crack.
+        cell_tags: Tags of its cells.
+
+    Attributes:
+        field: Damage, a :class:`mpm_dolfinx.ParticleField`: 0 where the body is whole, 1 in a
+            crack.
+
+    Raises:
+        MPMError: Laws that do not go together.
+    """
+
+    def __init__(
+        self, particles: Particles, materials: Any, cell_tags: mesh.MeshTags | None
+    ) -> None:
+        body, comm = particles.mesh, particles.mesh.comm
+        Q = fem.functionspace(body, ("Lagrange", 1))
+        d = particles.field(Q, at="nodes", kind="body", name="damage")
+        cells = fem.functionspace(body, ("Discontinuous Lagrange", 0))
+        self._toughness, self._length, self._cracks = (fem.Function(cells) for _ in range(3))
+        self._length.x.array[:] = 1.0
+        with agree(comm):
+            model = self._take(materials, cell_tags, cells)
+        self._drive = particles.quadrature_function("driving_energy")
+        shape = d if model == "AT1" else d**2
+        slope = ufl.dot(ufl.grad(d), ufl.grad(d))
+        weight = 8.0 / 3.0 if model == "AT1" else 2.0
+        dx = particles.dx
+        density = shape / self._length + self._length * slope
+        self._surface = compiled_form(self._toughness / weight * density * dx)
+        energy = ((1.0 - d) ** 2 * self._drive + self._toughness / weight * density) * dx
+        self._share = 3.0 / 8.0 if model == "AT1" else 0.5
+        self._points: MaterialPoints | None = None
+        self._said = False
+        super().__init__(
+            d,
+            ufl.derivative(energy, d, ufl.TestFunction(d.W)),
+            lower="previous",
+            upper=self._uppermost(d.W, cells),
+        )
+
+    def _take(
+        self, materials: Any, cell_tags: mesh.MeshTags | None, cells: fem.FunctionSpace
+    ) -> str:
+        """Take toughness and length of each cell; return the model of all."""
+        laws: list[tuple[Material, Any]]
+        if isinstance(materials, Mapping):
+            assert cell_tags is not None
+            laws = [(law, cell_tags.find(tag)) for tag, law in materials.items()]
+        else:
+            laws = [(materials, slice(None))]
+        models = set()
+        for law, where in laws:
+            if not isinstance(law, Fracture):
+                continue
+            models.add(law.model)
+            dofs = cells.dofmap.list[:, 0][where]
+            self._cracks.x.array[dofs] = 1.0
+            for function, name in ((self._toughness, "toughness"), (self._length, "length")):
+                value: Any = law.parameters[name]
+                if isinstance(value, np.ndarray):
+                    raise MPMError(f"The {name} of Fracture must be a number or a DG0 Function.")
+                if isinstance(value, fem.Function):
+                    value = value.x.array[dofs]
+                function.x.array[dofs] = getattr(value, "value", value)
+        if len(models) > 1:
+            raise MPMError("The laws of one body have different models of fracture; give one.")
+        return models.pop()
+
+    def _uppermost(self, W: fem.FunctionSpace, cells: fem.FunctionSpace) -> fem.Function:
+        """Return the largest damage: none at the nodes of cells that do not crack (collective)."""
+        upper = fem.Function(W)
+        upper.x.array[:] = 1.0
+        for function in (self._toughness, self._length, self._cracks):
+            function.x.scatter_forward()
+        whole = self._cracks.x.array[cells.dofmap.list[:, 0]] == 0.0
+        upper.x.array[W.dofmap.list[whole].ravel()] = 0.0
+        upper.x.scatter_forward()
+        # Elsewhere the equation is to have a solution, which its bound makes zero.
+        hollow = self._toughness.x.array == 0.0
+        self._toughness.x.array[hollow] = 1.0
+        return upper
+
+    # -- What it does in a step ------------------------------------------------------------------
+
+    @override
+    def take_part(
+        self,
+        number: int,
+        bodies: Sequence[Particles],
+        materials: Sequence[PointMaterial | None],
+    ) -> None:
+        super().take_part(number, bodies, materials)
+        points = materials[self._body_number]
+        assert isinstance(points, MaterialPoints)
+        self._points = points
+        self._tell()
+
+    @property
+    def _known(self) -> MaterialPoints:
+        assert self._points is not None
+        return self._points
+
+    @override
+    def alternate(self) -> int:
+        energy = self._known.variable("driving_energy", trial=True)
+        self._drive.x.array[: energy.size] = energy.ravel()
+        solves = super().alternate()
+        self._tell()
+        return solves
+
+    def _tell(self) -> None:
+        """Let the law know the damage at its points."""
+        self._known.suppose("damage", np.clip(self.field.at_points(), 0.0, 1.0))
+
+    @override
+    def commit(self) -> Callable[[], None]:
+        if not self._said:
+            self._warn_of_coarse_cells()
+        return super().commit()
+
+    @override
+    def roll_back(self) -> None:
+        super().roll_back()
+        self._tell()
+
+    # -- Results ---------------------------------------------------------------------------------
+
+    @collective()
+    def surface_energy(self) -> float:
+        """Return the energy that the cracks have taken up, with what the mesh adds (collective).
+
+        A crack in domains of size h counts ``1 + 3 h / (8 l)`` times the toughness with the model
+        AT1, ``1 + h / (2 l)`` times with AT2 (Bourdin, Francfort & Marigo 2008, section 8.1): see
+        :meth:`excess`.
+        """
+        mine: Any = fem.assemble_scalar(self._surface)
+        return float(over_ranks(self._comm, float(mine)))
+
+    @collective()
+    def excess(self) -> NDArray[np.float64]:
+        """Return how much more energy a crack takes on the mesh than the toughness (collective).
+
+        It is the band that is broken: as wide as the cells of the background, or of the body if
+        they are larger, over the length.
+
+        Returns:
+            Share of the toughness in each owned domain, shape ``(n,)``.
+        """
+        return self._share * self._sizes() / self._lengths()
+
+    def _lengths(self) -> NDArray[np.float64]:
+        cells = self._length.function_space.dofmap.list[: self.bodies[0].num_local, 0]
+        return np.asarray(self._length.x.array[cells])
+
+    def _sizes(self) -> NDArray[np.float64]:
+        """Return the size of the cells that displacements are resolved by (collective)."""
+        body = self.bodies[0]
+        power = 1.0 / body.mesh.geometry.dim
+        own = np.asarray(body.initial_volume**power)
+        if body.is_free or body.free_nodes is not None:
+            return own
+        return np.asarray(np.maximum(own, background_cells(body)[1] ** power))
+
+    def _warn_of_coarse_cells(self) -> None:
+        """Say so, once, where a crack runs through cells that are too large for its length."""
+        damage = self.field.x.array[self.field.W.dofmap.list[: self.bodies[0].num_local]]
+        if not over_ranks(self._comm, bool(np.any(damage > CRACKED)), MPI.LOR):
+            return
+        sizes, lengths = self._sizes(), self._lengths()
+        coarse = (damage.max(axis=1) > CRACKED) & (sizes > 0.505 * lengths)
+        ratio = float((sizes / lengths)[coarse].max(initial=0.0))
+        ratio = over_ranks(self._comm, ratio, MPI.MAX)
+        if ratio == 0.0:
+            return
+        self._said = True
+        warn(
+            self._comm,
+            f"A crack runs through cells of {ratio:.2g} times the length over which it is smeared; "
+            "they must be smaller than half of it. It takes "
+            f"{1.0 + self._share * ratio:.2f} times the toughness there, and follows the mesh.",
+            stacklevel=4,
+        )

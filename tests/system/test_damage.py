@@ -1,0 +1,256 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Bodies that crack: damage against closed forms, stock DOLFINx and balances of energy."""
+
+from contextlib import nullcontext
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+from compare import raises
+from scenes import QUADRILATERAL, WORLD
+
+import ufl
+from dolfinx import fem, mesh
+from dolfinx.fem.petsc import LinearProblem
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.materials import Fracture, Hencky, LinearElastic, NeoHooke
+
+YOUNG, TOUGHNESS, LENGTH = 100.0, 1.0, 0.5
+OPTIONS = {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
+
+
+def pulled(law, dim=2, **given):
+    """A unit square or cube, whose end goes to a value; the condition that holds it."""
+    create = mesh.create_rectangle if dim == 2 else mesh.create_box
+    kind = QUADRILATERAL if dim == 2 else mesh.CellType.hexahedron
+    body = create(WORLD, [[0.0] * dim, [1.0] * dim], [4] * dim, kind)
+    particles = mpm.Particles(body, quadrature_degree=2)
+    held = [mpm.held(particles.W, i, **{"xyz"[i]: 0.0}) for i in range(dim)]
+    face = mesh.locate_entities_boundary(body, dim - 1, lambda x: np.isclose(x[0], 1.0))
+    dofs = fem.locate_dofs_topological(particles.W.sub(0), dim - 1, face)
+    end = fem.Constant(body, 0.0)
+    grip = fem.dirichletbc(end, dofs, particles.W.sub(0))
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, law, **given), bcs=[*held, grip])
+    return problem, end, grip
+
+
+def uniform(model, energy):
+    """Damage at a uniform energy, in closed form (Pham et al. 2011)."""
+    if model == "AT2":
+        return 2 * energy / (2 * energy + TOUGHNESS / LENGTH)
+    return np.maximum(0.0, 1 - 3 * TOUGHNESS / (16 * LENGTH * energy))
+
+
+@pytest.mark.parametrize(
+    ("law", "split", "dim", "model"),
+    [
+        (LinearElastic, "none", 2, "AT1"),
+        (LinearElastic, "spectral", 2, "AT2"),
+        (Hencky, "volumetric", 2, "AT1"),
+        (Hencky, "spectral", 3, "AT1"),
+        (NeoHooke, "volumetric", 2, "AT2"),
+    ],
+)
+def test_damage_of_a_uniform_bar_is_the_closed_form(law, split, dim, model):
+    elastic = law(YOUNG, 0.0)
+    problem, end, grip = pulled(Fracture(elastic, TOUGHNESS, LENGTH, model=model, split=split), dim)
+    work = force = 0.0
+    stretches = np.linspace(0.0, 0.25, 26)[1:]
+    for stretch in stretches:
+        end.value = stretch
+        problem.step()
+        before, force = force, problem.reaction(grip)[0]
+        work += 0.01 * (before + force) / 2
+    damage = problem.damage[0]
+    strain = np.array([[0.25 if law is LinearElastic else np.log(1.25), 0.0, 0.0, 0.0]])
+    energy = elastic.stored_energy(strain)[0]
+    expected = uniform(model, energy)
+    assert expected > 0.5
+    np.testing.assert_allclose(damage.field.x.array, expected, atol=1e-5)
+    # What was put in is stored or has gone into cracks.
+    points = problem.points[0]
+    stored = WORLD.allreduce(float((points.strain_energy() * points.weights.ravel()).sum()))
+    surface = damage.surface_energy()
+    own = expected if model == "AT1" else expected**2
+    weight = 8 / 3 if model == "AT1" else 2.0
+    np.testing.assert_allclose(surface, TOUGHNESS / weight * own / LENGTH, rtol=1e-5)
+    np.testing.assert_allclose(work, stored + surface, rtol=5e-3)
+    # And back: nothing heals, and what is left is elastic.
+    end.value = 0.1
+    problem.step()
+    np.testing.assert_allclose(damage.field.x.array, expected, atol=1e-5)
+    np.testing.assert_allclose(damage.surface_energy(), surface, rtol=1e-12)
+
+
+def test_carried_and_free_bodies_crack_alike():
+    """A carried bar, pulled by a support, breaks at the strength of AT1 under a dead load."""
+    law = Fracture(LinearElastic(YOUNG, 0.0), TOUGHNESS, LENGTH)
+    found = []
+    for carried in (True, False):
+        body = mesh.create_rectangle(WORLD, [[0, 0], [1, 1]], [4, 4], QUADRILATERAL)
+        grid = mesh.create_rectangle(WORLD, [[-0.4, -0.4], [1.8, 1.4]], [7, 6], QUADRILATERAL)
+        V = fem.functionspace(grid, ("Lagrange", 1, (2,))) if carried else None
+        particles = mpm.Particles(body, V, quadrature_degree=2)
+        tags = mpm.facet_tags(body, {1: mpm.region(x=1.0), 2: mpm.region(x=0.0)})
+        strength = np.sqrt(3 * TOUGHNESS * YOUNG / (8 * LENGTH))
+        problem = mpm.QuasiStaticProblem(
+            mpm.Body(particles, law, tractions=[((0.99 * strength, 0.0), 1)], facet_tags=tags),
+            supports=[mpm.boundary.fixed(particles, tags, 2)],
+        )
+        problem.solve(2)
+        found.append(problem.damage[0].field.x.array.max())
+        assert problem.damage[0].surface_energy() == 0.0
+    assert found == [0.0, 0.0]
+
+
+def notched(n=12):
+    """A square with a slit, one cell wide."""
+    square = mesh.create_rectangle(WORLD, [[0, 0], [1, 1]], [n, n], QUADRILATERAL)
+    middle = mesh.compute_midpoints(
+        square, 2, np.arange(square.topology.index_map(2).size_local, dtype=np.int32)
+    )
+    slit = (np.abs(middle[:, 1] - 0.46) < 0.5 / n) & (middle[:, 0] < 0.5)
+    return mesh.create_submesh(square, 2, np.flatnonzero(~slit).astype(np.int32))[0]
+
+
+def test_a_notched_plate_is_that_of_dolfinx():
+    """Alternate minimisation of the same energy on the same mesh, by stock DOLFINx."""
+    toughness, length, top = 0.02, 0.15, 0.02
+    body = notched()
+    particles = mpm.Particles(body, quadrature_degree=3)
+    law = Fracture(LinearElastic(YOUNG, 0.3), toughness, length, model="AT2", split="none")
+    upper, lower = (mpm.held(particles.W, value=(0.0, v), y=y) for v, y in ((top, 1), (0, 0)))
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, law), bcs=[upper, lower])
+    step = problem.step()
+    assert step.alternations > 3
+
+    W = fem.functionspace(body, ("Lagrange", 1, (2,)))
+    Q = fem.functionspace(body, ("Lagrange", 1))
+    u, d = fem.Function(W), fem.Function(Q)
+    v, q = ufl.TestFunction(W), ufl.TestFunction(Q)
+    du, dd = ufl.TrialFunction(W), ufl.TrialFunction(Q)
+    dx = ufl.Measure("dx", body, metadata={"quadrature_degree": 3})
+    shear, lame = law.law.shear, law.law.bulk - 2 / 3 * law.law.shear
+
+    def stress(w):
+        e = ufl.sym(ufl.grad(w))
+        return 2 * shear * e + lame * ufl.tr(e) * ufl.Identity(2)
+
+    kept = (1 - d) ** 2 + 1e-6
+    zero = fem.Constant(body, (0.0, 0.0))
+    elastic = LinearProblem(
+        kept * ufl.inner(stress(du), ufl.sym(ufl.grad(v))) * dx,
+        ufl.inner(zero, v) * dx,
+        u=u,
+        bcs=[mpm.held(W, value=(0.0, w), y=y) for w, y in ((top, 1), (0, 0))],
+        petsc_options_prefix="u_",
+        petsc_options=OPTIONS,
+    )
+    energy = ufl.inner(stress(u), ufl.sym(ufl.grad(u))) / 2
+    spread = toughness * length * ufl.dot(ufl.grad(dd), ufl.grad(q))
+    cracks = LinearProblem(
+        ((2 * energy + toughness / length) * dd * q + spread) * dx,
+        2 * energy * q * dx,
+        u=d,
+        petsc_options_prefix="d_",
+        petsc_options=OPTIONS,
+    )
+    for _ in range(400):
+        before = d.x.array.copy()
+        elastic.solve()
+        cracks.solve()
+        if WORLD.allreduce(float(np.abs(d.x.array - before).max()), MPI.MAX) < 1e-10:
+            break
+    field = problem.damage[0].field
+    assert 0.2 < WORLD.allreduce(float(d.x.array.max()), MPI.MAX) < 1.0
+    np.testing.assert_allclose(field.x.array, d.x.array, atol=2e-5)
+    np.testing.assert_allclose(particles.displacement.x.array, u.x.array, atol=2e-7)
+
+
+def plate(tags=None, **given):
+    """A notched plate that is carried, and pulled by a support."""
+    body = notched()
+    grid = mesh.create_rectangle(WORLD, [[-0.2, -0.2], [1.2, 1.4]], [14, 16], QUADRILATERAL)
+    particles = mpm.Particles(
+        body, fem.functionspace(grid, ("Lagrange", 1, (2,))), quadrature_degree=2
+    )
+    law = Fracture(Hencky(YOUNG, 0.3), 0.02, 0.15, **given)
+    facets = mpm.facet_tags(body, {1: mpm.region(y=1.0), 2: mpm.region(y=0.0)})
+    top = mpm.boundary.fixed(particles, facets, 1, value=(0.0, 0.04))
+    bottom = mpm.boundary.fixed(particles, facets, 2)
+    made = mpm.Body(particles, law)
+    if tags is not None:
+        cells = mpm.cell_tags(body, tags)
+        made = mpm.Body(particles, {1: Hencky(YOUNG, 0.3), 0: law}, cell_tags=cells)
+    return mpm.QuasiStaticProblem(made, supports=[top, bottom]), top
+
+
+def test_a_plate_breaks_and_a_checkpoint_goes_on(tmp_path):
+    path = WORLD.bcast(tmp_path / "plate.mpm")
+    problem, top = plate()
+    values = []
+    told = pytest.warns(UserWarning, match="smaller than half of it")
+    with told if WORLD.rank == 0 else nullcontext():
+        for number, step in enumerate(problem.steps(8)):
+            damage = problem.damage[0].field.x.array
+            if values:
+                assert (damage - values[-1]).min() >= 0.0
+            values.append(damage.copy())
+            assert step.residuals[-1] <= 1e-6
+            if number == 3:
+                problem.save(path)
+    force = problem.reaction(top)
+    assert WORLD.allreduce(float(values[-1].max()), MPI.MAX) == 1.0
+    peak = problem.damage[0].surface_energy() / 0.02
+    assert 0.5 < peak < 0.5 * 1.5  # the ligament, and what the coarse mesh adds
+    other, grip = plate()
+    other.restore(path)
+    assert 0.0 < WORLD.allreduce(float(other.damage[0].field.x.array.max()), MPI.MAX) < 1.0
+    other.solve(8)
+    near = 0.0 if WORLD.size == 1 else 1e-6  # sums over ranks come in any order
+    np.testing.assert_allclose(other.damage[0].field.x.array, values[-1], rtol=0, atol=near)
+    np.testing.assert_allclose(other.reaction(grip), force, rtol=0, atol=near)
+
+
+def test_a_part_without_a_law_of_fracture_stays_whole():
+    problem, _ = plate({1: mpm.region(x=(0.75, 1.0)), 0: mpm.region(x=(0.0, 0.75))})
+    problem.solve(5)
+    field = problem.damage[0].field
+    x = field.W.tabulate_dof_coordinates()[:, 0]
+    assert (field.x.array[x >= 0.7499] == 0.0).all()
+    assert WORLD.allreduce(float(field.x.array.max()), MPI.MAX) > 0.2
+
+
+def test_what_does_not_go_together_is_refused():
+    body = mesh.create_rectangle(WORLD, [[0, 0], [1, 1]], [2, 2], QUADRILATERAL)
+    law = Fracture(Hencky(YOUNG, 0.3), 1.0, 1.0)
+    particles = mpm.Particles(body, quadrature_degree=2)
+
+    def refused(match, make=mpm.QuasiStaticProblem, options=None, **given):
+        raises(
+            lambda: make(mpm.Body(particles, law, **given), **(options or {})), mpm.MPMError, match
+        )
+
+    refused("f_bar", f_bar="domain")
+    refused("mixed", options={"mixed": "stabilised pressure"})
+    refused("axisymmetric", options={"axisymmetric": True})
+    refused("DynamicProblem", mpm.DynamicProblem, density=1.0)
+    refused("initial_stress", initial_stress=np.eye(3))
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, law), bcs=[mpm.held(particles.W, y=0.0)])
+    raises(
+        lambda: problem.stage("other", problem.body().replace(material=Hencky(1.0, 0.3))),
+        mpm.MPMError,
+        "in a stage",
+    )
+    raises(lambda: problem.remove([0]), mpm.MPMError, "removed")
+    raises(problem.repartition, mpm.MPMError, "Damage")
+    other = Fracture(Hencky(YOUNG, 0.3), 1.0, 1.0, model="AT2")
+    tags = mpm.cell_tags(body, {0: mpm.region(x=(0.0, 0.5)), 1: mpm.region(x=(0.5, 1.0))})
+    raises(
+        lambda: mpm.QuasiStaticProblem(mpm.Body(particles, {0: law, 1: other}, cell_tags=tags)),
+        mpm.MPMError,
+        "different models",
+    )
