@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """One version: what names it elsewhere agrees with the package."""
 
+import json
 import re
 from pathlib import Path
 
@@ -13,6 +14,8 @@ ROOT = Path(__file__).parents[1]
 def test_citation_names_the_version():
     text = (ROOT / "CITATION.cff").read_text("utf-8")
     assert re.findall(r"^version: (.*)$", text, re.MULTILINE) == [mpm_dolfinx.__version__]
+    metadata = json.loads((ROOT / "codemeta.json").read_text("utf-8"))
+    assert metadata["version"] == mpm_dolfinx.__version__
 
 
 def test_changelog_begins_with_the_version_or_what_is_not_released():
