@@ -81,6 +81,13 @@ def fix(V, where, value=0.0, component=None):
     return fem.dirichletbc(value, dofs, space)
 
 
+def below(V, height):
+    """Return a condition that holds all nodes of a background below a height, inside it too."""
+    dim = V.mesh.geometry.dim
+    dofs = fem.locate_dofs_geometrical(V, lambda x: x[dim - 1] < height)
+    return fem.dirichletbc(np.zeros(dim), dofs, V)
+
+
 def at(axis, *places):
     """Return a marker of the planes x[axis] = place."""
     return lambda x: np.isclose(x[axis][:, None], places).any(axis=1)

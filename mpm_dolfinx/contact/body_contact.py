@@ -32,7 +32,7 @@ class Coupled(NamedTuple):
         nodes: Of forces on nodes by nodes.
         of_motion: Of forces and moments on the rigid body by nodes; ``None``: none yet, as above.
         by_motion: Of forces on nodes by unknowns of the rigid body.
-        own: Of forces on the rigid body by its own unknowns, of this rank.
+        own: Of forces and moments on the rigid body by its step, of this rank, ``(n, n)``.
     """
 
     nodes: PETSc.Mat | None
@@ -226,7 +226,7 @@ class BodyContact(Rigid):
             self._matrix.of([self._blocks_of(slopes)]),
             of_motion.of([Blocks(keys, motions, slopes.dofs, of.reshape(m, n, k))]),
             by_motion.of([Blocks(keys, slopes.dofs, motions, by.reshape(m, k, n))]),
-            per_unknown.T @ own @ per_unknown,
+            own,
         )
 
     def of_own(

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..errors import ConvergenceError, MPMError, agree, agreed
 from ..system.own import OwnUnknowns
 from .body_contact import BodyContact
-from .rigid_motion import RigidMotion
+from .rigid_motion import RigidMotion, State
 from .rotation import Pose
 
 __all__ = ["RigidBalance"]
@@ -32,10 +32,10 @@ LOOSE = 1e-11
 #: before a step, and most iterations of that.
 UNBALANCED, MOST_ITERATIONS = 0.1, 60
 #: Drag on a body that creeps to its balance, over the largest stiffness, to begin with; by how much
-#: it changes in an iteration at most, down and up; and how much larger the residual may become.
-DRAG, FADES, RISES, GROWS = 0.1, 0.25, 4.0, 2.0
-#: Most that it turns in an iteration of that, and in a step that Newton's method tries.
-TURN, MOST_TURN = 0.5, 2.0
+#: it rises where the residual becomes larger than by a factor.
+DRAG, RISES, GROWS = 0.1, 4.0, 2.0
+#: Most that it turns in a step that is tried.
+MOST_TURN = 2.0
 #: Gap, over twice the length of what it falls on, to which a body without a hold falls; at least
 #: this much times the round-off of coordinates.
 NEAR, LEAST = 1e-7, 8.0
@@ -82,9 +82,10 @@ class RigidBalance:
         self.own = OwnUnknowns(comm, count) if count else None
         self.share = 1.0
         self._span = self._stiffness = 1.0
-        self._each = np.eye(len(motion.held))[:, self._free]
+        self._units = np.eye(len(motion.held))
         self._path = np.zeros(len(motion.held))
-        self._unsettled = False
+        self._unsettled, self._creeps = False, True
+        self._attempt: tuple[State, NDArray[np.float64]] | None = None
 
     def take_part(self) -> None:
         """Take the bodies as they are, at rest (collective)."""
@@ -93,7 +94,7 @@ class RigidBalance:
         self._span = max([contact.span() for contact in self._contacts])
         length = self._span if motion.gyration is None else motion.gyration
         turns = np.arange(len(motion.held)) >= len(motion.start)
-        self._each = np.diag(np.where(turns, 1.0 / length, 1.0))[:, self._free]
+        self._units = np.diag(np.where(turns, 1.0 / length, 1.0))
 
     def begin(self) -> None:
         """Begin a step, after its contacts (collective)."""
@@ -107,10 +108,19 @@ class RigidBalance:
         stiffness = sum(contact.whole_stiffness for contact in self._contacts)
         self._stiffness = self._comm.allreduce(stiffness)
         own.start = np.zeros(own.total)
+        before, aim = self._attempt, np.concatenate([*motion.push, self._path])
+        self._attempt = motion.last, aim
+        again = before is not None and before[0] is motion.last and np.array_equal(before[1], aim)
+        self._creeps = not (again and self._creeps)
         self._unsettled = motion.dt is None
         own.expected, own.advice = None, ADVICE
         if not self._unsettled:
             own.expected, own.advice = self._unknowns(guess), ""
+
+    @property
+    def _each(self) -> NDArray[np.float64]:
+        """Displacement and Cayley vector by each unknown, shape ``(gdim + nr, n)``."""
+        return self._units[:, self._free]
 
     def _unknowns(self, step: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the unknowns of a step, in the units of displacements."""
@@ -174,63 +184,69 @@ class RigidBalance:
             return {(i, i): K for i, each in enumerate(every) for K in each.values()}
         last, motion = len(self._contacts), self._motion
         found: dict[tuple[int, int], PETSc.Mat | None] = {}
-        own = np.zeros((unknowns.total, unknowns.total))
+        own = np.zeros_like(self._units)
         for i, contact in enumerate(self._contacts):
             part = contact.coupled(motion.centres, motion.theta, self._each, secants)
             found |= {(i, i): part.nodes, (last, i): part.of_motion, (i, last): part.by_motion}
             own += part.own
-        found[last, last] = unknowns.matrix(self._firm(self._whole(own)))
+        found[last, last] = unknowns.matrix(self._firm(*self._whole(own)))
         return {pair: K for pair, K in found.items() if K is not None}
 
-    def _whole(self, own: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the derivative of the balance by the unknowns (collective).
+    def _whole(self, own: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+        """Return the derivative of the balance by the unknowns, and the largest (collective).
+
+        The largest may be one by what is held: round-off is small beside that.
 
         Args:
-            own: That of forces of contact on this rank.
+            own: Derivative of forces of contact by the step, on this rank.
         """
-        inertial = self._each.T @ self._motion.slopes() @ self._each / self.share
-        return np.asarray(self._comm.allreduce(own) + inertial)
+        every = self._comm.allreduce(own) + self._motion.slopes() / self.share
+        K = self._each.T @ every @ self._each
+        return K, float(np.linalg.norm(self._units @ every @ self._units, 2))
 
-    def _firm(self, K: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a tangent that is as stiff as can be where nothing holds the body."""
+    def _firm(self, K: NDArray[np.float64], largest: float) -> NDArray[np.float64]:
+        """Return a tangent that is as stiff as can be where nothing holds the body.
+
+        Args:
+            K: The tangent.
+            largest: The largest stiffness there is, zero where nothing touches.
+        """
         U, sizes, V = np.linalg.svd(K)
-        largest = sizes[0] if sizes[0] > 0.0 else self._stiffness
-        return np.asarray(U * np.where(sizes > LOOSE * largest, sizes, largest) @ V)
+        most = largest or self._stiffness
+        return np.asarray(U * np.where(sizes > LOOSE * most, sizes, most) @ V)
 
     # -- Where it begins at rest ------------------------------------------------------------------
 
     def _approached(self, step: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return a step by which a body at rest comes near to its balance (collective).
 
-        Others stay as they are. It creeps there against a drag that fades: where points come to
-        touch and lift off on its way, Newton's method goes to and fro between places of no balance,
-        and what creeps goes downhill (pseudo-transient continuation, the drag in proportion to the
-        residual: Kelley & Keyes 1998, SIAM J. Numer. Anal. 35).
+        Others stay as they are. It creeps there against a drag: where points come to touch and lift
+        off on its way, Newton's method goes to and fro between places of no balance, and what
+        creeps goes downhill (pseudo-transient continuation). What it lies on does not give way
+        meanwhile; where the step fails from there, it is tried again from where it touches first.
 
         Raises:
             MPMError: There is nothing on its way.
         """
-        each, gdim, motion = self._each, len(self._motion.start), self._motion
+        each, motion = self._each, self._motion
         drag, now = 0.0, self._tried(step)
         for _ in range(MOST_ITERATIONS):
             norm = float(np.linalg.norm(now.left))
-            if norm <= UNBALANCED * now.size:
+            if norm <= UNBALANCED * now.size or (now.touches and not self._creeps):
                 break
             parts = [contact.of_own(motion.centres, motion.theta) for contact in self._contacts]
-            K = self._whole(each.T @ np.sum(parts, axis=0) @ each)
-            if not now.touches or not K.any():
+            K, largest = self._whole(np.sum(parts, axis=0))
+            if not now.touches or np.linalg.norm(K, 2) <= LOOSE * largest:
                 step = self._fallen(step, now)
                 now = self._tried(step)
                 continue
             drag = drag or DRAG * float(np.linalg.norm(K, 2))
             change = each @ np.linalg.solve(K + drag * np.eye(len(K)), now.left)
-            change *= min(1.0, TURN / max(float(np.linalg.norm(change[gdim:])), TURN))
             tried = self._tried(step - change)
-            if (found := float(np.linalg.norm(tried.left))) > GROWS * norm:
+            if float(np.linalg.norm(tried.left)) > GROWS * norm:
                 drag *= RISES
                 now = self._tried(step)
                 continue
-            drag *= max(found / norm, FADES)
             step, now = step - change, tried
         return step
 

@@ -22,7 +22,7 @@ def soil():
     """Return a block that stands on its base, and what holds it."""
     V = scenes.vectors(box([-1.0, -0.2], [4.0, 1.8], [15, 6], QUADRILATERAL))
     particles = mpm.Particles(box([0.2, 0.0], [2.8, 1.0], [26, 6], QUADRILATERAL), V)
-    return particles, [scenes.fix(V, lambda x: x[1] < 0.01)]
+    return particles, [scenes.below(V, 0.01)]
 
 
 def pressed(law="penalty", count=1, names=(None,), order=1):

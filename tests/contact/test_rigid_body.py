@@ -55,13 +55,6 @@ def thrown(shape="disc", friction=0.0, comm=WORLD, origin=0.0, law=None, **optio
     return problem, ball
 
 
-def base(V, height):
-    """Return a condition that holds all that is below some height."""
-    dim = V.mesh.geometry.dim
-    dofs = fem.locate_dofs_geometrical(V, lambda x: x[dim - 1] < height)
-    return fem.dirichletbc(np.zeros(dim), dofs, V)
-
-
 def energy(problem, ball):
     """Return all energy that there is now, and what friction has taken."""
     e = problem.history.energies[-1]
@@ -239,7 +232,7 @@ def test_a_disc_rolls_down_an_incline_with_two_thirds_of_the_acceleration(n, dt,
     problem = mpm.DynamicProblem(
         mpm.Body(particles, Hencky(1e6, 0.3), density=1000.0),
         scheme=scheme,
-        bcs=[base(V, -0.29)],
+        bcs=[scenes.below(V, -0.29)],
         rayleigh=(0.0, 1e-3),
         terms=[wheel],
     )
@@ -265,7 +258,7 @@ def footing(comm=WORLD, cell=QUADRILATERAL, fixed=(), **options):
         mpm.QuasiStaticProblem,
         particles,
         Hencky(YOUNG, POISSON),
-        bcs=[base(V, 0.01)],
+        bcs=[scenes.below(V, 0.01)],
         terms=[plate],
         **TIGHT,
     )
@@ -307,7 +300,9 @@ def test_a_plate_settles_as_a_column_is_compressed():
         ]
     ]
     problem = mpm.QuasiStaticProblem(
-        mpm.Body(particles, LinearElastic(1e4, POISSON)), bcs=[*sides, base(V, 0.01)], terms=[plate]
+        mpm.Body(particles, LinearElastic(1e4, POISSON)),
+        bcs=[*sides, scenes.below(V, 0.01)],
+        terms=[plate],
     )
     problem.solve(1, update=lambda t: plate.push((0.0, -82.0)))
     # (the last row of domains is as soft once more: the penalty is 1)
@@ -490,7 +485,7 @@ def test_a_ball_rolls_down_an_incline_with_five_sevenths_of_the_acceleration():
     problem = mpm.DynamicProblem(
         mpm.Body(particles, Hencky(1e6, 0.3), density=1000.0),
         scheme="euler",
-        bcs=[base(V, -0.19)],
+        bcs=[scenes.below(V, -0.19)],
         terms=[ball],
     )
     times, speeds = [], []
@@ -562,7 +557,7 @@ def test_an_error_in_any_one_call_of_a_shape_ends_the_step():
         plate = contact.RigidBody(particles, shape, centre=(0.5, 1.0), fixed=("rotation",))
         law = Hencky(YOUNG, POISSON)
         problem = mpm.QuasiStaticProblem(
-            mpm.Body(particles, law), bcs=[base(V, 0.01)], terms=[plate]
+            mpm.Body(particles, law), bcs=[scenes.below(V, 0.01)], terms=[plate]
         )
         begun = len(calls)
         problem.solve(1, update=lambda t: plate.push((0.0, -8.0 * t), 0.0))

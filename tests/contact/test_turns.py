@@ -18,7 +18,7 @@ def pressed(friction=0.3):
     V = scenes.vectors(box([0.0, -0.2], [2.0, 1.4], [10, 8], QUADRILATERAL))
     body = mpm.Particles(box([0.2, 0.0], [1.8, 1.0], [16, 8], QUADRILATERAL), V)
     disc = contact.Rigid(body, contact.disc((1.0, 1.3), 0.3), friction)
-    base = [scenes.fix(V, lambda x: x[1] < 0.01)]
+    base = [scenes.below(V, 0.01)]
     problem = mpm.QuasiStaticProblem(mpm.Body(body, Hencky(1e3, 0.3)), bcs=base, terms=[disc])
     problem.solve(2, update=lambda t: disc.move((0.0, -0.05 * t)))
     return problem, disc
