@@ -168,7 +168,6 @@ class Tie(Term):
         domain, dim = body.mesh, body.mesh.topology.dim - 1
         own = tags.find(self._tag)
         own = own[own < domain.topology.index_map(dim).size_local]
-        domain.topology.create_connectivity(dim, dim + 1)
         kinds = (basix.CellType.interval, basix.CellType.triangle)
         cell = domain.basix_cell()
         kind = kinds[dim - 1]

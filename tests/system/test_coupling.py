@@ -364,3 +364,6 @@ def test_a_face_counts_once_on_any_number_of_ranks(n):
     motion.set(1.0)
     K.mult(motion, force)
     assert motion.dot(force) == pytest.approx(2 * 3.0)
+    ring = mpm.Tie(lower, upper, tags, 1, 3.0, axisymmetric=True).tangents()[0, 0]
+    ring.mult(motion, force)
+    assert motion.dot(force) == pytest.approx(2 * 3.0 * np.pi)
