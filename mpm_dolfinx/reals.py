@@ -20,15 +20,16 @@ def as_reals(value: Any) -> NDArray[np.float64]:
     """Return numbers as a new array.
 
     Raises:
-        TypeError: Complex numbers, whose imaginary part would be dropped, truths, or UFL that has
-            no value (NumPy goes through the components of a scalar without end).
+        TypeError: Complex numbers, whose imaginary part would be dropped, truths, ``None``, which
+            NumPy takes for not a number, or UFL that has no value (NumPy goes through the
+            components of a scalar without end).
         ValueError: Something else that is none.
     """
     if holds_ufl(value, fem.Constant):
         raise TypeError("UFL is no number")
     array = np.asarray(value)
-    if array.dtype.kind in "cb" or _holds(value, (bool, np.bool_)):
-        raise TypeError("complex numbers, or truths")
+    if array.dtype.kind in "cb" or _holds(value, (bool, np.bool_, type(None))):
+        raise TypeError("complex numbers, truths, or nothing")
     try:
         return np.array(array, dtype=np.float64)
     except OverflowError as error:

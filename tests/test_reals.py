@@ -23,7 +23,9 @@ def test_numbers_and_constants():
     assert not np.shares_memory(as_reals(values), values)
 
 
-@pytest.mark.parametrize("value", [1j, (0.0, 1j), np.ones(2) * 1j, "up", [[1.0], [1.0, 2.0]], {}])
+@pytest.mark.parametrize(
+    "value", [None, (0.0, None), 1j, (0.0, 1j), np.ones(2) * 1j, "up", [[1.0], [1.0, 2.0]], {}]
+)
 def test_what_is_no_number(value):
     with pytest.raises((TypeError, ValueError)):
         as_reals(value)

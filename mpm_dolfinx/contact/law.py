@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._core import is_as_inherited, loops
-from ..errors import MPMError
+from ..errors import MPMError, as_ours
+from ..reals import as_reals
 
 __all__ = [
     "Coulomb",
@@ -227,9 +228,50 @@ def as_friction(value: Any) -> Friction:
     """Return a coefficient of friction, or a law, as a law.
 
     Raises:
-        MPMError: It is neither.
+        MPMError: It is neither, or a law whose memory does not begin with numbers.
     """
-    return value if isinstance(value, Friction) else Coulomb(friction=value)
+    if not isinstance(value, Friction):
+        return Coulomb(friction=value)
+    try:
+        begins = as_reals(value.memory)
+    except (TypeError, ValueError):
+        begins = np.array(np.nan)
+    if begins.ndim != 1 or not np.isfinite(begins).all():
+        raise MPMError(
+            f"{value.told[0]}.memory must be a list of finite numbers, not {value.memory!r}."
+        )
+    return value
+
+
+def _told_by(law: Friction, name: str, at: Rubbing, shape: tuple[int, ...]) -> Array:
+    """Return what a method of a law tells of points, which it may not change.
+
+    Raises:
+        MPMError: It fails, or does not tell as many finite numbers.
+    """
+    which = f"{law.told[0]}.{name}"
+    views = [values.view() for values in at]
+    for view in views:
+        view.setflags(write=False)
+    try:
+        found = np.array(getattr(law, name)(Rubbing(*views)), dtype=np.float64)
+    except Exception as error:
+        raise as_ours(error, which) from error
+    if found.shape != shape or not np.isfinite(found).all():
+        raise MPMError(f"{which} must return finite numbers of shape {shape}, one for each point.")
+    return found
+
+
+def _bound(law: Friction, at: Rubbing) -> Array:
+    """Return the bound by a law at points.
+
+    Raises:
+        MPMError: The law fails, or gives no bound for each point.
+    """
+    found = _told_by(law, "bound", at, (len(at.pressure),))
+    if not (found >= 0.0).all():
+        raise MPMError(f"{law.told[0]}.bound must return shear tractions from 0 on.")
+    return found
 
 
 def unworn(law: Friction, shape: tuple[int, ...]) -> Array:
@@ -427,7 +469,7 @@ def bounds(law: Friction, points: Points, at: Separation) -> Array:
     rubs, stiffness, length = _rubbing(law, points, at.real)
     size = float(rubs.pressure.max(initial=0.0)) or 1.0
     by_slip = _slope(law, rubs, "slip", length)
-    bound, slips = law.bound(rubs), rubs.slip > 0.0
+    bound, slips = _bound(law, rubs), rubs.slip > 0.0
     # (slip = way - bound / stiffness)
     k = np.where(slips, stiffness, np.inf)
     factor = 1.0 / (1.0 + by_slip / k)
@@ -444,7 +486,7 @@ def remembered(law: Friction, points: Points, at: Separation) -> Array:
     inside = traction(law, points, at).inside
     rubs, *_ = _rubbing(law, points.of(inside), at.of(inside))
     found = points.memory.copy()
-    found[inside] = law.remember(rubs)
+    found[inside] = _told_by(law, "remember", rubs, rubs.memory.shape)
     return found
 
 
@@ -467,12 +509,7 @@ def _rubbing(law: Friction, points: Points, at: Separation) -> tuple[Rubbing, Ar
     slip, low, high = np.zeros_like(way), np.zeros_like(way), way
     for _ in range(ITERATIONS):
         rubs = Rubbing(pressure, slip, at.gap, points.stretch, points.memory)
-        bound = np.asarray(law.bound(rubs))
-        if bound.shape != slip.shape or not (bound >= 0.0).all():
-            raise MPMError(
-                f"{law.told[0]}.bound must return a shear traction from 0 on for each of "
-                f"{len(slip)} points."
-            )
+        bound = _bound(law, rubs)
         left = size - stiffness * slip - bound
         done = np.abs(left) <= ERROR * size
         moves = ~done & ((left > 0.0) | (slip > 0.0))
@@ -492,7 +529,8 @@ def _slope(law: Friction, rubs: Rubbing, name: str, size: float) -> Array:
     It is of second order in a step forwards: there are no pressures nor slips below zero.
     """
     values, step = getattr(rubs, name), STEP * size
-    first, second, third = (law.bound(rubs._replace(**{name: values + i * step})) for i in range(3))
+    beside = (rubs._replace(**{name: values + i * step}) for i in range(3))
+    first, second, third = (_bound(law, at) for at in beside)
     return np.asarray((4.0 * second - 3.0 * first - third) / (2.0 * step))
 
 

@@ -21,7 +21,7 @@ from .. import _compat
 from ..assembly.inputs import is_tag, known_tags
 from ..errors import MPMError
 from ..meshes.remesh import Column
-from ..parallel.given import require_whole
+from ..parallel.given import require_truth, require_whole
 from ..particles.particles import Particles
 
 __all__ = [
@@ -180,6 +180,7 @@ class Surface:
         if degree is None:
             degree = 2 * int(particles.W.ufl_element().degree) + 1
         require_whole(f"quadrature_degree of {what}", degree, 100)  # 51 points each way
+        require_truth(f"axisymmetric of {what}", axisymmetric)
         self.particles = particles
         self.axisymmetric = axisymmetric
         self._where = Facets(particles, facet_tags, tag, what)

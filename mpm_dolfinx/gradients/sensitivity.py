@@ -19,6 +19,7 @@ from ..parallel.given import as_positive, require_same
 from ..problems.motion import MovingProblem
 from ..problems.particle_problem import ParticleProblem
 from ..problems.quasistatic import QuasiStaticProblem
+from ..reals import as_reals
 from ..stepping.control import Run
 from ..stepping.loading import Stepper
 from .forward import StepDerivative
@@ -130,7 +131,9 @@ class Sensitivity:
                     amount = sign * parameter.change
                     self._nearby.go(parameter, amount, rates)
                     with self._nearby.shown(amount, rates, self._reactions()):
-                        sides.append(np.array(look(), dtype=np.float64))
+                        sides.append(_numbers(look()))
+                if sides[0].shape != sides[1].shape:
+                    raise MPMError("A function of Sensitivity.of must always return one shape.")
                 columns.append(parameter.slope(*sides))
         return np.stack(columns, axis=-1)
 
@@ -262,6 +265,20 @@ class Sensitivity:
                 "A Sensitivity does not follow displacement control, whose load factor depends on "
                 "the parameters too; apply a load."
             )
+
+
+def _numbers(value: Any) -> Array:
+    """Return what a user's function found, as numbers.
+
+    Raises:
+        MPMError: It is something else.
+    """
+    try:
+        return as_reals(value)
+    except (TypeError, ValueError):
+        raise MPMError(
+            f"A function of Sensitivity.of must return a number or an array, not {value!r}."
+        ) from None
 
 
 def _require_followed(problem: ParticleProblem) -> None:

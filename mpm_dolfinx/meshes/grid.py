@@ -28,6 +28,11 @@ GROWTH = 1.2
 MOST, DEEPEST = 1_000_000, 20
 #: Distance over the whole length within which two lines are one.
 SAME = 1e-12
+#: Cells by the number of axes, the first by default.
+CELLS = {
+    2: (mesh.CellType.quadrilateral, mesh.CellType.triangle),
+    3: (mesh.CellType.hexahedron, mesh.CellType.tetrahedron),
+}
 
 
 def grid_lines(
@@ -61,8 +66,8 @@ def grid_lines(
     Raises:
         MPMError: Numbers that make no sense.
     """
-    ends = (start, stop) if equal is None else tuple(equal)
     try:
+        ends = (start, stop) if equal is None else tuple(equal)
         numbers = as_reals([start, stop, size, *ends])
         places = np.atleast_1d(as_reals(finer_at)) if np.size(finer_at) else np.zeros(0)
     except (TypeError, ValueError):
@@ -139,19 +144,26 @@ def grid(
         for along in axes:
             if along.ndim != 1 or len(along) < 2 or not (np.diff(along) > 0.0).all():
                 raise MPMError("The lines along an axis of grid() are two or more, ascending.")
+            if not np.isfinite(along).all():
+                raise MPMError("The lines along an axis of grid() must be finite.")
+        kinds = CELLS[len(axes)]
+        if cell_type is not None and cell_type not in kinds:
+            named = " or ".join(kind.name for kind in kinds)
+            raise MPMError(
+                f"cell_type of grid() with {len(axes)} axes is {named}, not {cell_type.name}."
+            )
     counts = [len(along) - 1 for along in axes]
     box: list[Any] = [np.zeros(len(axes)), np.array(counts, dtype=np.float64)]
-    types = mesh.CellType
     if len(axes) == 2:
         domain = mesh.create_rectangle(
             comm,
             box,
             counts,
-            cell_type or types.quadrilateral,
+            cell_type or kinds[0],
             diagonal=mesh.DiagonalType.left_right,
         )
     else:
-        domain = mesh.create_box(comm, box, counts, cell_type or types.hexahedron)
+        domain = mesh.create_box(comm, box, counts, cell_type or kinds[0])
     for axis, along in enumerate(axes):
         place = domain.geometry.x[:, axis]
         place[:] = np.interp(place, np.arange(len(along)), along)

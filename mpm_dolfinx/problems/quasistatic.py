@@ -284,6 +284,8 @@ class QuasiStaticProblem(ParticleProblem):
             MPMError: What does not go together. Nothing is changed then.
         """
         changed = as_given(bodies) if bodies != () else []
+        if changed:
+            as_bodies([body.particles for body in changed])
         self._require_given(changed)
         for body in changed:
             self._require_change(body)
@@ -360,7 +362,9 @@ class QuasiStaticProblem(ParticleProblem):
         Raises:
             MPMError: What does not go together. Nothing is changed then.
         """
-        (given,) = as_given(body)
+        given, *more = as_given(body)
+        if more:
+            raise MPMError("add() takes one mpm.Body; call it again for the next.")
         self._require_given([given])
         if given.may_crack:
             raise MPMError("A body with a law of fracture cannot be added; begin with it.")

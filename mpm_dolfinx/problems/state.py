@@ -21,6 +21,7 @@ from ..history import History
 from ..io import checkpoint, identity
 from ..io.series import Output, read_series
 from ..io.snapshot import Kept, adopt, capture, require_key
+from ..parallel.given import require_same
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..stepping.control import Run
@@ -138,8 +139,13 @@ class ProblemState:
         Raises:
             MPMError: It is something else, or its key is taken.
         """
-        if not isinstance(thing, Kept) or not isinstance(thing.key, str):
-            raise MPMError(f"keep() needs an heir of mpm_dolfinx.io.Kept, not {thing!r}.")
+        comm = self._problem.bodies[0].mesh.comm
+        with agree(comm):
+            if not isinstance(thing, Kept):
+                raise MPMError(f"keep() needs an heir of mpm_dolfinx.io.Kept, not {thing!r}.")
+            if not isinstance(thing.key, str):
+                raise MPMError(f"The key of what is kept must be a string, not {thing.key!r}.")
+        require_same(comm, key=thing.key)
         things, _ = self._all((), whole=False)
         require_key(thing.key, things, len(self._problem.bodies))
         self.kept.append((owner, thing))

@@ -15,6 +15,8 @@ import ufl
 from dolfinx import mesh
 
 from ..errors import MPMError
+from ..parallel.given import is_number
+from ..reals import holds_ufl
 
 __all__ = ["WaterTable"]
 
@@ -43,23 +45,35 @@ class WaterTable:
 
     def __post_init__(self) -> None:
         """Say so where something makes no sense."""
-        numbers = [self.weight] if callable(self.level) else [self.weight, self.level]
-        if not all(
-            isinstance(n, float | int | np.number) and not isinstance(n, bool) and np.isfinite(n)
-            for n in numbers
-        ):
+        numbers: list[Any] = [self.weight, *([] if self._function else [self.level])]
+        if not all(is_number(n) and np.isfinite(n) for n in numbers):
             raise MPMError("WaterTable needs a finite level, or a function of it, and a weight.")
         if not self.weight > 0.0:
             raise MPMError(f"The weight of water must be positive, not {self.weight:g}.")
 
     def level_at(self, x: Any) -> Any:
         """Return the level at coordinates, UFL or arrays."""
-        return self.level(x) if callable(self.level) else self.level
+        return self._function(x) if self._function else self.level
+
+    @property
+    def _function(self) -> Callable[[Any], Any] | None:
+        """The function of the level, if it is one; UFL can be called too."""
+        return self.level if callable(self.level) and not holds_ufl(self.level) else None
 
     def __call__(self, domain: mesh.Mesh) -> Any:
-        """Return the pore pressure on a mesh, in UFL."""
+        """Return the pore pressure on a mesh, in UFL.
+
+        Raises:
+            MPMError: The function of the level returns no level.
+        """
         x = ufl.SpatialCoordinate(domain)
-        below = self.level_at(x) - x[domain.geometry.dim - 1]
+        level = self.level_at(x)
+        if not (holds_ufl(level) or (is_number(level) and np.isfinite(level))):
+            raise MPMError(
+                "The level of a WaterTable must be a finite number, or UFL by arithmetic with the "
+                f"coordinates, not {level!r}."
+            )
+        below = level - x[domain.geometry.dim - 1]
         return ufl.conditional(ufl.gt(below, 0.0), self.weight * below, 0.0)
 
     def on(self, height: Any, x: Array) -> Array:

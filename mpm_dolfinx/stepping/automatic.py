@@ -16,6 +16,7 @@ import numpy as np
 from ..errors import MPMError
 from ..parallel.magnitudes import joint_norm
 from ..particles.particles import Particles
+from ..reals import as_reals
 from ..system.reduced import ReducedSystem
 from .control import LIMIT_HALVINGS, LIMIT_WIDTH, MOST_HALVINGS, Control, StepControl
 
@@ -135,10 +136,11 @@ class ErrorControl:
                 bound = "" if most == math.inf else f" up to {most:g}"
                 raise MPMError(f"{name} must be a positive number{bound}, not {value!r}.")
         try:
-            levels = sorted({float(t) for t in output_at} - {1.0})
+            places = as_reals(list(output_at))
         except (TypeError, ValueError):
-            levels = [math.nan]
-        if not all(0.0 < t < 1.0 for t in levels):
+            places = np.array([math.nan])
+        levels: list[float] = sorted({*places.ravel().tolist()} - {1.0})
+        if places.ndim != 1 or not all(0.0 < t < 1.0 for t in levels):
             raise MPMError(
                 "output_at must be a list of shares of the run, larger than 0 and up to 1, not "
                 f"{output_at!r}."

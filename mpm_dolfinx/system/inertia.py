@@ -263,7 +263,7 @@ class Inertia(Term):
         mass, share = self.mass(), self.scheme.share
         for term in self._rest.terms:
             term.pace(self.dt, share)
-        rates = rates_of(self.scheme, self.dt, self._state.last)
+        rates = rates_of(self.bodies[0].V.mesh.comm, self.scheme, self.dt, self._state.last)
         fields = [mass.vectors(own) for own in (self.velocities, *self._state.kept)]
         factors = (rates.acceleration + self._damping * rates.damped) / share
         staying = mass.times(_combined(factors[1:], fields))

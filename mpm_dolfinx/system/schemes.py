@@ -19,12 +19,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, override
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
+from ..parallel.boundary import Hooked
+from ..parallel.given import is_number, require_same, require_truth
 from ..reals import is_one_of
 from .mass import NodalMass
 
@@ -84,7 +87,7 @@ class Kinematics:
         return _difference(self.after, self.before)
 
 
-class Scheme(ABC):
+class Scheme(Hooked, ABC):
     """A rule by which bodies move through a step in time; a subclass is a new one.
 
     Give an instance as ``scheme=`` to a :class:`DynamicProblem`.
@@ -199,11 +202,7 @@ def as_scheme(value: Any, out_of_range: Any) -> Scheme:
     if isinstance(value, Scheme):
         if reflects and not value.reflects:
             raise MPMError("out_of_range='reflect' is for schemes by name; make this one reflect.")
-        if not 0.5 <= value.share <= 1.0 or (value.stress_of_step and value.share != 0.5):
-            raise MPMError(
-                f"{type(value).__name__}.share must be from 0.5 to 1, and 0.5 with a stress of the "
-                f"whole step, not {value.share!r}."
-            )
+        _require_whole(value)
         return value
     if not is_one_of(value, SCHEMES):
         raise MPMError(
@@ -212,13 +211,37 @@ def as_scheme(value: Any, out_of_range: Any) -> Scheme:
     return SCHEMES[value](reflects)
 
 
-def rates_of(scheme: Scheme, dt: float, last: float) -> Rates:
-    """Return the rates of a scheme, all with a factor for each field.
+def _require_whole(scheme: Scheme) -> None:
+    """Raise an error unless a user's scheme says all that a scheme must."""
+    kind, name = type(scheme).__name__, getattr(scheme, "name", None)
+    if not hasattr(scheme, "reflects"):
+        raise MPMError(f"{kind}.__init__ must call super().__init__(reflects).")
+    for truth in ("reflects", "stress_of_step"):
+        require_truth(f"{kind}.{truth}", getattr(scheme, truth))
+    if not isinstance(name, str) or not name or not isinstance(scheme, SCHEMES.get(name, Scheme)):
+        raise MPMError(
+            f"{kind}.name must be a word of its own, by which a checkpoint knows it, not {name!r}."
+        )
+    share, keeps = scheme.share, scheme.keeps
+    if not is_number(share) or not 0.5 <= share <= 1.0 or (scheme.stress_of_step and share != 0.5):
+        raise MPMError(
+            f"{kind}.share must be from 0.5 to 1, and 0.5 with a stress of the whole step, not "
+            f"{share!r}."
+        )
+    words = isinstance(keeps, list | tuple) and all(isinstance(one, str) and one for one in keeps)
+    if not words or len(set(keeps)) < len(keeps):
+        raise MPMError(f"{kind}.keeps must be a tuple of names that differ, not {keeps!r}.")
+
+
+def rates_of(comm: MPI.Comm, scheme: Scheme, dt: float, last: float) -> Rates:
+    """Return the rates of a scheme, all with a factor for each field (collective).
 
     Raises:
-        MPMError: Some have not, or are not finite.
+        MPMError: Some have not, are not finite, or differ between ranks.
     """
     found, count = scheme.rates(dt, last), 2 + len(scheme.keeps)
+    if not isinstance(found, Rates):
+        raise MPMError(f"{type(scheme).__name__}.rates must return mpm.Rates, not {found!r}.")
     rows = [found.acceleration, found.damped, found.velocity, *found.kept]
     shapes = {np.shape(row) for row in rows}
     if len(found.kept) != len(scheme.keeps) or shapes != {(count,)} or not np.isfinite(rows).all():
@@ -226,6 +249,7 @@ def rates_of(scheme: Scheme, dt: float, last: float) -> Rates:
             f"{type(scheme).__name__}.rates must return {3 + len(scheme.keeps)} rows of {count} "
             "finite numbers: factors of the increment, of the velocity, and of each field in keeps."
         )
+    require_same(comm, rates=rows)
     return found
 
 

@@ -172,12 +172,47 @@ def test_what_points_have_slipped_goes_with_a_body_that_is_rebased():
     assert slipped(die) == pytest.approx(slipped(alone), rel=1e-5)
 
 
+def raising(at):
+    raise KeyError("no table")
+
+
+BOUNDS = {
+    "a number": (lambda at: 0.3, "One.bound must return finite numbers of shape"),
+    "nan": (lambda at: np.nan * at.pressure, "One.bound must return finite numbers of shape"),
+    "negative": (lambda at: -at.pressure, "One.bound must return shear tractions from 0 on"),
+    "a word": (lambda at: "rough", "One.bound failed with"),
+    "an error": (raising, "One.bound failed with KeyError: 'no table'"),
+    "writes": (lambda at: np.multiply(at.pressure, 0.0, out=at.gap), "One.bound failed with"),
+}
+
+
+@pytest.mark.parametrize("kind", BOUNDS)
 @pytest.mark.parametrize("scene", SCENES)
-def test_a_law_that_gives_no_bound_for_each_point_is_refused(scene):
+def test_a_law_that_gives_no_bound_for_each_point_is_refused(scene, kind):
+    bound, sentence = BOUNDS[kind]
+
     class One(contact.Friction):
         def bound(self, at):
-            return 0.3
+            return bound(at)
 
     problem, _, path, steps = scene(One())
-    sentence = "One.bound must return a shear traction"
     raises(lambda: problem.solve(steps, update=path), mpm.MPMError, sentence)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_law_that_remembers_no_numbers_is_refused(scene):
+    class One(contact.Friction):
+        memory = (0.0,)
+
+        def bound(self, at):
+            return 0.3 * at.pressure
+
+        def remember(self, at):
+            return at.slip
+
+    problem, _, path, steps = scene(One())
+    sentence = "One.remember must return finite numbers of shape"
+    raises(lambda: problem.solve(steps, update=path), mpm.MPMError, sentence)
+    for wrong in (0.0, "new", (np.nan,), None):
+        One.memory = wrong
+        raises(lambda: scene(One()), mpm.MPMError, "One.memory must be a list of finite numbers")

@@ -131,7 +131,7 @@ RUNS = {
 }
 
 
-@pytest.mark.parametrize("run", all_but(["by hand"], RUNS))
+@pytest.mark.parametrize("run", all_but(["by hand", "to others"], RUNS))
 def test_each_way_to_run(run):
     check(lambda **v: Loaded(**v), LOADS, ["young", "moved", "stress"], change=1e-5, run=RUNS[run])
 
@@ -283,6 +283,15 @@ def test_what_is_not_followed_is_refused():
     problem.solve(2)
     with pytest.raises(mpm.MPMError, match="from its first step on"):
         mpm.Sensitivity(problem, [young])
+    counts = iter(range(100))
+    for wrong, words in (
+        (lambda: None, "must return a number or an array"),
+        (lambda: [[1.0], [1.0, 2.0]], "must return a number or an array"),
+        (lambda: scene.particles.displacement, "must return a number or an array"),
+        (lambda: np.zeros(next(counts)), "must always return one shape"),
+    ):
+        with pytest.raises(mpm.MPMError, match=words):
+            gradient.of(wrong)
     young.value = 4e4
     with pytest.raises(mpm.MPMError, match="has changed"):
         problem.step()

@@ -7,6 +7,8 @@ import pytest
 from compare import raises
 from scenes import TRIANGLE, WORLD
 
+from dolfinx import mesh
+
 import mpm_dolfinx as mpm
 
 
@@ -80,6 +82,21 @@ def test_what_makes_no_sense_is_said(options, words):
     raises(lambda: mpm.grid_lines(**given), mpm.MPMError, words)
 
 
-@pytest.mark.parametrize("places", [[[0.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 1.0], "lines"]])
+LINES = [0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    "places", [[LINES], [LINES, [1.0, 0.0]], [LINES, "lines"], [LINES, [0.0, np.inf]]]
+)
 def test_lines_that_make_no_mesh_are_refused(places):
     raises(lambda: mpm.grid(WORLD, places), mpm.MPMError, r"grid\(\)")
+
+
+def test_cells_of_another_dimension_are_refused():
+    for axes, kind in ((2, "tetrahedron"), (2, "interval"), (3, "quadrilateral"), (3, "prism")):
+        wrong = getattr(mesh.CellType, kind)
+        raises(
+            lambda axes=axes, wrong=wrong: mpm.grid(WORLD, [LINES] * axes, wrong),
+            mpm.MPMError,
+            f"with {axes} axes is .* not {kind}",
+        )

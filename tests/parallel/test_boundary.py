@@ -17,6 +17,7 @@ from mpm_dolfinx import boundary, contact, plot
 from mpm_dolfinx.io import Column, Kept, fill, of_cells
 from mpm_dolfinx.materials import Hencky, VonMises
 from mpm_dolfinx.parallel.boundary import collective, hooks_of, is_collective
+from mpm_dolfinx.system.schemes import Euler
 
 PROBLEMS = (
     mpm.ParticleProblem,
@@ -88,7 +89,8 @@ def ask(body, thing, name):
     return getattr(thing, name)(*[None] * count)
 
 
-HOOKS = [(base, name) for base in (mpm.Term, Kept, *PROBLEMS) for name in sorted(hooks_of(base))]
+HOOKED = (mpm.Term, Kept, Euler, *PROBLEMS)
+HOOKS = [(base, name) for base in HOOKED for name in sorted(hooks_of(base))]
 
 
 @pytest.mark.mpi
@@ -174,6 +176,26 @@ def test_a_law_whose_energy_fails_on_one_rank(name):
         lambda: made(mpm.DynamicProblem, law, scheme="conserving").step(0.1),
         rf"{name} of Own failed with ValueError: no table",
     )
+
+
+@pytest.mark.mpi
+def test_a_key_or_a_scheme_that_differs_between_ranks_is_named():
+    class Named(Kept):
+        def __init__(self, key):
+            self.key = key
+
+    problem = made()
+    fails(lambda: problem.keep(Named(differing("a", 5))), "key of what is kept must be a string")
+    fails(lambda: problem.keep(Named(differing("a", "b"))), "key differs between the ranks")
+
+    class Own(mpm.Scheme):
+        name = "own"
+
+        def rates(self, dt, last):
+            velocity = np.array([1.0 / dt, 0.0])
+            return mpm.Rates(differing(1.0, 2.0) * velocity / dt, velocity, velocity)
+
+    fails(lambda: made(mpm.DynamicProblem, scheme=Own()).step(0.1), "rates.* differs between")
 
 
 class Own(Kept):

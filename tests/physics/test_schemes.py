@@ -213,6 +213,26 @@ def test_schemes_that_cannot_be_are_refused():
         raises(lambda scheme=scheme: bar(scheme), mpm.MPMError, sentence)
     raises(lambda: bouncing(BDF2(), out_of_range="reflect"), mpm.MPMError, "make this one reflect")
 
+    def own(**members):
+        return type("Own", (BDF2,), members)()
+
+    for scheme, sentence in (
+        (own(name=None), "Own.name must be a word of its own"),
+        (own(name="euler"), "Own.name must be a word of its own"),
+        (own(share="half"), "Own.share must be from 0.5 to 1"),
+        (own(keeps="increment"), "Own.keeps must be a tuple of names"),
+        (own(keeps=("a", "a")), "Own.keeps must be a tuple of names"),
+        (own(stress_of_step=0.5), "Own.stress_of_step must be True or False"),
+        (own(__init__=lambda self: None), r"Own.__init__ must call super\(\)"),
+    ):
+        raises(lambda scheme=scheme: bar(scheme), mpm.MPMError, sentence)
+    for rates, sentence in (
+        (lambda self, dt, last: None, "Own.rates must return mpm.Rates"),
+        (lambda self, dt, last: 1 / 0, "Own.rates.* failed with ZeroDivisionError"),
+    ):
+        scheme = own(rates=rates)
+        raises(lambda scheme=scheme: bar(scheme).step(0.1), mpm.MPMError, sentence)
+
     class Short(Theta):
         keeps = ("increment",)
 

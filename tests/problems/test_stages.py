@@ -276,6 +276,10 @@ def test_what_cannot_be_leaves_all_as_it_was():
         problem.remove([])
     with pytest.raises(mpm.MPMError, match="given twice"):
         problem.add(mpm.Body(body, problem.setup.bodies[0].material))
+    with pytest.raises(mpm.MPMError, match="given twice"):
+        problem.stage(bodies=[problem.body(), problem.body().replace(density=1.0)])
+    with pytest.raises(mpm.MPMError, match=r"takes one mpm\.Body"):
+        problem.add([problem.body(), problem.body()])
     with pytest.raises(mpm.MPMError, match="no body 1"):
         problem.remove([0], body=1)
     V = vectors(box([0, 0], [2, 12], [2, 12], QUADRILATERAL))

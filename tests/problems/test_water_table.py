@@ -120,6 +120,9 @@ def test_what_makes_no_sense_is_said():
     for build, words in (
         (lambda: mpm.WaterTable("high", 10.0), "level"),
         (lambda: mpm.WaterTable(1.0, -10.0), "positive"),
+        (lambda: mpm.WaterTable(ufl.as_ufl(4.0), 10.0), "finite level, or a function"),
+        (lambda: ground(4.0, pore_pressure=mpm.WaterTable(lambda x: np.nan, 10.0)), "The level of"),
+        (lambda: ground(4.0, pore_pressure=mpm.WaterTable(lambda x: "high", 10.0)), "The level of"),
         (lambda: mpm.geostatic(4.0, 2.0, 0.5, G, water=3.0), "WaterTable"),
         (lambda: ground(4.0, pore_pressure=(1.0, 2.0)), "pore_pressure"),
         (lambda: ground(4.0, pore_fluid=mpm.PoreFluid(1.0)), "pore_fluid"),
