@@ -18,6 +18,8 @@ __all__ = ["mechanism", "not_held"]
 #: Stiffness along a motion, relative to that of its unknowns one by one and to the shift, up to
 #: which nothing holds it.
 MECHANISM = 1e-5
+#: The same of values that are no displacements, whose stiffness is known to round-off alone.
+UNKNOWN = 0.1
 #: Most inverse iterations that look for such a motion.
 INVERSE_ITERATIONS = 100
 
@@ -48,7 +50,7 @@ def mechanism(system: Resisting, factor: ShiftedFactor, y: PETSc.Vec) -> PETSc.V
             ratio = abs(system.stiffness(mode)) / mode.dot(force)
         else:
             ratio = system.stiffness(mode) / mode.dot(force)
-        if ratio <= MECHANISM:
+        if ratio <= MECHANISM or (ratio <= UNKNOWN and system.field_of(mode) is not None):
             return mode
         if ratio > 0.95 * before:
             return None
@@ -72,6 +74,9 @@ def not_held(
         mode: The motion.
         share: Share of the forces that act on it.
     """
+    field = system.field_of(mode)
+    if field is not None:
+        return _unheld(field, share)
     if not (system.is_rigid(mode) or _all_move_rigidly(system, levels, factor)):
         return _not_resisted(share)
     return _let_go(share) if system.one_sided else _unsupported(share)
@@ -99,6 +104,14 @@ def _unsupported(share: float) -> MPMError:
     return MPMError(
         f"Forces ({share:.1e} of all) act where nothing holds the bodies; support each of them "
         "against all rigid motions, with conditions and supports that reach it where it is"
+    )
+
+
+def _unheld(field: str, share: float) -> MPMError:
+    return MPMError(
+        f"What acts on the field '{field}' ({share:.1e} of all) does not balance, and nothing "
+        "holds its values: prescribe some of them by a condition on its background space, or let "
+        "it store or exchange what flows"
     )
 
 

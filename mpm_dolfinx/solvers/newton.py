@@ -239,7 +239,7 @@ class NewtonSolver:
         self._evaluate(self.x)
         if self._now.failure is not None:
             raise self._now.failure
-        size, scale = norm(self.F), self._problem.scale(self.F)
+        size, scale = norm(self.F), self._judged_by(self._problem.scale(self.F))
         return size / scale if scale > 0.0 else size
 
     def go_on(self, share: float) -> None:
@@ -443,11 +443,7 @@ class NewtonSolver:
         scale = self._problem.scale(self._R)
         if iteration >= 2 and size > max(0.25 * self._now.norm, rtol * scale):
             self._now.stalled = True
-        if self._now.stalled or scale == 0.0:
-            if scale < 1e-5 * self._now.internal:
-                self._now.internal = self._problem.balance.internal_scale()
-            if scale < 1e-6 * self._now.internal:
-                scale = self._now.internal
+        scale = self._judged_by(scale)
         self._now.norm = size
         self._now.norms.append(size)
         self.residuals.append(size / scale if scale > 0 else size)
@@ -486,6 +482,19 @@ class NewtonSolver:
             )
             return reasons.DIVERGED_MAX_IT
         return None
+
+    def _judged_by(self, scale: float) -> float:
+        """Return what a residual is compared with: internal forces, where there are no others.
+
+        Args:
+            scale: Size of those from outside.
+        """
+        if self._now.stalled or scale == 0.0:
+            if scale < 1e-5 * self._now.internal:
+                self._now.internal = self._problem.balance.internal_scale()
+            if scale < 1e-6 * self._now.internal:
+                return self._now.internal
+        return scale
 
     def _is_round_off(self, step: float, whole: float) -> bool:
         """Whether a step's motion is round-off of the whole motion or, after a stall, of places."""

@@ -47,6 +47,9 @@ class Resisting(Protocol):
     def is_rigid(self, x: PETSc.Vec) -> bool:
         """Return whether x moves each body as a rigid one."""
 
+    def field_of(self, x: PETSc.Vec) -> str | None:
+        """Return the name of the field that x changes alone, if it is one of no displacement."""
+
     def motion(self, x: PETSc.Vec) -> float:
         """Return the size of the displacement that x causes on the bodies."""
 

@@ -8,11 +8,17 @@ from functools import partial
 
 from petsc4py import PETSc
 
+import numpy as np
+
 from ..parallel.magnitudes import joint_norm, norm
 from .terms import Terms
 from .unknowns import Unknowns
+from .value_field import ValueField
 
 __all__ = ["Resistance"]
+
+#: What a motion of one field may be of others.
+ALONE = 1e-6
 
 
 class Resistance:
@@ -57,6 +63,17 @@ class Resistance:
         """Return the size of the displacement that x causes on the bodies."""
         sizes = [size for field in self._unknowns.fields for size in field.on_bodies(x)]
         return joint_norm([*sizes, *(norm(own.of(x)) for own in self._unknowns.own)])
+
+    def field_of(self, x: PETSc.Vec) -> str | None:
+        """Return the name of the field that x changes alone, if it is one of no displacement."""
+        sizes = [joint_norm(field.on_bodies(x)) for field in self._unknowns.fields]
+        largest = int(np.argmax(sizes))
+        field = self._unknowns.fields[largest]
+        if not isinstance(field, ValueField) or max(sizes) == 0.0:
+            return None
+        others = [size for number, size in enumerate(sizes) if number != largest]
+        alone = joint_norm([0.0, *others]) <= ALONE * sizes[largest]
+        return field.carried[0].field.name if alone else None
 
     def extent(self) -> float:
         """Return the size of the positions of all nodes."""

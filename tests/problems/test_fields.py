@@ -14,7 +14,7 @@ from scenes import QUADRILATERAL, TRIANGLE, WORLD
 from stock import held, mixed_space, newton, same_values
 
 import ufl
-from dolfinx import fem
+from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.solvers import linear
@@ -387,3 +387,20 @@ def test_values_that_make_no_sense_are_refused(at):
     ]:
         raises(lambda values=values: p.set(values if last else one), mpm.MPMError, sentence)
     assert np.array_equal(p.x.array, 2.0 * one) and np.array_equal(p.previous.x.array, 2.0 * one)
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+@pytest.mark.parametrize("cells", [(7, 8), (8, 8)])  # nodes that could be those of vectors, or not
+def test_a_field_that_nothing_holds_is_said_to_be_one(cells, symmetric):
+    grid = mesh.create_rectangle(scenes.WORLD, [[0, 0], [1, 1]], [4, 4], scenes.QUADRILATERAL)
+    body = mesh.create_rectangle(scenes.WORLD, [[0, 0], [1, 1]], cells, scenes.QUADRILATERAL)
+    particles = mpm.Particles(body, fem.functionspace(grid, ("Lagrange", 1, (2,))))
+    heat = particles.field(fem.functionspace(grid, ("Lagrange", 1)), at="nodes", name="heat")
+    q = ufl.TestFunction(heat.W)
+    flow = (ufl.dot(ufl.grad(heat), ufl.grad(q)) - particles.load * q) * particles.dx
+    problem = mpm.ParticleProblem([None, flow], particles, fields=[heat], symmetric=symmetric)
+    raises(lambda: problem.solve(1), mpm.MPMError, "'heat'.*nothing holds its values")
+    stored = flow + 1e-6 * heat * q * particles.dx
+    problem = mpm.ParticleProblem([None, stored], particles, fields=[heat], symmetric=symmetric)
+    problem.solve(1)
+    np.testing.assert_allclose(heat.x.array, 1e6, rtol=1e-5)

@@ -89,6 +89,9 @@ class DoubleWell:
     def extent(self):
         return 1.0
 
+    def field_of(self, x):
+        return None
+
     def is_rigid(self, x):
         return True
 

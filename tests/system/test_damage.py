@@ -170,14 +170,14 @@ def test_a_notched_plate_is_that_of_dolfinx():
     np.testing.assert_allclose(particles.displacement.x.array, u.x.array, atol=2e-7)
 
 
-def plate(tags=None, **given):
+def plate(tags=None, unit=1.0, **given):
     """A notched plate that is carried, and pulled by a support."""
     body = notched()
     grid = mesh.create_rectangle(WORLD, [[-0.2, -0.2], [1.2, 1.4]], [14, 16], QUADRILATERAL)
     particles = mpm.Particles(
         body, fem.functionspace(grid, ("Lagrange", 1, (2,))), quadrature_degree=2
     )
-    law = Fracture(Hencky(YOUNG, 0.3), 0.02, 0.15, **given)
+    law = Fracture(Hencky(unit * YOUNG, 0.3), unit * 0.02, 0.15, **given)
     facets = mpm.facet_tags(body, {1: mpm.region(y=1.0), 2: mpm.region(y=0.0)})
     top = mpm.boundary.fixed(particles, facets, 1, value=(0.0, 0.04))
     bottom = mpm.boundary.fixed(particles, facets, 2)
@@ -254,3 +254,15 @@ def test_what_does_not_go_together_is_refused():
         mpm.MPMError,
         "different models",
     )
+
+
+def test_units_do_not_matter():
+    """Supports are all that holds and moves it, so that no load tells the size of forces."""
+    turns = []
+    for unit in (1.0, 2.0**30):
+        problem, _ = plate(unit=unit)
+        problem.particles.load.value = 0.45
+        problem.step()
+        turns.append([step.alternations for step in problem.history.steps])
+    assert turns[0] == turns[1]
+    assert max(turns[0]) > 3
