@@ -24,10 +24,15 @@ enum class Law {
   mohr_coulomb,   // bulk, shear, sin(phi), sin(psi), 2 c cos(phi), cut-off, volume correction
   drucker_prager, // bulk, shear, eta, eta_psi, xi c, largest mean stress, volume correction
   mu_i,           // bulk, shear, mu_s, mu_2 - mu_s, d sqrt(rho_s)/I_0, duration of the step
-  cam_clay        // compression, swelling, M, shear, reference pressure
+  cam_clay,       // compression, swelling, M, shear, reference pressure
+  // Laws that soften by an average end with the decay, what drives it, and what plastic strain at
+  // the point takes from that; angles are in radians, c_r and phi_r residual values.
+  von_mises_averaged,      // bulk, shear, rho_y, hardening, residual share
+  mohr_coulomb_averaged,   // bulk, shear, c, c_r, phi, phi_r, psi, cut-off, volume correction, 0
+  drucker_prager_averaged, // the same, with the number of the cone: outer, inner, plane strain
 };
 
-constexpr std::size_t max_parameters = 7;
+constexpr std::size_t max_parameters = 13;
 constexpr std::size_t max_variables = 2;
 
 // How many parameters and internal variables a law has.
@@ -44,6 +49,11 @@ constexpr std::size_t num_parameters(Law law)
     return 6;
   case Law::cam_clay:
     return 5;
+  case Law::von_mises_averaged:
+    return 8;
+  case Law::mohr_coulomb_averaged:
+  case Law::drucker_prager_averaged:
+    return 13;
   default:
     return 7;
   }

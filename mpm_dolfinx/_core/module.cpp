@@ -242,6 +242,12 @@ Law law_of(const std::string& name)
     return Law::drucker_prager;
   if (name == "mu_i")
     return Law::mu_i;
+  if (name == "von_mises_averaged")
+    return Law::von_mises_averaged;
+  if (name == "mohr_coulomb_averaged")
+    return Law::mohr_coulomb_averaged;
+  if (name == "drucker_prager_averaged")
+    return Law::drucker_prager_averaged;
   throw std::invalid_argument("there is no compiled law " + name);
 }
 

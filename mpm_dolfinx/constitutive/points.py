@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from ..particles.field import ParticleField
 from .assignment import Assignment, Materials
 from .averaging import VolumeAveraging
 from .governed import Answer, Carried, Governed
+from .gradient_average import GradientAverage
 from .pressure import MeanStress, VolumeStrain
 from .strain import Strain
 from .succession import Episode, states_after
@@ -38,6 +40,8 @@ class _Converged(NamedTuple):
         compliance: Its own, where a law is evaluated at the pressure.
         recovery: See :attr:`MaterialPoints.recovery`.
         resisted: Energy that F-bar resists, shape ``(n nq,)``.
+        average: That of the plastic strain over the length of the body, of the same shape.
+        growth: Its change in the last step, by which it is expected to change in the next.
     """
 
     states: list[State]
@@ -47,6 +51,8 @@ class _Converged(NamedTuple):
     compliance: NDArray[np.float64]
     recovery: NDArray[np.float64] | float
     resisted: NDArray[np.float64]
+    average: NDArray[np.float64]
+    growth: NDArray[np.float64]
 
 
 class Governing(NamedTuple):
@@ -65,6 +71,7 @@ class MaterialPoints:
         cell_tags: Tags of the body's cells.
         f_bar: Kind of average of the volume ratio, or ``"none"``.
         pressure: A Function at the points that takes the place of the mean stress, if any.
+        length: What the plastic strain that softens is averaged over; ``None`` for no average.
 
     Attributes:
         dim: Dimension of stress and strain, 2 in plane strain.
@@ -87,6 +94,7 @@ class MaterialPoints:
         cell_tags: mesh.MeshTags | None,
         f_bar: str = "none",
         pressure: ParticleField | None = None,
+        length: float | None = None,
     ) -> None:
         self._particles = particles = strain.particles
         self.strain = strain
@@ -100,7 +108,11 @@ class MaterialPoints:
             states = [part.initial_state() for part in self._governed]
         shape = (self._points, self.dim, self.dim)
         none = np.zeros(self._points)
-        self._last = _Converged(states, np.zeros(shape), np.zeros(shape), none, none, 0.0, none)
+        zero = np.zeros(shape)
+        self._last = _Converged(states, zero, zero.copy(), none, none, 0.0, *[none] * 3)
+        self._spread = None if length is None else self._spread_over(length)
+        self._average = none
+        self._turns = 0
         self.first_piola = np.zeros(shape)
         self.tangent = np.zeros((*shape, self.dim, self.dim))
         self._trial, self._trial_gradient = states, self._last.gradient
@@ -117,6 +129,72 @@ class MaterialPoints:
     @property
     def _governed(self) -> list[Governed]:
         return self._assignment.governed
+
+    # -- An average over a length ------------------------------------------------------------
+
+    def _spread_over(self, length: float) -> GradientAverage:
+        """Return the average over a length of points whose laws soften (collective)."""
+        particles, counts = self._particles, np.zeros(self._points, dtype=bool)
+        for part in self._governed:
+            counts[part.points] = part.material.softens
+        if not any(part.material.softens for part in self._governed):
+            laws = ", ".join(type(law).__name__ for law in self.given)
+            raise MPMError(
+                f"length= is for laws that soften with their plastic strain (decay=), which {laws} "
+                "does not; omit it, or give the law a residual strength and decay."
+            )
+        counts = counts.reshape(particles.num_local, particles.num_points).any(axis=1)
+        return GradientAverage(self.strain, length, counts)
+
+    @property
+    def average(self) -> NDArray[np.float64]:
+        """The average that softens, at the last converged step, shape ``(n nq,)``."""
+        return self._last.average
+
+    @property
+    def averages(self) -> bool:
+        """Whether laws soften by an average over a length."""
+        return self._spread is not None
+
+    def _averaged(self, states: list[State]) -> NDArray[np.float64]:
+        """Return the average of the plastic strain of states, shape ``(n nq,)`` (collective)."""
+        assert self._spread is not None
+        values = np.zeros(self._points)
+        for part, state in zip(self._governed, states, strict=True):
+            if part.material.softens:
+                values[part.points] = state["plastic_strain"]
+        shape = self._particles.num_local, self._particles.num_points
+        return self._spread.of(values.reshape(shape)).ravel()
+
+    def alternate(self) -> int:
+        """Average the plastic strain of the last update for the next one (collective).
+
+        Each second time it goes twice as far: what converges slowly changes by little each time and
+        in one direction, so that this halves the number of alternations, and what grows goes on
+        to.
+
+        Returns:
+            The linear solves that it took.
+        """
+        if self._spread is None:
+            return 0
+        self._turns += 1
+        ahead = 2.0 if self._turns % 2 == 0 else 1.0
+        self._average = self._average + ahead * (self._averaged(self._trial) - self._average)
+        return 1
+
+    def _present(self, part: Governed, trial: bool = True) -> Governed:
+        """Return a material at its points with an average, where that softens it.
+
+        Args:
+            part: The material.
+            trial: Whether it is that of the present update, not of the last converged step.
+        """
+        if self._spread is None or not part.material.softens:
+            return part
+        average = (self._average if trial else self._last.average)[part.points]
+        law = part.law.softening_by(average)
+        return replace(part, material=part.material.softening_by(average), law=law)
 
     def _resistance(self) -> NDArray[np.float64]:
         """Return three times the shear modulus of each undeformed domain (collective)."""
@@ -211,7 +289,8 @@ class MaterialPoints:
 
     def go_from(self, states: list[State]) -> None:
         """Take states of the materials for those of the last converged step; all else stays."""
-        self._last = self._last._replace(states=states)
+        average = self._last.average if self._spread is None else self._averaged(states)
+        self._last = self._last._replace(states=states, average=average)
         self._forget_trial()
 
     def states(self, trial: bool = False) -> list[State]:
@@ -276,7 +355,8 @@ class MaterialPoints:
         stress = before.cauchy_stress(gradient).reshape(self._points, 3, 3)
         carried = Carried(stress, gradient, gap)
         episodes = before.episodes()
-        laws = list(zip(self._assignment.given, self._governed, strict=True))
+        self._average = before.average
+        laws = list(zip(self._assignment.given, map(self._present, self._governed), strict=True))
         self._settle(states_after(episodes, laws, carried, unchanged, self._particles.mesh.comm))
 
     def episodes(self) -> list[Episode]:
@@ -309,6 +389,9 @@ class MaterialPoints:
         """
         before = self._last
         now = before._replace(states=states, gradient=self._trial_gradient, stress=stress)
+        if self._spread is not None:
+            self._average, self._turns = self._averaged(states), 0
+            now = now._replace(average=self._average)
         if self.mean_stress is not None:
             seen = self.mean_stress.strain
             now = now._replace(volume=seen.volume)
@@ -356,7 +439,7 @@ class MaterialPoints:
     @property
     def symmetric(self) -> bool:
         """Whether the tangents of all materials are symmetric."""
-        return all(part.material.symmetric for part in self._governed)
+        return all(self._present(part).material.symmetric for part in self._governed)
 
     @property
     def weights(self) -> NDArray[np.float64]:
@@ -538,7 +621,8 @@ class MaterialPoints:
 
     def _update_materials(self, gradient: NDArray[np.float64]) -> None:
         trial, volumes = [], []
-        for part, state in zip(self._governed, self._last.states, strict=True):
+        laws = map(self._present, self._governed)
+        for part, state in zip(laws, self._last.states, strict=True):
             everywhere = len(part.points) == self._points
             its = gradient if everywhere else gradient[part.points]
             if self.mean_stress is None:
@@ -603,7 +687,7 @@ class MaterialPoints:
         tried = self._trial, self._trial_gradient, self.first_piola
 
         def undo() -> None:
-            self._last = before
+            self._last, self._average = before, before.average
             self._trial, self._trial_gradient, self.first_piola = tried
 
         self._trial = [
@@ -612,10 +696,17 @@ class MaterialPoints:
         ]
         alone = len(self._governed) == 1 and self._governed[0].is_own
         self._make_last(self._trial, self.first_piola if alone else self.first_piola.copy())
+        if self._spread is not None:
+            growth = self._last.average - before.average
+            self._last = self._last._replace(growth=growth)
+            self._average = self._last.average + growth
         return undo
 
     def roll_back(self) -> None:
         """Forget the last update."""
+        if self._trial is not self._last.states:
+            self._average = self._last.average  # what was expected is not what failed
+        self._turns = 0
         self._forget_trial()
         self.first_piola = self._last.stress.copy()
         if self.mean_stress is not None:
@@ -651,17 +742,22 @@ class MaterialPoints:
         columns = {
             name: Column(v.reshape(n, nq, *v.shape[1:]), "points") for name, v in whole.items()
         }
+        if self._spread is not None:
+            columns["growth"] = Column(self._last.growth.reshape(n, nq), "points")
         if self.averaging is not None:
             columns["recovery"] = Column(np.broadcast_to(self._last.recovery, (n, 3, 3)), "cells")
             columns["resisted"] = Column(self._last.resisted.reshape(n, nq), "points")
         return columns
 
     def set_converged_state(self, arrays: dict[str, NDArray[Any]]) -> None:
-        """Make what :meth:`converged_state` once returned the history of the last step."""
+        """Make what :meth:`converged_state` once returned the history of the last step.
+
+        With a length this is collective.
+        """
         flat = {
             name: v.reshape(self._points, *v.shape[2:])
             for name, v in arrays.items()
-            if name not in ("recovery", "resisted")
+            if name not in ("recovery", "resisted", "growth")
         }
         states: list[State] = [{} for _ in self._governed]
         last = self._last._replace(
@@ -677,7 +773,11 @@ class MaterialPoints:
             name, numbers = key.rsplit("@", 1)
             for number in map(int, numbers.split(",")):
                 states[number][name] = values[self._governed[number].points]
-        self._last = last
+        if self._spread is not None:
+            growth = arrays["growth"].reshape(self._points)
+            last = last._replace(average=self._averaged(states), growth=growth)
+        self._last, self._average = last, last.average + last.growth
+        self._forget_trial()
 
     def laws(self) -> list[tuple[str, dict[str, Any]]]:
         """Return name and parameters of each material; arrays with the indices of their points.
@@ -698,6 +798,8 @@ class MaterialPoints:
             if self.mean_stress is not None:
                 parameters["mixed"] = "pressure"
             parameters["f_bar"] = "none" if self.averaging is None else self.averaging.kind
+            if self._spread is not None:
+                parameters["length"] = self._spread.length
             laws.append((type(material).__name__, parameters))
         return laws
 
@@ -759,7 +861,7 @@ class MaterialPoints:
         """Yield function of the last converged step, shape ``(n, nq)``; -1 where elastic."""
 
         def value(part: Governed, state: State) -> Any:
-            rule = getattr(part.material, "yield_function", None)
+            rule = getattr(self._present(part, trial=False).material, "yield_function", None)
             if rule is None:
                 return -1.0
             names = getattr(part.material, "internal_variables", ()) or ("plastic_strain",)

@@ -410,6 +410,15 @@ class StepStress:
         """Return :meth:`MaterialPoints.initial_modulus` (collective)."""
         return self._points.initial_modulus()
 
+    @property
+    def averages(self) -> bool:
+        """Whether laws soften by an average over a length."""
+        return self._points.averages
+
+    def alternate(self) -> int:
+        """Average what softens; return the linear solves that it took (collective)."""
+        return self._points.alternate()
+
     def elastic(self) -> bool:
         """Return whether the history stays as it is in the last update."""
         return self._points.elastic()

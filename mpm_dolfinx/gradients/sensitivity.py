@@ -309,6 +309,9 @@ def _not_in(problem: ParticleProblem) -> list[str]:
             not (b.method == "cpdi2" or b.is_free) for b in bodies
         ),
         "bodies with free nodes (free=)": any(b.free_nodes is not None for b in bodies),
+        "bodies with a length=": any(
+            points.averages for points in problem.material_points() if points is not None
+        ),
         "bodies whose particles may be deleted": any(b.deletion is not None for b in bodies),
         "bodies whose domains are split": any(b.on_distortion == "split" for b in bodies),
         "rebased bodies": any(b.rebased for b in bodies),

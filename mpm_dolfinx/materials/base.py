@@ -291,6 +291,19 @@ class Material(ABC):
         """
         return self
 
+    @property
+    def softens(self) -> bool:
+        """Whether its strength falls with its plastic strain, so that a body may have a length."""
+        return False
+
+    def softening_by(self, average: NDArray[np.float64]) -> Self:
+        """Return this material with a strength that follows an average of the plastic strain.
+
+        Args:
+            average: That of ``"plastic_strain"`` over the length of a body, shape ``(n,)``.
+        """
+        return self
+
     def at(self, points: NDArray[np.integer[Any]]) -> Self:
         """Return this material restricted to points, given by their numbers.
 

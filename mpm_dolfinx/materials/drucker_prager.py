@@ -98,7 +98,12 @@ class DruckerPrager(FrictionalMaterial):
         self.match = match
 
     def _constants(self) -> tuple[Parameter, ...]:
-        """Return moduli, eta, eta_psi, strength xi c, largest mean stress, and the correction."""
+        """Return moduli, eta, eta_psi, strength xi c, largest mean stress, and the correction.
+
+        Where an average softens it, those of :meth:`_averaged_constants`.
+        """
+        if "average" in self.parameters:
+            return self._averaged_constants(get_args(Match).index(self.match))
         friction, dilation, cosine = self._sines()
         if self.match == "plane_strain":
             flow = dilation / np.sqrt(1.0 + dilation**2 / 3.0)
@@ -130,10 +135,7 @@ class DruckerPrager(FrictionalMaterial):
         return np.asarray(np.maximum(cone, mean - self._tension()))
 
     @override
-    def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
-        if "decay" in self.parameters:
-            law = self.softened(variables["plastic_strain"])
-            return law.integrate(trial_strain, variables, tangent)
+    def give_back(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
         n, m = trial_strain.shape
         stress = self.elastic_stress(trial_strain)
         D = self.elastic_tangent(n, m) if tangent else None

@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
-from .base import Field, Integration, Parameter, State, Update, check_parameter
+from .base import Field, Integration, Parameter, State, check_parameter
 from .elastic import IsotropicElastic
-from .given_pressure import AtPressure
 from .mandel import to_tensor
 from .principal import axes_in_order, from_axes, shear_quotients, tangent_from_axes
+from .softening import SofteningMaterial, require_softening
 
 __all__ = ["FrictionalMaterial", "MohrCoulomb", "Tresca"]
 
 Array = NDArray[np.float64]
 
 
-class FrictionalMaterial(IsotropicElastic):
+class FrictionalMaterial(SofteningMaterial):
     """Base of laws with a cohesion and angles of friction and dilation.
 
     Hencky elasticity at finite strain; the state holds the accumulated plastic strain kappa, the
@@ -40,10 +40,6 @@ class FrictionalMaterial(IsotropicElastic):
     """
 
     kinematics: ClassVar[Literal["small", "logarithmic"]] = "logarithmic"
-    inelastic: ClassVar[bool] = True
-    internal_variables: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType(
-        {"plastic_strain": ()}
-    )
     limits: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType(
         {
             **IsotropicElastic.limits,
@@ -119,20 +115,16 @@ class FrictionalMaterial(IsotropicElastic):
         _require_softening(checked)
         self.volume_correction = bool(volume_correction)
 
-    def softened(self, plastic_strain: Array) -> Self:
-        """Return the law with the strength after accumulated plastic strains, shape ``(n,)``.
-
-        It does not soften any more; a law that does not soften is returned as it is.
-        """
-        if "decay" not in self.parameters:
-            return self
-        left = np.exp(-self.parameters["decay"] * plastic_strain)
+    @override
+    def with_share(self, left: Array) -> Self:
         values = dict(self.parameters)
-        del values["decay"]
+        for name in ("decay", "average"):
+            values.pop(name, None)
         for name, residual in _RESIDUALS.items():
             if residual in values:
                 last = values.pop(residual)
                 values[name] = last + (values[name] - last) * left
+        values["friction_angle"] = np.minimum(values["friction_angle"], STEEPEST)
         friction, dilation = (values[angle] for angle in _ANGLES)
         values["dilation_angle"] = np.minimum(dilation, friction)
         other = copy.copy(self)
@@ -140,20 +132,11 @@ class FrictionalMaterial(IsotropicElastic):
         return other
 
     @override
-    def update(self, displacement_gradient: Array, state: State, tangent: bool = True) -> Update:
-        if "decay" in self.parameters:
-            law = self.softened(state["plastic_strain"])
-            return law.update(displacement_gradient, state, tangent)
-        return super().update(displacement_gradient, state, tangent)
-
-    @override
-    def at_pressure(
-        self, displacement_gradient: Array, state: State, pressure: Array, shear: Array
-    ) -> AtPressure:
-        if "decay" in self.parameters:
-            law = self.softened(state["plastic_strain"])
-            return law.at_pressure(displacement_gradient, state, pressure, shear)
-        return super().at_pressure(displacement_gradient, state, pressure, shear)
+    def softening_by(self, average: Array) -> Self:
+        other = super().softening_by(average)
+        if other is not self:
+            other.symmetric = False
+        return other
 
     @override
     def with_parameters(self, **parameters: Parameter) -> Self:
@@ -194,23 +177,34 @@ class FrictionalMaterial(IsotropicElastic):
         phi, psi = (np.radians(self.parameters[angle]) for angle in _ANGLES)
         return np.sin(phi), np.sin(psi), np.cos(phi)
 
+    def _averaged_constants(self, match: int = 0) -> tuple[Parameter, ...]:
+        """Return what a law that softens by an average is compiled with, angles in radians.
+
+        Args:
+            match: Number of the cone.
+        """
+        values = self.parameters
+        cohesion, friction, dilation = (values[n] for n in ("cohesion", *_ANGLES))
+        last = values.get("cohesion_residual", cohesion), values.get("friction_residual", friction)
+        angles = (np.radians(angle) for angle in (friction, last[1], dilation))
+        strength = (cohesion, last[0], *angles, self._tension())
+        corrects = float(self.volume_correction)
+        return self.bulk, self.shear, *strength, corrects, float(match), *self._driven()
+
     def _tension(self) -> Parameter:
         """Return the cut-off; infinite without."""
         return self.parameters.get("tension_cutoff", np.inf)
 
 
 _ANGLES = ("friction_angle", "dilation_angle")
+#: Angle of friction that a strength which grows goes up to, in degrees.
+STEEPEST = 89.0
 _RESIDUALS = {"cohesion": "cohesion_residual", "friction_angle": "friction_residual"}
 
 
 def _require_softening(parameters: Mapping[str, Parameter]) -> None:
     """Raise an error where what is said of softening is not whole, or is hardening."""
-    residuals = [name for name in _RESIDUALS.values() if name in parameters]
-    if ("decay" in parameters) != bool(residuals):
-        raise MPMError(
-            "Softening needs decay and a residual strength, cohesion_residual or "
-            f"friction_residual; given: {', '.join(residuals) or 'decay'}."
-        )
+    require_softening(parameters, _RESIDUALS)
     for name, residual in _RESIDUALS.items():
         first, last = parameters[name], parameters.get(residual, 0.0)
         if not all(isinstance(value, float | np.ndarray) for value in (first, last)):
@@ -265,17 +259,19 @@ class MohrCoulomb(FrictionalMaterial):
         return np.asarray(np.maximum(shear - strength, largest - self._tension()))
 
     def _constants(self) -> tuple[Parameter, ...]:
-        """Return the moduli, sin(phi), sin(psi), 2 c cos(phi), the cut-off, and the correction."""
+        """Return the moduli, sin(phi), sin(psi), 2 c cos(phi), the cut-off, and the correction.
+
+        Where an average softens it, those of :meth:`_averaged_constants`.
+        """
+        if "average" in self.parameters:
+            return self._averaged_constants()
         friction, dilation, cosine = self._sines()
         strength = 2.0 * self.parameters["cohesion"] * cosine
         corrects = float(self.volume_correction)
         return self.bulk, self.shear, friction, dilation, strength, self._tension(), corrects
 
     @override
-    def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
-        if "decay" in self.parameters:
-            softer = self.softened(variables["plastic_strain"])
-            return softer.integrate(trial_strain, variables, tangent)
+    def give_back(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
         n, m = trial_strain.shape
         stress = self.elastic_stress(trial_strain)
         D = self.elastic_tangent(n, m) if tangent else None

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import ClassVar, Literal, Self, override
@@ -15,16 +16,18 @@ from ..errors import MPMError
 from .base import Field, Integration, Parameter, State, check_parameter
 from .elastic import IsotropicElastic
 from .mandel import deviator, deviatoric_projector, identity, norm, trace
+from .softening import SofteningMaterial, require_softening
 
 __all__ = ["SmallStrainVonMises", "VonMises"]
 
 
-class VonMises(IsotropicElastic):
+class VonMises(SofteningMaterial):
     """Elastoplasticity of von Mises at finite strain (Wang, Coombs, Augarde & Brown, eq. 1).
 
     Hencky elasticity, yield function f = |dev tau| / rho(kappa) - 1 with the Kirchhoff stress
     tau, associated flow and rho(kappa) = rho_y + sqrt(2/3) hardening kappa; kappa is the sum of
-    sqrt(2/3) |d eps_p|, the uniaxial plastic strain. Backward Euler is the radial return
+    sqrt(2/3) |d eps_p|, the uniaxial plastic strain. With ``decay`` rho_y softens: see
+    :class:`SofteningMaterial`. Backward Euler is the radial return
     (Wilkins 1964), with the consistent tangent of Simo & Taylor (1985, eq. 3.17).
 
     The state holds kappa as ``"plastic_strain"``, shape ``(n,)``.
@@ -34,17 +37,15 @@ class VonMises(IsotropicElastic):
     """
 
     kinematics: ClassVar[Literal["small", "logarithmic"]] = "logarithmic"
-    inelastic: ClassVar[bool] = True
     linear_in_volume: ClassVar[bool] = True
-    internal_variables: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType(
-        {"plastic_strain": ()}
-    )
     limits: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType(
         {
             **IsotropicElastic.limits,
             "rho_y": {"above": 0.0},
             "yield_stress": {"above": 0.0},
             "hardening": {"least": 0.0},
+            "residual": {"least": 0.0, "below": 1.0},
+            "decay": {"least": 0.0},
         }
     )
     yield_tolerance: ClassVar[float] = 1e-13
@@ -57,6 +58,9 @@ class VonMises(IsotropicElastic):
         rho_y: ArrayLike | Field | None = None,
         yield_stress: ArrayLike | Field | None = None,
         hardening: ArrayLike | Field = 0.0,
+        *,
+        residual: ArrayLike | Field | None = None,
+        decay: ArrayLike | Field | None = None,
     ) -> None:
         """Set the parameters.
 
@@ -66,10 +70,13 @@ class VonMises(IsotropicElastic):
             rho_y: Norm of the stress deviator at first yield.
             yield_stress: Uniaxial stress at first yield, sqrt(3/2) rho_y.
             hardening: d(uniaxial stress)/d(plastic strain).
+            residual: Share of the stress at first yield that is left after much plastic strain;
+                ``None``: all of it.
+            decay: How fast it falls: by 1/e in a plastic strain of 1/decay.
 
         Raises:
             MPMError: A value is out of range, or not exactly one of ``rho_y`` and
-                ``yield_stress`` is given.
+                ``yield_stress`` is given; ``residual`` without ``decay``, or the other way.
         """
         super().__init__(young, poisson)
         name, strength = ("rho_y", rho_y) if rho_y is not None else ("yield_stress", yield_stress)
@@ -80,11 +87,30 @@ class VonMises(IsotropicElastic):
             name: check_parameter(name, strength, **self.limits[name]),
             "hardening": check_parameter("hardening", hardening, **self.limits["hardening"]),
         }
+        further = {"residual": residual, "decay": decay}
+        self.parameters = {**self.parameters} | {
+            key: check_parameter(key, value, **self.limits[key])
+            for key, value in further.items()
+            if value is not None
+        }
+        require_softening(self.parameters, {"rho_y": "residual"})
 
     @override
     def weakened(self, factor: float) -> Self:
         names = [name for name in ("rho_y", "yield_stress", "hardening") if name in self.parameters]
         return self.with_parameters(**{name: self.parameters[name] / factor for name in names})
+
+    @override
+    def with_share(self, left: NDArray[np.float64]) -> Self:
+        values = dict(self.parameters)
+        for name in ("decay", "average"):
+            values.pop(name, None)
+        residual = values.pop("residual", 1.0)
+        name = "rho_y" if "rho_y" in values else "yield_stress"
+        values[name] = values[name] * (residual + (1.0 - residual) * left)
+        other = copy.copy(self)
+        other.parameters = values
+        return other
 
     @property
     def rho_y(self) -> Parameter:
@@ -102,17 +128,21 @@ class VonMises(IsotropicElastic):
         self, stress: NDArray[np.float64], plastic_strain: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return f, shape ``(n,)``, of a state's stress ``(n, m)`` and plastic strain ``(n,)``."""
+        if self.softens:
+            return self.softened(plastic_strain).yield_function(stress, plastic_strain)
         return np.asarray(norm(deviator(stress)) / self.strength(plastic_strain) - 1.0)
 
     @override
-    def plastic_work(self, state: State) -> NDArray[np.float64]:
-        """Work of the uniaxial stress along the plastic strain."""
+    def plastic_work(self, state: State) -> NDArray[np.float64] | None:
+        """Work of the uniaxial stress along the plastic strain; not known of one that softens."""
+        if self.softens:
+            return None
         kappa = state["plastic_strain"]
         yields = np.sqrt(1.5) * self.rho_y + 0.5 * self.parameters["hardening"] * kappa
         return np.asarray(yields * kappa)
 
     @override
-    def integrate(
+    def give_back(
         self, trial_strain: NDArray[np.float64], variables: State, tangent: bool
     ) -> Integration:
         n, m = trial_strain.shape
@@ -138,6 +168,9 @@ class VonMises(IsotropicElastic):
         return Integration(stress, D, elastic_strain, {"plastic_strain": plastic_strain})
 
     def _constants(self) -> tuple[Parameter, ...]:
+        if "average" in self.parameters:
+            own = self.bulk, self.shear, self.rho_y, self.parameters["hardening"]
+            return *own, self.parameters["residual"], *self._driven()
         return self.bulk, self.shear, self.rho_y, self.parameters["hardening"]
 
 

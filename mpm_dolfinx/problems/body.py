@@ -98,6 +98,9 @@ class Body:
         f_bar: Average of the volume ratio that the material sees, against hourglass modes and
             locking: ``"none"``, ``"domain"`` (over a domain's points) or ``"patch"`` (over the
             domains of about one background cell).
+        length: What plastic strain is averaged over where it softens the law (``decay``), so that
+            a band of it is as wide on any mesh: about five lengths, for which the domains must be
+            smaller than the length. ``None``: each point softens by its own.
         initial_stress: Cauchy stress that the body carries before it has moved, which its material
             must be able to bear: ``(3, 3)`` with the direction out of the plane (or around the
             axis) at last, one for each owned particle or point ``(n, 3, 3)`` or
@@ -126,6 +129,7 @@ class Body:
     cell_tags: Any = None
     facet_tags: Any = None
     f_bar: str = "none"
+    length: float | None = None
     initial_stress: Any = None
     velocity: Any = None
     pore_fluid: PoreFluid | None = None
@@ -150,6 +154,8 @@ class Body:
             raise MPMError(
                 f"Unknown f_bar={self.f_bar!r}; choose one of {', '.join(map(repr, F_BARS))}."
             )
+        if self.length is not None and not (is_number(self.length) and 0.0 < self.length < np.inf):
+            raise MPMError(f"length must be a positive number or None, not {self.length!r}.")
         if self.pore_fluid is not None and not isinstance(self.pore_fluid, PoreFluid):
             raise MPMError(
                 f"pore_fluid must be an mpm.PoreFluid, not a {type(self.pore_fluid).__name__}."
@@ -193,6 +199,7 @@ class Body:
             if loads:
                 acts.append(counted(len(loads), noun))
         more = [] if self.f_bar == "none" else [f"F-bar over each {self.f_bar}"]
+        more += [] if self.length is None else [f"softening over a length of {self.length:g}"]
         more += [] if self.pore_fluid is None and self.pore_pressure is None else ["water"]
         return "; ".join([words, ", ".join(acts) or "no loads", *more])
 
@@ -237,6 +244,8 @@ class Body:
     def require_movable_nodes(self, consequence: str) -> None:
         """Raise an error unless the nodes of the body's mesh can be moved; see above."""
         self.require_movable(consequence)
+        if self.length is not None:
+            raise MPMError(f"length= averages over the undeformed body, so {consequence}.")
         for name in ("density", "body_force", "tractions", "pressures", "pore_pressure"):
             if holds(getattr(self, name), Callable):
                 raise MPMError(

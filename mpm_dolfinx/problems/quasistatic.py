@@ -447,6 +447,7 @@ class QuasiStaticProblem(ParticleProblem):
             given.cell_tags,
             given.f_bar,
             next((field for field in self.pressure if field.particles is body), None),
+            given.length,
         )
         if any(field.particles is body for field in self._new_pressures):
             history.begin_with_pressure()

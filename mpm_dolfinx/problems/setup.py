@@ -146,6 +146,11 @@ class Setup:
                     f"Domains cannot be split with f_bar={body.f_bar!r}, whose averages they would "
                     "change; it keeps most domains from folding by itself."
                 )
+            if body.length is not None:
+                raise MPMError(
+                    "Domains cannot be split in a body with a length=, which averages over the "
+                    "undeformed body; omit one of them."
+                )
         if self.axisymmetric:
             raise MPMError(
                 "Domains of a body of revolution cannot be split, since the halves have other "

@@ -31,6 +31,13 @@ class PointHistory(PointMaterial, Protocol):
     def update(self) -> None:
         """Update stress and tangent for the present displacement, or raise an MPMError."""
 
+    @property
+    def averages(self) -> bool:
+        """Whether laws soften by an average over a length, found in turn with displacements."""
+
+    def alternate(self) -> int:
+        """Average what softens; return the linear solves that it took (collective)."""
+
     def elastic(self) -> bool:
         """Return whether the history stays as it is in the last update."""
 
@@ -171,6 +178,15 @@ class BodyTerm(Term):
         except MPMError as error:
             return error
         return None
+
+    @property
+    @override
+    def alternates(self) -> bool:
+        return self._material is not None and self._material.averages
+
+    @override
+    def alternate(self) -> int:
+        return 0 if self._material is None else self._material.alternate()
 
     @override
     def smooth(self) -> bool:

@@ -129,6 +129,11 @@ class Term(Hooked):
         """The fields that :meth:`alternate` finds."""
         return ()
 
+    @property
+    def alternates(self) -> bool:
+        """Whether :meth:`alternate` is to be called, on all ranks."""
+        return bool(self.solves)
+
     def alternate(self) -> int:
         """Solve its own equations at the displacements of the last evaluation.
 

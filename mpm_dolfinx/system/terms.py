@@ -51,11 +51,11 @@ class Terms:
     @property
     def alternates(self) -> bool:
         """Whether a term has equations that are solved in turn with the displacements."""
-        return any(term.solves for term in self._terms)
+        return any(term.alternates for term in self._terms)
 
     def take_turns(self) -> int:
         """Let such terms solve their equations; return the linear solves that it took."""
-        return sum(term.alternate() for term in self._terms if term.solves)
+        return sum(term.alternate() for term in self._terms if term.alternates)
 
     # -- Histories --------------------------------------------------------------------------------
 

@@ -1,0 +1,125 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Laws that soften with their plastic strain, by their own or by an average over a length."""
+
+import numpy as np
+import pytest
+from laws import in_python
+from materials.test_von_mises import random_path
+
+from mpm_dolfinx import MPMError
+from mpm_dolfinx.materials import (
+    DruckerPrager,
+    Hencky,
+    MohrCoulomb,
+    SmallStrainVonMises,
+    Tresca,
+    VonMises,
+    check_tangent,
+)
+
+COUNT = 30
+AVERAGE = np.linspace(0.0, 0.1, COUNT)
+FALL = {"cohesion_residual": 0.5, "decay": 20.0}
+LAWS = {
+    "von mises": VonMises(1e3, 0.3, rho_y=2.0, residual=0.3, decay=20.0),
+    "hardening too": VonMises(1e3, 0.3, yield_stress=2.0, hardening=20.0, residual=0.3, decay=20.0),
+    "small strain": SmallStrainVonMises(1e3, 0.3, yield_stress=2.0, residual=0.3, decay=20.0),
+    "tresca": Tresca(1e3, 0.3, 2.0, 1.0, **FALL),
+    "mohr-coulomb": MohrCoulomb(1e3, 0.3, 2.0, 30.0, 10.0, friction_residual=15.0, **FALL),
+    "corrected": MohrCoulomb(*(1e3, 0.3, 2.0, 30.0, 10.0, 0.5), volume_correction=True, **FALL),
+    "sand": MohrCoulomb(1e3, 0.3, 0.0, 30.0, 30.0, friction_residual=15.0, decay=20.0),
+    "cone": DruckerPrager(1e3, 0.3, 2.0, 30.0, 10.0, friction_residual=15.0, **FALL),
+    "inner cone": DruckerPrager(1e3, 0.3, 2.0, 30.0, 10.0, match="inner", **FALL),
+    "plane strain": DruckerPrager(1e3, 0.3, 2.0, 30.0, 10.0, 0.5, match="plane_strain", **FALL),
+}
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("name", LAWS)
+def test_tangent_with_an_average_is_the_derivative(name, dim):
+    law = LAWS[name].softening_by(AVERAGE)
+    assert check_tangent(law, dim, strain=0.05, steps=6) < 1e-8
+    assert check_tangent(in_python(law), dim, strain=0.05, steps=6) < 1e-8
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("name", [name for name in LAWS if name != "small strain"])
+def test_compiled_update_with_an_average_is_that_of_numpy(name, dim):
+    law = LAWS[name].softening_by(AVERAGE)
+    reference, state = in_python(law), law.initial_state(COUNT, dim)
+    for H in random_path(COUNT, dim, 5, size=0.03, turn=0.3):
+        H[0] = 0.0
+        mine, theirs = law.update(H, state), reference.update(H, state)
+        assert mine.state.keys() == theirs.state.keys()
+        for key, values in theirs.state.items():
+            bound = 1e-11 * np.abs(values).max()
+            np.testing.assert_allclose(mine.state[key], values, rtol=0.0, atol=bound)
+        bound = 2e-9 * np.abs(theirs.tangent).max()
+        np.testing.assert_allclose(mine.tangent, theirs.tangent, rtol=0.0, atol=bound)
+        state = theirs.state
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_strength_is_that_of_the_end_of_a_step(name):
+    law = LAWS[name].softening_by(AVERAGE)
+    state = law.initial_state(COUNT, 2)
+    for H in random_path(COUNT, 2, 4, size=0.03, turn=0.0):
+        before, state = state["plastic_strain"], law.update(H, state).state
+    yields = state["plastic_strain"] > before
+    assert yields.any()
+    f = law.yield_function(state["stress"], state["plastic_strain"])
+    size = np.abs(state["stress"]).max(axis=1) + 1.0
+    assert np.all(f <= 1e-12 * size)
+    assert np.all(f[yields] >= -1e-12 * size[yields])
+
+
+def sheared(law, shears):
+    """Return shear stresses of one point at shear strains one after the other."""
+    state, stresses = law.initial_state(1, 2), []
+    for shear in shears:
+        H = np.zeros((1, 2, 2))
+        H[0, 0, 1] = shear
+        state = law.update(H, state).state
+        stresses.append(float(state["stress"][0, 3]) / np.sqrt(2.0))
+    return np.array(stresses), float(state["plastic_strain"][0])
+
+
+def test_von_mises_softens_to_a_share_of_its_strength():
+    law = SmallStrainVonMises(1e3, 0.3, yield_stress=np.sqrt(3.0), residual=0.25, decay=30.0)
+    stresses, kappa = sheared(law, np.linspace(0.0, 0.4, 4001))
+    assert abs(stresses.max() - 1.0) < 1e-12
+    assert abs(stresses[-1] - (0.25 + 0.75 * np.exp(-30.0 * kappa))) < 1e-4
+    ends, _ = sheared(law.with_parameters(decay=1e4), np.linspace(0.0, 0.4, 401))
+    assert abs(ends[-1] - 0.25) < 1e-12
+
+
+def test_a_point_by_itself_hardens_against_its_average():
+    """The strength at 2 k - kappa, with the odd continuation below zero."""
+    law = SmallStrainVonMises(1e3, 0.3, yield_stress=np.sqrt(3.0), residual=0.25, decay=30.0)
+    for average in (0.0, 0.01, 0.2):
+        stresses, kappa = sheared(law.softening_by(np.array([average])), [0.01, 0.1])
+        driving = 30.0 * (2.0 * average - kappa)
+        left = np.exp(-driving) if driving > 0.0 else 2.0 - np.exp(driving)
+        assert abs(stresses[-1] - (0.25 + 0.75 * left)) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"residual": 0.5}, "Softening needs decay and a residual strength"),
+        ({"decay": 5.0}, "Softening needs decay and a residual strength"),
+        ({"residual": 1.5, "decay": 5.0}, "residual is 1.5"),
+        ({"residual": 0.5, "decay": -5.0}, "decay is -5"),
+    ],
+)
+def test_softening_that_makes_no_sense_is_refused(given, words):
+    with pytest.raises(MPMError, match=words):
+        VonMises(1e3, 0.3, yield_stress=1.0, **given)
+
+
+def test_laws_that_do_not_soften_stay_as_they_are():
+    for law in (Hencky(1e3, 0.3), VonMises(1e3, 0.3, yield_stress=1.0)):
+        assert not law.softens
+        assert law.softening_by(AVERAGE) is law
+    assert LAWS["tresca"].softens
