@@ -6,7 +6,10 @@ import json
 import re
 from pathlib import Path
 
+import pytest
+
 import mpm_dolfinx
+from mpm_dolfinx import _core
 
 ROOT = Path(__file__).parents[1]
 
@@ -24,3 +27,12 @@ def test_changelog_begins_with_the_version_or_what_is_not_released():
     )
     assert headings[0].startswith("Unreleased") or headings[0] == mpm_dolfinx.__version__
     assert mpm_dolfinx.__version__ in headings
+
+
+def test_loops_of_other_sources_are_told():
+    made_of = getattr(_core.loops, "sources", "")
+    assert len(made_of) == 64
+    _core.require_of(made_of, made_of)
+    _core.require_of("", made_of)  # a wheel has no sources
+    with pytest.raises(ImportError, match="install mpm_dolfinx again"):
+        _core.require_of("0" * 64, made_of)

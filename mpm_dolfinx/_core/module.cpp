@@ -309,6 +309,7 @@ Target target_of(const Domains& domains, const Offsets& offsets, const Indices& 
 
 NB_MODULE(_loops, m)
 {
+  m.attr("sources") = LOOPS_SOURCES;
   m.doc() = "Compiled loops over particle domains.";
 
   m.def("displacement_gradient", [](Reals u, Indices dofmap, Reals gradients, RealsOut H) {
