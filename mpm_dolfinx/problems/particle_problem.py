@@ -597,16 +597,20 @@ class ParticleProblem(Hooked):
         Raises:
             MPMError: The condition is not one of the problem's.
         """
+        known: Sequence[Any]
         if isinstance(bc, Contact | RigidBody):
-            if all(bc is not term for term in self.terms):
-                raise MPMError("reaction() needs one of the contacts of this problem.")
+            what, known = "contacts", self.terms
+        elif isinstance(bc, Support):
+            what, known = "supports", [bc for body in self.bodies if bc.particles is body]
+        else:
+            what, known = "Dirichlet conditions", self.bcs
+        place = next((number for number, one in enumerate(known) if one is bc), None)
+        with agree(self._comm):
+            if place is None:
+                raise MPMError(f"reaction() needs one of the {what} of this problem.")
+        require_same(self._comm, bc=f"number {place} of the {what}")
+        if isinstance(bc, Contact | RigidBody | Support):
             return bc.reaction
-        if isinstance(bc, Support):
-            if all(bc.particles is not body for body in self.bodies):
-                raise MPMError("reaction() needs a support on one of the bodies of this problem.")
-            return bc.reaction
-        if not any(bc is known for known in self.bcs):
-            raise MPMError("reaction(bc) needs one of the Dirichlet conditions of this problem.")
         number, field = next(
             (number, field)
             for number, field in enumerate(self.reduced.fields)

@@ -255,19 +255,24 @@ def chosen_cells(particles: Particles, which: Any, tags: Any, cell_tags: Any) ->
                     "particles= are global indices, whole numbers, or a function of coordinates, "
                     f"not {which!r}."
                 ) from None
-            chosen = np.isin(particles.global_index, indices)
-            lost = (indices < 0) | (indices >= particles.num_global)
-            unknown = np.unique(indices[lost]).tolist()
+            lost = np.unique(indices[(indices < 0) | (indices >= particles.num_global)])
+            if len(lost):
+                raise _not_there(lost.tolist())
+            chosen, unknown = np.isin(particles.global_index, indices), []
     count = comm.allreduce(int((chosen & ~particles.deleted).sum()))
     rest = comm.allreduce(int((~chosen & ~particles.deleted).sum()))
     unknown = sorted(set.intersection(*[set(u) for u in comm.allgather(unknown)]))
     if unknown:
-        raise MPMError(f"There are no cells {', '.join(map(str, unknown))} to be removed.")
+        raise _not_there(unknown)
     if count == 0:
         raise MPMError("Nothing is to be removed, or it is removed already.")
     if rest == 0:
         raise MPMError("Nothing would be left of the body; a problem keeps a part of each body.")
     return np.flatnonzero(chosen & ~particles.deleted)
+
+
+def _not_there(cells: Sequence[int]) -> MPMError:
+    return MPMError(f"There are no cells {', '.join(map(str, cells))} to be removed.")
 
 
 def _tagged(particles: Particles, tags: Any, cell_tags: Any) -> tuple[NDArray[np.bool_], list[int]]:

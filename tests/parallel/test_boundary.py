@@ -198,6 +198,19 @@ def test_a_key_or_a_scheme_that_differs_between_ranks_is_named():
     fails(lambda: made(mpm.DynamicProblem, scheme=Own()).step(0.1), "rates.* differs between")
 
 
+@pytest.mark.mpi
+def test_a_condition_or_cells_that_differ_between_ranks_are_named():
+    problem = made()
+    problem.solve(1)
+    strange = scenes.fix(particles().V, scenes.at(0, 0.0))
+    for wrong, words in (
+        (strange, "one of the Dirichlet conditions of this problem"),
+        (contact.Rigid(particles(), contact.plane((0.0, 9.0), (0.0, -1.0))), "differs"),
+    ):
+        fails(lambda wrong=wrong: problem.reaction(differing(problem.bcs[0], wrong)), words)
+    fails(lambda: problem.remove(differing([0], [99])), "no cells 99 to be removed")
+
+
 class Own(Kept):
     """Nodal values that go with a problem; on the last rank one method fails or differs."""
 
