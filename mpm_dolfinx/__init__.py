@@ -14,6 +14,7 @@ from .errors import (  # noqa: E402
     MPMError,
     ParticleOutsideError,
 )
+from .gradients.adjoint import Adjoint  # noqa: E402
 from .gradients.sensitivity import Sensitivity  # noqa: E402
 from .history import Energy, History, Loss, Stage, Statistics, Step  # noqa: E402
 from .meshes.grid import grid, grid_lines  # noqa: E402
@@ -40,6 +41,7 @@ from .transfer.weights import Weights  # noqa: E402
 __version__ = "0.3.0"
 
 __all__ = [
+    "Adjoint",
     "AveragedVolumeRatio",
     "Body",
     "ConvergenceError",

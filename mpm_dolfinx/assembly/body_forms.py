@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ufl
-from dolfinx import fem
+from dolfinx import fem, la
 from dolfinx.fem import petsc as fem_petsc
 
 from .. import _compat
@@ -139,6 +139,7 @@ class BodyForms:
         self.stock = [form for form, fuse in zip(compiled, together, strict=True) if not fuse]
         self._stock_ufl = [form for form, fuse in zip(tangents, together, strict=True) if not fuse]
         self._tangents = tangents
+        self._works: dict[int, tuple[fem.Function, list[fem.Form], fem.Function]] = {}
         source = low_rank if self._average is None else self._average
         self._source = source
         self._low_rank = None if source is None else LowRankTangent(particles, source)
@@ -246,6 +247,41 @@ class BodyForms:
             force,
         )
         return force
+
+    def force_of(self, stress: NDArray[np.float64]) -> PETSc.Vec:
+        """Return the virtual work of a first Piola stress at the points (collective)."""
+        assert self.internal is not None
+        total = self.r.duplicate()
+        assemble_into(total, [], self._force_of(self.internal, stress))
+        return total
+
+    def work_by(self, function: fem.Function, motion: fem.Function) -> NDArray[np.float64]:
+        """Return the derivative of the forms' work on a motion by a Function (collective).
+
+        Args:
+            function: What forms may hold; not the displacement.
+            motion: On W.
+
+        Returns:
+            On the local dofs of the Function.
+        """
+        key = id(function)
+        if key not in self._works:
+            virtual, forms = fem.Function(self._particles.W), []
+            for part in self._parts:
+                if any(each is function for each in part.coefficients()):
+                    work = ufl.replace(part, {self._test: virtual})
+                    forms.append(ufl.derivative(work, function))
+            self._works[key] = virtual, self._compile(forms), function
+        virtual, compiled, _ = self._works[key]
+        virtual.x.array[:] = motion.x.array
+        total = fem.Function(function.function_space)
+        for form in compiled:
+            vector = fem.assemble_vector(form)
+            vector.scatter_reverse(la.InsertMode.add)
+            total.x.array[:] += vector.array
+        total.x.scatter_forward()
+        return np.asarray(total.x.array)
 
     def stiffness_force(self, w: PETSc.Vec) -> PETSc.Vec:
         """Return the whole tangent times a vector on W (collective)."""

@@ -96,6 +96,7 @@ class Support:
         self._share = 1.0
         self._sums: list[fem.Form] | None = None
         self._power: fem.Form | None = None
+        self._works: tuple[fem.Function, fem.Form] | None = None
 
     def scale(self, modulus: Any) -> None:
         """Set the modulus that the penalty is relative to (collective).
@@ -197,6 +198,24 @@ class Support:
         cells = each.function_space.dofmap.list[: self.particles.num_local, 0]
         each.x.array[cells] = moduli()
         return each
+
+    def work_by_stiffness(self, motion: fem.Function) -> NDArray[np.float64]:
+        """Return the derivative of the residual's work on a motion by :attr:`stiffness`.
+
+        Args:
+            motion: On W of the body (collective).
+
+        Returns:
+            Shape as :attr:`stiffness`, zero at ghosts.
+        """
+        if self._works is None:
+            virtual = fem.Function(self.particles.W)
+            work = ufl.replace(self.residual, {ufl.TestFunction(self.particles.W): virtual})
+            self._works = virtual, compiled_form(ufl.derivative(work, self._stiffness))
+        virtual, form = self._works
+        virtual.x.array[:] = motion.x.array
+        vector = fem.assemble_vector(form)
+        return np.asarray(vector.array)
 
     def forget_modulus(self) -> None:
         """Take that of another problem's material, unless one was given."""

@@ -117,6 +117,7 @@ class MaterialPoints:
         self.tangent = np.zeros((*shape, self.dim, self.dim))
         self._trial, self._trial_gradient = states, self._last.gradient
         self._asks_tangents = True
+        self._imposed: NDArray[np.float64] | None = None
         self.averaging: VolumeAveraging | None = None
         if f_bar != "none":
             material = np.zeros(particles.num_local, dtype=np.int64)
@@ -259,6 +260,51 @@ class MaterialPoints:
             yield
         finally:
             self._asks_tangents = True
+
+    def answers(
+        self, gradient: NDArray[np.float64], states: list[State]
+    ) -> tuple[NDArray[np.float64], list[State]]:
+        """Return what the materials answer, and leave all as it is (not collective).
+
+        Args:
+            gradient: ``F - I`` that they see, shape ``(n nq, dim, dim)``.
+            states: Of each material at the beginning of the step.
+
+        Returns:
+            Their first Piola stress, of the same shape, and their states.
+        """
+        stress, found = np.zeros(gradient.shape), []
+        for part, state in zip(self._governed, states, strict=True):
+            everywhere = len(part.points) == self._points
+            its = gradient if everywhere else gradient[part.points]
+            answer = part.answer(its, state, tangent=False)
+            if everywhere and part.is_own:
+                stress = answer.first_piola
+            else:
+                stress[part.points] = answer.first_piola
+            own = answer.state
+            found.append(own if part.is_own else {name: v.copy() for name, v in own.items()})
+        return stress, found
+
+    def points_of_laws(self) -> list[NDArray[np.int64]]:
+        """Return the numbers of the points of each material."""
+        return [part.points for part in self._governed]
+
+    def tangents(self, gradient: NDArray[np.float64], states: list[State]) -> NDArray[np.float64]:
+        """Return derivatives of :meth:`answers` as the materials tell them (not collective)."""
+        found = np.zeros(self.tangent.shape)
+        for part, state in zip(self._governed, states, strict=True):
+            found[part.points] = part.answer(gradient[part.points], state).tangent
+        return found
+
+    @contextmanager
+    def with_tangent(self, tangent: NDArray[np.float64] | None) -> Iterator[None]:
+        """Let the tangent of the materials be another one in the block; ``None``: their own."""
+        self._imposed = tangent
+        try:
+            yield
+        finally:
+            self._imposed = None
 
     @contextmanager
     def in_no_time(self) -> Iterator[None]:
@@ -639,6 +685,8 @@ class MaterialPoints:
             elif self._asks_tangents:
                 self.tangent[part.points] = answer.tangent
             trial.append(answer.state)
+        if self._imposed is not None:
+            self.tangent = self._imposed
         self._trial, self._trial_gradient = trial, gradient
         if self.mean_stress is not None:
             self.mean_stress.see(volumes)

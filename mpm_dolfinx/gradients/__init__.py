@@ -9,4 +9,7 @@ evaluated beside the state (:mod:`~mpm_dolfinx.gradients.nearby`), and one linea
 tangent of the step gives the derivative at its end (:mod:`~mpm_dolfinx.gradients.forward`). What
 a step in time takes over of the velocities before is differentiated in
 :mod:`~mpm_dolfinx.gradients.velocities`.
+
+:class:`~mpm_dolfinx.gradients.adjoint.Adjoint` notes the steps, and takes derivatives of
+functionals backward through them (:mod:`~mpm_dolfinx.gradients.backward`).
 """

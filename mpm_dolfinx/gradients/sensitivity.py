@@ -26,7 +26,7 @@ from .forward import StepDerivative
 from .nearby import Nearby, Rates, followed, varying
 from .parameters import as_parameter
 
-__all__ = ["Sensitivity"]
+__all__ = ["Sensitivity", "require_followed"]
 
 type Array = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ class Sensitivity:
         parameters: Sequence[Any],
         scales: Sequence[float] | None = None,
     ) -> None:
-        _require_followed(problem)
+        require_followed(problem, "A Sensitivity")
         sizes: list[float | None] = [None] * len(parameters)
         if scales is not None:
             sizes = [as_positive(scale, "scales of Sensitivity()") for scale in scales]
@@ -281,19 +281,23 @@ def _numbers(value: Any) -> Array:
         ) from None
 
 
-def _require_followed(problem: ParticleProblem) -> None:
+def require_followed(problem: ParticleProblem, who: str) -> None:
     """Raise an error unless the derivative of a problem's steps has all that acts in them.
+
+    Args:
+        problem: The problem.
+        who: Follows it.
 
     Raises:
         MPMError: Something acts that has no part in it yet.
     """
     if not isinstance(problem, ParticleProblem):
-        raise MPMError(f"A Sensitivity follows a problem, not a {type(problem).__name__}.")
+        raise MPMError(f"{who} follows a problem, not a {type(problem).__name__}.")
     what = next(iter(_not_in(problem)), None)
     if what is not None:
-        raise MPMError(f"A Sensitivity does not follow {what} yet.")
+        raise MPMError(f"{who} does not follow {what} yet.")
     if problem.history.steps or any(np.any(b.converged_displacement) for b in problem.bodies):
-        raise MPMError("A Sensitivity follows a problem from its first step on; make it before.")
+        raise MPMError(f"{who} follows a problem from its first step on; make it before.")
 
 
 def _not_in(problem: ParticleProblem) -> list[str]:
@@ -312,6 +316,7 @@ def _not_in(problem: ParticleProblem) -> list[str]:
         "bodies with a length=": any(
             points.averages for points in problem.material_points() if points is not None
         ),
+        "fields that are solved in turn with the displacements": problem.reduced.terms.alternates,
         "bodies whose particles may be deleted": any(b.deletion is not None for b in bodies),
         "bodies whose domains are split": any(b.on_distortion == "split" for b in bodies),
         "rebased bodies": any(b.rebased for b in bodies),

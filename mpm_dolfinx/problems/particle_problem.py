@@ -774,6 +774,10 @@ class ParticleProblem(Hooked):
         """
         self._stepper.record(recorder)
 
+    def constants(self) -> list[fem.Constant]:
+        """Return the Constants of all forms, without loads of bodies."""
+        return list(self._constants)
+
     def begin_anew(self) -> None:
         """Let bodies that have not moved be what parameters make of them now (collective)."""
 

@@ -163,13 +163,20 @@ class NewtonSolver:
             for each in zip(*([] if self._attempt is None else self._attempt.yielding), strict=True)
         ]
 
-    def linearise(self) -> Callable[[PETSc.Vec, PETSc.Vec], None]:
+    def linearise(self, anew: bool = False) -> Callable[[PETSc.Vec, PETSc.Vec], None]:
         """Factorise the tangent at the solution (collective).
+
+        Args:
+            anew: Whether it is that of another step than the last one that was solved.
 
         Returns:
             A function of b and x that sets x to the solution of ``K x = b``, as far as K holds x.
         """
-        self._set_tangent(self._problem.tangent())
+        K = self._problem.tangent()
+        if anew:
+            self._factor.begin(K.getSize()[0], self._problem.levels, self.lets_go)
+            self._start(K.getSizes()[0])
+        self._set_tangent(K)
 
         def solve(b: PETSc.Vec, x: PETSc.Vec) -> None:
             self._factor.solve(b, x)

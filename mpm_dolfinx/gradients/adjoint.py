@@ -1,0 +1,543 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Derivatives of a functional by any number of parameters, by going through a run backward."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ufl
+from dolfinx import fem, la
+from ufl.algorithms.analysis import extract_coefficients
+
+from .. import _compat
+from ..errors import MPMError
+from ..materials.base import State
+from ..parallel.boundary import collective, of_user
+from ..parallel.compilation import compiled_form
+from ..particles.particles import Particles
+from ..problems.quasistatic import QuasiStaticProblem
+from ..problems.through_time import TimeProblem
+from ..stepping.loading import Stepper
+from ..system.field import Field
+from .backward import Backward, Laws, Record, Weights, no_weights, slope_of
+from .nearby import varying
+from .parameters import CHANGE, Parameter, as_parameter
+from .sensitivity import require_followed
+
+__all__ = ["Adjoint"]
+
+type Array = NDArray[np.float64]
+type Sides = tuple[Array, Array]
+
+
+@dataclass
+class _First:
+    """What a parameter does before the first step, at the points and cells of each body.
+
+    Attributes:
+        states: Derivatives of what materials keep, by the amount.
+        stiffness: Of that of supports, in each cell.
+        tangent: Of ``W C_iJiJ`` of undeformed points, shape ``(n nq, gdim, gdim)``.
+        modulus: Of the modulus of F-bar, in each cell, or ``None``.
+    """
+
+    states: list[list[State]]
+    stiffness: list[list[Array]]
+    tangent: list[Array]
+    modulus: list[Array | None]
+
+
+class _Many:
+    """A parameter, all values of which change by themselves.
+
+    Args:
+        given: As the user names it.
+        problem: The problem.
+    """
+
+    def __init__(self, given: Any, problem: QuasiStaticProblem) -> None:
+        self.function = given if isinstance(given, fem.Function) else None
+        if isinstance(given, tuple) and len(given) == 2:
+            value = getattr(given[0], "parameters", {}).get(str(given[1]))
+            self.function = value if isinstance(value, fem.Function) else None
+        self._sizes: Array = np.ones(1)
+        if self.function is not None:
+            values = np.abs(self.function.x.array)
+            comm: MPI.Comm = self.function.function_space.mesh.comm
+            largest = float(comm.allreduce(float(values.max(initial=0.0)), MPI.MAX))
+            if largest == 0.0:
+                raise MPMError(f"'{self.function.name}' is zero, which says nothing of its size.")
+            self._sizes = np.where(values > 1e-3 * largest, values, largest)
+            given = (self.function, self._sizes)
+        self.parameter: Parameter = as_parameter(given, problem, None)
+        if self.function is None and isinstance(given, fem.Constant):
+            if any(_compat.holds(bc, given) for bc in problem.bcs):
+                raise MPMError("An Adjoint does not differentiate by Dirichlet values yet.")
+        self.total: Array = np.zeros(self._sizes.shape if self.function is not None else ())
+        self._problem = problem
+
+    def zero(self) -> None:
+        """Forget what was added."""
+        self.total = np.zeros(self.total.shape)
+
+    def add_of_points(self, body: Particles, values: Array) -> None:
+        """Add derivatives at the points of a body, by the amount, shape ``(n nq,)``."""
+        self.add_of_cells(body, values.reshape(body.num_local, -1).sum(axis=1))
+
+    def add_of_cells(self, body: Particles, values: Array) -> None:
+        """Add derivatives in the owned cells of a body, by the amount."""
+        if self.function is None:
+            self.total = self.total + values.sum()
+        elif self.function.function_space.mesh is body.mesh:
+            dofs = self.function.function_space.dofmap.list[: body.num_local, 0]
+            self.total[dofs] += values / self._sizes[dofs]
+
+    def result(self) -> Array:
+        """Return what was added, with that of other ranks (collective)."""
+        if self.function is None:
+            comm: MPI.Comm = self._problem.bodies[0].mesh.comm
+            return np.asarray(comm.allreduce(float(self.total)))
+        whole = fem.Function(self.function.function_space)
+        whole.x.array[:] = self.total
+        whole.x.scatter_forward()
+        return np.asarray(whole.x.array)
+
+
+class Adjoint:
+    """Derivatives of a functional by any number of parameters (collective).
+
+    It is made before the first step, and kept; it notes each step, and :meth:`of` goes through
+    them backward, at the cost of about one run whatever the number of parameters::
+
+        young = fem.Function(fem.functionspace(body, ("DG", 0)))
+        problem = mpm.QuasiStaticProblem(mpm.Body(particles, mpm.materials.Hencky(young, 0.3)), bcs)
+        adjoint = mpm.Adjoint(problem, [young])
+        problem.solve(steps=20)
+        d = particles.displacement
+        (slope,) = adjoint.of(0.5 * ufl.inner(d - measured, d - measured) * ds(1))
+
+    Like those of a :class:`Sensitivity` the derivatives are those of the discrete run, with its
+    history, its moving domains and its stabilisation.
+
+    Args:
+        problem: A :class:`QuasiStaticProblem`.
+        parameters: By what to differentiate: Functions, each value by itself (DG0 ones of laws, or
+            of loads), Constants, and pairs of a material and the name of one of its numbers.
+
+    Attributes:
+        problem: As given.
+
+    Raises:
+        MPMError: Something that cannot be differentiated (yet), or a problem that has begun.
+    """
+
+    @collective("parameters")
+    def __init__(self, problem: QuasiStaticProblem, parameters: Sequence[Any]) -> None:
+        require_followed(problem, "An Adjoint")
+        _require_plain(problem)
+        self.problem = problem
+        self._many = [_Many(given, problem) for given in parameters]
+        if not self._many:
+            raise MPMError("Name a parameter to differentiate by.")
+        self._first = [self._at_first(one) for one in self._many]
+        self._records: list[Record] = []
+        self._stepper: Stepper | None = None
+        self._reduced = problem.reduced
+        self._values = [one.function.x.array.copy() if one.function else None for one in self._many]
+        problem.record(self)
+
+    # -- What follows the run -----------------------------------------------------------------
+
+    def begins(self) -> None:
+        """Do nothing: this is for motions."""
+
+    def solved(self, stepper: Stepper) -> Callable[[], None]:
+        """Note a step that is solved; see :meth:`ParticleProblem.record`."""
+        problem = self.problem
+        self._require_present()
+        if stepper.run is not None and stepper.run.goal is not None:
+            raise MPMError("An Adjoint does not follow displacement control; apply a load.")
+        before = [body.converged_displacement.copy() for body in problem.bodies]
+        record = Record(
+            self._records[-1].after if self._records else before,
+            [np.array(body.displacement.x.array) for body in problem.bodies],
+            [field.u.array_r.copy() for field in stepper.reduced.fields],
+            [
+                [
+                    _kept(law, state)
+                    for law, state in zip(points.given, points.states(), strict=True)
+                ]
+                for points in problem.material_points()
+            ],
+            [array.copy() for array in self._data()],
+        )
+
+        def take() -> None:
+            self._stepper = stepper
+            self._records.append(record)
+
+        return take
+
+    def _data(self) -> list[Array]:
+        """Return what forms hold besides displacements, to be set."""
+        constants = [c for body in self.problem.bodies for c in (body.load, body.proportional)]
+        found = [*constants, *self.problem.loads(), *self.problem.constants()]
+        mine = [one.function for one in self._many]
+        return [
+            value.x.array if isinstance(value, fem.Function) else value.value
+            for value in found
+            if all(value is not own for own in mine)
+        ]
+
+    def _require_present(self) -> None:
+        """Raise an error where the problem is in another state than that which was followed."""
+        bodies = self.problem.bodies
+        same = self._reduced is self.problem.reduced
+        if same and self._records:
+            pairs = zip(bodies, self._records[-1].after, strict=True)
+            same = all(np.array_equal(b.converged_displacement, after) for b, after in pairs)
+        values = zip(self._many, self._values, strict=True)
+        for one, value in values:
+            one.parameter.require_unchanged()
+            if one.function is not None and value is not None:
+                same = same and np.array_equal(one.function.x.array, value)
+        if not bodies[0].mesh.comm.allreduce(same, MPI.LAND):
+            raise MPMError(
+                "The problem has come to another state than by the steps that an Adjoint follows "
+                "(a stage, a checkpoint, other meshes); make a new problem and a new Adjoint."
+            )
+
+    # -- Before the first step ------------------------------------------------------------------
+
+    def _at_first(self, one: _Many) -> _First:
+        """Return what a parameter does before the first step (collective)."""
+        problem, parameter = self.problem, one.parameter
+        sides = []
+        for sign in (1.0, -1.0, 0.0):
+            parameter.shift(sign * parameter.change)
+            for points in problem.material_points():
+                parameter.govern(points, sign * parameter.change)
+            problem.begin_anew()
+            sides.append(self._look())
+        after, before = sides[:2]
+        return _First(
+            [
+                [parameter.rate(*pair) for pair in zip(*own, strict=True)]
+                for own in zip(after.states, before.states, strict=True)
+            ],
+            [
+                [parameter.slope(*pair) for pair in zip(*own, strict=True)]
+                for own in zip(after.stiffness, before.stiffness, strict=True)
+            ],
+            [parameter.slope(*p) for p in zip(after.tangent, before.tangent, strict=True)],
+            [
+                None if a is None or b is None else parameter.slope(a, b)
+                for a, b in zip(after.modulus, before.modulus, strict=True)
+            ],
+        )
+
+    def _look(self) -> _First:
+        """Return the values of what :class:`_First` has derivatives of (collective)."""
+        problem, tangents = self.problem, []
+        for points in problem.material_points():
+            gdim = points.strain.particles.mesh.geometry.dim
+            C = points.undeformed_tangent()[:, :gdim, :gdim, :gdim, :gdim]
+            tangents.append(points.weights.ravel()[:, None, None] * np.einsum("niJiJ->niJ", C))
+        return _First(
+            [[varying(s) for s in points.states()] for points in problem.material_points()],
+            [
+                [one.stiffness.copy() for one in problem.setup.supports_of(body)]
+                for body in problem.bodies
+            ],
+            tangents,
+            [
+                None if points.averaging is None else points.averaging.modulus.copy()
+                for points in problem.material_points()
+            ],
+        )
+
+    # -- Backward -------------------------------------------------------------------------------
+
+    @collective("functional")
+    def of(self, functional: Any) -> list[Array]:
+        """Return the derivatives of a functional by all parameters (collective).
+
+        Args:
+            functional: A scalar UFL form in ``particles.displacement``, of the last step; a
+                dictionary of such forms by the numbers of steps, from 0; or a function of the
+                number of a step, which sees its displacements in place, and returns a form,
+                ``None``, or derivatives as arrays: a dictionary of them by ``"displacement"`` (on
+                the local dofs of W) and by the names of variables of the materials, shape
+                ``(n, nq, ...)`` (of each body in a list).
+
+        Returns:
+            An array for each parameter: one number, or one for each local dof of a Function.
+        """
+        self._require_present()
+        if self._stepper is None:
+            raise MPMError("There is no step yet that an Adjoint could go through.")
+        look = self._look_of(functional)
+        problem, data = self.problem, self._data()
+        back = Backward(problem, self._stepper.newton)
+        own = [array.copy() for array in data]
+        states = [points.states() for points in problem.material_points()]
+        for one in self._many:
+            one.zero()
+        try:
+            self._go_back(back, look, data)
+        finally:
+            for array, values in zip(data, own, strict=True):
+                array[...] = values
+            for body, points, last, its in zip(
+                problem.bodies,
+                problem.material_points(),
+                self._records[-1].after,
+                states,
+                strict=True,
+            ):
+                body.restore(last.copy().reshape(-1, body.mesh.geometry.dim))
+                points.go_from(its)
+            self._reduced.unknowns.forget()
+            self._stepper.go_back()
+        return [one.result() for one in self._many]
+
+    def _go_back(self, back: Backward, look: Callable[[int], Any], data: Sequence[Array]) -> None:
+        """Go through all steps backward, and add up derivatives."""
+        problem, weights = self.problem, no_weights(self.problem)
+        penalised: dict[int, Array] = {}
+        stiffened = [[np.zeros_like(a) for a in own] for own in self._look().stiffness]
+        for number in range(len(self._records) - 1, -1, -1):
+            record = self._records[number]
+            back.go_to(record, data)
+            self._add_functional(look(number), weights)
+            moved, laws = back.step(record, weights)
+            self._add_penalties(back, penalised)
+            for own, body, motion in zip(stiffened, problem.bodies, moved, strict=True):
+                for total, support in zip(own, problem.setup.supports_of(body), strict=True):
+                    total -= support.work_by_stiffness(motion)
+            for one in self._many:
+                if one.parameter.outside:
+                    self._add_loads(one, moved)
+            for place, (law, motion) in enumerate(zip(laws, moved, strict=True)):
+                self._add_law(place, law, motion, weights)
+        for one, first in zip(self._many, self._first, strict=True):
+            if one.parameter.of_law:
+                self._add_first(one, first, weights, penalised, stiffened)
+
+    def _add_law(self, place: int, law: Laws, motion: fem.Function, weights: Weights) -> None:
+        """Add what the laws of a body depend on, and take weights to the step's beginning."""
+        points, body = self.problem.material_points()[place], self.problem.bodies[place]
+        seen, resists = law.seen(motion)
+        work = points.weights.ravel()[:, None, None] * seen
+        states = weights.states[place]
+        for one, first in zip(self._many, self._first, strict=True):
+            parameter = one.parameter
+            if not parameter.of_law:
+                continue
+
+            def at(amount: float, parameter: Parameter = parameter) -> Array:
+                parameter.shift(amount)
+                parameter.govern(points, amount)
+                return law.change(states, work, law.answers())
+
+            one.add_of_points(body, slope_of(at, parameter.change))
+            parameter.shift(0.0)
+            parameter.govern(points, 0.0)
+            modulus = first.modulus[place]
+            if modulus is not None:
+                one.add_of_cells(body, -modulus * (points.weights * resists).sum(axis=1))
+        if any(law.have_history()):
+            weights.states[place] = law.by_states(states, work)
+        else:
+            weights.states[place] = [{k: 0.0 * v for k, v in own.items()} for own in states]
+
+    def _add_loads(self, one: _Many, moved: Sequence[fem.Function]) -> None:
+        """Add what forces depend on besides laws."""
+        problem, parameter = self.problem, one.parameter
+        if one.function is not None:
+            for term, motion in zip(problem.body_terms, moved, strict=True):
+                one.total -= term.forms.work_by(one.function, motion)
+            return
+        sides = []
+        for sign in (1.0, -1.0):
+            parameter.shift(sign * parameter.change)
+            problem.renew_external()
+            sides.append(self._reduced.terms.last_nodal_forces())
+        parameter.shift(0.0)
+        problem.renew_external()
+        for motion, after, before in zip(moved, *sides, strict=True):
+            work = motion.x.array[: len(after)] @ (after - before)
+            one.total = one.total - work / (2.0 * parameter.change)
+
+    def _add_penalties(self, back: Backward, totals: dict[int, Array]) -> None:
+        """Add derivatives by the moduli of penalties."""
+        for number, (field, z) in enumerate(
+            zip(self._reduced.fields, back.background, strict=True)
+        ):
+            if field.moduli is None:
+                continue
+            own, slopes = np.array(field.moduli), []
+            for place in range(len(own)):
+                amount = np.zeros(len(own))
+                amount[place] = CHANGE * own.max()
+                parts = [field.penalty_force((own + s * amount).tolist()) for s in (1.0, -1.0)]
+                slopes.append((z.dot(parts[0]) - z.dot(parts[1])) / (2.0 * amount[place]))
+            totals[number] = totals.get(number, 0.0) - np.array(slopes)
+
+    def _add_first(
+        self,
+        one: _Many,
+        first: _First,
+        weights: Weights,
+        penalised: Mapping[int, Array],
+        stiffened: Sequence[Sequence[Array]],
+    ) -> None:
+        """Add what a parameter of a law does before the first step (collective)."""
+        problem = self.problem
+        for place, (body, points) in enumerate(
+            zip(problem.bodies, problem.material_points(), strict=True)
+        ):
+            found = np.zeros(len(first.tangent[place]))
+            for own, rates, where in zip(
+                weights.states[place], first.states[place], points.points_of_laws(), strict=True
+            ):
+                for name, values in own.items():
+                    product = (values * rates[name]).reshape(len(where), -1)
+                    found[where] += product.sum(axis=1)
+            one.add_of_points(body, found)
+            for total, slope in zip(stiffened[place], first.stiffness[place], strict=True):
+                dofs = slice(0, body.num_local)
+                one.add_of_cells(body, (total * slope)[dofs])
+            number, field = next(
+                (n, f) for n, f in enumerate(self._reduced.fields) if _has(f, body)
+            )
+            if number in penalised:
+                share = penalised[number][
+                    next(n for n, its in enumerate(field.bodies) if its is body)
+                ]
+                one.add_of_points(body, share * self._modulus_slope(body, points, first, place))
+
+    def _modulus_slope(self, body: Particles, points: Any, first: _First, place: int) -> Array:
+        """Return the derivative of a body's mean shear modulus at its points (collective)."""
+        (tangent,) = (self._look().tangent[place],)
+        comm: MPI.Comm = body.mesh.comm
+        energies = comm.allreduce(tangent.sum(axis=0))
+        volume = comm.allreduce(float(body.initial_volume.sum()))
+        positive = np.where(energies > 0.0, energies, np.inf)
+        i, J = np.unravel_index(int(positive.argmin()), positive.shape)
+        return np.asarray(first.tangent[place][:, i, J] / volume)
+
+    # -- The functional ---------------------------------------------------------------------------
+
+    def _look_of(self, functional: Any) -> Callable[[int], Any]:
+        """Return a function of the number of a step that returns what there is of a functional."""
+        last = len(self._records) - 1
+        if isinstance(functional, ufl.Form):
+            return lambda number: functional if number == last else None
+        if isinstance(functional, Mapping):
+            return lambda number: functional.get(number, functional.get(number - last - 1))
+        if not callable(functional):
+            raise MPMError(
+                "A functional is a UFL form, a dictionary of forms by steps, or a function of the "
+                f"number of a step, not {functional!r}."
+            )
+        return of_user(self.problem.bodies[0].mesh.comm, functional)
+
+    def _add_functional(self, given: Any, weights: Weights) -> None:
+        """Add derivatives of a functional at the end of a step (collective)."""
+        if given is None:
+            return
+        if isinstance(given, ufl.Form):
+            self._add_form(given, weights)
+            return
+        bodies = self.problem.bodies
+        listed = given if isinstance(given, list | tuple) else [given]
+        if len(listed) != len(bodies) or not all(isinstance(own, Mapping) for own in listed):
+            raise MPMError(
+                "Derivatives of a functional are a dictionary of arrays (a list of them where "
+                "there is a list of bodies) by 'displacement' and names of variables."
+            )
+        for place, own in enumerate(listed):
+            for name, values in own.items():
+                self._add_array(place, name, np.asarray(values, dtype=np.float64), weights)
+
+    def _add_array(self, place: int, name: str, values: Array, weights: Weights) -> None:
+        """Add derivatives by displacements or a variable of a body."""
+        if name == "displacement":
+            target = weights.motion[place].x.array
+            if values.shape != target.shape:
+                raise MPMError(f"Derivatives by the displacement have {target.shape} numbers.")
+            target += values
+            weights.motion[place].x.scatter_forward()
+            return
+        points, known = self.problem.material_points()[place], False
+        for own, where in zip(weights.states[place], points.points_of_laws(), strict=True):
+            if name in own:
+                known = True
+                flat = values.reshape(-1, *own[name].shape[1:])
+                own[name] += flat[where]
+        if not known:
+            raise MPMError(f"No material of these particles has a variable {name!r} that varies.")
+
+    def _add_form(self, form: ufl.Form, weights: Weights) -> None:
+        """Add derivatives of a form by displacements and by parameters in it (collective)."""
+        held = form.coefficients()
+        for body, motion in zip(self.problem.bodies, weights.motion, strict=True):
+            if any(one is body.displacement for one in held):
+                motion.x.array[:] += _assembled(ufl.derivative(form, body.displacement))
+                motion.x.scatter_forward()
+        for one in self._many:
+            if one.function is not None and any(own is one.function for own in held):
+                own = _assembled(ufl.derivative(form, one.function))
+                one.total += own
+
+
+def _has(field: Field, body: Particles) -> bool:
+    return any(one is body for one in field.bodies)
+
+
+def _assembled(form: ufl.Form) -> Array:
+    """Return a linear form, assembled on the local dofs with those of other ranks (collective)."""
+    vector = fem.assemble_vector(compiled_form(form))
+    vector.scatter_reverse(la.InsertMode.add)
+    vector.scatter_forward()
+    return np.asarray(vector.array)
+
+
+def _kept(law: Any, state: State) -> State:
+    """Return a copy of what a law needs of its state."""
+    if not getattr(law, "inelastic", True):
+        return {}
+    return {name: values.copy() for name, values in state.items()}
+
+
+def _require_plain(problem: Any) -> None:
+    """Raise an error where going backward would not be exact.
+
+    Raises:
+        MPMError: It would not.
+    """
+    if not isinstance(problem, QuasiStaticProblem) or isinstance(problem, TimeProblem):
+        raise MPMError(
+            f"An Adjoint follows a QuasiStaticProblem, not a {type(problem).__name__}; a "
+            "Sensitivity follows others too."
+        )
+    for body in problem.setup.given:
+        if body.initial_stress is not None:
+            raise MPMError("An Adjoint does not follow an initial stress yet.")
+        follows = any(
+            one is body.particles.displacement
+            for value, _ in body.tractions
+            if isinstance(value, ufl.core.expr.Expr)
+            for one in extract_coefficients(value)
+        )
+        if body.pressures or follows:
+            raise MPMError("An Adjoint does not follow loads that depend on the displacement yet.")
