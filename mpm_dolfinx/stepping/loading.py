@@ -47,6 +47,8 @@ __all__ = ["Mender", "Owner", "Recorder", "Stepper"]
 ALTERNATED = 1e-6
 #: What an alternation may leave of the residual that it begins with.
 INEXACT = 0.1
+#: How much farther a body may move for the same controlled displacement than in the step before.
+JUMP = 10.0
 #: Alternations after which a step is given up.
 MOST_ALTERNATIONS = 5000
 
@@ -138,6 +140,7 @@ class Stepper:
         self._mender = mender
         self.run: Run | None = None
         self._resumes = self._follows = self._begins = False
+        self._moved: float | None = None
         self._recorders: list[weakref.ref[Recorder]] = []
 
     def record(self, recorder: Recorder) -> None:
@@ -476,7 +479,7 @@ class Stepper:
         span: tuple[float, float] | None,
     ) -> Run:
         """Return a new run, or the one that a checkpoint interrupted."""
-        goal = None
+        goal = self._moved = None
         if control is not None:
             control.require_for(self.owner.bodies, update is not None)
             goal = control.value
@@ -547,6 +550,7 @@ class Stepper:
             return None
         taken = [recorder.solved(self) for recorder in self.recorders]
         if control is not None:
+            self._look_for_jump(owner, size, parameter)
             parameter = float(owner.bodies[0].load.value)
         before = [body.converged_displacement for body in owner.bodies]
         last = run is None or run.control.target == 1.0
@@ -636,6 +640,25 @@ class Stepper:
             if control is not None:
                 self._set_load(self.converged.load, self.converged.proportional)
             reduced.terms.roll_back()
+
+    def _look_for_jump(self, owner: Owner, size: float, displacement: float) -> None:
+        """Warn where a body has moved much farther than its controlled displacement (collective).
+
+        Args:
+            owner: The problem.
+            size: How far that has moved in the step.
+            displacement: Its value.
+        """
+        assert self.newton.x is not None
+        moved, before = self._reduced.resistance.motion(self.newton.x) / size, self._moved
+        self._moved = moved
+        if before is not None and moved > JUMP * before:
+            owner.warn(
+                f"In the step to a controlled displacement of {displacement:.6g} the body moved "
+                f"{moved / before:.3g} times as far for it as in the step before: it has jumped to "
+                "another state, between which and the last one the displacement went back. Control "
+                "one that grows all the way, such as the opening of a crack."
+            )
 
     def _alternate(self) -> int:
         """Solve equations of terms in turn with the displacements, until all hold together.
