@@ -18,7 +18,7 @@ CASES = Path(__file__).parents[2] / "benchmarks" / "cases"
 #: Programs that ``make test`` runs, and numbers that it leaves to ``make test-all``.
 SHORT = ("compaction", "column_free", "snap_through")
 LONG = {
-    *("sand-damped", "sand-dilates"),
+    *("sand-damped", "sand-dilates", "notch"),
     *("vortex", "disc", "discs", "discs-contact", "column"),
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
     *("slope", "vertical-cut", "footing-friction", "footing-weight-rough", "footing-edge"),
@@ -294,6 +294,11 @@ RUNS = {
         "--parameters 2 --steps 4",
         {"difference": 1e-6, "trend": 0.02, "cutbacks": 0},
     ),
+    "notch": (
+        "notch",
+        "--body free --steps 20",
+        {"energy": 1.05, "fallen": 1e-10, "iterations": 220, "cutbacks": 0},
+    ),
     "column": ("column_dynamic", "--time 0.4", {"cutbacks": 0, "balance_error": 1e-12}),
 }
 #: Cases that go through time, whose load is that.
@@ -337,6 +342,7 @@ KEYS = {
     "free_body": {"difference", "seconds_ratio", "unknowns"},
     "lshape": {"error", "estimate", "unknowns", "error_all_free", "unknowns_carried"},
     "gradient": {"taylor", "difference", "trend", "seconds_ratio"},
+    "notch": {"peak", "energy", "crack_length", "alternations", "fallen"},
     "snap_through": {"limit", "valley", "crown", "error"},
     "wall": {"head", "reference", "error", "unknowns", "unknowns_carried"},
 }
@@ -370,7 +376,7 @@ def test_numbers(case, capfd):
     timed = {key for key in numbers if "time" in key or "seconds" in key}
     assert timed == ({"seconds_ratio"} if name in ("free_body", "gradient") else set())
     assert numbers["completed"] == 1 and numbers["failure"] is None
-    assert numbers["load"] == 1.0 or name in {"snap_through", "expansion", *IN_TIME}
+    assert numbers["load"] == 1.0 or name in {"snap_through", "expansion", "notch", *IN_TIME}
     assert (numbers["iterations"] > 0) == (name != "domain_distortion")  # there all is prescribed
     for key, bound in bounds.items():
         assert numbers[key] <= bound, key
