@@ -288,6 +288,16 @@ RUNS = {
         "--scene block --size 3 --steps 2",
         {"difference": 1e-9, "iterations": 12, "cutbacks": 0},
     ),
+    "softening": (
+        "softening",
+        "--cells 8 --length 0.2 --steps 6",
+        {"iterations": 260, "cutbacks": 0},
+    ),
+    "softening-turned": (
+        "softening",
+        "--case biaxial --cells 5 --length 0.3 --angle 30 --steps 4",
+        {"iterations": 120, "cutbacks": 0},
+    ),
     "lshape": ("lshape", "--offset 0.37", {"error": 0.21, "estimate": 0.21, "iterations": 1}),
     "gradient": (
         "gradient",
@@ -345,6 +355,7 @@ KEYS = {
     "notch": {"peak", "energy", "crack_length", "alternations", "fallen"},
     "snap_through": {"limit", "valley", "crown", "error"},
     "wall": {"head", "reference", "error", "unknowns", "unknowns_carried"},
+    "softening": {"peak", "energy", "width", "forces", "alternations"},
 }
 
 
@@ -390,6 +401,9 @@ def test_numbers(case, capfd):
         assert abs(numbers["height"] - 1.2) < 1e-3
     if name in ("strength", "footing", "penetration") and numbers.get("ratio"):
         assert numbers["ratio"] > 0.9
+    if case == "softening":
+        assert abs(numbers["width"] / (3.4389 * 0.2) - 1.0) < 0.04  # that of the closed form
+        assert 0.9 < numbers["peak"] < 1.0
     if name == "embankment":
         assert numbers["built"] == 1 and numbers["factor"] > 1.9
     if name == "gradient":
@@ -525,6 +539,7 @@ def test_case_is_a_program(name, tmp_path):
         "lshape": "--cells 2",
         "free_body": "--size 2 --steps 2",
         "wall": "--cell 1",
+        "softening": "--cells 6 --length 0.3 --steps 2",
     }.get(name, "--elements 4 --steps 4")
     done = programs.run(CASES / f"{name}.py", *small.split(), "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
