@@ -659,8 +659,9 @@ class ParticleProblem(Hooked):
         Raises:
             MPMError: As for :meth:`error`, or there is no such body.
         """
-        if body not in range(len(self.bodies)):
-            raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
+        with agree(self._comm):
+            if not isinstance(body, int | np.integer) or body not in range(len(self.bodies)):
+                raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
         return self._errors().of_particles(body, self.bodies[body])
 
     def _errors(self) -> Errors:

@@ -223,3 +223,22 @@ def test_bad_input():
     other = mpm.AveragedVolumeRatio(particles, "patch")
     with pytest.raises(mpm.MPMError, match="not several"):
         mpm.ParticleProblem(R + other.residual(rubber(d, other) * particles.dx), particles)
+
+
+def test_deleted_domains_have_no_part_in_the_averages():
+    particles, bcs = block(QUADRILATERAL, None, n=8)
+    ratio = mpm.AveragedVolumeRatio(particles, "patch")
+    d = particles.displacement
+    energy = rubber(d, ratio) + 7.0 * ratio  # (with a pressure at no deformation)
+    R = ratio.residual(energy * particles.dx) + weight(particles)
+    mpm.ParticleProblem(R, particles, bcs=bcs, symmetric=True)
+    X = particles.W.tabulate_dof_coordinates()[:, :2]
+    d.x.array[:] = (0.1 * np.sin(X @ (1.0 + np.eye(2)))).ravel()
+    gone = np.flatnonzero((particles.global_index == 0) | (particles.global_index == 5))
+    particles.remove(gone)
+    ratio.update()
+    cells = ratio.function_space.dofmap.list[: particles.num_local, 0]
+    there = ~particles.deleted
+    values, pressure = (f.x.array[cells][there] for f in (ratio, ratio.pressure))
+    np.testing.assert_allclose(pressure, BULK * (values - 1.0) + 7.0, rtol=1e-12)
+    assert WORLD.allreduce(int(np.unique(values.round(12)).size)) > 3
