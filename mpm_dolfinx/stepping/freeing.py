@@ -72,8 +72,8 @@ def carried_after(bodies: Sequence[Particles]) -> Carried:
     return Carried(found, too_late)
 
 
-def relieve(bodies: Sequence[Particles], error: MPMError) -> bool:
-    """Carry the free nodes of domains that an error names; return whether any are (collective).
+def relieve(bodies: Sequence[Particles], error: MPMError) -> Carried:
+    """Return the free nodes of domains that an error names, which are to be carried (collective).
 
     Args:
         bodies: All bodies, at their last converged step.
@@ -87,8 +87,7 @@ def relieve(bodies: Sequence[Particles], error: MPMError) -> bool:
             seeds[body.domain_nodes[named]] = True
             if (rest := _without(body, seeds & body.free, body.node_positions)) is not None:
                 found.append((body, rest))
-    Carried(found, False).apply()
-    return bool(found)
+    return Carried(found, False)
 
 
 def _any(body: Particles, mask: NDArray[np.bool_]) -> bool:

@@ -38,7 +38,7 @@ from .automatic import ErrorControl, error_of_step
 from .control import Control, Converged, Progress, Run, StepControl
 from .diagnosis import count_folded, placed
 from .displacement_control import ControlledSystem, DisplacementControl
-from .freeing import carried_after, relieve
+from .freeing import Carried, carried_after, relieve
 from .leaving import may_stop, move_bodies
 
 __all__ = ["Mender", "Owner", "Recorder", "Stepper"]
@@ -139,6 +139,8 @@ class Stepper:
         self._release = release
         self._mender = mender
         self.run: Run | None = None
+        #: Free nodes of the last converged step, where others are tried since.
+        self._free: list[tuple[Particles, NDArray[np.bool_]]] = []
         self._resumes = self._follows = self._begins = False
         self._moved: float | None = None
         self._recorders: list[weakref.ref[Recorder]] = []
@@ -162,7 +164,7 @@ class Stepper:
             clean_up: Frees what is out of use.
         """
         self._reduced, self.newton, self._clean_up = reduced, newton, clean_up
-        self._follows = True
+        self._follows, self._free = True, []
         first = self.owner.bodies[0]
         load = float(first.load.value)
         none = [np.zeros(len(field.bodies[0].increment.x.array)) for field in reduced.fields]
@@ -337,11 +339,11 @@ class Stepper:
             values = self.prescribed()
             step = self._advance(end, values, run, control)
         except Interrupted:
-            self.go_back()
+            self._give_up()
             self._leave(update)
         except TRIAL_ERRORS as error:
             self._take_back(run.size, end, str(error))
-            if relieve(owner.bodies, error):
+            if self._carry(relieve(owner.bodies, error)):
                 return None
             gave_up = self.newton.gave_up
             if run.control.cut_back(gave_up):
@@ -360,14 +362,14 @@ class Stepper:
             if owner.mend(told) or (self._mender is not None and self._mender.mend(told)):
                 run.control.begin_anew()
                 return None
-            self.go_back(update)
+            self._give_up(update)
             raise told from error.__cause__
         except MPMError as error:
-            self.go_back(update)
+            self._give_up(update)
             told = self._placed(error, self.converged.parameter)
             raise told from error.__cause__
         except BaseException:
-            self.go_back()
+            self._give_up()
             raise
         if step is not None:
             run.control.accept(step.iterations)
@@ -435,10 +437,10 @@ class Stepper:
                         step = self._advance(load, self.prescribed())
                     except TRIAL_ERRORS as error:
                         self.go_back()
-                        if not relieve(owner.bodies, error):
+                        if not self._carry(relieve(owner.bodies, error)):
                             raise
             except BaseException as error:
-                self.go_back()
+                self._give_up()
                 reached = self.converged.parameter
                 self.run, self.converged.parameter = before
                 if isinstance(error, Interrupted):
@@ -465,6 +467,21 @@ class Stepper:
         self._set_load(self.converged.load, self.converged.proportional)
         self._reduced.terms.roll_back()
         self._follow_back(update)
+
+    def _carry(self, carried: Carried) -> bool:
+        """Carry free nodes before a step is tried again; return whether any are (collective)."""
+        if carried.free and not self._free:
+            bodies = [body for body in self.owner.bodies if body.frees_by_itself]
+            self._free = [(body, body.free.copy()) for body in bodies]
+        carried.apply()
+        return bool(carried.free)
+
+    def _give_up(self, update: Path | None = None) -> None:
+        """Return to the last converged step, and to the free nodes that it had (collective)."""
+        for body, free in self._free:
+            body.choose_free(free)
+        self._free = []
+        self.go_back(update)
 
     def _follow_back(self, update: Path | None) -> None:
         """Let a path of the user's set what it does at the last converged step."""
@@ -543,7 +560,7 @@ class Stepper:
         carried = carried_after(owner.bodies)
         if carried.too_late:
             self._take_back(size, parameter, "free nodes left the background")
-            carried.apply()
+            self._carry(carried)
             return None
         if run is not None and self._reject(run, size, parameter):
             self.newton.experience = experience
@@ -575,6 +592,7 @@ class Stepper:
             reduced.end()
             for take in taken:
                 take()
+            self._free = []
             carried.apply()
             count_folded(owner.bodies, owner.history.statistics)
             self._clean_up()

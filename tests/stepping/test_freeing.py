@@ -160,6 +160,30 @@ def test_nodes_that_a_failed_step_left_may_be_freed():
     np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-8)
 
 
+@pytest.mark.parametrize("how", ["step", "run"])
+def test_a_step_that_fails_leaves_free_nodes_as_they_were(how):
+    ends = []
+    for fails in (False, True):
+        problem, own = column(weight=2e3)
+        problem.solve(2)
+        assert own.free.all()
+        if fails:
+
+            def far(t):
+                own.load.value = 1.0 + 1e6 * t
+
+            with pytest.raises(mpm.MPMError):
+                if how == "run":
+                    problem.solve(1, update=far)
+                far(1.0)
+                problem.step()
+            assert own.free.all()
+            own.load.value = 1.0
+        problem.step()
+        ends.append(scenes.in_order(own, own.centroid))
+    np.testing.assert_array_equal(*ends)
+
+
 def test_conditions_on_its_own_nodes_are_refused():
     _, own = column()
     body = mpm.Body(own, NeoHooke(1.0, 0.3))
