@@ -120,3 +120,14 @@ def test_it_falls_on_what_is_below(gap):
     plate.push((0.0, 1.0))
     raises(problem.step, mpm.ConvergenceError, "Nothing holds a RigidBody against 1.0e")
     assert not plate.offset.any()
+
+
+def test_it_falls_past_what_is_beside_its_way():
+    wall = contact.plane((0.0, 1.2), (0.0, -1.0))
+    problem, rigid = on_block(wall)
+    rigid.push((1.0, 0.0))  # along the block, as far above it as ever
+    raises(problem.step, mpm.ConvergenceError, "Nothing holds a RigidBody against 1.0e")
+    problem, rigid = on_block(contact.disc((-0.5, 2.0), 0.3))
+    rigid.push((-1.0, -0.1))  # away from it
+    raises(problem.step, mpm.ConvergenceError, "Nothing holds a RigidBody against 1.0e")
+    assert not rigid.offset.any()
