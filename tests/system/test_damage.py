@@ -188,40 +188,47 @@ def plate(tags=None, unit=1.0, **given):
     return mpm.QuasiStaticProblem(made, supports=[top, bottom]), top
 
 
-def test_a_plate_breaks_and_a_checkpoint_goes_on(tmp_path):
+@pytest.mark.skip_in_parallel  # hundreds of turns, in each of which ranks wait for each other
+def test_a_plate_breaks():
+    problem, top = plate()
+    before, forces = 0.0, []
+    with pytest.warns(UserWarning, match="smaller than half of it"):
+        for step in problem.steps(8):
+            damage = problem.damage[0].field.x.array
+            assert (damage - before).min() >= 0.0
+            before = damage.copy()
+            assert step.residuals[-1] <= 1e-6
+            forces.append(problem.reaction(top)[1])
+    assert before.max() == 1.0
+    assert forces[-1] < 0.1 * max(forces)
+    length = problem.damage[0].surface_energy() / 0.02
+    assert 0.5 < length < 0.5 * 1.5  # the ligament, and what the coarse mesh adds
+
+
+def test_a_checkpoint_goes_on_as_if_nothing_had_been(tmp_path):
     path = WORLD.bcast(tmp_path / "plate.mpm")
     problem, top = plate()
-    values = []
-    told = pytest.warns(UserWarning, match="smaller than half of it")
-    with told if WORLD.rank == 0 else nullcontext():
-        for number, step in enumerate(problem.steps(8)):
-            damage = problem.damage[0].field.x.array
-            if values:
-                assert (damage - values[-1]).min() >= 0.0
-            values.append(damage.copy())
-            assert step.residuals[-1] <= 1e-6
-            if number == 3:
-                problem.save(path)
-    force = problem.reaction(top)
-    assert WORLD.allreduce(float(values[-1].max()), MPI.MAX) == 1.0
-    peak = problem.damage[0].surface_energy() / 0.02
-    assert 0.5 < peak < 0.5 * 1.5  # the ligament, and what the coarse mesh adds
+    for number, _ in zip(range(3), problem.steps(8), strict=False):
+        if number == 1:
+            problem.save(path)
+    damage, force = problem.damage[0].field.x.array.copy(), problem.reaction(top)
+    assert 0.0 < WORLD.allreduce(float(damage.max()), MPI.MAX) < 1.0
     other, grip = plate()
     other.restore(path)
-    assert 0.0 < WORLD.allreduce(float(other.damage[0].field.x.array.max()), MPI.MAX) < 1.0
-    other.solve(8)
-    near = 0.0 if WORLD.size == 1 else 1e-6  # sums over ranks come in any order
-    np.testing.assert_allclose(other.damage[0].field.x.array, values[-1], rtol=0, atol=near)
+    next(other.steps(8))
+    near = 0.0 if WORLD.size == 1 else 1e-8  # sums over ranks come in any order
+    np.testing.assert_allclose(other.damage[0].field.x.array, damage, rtol=0, atol=near)
     np.testing.assert_allclose(other.reaction(grip), force, rtol=0, atol=near)
 
 
 def test_a_part_without_a_law_of_fracture_stays_whole():
     problem, _ = plate({1: mpm.region(x=(0.75, 1.0)), 0: mpm.region(x=(0.0, 0.75))})
-    problem.solve(5)
+    for _ in zip(range(3), problem.steps(8), strict=False):
+        pass
     field = problem.damage[0].field
     x = field.W.tabulate_dof_coordinates()[:, 0]
     assert (field.x.array[x >= 0.7499] == 0.0).all()
-    assert WORLD.allreduce(float(field.x.array.max()), MPI.MAX) > 0.2
+    assert WORLD.allreduce(float(field.x.array.max()), MPI.MAX) > 0.0
 
 
 def test_what_does_not_go_together_is_refused():
