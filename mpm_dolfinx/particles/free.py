@@ -17,6 +17,7 @@ from dolfinx import fem, la, mesh
 from .. import _compat
 from ..background.basis import PointBasis
 from ..errors import MPMError, agree, as_ours
+from ..parallel.given import require_same
 from ..reals import as_wholes
 from ..transfer.matrix import transfer_matrix
 
@@ -156,8 +157,9 @@ def chosen_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.bool_]:
             nodes of W, of which there may be none; or ``"auto"``: all nodes.
 
     Raises:
-        MPMError: Something else, or a place where no node is.
+        MPMError: Something else, a place where no node is, or ranks that choose by other means.
     """
+    require_same(W.mesh.comm, free="nodes" if _is_listed(where) else type(where).__name__)
     layout = W.dofmap.index_map
     marks = la.vector(layout, 1, dtype=np.float64)
     with agree(W.mesh.comm):

@@ -209,6 +209,12 @@ def test_a_condition_or_cells_that_differ_between_ranks_are_named():
     ):
         fails(lambda wrong=wrong: problem.reaction(differing(problem.bcs[0], wrong)), words)
     fails(lambda: problem.remove(differing([0], [99])), "no cells 99 to be removed")
+    V = problem.particles.V
+
+    def freed(free):
+        return mpm.Particles(scenes.unit(3, QUADRILATERAL), V, free=free, quadrature_degree=2)
+
+    fails(lambda: freed(differing("auto", [1])), "free differs between the ranks: 'str'")
 
 
 class Own(Kept):
