@@ -20,6 +20,7 @@ SHORT = ("compaction", "column_free", "snap_through")
 LONG = {
     *("sand-damped", "sand-dilates", "notch"),
     *("vortex", "disc", "discs", "discs-contact", "column"),
+    "indentation",
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
     *("slope", "vertical-cut", "footing-friction", "footing-weight-rough", "footing-edge"),
     *("finer-footing", "mixed-footing"),
@@ -309,6 +310,16 @@ RUNS = {
         "--body free --steps 20",
         {"energy": 1.05, "fallen": 1e-10, "iterations": 220, "cutbacks": 0},
     ),
+    "indentation": (
+        "indentation",
+        "--steps 1",
+        {"stiffness": 13567 * 1.05, "inverse_runs": 6, "inverse_error": 1e-8, "cutbacks": 0},
+    ),
+    "adjoint": (
+        "gradient",
+        "--mode adjoint --parameters 20 --steps 4",
+        {"difference": 1e-6, "trend": 0.02, "cutbacks": 0},
+    ),
     "column": ("column_dynamic", "--time 0.4", {"cutbacks": 0, "balance_error": 1e-12}),
 }
 #: Cases that go through time, whose load is that.
@@ -317,6 +328,7 @@ IN_TIME = {
     "flying_bar",
     "spinning_block",
     "consolidation",
+    "indentation",
     "colliding_discs",
     "column_dynamic",
 }
@@ -353,6 +365,7 @@ KEYS = {
     "lshape": {"error", "estimate", "unknowns", "error_all_free", "unknowns_carried"},
     "gradient": {"taylor", "difference", "trend", "seconds_ratio"},
     "notch": {"peak", "energy", "crack_length", "alternations", "fallen"},
+    "indentation": {"stiffness", "inverse_runs", "inverse_error"},
     "snap_through": {"limit", "valley", "crown", "error"},
     "wall": {"head", "reference", "error", "unknowns", "unknowns_carried"},
     "softening": {"peak", "energy", "width", "forces", "alternations"},
@@ -538,6 +551,8 @@ def test_case_is_a_program(name, tmp_path):
         "penetration": "--cell 0.25 --depth 0.05 --steps 4",
         "lshape": "--cells 2",
         "free_body": "--size 2 --steps 2",
+        "gradient": "--parameters 1 --steps 2",
+        "indentation": "--steps 1",
         "wall": "--cell 1",
         "softening": "--cells 6 --length 0.3 --steps 2",
     }.get(name, "--elements 4 --steps 4")

@@ -6,7 +6,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
-from gradients.runs import EXACT, TOLERANCE
+from gradients.runs import EXACT, TOLERANCE, Stacked
 from marks import all_but
 from scenes import QUADRILATERAL, TRIANGLE, WORLD, box, in_order, vectors
 
@@ -184,6 +184,27 @@ def test_functionals_at_several_steps_and_of_the_history():
     expected = p.mesh.comm.allreduce(float((weights * strains).sum()))
     size = p.mesh.comm.allreduce(float(np.abs(weights * strains).sum()))
     assert abs(along(scene, "young", slope, way) - expected) < 1e-8 * size
+
+
+def test_bodies_that_stick_by_their_joints():
+    names, ends = ("below", "above"), []
+    for follows in (mpm.Adjoint, mpm.Sensitivity):
+        scene = Stacked(below=2e4, above=1e4, weight=300.0)
+        d, comm = scene.problem.bodies[1].displacement, scene.problem.bodies[1].mesh.comm
+        form = 0.5 * ufl.inner(d, d) * ufl.dx
+        compiled = fem.form(form)
+        gradient = follows(scene.problem, [scene.named[name] for name in names])
+        counts = [scene.problem.history.statistics["joint_nodes"] for _ in scene.problem.steps(6)]
+        assert max(counts) > 0
+        if follows is mpm.Adjoint:
+            ends.append(np.array(gradient.of(form)))
+        else:
+
+            def value(compiled=compiled, comm=comm):
+                return comm.allreduce(fem.assemble_scalar(compiled))
+
+            ends.append(gradient.of(value))
+    assert np.abs(ends[0] / ends[1] - 1.0).max() < 1e-7, ends
 
 
 def test_it_goes_on_after_a_look_and_is_the_same_on_any_number_of_ranks():

@@ -96,7 +96,8 @@ KINDS = {
 @pytest.mark.parametrize("kind", all_but(["axisymmetric patch", "degree 2"], KINDS))
 def test_each_kind_of_body(kind):
     names = ["young", "strength"]
-    check(lambda **numbers: Slump(von_mises, numbers, **KINDS[kind]), VON_MISES, names)
+    # (at 1e-6 of the strength a point begins to yield in one of them)
+    check(lambda **numbers: Slump(von_mises, numbers, **KINDS[kind]), VON_MISES, names, change=5e-7)
 
 
 @pytest.mark.parametrize("support", all_but(["roller"], ["fixed", "roller"]))
