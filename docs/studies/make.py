@@ -42,6 +42,7 @@ import solver
 import splitting
 import step_size
 import supports
+import validation
 from case_runs import ROOT, Table, head, row
 
 DOCS = ROOT / "docs"
@@ -56,6 +57,7 @@ SCRIPTS = (
     high_order,
     solver,
     supports,
+    validation,
 )
 TABLES: dict[str, tuple[Table, Path]] = {
     name: (table, Path(str(script.__file__)))

@@ -53,6 +53,12 @@ RUNS = {
         "--settlement 0.3",
         {"error": 7.5e-3, "error_degree": 5e-3, "iterations": 16},
     ),
+    "mandel": (
+        "mandel_cryer",
+        "--case slab --cells 4",
+        {"error": 5e-3, "error_force": 4e-3, "iterations": 112, "cutbacks": 0},
+    ),
+    "cryer": ("mandel_cryer", "--cells 8", {"error": 0.025, "iterations": 112, "cutbacks": 0}),
     "cantilever-mixed": (
         "cantilever",
         "--degree 2 --mixed pressure --poisson 0.4999 --steps 10",
@@ -329,6 +335,7 @@ IN_TIME = {
     "spinning_block",
     "consolidation",
     "indentation",
+    "mandel_cryer",
     "colliding_discs",
     "column_dynamic",
 }
@@ -359,6 +366,7 @@ KEYS = {
     "sand_column": {"run_out", "experiment", "ratio", "deposit", "front", "height_at_wall"},
     "strength": {"factor", "exact", "ratio", "plateau", "particles"},
     "consolidation": {"error", "degree", "error_degree", "particles"},
+    "mandel_cryer": {"peak", "exact", "error", "error_force"},
     "penetration": {"force", "depth", "ratio", "iterations_per_step", "penetration"},
     "hertz": {"force", "error_force", "error_radius", "error_pressure", "error_most"},
     "free_body": {"difference", "seconds_ratio", "unknowns"},
@@ -536,6 +544,7 @@ def test_case_is_a_program(name, tmp_path):
         "collapse": "--cell 2 --particles-per-cell 1 --f-bar domain --steps 4",
         "footing": "--cell 0.5 --steps 4",
         "consolidation": "--cells 4 --steps 2",
+        "mandel_cryer": "--cells 2",
         "expansion": "--cells 2 --steps 4 --widest 2",
         "strength": "--cell 0.5",
         "embankment": "--lifts 1 --line 2 --tolerance 0.5",
