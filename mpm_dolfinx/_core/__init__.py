@@ -13,7 +13,7 @@ __all__ = ["is_as_inherited", "loops"]
 
 
 def _digest() -> str:
-    """Return what the sources beside this file are known by, as CMakeLists.txt does; or nothing."""
+    """Return the digest of the sources beside this file, as CMakeLists.txt does; or nothing."""
     here = Path(__file__).parent
     files = sorted([*here.glob("*.cpp"), *here.glob("*.h")])
     each = [sha256(file.read_bytes()).hexdigest() for file in files]

@@ -266,7 +266,7 @@ class Support:
         return []
 
     def at_end(self) -> list[NDArray[np.float64]]:
-        """Return what :meth:`settle` would make of them."""
+        """Return the forces as :meth:`settle` would leave them."""
         return []
 
     def step_work(self) -> tuple[float, float]:

@@ -264,7 +264,7 @@ class MaterialPoints:
     def answers(
         self, gradient: NDArray[np.float64], states: list[State]
     ) -> tuple[NDArray[np.float64], list[State]]:
-        """Return what the materials answer, and leave all as it is (not collective).
+        """Return the answers of the materials, and leave all as it is (not collective).
 
         Args:
             gradient: ``F - I`` that they see, shape ``(n nq, dim, dim)``.

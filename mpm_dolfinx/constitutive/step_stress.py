@@ -74,7 +74,7 @@ class _Beginning(NamedTuple):
     undeformed: Array | None
 
     def arrays(self, conserving: bool) -> list[Array]:
-        """Return what the stress of a step depends on, in which it is conserving or not."""
+        """Return the arrays that the stress of a step depends on, conserving or not."""
         whole = [self.stress, self.potential] if conserving else []
         if self.undeformed is not None:
             whole.append(self.undeformed)
@@ -325,7 +325,7 @@ class StepStress:
         return self._begin.arrays(self._conserving)
 
     def at_end(self) -> list[Array]:
-        """Return what :meth:`settle` would make of them after the last update (collective)."""
+        """Return them as :meth:`settle` would leave them after the last update (collective)."""
         return self._settled(self._found, trial=True)[0].arrays(self._conserving)
 
     def _settled(self, found: _Evaluation, trial: bool = False) -> tuple[_Beginning, _Evaluation]:

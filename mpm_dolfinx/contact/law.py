@@ -244,7 +244,7 @@ def as_friction(value: Any) -> Friction:
 
 
 def _told_by(law: Friction, name: str, at: Rubbing, shape: tuple[int, ...]) -> Array:
-    """Return what a method of a law tells of points, which it may not change.
+    """Return the answer of a law's method at points, which it may not change.
 
     Raises:
         MPMError: It fails, or does not tell as many finite numbers.

@@ -40,7 +40,7 @@ type Sides = tuple[Array, Array]
 
 @dataclass
 class _First:
-    """What a parameter does before the first step, at the points and cells of each body.
+    """Effects of a parameter before the first step, at the points and cells of each body.
 
     Attributes:
         states: Derivatives of what materials keep, by the amount.
@@ -101,7 +101,7 @@ class _Many:
             self.total[dofs] += values / self._sizes[dofs]
 
     def result(self) -> Array:
-        """Return what was added, with that of other ranks (collective)."""
+        """Return the sum, over all ranks (collective)."""
         if self.function is None:
             comm: MPI.Comm = self._problem.bodies[0].mesh.comm
             return np.asarray(comm.allreduce(float(self.total)))
@@ -187,7 +187,7 @@ class Adjoint:
         return take
 
     def _data(self) -> list[Array]:
-        """Return what forms hold besides displacements, to be set."""
+        """Return the data of forms besides displacements, to be set."""
         constants = [c for body in self.problem.bodies for c in (body.load, body.proportional)]
         found = [*constants, *self.problem.loads(), *self.problem.constants()]
         mine = [one.function for one in self._many]
@@ -218,7 +218,7 @@ class Adjoint:
     # -- Before the first step ------------------------------------------------------------------
 
     def _at_first(self, one: _Many) -> _First:
-        """Return what a parameter does before the first step (collective)."""
+        """Return the effects of a parameter before the first step (collective)."""
         problem, parameter = self.problem, one.parameter
         sides = []
         for sign in (1.0, -1.0, 0.0):

@@ -219,7 +219,7 @@ class Laws:
     # -- F-bar -----------------------------------------------------------------------------
 
     def seen(self, motion: fem.Function) -> tuple[Array, Array]:
-        """Return what laws see of a motion (collective).
+        """Return a motion as laws see it (collective).
 
         Args:
             motion: On W.
@@ -428,7 +428,7 @@ def slope_of(at: Callable[[float], Array], amount: float) -> Array:
 
 
 def _gradients(body: Particles) -> list[PETSc.Mat]:
-    """Return what gives derivatives in each direction at a body's nodes of functions on V."""
+    """Return matrices of derivatives of functions on V, in each direction, at a body's nodes."""
     basis = body.node_gradients()
     assert basis.gradients is not None
     return [

@@ -343,7 +343,7 @@ class StepDerivative:
         return _Side(forces, states, seen, kept)
 
     def _kept(self, amount: float, change: _Change) -> list[Array]:
-        """Return what the next step begins with besides, beside the state."""
+        """Return the other arrays that the next step begins with, beside the state."""
         if self._moving is None:
             return self._problem.at_end()
         pairs = zip(self._fields, change.changes, strict=True)

@@ -53,7 +53,7 @@ class Rates:
 
 
 def followed(problem: ParticleProblem) -> list[Particles | CarriedField]:
-    """Return what a problem moves: its bodies, then their other fields."""
+    """Return the motions of a problem: of its bodies, then of their other fields."""
     return [*problem.bodies, *problem.carried]
 
 

@@ -268,7 +268,7 @@ class Sensitivity:
 
 
 def _numbers(value: Any) -> Array:
-    """Return what a user's function found, as numbers.
+    """Return the result of a user's function, as numbers.
 
     Raises:
         MPMError: It is something else.

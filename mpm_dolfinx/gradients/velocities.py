@@ -34,7 +34,7 @@ APART = 1e-6
 
 
 class TakenVelocities:
-    """What a step takes over of the velocities before, to be differentiated (collective).
+    """The velocities that a step takes over, to be differentiated (collective).
 
     Args:
         problem: The motion.

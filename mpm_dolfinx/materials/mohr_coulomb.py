@@ -178,7 +178,7 @@ class FrictionalMaterial(SofteningMaterial):
         return np.sin(phi), np.sin(psi), np.cos(phi)
 
     def _averaged_constants(self, match: int = 0) -> tuple[Parameter, ...]:
-        """Return what a law that softens by an average is compiled with, angles in radians.
+        """Return the constants of a compiled law that softens by an average, angles in radians.
 
         Args:
             match: Number of the cone.

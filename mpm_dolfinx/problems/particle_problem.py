@@ -791,7 +791,7 @@ class ParticleProblem(Hooked):
         return [np.asarray(field.previous.x.array) for field in self.fields]
 
     def at_end(self) -> list[NDArray[np.float64]]:
-        """Return what :meth:`beginning` will be after the last evaluation (collective)."""
+        """Return :meth:`beginning` as it will be after the last evaluation (collective)."""
         return [np.asarray(field.x.array) for field in self.fields]
 
     def renew_external(self) -> None:

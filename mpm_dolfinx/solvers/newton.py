@@ -491,7 +491,7 @@ class NewtonSolver:
         return None
 
     def _judged_by(self, scale: float) -> float:
-        """Return what a residual is compared with: internal forces, where there are no others.
+        """Return the size that a residual is compared with; of internal forces without others.
 
         Args:
             scale: Size of those from outside.

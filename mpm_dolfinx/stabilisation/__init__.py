@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What holds badly supported dofs.
+"""Stabilisation of badly supported dofs.
 
 Background dofs that hardly anything of a body supports make a tangent singular or nearly so. They
 are held by a penalty on facets (:mod:`~mpm_dolfinx.stabilisation.ghost_penalty`);

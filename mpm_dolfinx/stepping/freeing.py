@@ -98,7 +98,7 @@ def _any(body: Particles, mask: NDArray[np.bool_]) -> bool:
 def _without(
     body: Particles, seeds: NDArray[np.bool_], positions: NDArray[np.float64]
 ) -> NDArray[np.bool_] | None:
-    """Return what stays free as nodes and what moves with them are carried (collective).
+    """Return the nodes that stay free as some and all that follow are carried (collective).
 
     Args:
         body: The body.

@@ -67,7 +67,7 @@ class StepForce(Protocol):
         """Return the arrays of :meth:`settle` that forces depend on, to be set."""
 
     def at_end(self) -> list[NDArray[np.float64]]:
-        """Return what :meth:`settle` would make of them after the last update (collective)."""
+        """Return them as :meth:`settle` would leave them after the last update (collective)."""
 
     def step_work(self) -> tuple[float, float]:
         """Return this rank's work in the last step, internal and damping."""

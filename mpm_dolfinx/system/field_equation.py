@@ -241,7 +241,7 @@ class FieldEquation(Term):
         return [_Values(self, self.name or f"equation{self._number}")]
 
     def columns(self, body: int | None) -> dict[str, Column]:
-        """Return what is kept on a body, by its number in the problem."""
+        """Return the arrays that are kept on a body, by its number in the problem."""
         if body != self._body_number:
             return {}
         return {self.field.name: Column(of_cells(self.field.previous), "nodes")}

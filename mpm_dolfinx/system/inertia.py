@@ -320,7 +320,7 @@ class Inertia(Term):
 
     @property
     def projected(self) -> Projected | None:
-        """What the step's background can follow of the velocities; ``None``: not asked for."""
+        """Velocities that the step's background can follow; ``None``: not asked for."""
         return self._projected
 
     def driven(self, changes: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
