@@ -26,6 +26,8 @@ FLOAT = np.dtype(np.float64)
 NO_TANGENT = np.zeros((0, 3, 3, 3, 3))
 #: What a law answers first of all.
 STRESS = "stress P"
+#: Parts of a state that updates of this package do not read, or that displacements tell.
+TOLD = ("stress", "displacement_gradient")
 
 
 class Answer(NamedTuple):
@@ -76,8 +78,26 @@ class Governed:
     @cached_property
     def is_own(self) -> bool:
         """Whether the law is one of this package, which gives its answers away for good."""
-        own = Material.__module__.rpartition(".")[0] + "."
-        return type(self.material).__module__.startswith(own)
+        return _of_package(type(self.material))
+
+    def memory(self, state: State) -> State:
+        """Return the part of a converged state that updates read and displacements do not tell.
+
+        A law with an update of its own may read all of it.
+        """
+        told = TOLD if _of_package(type(self.material).update) else ()
+        return {name: values for name, values in state.items() if name not in told}
+
+    def recalled(self, memory: State, gradient: NDArray[np.float64], state: State) -> State:
+        """Return a state that updates go on from as they would from that of a :meth:`memory`.
+
+        Args:
+            memory: The memory.
+            gradient: ``F - I`` that the law saw then, shape ``(n, dim, dim)``.
+            state: Any of this law.
+        """
+        seen = {"displacement_gradient": gradient} if "displacement_gradient" in state else {}
+        return state | seen | memory
 
     def initial_state(self) -> State:
         """Return the state of the points where nothing is strained yet.
@@ -300,6 +320,12 @@ class Governed:
         particles = np.unique(self.particles.global_index[domains])
         where = " (at {particles})" if len(particles) else ""
         return type(error)(error.message.rstrip(".") + where, particles)
+
+
+def _of_package(thing: Any) -> bool:
+    """Return whether a class or function is of this package."""
+    package = Material.__module__.rpartition(".")[0] + "."
+    return str(thing.__module__).startswith(package)
 
 
 def _read_only(values: NDArray[Any]) -> NDArray[Any]:

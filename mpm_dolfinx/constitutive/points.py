@@ -339,6 +339,20 @@ class MaterialPoints:
         self._last = self._last._replace(states=states, average=average)
         self._forget_trial()
 
+    def memories(self) -> list[State]:
+        """Return what a converged step must keep of each material for :meth:`recall`."""
+        pairs = zip(self._governed, self._last.states, strict=True)
+        return [part.memory(state) for part, state in pairs]
+
+    def recall(self, memories: list[State]) -> None:
+        """Go on from memories of a converged step at the present displacement (collective)."""
+        gradient = self.strain.gradient()
+        if self.averaging is not None:
+            gradient = self.averaging.average(gradient)
+        gradient = gradient.reshape(-1, self.dim, self.dim)
+        known = zip(self._governed, memories, self._last.states, strict=True)
+        self.go_from([part.recalled(own, gradient[part.points], s) for part, own, s in known])
+
     def states(self, trial: bool = False) -> list[State]:
         """Return the state of each material, converged or of the last update."""
         return self._trial if trial else self._last.states

@@ -171,10 +171,7 @@ class Adjoint:
             [np.array(body.displacement.x.array) for body in problem.bodies],
             [field.u.array_r.copy() for field in stepper.reduced.fields],
             [
-                [
-                    _kept(law, state)
-                    for law, state in zip(points.given, points.states(), strict=True)
-                ]
+                [{name: v.copy() for name, v in own.items()} for own in points.memories()]
                 for points in problem.material_points()
             ],
             [array.copy() for array in self._data()],
@@ -510,13 +507,6 @@ def _assembled(form: ufl.Form) -> Array:
     vector.scatter_reverse(la.InsertMode.add)
     vector.scatter_forward()
     return np.asarray(vector.array)
-
-
-def _kept(law: Any, state: State) -> State:
-    """Return a copy of what a law needs of its state."""
-    if not getattr(law, "inelastic", True):
-        return {}
-    return {name: values.copy() for name, values in state.items()}
 
 
 def _require_plain(problem: Any) -> None:

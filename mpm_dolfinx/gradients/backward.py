@@ -59,14 +59,15 @@ class Record(NamedTuple):
         before: Displacement at its beginning, of each body.
         after: That at its end.
         increments: Of the background, on own dofs of V of each field.
-        states: What materials kept at its beginning, for each body; as far as it is needed.
+        memories: What materials kept at its beginning, for each body, where displacements do not
+            tell it.
         data: What the forms hold besides.
     """
 
     before: list[Array]
     after: list[Array]
     increments: list[Array]
-    states: list[list[State]]
+    memories: list[list[State]]
     data: list[Array]
 
 
@@ -141,7 +142,7 @@ class Laws:
 
     def have_history(self) -> list[bool]:
         """Return whether the answer of each material depends on what it keeps."""
-        return [bool(getattr(law, "inelastic", True)) for law in self._points.given]
+        return [bool(memory) for memory in self._points.memories()]
 
     def by_states(self, weights: list[State], work: Array) -> list[State]:
         """Return ``H_h^T m - P_h^T W g q``, as states are.
@@ -285,12 +286,12 @@ class Backward:
         problem, reduced = self._problem, self._reduced
         for array, values in zip(data, record.data, strict=True):
             array[...] = values
-        for body, points, before, states in zip(
-            problem.bodies, problem.material_points(), record.before, record.states, strict=True
+        for body, points, before, memories in zip(
+            problem.bodies, problem.material_points(), record.before, record.memories, strict=True
         ):
             body.restore(before.copy().reshape(-1, body.mesh.geometry.dim))
             body.roll_back()
-            points.go_from([own | new for own, new in zip(points.states(), states, strict=True)])
+            points.recall(memories)
         reduced.unknowns.forget()
         none = [np.zeros(len(field.bodies[0].increment.x.array)) for field in reduced.fields]
         reduced.begin(none, 0.0)

@@ -49,3 +49,21 @@ def test_an_update_that_fails_leaves_the_last_converged_step():
     body.displacement.x.array[:] = good
     stress.roll_back()
     np.testing.assert_array_equal(stress.strain_energy(), at_rest)
+
+
+@pytest.mark.parametrize("f_bar", ["none", "patch"])
+def test_memories_and_displacements_bring_a_converged_step_back(f_bar):
+    law = VonMises(1e3, 0.3, yield_stress=20.0, hardening=300.0)
+    problem = scenes.block(law, f_bar=f_bar)
+    problem.solve(steps=2)
+    (points,) = problem.points
+    (kept,) = points.states()
+    assert problem.particles.mesh.comm.allreduce(kept["plastic_strain"].sum()) > 0.0
+    memories = [{name: v.copy() for name, v in own.items()} for own in points.memories()]
+    count = len(kept["stress"])
+    assert sum(values.nbytes for values in memories[0].values()) == 40 * count
+    points.begin_anew()
+    assert not points.states()[0]["displacement_gradient"].any()
+    points.recall(memories)
+    for name in kept.keys() - {"stress"}:
+        np.testing.assert_array_equal(points.states()[0][name], kept[name])

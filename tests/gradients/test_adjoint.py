@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Derivatives found by going backward, against those carried forward and differences of runs."""
 
+from types import MappingProxyType
+
 from mpi4py import MPI
 
 import numpy as np
 import pytest
-from gradients.runs import EXACT, TOLERANCE, Stacked
+from gradients.runs import EXACT, TOLERANCE, Slump, Stacked
 from marks import all_but
 from scenes import QUADRILATERAL, TRIANGLE, WORLD, box, in_order, vectors
 
@@ -184,6 +186,36 @@ def test_functionals_at_several_steps_and_of_the_history():
     expected = p.mesh.comm.allreduce(float((weights * strains).sum()))
     size = p.mesh.comm.allreduce(float(np.abs(weights * strains).sum()))
     assert abs(along(scene, "young", slope, way) - expected) < 1e-8 * size
+
+
+class Wearing(materials.Hencky):
+    """An elastic law that remembers: its stress falls with all strains that it has had."""
+
+    internal_variables = MappingProxyType({"wear": ()})
+
+    def integrate(self, trial_strain, variables, tangent):
+        stress, D, strain, _ = super().integrate(trial_strain, {}, tangent)
+        left = 1.0 / (1.0 + variables["wear"])
+        worn = variables["wear"] + 20.0 * np.sqrt((trial_strain**2).sum(axis=1))
+        D = None if D is None else D * left[:, None, None]
+        return materials.Integration(stress * left[:, None], D, strain, {"wear": worn})
+
+
+def test_a_law_that_remembers_without_being_inelastic():
+    names, ends = ("young", "weight"), []
+    for follows in (mpm.Adjoint, mpm.Sensitivity):
+        scene = Slump(lambda young: Wearing(young, 0.3), {"young": 5e4, "weight": 1e3})
+        d, comm = scene.particles.displacement, scene.particles.mesh.comm
+        form = 0.5 * ufl.inner(d, d) * ufl.dx
+        compiled = fem.form(form)
+        gradient = follows(scene.problem, [scene.named[name] for name in names])
+        scene.problem.solve(3)
+
+        def value(compiled=compiled, comm=comm):
+            return comm.allreduce(fem.assemble_scalar(compiled))
+
+        ends.append(np.array(gradient.of(form if follows is mpm.Adjoint else value)))
+    assert np.abs(ends[0] / ends[1] - 1.0).max() < 1e-8, ends
 
 
 def test_bodies_that_stick_by_their_joints():

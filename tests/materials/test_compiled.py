@@ -92,6 +92,23 @@ def test_compiled_update_is_that_of_numpy(law, dim, size):
         state = theirs.state
 
 
+@pytest.mark.parametrize("law", [*LAWS, "fracture"])
+def test_updates_do_not_read_the_stress_of_the_step_before(law):
+    """What goes back through a run keeps no stress, see ``Governed.memory``."""
+    fracture = mpm_dolfinx.materials.Fracture(Hencky(1e3, 0.3), 1.0, 0.1)
+    compiled = LAWS.get(law, fracture)
+    for one in (compiled, in_python(compiled)) if law in LAWS else (fracture,):
+        state = one.initial_state(COUNT, 2)
+        for H in random_path(COUNT, 2, 2, size=0.05):
+            unknown = state | {"stress": np.full_like(state["stress"], np.nan)}
+            mine, theirs = one.update(H, unknown), one.update(H, state)
+            np.testing.assert_array_equal(mine.first_piola, theirs.first_piola)
+            np.testing.assert_array_equal(mine.tangent, theirs.tangent)
+            for name, values in theirs.state.items():
+                np.testing.assert_array_equal(mine.state[name], values)
+            state = theirs.state
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_derived_laws_keep_their_own_integration(dim):
     class Doubled(Hencky):
