@@ -24,7 +24,7 @@ from .governed import Governed
 from .pressure import MeanStress, is_split, without_bulk
 from .succession import equals
 
-__all__ = ["Assignment", "Materials"]
+__all__ = ["Assignment", "Materials", "per_cell"]
 
 type Materials = Material | Mapping[int, Material]
 
@@ -239,7 +239,7 @@ class Assignment:
                 replaced[name] = float(value.value)
             if not isinstance(value, fem.Function | np.ndarray):
                 continue
-            values = np.repeat(self._per_cell(name, value), self._particles.num_points)
+            values = np.repeat(per_cell(self._particles, name, value), self._particles.num_points)
             values.flags.writeable = False
             replaced[name] = values
         if replaced:
@@ -248,20 +248,30 @@ class Assignment:
             material = material.weakened(self.weakening)
         return material
 
-    def _per_cell(self, name: str, value: Any) -> NDArray[np.float64]:
-        """Return a parameter's values in the owned cells."""
-        n = self._particles.num_local
-        if isinstance(value, Refused):
-            raise MPMError(value.message)
-        if isinstance(value, np.ndarray):
-            if value.shape != (n,):
-                raise MPMError(
-                    f"The parameter {name} has {len(value)} values for {n} particles; give a "
-                    "number, a DG0 Function on the body, or one value for each owned particle."
-                )
-            return value
-        space = value.function_space
-        element = space.ufl_element()
-        if space.mesh is not self._particles.mesh or element.degree != 0 or space.value_size != 1:
-            raise MPMError(f"The parameter {name} must be a scalar DG0 Function on the body mesh.")
-        return np.asarray(value.x.array[space.dofmap.list[:n, 0]])
+
+def per_cell(particles: Particles, name: str, value: Any) -> NDArray[np.float64]:
+    """Return a parameter's values in the owned cells of a body, shape ``(n,)``.
+
+    Args:
+        particles: The body.
+        name: Name of the parameter.
+        value: A number for each owned cell, or a DG0 Function on the body's mesh.
+
+    Raises:
+        MPMError: Something else.
+    """
+    n = particles.num_local
+    if isinstance(value, Refused):
+        raise MPMError(value.message)
+    if isinstance(value, np.ndarray):
+        if value.shape != (n,):
+            raise MPMError(
+                f"The parameter {name} has {len(value)} values for {n} particles; give a "
+                "number, a DG0 Function on the body, or one value for each owned particle."
+            )
+        return value
+    space = value.function_space
+    element = space.ufl_element()
+    if space.mesh is not particles.mesh or element.degree != 0 or space.value_size != 1:
+        raise MPMError(f"The parameter {name} must be a scalar DG0 Function on the body mesh.")
+    return np.asarray(value.x.array[space.dofmap.list[:n, 0]])

@@ -51,7 +51,7 @@ class Fracture(StrainMaterial):
 
     Args:
         law: An elastic law: :class:`LinearElastic`, :class:`Hencky` or :class:`NeoHooke`.
-        toughness: Energy G_c to make a crack, per area; a number or a DG0 Function.
+        toughness: Energy G_c to make a crack, per area; as any parameter.
         length: Length l over which a crack is smeared, likewise. The cells where it cracks must be
             smaller than half of it, better a quarter.
         model: ``"AT1"``: w = d, c_w = 8/3: elastic up to a stress ``sqrt(3 G_c E / (8 l))`` and

@@ -100,7 +100,7 @@ class Body:
             domains of about one background cell).
         length: What plastic strain is averaged over where it softens the law (``decay``), so that
             a band of it is as wide on any mesh: about five lengths, for which the domains must be
-            smaller than the length. ``None``: each point softens by its own.
+            smaller than half of it. ``None``: each point softens by its own.
         initial_stress: Cauchy stress that the body carries before it has moved, which its material
             must be able to bear: ``(3, 3)`` with the direction out of the plane (or around the
             axis) at last, one for each owned particle or point ``(n, 3, 3)`` or

@@ -8,17 +8,18 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, override
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import numpy as np
 from numpy.typing import NDArray
 
 import ufl
-from dolfinx import fem, mesh
+from dolfinx import fem, la, mesh
 
+from ..constitutive.assignment import per_cell
 from ..constitutive.groups import background_cells
 from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree, warn
-from ..materials.base import Material
 from ..materials.fracture import Fracture
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
@@ -60,10 +61,11 @@ class Damage(FieldEquation):
         Q = fem.functionspace(body, ("Lagrange", 1))
         d = particles.field(Q, at="nodes", kind="body", name="damage")
         cells = fem.functionspace(body, ("Discontinuous Lagrange", 0))
-        self._toughness, self._length, self._cracks = (fem.Function(cells) for _ in range(3))
-        self._length.x.array[:] = 1.0
+        self._toughness, self._length = (fem.Function(cells) for _ in range(2))
         with agree(comm):
-            model = self._take(materials, cell_tags, cells)
+            self._laws = _in_cells(particles, materials, cell_tags)
+        model = self._model()
+        self._follow(particles)
         self._drive = particles.quadrature_function("driving_energy")
         shape = d if model == "AT1" else d**2
         slope = ufl.dot(ufl.grad(d), ufl.grad(d))
@@ -79,49 +81,40 @@ class Damage(FieldEquation):
             d,
             ufl.derivative(energy, d, ufl.TestFunction(d.W)),
             lower="previous",
-            upper=self._uppermost(d.W, cells),
+            upper=self._uppermost(particles, d.W),
         )
 
-    def _take(
-        self, materials: Any, cell_tags: mesh.MeshTags | None, cells: fem.FunctionSpace
-    ) -> str:
-        """Take toughness and length of each cell; return the model of all."""
-        laws: list[tuple[Material, Any]]
-        if isinstance(materials, Mapping):
-            assert cell_tags is not None
-            laws = [(law, cell_tags.find(tag)) for tag, law in materials.items()]
-        else:
-            laws = [(materials, slice(None))]
-        models = set()
-        for law, where in laws:
-            if not isinstance(law, Fracture):
-                continue
-            models.add(law.model)
-            dofs = cells.dofmap.list[:, 0][where]
-            self._cracks.x.array[dofs] = 1.0
-            for function, name in ((self._toughness, "toughness"), (self._length, "length")):
-                value: Any = law.parameters[name]
-                if isinstance(value, np.ndarray):
-                    raise MPMError(f"The {name} of Fracture must be a number or a DG0 Function.")
-                if isinstance(value, fem.Function):
-                    value = value.x.array[dofs]
-                function.x.array[dofs] = getattr(value, "value", value)
+    def _model(self) -> str:
+        """Return the model of fracture of all laws."""
+        models = {law.model for law, _ in self._laws}
         if len(models) > 1:
             raise MPMError("The laws of one body have different models of fracture; give one.")
         return models.pop()
 
-    def _uppermost(self, W: fem.FunctionSpace, cells: fem.FunctionSpace) -> fem.Function:
-        """Return the largest damage: none at the nodes of cells that do not crack (collective)."""
-        upper = fem.Function(W)
-        upper.x.array[:] = 1.0
-        for function in (self._toughness, self._length, self._cracks):
+    def _follow(self, body: Particles) -> None:
+        """Take toughness and length of each cell as they are now (collective)."""
+        dofs = self._toughness.function_space.dofmap.list[: body.num_local, 0]
+        with agree(body.mesh.comm):
+            for function, name in ((self._toughness, "toughness"), (self._length, "length")):
+                function.x.array[:] = 1.0  # which means nothing where there is no damage
+                for law, where in self._laws:
+                    value: Any = law.parameters[name]
+                    if isinstance(value, fem.Function | np.ndarray):
+                        value = per_cell(body, name, value)[where]
+                    function.x.array[dofs[where]] = getattr(value, "value", value)
+        for function in (self._toughness, self._length):
             function.x.scatter_forward()
-        whole = self._cracks.x.array[cells.dofmap.list[:, 0]] == 0.0
-        upper.x.array[W.dofmap.list[whole].ravel()] = 0.0
-        upper.x.scatter_forward()
-        # Elsewhere the equation is to have a solution, which its bound makes zero.
-        hollow = self._toughness.x.array == 0.0
-        self._toughness.x.array[hollow] = 1.0
+
+    def _uppermost(self, body: Particles, W: fem.FunctionSpace) -> fem.Function:
+        """Return the largest damage: none at the nodes of cells that do not crack (collective)."""
+        whole = np.ones(body.num_local, dtype=bool)
+        for _, where in self._laws:
+            whole[where] = False
+        upper, touched = fem.Function(W), fem.Function(W)
+        touched.x.array[W.dofmap.list[: body.num_local][whole].ravel()] = 1.0
+        touched.x.scatter_reverse(la.InsertMode.add)  # by cells of any rank
+        touched.x.scatter_forward()
+        upper.x.array[:] = touched.x.array == 0.0
         return upper
 
     # -- What it does in a step ------------------------------------------------------------------
@@ -143,6 +136,11 @@ class Damage(FieldEquation):
     def _known(self) -> MaterialPoints:
         assert self._points is not None
         return self._points
+
+    @override
+    def begin(self) -> Sequence[PETSc.Vec]:
+        self._follow(self.bodies[0])
+        return super().begin()
 
     @override
     def alternate(self) -> int:
@@ -224,3 +222,18 @@ class Damage(FieldEquation):
             f"{1.0 + self._share * ratio:.2f} times the toughness there, and follows the mesh.",
             stacklevel=4,
         )
+
+
+def _in_cells(
+    particles: Particles, materials: Any, cell_tags: mesh.MeshTags | None
+) -> list[tuple[Fracture, Any]]:
+    """Return the laws of fracture of a body, each with the cells of it that this rank owns."""
+    if not isinstance(materials, Mapping):
+        return [(materials, slice(None))]
+    assert cell_tags is not None
+    cells = {tag: cell_tags.find(tag) for tag in materials}
+    return [
+        (law, cells[tag][cells[tag] < particles.num_local])
+        for tag, law in materials.items()
+        if isinstance(law, Fracture)
+    ]

@@ -261,6 +261,12 @@ def test_what_does_not_go_together_is_refused():
         mpm.MPMError,
         "different models",
     )
+    elsewhere = mesh.create_rectangle(WORLD, [[0, 0], [1, 1]], [1, 1], QUADRILATERAL)
+    far = fem.Function(fem.functionspace(elsewhere, ("Discontinuous Lagrange", 0)))
+    far.x.array[:] = 1.0
+    for numbers in ((far, 1.0), (1.0, far)):
+        wrong = mpm.Body(particles, Fracture(Hencky(YOUNG, 0.3), *numbers))
+        raises(lambda made=wrong: mpm.QuasiStaticProblem(made), mpm.MPMError, "on the body mesh")
 
 
 def test_units_do_not_matter():
@@ -295,3 +301,53 @@ def test_a_controlled_displacement_that_jumps_says_so():
     strength = np.sqrt(3 * 0.9 * YOUNG / (8 * LENGTH)) / 10.0  # where it is weak
     assert 0.95 * strength < max(loads) <= 1.01 * strength * np.sqrt(1 / 0.9)
     assert loads[-1] < 0.05 * max(loads)
+
+
+@pytest.mark.parametrize("ghosts", [mesh.GhostMode.none, mesh.GhostMode.shared_facet])
+def test_nodes_of_whole_cells_stay_whole_on_any_partition(ghosts):
+    """Also where the rank that owns a node has none of the cells that hold it."""
+    body = mesh.create_rectangle(
+        WORLD, [[0, 0], [1, 1]], [12, 12], QUADRILATERAL, ghost_mode=ghosts
+    )
+    particles = mpm.Particles(body, quadrature_degree=2)
+    elastic = Hencky(YOUNG, 0.3)
+
+    def apart(x):
+        return (np.floor(12 * x[0]) % 3 == 0) & (np.floor(12 * x[1]) % 3 == 0)
+
+    tags = mpm.cell_tags(body, {0: mpm.region(x=(0.0, 1.0)), 1: apart})
+    made = mpm.Body(particles, {0: Fracture(elastic, 1.0, 1.0), 1: elastic}, cell_tags=tags)
+    problem = mpm.QuasiStaticProblem(made, bcs=[mpm.held(particles.W, y=0.0)])
+    upper = problem.damage[0].upper
+    own = upper.x.array[: upper.function_space.dofmap.index_map.size_local]
+    assert WORLD.allreduce(int((own == 0.0).sum())) == 16 * 4
+
+
+@pytest.mark.parametrize("kind", ["constant", "function", "array"])
+def test_toughness_is_followed_from_step_to_step(kind):
+    """A bar that is held gets brittle: its damage is that of the new toughness."""
+    body = mesh.create_rectangle(WORLD, [[0, 0], [1, 1]], [4, 4], QUADRILATERAL)
+    particles = mpm.Particles(body, quadrature_degree=2)
+    toughness = fem.Constant(body, 2.0 * TOUGHNESS)
+    if kind != "constant":
+        toughness = fem.Function(fem.functionspace(body, ("Discontinuous Lagrange", 0)))
+        toughness.x.array[:] = 2.0 * TOUGHNESS
+    given = np.full(particles.num_local, TOUGHNESS) if kind == "array" else toughness
+    law = Fracture(LinearElastic(YOUNG, 0.0), given, LENGTH)
+    end = mpm.held(particles.W, 0, value=0.18, x=1.0)
+    rest = [mpm.held(particles.W, i, **{"xy"[i]: 0.0}) for i in range(2)]
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, law), bcs=[end, *rest])
+    energy = 0.5 * YOUNG * 0.18**2
+    if kind != "array":
+        problem.step()
+        np.testing.assert_allclose(
+            problem.damage[0].field.x.array, uniform("AT1", energy / 2.0), atol=1e-5
+        )
+        if kind == "function":
+            toughness.x.array[:] = TOUGHNESS
+        else:
+            toughness.value = TOUGHNESS
+    problem.step()
+    expected = uniform("AT1", energy)
+    assert expected > 0.5
+    np.testing.assert_allclose(problem.damage[0].field.x.array, expected, atol=1e-5)
