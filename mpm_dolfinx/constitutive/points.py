@@ -217,6 +217,11 @@ class MaterialPoints:
             self.averaging.modulus = self._resistance()
 
     @property
+    def are_own(self) -> bool:
+        """Whether all materials are of this package, which have no numbers but parameters."""
+        return all(part.is_own for part in self._governed)
+
+    @property
     def given(self) -> list[Material]:
         """The materials as they were given."""
         return self._assignment.given

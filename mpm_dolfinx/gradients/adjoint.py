@@ -18,18 +18,19 @@ from dolfinx import fem, la
 from ufl.algorithms.analysis import extract_coefficients
 
 from .. import _compat
-from ..errors import MPMError
-from ..materials.base import State
+from ..errors import MPMError, agree
+from ..materials.base import Material, State
 from ..parallel.boundary import collective, of_user
 from ..parallel.compilation import compiled_form
 from ..particles.particles import Particles
 from ..problems.quasistatic import QuasiStaticProblem
 from ..problems.through_time import TimeProblem
+from ..reals import as_reals
 from ..stepping.loading import Stepper
 from ..system.field import Field
 from .backward import Backward, Laws, Record, Weights, no_weights, slope_of
 from .nearby import varying
-from .parameters import CHANGE, Parameter, as_parameter
+from .parameters import CHANGE, Parameter, as_parameter, largest
 from .sensitivity import require_followed
 
 __all__ = ["Adjoint"]
@@ -64,23 +65,27 @@ class _Many:
     """
 
     def __init__(self, given: Any, problem: QuasiStaticProblem) -> None:
-        self.function = given if isinstance(given, fem.Function) else None
+        self._thing, whole = given, True
         if isinstance(given, tuple) and len(given) == 2:
-            value = getattr(given[0], "parameters", {}).get(str(given[1]))
-            self.function = value if isinstance(value, fem.Function) else None
+            whole = isinstance(given[0], Material)
+            self._thing = given[0].parameters.get(str(given[1])) if whole else given[0]
+        function = whole and isinstance(self._thing, fem.Function)
+        self.function: fem.Function | None = self._thing if function else None
         self._sizes: Array = np.ones(1)
         if self.function is not None:
             values = np.abs(self.function.x.array)
-            comm: MPI.Comm = self.function.function_space.mesh.comm
-            largest = float(comm.allreduce(float(values.max(initial=0.0)), MPI.MAX))
-            if largest == 0.0:
+            size = largest(values, problem)
+            if size == 0.0:
                 raise MPMError(f"'{self.function.name}' is zero, which says nothing of its size.")
-            self._sizes = np.where(values > 1e-3 * largest, values, largest)
+            if not np.isfinite(size):
+                raise MPMError(f"'{self.function.name}' must be finite to differentiate by it.")
+            self._sizes = np.where(values > 1e-3 * size, values, size)
             given = (self.function, self._sizes)
         self.parameter: Parameter = as_parameter(given, problem, None)
-        if self.function is None and isinstance(given, fem.Constant):
-            if any(_compat.holds(bc, given) for bc in problem.bcs):
-                raise MPMError("An Adjoint does not differentiate by Dirichlet values yet.")
+        if isinstance(self._thing, fem.Constant | fem.Function) and any(
+            _compat.holds(bc, self._thing) for bc in problem.bcs
+        ):
+            raise MPMError("An Adjoint does not differentiate by Dirichlet values yet.")
         self.total: Array = np.zeros(self._sizes.shape if self.function is not None else ())
         self._problem = problem
 
@@ -99,6 +104,22 @@ class _Many:
         elif self.function.function_space.mesh is body.mesh:
             dofs = self.function.function_space.dofmap.list[: body.num_local, 0]
             self.total[dofs] += values / self._sizes[dofs]
+
+    def is_in(self, form: ufl.Form) -> bool:
+        """Return whether a form has it in itself."""
+        return any(one is self._thing for one in (*form.coefficients(), *form.constants()))
+
+    def add_of_form(self, form: ufl.Form) -> None:
+        """Add derivatives of a form by what it has of this in itself (collective)."""
+        if self.function is not None:
+            self.total += _assembled(ufl.derivative(form, self.function))
+            return
+        compiled, sides = compiled_form(form), []
+        for sign in (1.0, -1.0):
+            self.parameter.shift(sign * self.parameter.change)
+            sides.append(np.asarray(fem.assemble_scalar(compiled)))
+        self.parameter.shift(0.0)
+        self.total = self.total + self.parameter.slope(*sides)
 
     def result(self) -> Array:
         """Return the sum, over all ranks (collective)."""
@@ -304,7 +325,11 @@ class Adjoint:
                 points.go_from(its)
             self._reduced.unknowns.forget()
             self._stepper.go_back()
-        return [one.result() for one in self._many]
+        found = [one.result() for one in self._many]
+        with agree(problem.bodies[0].mesh.comm):
+            if not all(np.isfinite(slope).all() for slope in found):
+                raise MPMError("A derivative is not finite, as that of the functional is not.")
+        return found
 
     def _go_back(self, back: Backward, look: Callable[[int], Any], data: Sequence[Array]) -> None:
         """Go through all steps backward, and add up derivatives."""
@@ -440,8 +465,14 @@ class Adjoint:
         if isinstance(functional, ufl.Form):
             return lambda number: functional if number == last else None
         if isinstance(functional, Mapping):
+            steps = range(-last - 1, last + 1)
+            if not functional or any(number not in steps for number in functional):
+                raise MPMError(
+                    f"A functional is a dictionary of forms by steps from 0 to {last} (or back "
+                    f"from -1), not by {list(functional)}."
+                )
             return lambda number: functional.get(number, functional.get(number - last - 1))
-        if not callable(functional):
+        if not callable(functional) or isinstance(functional, ufl.core.expr.Expr):
             raise MPMError(
                 "A functional is a UFL form, a dictionary of forms by steps, or a function of the "
                 f"number of a step, not {functional!r}."
@@ -462,39 +493,58 @@ class Adjoint:
                 "Derivatives of a functional are a dictionary of arrays (a list of them where "
                 "there is a list of bodies) by 'displacement' and names of variables."
             )
-        for place, own in enumerate(listed):
-            for name, values in own.items():
-                self._add_array(place, name, np.asarray(values, dtype=np.float64), weights)
+        with agree(bodies[0].mesh.comm):
+            for place, own in enumerate(listed):
+                for name, values in own.items():
+                    self._add_array(place, name, values, weights)
+        for motion in weights.motion:
+            motion.x.scatter_forward()
 
-    def _add_array(self, place: int, name: str, values: Array, weights: Weights) -> None:
-        """Add derivatives by displacements or a variable of a body."""
-        if name == "displacement":
-            target = weights.motion[place].x.array
-            if values.shape != target.shape:
-                raise MPMError(f"Derivatives by the displacement have {target.shape} numbers.")
-            target += values
-            weights.motion[place].x.scatter_forward()
-            return
-        points, known = self.problem.material_points()[place], False
-        for own, where in zip(weights.states[place], points.points_of_laws(), strict=True):
-            if name in own:
-                known = True
-                flat = values.reshape(-1, *own[name].shape[1:])
-                own[name] += flat[where]
-        if not known:
-            raise MPMError(f"No material of these particles has a variable {name!r} that varies.")
+    def _add_array(self, place: int, name: str, given: Any, weights: Weights) -> None:
+        """Add derivatives by displacements or a variable of a body (not collective)."""
+        points, body = self.problem.material_points()[place], self.problem.bodies[place]
+        targets, shape = [weights.motion[place].x.array], weights.motion[place].x.array.shape
+        places: Sequence[Any] = [slice(None)]
+        if name != "displacement":
+            pairs = zip(weights.states[place], points.points_of_laws(), strict=True)
+            found = [(own[name], where) for own, where in pairs if name in own]
+            if not found:
+                raise MPMError(
+                    f"No material of these particles has a variable {name!r} that varies."
+                )
+            targets, places = [own for own, _ in found], [where for _, where in found]
+            shape = (body.num_local, body.num_points, *targets[0].shape[1:])
+        try:
+            values = as_reals(given)
+        except (TypeError, ValueError):
+            values = np.empty(0)
+        if values.shape != shape:
+            raise MPMError(f"Derivatives by {name!r} are an array of the shape {shape}.")
+        values = values.reshape(-1, *targets[0].shape[1:])
+        for target, where in zip(targets, places, strict=True):
+            target += values[where]
 
     def _add_form(self, form: ufl.Form, weights: Weights) -> None:
         """Add derivatives of a form by displacements and by parameters in it (collective)."""
         held = form.coefficients()
+        if form.arguments():
+            raise MPMError(
+                "A functional is a form without test functions, whose value is a number."
+            )
+        if not any(one.is_in(form) for one in self._many) and not any(
+            one is body.displacement for body in self.problem.bodies for one in held
+        ):
+            raise MPMError(
+                "A functional has particles.displacement of this problem in it, or a parameter; "
+                f"this form has neither: {form}."
+            )
         for body, motion in zip(self.problem.bodies, weights.motion, strict=True):
             if any(one is body.displacement for one in held):
                 motion.x.array[:] += _assembled(ufl.derivative(form, body.displacement))
                 motion.x.scatter_forward()
         for one in self._many:
-            if one.function is not None and any(own is one.function for own in held):
-                own = _assembled(ufl.derivative(form, one.function))
-                one.total += own
+            if one.is_in(form):
+                one.add_of_form(form)
 
 
 def _has(field: Field, body: Particles) -> bool:

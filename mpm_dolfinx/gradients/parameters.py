@@ -19,9 +19,10 @@ from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree
 from ..materials.base import Material, State
 from ..problems.particle_problem import ParticleProblem
+from ..problems.quasistatic import QuasiStaticProblem
 from ..reals import as_reals
 
-__all__ = ["Parameter", "as_parameter"]
+__all__ = ["Parameter", "as_parameter", "largest"]
 
 type Array = NDArray[np.float64]
 
@@ -47,10 +48,12 @@ class Parameter(ABC):
     """
 
     def __init__(self, name: str, scale: float, of_law: bool, outside: bool) -> None:
-        if not (np.isfinite(scale) and scale > 0.0):
+        if not np.isfinite(scale):
+            raise MPMError(f"{name} must be finite to differentiate by it.")
+        if scale <= 0.0:
             raise MPMError(
-                f"{name} is zero, which says nothing of its size; give scales=, for each parameter "
-                "an amount by which it matters."
+                f"{name} is zero, which says nothing of its size; give a Sensitivity scales=, for "
+                "each parameter an amount by which it matters."
             )
         self.name, self.of_law, self.outside = name, of_law, outside
         self.change = CHANGE * scale
@@ -110,7 +113,7 @@ class _Values(Parameter):
     def require_unchanged(self) -> None:
         if not np.array_equal(self._values, self._first):
             raise MPMError(
-                f"{self.name} has changed since the Sensitivity was made, so that its derivative "
+                f"{self.name} has changed since its derivative was asked for, so that this "
                 "means nothing; let a path change something else, such as a factor of it."
             )
 
@@ -157,7 +160,7 @@ def as_parameter(given: Any, problem: ParticleProblem, scale: float | None) -> P
         if isinstance(value, fem.Constant | fem.Function):
             thing, direction = value, np.ones(1)
         else:
-            size = _largest(np.abs(value), problem) if scale is None else scale
+            size = largest(np.abs(value), problem) if scale is None else scale
             known = [law for points in problem.material_points() for law in points.given]
             if all(law is not thing for law in known):
                 raise MPMError(f"{thing!r} is no material of this problem; name one as given.")
@@ -192,19 +195,46 @@ def _along(
             ) from None
         if not np.isfinite(along).all():
             raise MPMError(f"The direction of {name} must be finite.")
-    size = _largest(np.abs(along), problem)
+    size = largest(np.abs(along), problem)
     if size == 0.0:
         raise MPMError(f"The direction of {name} must not be zero.")
     if scale is None:
-        scale = _largest(np.abs(values), problem) / size
+        scale = largest(np.abs(values), problem) / size
     laws = [law for points in problem.material_points() for law in points.given]
     numbers: list[Any] = [value for law in laws for value in law.parameters.values()]
     of_law = any(value is thing for value in numbers)
     elsewhere = any(load is thing for load in problem.loads())
-    outside = not of_law or elsewhere or any(_compat.holds(bc, thing) for bc in problem.bcs)
+    elsewhere = elsewhere or any(_compat.holds(bc, thing) for bc in problem.bcs)
+    with agree(problem.bodies[0].mesh.comm):
+        if not of_law and not elsewhere and _is_in_none(thing, problem):
+            raise MPMError(
+                f"{name} is in no material, load, support or Dirichlet value of this problem, "
+                "which does not depend on it; name one that is, as given."
+            )
+    outside = not of_law or elsewhere
     return _Values(values, along, name, scale, of_law, outside)
 
 
-def _largest(sizes: Any, problem: ParticleProblem) -> float:
+def _is_in_none(thing: fem.Constant | fem.Function, problem: ParticleProblem) -> bool:
+    """Return whether no form has what is in no material, load or condition, where that is known.
+
+    Laws of the user's own may hold whatever they like, and initial stresses are of no form.
+    """
+    if type(problem) is not QuasiStaticProblem:
+        return False
+    if any(
+        b.initial_stress is not None or b.pore_pressure is not None for b in problem.setup.given
+    ):
+        return False
+    if not all(points.are_own for points in problem.material_points()):
+        return False
+    if isinstance(thing, fem.Function):
+        return not any(problem.setup.supports_of(body) for body in problem.bodies)
+    return all(constant is not thing for constant in problem.constants())
+
+
+def largest(sizes: Any, problem: ParticleProblem) -> float:
+    """Return the largest of sizes on all ranks, infinite where one is no number (collective)."""
     comm: MPI.Comm = problem.bodies[0].mesh.comm
-    return float(comm.allreduce(float(np.max(sizes, initial=0.0)), MPI.MAX))
+    known = np.where(np.isfinite(sizes), sizes, np.inf)
+    return float(comm.allreduce(float(np.max(known, initial=0.0)), MPI.MAX))

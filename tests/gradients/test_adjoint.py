@@ -256,6 +256,67 @@ def test_it_goes_on_after_a_look_and_is_the_same_on_any_number_of_ranks():
         assert np.abs(one - other).max() < 1e-8 * np.abs(other).max()
 
 
+def test_a_functional_with_parameters_in_itself():
+    """Terms of a cost that have a Constant, or a Function along a direction, besides motion."""
+    ends = []
+    for follows in (mpm.Adjoint, mpm.Sensitivity):
+        scene = Layered(law="Hencky")
+        weight, young = scene.named["weight"], scene.named["young"]
+        d, comm = scene.particles.displacement, scene.particles.mesh.comm
+        form = weight**2 * young * ufl.inner(d, d) * ufl.dx
+        compiled = fem.form(form)
+        gradient = follows(scene.problem, [weight, (young, ways(scene)["young"])])
+        scene.problem.solve(2)
+
+        def value(compiled=compiled, comm=comm):
+            return comm.allreduce(fem.assemble_scalar(compiled))
+
+        ends.append(np.array(gradient.of(form if follows is mpm.Adjoint else value)))
+    assert np.abs(ends[0] / ends[1] - 1.0).max() < 1e-7, ends
+
+
+def test_wrong_functionals_and_parameters_are_told():
+    scene = Layered()
+    p, weight = scene.particles, scene.named["weight"]
+    foreign = fem.Constant(p.mesh, 3.0)
+    unused = fem.Function(fem.functionspace(p.mesh, ("DG", 1)))
+    unused.x.array[:] = 1.0
+    for follows, given in (
+        (mpm.Adjoint, foreign),
+        (mpm.Adjoint, unused),
+        (mpm.Sensitivity, foreign),
+        (mpm.Sensitivity, (unused, 1.0)),
+    ):
+        with pytest.raises(mpm.MPMError, match="does not depend on it"):
+            follows(scene.problem, [given])
+    prescribed = fem.Function(p.V)
+    prescribed.x.array[:] = 1e-3
+    dofs = fem.locate_dofs_geometrical(p.V, lambda x: np.isclose(x[1], -0.5))
+    moved = mpm.QuasiStaticProblem(
+        mpm.Body(p, materials.Hencky(1e3, 0.3)), [fem.dirichletbc(prescribed, dofs)]
+    )
+    with pytest.raises(mpm.MPMError, match="Dirichlet values"):
+        mpm.Adjoint(moved, [prescribed])
+    scene = Layered()
+    p, weight = scene.particles, scene.named["weight"]
+    adjoint = mpm.Adjoint(scene.problem, [weight])
+    scene.problem.solve(2)
+    d, slope = p.displacement, adjoint.of(scene.form)[0]
+    wrong = {
+        "without test functions": ufl.inner(d, ufl.TestFunction(p.W)) * ufl.dx,
+        "has neither": fem.Constant(p.mesh, 1.0) * ufl.dx(domain=p.mesh),
+        "A functional is": d[0],
+        "from 0 to 1": {2: scene.form},
+        "not finite": fem.Constant(p.mesh, np.nan) * d[0] * ufl.dx,
+        "of the shape": lambda number: {"displacement": np.zeros(3)},
+        "'plastic_strain' are": lambda number: {"plastic_strain": "three"},
+    }
+    for words, functional in wrong.items():
+        with pytest.raises(mpm.MPMError, match=words):
+            adjoint.of(functional)
+    assert adjoint.of(scene.form)[0] == slope  # (all is as it was)
+
+
 def test_what_is_not_gone_through_is_refused():
     scene = Layered()
     with pytest.raises(mpm.MPMError, match="Name a parameter"):
