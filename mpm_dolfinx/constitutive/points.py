@@ -771,8 +771,10 @@ class MaterialPoints:
 
     def roll_back(self) -> None:
         """Forget the last update."""
-        if self._trial is not self._last.states:
-            self._average = self._last.average  # what was expected is not what failed
+        if self._spread is not None and self._trial is not self._last.states:
+            # What was expected is not what failed.
+            self._last = self._last._replace(growth=np.zeros(self._points))
+            self._average = self._last.average
         self._turns = 0
         self._forget_trial()
         self.first_piola = self._last.stress.copy()

@@ -163,6 +163,32 @@ def test_bar_after_a_step_that_failed_is_as_if_it_had_not():
     assert abs(shear(troubled) - shear(plain)) < 1e-4
 
 
+def test_checkpoint_after_a_step_that_failed_goes_on_as_the_run(tmp_path_factory):
+    """Growth that was expected in the step that failed is expected in neither."""
+    path = comm.bcast(str(tmp_path_factory.mktemp("bar")) if comm.rank == 0 else None) + "/bar.ckpt"
+    run_on, resumed = bar(24), bar(24)
+    for _ in zip(range(3), run_on.steps(6), strict=False):
+        pass
+    (points,) = run_on.points
+    update = points.update
+
+    def failing():
+        update()
+        raise mpm.ConvergenceError("Not now")
+
+    points.update = failing
+    with pytest.raises(mpm.ConvergenceError, match="Not now"):
+        run_on.step()
+    points.update = update
+    run_on.save(path)
+    resumed.restore(path)
+    for problem in (run_on, resumed):
+        problem.particles.load.value = 4.0 / 6.0
+        problem.step()
+    assert run_on.history.steps[-1].alternations == resumed.history.steps[-1].alternations
+    assert abs(shear(run_on) - shear(resumed)) < 1e-13
+
+
 def test_a_stage_with_an_equal_law_goes_on():
     plain, staged = bar(48), bar(48)
     plain.solve(steps=6)
