@@ -24,7 +24,7 @@ from .governed import Governed
 from .pressure import MeanStress, is_split, without_bulk
 from .succession import equals
 
-__all__ = ["Assignment", "Materials", "per_cell"]
+__all__ = ["Assignment", "Materials", "in_cells", "per_cell"]
 
 type Materials = Material | Mapping[int, Material]
 
@@ -175,35 +175,11 @@ class Assignment:
         self, materials: Materials, cell_tags: mesh.MeshTags | None
     ) -> list[tuple[Material, NDArray[np.int64]]]:
         """Return each material with the points it is for."""
-        nq, count = self._particles.num_points, self._particles.num_local
-        if isinstance(materials, Material):
-            return [(materials, np.arange(count * nq))]
-        if not isinstance(materials, Mapping) or not all(
-            isinstance(m, Material) for m in materials.values()
-        ):
-            raise MPMError(
-                "material must be a material of mpm.materials or a dictionary "
-                f"{{cell tag: material}}, not {type(materials).__name__}."
-            )
-        body = self._particles.mesh
-        if cell_tags is None or cell_tags.dim != body.topology.dim:
-            raise MPMError("A dictionary of materials needs cell_tags=, tags of the body's cells.")
-        if not _compat.are_tags_of(cell_tags, body):
-            raise MPMError("cell_tags are those of another mesh than the body's.")
-        tags = np.full(count, -1, dtype=np.int64)
-        own = cell_tags.indices < count
-        tags[cell_tags.indices[own]] = cell_tags.values[own]
-        known = np.isin(tags, list(materials))
-        without = self._particles.global_index[~known]
-        if len(without):
-            missing = ", ".join(str(tag) if tag >= 0 else "none" for tag in np.unique(tags[~known]))
-            raise MPMError(
-                f"The cell tags of {{particles}} ({missing}) have no material, as there are "
-                f"materials for {', '.join(map(str, materials))} alone; give one for each tag.",
-                without,
-            )
-        tags = np.repeat(tags, nq)
-        return [(material, np.flatnonzero(tags == tag)) for tag, material in materials.items()]
+        each = np.arange(self._particles.num_points)
+        return [
+            (material, (cells[:, None] * len(each) + each).ravel())
+            for material, cells in in_cells(self._particles, materials, cell_tags)
+        ]
 
     def _governing(self, material: Material, points: NDArray[np.int64]) -> Governed:
         """Return a material as it was given at points."""
@@ -247,6 +223,49 @@ class Assignment:
         if weakened and self.weakening != 1.0:
             material = material.weakened(self.weakening)
         return material
+
+
+def in_cells(
+    particles: Particles, materials: Materials, cell_tags: mesh.MeshTags | None
+) -> list[tuple[Material, NDArray[np.int64]]]:
+    """Return the materials of a body, each with the owned cells that it is for.
+
+    Args:
+        particles: The body.
+        materials: A material, or one for each tag.
+        cell_tags: Tags of the body's cells.
+
+    Raises:
+        MPMError: Something else, or cells without a material.
+    """
+    count = particles.num_local
+    if isinstance(materials, Material):
+        return [(materials, np.arange(count))]
+    if not isinstance(materials, Mapping) or not all(
+        isinstance(m, Material) for m in materials.values()
+    ):
+        raise MPMError(
+            "material must be a material of mpm.materials or a dictionary "
+            f"{{cell tag: material}}, not {type(materials).__name__}."
+        )
+    body = particles.mesh
+    if cell_tags is None or cell_tags.dim != body.topology.dim:
+        raise MPMError("A dictionary of materials needs cell_tags=, tags of the body's cells.")
+    if not _compat.are_tags_of(cell_tags, body):
+        raise MPMError("cell_tags are those of another mesh than the body's.")
+    tags = np.full(count, -1, dtype=np.int64)
+    own = cell_tags.indices < count
+    tags[cell_tags.indices[own]] = cell_tags.values[own]
+    known = np.isin(tags, list(materials))
+    without = particles.global_index[~known]
+    if len(without):
+        missing = ", ".join(str(tag) if tag >= 0 else "none" for tag in np.unique(tags[~known]))
+        raise MPMError(
+            f"The cell tags of {{particles}} ({missing}) have no material, as there are "
+            f"materials for {', '.join(map(str, materials))} alone; give one for each tag.",
+            without,
+        )
+    return [(material, np.flatnonzero(tags == tag)) for tag, material in materials.items()]
 
 
 def per_cell(particles: Particles, name: str, value: Any) -> NDArray[np.float64]:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, override
 
 from mpi4py import MPI
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem, la, mesh
 
-from ..constitutive.assignment import per_cell
+from ..constitutive.assignment import in_cells, per_cell
 from ..constitutive.groups import background_cells
 from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree, warn
@@ -63,7 +63,8 @@ class Damage(FieldEquation):
         cells = fem.functionspace(body, ("Discontinuous Lagrange", 0))
         self._toughness, self._length = (fem.Function(cells) for _ in range(2))
         with agree(comm):
-            self._laws = _in_cells(particles, materials, cell_tags)
+            laws = in_cells(particles, materials, cell_tags)
+        self._laws = [(law, where) for law, where in laws if isinstance(law, Fracture)]
         model = self._model()
         self._follow(particles)
         self._drive = particles.quadrature_function("driving_energy")
@@ -222,18 +223,3 @@ class Damage(FieldEquation):
             f"{1.0 + self._share * ratio:.2f} times the toughness there, and follows the mesh.",
             stacklevel=4,
         )
-
-
-def _in_cells(
-    particles: Particles, materials: Any, cell_tags: mesh.MeshTags | None
-) -> list[tuple[Fracture, Any]]:
-    """Return the laws of fracture of a body, each with the cells of it that this rank owns."""
-    if not isinstance(materials, Mapping):
-        return [(materials, slice(None))]
-    assert cell_tags is not None
-    cells = {tag: cell_tags.find(tag) for tag in materials}
-    return [
-        (law, cells[tag][cells[tag] < particles.num_local])
-        for tag, law in materials.items()
-        if isinstance(law, Fracture)
-    ]

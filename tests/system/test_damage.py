@@ -261,6 +261,7 @@ def test_what_does_not_go_together_is_refused():
         mpm.MPMError,
         "different models",
     )
+    raises(lambda: mpm.QuasiStaticProblem(mpm.Body(particles, {0: law})), mpm.MPMError, "cell_tags")
     elsewhere = mesh.create_rectangle(WORLD, [[0, 0], [1, 1]], [1, 1], QUADRILATERAL)
     far = fem.Function(fem.functionspace(elsewhere, ("Discontinuous Lagrange", 0)))
     far.x.array[:] = 1.0
