@@ -43,7 +43,8 @@ def unit_sized(v: PETSc.Vec) -> tuple[PETSc.Vec, int]:
         The vector, of size about one where it is not v itself, and the exponent of what it was
         divided by.
     """
-    if _is_safe(v.norm()):
+    size = v.norm()
+    if _is_safe(size) or np.isnan(size):  # (what the largest is of NaN, ranks do not agree on)
         return v, 0
     largest = v.norm(PETSc.NormType.NORM_INFINITY)
     if largest == 0.0 or not np.isfinite(largest):
@@ -57,7 +58,7 @@ def unit_sized(v: PETSc.Vec) -> tuple[PETSc.Vec, int]:
 def norm(v: PETSc.Vec) -> float:
     """Return the Euclidean norm of a vector, whatever its size (collective)."""
     size = float(v.norm())
-    if _is_safe(size):
+    if _is_safe(size) or np.isnan(size):
         return size
     scaled, exponent = unit_sized(v)
     return float(np.ldexp(scaled.norm(), exponent))

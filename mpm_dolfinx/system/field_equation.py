@@ -163,12 +163,11 @@ class FieldEquation(Term):
             change = np.where(low, lower - values, np.where(high, upper - values, 0.0))
             missed = np.where(low | high, np.abs(change), np.abs(step))
             size = float(np.abs(values + change).max(initial=0.0))
-            missing, size = (
-                over_ranks(self._comm, number, MPI.MAX)
-                for number in (float(missed.max(initial=0.0)), size)
-            )
-            if not np.isfinite(missing):
+            missing = float(missed.max(initial=0.0))
+            # (what MPI makes of the larger one of a number and NaN depends on their order)
+            if over_ranks(self._comm, not np.isfinite(missing), MPI.LOR):
                 break
+            missing, size = (over_ranks(self._comm, one, MPI.MAX) for one in (missing, size))
             if missing <= SOLVED * size:
                 p.array[:own] = np.clip(values, lower, upper)
                 p.scatter_forward()

@@ -133,3 +133,14 @@ def test_norms_of_vectors_whose_squares_are_no_numbers():
         assert sign_of_product(v, v) > 0.0 > sign_of_product(v, w)
     v.set(0.0)
     assert norm(v) == 0.0 == sign_of_product(v, v)
+
+
+def test_norms_of_what_is_not_a_number_on_one_rank():
+    v = PETSc.Vec().createMPI((3, None), comm=WORLD)
+    v.set(2.0)
+    if WORLD.rank == WORLD.size - 1:
+        v.setValue(v.getOwnershipRange()[0], np.nan)
+    v.assemble()
+    assert np.isnan(norm(v))
+    assert np.isnan(sign_of_product(v, v))
+    assert np.isnan(joint_norm(v.array_r, WORLD))
