@@ -33,8 +33,7 @@ class CellPairs:
         pairs: Two cells of each pair with an own cell, which is the first, shape ``(n, 2)``.
         mine: Whether a pair belongs to this rank, that of the lower one of its cells' owners.
         num_own: Number of cells that this rank owns.
-        index: Input index of each cell, those of other ranks last, shape ``(c,)``.
-        nodes: Global nodes of V of each cell, shape ``(c, k)``.
+        nodes: Global nodes of V of each cell, those of other ranks last, shape ``(c, k)``.
         vertices: Geometry nodes of each cell, shape ``(c, m, gdim)``.
         volumes: Volumes of the cells that this rank owns, areas in the plane.
     """
@@ -66,7 +65,6 @@ class CellPairs:
         dofs = V.dofmap.list[: self.num_own]
         nodes = V.dofmap.index_map.local_to_global(dofs.ravel()).reshape(dofs.shape)
         geometry = _compat.geometry_dofmap(background)[: self.num_own]
-        self.index = self.with_others(_compat.input_cell_index(background))
         self.nodes = self.with_others(nodes)
         self.vertices = self.with_others(background.geometry.x[geometry, : background.geometry.dim])
         self.volumes = cell_volumes(background)

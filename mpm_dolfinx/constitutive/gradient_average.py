@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import ConvergenceError, MPMError
 from ..meshes.quadrature import DomainQuadrature, exact_degree
+from ..parallel.conjugate_gradients import conjugate_gradients
 from ..parallel.totals import over_ranks
 from .strain import Strain
 
@@ -24,8 +25,8 @@ __all__ = ["GradientAverage"]
 
 type Array = NDArray[np.float64]
 
-#: Residual that the method of conjugate gradients leaves, relative to that before.
-LINEAR = 1e-13
+#: Most iterations of the method of conjugate gradients.
+MOST_ITERATIONS = 10000
 
 
 class GradientAverage:
@@ -58,10 +59,7 @@ class GradientAverage:
         numbers = index_map.local_to_global(body.domain_nodes.ravel())
         self._numbers = numbers.reshape(body.domain_nodes.shape).astype(PETSc.IntType)
         self._present: NDArray[np.bool_] | None = None
-        self._ksp = PETSc.KSP().create(self._comm)
-        self._ksp.setType("cg")
-        self._ksp.getPC().setType("jacobi")
-        self._ksp.setTolerances(rtol=LINEAR, max_it=10000)
+        self._ksp = conjugate_gradients(self._comm, MOST_ITERATIONS)
 
     def _vector(self) -> PETSc.Vec:
         vector = PETSc.Vec().createGhost(self._ghosts, self._sizes, comm=self._comm)

@@ -345,7 +345,7 @@ class MaterialPoints:
         self._forget_trial()
 
     def memories(self) -> list[State]:
-        """Return what a converged step must keep of each material for :meth:`recall`."""
+        """Return the part of each material's converged state that :meth:`recall` needs."""
         pairs = zip(self._governed, self._last.states, strict=True)
         return [part.memory(state) for part, state in pairs]
 

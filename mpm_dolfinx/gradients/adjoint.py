@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,6 @@ from ..problems.quasistatic import QuasiStaticProblem
 from ..problems.through_time import TimeProblem
 from ..reals import as_reals
 from ..stepping.loading import Stepper
-from ..system.field import Field
 from .backward import Backward, Laws, Record, Weights, no_weights, slope_of
 from .nearby import varying
 from .parameters import CHANGE, Parameter, as_parameter, largest
@@ -169,6 +169,7 @@ class Adjoint:
         if not self._many:
             raise MPMError("Name a parameter to differentiate by.")
         self._first = [self._at_first(one) for one in self._many]
+        self._shear = self._shear_modes()
         self._records: list[Record] = []
         self._stepper: Stepper | None = None
         self._reduced = problem.reduced
@@ -244,8 +245,9 @@ class Adjoint:
             for points in problem.material_points():
                 parameter.govern(points, sign * parameter.change)
             problem.begin_anew()
-            sides.append(self._look())
-        after, before = sides[:2]
+            if sign != 0.0:
+                sides.append(self._look())
+        after, before = sides
         return _First(
             [
                 [parameter.rate(*pair) for pair in zip(*own, strict=True)]
@@ -261,6 +263,17 @@ class Adjoint:
                 for a, b in zip(after.modulus, before.modulus, strict=True)
             ],
         )
+
+    def _shear_modes(self) -> list[tuple[tuple[int, int], float]]:
+        """Return the simple shear that tells each body's modulus, and its volume (collective)."""
+        found = []
+        for body, tangent in zip(self.problem.bodies, self._look().tangent, strict=True):
+            comm: MPI.Comm = body.mesh.comm
+            energies = comm.allreduce(tangent.sum(axis=0))
+            positive = np.where(energies > 0.0, energies, np.inf)
+            i, J = divmod(int(positive.argmin()), positive.shape[1])
+            found.append(((i, J), comm.allreduce(float(body.initial_volume.sum()))))
+        return found
 
     def _look(self) -> _First:
         """Return the values of what :class:`_First` has derivatives of (collective)."""
@@ -335,13 +348,16 @@ class Adjoint:
         """Go through all steps backward, and add up derivatives."""
         problem, weights = self.problem, no_weights(self.problem)
         penalised: dict[int, Array] = {}
-        stiffened = [[np.zeros_like(a) for a in own] for own in self._look().stiffness]
+        stiffened = [
+            [np.zeros_like(one.stiffness) for one in problem.setup.supports_of(body)]
+            for body in problem.bodies
+        ]
         for number in range(len(self._records) - 1, -1, -1):
             record = self._records[number]
             back.go_to(record, data)
             self._add_functional(look(number), weights)
-            moved, laws = back.step(record, weights)
-            self._add_penalties(back, penalised)
+            moved, backgrounds, laws = back.step(record, weights)
+            self._add_penalties(backgrounds, penalised)
             for own, body, motion in zip(stiffened, problem.bodies, moved, strict=True):
                 for total, support in zip(own, problem.setup.supports_of(body), strict=True):
                     total -= support.work_by_stiffness(motion)
@@ -399,11 +415,9 @@ class Adjoint:
             work = motion.x.array[: len(after)] @ (after - before)
             one.total = one.total - work / (2.0 * parameter.change)
 
-    def _add_penalties(self, back: Backward, totals: dict[int, Array]) -> None:
+    def _add_penalties(self, backgrounds: Sequence[PETSc.Vec], totals: dict[int, Array]) -> None:
         """Add derivatives by the moduli of penalties."""
-        for number, (field, z) in enumerate(
-            zip(self._reduced.fields, back.background, strict=True)
-        ):
+        for number, (field, z) in enumerate(zip(self._reduced.fields, backgrounds, strict=True)):
             if field.moduli is None:
                 continue
             own, slopes = np.array(field.moduli), []
@@ -438,24 +452,13 @@ class Adjoint:
             for total, slope in zip(stiffened[place], first.stiffness[place], strict=True):
                 dofs = slice(0, body.num_local)
                 one.add_of_cells(body, (total * slope)[dofs])
-            number, field = next(
-                (n, f) for n, f in enumerate(self._reduced.fields) if _has(f, body)
-            )
+            field = self._reduced.unknowns.place(body)[0]
+            number = self._reduced.fields.index(field)
             if number in penalised:
-                share = penalised[number][
-                    next(n for n, its in enumerate(field.bodies) if its is body)
-                ]
-                one.add_of_points(body, share * self._modulus_slope(body, points, first, place))
-
-    def _modulus_slope(self, body: Particles, points: Any, first: _First, place: int) -> Array:
-        """Return the derivative of a body's mean shear modulus at its points (collective)."""
-        (tangent,) = (self._look().tangent[place],)
-        comm: MPI.Comm = body.mesh.comm
-        energies = comm.allreduce(tangent.sum(axis=0))
-        volume = comm.allreduce(float(body.initial_volume.sum()))
-        positive = np.where(energies > 0.0, energies, np.inf)
-        i, J = np.unravel_index(int(positive.argmin()), positive.shape)
-        return np.asarray(first.tangent[place][:, i, J] / volume)
+                its = next(n for n, own in enumerate(field.bodies) if own is body)
+                mode, volume = self._shear[place]
+                slope = first.tangent[place][:, *mode] / volume
+                one.add_of_points(body, penalised[number][its] * slope)
 
     # -- The functional ---------------------------------------------------------------------------
 
@@ -545,10 +548,6 @@ class Adjoint:
         for one in self._many:
             if one.is_in(form):
                 one.add_of_form(form)
-
-
-def _has(field: Field, body: Particles) -> bool:
-    return any(one is body for one in field.bodies)
 
 
 def _assembled(form: ufl.Form) -> Array:

@@ -37,7 +37,7 @@ from ..particles.particles import Particles
 from ..problems.quasistatic import QuasiStaticProblem
 from ..solvers.newton import NewtonSolver
 from ..transfer.matrix import transfer_matrix
-from .nearby import varying
+from .nearby import add_product, varying
 from .parameters import CHANGE
 
 __all__ = ["Backward", "Laws", "Record", "Weights", "no_weights", "slope_of"]
@@ -261,6 +261,20 @@ class Laws:
         return (whole - own).reshape(stress.shape)
 
 
+class Gone(NamedTuple):
+    """A step that was gone through.
+
+    Attributes:
+        moved: q on W of each body.
+        backgrounds: z on own dofs of V of each field.
+        laws: Derivatives of the materials of each body.
+    """
+
+    moved: list[fem.Function]
+    backgrounds: list[PETSc.Vec]
+    laws: list[Laws]
+
+
 class Backward:
     """Goes through the steps of a run backward (collective).
 
@@ -308,15 +322,15 @@ class Backward:
                 "has changed, other than Constants, loads and parameters of materials."
             )
 
-    def step(self, record: Record, weights: Weights) -> tuple[list[fem.Function], list[Laws]]:
+    def step(self, record: Record, weights: Weights) -> Gone:
         """Take derivatives by a step's end to those by its beginning; :meth:`go_to` comes first.
 
         Args:
             record: The step.
             weights: At its end; its motion is changed, states are for the caller to change.
 
-        Returns:
-            q on W of each body, and the laws.
+        Raises:
+            MPMError: The end of the step cannot be evaluated.
         """
         problem, reduced = self._problem, self._reduced
         laws = [Laws(points) for points in problem.material_points()]
@@ -344,9 +358,9 @@ class Backward:
                 if (failure := reduced.balance.evaluate()) is not None:
                     raise failure
             z = self._solved([_vector(motion) for motion in weights.motion])
-            moved = self._moved(z)
+            backgrounds = [field.on_background(z) for field in reduced.fields]
+            moved = self._moved(backgrounds)
             forces = self._stiffness(moved)
-        backgrounds = [field.on_background(z) for field in reduced.fields]
         for number, (body, motion) in enumerate(zip(problem.bodies, weights.motion, strict=True)):
             place = reduced.fields.index(reduced.unknowns.place(body)[0])
             gdim = body.mesh.geometry.dim
@@ -363,8 +377,7 @@ class Backward:
                 total[:, i] -= (slope_z.array_r.reshape(-1, gdim) * forces_here).sum(axis=1)
             motion.x.array[: total.size] = total.ravel()
             motion.x.scatter_forward()
-        self.background = backgrounds
-        return moved, laws
+        return Gone(moved, backgrounds, laws)
 
     def _solved(self, motion: Sequence[PETSc.Vec]) -> PETSc.Vec:
         """Return z of ``A^T z = T^T l`` in the unknowns."""
@@ -388,17 +401,13 @@ class Backward:
             rest.aypx(-1.0, right)
         return z
 
-    def _moved(self, z: PETSc.Vec) -> list[fem.Function]:
+    def _moved(self, backgrounds: Sequence[PETSc.Vec]) -> list[fem.Function]:
         """Return ``T z`` on W of each body."""
-        found = []
+        reduced, found = self._reduced, []
         for body in self._problem.bodies:
-            field, _ = self._reduced.unknowns.place(body)
-            function = fem.Function(body.W)
-            moved = body.T.createVecLeft()
-            body.T.mult(field.on_background(z), moved)
-            function.x.array[: moved.getLocalSize()] = moved.array_r
-            function.x.scatter_forward()
-            found.append(function)
+            place = reduced.fields.index(reduced.unknowns.place(body)[0])
+            found.append(fem.Function(body.W))
+            add_product(found[-1], body.T, backgrounds[place])
         return found
 
     def _stiffness(self, motion: Sequence[fem.Function]) -> list[Array]:

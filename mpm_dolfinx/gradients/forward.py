@@ -40,7 +40,7 @@ from ..problems.particle_problem import ParticleProblem
 from ..stepping.loading import Stepper
 from ..system.value_field import ValueField
 from ..transfer.matrix import transfer_matrix
-from .nearby import Nearby, Rates, followed, varying
+from .nearby import Nearby, Rates, add_product, followed, varying
 from .parameters import CHANGE, Parameter
 from .velocities import TakenVelocities, driven_on
 
@@ -136,7 +136,7 @@ class StepDerivative:
         ):
             if isinstance(thing, CarriedField) and thing.total:
                 motion[number].x.array[:] = 0.0
-            _add(motion[number], turn, self._z[field])
+            add_product(motion[number], turn, self._z[field])
         self._move(motion, y_rate)
         held = self._held(parameter, moduli, turns)
         first, last = 0.0, np.inf
@@ -291,10 +291,10 @@ class StepDerivative:
         for n, (body, turn) in enumerate(zip(self._problem.bodies, turns, strict=True)):
             if self._of_fields[n] == number:
                 moved = fem.Function(body.W)
-                _add(moved, body.T, u)
+                add_product(moved, body.T, u)
                 offsets[n][:] += moved.x.array
-                _add(motion[n], body.T, rate)
-                _add(motion[n], turn, u)
+                add_product(motion[n], body.T, rate)
+                add_product(motion[n], turn, u)
 
     def _held(
         self, parameter: Parameter, moduli: dict[int, Array], turns: Sequence[PETSc.Mat]
@@ -371,14 +371,13 @@ class StepDerivative:
     ) -> None:
         """Add to derivatives of forces what does not come of the bodies' motion."""
         for field, force, known, rate in zip(self._fields, forces, held, y_rate, strict=True):
-            more = known.copy()
-            field.add_product(rate, more, partial(self._reduced.terms.shear_moduli, field))
-            force.axpy(1.0, more)
+            field.add_product(rate, force, partial(self._reduced.terms.shear_moduli, field))
+            force.axpy(1.0, known)
 
     def _move(self, motion: Sequence[fem.Function], changes: Sequence[PETSc.Vec]) -> None:
         """Add to a motion of the bodies that of the backgrounds."""
         for thing, number, field in zip(self._things, self._numbers, self._of_fields, strict=True):
-            _add(motion[number], thing.T, changes[field])
+            add_product(motion[number], thing.T, changes[field])
 
     @staticmethod
     def _require(failure: MPMError | None, parameter: Parameter) -> None:
@@ -395,11 +394,3 @@ def _copy(function: fem.Function) -> fem.Function:
     other = fem.Function(function.function_space, name=function.name)
     other.x.array[:] = function.x.array
     return other
-
-
-def _add(function: fem.Function, matrix: PETSc.Mat, change: PETSc.Vec) -> None:
-    """Add the product of a matrix on V to a Function on W (collective)."""
-    part = matrix.createVecLeft()
-    matrix.mult(change, part)
-    function.x.array[: part.getLocalSize()] += part.array_r
-    function.x.scatter_forward()

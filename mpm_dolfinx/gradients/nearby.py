@@ -8,6 +8,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
+from petsc4py import PETSc
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +24,7 @@ from ..problems.particle_problem import ParticleProblem
 from ..system.mass import NodalMass
 from .parameters import Parameter
 
-__all__ = ["Nearby", "Rates", "followed", "varying"]
+__all__ = ["Nearby", "Rates", "add_product", "followed", "varying"]
 
 type Array = NDArray[np.float64]
 
@@ -196,6 +198,14 @@ class Nearby:
                 force[:] = values
             for points, seen in zip(self._points, self._seen, strict=True):
                 points.see(seen)
+
+
+def add_product(function: fem.Function, matrix: PETSc.Mat, change: PETSc.Vec) -> None:
+    """Add the product of a matrix on V to a Function on W (collective)."""
+    part = matrix.createVecLeft()
+    matrix.mult(change, part)
+    function.x.array[: part.getLocalSize()] += part.array_r
+    function.x.scatter_forward()
 
 
 def varying(state: State) -> State:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ufl
-from dolfinx import fem, la, mesh
+from dolfinx import fem, mesh
 
 from ..constitutive.assignment import in_cells, per_cell
 from ..constitutive.groups import background_cells
@@ -24,6 +24,7 @@ from ..materials.fracture import Fracture
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
 from ..parallel.totals import over_ranks
+from ..particles.free import chosen_nodes
 from ..particles.particles import Particles
 from .field_equation import FieldEquation
 from .term import PointMaterial
@@ -111,11 +112,8 @@ class Damage(FieldEquation):
         whole = np.ones(body.num_local, dtype=bool)
         for _, where in self._laws:
             whole[where] = False
-        upper, touched = fem.Function(W), fem.Function(W)
-        touched.x.array[W.dofmap.list[: body.num_local][whole].ravel()] = 1.0
-        touched.x.scatter_reverse(la.InsertMode.add)  # by cells of any rank
-        touched.x.scatter_forward()
-        upper.x.array[:] = touched.x.array == 0.0
+        upper = fem.Function(W)
+        upper.x.array[:] = ~chosen_nodes(W, W.dofmap.list[: body.num_local][whole].ravel())
         return upper
 
     # -- What it does in a step ------------------------------------------------------------------

@@ -21,6 +21,7 @@ from ..errors import ConvergenceError, MPMError, agree
 from ..io.snapshot import Kept, Taken, fill, of_cells
 from ..meshes.remesh import Column
 from ..parallel.boundary import collective
+from ..parallel.conjugate_gradients import conjugate_gradients
 from ..parallel.given import is_number
 from ..parallel.totals import over_ranks
 from ..particles.field import ParticleField
@@ -34,10 +35,9 @@ type Bound = float | fem.Function | str | None
 
 #: Step of Jacobi's method, relative to the largest value, below which an equation is solved.
 SOLVED = 1e-10
-#: Residual that the method of conjugate gradients leaves, relative to that before.
-LINEAR = 1e-13
-#: Solves with other sets of active bounds after which a solution is given up.
-MOST = 200
+#: Solves with other sets of active bounds after which a solution is given up, and the most
+#: iterations of one.
+MOST, MOST_ITERATIONS = 200, 10000
 
 
 class FieldEquation(Term):
@@ -97,10 +97,7 @@ class FieldEquation(Term):
         self._own = field.W.dofmap.index_map.size_local * field.W.dofmap.index_map_bs
         self._comm: MPI.Comm = body.mesh.comm
         self._number = self._body_number = 0
-        self._ksp = PETSc.KSP().create(self._comm)
-        self._ksp.setType("cg")
-        self._ksp.getPC().setType("jacobi")
-        self._ksp.setTolerances(rtol=LINEAR, max_it=10000)
+        self._ksp = conjugate_gradients(self._comm, MOST_ITERATIONS)
 
     def _require_bound(self, bound: Any) -> None:
         known = bound is None or bound == "previous" or is_number(bound)
@@ -150,7 +147,6 @@ class FieldEquation(Term):
         self._forms.assemble_external()
         p, own = self.field.x, self._own
         lower, upper = self._bounds()
-        matrix: PETSc.Mat | None = None
         for solves in range(MOST):
             (residual,) = self._forms.assemble_residuals()
             matrix = self._forms.assemble_tangents()[1, 1]

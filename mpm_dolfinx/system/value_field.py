@@ -13,9 +13,9 @@ import numpy as np
 
 from dolfinx import fem
 
+from ..parallel.conjugate_gradients import conjugate_gradients
 from ..parallel.magnitudes import norm
 from ..particles.field import CarriedField
-from ..tolerances import ROUND_OFF
 from .field import Field
 from .numbering import FreeDofs
 
@@ -107,11 +107,8 @@ class ValueField(Field):
         free = PETSc.IS().createGeneral((first + self.dofs).astype(PETSc.IntType), comm=self._comm)
         block, part = normal.createSubMatrix(free, free), right.getSubVector(free)
         change = part.duplicate()
-        ksp = PETSc.KSP().create(self._comm)
-        ksp.setType("cg")
-        ksp.getPC().setType("jacobi")
+        ksp = conjugate_gradients(self._comm, 1000)
         ksp.setOperators(block)
-        ksp.setTolerances(rtol=ROUND_OFF, max_it=1000)
         ksp.solve(part, change)
         if np.isfinite(norm(change)):
             start.array_w[self.dofs] = start.array_r[self.dofs] + change.array_r
