@@ -2,7 +2,11 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """A rigid pile, disc, wedge or footing is pressed into undrained clay.
 
-demos/demo_pipe.py is its simplest form.
+demos/demo_pipe.py is its simplest form. A wedge cuts the clay, and most of its face bears on what
+the cut has laid bare; a mesh that is held together on the axis would cover that with its first
+facet alone. So for a wedge the clay is parted there: it leans on a smooth wall, and the tip goes
+down between the two. The wedge's `ratio` is the force over the depth, which is the same at all
+depths, in the last half of the path, over the exact one.
 """
 
 import kit
@@ -58,8 +62,10 @@ across, up = lines(wide, 1.5), -lines(deep, 1.0)[::-1]
 across, up = kit.finer_at(0.5, across, args.finer), kit.finer_at(0.0, up, args.finer)
 above = kit.finer_at(0.0, h * np.arange(round(1.0 / h) + 1), args.finer)
 room = np.append(up, above[1:])
+parted = args.obstacle == "wedge"
+aside = np.append(-h, across) if parted else across
 V = fem.functionspace(
-    kit.grid([across, room], mesh.CellType.quadrilateral), ("Lagrange", args.degree, (2,))
+    kit.grid([aside, room], mesh.CellType.quadrilateral), ("Lagrange", args.degree, (2,))
 )
 rule = args.quadrature_degree
 if rule is None and args.domain == "quad" and args.degree == 1:
@@ -87,8 +93,8 @@ shape = {
     "disc": lambda: mpm.contact.disc((0.0, 0.5), 0.5),
     "wedge": lambda: mpm.contact.polygon([(0, 0), (3 * slope, 3), (-3 * slope, 3)]),
 }[args.obstacle]()
-ground = mesh.locate_entities_boundary(soil.mesh, 1, lambda x: np.isclose(x[1], 0.0))
-tags = mesh.meshtags(soil.mesh, 1, np.sort(ground), np.full(len(ground), 1, np.int32))
+surface, axis = mpm.region(y=0.0), mpm.region(x=0.0)
+tags = mpm.facet_tags(soil.mesh, {1: lambda x: surface(x) | (axis(x) & parted)})
 obstacle = mpm.contact.Rigid(
     soil,
     shape,
@@ -101,24 +107,21 @@ obstacle = mpm.contact.Rigid(
 )
 
 
-def held(component: int, where) -> fem.DirichletBC:
-    dofs = fem.locate_dofs_geometrical((V.sub(component), V.sub(component).collapse()[0]), where)
-    return fem.dirichletbc(fem.Function(V.sub(component).collapse()[0]), dofs, V.sub(component))
-
-
+terms, held = [obstacle], [mpm.held(V, 0, x=wide), mpm.held(V, y=-deep)]
+if parted:
+    plane = mpm.contact.plane((0.0, 0.0), (1.0, 0.0))
+    terms.append(mpm.contact.Rigid(soil, plane, facet_tags=tags, tag=1))
+else:
+    held.append(mpm.held(V, 0, x=0.0))
 problem = mpm.QuasiStaticProblem(
     mpm.Body(
         soil,
         mpm.materials.VonMises(young, poisson, rho_y=np.sqrt(2.0) * cohesion),
         f_bar=args.f_bar if args.mixed == "none" else "none",
     ),
-    bcs=[
-        held(0, lambda x: np.isclose(x[0], 0.0) | np.isclose(x[0], wide)),
-        held(0, lambda x: np.isclose(x[1], -deep)),
-        held(1, lambda x: np.isclose(x[1], -deep)),
-    ],
+    bcs=held,
     mixed=None if args.mixed == "none" else args.mixed,
-    terms=[obstacle],
+    terms=terms,
 )
 
 
@@ -144,18 +147,19 @@ try:
 except mpm.MPMError as error:
     failure = error
 reached, force = np.array(path).T
-exact = None
+ratio = None
 if args.obstacle == "footing":
-    exact = (2.0 + np.pi) * cohesion * 0.5
-if args.obstacle == "wedge" and args.friction == 0.0:
-    exact = hill() * reached[-1]
+    ratio = float(force[-1]) / ((2.0 + np.pi) * cohesion * 0.5)
+if parted and args.friction == 0.0 and failure is None:
+    late = reached > 0.5 * depth
+    ratio = float(force[late] @ reached[late] / (reached[late] @ reached[late])) / hill()
 history = problem.history
 most = max(history.iterations, default=0)
 numbers = {
     **kit.outcome(history, failure),
     "depth": float(reached[-1]),
     "force": 2.0 * float(force[-1]) / cohesion,
-    "ratio": None if exact is None else float(force[-1]) / exact,
+    "ratio": ratio,
     "iterations_per_step": float(np.mean(history.iterations)) if history.iterations else 0.0,
     "iterations_most": most,
     "penetration": kit.largest(-obstacle.gap) / h,
@@ -168,8 +172,8 @@ rows = [
     ("force over c and 1 m", f"{numbers['force']:.3f}"),
     ("penetration in cells", f"{numbers['penetration']:.1e}"),
 ]
-if exact is not None:
-    rows.append(("force over the exact one", f"{numbers['ratio']:.4f}"))
+if ratio is not None:
+    rows.append(("force over the exact one", f"{ratio:.4f}"))
 
 if args.plot:
     fig, axes = kit.figure(12.0, 5.0, [["soil", "force"]])

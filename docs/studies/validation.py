@@ -132,7 +132,7 @@ PLASTIC = {
         "ratio", 1.0, "footing --cell 0.25", "--cell 0.125"
     ),
     "Smooth wedge into clay, force (Hill, Lee & Tupper 1947)": Value(
-        "ratio", 1.0, f"{WEDGE} --cell 0.25", "--cell 0.125"
+        "ratio", 1.0, f"{WEDGE} --cell 0.125", "--cell 0.0625"
     ),
 }
 SOILS = {

@@ -25,6 +25,7 @@ LONG = {
     *("slope", "vertical-cut", "footing-friction", "footing-weight-rough", "footing-edge"),
     *("finer-footing", "mixed-footing"),
     *("stiff-footing", "hertz", "hertz-penalty", "hertz-tets", "expansion-whole", "pile-deep"),
+    "wedge-fine",
     *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
 }
 COMMON = {"completed", "load", "iterations", "cutbacks", "failure"}
@@ -221,6 +222,16 @@ RUNS = {
         "hertz",
         "--cells 3 --law nitsche --penalty 0.5",
         {"error_force": 0.04, "error_radius": 0.01, "error_pressure": 0.08},
+    ),
+    "wedge": (
+        "penetration",
+        "--obstacle wedge --depth 0.5 --cell 0.25",
+        {"ratio": 1.085, "cutbacks": 0, "iterations": 380},
+    ),
+    "wedge-fine": (
+        "penetration",
+        "--obstacle wedge --depth 0.5",
+        {"ratio": 1.045, "cutbacks": 0, "iterations": 500},
     ),
     "pile": (
         "penetration",
