@@ -24,9 +24,18 @@ from .governed import Governed
 from .pressure import MeanStress, is_split, without_bulk
 from .succession import equals
 
-__all__ = ["Assignment", "Materials", "in_cells", "per_cell"]
+__all__ = ["Assignment", "Materials", "equal_laws", "in_cells", "per_cell"]
 
 type Materials = Material | Mapping[int, Material]
+
+
+def equal_laws(one: Materials, other: Materials) -> bool:
+    """Return whether a body's materials are equal, each for its tag."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(
+            equals(law, other[tag]) for tag, law in one.items()
+        )
+    return isinstance(one, Material) and isinstance(other, Material) and equals(one, other)
 
 
 class _Given(NamedTuple):

@@ -40,7 +40,8 @@ class _Converged(NamedTuple):
         compliance: Its own, where a law is evaluated at the pressure.
         recovery: See :attr:`MaterialPoints.recovery`.
         resisted: Energy that F-bar resists, shape ``(n nq,)``.
-        average: That of the plastic strain over the length of the body, of the same shape.
+        average: That of the plastic strain over the length of the body, with which its stress was
+            found, of the same shape.
         growth: Its change in the last step, by which it is expected to change in the next.
     """
 
@@ -112,7 +113,7 @@ class MaterialPoints:
         self._last = _Converged(states, zero, zero.copy(), none, none, 0.0, *[none] * 3)
         self._spread = None if length is None else self._spread_over(length)
         self._average = none
-        self._turns = 0
+        self._turns, self._expecting = 0, False
         self.first_piola = np.zeros(shape)
         self.tangent = np.zeros((*shape, self.dim, self.dim))
         self._trial, self._trial_gradient = states, self._last.gradient
@@ -153,6 +154,11 @@ class MaterialPoints:
         return self._last.average
 
     @property
+    def growth(self) -> NDArray[np.float64]:
+        """By how much the average is expected to change in the next step, shape ``(n nq,)``."""
+        return self._last.growth
+
+    @property
     def averages(self) -> bool:
         """Whether laws soften by an average over a length."""
         return self._spread is not None
@@ -166,6 +172,10 @@ class MaterialPoints:
                 values[part.points] = state["plastic_strain"]
         shape = self._particles.num_local, self._particles.num_points
         return self._spread.of(values.reshape(shape)).ravel()
+
+    def expect(self) -> None:
+        """Begin a step with the average that is expected at its end."""
+        self._average, self._expecting = self._last.average + self._last.growth, True
 
     def alternate(self) -> int:
         """Average the plastic strain of the last update for the next one (collective).
@@ -420,6 +430,7 @@ class MaterialPoints:
         stress = before.cauchy_stress(gradient).reshape(self._points, 3, 3)
         carried = Carried(stress, gradient, gap)
         episodes = before.episodes()
+        self._last = self._last._replace(average=before.average, growth=before.growth)
         self._average = before.average
         laws = list(zip(self._assignment.given, map(self._present, self._governed), strict=True))
         self._settle(states_after(episodes, laws, carried, unchanged, self._particles.mesh.comm))
@@ -454,9 +465,7 @@ class MaterialPoints:
         """
         before = self._last
         now = before._replace(states=states, gradient=self._trial_gradient, stress=stress)
-        if self._spread is not None:
-            self._average, self._turns = self._averaged(states), 0
-            now = now._replace(average=self._average)
+        now = now._replace(average=self._average)
         if self.mean_stress is not None:
             seen = self.mean_stress.strain
             now = now._replace(volume=seen.volume)
@@ -764,18 +773,16 @@ class MaterialPoints:
         alone = len(self._governed) == 1 and self._governed[0].is_own
         self._make_last(self._trial, self.first_piola if alone else self.first_piola.copy())
         if self._spread is not None:
-            growth = self._last.average - before.average
-            self._last = self._last._replace(growth=growth)
-            self._average = self._last.average + growth
+            self._last = self._last._replace(growth=self._last.average - before.average)
+        self._turns, self._expecting = 0, False
         return undo
 
     def roll_back(self) -> None:
         """Forget the last update."""
-        if self._spread is not None and self._trial is not self._last.states:
-            # What was expected is not what failed.
+        if self._expecting:  # what was not found is not expected again
             self._last = self._last._replace(growth=np.zeros(self._points))
-            self._average = self._last.average
-        self._turns = 0
+        self._average = self._last.average
+        self._turns, self._expecting = 0, False
         self._forget_trial()
         self.first_piola = self._last.stress.copy()
         if self.mean_stress is not None:
@@ -812,6 +819,7 @@ class MaterialPoints:
             name: Column(v.reshape(n, nq, *v.shape[1:]), "points") for name, v in whole.items()
         }
         if self._spread is not None:
+            columns["average"] = Column(self._last.average.reshape(n, nq), "points")
             columns["growth"] = Column(self._last.growth.reshape(n, nq), "points")
         if self.averaging is not None:
             columns["recovery"] = Column(np.broadcast_to(self._last.recovery, (n, 3, 3)), "cells")
@@ -819,14 +827,11 @@ class MaterialPoints:
         return columns
 
     def set_converged_state(self, arrays: dict[str, NDArray[Any]]) -> None:
-        """Make what :meth:`converged_state` once returned the history of the last step.
-
-        With a length this is collective.
-        """
+        """Make what :meth:`converged_state` once returned the history of the last step."""
         flat = {
             name: v.reshape(self._points, *v.shape[2:])
             for name, v in arrays.items()
-            if name not in ("recovery", "resisted", "growth")
+            if name not in ("recovery", "resisted")
         }
         states: list[State] = [{} for _ in self._governed]
         last = self._last._replace(
@@ -835,6 +840,8 @@ class MaterialPoints:
             stress=flat.pop("first_piola"),
             volume=flat.pop("volume_strain", self._last.volume),
             compliance=flat.pop("compliance", self._last.compliance),
+            average=flat.pop("average", self._last.average),
+            growth=flat.pop("growth", self._last.growth),
             recovery=arrays.get("recovery", 0.0),
             resisted=arrays.get("resisted", self._last.resisted).reshape(self._points),
         )
@@ -842,10 +849,7 @@ class MaterialPoints:
             name, numbers = key.rsplit("@", 1)
             for number in map(int, numbers.split(",")):
                 states[number][name] = values[self._governed[number].points]
-        if self._spread is not None:
-            growth = arrays["growth"].reshape(self._points)
-            last = last._replace(average=self._averaged(states), growth=growth)
-        self._last, self._average = last, last.average + last.growth
+        self._last, self._average, self._expecting = last, last.average, False
         self._forget_trial()
 
     def laws(self) -> list[tuple[str, dict[str, Any]]]:

@@ -415,6 +415,10 @@ class StepStress:
         """Whether laws soften by an average over a length."""
         return self._points.averages
 
+    def expect(self) -> None:
+        """Begin a step with the average that is expected at its end."""
+        self._points.expect()
+
     def alternate(self) -> int:
         """Average what softens; return the linear solves that it took (collective)."""
         return self._points.alternate()

@@ -71,9 +71,11 @@ def _of_one_law(one: Material, other: Material) -> bool:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Return whether values are the same object, or equal numbers, words or arrays of them."""
+    """Return whether values are the same object, or equal laws, numbers, words or arrays."""
     if one is other:
         return True
+    if isinstance(one, Material) and isinstance(other, Material):
+        return equals(one, other)
     plain = int | float | str | np.ndarray | np.number
     return isinstance(one, plain) and isinstance(other, plain) and np.array_equal(one, other)
 

@@ -18,6 +18,7 @@ from ..assembly.inputs import Density, functions_of
 from ..assembly.loads import VirtualWork, changeable
 from ..assembly.rules import depends_on
 from ..boundary.supports import Support
+from ..constitutive.assignment import equal_laws
 from ..constitutive.groups import background_cells
 from ..constitutive.points import MaterialPoints
 from ..constitutive.step_stress import StepStress
@@ -307,9 +308,12 @@ class QuasiStaticProblem(ParticleProblem):
         other = [name for name in INITIAL if getattr(body, name) is not getattr(before, name)]
         for name in [*other, *(["f_bar"] if body.f_bar != before.f_bar else [])]:
             raise MPMError(f"{name} cannot change in a stage; a body begins with it.")
-        same = body.material is before.material and body.cell_tags is before.cell_tags
+        same = body.cell_tags is before.cell_tags and equal_laws(body.material, before.material)
         if not same and (body.may_crack or before.may_crack):
-            raise MPMError("A law of fracture cannot come or go in a stage; a body begins with it.")
+            raise MPMError(
+                "A body with a law of fracture keeps its laws in a stage, as it begins with them; "
+                "give parameters that are to change as Constants or Functions."
+            )
 
     @collective("particles")
     def remove(

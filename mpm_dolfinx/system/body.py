@@ -16,7 +16,7 @@ from ..assembly.body_forms import BodyForms
 from ..assembly.low_rank import ReducedLowRank
 from ..errors import MPMError
 from ..particles.particles import Particles
-from .term import PointMaterial, Term, Transfer
+from .term import Motion, PointMaterial, Term, Transfer
 
 __all__ = ["BodyTerm", "PointHistory", "StepForce"]
 
@@ -34,6 +34,9 @@ class PointHistory(PointMaterial, Protocol):
     @property
     def averages(self) -> bool:
         """Whether laws soften by an average over a length, found in turn with displacements."""
+
+    def expect(self) -> None:
+        """Begin a step with the average that is expected at its end."""
 
     def alternate(self) -> int:
         """Average what softens; return the linear solves that it took (collective)."""
@@ -124,6 +127,11 @@ class BodyTerm(Term):
     def begin(self) -> Sequence[PETSc.Vec]:
         self.forms.assemble_external()
         return [self.forms.external]
+
+    @override
+    def start(self, transfer: Transfer, prescribed: Motion) -> None:
+        if self._material is not None and self._material.averages:
+            self._material.expect()
 
     @override
     def pace(self, dt: float, share: float) -> None:

@@ -21,6 +21,7 @@ from ..constitutive.groups import background_cells
 from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree, warn
 from ..materials.fracture import Fracture
+from ..meshes.quadrature import exact_degree
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
 from ..parallel.totals import over_ranks
@@ -72,10 +73,13 @@ class Damage(FieldEquation):
         shape = d if model == "AT1" else d**2
         slope = ufl.dot(ufl.grad(d), ufl.grad(d))
         weight = 8.0 / 3.0 if model == "AT1" else 2.0
-        dx = particles.dx
+        # (one point in a quadrilateral would not see damage that alternates from node to node)
+        degree = exact_degree(body.topology.cell_name(), 1)
+        exact = ufl.Measure("dx", domain=body, metadata={"quadrature_degree": degree})
         density = shape / self._length + self._length * slope
-        self._surface = compiled_form(self._toughness / weight * density * dx)
-        energy = ((1.0 - d) ** 2 * self._drive + self._toughness / weight * density) * dx
+        surface = self._toughness / weight * density * exact
+        self._surface = compiled_form(surface)
+        energy = (1.0 - d) ** 2 * self._drive * particles.dx + surface
         self._share = 3.0 / 8.0 if model == "AT1" else 0.5
         self._points: MaterialPoints | None = None
         self._said = False

@@ -19,6 +19,7 @@ from posed import staged as staged_with
 from routes import on_route
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE
 
+import ufl
 from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
@@ -87,6 +88,7 @@ AROUND = {
 }
 LAWS = {
     "hencky": lambda s: materials.Hencky(YOUNG * s, 0.3),
+    "neo hooke": lambda s: materials.NeoHooke(YOUNG * s, 0.3),
     "linear": lambda s: materials.LinearElastic(YOUNG * s, 0.3),
     "von mises": lambda s: materials.VonMises(YOUNG * s, 0.3, yield_stress=8 * s, hardening=50 * s),
     "tresca": lambda s: materials.Tresca(YOUNG * s, 0.3, 12 * s),
@@ -440,6 +442,71 @@ def reduced(frame):
     return scene
 
 
+def free(frame, what="body", **options):
+    """A block of finite elements, or with nodes that are free as far as told."""
+    scene = Scene(frame, particles={"quadrature_degree": 3}, law=options.pop("law", "hencky"))
+    if what == "body":
+        body = scene.body(None)
+        scene.hold(body.W, 0, 0.0)
+        scene.hold(body.W, 1, 0.0)
+    else:
+
+        def inside(x):
+            at = frame.back(x[:2].T)
+            return (at[:, 0] > 0.7) & (at[:, 1] < 1.1)
+
+        scene.options["free"] = inside if what == "some" else what
+        scene.body(scene.background())
+    problem = scene.problem(**options)
+    for number, _ in enumerate(problem.steps(2)):
+        scene.seen[f"error {number}"] = problem.error()
+    return scene
+
+
+def softening(frame):
+    """A block of which the strength falls by an average over a length."""
+    scene = Scene(frame, particles={"quadrature_degree": 2})
+    scene.body(scene.background())
+    s = frame.stress
+    law = materials.VonMises(YOUNG * s, 0.3, 8 * s, hardening=100 * s, residual=0.7, decay=10.0)
+    problem = scene.problem(law=law, length=0.5 * frame.length)
+    problem.solve(3)
+    assert problem.history.steps[-1].alternations > 2
+    scene.seen["turns"] = np.array([step.alternations for step in problem.history.steps])
+    return scene
+
+
+def cracking(frame, split="volumetric", **scene):
+    """A block that is damaged under its weight."""
+    scene = Scene(frame, **scene)
+    body = scene.body(scene.background())
+    s = frame.stress
+    toughness = 5.0 * s * frame.length
+    law = materials.Fracture(scene.law, toughness, 0.6 * frame.length, model="AT2", split=split)
+    problem = scene.problem(law=law)
+    problem.solve(2)
+    damage = problem.damage[0]
+    values = damage.field.x.array[damage.field.W.dofmap.list[: body.num_local]]
+    scene.seen["damage"] = scenes.in_order(body, values).sum(axis=1)
+    surface = frame.stress * frame.length**scene.dim
+    scene.seen["surface energy"] = damage.surface_energy() / surface
+    return scene
+
+
+def under_water(frame):
+    """A block with a water table in it."""
+    scene = Scene(frame)
+    body = scene.body(scene.background(), size=(3.0, 1.55))
+    scene.hold(body.V, 0, 3.0)
+    up, x = frame.vector(0.0, 1.0), ufl.SpatialCoordinate(body.mesh)
+    level = float(np.dot(frame.point([0.0, 1.0]), up))
+    below = level - ufl.dot(x, ufl.as_vector(up))
+    weight = 0.5 * GRAVITY * frame.stress / frame.length
+    pressure = ufl.conditional(ufl.gt(below, 0.0), weight * below, 0.0)
+    scene.problem(pore_pressure=pressure).solve(2)
+    return scene
+
+
 def kept(**options):
     return lambda frame: weight(frame, **options)
 
@@ -496,6 +563,13 @@ SCENES = {
     "displacement control": controlled,
     "automatic steps": automatic,
     "strength reduction": reduced,
+    "finite elements": free,
+    "free nodes": of(free, "some"),
+    "free as long as they last": of(free, "auto", law="von mises"),
+    "softening": softening,
+    "fracture": cracking,
+    "fracture in space": of(cracking, "spectral", dim=3),
+    "water table": under_water,
 }
 ROUND = {
     "cpdi2": kept(axisymmetric=True),

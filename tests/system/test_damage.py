@@ -8,8 +8,9 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+import scenes
 from compare import raises
-from scenes import QUADRILATERAL, WORLD
+from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD
 
 import ufl
 from dolfinx import fem, mesh
@@ -104,6 +105,32 @@ def test_carried_and_free_bodies_crack_alike():
         found.append(problem.damage[0].field.x.array.max())
         assert problem.damage[0].surface_energy() == 0.0
     assert found == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(("dim", "cell"), [(2, QUADRILATERAL), (2, TRIANGLE), (3, HEXAHEDRON)])
+@pytest.mark.parametrize("model", ["AT1", "AT2"])
+def test_one_point_in_a_domain_finds_the_damage_of_all_nodes(model, dim, cell):
+    """It sees no damage that alternates from node to node, which takes energy nevertheless."""
+    body = scenes.box([0.0] * dim, [1.0] * dim, [4] * dim, cell)
+    grid = scenes.box([0.0] * dim, [1.5] * dim, [3] * dim, QUADRILATERAL if dim == 2 else cell)
+    V = scenes.vectors(grid)
+    particles = mpm.Particles(body, V)
+    assert particles.num_points == 1
+    pull = fem.Function(V)
+    pull.interpolate(lambda x: np.array([0.25 * x[0], *np.zeros((dim - 1, x.shape[1]))]))
+    held = fem.dirichletbc(pull, scenes.below(V, 9.0).dof_indices()[0][::dim] // dim)
+    law = Fracture(LinearElastic(YOUNG, 0.0), TOUGHNESS, LENGTH, model=model, split="none")
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, law), bcs=[held])
+    problem.step()
+    equation = problem.damage[0]
+    expected = uniform(model, 0.5 * YOUNG * 0.25**2)
+    assert expected > 0.5
+    np.testing.assert_allclose(equation.field.x.array, expected, atol=1e-7)
+    equation.lower = None
+    equation.field.x.array[:] += 1e-3 * np.sin(37.0 * np.arange(len(equation.field.x.array)))
+    equation.field.x.scatter_forward()
+    equation.alternate()
+    np.testing.assert_allclose(equation.field.x.array, expected, atol=1e-7)
 
 
 def notched(n=12):
