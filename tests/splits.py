@@ -67,7 +67,7 @@ def sums(problem):
     forms = problem.body_terms[0].forms
     forms.assemble_external()
     (stress,) = problem._stresses
-    strain = stress.strain.average(stress.variable("elastic_b_minus_identity"))
+    strain = stress.strain.average(stress.last.variable("elastic_b_minus_identity"))
     return {
         "volume": scenes.total(p, volume),
         "present volume": scenes.total(p, p.volume),

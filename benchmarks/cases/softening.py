@@ -134,13 +134,13 @@ problem = mpm.QuasiStaticProblem(
 
 curve = [(0.0, 0.0)]
 (points,) = problem.points
-before = last = points.plastic_strain()
+before = last = points.last.plastic_strain()
 failure = None
 sign, across = (1.0, size[1]) if bar else (-1.0, 1.0)
 try:
     for step in kit.progress(problem.steps(args.steps), args.steps, args):
         curve.append((step.load * path, sign * problem.reaction(plate)[1] / across))
-        before, last = last, points.plastic_strain()
+        before, last = last, points.last.plastic_strain()
 except mpm.MPMError as error:
     failure = error
 

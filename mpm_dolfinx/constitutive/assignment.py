@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ from dolfinx import fem, mesh
 
 from .. import _compat
 from ..errors import MPMError, agree
-from ..materials.base import Material, Parameter, Refused, check_parameter
+from ..materials.base import Material, Parameter, Refused, State, check_parameter
 from ..particles.particles import Particles
 from .governed import Governed
 from .pressure import MeanStress, is_split, without_bulk
@@ -73,6 +74,9 @@ class Assignment:
         mean_stress: The pressure in place of the mean stress, if there is one.
 
     Attributes:
+        particles: As given.
+        dim: As given.
+        num_points: Number of points of this rank.
         governed: The materials at their points.
         weakening: What the strength of all of them is divided by.
         duration: Of the steps of which updates are; infinite where no time passes.
@@ -89,8 +93,9 @@ class Assignment:
         cell_tags: mesh.MeshTags | None,
         mean_stress: MeanStress | None,
     ) -> None:
-        self._particles = particles
-        self._dim = dim
+        self.particles = particles
+        self.dim = dim
+        self.num_points = particles.num_local * particles.num_points
         self._mean_stress = mean_stress
         self.weakening = 1.0
         self.duration = math.inf
@@ -103,7 +108,7 @@ class Assignment:
         """Return for each material the number of the first that equals it (collective)."""
         given = self.given
         equal = np.array([[equals(one, other) for other in given] for one in given])
-        self._particles.mesh.comm.Allreduce(MPI.IN_PLACE, equal, MPI.LAND)
+        self.particles.mesh.comm.Allreduce(MPI.IN_PLACE, equal, MPI.LAND)
         return np.asarray(equal.argmax(axis=1))
 
     @property
@@ -130,7 +135,7 @@ class Assignment:
             MPMError: They are not allowed, or the parameters of a material are other objects than
                 when this was made.
         """
-        with agree(self._particles.mesh.comm):
+        with agree(self.particles.mesh.comm):
             for given in self._given:
                 given.require_same()
         for given in self._given:
@@ -164,7 +169,7 @@ class Assignment:
             MPMError: A material does not say what its strength is.
         """
         self.weakening = factor
-        with agree(self._particles.mesh.comm):
+        with agree(self.particles.mesh.comm):
             self.governed = [
                 self._governing(material, part.points)
                 for material, part in zip(self.given, self.governed, strict=True)
@@ -180,14 +185,99 @@ class Assignment:
             if law is not part.law:
                 self.governed[number] = replace(part, law=law)
 
+    @contextmanager
+    def in_no_time(self) -> Iterator[None]:
+        """Let no time pass in updates in the block."""
+        duration = self.duration
+        self.pace(0.0)
+        try:
+            yield
+        finally:
+            self.pace(duration)
+
+    # -- What is known of the laws -------------------------------------------------------------
+
+    def by_domain[T: np.generic](self, values: NDArray[T]) -> NDArray[T]:
+        """Return values at all points, shape ``(n nq, ...)``, as ``(n, nq, ...)``."""
+        shape = self.particles.num_local, self.particles.num_points
+        return values.reshape(*shape, *values.shape[1:])
+
+    def where(self, holds: Callable[[Governed], bool]) -> NDArray[np.bool_]:
+        """Return which points have a law for which something holds, shape ``(n nq,)``."""
+        result = np.zeros(self.num_points, dtype=bool)
+        for part in self.governed:
+            result[part.points] = holds(part)
+        return result
+
+    @property
+    def numbers(self) -> NDArray[np.int64]:
+        """Number of the law of each domain, shape ``(n,)``."""
+        result = np.zeros(self.particles.num_local, dtype=np.int64)
+        for number, part in enumerate(self.governed):
+            result[part.points // self.particles.num_points] = number
+        return result
+
+    @property
+    def are_own(self) -> bool:
+        """Whether all are of this package, which have no numbers but parameters."""
+        return all(part.is_own for part in self.governed)
+
+    @property
+    def comes_apart(self) -> bool:
+        """Whether mean stresses depend on the volume alone, so that a pressure can replace them."""
+        return not any(part.at_pressure for part in self.governed)
+
+    @property
+    def at_pressure(self) -> NDArray[np.bool_]:
+        """Whether the law of each point is evaluated at its pressure, shape ``(n nq,)``."""
+        return self.where(lambda part: part.at_pressure)
+
+    @property
+    def has_small_strain(self) -> NDArray[np.bool_]:
+        """Which points have a law of small strains, shape ``(n nq,)``."""
+        return self.where(lambda part: getattr(part.material, "kinematics", None) == "small")
+
+    def answers(
+        self, gradient: NDArray[np.float64], states: list[State]
+    ) -> tuple[NDArray[np.float64], list[State]]:
+        """Return the answers of the materials (not collective).
+
+        Args:
+            gradient: ``F - I`` that they see, shape ``(n nq, dim, dim)``.
+            states: Of each material at the beginning of the step.
+
+        Returns:
+            Their first Piola stress, of the same shape, and their states.
+        """
+        stress, found = np.zeros(gradient.shape), []
+        for part, state in zip(self.governed, states, strict=True):
+            everywhere = len(part.points) == self.num_points
+            its = gradient if everywhere else gradient[part.points]
+            answer = part.answer(its, state, tangent=False)
+            if everywhere and part.is_own:
+                stress = answer.first_piola
+            else:
+                stress[part.points] = answer.first_piola
+            found.append(part.given_away(answer.state))
+        return stress, found
+
+    def tangents(self, gradient: NDArray[np.float64], states: list[State]) -> NDArray[np.float64]:
+        """Return derivatives of :meth:`answers` as the materials tell them (not collective)."""
+        found = np.zeros((self.num_points, *(self.dim,) * 4))
+        for part, state in zip(self.governed, states, strict=True):
+            found[part.points] = part.answer(gradient[part.points], state).tangent
+        return found
+
+    # -- How it is made --------------------------------------------------------------------------
+
     def _chosen(
         self, materials: Materials, cell_tags: mesh.MeshTags | None
     ) -> list[tuple[Material, NDArray[np.int64]]]:
         """Return each material with the points it is for."""
-        each = np.arange(self._particles.num_points)
+        each = np.arange(self.particles.num_points)
         return [
             (material, (cells[:, None] * len(each) + each).ravel())
-            for material, cells in in_cells(self._particles, materials, cell_tags)
+            for material, cells in in_cells(self.particles, materials, cell_tags)
         ]
 
     def _governing(self, material: Material, points: NDArray[np.int64]) -> Governed:
@@ -197,7 +287,7 @@ class Assignment:
     def _taken(self, material: Material, points: NDArray[np.int64]) -> Governed:
         """Return a material at its points, without its mean stress where a pressure is that."""
         law = material.in_time(self.duration)
-        whole = Governed(self._particles, self._dim, material, points, law)
+        whole = Governed(self.particles, self.dim, material, points, law)
         if self._mean_stress is None:
             return whole
         if not is_split(material):
@@ -224,7 +314,7 @@ class Assignment:
                 replaced[name] = float(value.value)
             if not isinstance(value, fem.Function | np.ndarray):
                 continue
-            values = np.repeat(per_cell(self._particles, name, value), self._particles.num_points)
+            values = np.repeat(per_cell(self.particles, name, value), self.particles.num_points)
             values.flags.writeable = False
             replaced[name] = values
         if replaced:

@@ -80,6 +80,10 @@ class Governed:
         """Whether the law is one of this package, which gives its answers away for good."""
         return _of_package(type(self.material))
 
+    def given_away(self, state: State) -> State:
+        """Return an answered state that the law will not write into any more."""
+        return state if self.is_own else {name: values.copy() for name, values in state.items()}
+
     def memory(self, state: State) -> State:
         """Return the part of a converged state that updates read and displacements do not tell.
 

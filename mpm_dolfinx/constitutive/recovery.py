@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dolfinx import la
 
 from ..particles.particles import Particles
+from .moduli import bulk_and_shear_moduli
 from .points import MaterialPoints
 
 __all__ = ["stress_errors"]
@@ -31,17 +32,17 @@ def stress_errors(particles: Particles, points: MaterialPoints) -> Array:
     Returns:
         ``int ds : C^-1 : ds dX`` with the undeformed body's moduli, shape ``(n,)``.
     """
-    stress = points.cauchy_stress()
-    stress = stress + np.broadcast_to(points.recovery, (len(stress), 3, 3))[:, None]
+    stress = points.last.cauchy_stress()
+    stress = stress + np.broadcast_to(points.last.recovery, (len(stress), 3, 3))[:, None]
     weights = points.weights
     at_nodes = _continued(particles, stress, weights)
     smooth = np.empty_like(stress)
     shapes = particles.quadrature.shapes
-    for law in range(points.num_laws):
-        mine = points.law_numbers == law
+    for law in range(len(points.laws.governed)):
+        mine = points.laws.numbers == law
         means = _means(particles, at_nodes, weights.sum(axis=1) * mine)
         smooth[mine] = np.einsum("qk,nkij->nqij", shapes, means[mine])
-    bulk, shear = (m.reshape(weights.shape) for m in points.undeformed_moduli())
+    bulk, shear = (m.reshape(weights.shape) for m in bulk_and_shear_moduli(points.laws))
     change = smooth - stress
     mean = np.trace(change, axis1=2, axis2=3) / 3.0
     deviator = change - mean[:, :, None, None] * np.eye(3)

@@ -37,6 +37,7 @@ from ..particles.reference import Reference
 from .averaging import Linearised, LowRankTerm, VolumeAveraging
 from .discrete_gradient import Ends, Gradients, abandon, by_end, mean, mean_of_groups
 from .groups import Groups
+from .moduli import undeformed_tangent
 from .points import MaterialPoints
 from .pressure import MeanStress, VolumeStrain, slope_of_volume
 
@@ -121,9 +122,9 @@ class _PressurePart:
 
     def __init__(self, points: MaterialPoints) -> None:
         self._points = points
-        self._small = points.has_small_strain
+        self._small = points.laws.has_small_strain
         # points whose law is evaluated at the pressure, and knows no volume strain of its own
-        self.pressed = points.at_pressure
+        self.pressed = points.laws.at_pressure
 
     @property
     def pressure(self) -> Array:
@@ -135,7 +136,7 @@ class _PressurePart:
     @property
     def converged(self) -> Array:
         """That of the last converged step."""
-        return np.where(self.pressed, self.pressure, self._points.converged_pressure)
+        return np.where(self.pressed, self.pressure, self._points.last.mean_stress())
 
     def stored(self, pressure: Array) -> Array:
         """Return the energy that a potential has by the pressure, per volume."""
@@ -234,9 +235,9 @@ class StepStress:
         self._works = _Works()
         splits = points.mean_stress is not None and share < 1.0
         self._part = _PressurePart(points) if splits else None
-        pressed = points.at_pressure & splits
-        self._small = points.has_small_strain
-        bounded = points.may_part & ~np.isnan(points.strain_energy()) & ~pressed
+        pressed = points.laws.at_pressure & splits
+        self._small = points.laws.has_small_strain
+        bounded = _may_part(points) & ~np.isnan(points.strain_energy()) & ~pressed
         self._kind = np.where(bounded, 3, 1).astype(np.uint8)
         self._kind[points.has_potential & ~self._small], self._kind[self._small] = 2, 0
         plain = not conserving and viscosity == 0.0 and not splits
@@ -308,7 +309,7 @@ class StepStress:
     def pace(self, dt: float, share: float) -> None:
         """See :meth:`system.term.Term.pace`."""
         self._dt, self._share = dt, share
-        self._points.pace(dt)
+        self._points.laws.pace(dt)
         if _reference(self._points) is not self._begin.reference:
             self.settle()
 
@@ -346,7 +347,7 @@ class StepStress:
             found = replace(found, own=stress, slope=slope, by_pressure=slope)
         energy, reference = points.strain_energy(trial), _reference(points)
         # (a body that was rebased or split learns what its mesh is strained by after that)
-        undeformed = points.undeformed_tangent() if self._viscosity > 0.0 else None
+        undeformed = undeformed_tangent(points.laws) if self._viscosity > 0.0 else None
         return _Beginning(reference, H, stress, energy, potential, volume, undeformed), found
 
     def update(self) -> None:
@@ -500,6 +501,13 @@ class StepStress:
 def _between(share: float, before: Array, after: Array) -> Array:
     """Return the mean over a step of values at its ends, by their weights."""
     return (1.0 - share) * before + share * after
+
+
+def _may_part(points: MaterialPoints) -> NDArray[np.bool_]:
+    """Return which points have a law whose pressure may vanish by yielding, shape ``(n nq,)``."""
+    return points.laws.where(
+        lambda part: not vars(type(part.material)).get("linear_in_volume", False)
+    )
 
 
 def _gradient(points: MaterialPoints) -> Array:

@@ -19,6 +19,7 @@ from dolfinx import fem, la
 from ufl.algorithms.analysis import extract_coefficients
 
 from .. import _compat
+from ..constitutive.moduli import undeformed_tangent
 from ..errors import MPMError, agree
 from ..materials.base import Material, State
 from ..parallel.boundary import collective, of_user
@@ -193,7 +194,7 @@ class Adjoint:
             [np.array(body.displacement.x.array) for body in problem.bodies],
             [field.u.array_r.copy() for field in stepper.reduced.fields],
             [
-                [{name: v.copy() for name, v in own.items()} for own in points.memories()]
+                [{name: v.copy() for name, v in own.items()} for own in points.last.memories()]
                 for points in problem.material_points()
             ],
             [array.copy() for array in self._data()],
@@ -280,10 +281,10 @@ class Adjoint:
         problem, tangents = self.problem, []
         for points in problem.material_points():
             gdim = points.strain.particles.mesh.geometry.dim
-            C = points.undeformed_tangent()[:, :gdim, :gdim, :gdim, :gdim]
+            C = undeformed_tangent(points.laws)[:, :gdim, :gdim, :gdim, :gdim]
             tangents.append(points.weights.ravel()[:, None, None] * np.einsum("niJiJ->niJ", C))
         return _First(
-            [[varying(s) for s in points.states()] for points in problem.material_points()],
+            [[varying(s) for s in points.last.states] for points in problem.material_points()],
             [
                 [one.stiffness.copy() for one in problem.setup.supports_of(body)]
                 for body in problem.bodies
@@ -319,7 +320,7 @@ class Adjoint:
         problem, data = self.problem, self._data()
         back = Backward(problem, self._stepper.newton)
         own = [array.copy() for array in data]
-        states = [points.states() for points in problem.material_points()]
+        states = [points.last.states for points in problem.material_points()]
         for one in self._many:
             one.zero()
         try:
@@ -442,12 +443,12 @@ class Adjoint:
             zip(problem.bodies, problem.material_points(), strict=True)
         ):
             found = np.zeros(len(first.tangent[place]))
-            for own, rates, where in zip(
-                weights.states[place], first.states[place], points.points_of_laws(), strict=True
+            for own, rates, part in zip(
+                weights.states[place], first.states[place], points.laws.governed, strict=True
             ):
                 for name, values in own.items():
-                    product = (values * rates[name]).reshape(len(where), -1)
-                    found[where] += product.sum(axis=1)
+                    product = (values * rates[name]).reshape(len(part.points), -1)
+                    found[part.points] += product.sum(axis=1)
             one.add_of_points(body, found)
             for total, slope in zip(stiffened[place], first.stiffness[place], strict=True):
                 dofs = slice(0, body.num_local)
@@ -509,8 +510,8 @@ class Adjoint:
         targets, shape = [weights.motion[place].x.array], weights.motion[place].x.array.shape
         places: Sequence[Any] = [slice(None)]
         if name != "displacement":
-            pairs = zip(weights.states[place], points.points_of_laws(), strict=True)
-            found = [(own[name], where) for own, where in pairs if name in own]
+            pairs = zip(weights.states[place], points.laws.governed, strict=True)
+            found = [(own[name], part.points) for own, part in pairs if name in own]
             if not found:
                 raise MPMError(
                     f"No material of these particles has a variable {name!r} that varies."

@@ -93,9 +93,9 @@ class Laws:
 
     def __init__(self, points: MaterialPoints) -> None:
         self._points = points
-        self._gradient = points.seen_gradient(trial=True).copy()
-        self._states = points.states()
-        self._after = points.states(trial=True)
+        self._gradient = points.trial.gradient.copy()
+        self._states = points.last.states
+        self._after = points.trial.states
         self._own = self.answers()
         particles = points.strain.particles
         self._shape = (particles.num_local, particles.num_points)
@@ -117,14 +117,14 @@ class Laws:
             self.have_history()
         ):
             return found, None
-        tangent = self._points.tangents(self._gradient, self._states)
+        tangent = self._points.laws.tangents(self._gradient, self._states)
         slopes = np.empty(tangent.shape)
         for i, J in np.ndindex(found.shape[1:]):
             way = np.zeros(found.shape[1:])
             way[i, J] = 1.0
 
             def at(amount: float, way: Array = way) -> Array:
-                P, states = self._points.answers(self._gradient + amount * way, self._states)
+                P, states = self._points.laws.answers(self._gradient + amount * way, self._states)
                 kept = self._weighed(weights, states, self._own[1])
                 return np.column_stack([kept, (P - self._own[0]).reshape(len(P), -1)])
 
@@ -142,7 +142,7 @@ class Laws:
 
     def have_history(self) -> list[bool]:
         """Return whether the answer of each material depends on what it keeps."""
-        return [bool(memory) for memory in self._points.memories()]
+        return [bool(memory) for memory in self._points.last.memories()]
 
     def by_states(self, weights: list[State], work: Array) -> list[State]:
         """Return ``H_h^T m - P_h^T W g q``, as states are.
@@ -170,16 +170,16 @@ class Laws:
                         place: tuple[int, ...] = place,
                     ) -> Array:
                         states = self._with(law, name, place, change)
-                        answer = self._points.answers(self._gradient, states)
+                        answer = self._points.laws.answers(self._gradient, states)
                         return self.change(weights, work, answer)
 
                     slope = slope_of(at, amount)
-                    values[:, *place] = slope[self._points.points_of_laws()[law]]
+                    values[:, *place] = slope[self._points.laws.governed[law].points]
         return found
 
     def _matters(self, law: int, name: str, amount: float) -> bool:
         """Return whether anything depends on a part of the state, on this rank."""
-        whole = self._points.answers(self._gradient, self._with(law, name, (), amount))
+        whole = self._points.laws.answers(self._gradient, self._with(law, name, (), amount))
         own = self._own
         same = np.array_equal(whole[0], own[0])
         return not same or any(
@@ -204,17 +204,17 @@ class Laws:
 
     def answers(self) -> tuple[Array, list[State]]:
         """Return the answers of the laws, with the numbers that they have now."""
-        return self._points.answers(self._gradient, self._states)
+        return self._points.laws.answers(self._gradient, self._states)
 
     def _weighed(self, weights: list[State], after: list[State], before: list[State]) -> Array:
         """Return the products of weights and differences of states, at all points."""
         found = np.zeros(len(self._gradient))
-        for points, own, one, other in zip(
-            self._points.points_of_laws(), weights, after, before, strict=True
-        ):
+        laws = self._points.laws.governed
+        for part, own, one, other in zip(laws, weights, after, before, strict=True):
+            points = part.points
             for name, values in own.items():
-                part = (one[name] - other[name]) * values
-                found[points] += part.reshape(len(points), -1).sum(axis=1)
+                product = (one[name] - other[name]) * values
+                found[points] += product.reshape(len(points), -1).sum(axis=1)
         return found
 
     # -- F-bar -----------------------------------------------------------------------------
@@ -467,7 +467,7 @@ def _add_to(function: fem.Function, vector: PETSc.Vec) -> None:
 def no_weights(problem: QuasiStaticProblem) -> Weights:
     """Return derivatives of nothing."""
     states = [
-        [{k: np.zeros_like(v) for k, v in varying(one).items()} for one in points.states()]
+        [{k: np.zeros_like(v) for k, v in varying(one).items()} for one in points.last.states]
         for points in problem.material_points()
     ]
     return Weights([fem.Function(body.W) for body in problem.bodies], states)

@@ -337,8 +337,8 @@ class StepDerivative:
             self._require(self._reduced.balance.evaluate(), parameter)
         forces = [force.array_r.copy() for force in self._reduced.unknowns.forces]
         # (what follows may ask the laws again, which may answer in the same arrays)
-        states = [[_copies(varying(one)) for one in own.states(trial=True)] for own in points]
-        seen = [own.seen_gradient(trial=True).copy() for own in points]
+        states = [[_copies(varying(one)) for one in own.trial.states] for own in points]
+        seen = [own.trial.gradient.copy() for own in points]
         kept = [array.copy() for array in self._kept(sign * parameter.change, change)]
         return _Side(forces, states, seen, kept)
 

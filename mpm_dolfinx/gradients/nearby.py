@@ -86,8 +86,8 @@ class Nearby:
         arrays = [*present, *problem.beginning()]
         self._arrays = [(values, values.copy()) for values in arrays]
         self._from = [body.converged_displacement.copy() for body in problem.bodies]
-        self._states = [points.states() for points in self._points]
-        self._seen = [points.seen_gradient() for points in self._points]
+        self._states = [points.last.states for points in self._points]
+        self._seen = [points.last.gradient for points in self._points]
         self._own = [points.governing() for points in self._points]
         self._governing: dict[tuple[int, float], list[Governing]] = {}
         self._moved: Parameter | None = None

@@ -226,7 +226,7 @@ def _is_in_none(thing: fem.Constant | fem.Function, problem: ParticleProblem) ->
         b.initial_stress is not None or b.pore_pressure is not None for b in problem.setup.given
     ):
         return False
-    if not all(points.are_own for points in problem.material_points()):
+    if not all(points.laws.are_own for points in problem.material_points()):
         return False
     if isinstance(thing, fem.Function):
         return not any(problem.setup.supports_of(body) for body in problem.bodies)

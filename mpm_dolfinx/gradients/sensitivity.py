@@ -186,7 +186,7 @@ class Sensitivity:
                     self._nearby.go(parameter, sign * parameter.change, rates)
                     with ExitStack() as blocks:
                         for own in points:
-                            blocks.enter_context(own.in_no_time())
+                            blocks.enter_context(own.laws.in_no_time())
                         if (failure := problem.reduced.terms.update()) is not None:
                             raise failure
                         sides.append([array.copy() for array in problem.before_motion()])
@@ -207,7 +207,7 @@ class Sensitivity:
                     parameter.govern(own, amount)
                 problem.begin_anew()
                 kept = [array.copy() for array in problem.beginning()]
-                sides.append(([[varying(s) for s in p.states()] for p in points], kept))
+                sides.append(([[varying(s) for s in p.last.states] for p in points], kept))
             parameter.shift(0.0)
             for own in points:
                 parameter.govern(own, 0.0)
@@ -220,7 +220,7 @@ class Sensitivity:
                 Rates(
                     [fem.Function(thing.W) for thing in followed(problem)],
                     states,
-                    [np.zeros_like(p.seen_gradient()) for p in points],
+                    [np.zeros_like(p.last.gradient) for p in points],
                     [parameter.slope(*pair) for pair in zip(more, less, strict=True)],
                     none,
                     none,

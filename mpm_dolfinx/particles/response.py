@@ -27,22 +27,30 @@ class Kinematics(Protocol):
         """Return volume averages of values ``(n, nq, ...)``."""
 
 
-class Response(Protocol):
-    """Source of stress and internal variables of a body, at its points."""
+class Answers(Protocol):
+    """Stress and internal variables at a body's points."""
 
     @property
     def recovery(self) -> NDArray[np.float64] | float:
         """Correction of the mean stress of each domain, shape ``(n, 3, 3)``, or 0."""
-
-    @property
-    def strain(self) -> Kinematics:
-        """Kinematics of the points."""
 
     def cauchy_stress(self) -> NDArray[np.float64]:
         """Return the Cauchy stress, shape ``(n, nq, 3, 3)``."""
 
     def plastic_strain(self) -> NDArray[np.float64]:
         """Return the accumulated plastic strain, shape ``(n, nq)``."""
+
+
+class Response(Protocol):
+    """Material at the points of a body."""
+
+    @property
+    def strain(self) -> Kinematics:
+        """Kinematics of the points."""
+
+    @property
+    def last(self) -> Answers:
+        """Stress and internal variables at the last converged step."""
 
 
 class Unknown(Protocol):
@@ -117,13 +125,13 @@ class MaterialDomains(Domains):
         Raises:
             MPMError: The particles have no material (a problem written in UFL).
         """
-        response = self._answering("stress")
-        return self._average(response.cauchy_stress()) + response.recovery
+        last = self._answering("stress").last
+        return self._average(last.cauchy_stress()) + last.recovery
 
     @property
     def plastic_strain(self) -> NDArray[np.float64]:
         """Accumulated plastic strain ``sqrt(2/3) |d eps_p|``, shape ``(n,)``."""
-        return self._average(self._answering("plastic strain").plastic_strain())
+        return self._average(self._answering("plastic strain").last.plastic_strain())
 
     @property
     def point_stress(self) -> NDArray[np.float64]:
@@ -132,12 +140,12 @@ class MaterialDomains(Domains):
         Raises:
             MPMError: The particles have no material (a problem written in UFL).
         """
-        return self._answering("stress").cauchy_stress()
+        return self._answering("stress").last.cauchy_stress()
 
     @property
     def point_plastic_strain(self) -> NDArray[np.float64]:
         """Accumulated plastic strain at the quadrature points, shape ``(n, nq)``."""
-        return self._answering("plastic strain").plastic_strain()
+        return self._answering("plastic strain").last.plastic_strain()
 
     @property
     def point_deformation_gradient(self) -> NDArray[np.float64]:

@@ -454,7 +454,8 @@ class QuasiStaticProblem(ParticleProblem):
             given.length,
         )
         if any(field.particles is body for field in self._new_pressures):
-            history.begin_with_pressure()
+            assert history.mean_stress is not None
+            history.mean_stress.begin_with(history.last.mean_stress())
         self._stresses.append(history)
         work = VirtualWork(strain)
         density = Density(1.0 if given.density is None else given.density, body)
@@ -683,7 +684,7 @@ class QuasiStaticProblem(ParticleProblem):
 
     @override
     def laws(self) -> list[list[Law]]:
-        return [stress.laws() for stress in self._stresses]
+        return [stress.identity() for stress in self._stresses]
 
     @property
     def yield_function(self) -> NDArray[np.float64]:
@@ -692,7 +693,7 @@ class QuasiStaticProblem(ParticleProblem):
         In the unit of the material's own function; -1 where a material has none.
         With several bodies, their particles one body after the other.
         """
-        values = [s.yield_function().max(axis=1, initial=-np.inf) for s in self._stresses]
+        values = [s.last.yield_function().max(axis=1, initial=-np.inf) for s in self._stresses]
         return np.concatenate(values)
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
+from ..constitutive.moduli import mean_shear_modulus
 from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree, as_ours
 from ..io.snapshot import spaces_of
@@ -133,7 +134,7 @@ class Given(_Change):
         ):
             if changed & OF_LAWS:
                 points.take_over(before)
-                factors[id(body)] = points.shear_modulus() / before.shear_modulus()
+                factors[id(body)] = _shear(points) / _shear(before)
         if self._moduli is not None:
             problem.reduced.unknowns.moduli = [
                 None if modulus is None else modulus * factors.get(id(moved), 1.0)
@@ -145,6 +146,11 @@ class Given(_Change):
         if body is None:
             return name == "moduli"
         return bool(self._changed[body] & OF_LAWS) and name.startswith("history ")
+
+
+def _shear(points: MaterialPoints) -> float:
+    """Return the mean shear modulus of a body (collective)."""
+    return mean_shear_modulus(points.laws, points.strain.volumes())
 
 
 class Removal(_Change):

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..constitutive.moduli import undeformed_tangent
 from ..errors import TRIAL_ERRORS, MPMError, ParticleOutsideError
 from ..parallel.boundary import collective
 from ..parallel.interruption import held, interrupted, settle
@@ -285,7 +286,7 @@ def _elastic_displacement(problem: QuasiStaticProblem) -> float:
     comm = problem.bodies[0].V.mesh.comm
     sums, corners = np.zeros(2), []
     for body, points in zip(problem.bodies, problem.points, strict=True):
-        shear = points.undeformed_tangent()[:, 0, 1, 0, 1].reshape(body.num_local, -1)
+        shear = undeformed_tangent(points.laws)[:, 0, 1, 0, 1].reshape(body.num_local, -1)
         strains = np.linalg.norm(body.stress.reshape(-1, 9), axis=1) / shear.mean(axis=1)
         sums += body.initial_volume @ strains**2, body.initial_volume.sum()
         corners.append(body.mesh.geometry.x[:, : body.V.mesh.geometry.dim])

@@ -147,7 +147,7 @@ class Damage(FieldEquation):
 
     @override
     def alternate(self) -> int:
-        energy = self._known.variable("driving_energy", trial=True)
+        energy = self._known.trial.variable("driving_energy")
         self._drive.x.array[: energy.size] = energy.ravel()
         solves = super().alternate()
         self._tell()
@@ -155,7 +155,8 @@ class Damage(FieldEquation):
 
     def _tell(self) -> None:
         """Let the law know the damage at its points."""
-        self._known.suppose("damage", np.clip(self.field.at_points(), 0.0, 1.0))
+        points, damage = self._known, np.clip(self.field.at_points(), 0.0, 1.0)
+        points.go_from(points.last.supposing("damage", damage))
 
     @override
     def commit(self) -> Callable[[], None]:

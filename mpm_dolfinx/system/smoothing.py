@@ -5,29 +5,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol, override
+from typing import override
 
 from petsc4py import PETSc
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..background.basis import PointBasis
+from ..constitutive.moduli import undeformed_tangent
+from ..constitutive.points import MaterialPoints
 from ..particles.field import CarriedField
 from .values import FieldTerm
 
-__all__ = ["PressureSmoothing", "ShearPoints"]
-
-
-class ShearPoints(Protocol):
-    """The material at a body's points, as far as smoothing asks for it."""
-
-    @property
-    def weights(self) -> NDArray[np.float64]:
-        """Undeformed volume of each point, shape ``(n, nq)``; 0 where deleted."""
-
-    def undeformed_tangent(self) -> NDArray[np.float64]:
-        """Return dP/dF of all points where nothing is strained, ``(n nq, dim, dim, dim, dim)``."""
+__all__ = ["PressureSmoothing"]
 
 
 class PressureSmoothing(FieldTerm):
@@ -44,7 +34,9 @@ class PressureSmoothing(FieldTerm):
             ``1 / share`` times, as the constraint does.
     """
 
-    def __init__(self, pressure: CarriedField, material: ShearPoints, share: float = 1.0) -> None:
+    def __init__(
+        self, pressure: CarriedField, material: MaterialPoints, share: float = 1.0
+    ) -> None:
         super().__init__(None, [pressure])
         self.fields = []  # committed by the constraint's own term
         self._pressure, self._material = pressure, material
@@ -84,7 +76,7 @@ class PressureSmoothing(FieldTerm):
     def _made(self, basis: PointBasis) -> PETSc.Mat:
         """Return the tangent at points in background cells (collective)."""
         comm, volumes = self._pressure.mesh.comm, self._material.weights.ravel()
-        shear = self._material.undeformed_tangent()[:, 0, 1, 0, 1]
+        shear = undeformed_tangent(self._material.laws)[:, 0, 1, 0, 1]
         topology = self._pressure.V.mesh.topology
         cells = topology.index_map(topology.dim)
         assert basis.cell is not None and basis.rank is not None

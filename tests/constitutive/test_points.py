@@ -57,13 +57,13 @@ def test_memories_and_displacements_bring_a_converged_step_back(f_bar):
     problem = scenes.block(law, f_bar=f_bar)
     problem.solve(steps=2)
     (points,) = problem.points
-    (kept,) = points.states()
+    (kept,) = points.last.states
     assert problem.particles.mesh.comm.allreduce(kept["plastic_strain"].sum()) > 0.0
-    memories = [{name: v.copy() for name, v in own.items()} for own in points.memories()]
+    memories = [{name: v.copy() for name, v in own.items()} for own in points.last.memories()]
     count = len(kept["stress"])
     assert sum(values.nbytes for values in memories[0].values()) == 40 * count
     points.begin_anew()
-    assert not points.states()[0]["displacement_gradient"].any()
+    assert not points.last.states[0]["displacement_gradient"].any()
     points.recall(memories)
     for name in kept.keys() - {"stress"}:
-        np.testing.assert_array_equal(points.states()[0][name], kept[name])
+        np.testing.assert_array_equal(points.last.states[0][name], kept[name])

@@ -11,6 +11,7 @@ from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD, box, vectors
 from dolfinx import mesh
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.constitutive.moduli import undeformed_tangent
 from mpm_dolfinx.constitutive.points import MaterialPoints
 from mpm_dolfinx.constitutive.step_stress import StepStress
 from mpm_dolfinx.constitutive.strain import strain_of
@@ -126,7 +127,7 @@ def test_the_tangent_is_the_derivative(cell, law, conserving, viscosity, axisymm
 def test_the_stress_is_that_of_the_formula(cell, law, axisymmetric, viscosity):
     """P* and P_v point by point, as the head of the module has them."""
     _, points, stress, put = stepped(cell, law_of(law), True, viscosity, axisymmetric)
-    C, dim = points.undeformed_tangent(), points.dim
+    C, dim = undeformed_tangent(points.laws), points.dim
     ends = []
     for amount in (None, 0.4):
         if amount is not None:
@@ -134,7 +135,7 @@ def test_the_stress_is_that_of_the_formula(cell, law, axisymmetric, viscosity):
             stress.update()
         F = np.eye(dim) + points.strain.gradient().reshape(-1, dim, dim)
         ends.append((F, points.first_piola.copy(), points.potential(trial=True)))
-    small = points.has_small_strain
+    small = points.laws.has_small_strain
     for n, (F_n, P_n, W_n, F, P, W) in enumerate(zip(*ends[0], *ends[1], strict=True)):
         F_m, S = 0.5 * (F_n + F), 0.5 * (np.linalg.solve(F_n, P_n) + np.linalg.solve(F, P))
         dE = 0.5 * (F.T @ F - F_n.T @ F_n)
@@ -181,11 +182,14 @@ def test_the_work_of_metal_is_its_energy_and_what_yielding_takes(cell):
     _, points, stress, put = stepped(cell, law)
     first, all_taken = WORLD.allreduce(stress.strain_energy()), 0.0
     for amount in (0.3, 0.6, 0.5, -0.1):
-        kappa, energy = points.plastic_strain().ravel(), WORLD.allreduce(stress.strain_energy())
+        kappa, energy = (
+            points.last.plastic_strain().ravel(),
+            WORLD.allreduce(stress.strain_energy()),
+        )
         put(amount, 3.0)
         stress.update()
         stress.commit()
-        change = points.plastic_strain().ravel() - kappa
+        change = points.last.plastic_strain().ravel() - kappa
         middle = rho_y + np.sqrt(2.0 / 3.0) * hardening * (kappa + 0.5 * change)
         taken = WORLD.allreduce(float(points.weights.ravel() @ (np.sqrt(1.5) * middle * change)))
         found = WORLD.allreduce(stress.stress_work)

@@ -109,7 +109,7 @@ class Slump:
             "reaction": lambda: self.problem.reaction(self.bcs[0]),
         }
         if getattr(points.given[0], "inelastic", False):
-            self.looks["plastic"] = lambda: points.variable("plastic_strain")
+            self.looks["plastic"] = lambda: points.last.variable("plastic_strain")
 
 
 class Loaded:
@@ -159,7 +159,7 @@ class Loaded:
         self.looks = {
             "displacement": lambda: particles.displacement.x.array,
             "stress": lambda: particles.stress,
-            "plastic": lambda: self.problem.points[0].variable("plastic_strain"),
+            "plastic": lambda: self.problem.points[0].last.variable("plastic_strain"),
             "support": lambda: self.problem.reaction(rest),
             "side": lambda: self.problem.reaction(self.bcs[0]),
         }

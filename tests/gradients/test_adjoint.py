@@ -172,7 +172,7 @@ def test_functionals_at_several_steps_and_of_the_history():
     curve, strains = [], None
     for _ in scene.problem.steps(4):
         curve.append(float(gradient.of(scene.value)[0]))
-    strains = gradient.of(lambda: points.variable("plastic_strain"))[..., 0]
+    strains = gradient.of(lambda: points.last.variable("plastic_strain"))[..., 0]
     (slope,) = adjoint.of({1: scene.form, -1: scene.form})
     expected = curve[1] + curve[3]
     assert abs(along(scene, "young", slope, way) - expected) < 1e-8 * abs(expected)

@@ -140,7 +140,7 @@ def test_slope_with_a_pressure_of_its_own(take):
         problem.solve(2)
         found = mpm.strength_reduction(problem)
         assert found.factor == pytest.approx(1.39, abs=0.02)  # F-bar over patches: 1.49
-        assert problem.points[0].yield_function().max(initial=-1.0) < 0.0
+        assert problem.points[0].last.yield_function().max(initial=-1.0) < 0.0
         ends.append(found)
     assert ends[0].factors == ends[1].factors
     np.testing.assert_allclose(ends[0].displacements, ends[1].displacements, rtol=1e-5)
@@ -211,7 +211,7 @@ def test_stops_where_the_body_moves_too_far():
     assert 0 < np.linalg.norm(moved, axis=1).max() <= 0.2 and found.displacements[-1] <= 0.2
     assert 1.5 < found.factor < 4.0
     assert found.above - found.factor <= 0.01
-    yields = problem.points[0].yield_function().max()
+    yields = problem.points[0].last.yield_function().max()
     assert yields < 0.0  # of the strength that was given
     with pytest.raises(mpm.MPMError, match="positive"):
         mpm.strength_reduction(problem, step=0.0)

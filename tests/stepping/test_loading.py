@@ -220,7 +220,7 @@ def test_failing_law_names_its_particles_and_the_run_can_go_on():
     for _ in range(4):
         next(steps)
     law.limit = 1e-12
-    for part in problem.particles._response._governed:
+    for part in problem.particles._response.laws.governed:
         part.material.limit = 1e-12
     kept = scenes.state(problem)
     with pytest.raises(mpm.ConvergenceError, match="too large for the law") as caught:
@@ -235,7 +235,7 @@ def test_failing_law_names_its_particles_and_the_run_can_go_on():
         problem.step()
     scenes.assert_same_state(kept, scenes.state(problem))
     # With the law mended, the rest of the load brings it where a run without a stop ends.
-    for part in problem.particles._response._governed:
+    for part in problem.particles._response.laws.governed:
         part.material.limit = 0.15
     problem.solve(steps=4)
     assert problem.history.load == [k / 8 for k in range(1, 9)]

@@ -447,7 +447,7 @@ class Observer:
             dim = 3 if domains.axisymmetric else domains.dim
             kept = points.converged_state()["gradient"].values
             F[..., :dim, :dim] += kept.reshape(*F.shape[:2], dim, dim)
-        sigma = points.cauchy_stress()
+        sigma = points.last.cauchy_stress()
         if self.law == "small":
             return F, sigma, sigma, None
         tau = np.linalg.det(F)[..., None, None] * sigma
@@ -471,7 +471,7 @@ class Observer:
             P, energy = elastic_stress(self.law, self.run.young, poisson, bar)
             tau = np.einsum("...ik,...jk->...ij", P, bar)
         else:
-            sigma = self.run.problem.points[i].cauchy_stress()
+            sigma = self.run.problem.points[i].last.cauchy_stress()
             tau = np.linalg.det(bar)[..., None, None] * sigma
         pressure = np.trace(tau[..., :dim, :dim], axis1=-2, axis2=-1) / dim
         shared = J * (w * pressure).sum(axis=1, keepdims=True) / (w * J).sum(axis=1, keepdims=True)
