@@ -48,7 +48,7 @@ class VirtualWork:
     def seepage(self, pressure: Any) -> ufl.Form:
         """Return the virtual work of the gradient of a pore pressure, in the undeformed body."""
         p = as_expression(pressure, self._body, "pore_pressure", ())
-        force = -ufl.grad(p) * self._body.mass_ratio
+        force = -ufl.grad(p) * self._body.undeformed.mass_ratio
         work: ufl.Form = self._strain.turn * ufl.inner(force, self._v) * self._body.dx_exact
         return self._at_load([work])
 
@@ -57,7 +57,7 @@ class VirtualWork:
         ds = facet_measure(self._body, tags, loads, "tractions")
         terms = [
             self._strain.turn
-            * self._body.area_ratio
+            * self._body.undeformed.area_ratio
             * ufl.inner(as_expression(t, self._body, "a traction", (self._dim,)), self._v)
             * ds(tag)
             for t, tag in loads

@@ -508,10 +508,10 @@ class MaterialPoints:
     def roll_back(self) -> None:
         """Forget the last update."""
         last = self.last
-        if self.softening is not None and last.average is not None:
+        if self.softening is not None and (average := last.average) is not None:
             if self.softening.expects:  # what was not found is not expected again
-                self.last = last = replace(last, growth=np.zeros(len(last.average)))
-            self.softening.begin(last.average)
+                self.last = last = replace(last, growth=np.zeros(len(average)))
+            self.softening.begin(average)
         self.trial = last
         self.first_piola = last.stress.copy()
         if self.mean_stress is not None:

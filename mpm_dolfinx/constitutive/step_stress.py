@@ -517,5 +517,5 @@ def _gradient(points: MaterialPoints) -> Array:
 
 def _reference(points: MaterialPoints) -> Reference | None:
     """Return the present reference of a body's mesh, the same object while it is the same."""
-    particles = points.strain.particles
-    return particles.reference if particles.rebased else None
+    undeformed = points.strain.particles.undeformed
+    return undeformed.reference if undeformed.differs else None

@@ -89,9 +89,10 @@ class Strain:
         Returns:
             Shape ``(n, nq, gdim, gdim)``, or ``None`` where it sees all.
         """
-        if not self.particles.rebased:
+        undeformed = self.particles.undeformed
+        if not undeformed.differs:
             return None
-        gradient = self.particles.reference.gradient
+        gradient = undeformed.reference.gradient
         return np.asarray(np.eye(gradient.shape[-1]) + gradient)
 
     def integral(self, work: Any) -> ufl.Form:
@@ -127,22 +128,23 @@ class Revolution(Strain):
 
     def __init__(self, particles: Particles) -> None:
         super().__init__(particles)
-        particles.require_radius()
+        undeformed = particles.undeformed
+        undeformed.require_radius()
         if not particles.moves_at_nodes:
             raise MPMError(
                 f"A body of revolution needs method='cpdi2' or 'cpdi': the weights of "
                 f"{particles.method!r} are means in the plane, and stresses at the axis would be "
                 "wrong on any grid."
             )
-        particles.revolve(True)
+        undeformed.revolve(True)
         self.dim = 3
         self._mesh_radius = ufl.SpatialCoordinate(particles.mesh)[0]
-        self._radius = self._mesh_radius if particles.origin is None else particles.origin[0]
+        self._radius = self._mesh_radius if undeformed.origin is None else undeformed.origin[0]
 
     @property
     @override
     def hoop(self) -> Array | None:
-        return self.particles.hoop
+        return self.particles.undeformed.hoop
 
     @override
     def gradient(self) -> Array:
@@ -161,11 +163,11 @@ class Revolution(Strain):
 
     @override
     def before_mesh(self) -> Array | None:
-        return super().before_mesh() if self.particles.means is None else None
+        return super().before_mesh() if self.particles.undeformed.means is None else None
 
     @override
     def integral(self, work: Any) -> ufl.Form:
-        means = self.particles.means
+        means = self.particles.undeformed.means
         if means is None:
             return super().integral(work)
         form: ufl.Form = means.share * work * self.particles.dx
@@ -173,7 +175,7 @@ class Revolution(Strain):
 
     @override
     def ufl_gradient(self, w: Any) -> Any:
-        means = self.particles.means
+        means = self.particles.undeformed.means
         if means is None:
             return super().ufl_gradient(w)
         return _in_space(means.gradient(w), means.hoop(w))
@@ -207,5 +209,5 @@ def strain_of(particles: Particles, axisymmetric: bool) -> Strain:
     """
     if axisymmetric:
         return Revolution(particles)
-    particles.revolve(False)
+    particles.undeformed.revolve(False)
     return Strain(particles)

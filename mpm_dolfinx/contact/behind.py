@@ -106,9 +106,9 @@ class Behind:
         self._weights = taken[:, :, :, None] * surface.undeformed_normals()[:, :, None, :]
         # What was cut has a gradient of its own, not that of its corners; it is the same everywhere
         # in the cell, so that the traction may be taken from the mesh.
-        cut = np.flatnonzero(particles.triangular[self._cells])
-        if len(cut) and particles.rebased:
-            G = np.eye(gdim) + particles.reference.gradient[self._cells[cut]]
+        cut = np.flatnonzero(particles.geometry.triangular[self._cells])
+        if len(cut) and particles.undeformed.differs:
+            G = np.eye(gdim) + particles.undeformed.reference.gradient[self._cells[cut]]
             normals = surface.mesh_normals()[cut]
             turned = np.einsum("mpJK,mqK->mqpJ", G.swapaxes(2, 3), normals)
             turned *= (taken[cut] / np.linalg.det(G)[:, None])[:, :, :, None]

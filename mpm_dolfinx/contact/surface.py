@@ -230,7 +230,7 @@ class Surface:
             here = facets == side
             nodes[here] = W.dofmap.list[cells[here]][:, own]
         distinct, places = np.unique(nodes, return_inverse=True)
-        origin = self.particles.origin
+        origin = self.particles.undeformed.origin
         X = x if origin is None else origin.x.array.reshape(-1, self.gdim)
         edges, undeformed = (np.einsum("jqk,mki->mqij", self.slopes, y[nodes]) for y in (x, X))
         in_mesh, self._areas = (
@@ -315,7 +315,7 @@ class Surface:
 
     def undeformed_normals(self) -> NDArray[np.float64]:
         """Return outward unit normals of the undeformed body, as those in the present mesh."""
-        origin = self.particles.origin
+        origin = self.particles.undeformed.origin
         if origin is None:
             return self.mesh_normals()
         x = origin.x.array.reshape(-1, self.gdim)[self.layout.nodes]

@@ -108,7 +108,9 @@ def _grid(particles: Particles) -> dict[str, dict[str, NDArray[Any]]]:
     with agree(comm):
         known = particles.fields()
     degree = particles.W.ufl_element().degree
-    start, now = (particles.outlined(x) for x in (particles.initial_domains, particles.domains))
+    start, now = (
+        particles.geometry.outlined(x) for x in (particles.initial_domains, particles.domains)
+    )
     n, k = now.shape[:2]
     before = sum(comm.allgather(n)[: comm.rank])
     deleted = comm.allreduce(bool(particles.deleted.any()), MPI.LOR)

@@ -87,19 +87,22 @@ class Body(Protocol):
     def quadrature_function(self, name: str, shape: tuple[int, ...] = ()) -> fem.Function:
         """Return a Function for data at the history's points."""
 
+    @property
+    def W(self) -> fem.FunctionSpace:
+        """Space of the displacement."""
+
+    @property
+    def converged_displacement(self) -> NDArray[np.float64]:
+        """Displacement at the last converged step, on the local dofs of W."""
+
     def converged_points(self) -> NDArray[np.float64]:
         """Return positions of all history's points, last converged, ``(n, nq, gdim)``."""
 
-    def converged_nodes(self, W: fem.FunctionSpace) -> NDArray[np.float64]:
-        """Return positions of the nodes of a Lagrange space, last converged, ``(N, gdim)``."""
+    def of_domains(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return displacements of nodes ``(N, gdim)`` for each domain, shape ``(n, k, gdim)``."""
 
-    def motion_at_points(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a motion of the body's nodes at its points, ``(n, nq, gdim)``."""
-
-    def motion_at_nodes(
-        self, W: fem.FunctionSpace, motion: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return a motion of the body's nodes at those of a Lagrange space, ``(N, gdim)``."""
+    def at_points(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return values at the domains' nodes, ``(n, k, gdim)``, at the history's points."""
 
 
 class ParticleField(fem.Function):
@@ -247,6 +250,7 @@ class CarriedField:
         self._at: Transfer | None = None
         self._rows: PointBasis | None = None
         self._T: PETSc.Mat | None = None
+        self._vectors: fem.FunctionSpace | None = None
 
     @property
     def total(self) -> bool:
@@ -339,8 +343,27 @@ class CarriedField:
         if self.is_frozen:
             x = self.W.tabulate_dof_coordinates()[:, :gdim]
         else:
-            x = body.converged_nodes(self.W)
+            x = self.converged_nodes()
         return np.asarray(x[: self.W.dofmap.index_map.size_local])
+
+    def converged_nodes(self) -> NDArray[np.float64]:
+        """Return the positions of a field's nodes, last converged, ``(N, gdim)`` (collective)."""
+        x = self.W.tabulate_dof_coordinates()[:, : self.mesh.geometry.dim]
+        return np.asarray(x + self._at_nodes(self.field.particles.converged_displacement))
+
+    def _at_nodes(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a motion of the body's nodes at those of the field, ``(N, gdim)`` (collective)."""
+        body, gdim = self.field.particles, self.mesh.geometry.dim
+        if self._vectors is None:
+            degree = self.W.ufl_element().degree
+            self._vectors = fem.functionspace(self.mesh, ("Lagrange", degree, (gdim,)))
+            if not np.array_equal(self._vectors.dofmap.list, self.W.dofmap.list):
+                raise MPMError("DOLFINx numbers nodes of scalars and vectors differently here.")
+        own, moved = fem.Function(body.W), fem.Function(self._vectors)
+        own.x.array[:] = motion
+        moved.interpolate(own)
+        moved.x.scatter_forward()
+        return np.asarray(moved.x.array.reshape(-1, gdim))
 
     def node_gradients(self) -> PointBasis:
         """Return :attr:`node_basis` with gradients, zero where T does not change (collective)."""
@@ -357,10 +380,11 @@ class CarriedField:
             motion: On the local dofs of the body's W.
         """
         body = self.field.particles
+        gdim = self.mesh.geometry.dim
         if self.field.at == "points":
-            moved = body.motion_at_points(motion)
-            return moved.reshape(-1, moved.shape[-1])
-        return body.motion_at_nodes(self.W, motion)
+            moved = body.at_points(body.of_domains(motion.reshape(-1, gdim)))
+            return moved.reshape(-1, gdim)
+        return self._at_nodes(motion)
 
     def _undeformed_points(self) -> NDArray[np.float64]:
         """Return the undeformed positions of the history's points, ``(n, nq, gdim)``."""

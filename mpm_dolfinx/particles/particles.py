@@ -19,7 +19,7 @@ from ..background.basis import BackgroundBasis, PointBasis
 from ..background.ownership import ranks_of_background
 from ..errors import MPMError, ParticleOutsideError, agree
 from ..meshes.boxes import mesh_of_boxes
-from ..meshes.quadrature import default_degree, volume_ratio
+from ..meshes.quadrature import default_degree
 from ..meshes.redistribution import Carrier, Redistribution, cell_centres
 from ..meshes.remesh import Column, Cuts, Remesh
 from ..meshes.trail import Trail
@@ -45,6 +45,7 @@ from .options import (
 )
 from .reference import Reference
 from .response import MaterialDomains
+from .undeformed import Undeformed
 
 __all__ = ["LoadFactor", "Particles"]
 
@@ -121,14 +122,11 @@ class Particles(MaterialDomains):
         outside: The policy for domains that leave the background.
         deletion: Which domains are deleted, with ``outside="delete"``, otherwise ``None``.
         on_distortion: As given.
-        mass_share: Factor of the density that keeps the mass at each node where domains were
-            split or the body rebased, otherwise ``None``.
+        undeformed: The undeformed body, where its mesh does not show it too.
         shares_nodes: Whether neighbours share their nodes, as with ``"cpdi2"``.
         rebases: How often the nodes of the mesh were moved.
         free_nodes: The free nodes as the system moves them; ``None`` without ``free=``.
         frees_by_itself: Whether nodes are free as long as the domains around them are good.
-        origin: Undeformed positions of the nodes of W where the body was rebased, otherwise
-            ``None``.
 
     Raises:
         MPMError: Spaces, meshes, method or degrees that do not go together.
@@ -185,13 +183,13 @@ class Particles(MaterialDomains):
             self._trail.append(move := Redistribution(body, ranks))
             body = move.mesh
         self._has_free, self.frees_by_itself = free is not None, _is_auto(free)
-        self._settle(body)
+        self._settle(body, outside == "delete")
         if self.free_nodes is not None:
             if isinstance(free, tuple):
                 free = tuple(self.carry(part) for part in free)
             self.free_nodes.choose(chosen_nodes(self.W, free))
         self._method.require(body, self.initial_domains, self.global_index)
-        self._geometry.require_volume(self.quadrature)
+        self.geometry.require_volume(self.quadrature)
         self.locate()
 
     def _ride_on(self, V: fem.FunctionSpace) -> None:
@@ -241,20 +239,28 @@ class Particles(MaterialDomains):
             f"{kinds} of degree {self.V.ufl_element().degree}"
         )
 
-    def _settle(self, body: mesh.Mesh) -> None:
-        """Live on a body mesh, undeformed: at the start and after each move (collective)."""
+    def _settle(
+        self, body: mesh.Mesh, deletable: bool, cut: bool = False, moved: bool = False
+    ) -> None:
+        """Live on a body mesh, where nothing is displaced: at the start and after each move.
+
+        Args:
+            body: The mesh (collective).
+            deletable: Whether domains may be deleted.
+            cut: Whether domains were cut since the start.
+            moved: Whether the mesh's nodes are elsewhere than in the undeformed body.
+        """
         family = "Lagrange" if METHODS[self.method].shares_nodes else "Discontinuous Lagrange"
-        deletable = self.outside == "delete" or getattr(self, "deletion", None) is not None
-        self._live_on(Geometry(body, family, *self._degrees), deletable)
+        geometry = Geometry(body, family, *self._degrees)
+        self._live_on(geometry, Undeformed(geometry, cut, moved), deletable)
         self._coordinates = Coordinates(body, "body")
         if METHODS[self.method].free:
             self._ride_on(self.W)
         self.load = LoadFactor(body, 0.0)
         self.proportional = fem.Constant(body, 1.0)
-        self._converged = np.zeros_like(self._geometry.nodes)
+        self._converged = np.zeros_like(self.geometry.nodes)
         self.free_nodes = FreeNodes(self) if self._has_free else None
         self._transfer: Transfer | None = None
-        self._vectors: tuple[fem.FunctionSpace, fem.FunctionSpace] | None = None
 
     @classmethod
     def from_points(
@@ -326,7 +332,7 @@ class Particles(MaterialDomains):
         Args:
             ranks: New rank of each particle this rank owns, shape ``(n,)``.
         """
-        self._take(Redistribution(self.mesh, ranks), self.origin is not None)
+        self._take(Redistribution(self.mesh, ranks), self.undeformed.origin is not None)
 
     def rebase(self, cuts: Cuts, positions: NDArray[np.float64] | None = None) -> Remesh:
         """Cut quadrilaterals of the mesh in two, or move its nodes (collective).
@@ -340,7 +346,9 @@ class Particles(MaterialDomains):
         """
         own = self.W if positions is not None and self.W.ufl_element().degree > 1 else None
         move = Remesh(self.mesh, cuts, positions, own)
-        self._take(move, positions is not None or self.origin is not None, cuts, positions)
+        self._take(
+            move, positions is not None or self.undeformed.origin is not None, cuts, positions
+        )
         return move
 
     def _take(
@@ -354,14 +362,12 @@ class Particles(MaterialDomains):
         before: Reference | None = None
         if positions is not None:
             before = self.present_reference()
-        elif cuts is None and self.rebased:
-            before = self.reference
+        elif cuts is None and self.undeformed.differs:
+            before = self.undeformed.reference
         self._trail.append(move, cuts, positions is not None)
-        self._settle(move.mesh)
-        if moved or len(self.cuts):
-            self.expect_reference(moved)
+        self._settle(move.mesh, self.deletion is not None, len(self.cuts) > 0, moved)
         if before is not None:  # at once, for what is made of the undeformed body
-            self.refer(Reference(*(move.of_cells(values) for values in before)))
+            self.undeformed.refer(Reference(*(move.of_cells(values) for values in before)))
 
     def require_meshes_as_they_were(self) -> None:
         """Raise an error where coordinates of body or background have changed on this rank.
@@ -412,7 +418,7 @@ class Particles(MaterialDomains):
         """
         if self.free_nodes is not None:
             return self.free_nodes.chosen.copy()
-        return np.full(len(self._geometry.nodes), self.is_free)
+        return np.full(len(self.geometry.nodes), self.is_free)
 
     @free.setter
     @collective("where")
@@ -431,14 +437,6 @@ class Particles(MaterialDomains):
         assert self.free_nodes is not None
         self.free_nodes.choose(chosen)
         self._transfer = None
-
-    def quality(self, domains: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how little the shape of this rank's own domains has changed, shape ``(n,)``.
-
-        Args:
-            domains: Their nodes, shape ``(n, k, gdim)``.
-        """
-        return self._geometry.quality(domains)
 
     @property
     def moves_at_nodes(self) -> bool:
@@ -478,17 +476,17 @@ class Particles(MaterialDomains):
         self, displacement: NDArray[np.float64], gradient: Callable[[], NDArray[np.float64]]
     ) -> DomainState:
         """Return where nodes displaced ``(N, gdim)`` and ``F - I`` at points put the domains."""
-        nodes, corners = self._geometry.nodes, self._geometry.corners
+        nodes, corners = self.geometry.nodes, self.geometry.corners
 
         def centred() -> ParticleState:
             return ParticleState(
                 self.initial_centroid,
-                self.mean(corners + self._of_domains(displacement)),
+                self.mean(corners + self.of_domains(displacement)),
                 # methods that ask for it have one point
-                np.eye(self._geometry.gdim) + gradient()[:, 0],
+                np.eye(self.geometry.gdim) + gradient()[:, 0],
             )
 
-        return DomainState(nodes, displacement, self.domain_nodes, self._of_domains, centred)
+        return DomainState(nodes, displacement, self.domain_nodes, self.of_domains, centred)
 
     def _at_converged(self) -> DomainState:
         """Return where the domains are at the last converged step."""
@@ -503,7 +501,7 @@ class Particles(MaterialDomains):
 
     def _converged_corners(self) -> NDArray[np.float64]:
         """Return the positions of the domains' nodes, last converged, ``(n, k, gdim)``."""
-        return np.asarray(self._geometry.corners + self._of_domains(self._converged))
+        return np.asarray(self.geometry.corners + self.of_domains(self._converged))
 
     def _lost(self, rows: CornerBasis) -> NDArray[np.int64]:
         """Return the local domains that are not wholly in the background."""
@@ -561,79 +559,16 @@ class Particles(MaterialDomains):
         return ParticleField(self, V, at, kind, name)
 
     def converged_points(self) -> NDArray[np.float64]:
-        """Return positions of all history's points, last converged, ``(n, nq, gdim)``.
-
-        The point of a triangle that was cut from a quadrilateral is its centroid.
-        """
-        return self._at_points(self._converged_corners())
-
-    def motion_at_points(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a motion of the nodes at the points of :meth:`converged_points`.
-
-        Args:
-            motion: On the local dofs of W.
-
-        Returns:
-            Shape ``(n, nq, gdim)``.
-        """
-        return self._at_points(self._of_domains(motion.reshape(self._converged.shape)))
-
-    def _at_points(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values at the domains' nodes, ``(n, k, gdim)``, at the history's points."""
-        points = np.asarray(np.einsum("qk,nki->nqi", self.quadrature.shapes, corners))
-        cut = self.triangular
-        if cut.any():
-            points[cut] = np.einsum("nk,nki->ni", self.mesh_averages[cut], corners[cut])[:, None]
-        return points
-
-    def converged_nodes(self, W: fem.FunctionSpace) -> NDArray[np.float64]:
-        """Return positions of the nodes of a Lagrange space on the body mesh, last converged.
-
-        Args:
-            W: The space, of any shape (collective).
-
-        Returns:
-            Positions of its local nodes, shape ``(N, gdim)``.
-        """
-        x = W.tabulate_dof_coordinates()[:, : self._geometry.gdim]
-        return np.asarray(x + self.motion_at_nodes(W, self._converged.ravel()))
-
-    def motion_at_nodes(
-        self, W: fem.FunctionSpace, motion: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return a motion of the body's nodes at those of :meth:`converged_nodes` (collective).
-
-        Args:
-            W: As there.
-            motion: On the local dofs of the body's own W.
-
-        Returns:
-            Shape ``(N, gdim)``.
-        """
-        own, moved = fem.Function(self.W), fem.Function(self._vectors_on(W))
-        own.x.array[:] = motion
-        moved.interpolate(own)
-        moved.x.scatter_forward()
-        return np.asarray(moved.x.array.reshape(-1, self._geometry.gdim))
-
-    def _vectors_on(self, W: fem.FunctionSpace) -> fem.FunctionSpace:
-        """Return the space of vectors with the nodes of a space, made once for each."""
-        if self._vectors is None or self._vectors[0] is not W:
-            shape = (self._geometry.gdim,)
-            space = fem.functionspace(W.mesh, ("Lagrange", W.ufl_element().degree, shape))
-            if not np.array_equal(space.dofmap.list, W.dofmap.list):
-                raise MPMError("DOLFINx numbers nodes of scalars and vectors differently here.")
-            self._vectors = W, space
-        return self._vectors[1]
+        """Return positions of all history's points, last converged, ``(n, nq, gdim)``."""
+        return self.at_points(self._converged_corners())
 
     def present_reference(self) -> Reference:
         """Return the undeformed body as a mesh shows it that has the last converged positions."""
-        return self.reference._replace(gradient=self.converged_gradient())
+        return self.undeformed.reference._replace(gradient=self.converged_gradient())
 
     def converged_gradient(self) -> NDArray[np.float64]:
         """Return ``F - I`` at the history's points, last converged, ``(n, nq, gdim, gdim)``."""
-        gradient = self.quadrature.displacement_gradient(self._of_domains(self._converged))
-        return self._whole_gradient(gradient)
+        return self.undeformed.gradient_of(self.of_domains(self._converged))
 
     def leaving(self) -> NDArray[np.int64]:
         """Return which of this rank's particles the last step took out (collective).
@@ -667,7 +602,7 @@ class Particles(MaterialDomains):
             domains: Local indices of this rank's particles.
         """
         assert self.deletion is not None
-        self.deletion.add(domains, self._of_domains(self._converged))
+        self.deletion.add(domains, self.of_domains(self._converged))
         self._transfer = self._transfer_by(self.transfer.rows)
 
     def remove(self, domains: NDArray[np.int64]) -> None:
@@ -723,7 +658,7 @@ class Particles(MaterialDomains):
         boxes; for mpm, whose particles are points, parallelograms of their volume.
         """
         present = np.asarray(self.displacement.x.array, dtype=np.float64)
-        present = present.reshape(-1, self._geometry.gdim)
+        present = present.reshape(-1, self.geometry.gdim)
         return self._method.domains(self._state(present, self.displacement_gradient))
 
     @property
@@ -739,7 +674,7 @@ class Particles(MaterialDomains):
     @property
     def node_positions(self) -> NDArray[np.float64]:
         """Positions of this rank's nodes of W at the last converged step, shape ``(N, gdim)``."""
-        return np.asarray(self._geometry.nodes + self._converged)
+        return np.asarray(self.geometry.nodes + self._converged)
 
     def _domain_averages(
         self,
@@ -747,9 +682,9 @@ class Particles(MaterialDomains):
         corners = self.transfer.rows.corners
         return domain_weights(
             self.converged_domains if corners is None else corners,
-            self._geometry.shape_functions,
+            self.geometry.shape_functions,
             self.mesh.basix_cell(),
-            self._geometry.exact_degree,
+            self.geometry.exact_degree,
         )
 
     @property
@@ -772,7 +707,7 @@ class Particles(MaterialDomains):
         """Return :attr:`node_basis` with gradients (collective)."""
         rows = self.node_basis
         if self.is_free:
-            return rows._replace(gradients=np.zeros((*rows.nodes.shape, self._geometry.gdim)))
+            return rows._replace(gradients=np.zeros((*rows.nodes.shape, self.geometry.gdim)))
         basis = self._background.at(self.node_positions[: len(rows.nodes)], gradients=True)
         assert basis.gradients is not None
         other = np.flatnonzero((basis.nodes != rows.nodes).any(axis=1))
@@ -805,21 +740,6 @@ class Particles(MaterialDomains):
         """Evaluator of the basis of V at points."""
         return self._background
 
-    def quadrature_points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return positions ``(n nq, gdim)`` and volumes ``(n nq,)`` of the history's points.
-
-        They are those of the last converged step, without particles that are deleted or of which
-        no node is carried.
-        """
-        nodal, gradient = self._converged_corners(), self.converged_gradient()
-        weights = self.quadrature.weights
-        if self.deletion is not None or self.free_nodes is not None:
-            there = ~(self.deleted | self.free[self.domain_nodes].all(axis=1))
-            nodal, gradient, weights = nodal[there], gradient[there], weights[there]
-        points = np.einsum("qk,nki->nqi", self.quadrature.shapes, nodal)
-        volumes = weights * volume_ratio(gradient)
-        return points.reshape(-1, self._geometry.gdim), volumes.ravel()
-
     def options(self) -> dict[str, Any]:
         """Return method and degrees, for a checkpoint to know these particles by."""
         return {
@@ -840,17 +760,17 @@ class Particles(MaterialDomains):
         if self.deletion is not None:
             columns["deleted"] = Column(self.deletion.mask, "cells")
             columns["kept"] = Column(self.deletion.kept(nodal), "nodes")
-        if self.mass_share is not None:
-            columns |= self.reference.columns()
-            columns["mass share"] = Column(self.mass_shares(), "nodes")
-        if self.origin is not None:
-            columns["mesh nodes"] = Column(self._geometry.corners, "nodes")
+        if self.undeformed.mass_share is not None:
+            columns |= self.undeformed.reference.columns()
+            columns["mass share"] = Column(self.undeformed.mass_shares(), "nodes")
+        if self.undeformed.origin is not None:
+            columns["mesh nodes"] = Column(self.geometry.corners, "nodes")
         return columns
 
     def set_converged_state(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Make what :meth:`converged_state` once returned the last converged step (collective)."""
         d = self.displacement.x
-        d.array.reshape(-1, self._geometry.gdim)[self.domain_nodes] = arrays["displacement"]
+        d.array.reshape(-1, self.geometry.gdim)[self.domain_nodes] = arrays["displacement"]
         d.scatter_forward()
         if self.free_nodes is not None:
             nodes = np.unique(self.domain_nodes[arrays["free"] > 0.5])
@@ -858,15 +778,16 @@ class Particles(MaterialDomains):
         if self.deletion is not None:
             self.deletion.restore(np.zeros_like(self.deletion.mask), arrays["kept"])
             self.deletion.restore(arrays["deleted"], arrays["kept"])
-        if self.mass_share is not None:
-            self.refer(Reference(*(arrays[f"reference {name}"] for name in Reference._fields)))
-            self.set_mass_shares(arrays["mass share"])
+        if self.undeformed.mass_share is not None:
+            reference = (arrays[f"reference {name}"] for name in Reference._fields)
+            self.undeformed.refer(Reference(*reference))
+            self.undeformed.set_mass_shares(arrays["mass share"])
         self.commit()
 
     def commit(self) -> NDArray[np.float64]:
         """Make the present displacement the converged one; return what that was before."""
         before = self._converged
-        present = self.displacement.x.array.reshape(-1, self._geometry.gdim)
+        present = self.displacement.x.array.reshape(-1, self.geometry.gdim)
         self.restore(np.array(present, dtype=np.float64))
         return before
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..errors import MPMError
 from .domains import Domains
 from .geometry import Geometry
+from .undeformed import Undeformed
 
 __all__ = ["MaterialDomains", "Response"]
 
@@ -72,9 +73,9 @@ class MaterialDomains(Domains):
     governed_by: object | None = None
 
     @override
-    def _live_on(self, geometry: Geometry, deletable: bool) -> None:
+    def _live_on(self, geometry: Geometry, undeformed: Undeformed, deletable: bool) -> None:
         """Live on another mesh, for whose domains no response answers yet."""
-        super()._live_on(geometry, deletable)
+        super()._live_on(geometry, undeformed, deletable)
         self._response: Response | None = None
         self._unknowns: Sequence[Unknown] = ()
         self._pore_pressure: Unknown | None = None

@@ -183,8 +183,8 @@ def grid(particles: Particles) -> Any:
     gdim = particles.mesh.geometry.dim
     data: dict[str, NDArray[Any]] = {
         "particle": particles.global_index,
-        "start": particles.outlined(particles.initial_domains)[:, nodes],
-        "now": particles.outlined(particles.domains)[:, nodes],
+        "start": particles.geometry.outlined(particles.initial_domains)[:, nodes],
+        "now": particles.geometry.outlined(particles.domains)[:, nodes],
         **particles.fields(),
     }
     gathered = comm.gather(data)

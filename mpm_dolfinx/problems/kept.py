@@ -59,8 +59,8 @@ class Bodies(Kept):
     def restore(self, taken: Taken) -> None:
         for body, columns in zip(self._bodies, taken.columns, strict=False):
             body.set_converged_state(columns)
-            if "mass share per" not in taken.numbers and body.origin is not None:
-                body.refer_mass_shares()
+            if "mass share per" not in taken.numbers and body.undeformed.origin is not None:
+                body.undeformed.refer_mass_shares()
 
 
 class Material(Kept):

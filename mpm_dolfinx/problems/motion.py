@@ -121,7 +121,9 @@ class MovingProblem(TimeProblem):
             "Lagrange", element.cell_type, element.degree, discontinuous=True
         )
         space = fem.functionspace(body.mesh, broken)
-        product = body.mass_ratio * ufl.inner(ufl.TrialFunction(space), ufl.TestFunction(space))
+        product = body.undeformed.mass_ratio * ufl.inner(
+            ufl.TrialFunction(space), ufl.TestFunction(space)
+        )
         form = self._mass_form(number, product)
         if body.deletion is not None:
             form = body.deletion.present_only(form)

@@ -265,7 +265,7 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         slope = flow.undeformed.grad(q)
         own = flow.undeformed.volume_ratio * turn
         R: ufl.Form = own * (-stored + dt * ufl.dot(flux, slope)) * body.dx
-        normal, area = flow.undeformed.normal(), body.area_ratio * turn
+        normal, area = flow.undeformed.normal(), body.undeformed.area_ratio * turn
         if pores.drained:
             ds = facet_measure(body, given.facet_tags, pores.drained, "drained")
             inside = flow.conductivity(k) * normal
@@ -325,9 +325,9 @@ class _Undeformed:
 
     def __init__(self, strain: Strain) -> None:
         self._strain, self._body = strain, strain.particles
-        origin = self._origin = self._body.origin
+        origin = self._origin = self._body.undeformed.origin
         self._to_mesh = None if origin is None else ufl.inv(ufl.grad(origin))
-        self.volume_ratio = self._body.volume_ratio
+        self.volume_ratio = self._body.undeformed.volume_ratio
 
     def grad(self, w: Any) -> Any:
         """Return the gradient of a field on the mesh."""

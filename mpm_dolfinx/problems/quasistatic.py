@@ -28,9 +28,9 @@ from ..io.checkpoint import Snapshot
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
 from ..parallel.given import is_number
-from ..particles.domains import separate_nodes
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
+from ..particles.undeformed import separate_nodes
 from ..system.body import StepForce
 from ..system.damage import Damage
 from ..system.pressure import PressureTerm
@@ -461,7 +461,7 @@ class QuasiStaticProblem(ParticleProblem):
         density = Density(1.0 if given.density is None else given.density, body)
         density.require()
         self._density.append((work, density))
-        mass = density.value * body.mass_ratio
+        mass = density.value * body.undeformed.mass_ratio
         acting, of_step = self._in_time(history, supports)
         self._acting.append(acting)
         symmetric = acting.symmetric and not given.pressures
@@ -647,7 +647,7 @@ class QuasiStaticProblem(ParticleProblem):
         """Return ``int density Q_c dX`` of each owned domain of a body, ``(n, k)`` (collective)."""
         body, (work, density) = self.bodies[number], self._density[number]
         space = separate_nodes(body.W)
-        test = body.mass_ratio * ufl.TestFunction(space)
+        test = body.undeformed.mass_ratio * ufl.TestFunction(space)
         vector = fem.assemble_vector(compiled_form(work.mass(density.value, test)))
         return np.asarray(vector.array[space.dofmap.list[: body.num_local]])
 
@@ -658,7 +658,9 @@ class QuasiStaticProblem(ParticleProblem):
         """
         body, (work, density) = self.bodies[number], self._density[number]
         space = separate_nodes(body.W)
-        product = body.volume_ratio * (ufl.TrialFunction(space) * ufl.TestFunction(space))
+        product = body.undeformed.volume_ratio * (
+            ufl.TrialFunction(space) * ufl.TestFunction(space)
+        )
         matrix = fem.assemble_matrix(compiled_form(work.mass(density.value, product)))
         n, k = body.num_local, space.dofmap.list.shape[1]
         return matrix.data[: n * k * k].reshape(n, k, k)

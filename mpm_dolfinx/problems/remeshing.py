@@ -178,7 +178,7 @@ class Remeshing:
         own = snapshot.tables[: len(problem.bodies)]
         moved = ["mesh nodes" in table.columns for table in own]
         if any(
-            body.origin is not None and not new
+            body.undeformed.origin is not None and not new
             for body, new in zip(problem.bodies, moved, strict=True)
         ):
             raise MPMError(
@@ -229,19 +229,24 @@ class Remeshing:
         for number, (body, move, gradient, mass) in enumerate(
             zip(problem.bodies, moves, gradients, masses, strict=True)
         ):
-            nodal, matrices = move.masses(mass), problem.mass_matrices(number)
+            masses_of_nodes, matrices = move.masses(mass), problem.mass_matrices(number)
             gradient = move.of_cells(gradient)
-            if body.mass_share is None:
+            undeformed = body.undeformed
+            if undeformed.mass_share is None:
                 continue
-            halves, reference, shares = move.halves, body.reference, body.mass_shares()
+            halves, reference = move.halves, undeformed.reference
+            shares = undeformed.mass_shares()
             earlier = reference.gradient.copy()
-            earlier[halves] = _earlier(gradient[halves], body.mesh_gradient()[halves])
-            volume = body.mesh_rule().weights / np.linalg.det(np.eye(earlier.shape[-1]) + earlier)
+            rule, gdim = body.geometry.rule(), earlier.shape[-1]
+            nodal = body.of_domains(body.converged_displacement.reshape(-1, gdim))
+            in_mesh = rule.displacement_gradient(nodal)
+            earlier[halves] = _earlier(gradient[halves], in_mesh[halves])
+            volume = rule.weights / np.linalg.det(np.eye(gdim) + earlier)
             volume = np.where(halves, volume.sum(axis=1), reference.volume)
-            averages = np.where(halves[:, None], body.mesh_averages, reference.averages)
-            body.refer(Reference(earlier, volume, averages, reference.domains))
-            shares[halves] = _shares(matrices[halves], nodal[halves])
-            body.set_mass_shares(shares)
+            averages = np.where(halves[:, None], body.geometry.averages, reference.averages)
+            undeformed.refer(Reference(earlier, volume, averages, reference.domains))
+            shares[halves] = _shares(matrices[halves], masses_of_nodes[halves])
+            undeformed.set_mass_shares(shares)
         count = sum(map(len, cuts))
         problem.history.statistics["split_domains"] += count
         return count
@@ -261,7 +266,9 @@ class Remeshing:
         for number, (body, move, mass) in enumerate(
             zip(problem.bodies, moves, masses, strict=True)
         ):
-            body.set_mass_shares(_shares(problem.mass_matrices(number), move.masses(mass)))
+            body.undeformed.set_mass_shares(
+                _shares(problem.mass_matrices(number), move.masses(mass))
+            )
 
     def _require_movable_nodes(self) -> None:
         problem = self._problem
@@ -304,11 +311,13 @@ class Remeshing:
         places = [None] * len(cuts) if positions is None else list(positions)
         moves: list[Remesh] = []
         references = [
-            body.reference if x is None else body.present_reference()
+            body.undeformed.reference if x is None else body.present_reference()
             for body, x in zip(problem.bodies, places, strict=True)
         ]
         shares = [
-            np.ones(body.domain_nodes.shape) if body.mass_share is None else body.mass_shares()
+            np.ones(body.domain_nodes.shape)
+            if body.undeformed.mass_share is None
+            else body.undeformed.mass_shares()
             for body in problem.bodies
         ]
 
@@ -322,7 +331,7 @@ class Remeshing:
                 problem.bodies, moves, snapshot.tables, references, shares, places, strict=False
             ):
                 before = {name: Column(v, table.places[name]) for name, v in table.columns.items()}
-                if body.mass_share is not None:
+                if body.undeformed.mass_share is not None:
                     before |= {**reference.columns(), "mass share": Column(share, "nodes")}
                 if x is not None:
                     before["mesh nodes"] = Column(x, "nodes")
@@ -341,7 +350,7 @@ class Remeshing:
 def _diagonals(body: Particles) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the diagonal of each owned domain, and whether it can be cut along it."""
     diagonal, least = diagonals(body.corner_jacobians())
-    return diagonal, (least > 0.0) & ~body.triangular & ~body.deleted
+    return diagonal, (least > 0.0) & ~body.geometry.triangular & ~body.deleted
 
 
 def _cuts(body: Particles, which: list[int]) -> Cuts:

@@ -16,6 +16,7 @@ from dolfinx import la
 
 from ..background.basis import PointBasis
 from ..background.pairs import CellPairs
+from ..meshes.quadrature import volume_ratio
 from ..particles.particles import Particles
 
 __all__ = ["CellFill", "poorly_filled"]
@@ -32,6 +33,22 @@ def poorly_filled(fill: NDArray[np.float64]) -> NDArray[np.bool_]:
         fill: Of each body, shape ``(c, bodies)``.
     """
     return np.asarray(fill.sum(axis=1) < FILL - SAME)
+
+
+def _points(body: Particles) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return positions ``(n nq, gdim)`` and volumes ``(n nq,)`` of a body's points.
+
+    They are those of the last converged step, without particles that are deleted or of which no
+    node is carried.
+    """
+    nodes, gradient = body.domain_nodes, body.converged_gradient()
+    there = np.ones(len(nodes), dtype=bool)
+    if body.deletion is not None or body.free_nodes is not None:
+        there = ~(body.deleted | body.free[nodes].all(axis=1))
+    rule, corners = body.quadrature, body.node_positions[nodes[there]]
+    points = np.einsum("qk,nki->nqi", rule.shapes, corners)
+    volumes = rule.weights[there] * volume_ratio(gradient[there])
+    return points.reshape(-1, corners.shape[-1]), volumes.ravel()
 
 
 class CellFill(NamedTuple):
@@ -63,7 +80,7 @@ class CellFill(NamedTuple):
         used = np.zeros(count, dtype=np.uint64)
         bit = np.uint64(1) << np.arange(V.dofmap.list.shape[1], dtype=np.uint64)
         for number, body in enumerate(bodies):
-            points, volumes = body.quadrature_points()
+            points, volumes = _points(body)
             at = body.background_basis.at(points)
             for cells, values in _sent(comm, at, at.found, volumes):
                 volume[:, number] += np.bincount(cells, weights=values, minlength=count)

@@ -159,7 +159,7 @@ class DisplacementControl:
         The map of such a half is singular at the corner that is there twice.
         """
         particles = self.particles
-        ring = particles.domain_nodes[particles.triangular][:, RING]
+        ring = particles.domain_nodes[particles.geometry.triangular][:, RING]
         x = particles.W.tabulate_dof_coordinates()[:, : len(self._point)]
         edges = np.linalg.norm(x[ring] - x[np.roll(ring, 1, axis=1)], axis=2)
         kept = (edges.argmin(axis=1)[:, None] + np.arange(1, 4)) % 4

@@ -65,7 +65,7 @@ def carried_after(bodies: Sequence[Particles]) -> Carried:
         here = before if left else after
         seeds = np.zeros(len(free), dtype=bool)
         seeds[nodes] = was & ~stays if left else stays & ~remains
-        quality = np.minimum(*(body.quality(x[body.domain_nodes]) for x in (after, ahead)))
+        quality = np.minimum(*(body.geometry.quality(x[body.domain_nodes]) for x in (after, ahead)))
         seeds[body.domain_nodes[(quality < LEAST_QUALITY) & ~body.deleted]] = True
         if (rest := _without(body, seeds & free, here)) is not None:
             found.append((body, rest))

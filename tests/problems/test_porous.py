@@ -17,6 +17,7 @@ from dolfinx import fem
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import Hencky, LinearElastic, SmallStrainVonMises, VonMises
+from mpm_dolfinx.particles.field import CarriedField
 from mpm_dolfinx.plot.fields import values_of
 
 SOIL = LinearElastic(1e3, 0.25)
@@ -556,7 +557,7 @@ def test_a_rebased_body_goes_on_as_one_that_is_not(options):
             problem.rebase()
         problem.solve(0.4, 0.1)
         (p,) = problem.pore_pressure
-        where = problem.particles.converged_nodes(p.W)
+        where = CarriedField(p).converged_nodes()
         own = p.W.dofmap.list[: problem.particles.num_local]
         values = {
             "pressure": scenes.in_order(problem.particles, p.x.array[own]),

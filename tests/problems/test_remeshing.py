@@ -35,9 +35,9 @@ def test_split_keeps_everything():
     assert problem.history.statistics["split_domains"] == len(which)
     origin = scenes.in_order(p, p.origin_index)
     assert np.array_equal(origin, [*range(total), *which])
-    triangular = scenes.in_order(p, p.triangular)
+    triangular = scenes.in_order(p, p.geometry.triangular)
     assert np.array_equal(np.flatnonzero(triangular), [*which, *range(total, p.num_global)])
-    assert scenes.largest(p.domain_distortion()[p.triangular] - 1.0) == 0.0
+    assert scenes.largest(p.domain_distortion()[p.geometry.triangular] - 1.0) == 0.0
     assert len(p.crossed()) == len(p.inverted()) == len(p.folded()) == 0
     for name, values in kept.items():
         size = np.abs(values).max()
@@ -80,7 +80,9 @@ def test_split_at_first_is_a_body_of_triangles():
     split = bar(scenes.box(*corners, QUADRILATERAL))
     p = split.particles
     split.split(range(p.num_global))
-    split.particles.mass_share.x.array[:] = 1.0  # masses of triangles, not of quadrilaterals
+    split.particles.undeformed.mass_share.x.array[:] = (
+        1.0  # masses of triangles, not of quadrilaterals
+    )
     # Split where undeformed, all are cut along the diagonal from the first corner to the last.
     triangles = bar(scenes.box(*corners, TRIANGLE, diagonal="right"))
     histories = [problem.solve(4) for problem in (split, triangles)]
@@ -171,7 +173,7 @@ def test_what_keeps_a_step_from_converging_is_split():
     )
     p, failing = problem.particles, 0.0
     for step in problem.steps(10):
-        if p.triangular.any() and not failing:
+        if p.geometry.triangular.any() and not failing:
             failing = step.load
         if failing and step.load > failing + 0.01:
             break
@@ -376,7 +378,7 @@ def test_rebase_keeps_the_mass_matrices(cell, degree):
     problem.rebase()
     after = scenes.in_order(problem.particles, problem.mass_matrices(0))
     np.testing.assert_allclose(after, before, rtol=0, atol=1e-13 * np.abs(before).max())
-    shares = problem.particles.mass_shares()
+    shares = problem.particles.undeformed.mass_shares()
     np.testing.assert_allclose(shares, 1.0, rtol=0, atol=1e-10)
 
 
