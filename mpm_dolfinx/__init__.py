@@ -26,6 +26,7 @@ from .problems.dynamic import DynamicParticleProblem, DynamicProblem  # noqa: E4
 from .problems.initial_stress import geostatic  # noqa: E402
 from .problems.particle_problem import ParticleProblem  # noqa: E402
 from .problems.porous import PorousProblem  # noqa: E402
+from .problems.problem import Problem  # noqa: E402
 from .problems.quasistatic import QuasiStaticProblem  # noqa: E402
 from .problems.solver import Solver  # noqa: E402
 from .problems.strength import StrengthReduction, strength_reduction  # noqa: E402
@@ -62,6 +63,7 @@ __all__ = [
     "Particles",
     "PoreFluid",
     "PorousProblem",
+    "Problem",
     "QuasiStaticProblem",
     "Rates",
     "Scheme",

@@ -143,7 +143,7 @@ class Step:
         time: Time at its end: the number of stages before it, and how much of its own is done.
         output: Whether it ends at one of the levels that were asked for (``output_at``), or at the
             end of the run.
-        error: What :meth:`ParticleProblem.error` found at its end, ``None`` where it was not asked.
+        error: What :meth:`Problem.error` found at its end, ``None`` where it was not asked.
         alternations: How often equations of fields were solved in turn with the displacements.
     """
 

@@ -183,7 +183,7 @@ class Adjoint:
         """Do nothing: this is for motions."""
 
     def solved(self, stepper: Stepper) -> Callable[[], None]:
-        """Note a step that is solved; see :meth:`ParticleProblem.record`."""
+        """Note a step that is solved; see :meth:`Problem.record`."""
         problem = self.problem
         self._require_present()
         if stepper.run is not None and stepper.run.goal is not None:

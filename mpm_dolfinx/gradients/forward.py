@@ -36,7 +36,7 @@ from ..materials.base import State
 from ..parallel.magnitudes import norm
 from ..particles.field import CarriedField
 from ..problems.motion import MovingProblem
-from ..problems.particle_problem import ParticleProblem
+from ..problems.problem import Problem
 from ..stepping.loading import Stepper
 from ..system.value_field import ValueField
 from ..transfer.matrix import transfer_matrix
@@ -92,7 +92,7 @@ class StepDerivative:
         nearby: The state at its end, which is held.
     """
 
-    def __init__(self, problem: ParticleProblem, stepper: Stepper, nearby: Nearby) -> None:
+    def __init__(self, problem: Problem, stepper: Stepper, nearby: Nearby) -> None:
         self._problem, self._stepper, self._nearby = problem, stepper, nearby
         self._reduced = stepper.reduced
         self._fields = self._reduced.fields

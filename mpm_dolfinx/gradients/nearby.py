@@ -20,7 +20,7 @@ from ..materials.base import State
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..problems.motion import MovingProblem
-from ..problems.particle_problem import ParticleProblem
+from ..problems.problem import Problem
 from ..system.mass import NodalMass
 from .parameters import Parameter
 
@@ -54,7 +54,7 @@ class Rates:
     moduli: dict[int, Array]
 
 
-def followed(problem: ParticleProblem) -> list[Particles | CarriedField]:
+def followed(problem: Problem) -> list[Particles | CarriedField]:
     """Return the motions of a problem: of its bodies, then of their other fields."""
     return [*problem.bodies, *problem.carried]
 
@@ -66,7 +66,7 @@ class Nearby:
         problem: The problem.
     """
 
-    def __init__(self, problem: ParticleProblem) -> None:
+    def __init__(self, problem: Problem) -> None:
         self._problem = problem
         self._moving = problem if isinstance(problem, MovingProblem) else None
         # whether forces that stay through a step depend on what it begins with

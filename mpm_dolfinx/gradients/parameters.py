@@ -18,7 +18,7 @@ from .. import _compat
 from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree
 from ..materials.base import Material, State
-from ..problems.particle_problem import ParticleProblem
+from ..problems.problem import Problem
 from ..problems.quasistatic import QuasiStaticProblem
 from ..reals import as_reals
 
@@ -137,7 +137,7 @@ class _OfLaw(Parameter):
         points.assume(self._law, self._parameter, value + amount if amount else value)
 
 
-def as_parameter(given: Any, problem: ParticleProblem, scale: float | None) -> Parameter:
+def as_parameter(given: Any, problem: Problem, scale: float | None) -> Parameter:
     """Return the parameter that a user names (collective).
 
     Args:
@@ -174,7 +174,7 @@ def as_parameter(given: Any, problem: ParticleProblem, scale: float | None) -> P
 
 
 def _along(
-    thing: fem.Constant | fem.Function, direction: Any, problem: ParticleProblem, scale: Any
+    thing: fem.Constant | fem.Function, direction: Any, problem: Problem, scale: Any
 ) -> Parameter:
     """Return a Constant or Function along a direction as a parameter (collective)."""
     function = isinstance(thing, fem.Function)
@@ -215,7 +215,7 @@ def _along(
     return _Values(values, along, name, scale, of_law, outside)
 
 
-def _is_in_none(thing: fem.Constant | fem.Function, problem: ParticleProblem) -> bool:
+def _is_in_none(thing: fem.Constant | fem.Function, problem: Problem) -> bool:
     """Return whether no form has what is in no material, load or condition, where that is known.
 
     Laws of the user's own may hold whatever they like, and initial stresses are of no form.
@@ -233,7 +233,7 @@ def _is_in_none(thing: fem.Constant | fem.Function, problem: ParticleProblem) ->
     return all(constant is not thing for constant in problem.constants())
 
 
-def largest(sizes: Any, problem: ParticleProblem) -> float:
+def largest(sizes: Any, problem: Problem) -> float:
     """Return the largest of sizes on all ranks, infinite where one is no number (collective)."""
     comm: MPI.Comm = problem.bodies[0].mesh.comm
     known = np.where(np.isfinite(sizes), sizes, np.inf)

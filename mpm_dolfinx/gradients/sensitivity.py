@@ -17,7 +17,7 @@ from ..errors import MPMError, agree
 from ..parallel.boundary import collective, of_user
 from ..parallel.given import as_positive, require_same
 from ..problems.motion import MovingProblem
-from ..problems.particle_problem import ParticleProblem
+from ..problems.problem import Problem
 from ..problems.quasistatic import QuasiStaticProblem
 from ..reals import as_reals
 from ..stepping.control import Run
@@ -72,7 +72,7 @@ class Sensitivity:
     @collective("parameters")
     def __init__(
         self,
-        problem: ParticleProblem,
+        problem: Problem,
         parameters: Sequence[Any],
         scales: Sequence[float] | None = None,
     ) -> None:
@@ -144,7 +144,7 @@ class Sensitivity:
     # -- What follows the run --------------------------------------------------------------
 
     def solved(self, stepper: Stepper) -> Callable[[], None]:
-        """Find the derivatives of a step that is solved; see :meth:`ParticleProblem.record`.
+        """Find the derivatives of a step that is solved; see :meth:`Problem.record`.
 
         Raises:
             MPMError: There are none.
@@ -281,7 +281,7 @@ def _numbers(value: Any) -> Array:
         ) from None
 
 
-def require_followed(problem: ParticleProblem, who: str) -> None:
+def require_followed(problem: Problem, who: str) -> None:
     """Raise an error unless the derivative of a problem's steps has all that acts in them.
 
     Args:
@@ -291,7 +291,7 @@ def require_followed(problem: ParticleProblem, who: str) -> None:
     Raises:
         MPMError: Something acts that has no part in it yet.
     """
-    if not isinstance(problem, ParticleProblem):
+    if not isinstance(problem, Problem):
         raise MPMError(f"{who} follows a problem, not a {type(problem).__name__}.")
     what = next(iter(_not_in(problem)), None)
     if what is not None:
@@ -300,7 +300,7 @@ def require_followed(problem: ParticleProblem, who: str) -> None:
         raise MPMError(f"{who} follows a problem from its first step on; make it before.")
 
 
-def _not_in(problem: ParticleProblem) -> list[str]:
+def _not_in(problem: Problem) -> list[str]:
     """Return the parts of a problem that have none in the derivative, in words."""
     bodies, kind = problem.bodies, type(problem)
     hooks = ("evaluate", "commit", "roll_back")
@@ -321,7 +321,7 @@ def _not_in(problem: ParticleProblem) -> list[str]:
         "bodies whose domains are split": any(b.on_distortion == "split" for b in bodies),
         "rebased bodies": any(b.undeformed.differs for b in bodies),
         "hooks of a subclass (evaluate, commit, roll_back)": any(
-            getattr(kind, name) is not getattr(ParticleProblem, name) for name in hooks
+            getattr(kind, name) is not getattr(Problem, name) for name in hooks
         ),
         "Functions at quadrature points in a residual": bool(problem.data_at_points()),
     }

@@ -41,7 +41,7 @@ class Kept(Hooked):
     """Something that goes with a problem: split, moved to other ranks, saved and restored.
 
     A heir says what it is and where it lives, and takes it again; give it to
-    :meth:`ParticleProblem.keep`. All calls are collective.
+    :meth:`Problem.keep`. All calls are collective.
 
     Attributes:
         key: Name, which is the prefix of what is its own in a checkpoint.

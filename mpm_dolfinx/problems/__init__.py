@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """The problems that users make, and what they are made of.
 
+:class:`~mpm_dolfinx.problems.problem.Problem` is what all have in common.
 :class:`~mpm_dolfinx.problems.particle_problem.ParticleProblem` is written in UFL,
 :class:`~mpm_dolfinx.problems.quasistatic.QuasiStaticProblem` in materials and loads,
 :class:`~mpm_dolfinx.problems.dynamic.DynamicParticleProblem` and

@@ -34,6 +34,7 @@ from .motion import (
     rayleigh_of,
     require_motion,
 )
+from .particle_problem import ParticleProblem
 from .parts import Contribution
 from .quasistatic import QuasiStaticProblem
 from .stages import join
@@ -228,7 +229,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         return work.mass(density.value, product)
 
 
-class DynamicParticleProblem(MovingProblem):
+class DynamicParticleProblem(MovingProblem, ParticleProblem):
     """Motion of bodies whose forces are a UFL residual: a :class:`ParticleProblem` with inertia.
 
     The residual has no inertia itself; the force of a step is the mean of what it is at the step's

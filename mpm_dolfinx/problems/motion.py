@@ -242,7 +242,7 @@ class MovingProblem(TimeProblem):
 
         That is the mean over the step, but with ``scheme="euler"``, as is that of a contact;
         supports of :mod:`mpm_dolfinx.boundary` have that at its end. See
-        :meth:`ParticleProblem.reaction`.
+        :meth:`Problem.reaction`.
         """
         force = super().reaction(bc)
         if isinstance(bc, Support | Contact | RigidBody):

@@ -39,8 +39,8 @@ from ..particles.particles import Particles
 from ..reals import as_reals
 from ..system.term import PointMaterial
 from .body import Body, PoreFluid, as_given
-from .particle_problem import Law
 from .parts import Contribution
+from .problem import Law
 from .quasistatic import QuasiStaticProblem
 from .through_time import TimeProblem
 

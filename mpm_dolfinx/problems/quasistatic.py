@@ -40,8 +40,8 @@ from ..system.values import FieldTerm
 from .arguments import as_bodies, as_supports, as_terms, require_no_conditions_on_bodies
 from .body import INITIAL, Body, as_given
 from .initial_stress import initial_stress_at_points
-from .particle_problem import Law, ParticleProblem
 from .parts import Contribution, Parts
+from .problem import Law, Problem
 from .remeshing import Remeshing, as_indices
 from .setup import Setup
 from .solver import Solver, as_solver
@@ -54,7 +54,7 @@ __all__ = ["QuasiStaticProblem"]
 CROWDED = 0.5
 
 
-class QuasiStaticProblem(ParticleProblem):
+class QuasiStaticProblem(Problem):
     """Equilibrium of bodies with materials, under body force, tractions and supports.
 
     ``int P : grad v dX - load (int density b . v dX + int t . v dS) = 0`` on the undeformed
@@ -127,7 +127,7 @@ class QuasiStaticProblem(ParticleProblem):
         self._left: dict[int, tuple[fem.Function, NDArray[np.float64]]] = {}
         self._remeshing = Remeshing(self)
         one = particles if isinstance(bodies, list | tuple) else particles[0]
-        self._begin(one, bcs, background, as_solver(solver), terms, self._remeshing)
+        super().__init__(one, bcs, background, as_solver(solver), terms, mender=self._remeshing)
         self._carry_stress([body.initial_stress for body in given])
         for body in particles:
             _warn_of_hourglass(body)

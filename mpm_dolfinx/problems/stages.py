@@ -3,7 +3,7 @@
 """Changes of a stage: new input, cells that are taken away, bodies that come.
 
 Each change is made in the same state: displacement, stress and history stay where they were
-(:meth:`ParticleProblem.begin_stage`).
+(:meth:`Problem.begin_stage`).
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ class Change(Protocol):
 
 
 class Renewable(Protocol):
-    """A problem that can be made again in the same state; see :class:`ParticleProblem`.
+    """A problem that can be made again in the same state; see :class:`Problem`.
 
     Attributes:
         bodies: The bodies.
@@ -131,7 +131,7 @@ class Staging:
         return problem
 
     def begin(self, name: str, change: Change, sudden: bool) -> None:
-        """Begin a stage: see :meth:`ParticleProblem.begin_stage` (collective)."""
+        """Begin a stage: see :meth:`Problem.begin_stage` (collective)."""
         problem, state, release = self._problem, self._state, self._release
         if sudden and release.remaining > 0.0:
             raise MPMError(

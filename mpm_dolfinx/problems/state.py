@@ -35,7 +35,7 @@ __all__ = ["ProblemState", "Stateful"]
 
 
 class Stateful(Protocol):
-    """A problem that has a state; see :class:`ParticleProblem` for each.
+    """A problem that has a state; see :class:`Problem` for each.
 
     Attributes:
         bodies: The bodies.
@@ -178,7 +178,7 @@ class ProblemState:
         """Return all that goes with the problem, and what knows how far it is.
 
         Args:
-            functions: As in :meth:`ParticleProblem.save`.
+            functions: As in :meth:`Problem.save`.
             whole: Whether data at points must be among them.
 
         Raises:
@@ -233,7 +233,7 @@ class ProblemState:
         """Return the state at the last converged step (collective).
 
         Args:
-            functions: As in :meth:`ParticleProblem.save`.
+            functions: As in :meth:`Problem.save`.
 
         Raises:
             MPMError: Functions that cannot be kept, or that are missing.
@@ -264,7 +264,7 @@ class ProblemState:
 
         Args:
             snapshot: The state, one of this problem on its present meshes.
-            functions: As in :meth:`ParticleProblem.restore`.
+            functions: As in :meth:`Problem.restore`.
             source: What to call it in an error.
 
         Raises:
@@ -276,11 +276,11 @@ class ProblemState:
         return standing.progress.run
 
     def save(self, path: Path, functions: Sequence[fem.Function]) -> None:
-        """Write a checkpoint: see :meth:`ParticleProblem.save`."""
+        """Write a checkpoint: see :meth:`Problem.save`."""
         checkpoint.write(self._comm, path, self.capture(functions))
 
     def restore(self, path: Path, functions: Sequence[fem.Function], resume: bool) -> None:
-        """Return to the state of a checkpoint: see :meth:`ParticleProblem.restore`."""
+        """Return to the state of a checkpoint: see :meth:`Problem.restore`."""
         problem = self._problem
         snapshot, source = checkpoint.read(self._comm, path), f"The checkpoint '{path}'"
         with agree(self._comm):

@@ -16,14 +16,14 @@ from ..parallel.boundary import collective, of_user
 from ..parallel.given import as_positive
 from ..stepping.progress import with_bar
 from ..tolerances import NEGLIGIBLE
-from .particle_problem import ParticleProblem
+from .problem import Problem
 
 __all__ = ["TimeProblem"]
 
 type Path_ = Callable[[float], None]
 
 
-class TimeProblem(ParticleProblem):
+class TimeProblem(Problem):
     """A problem whose steps have a duration. Loads act in full unless a path says otherwise."""
 
     _predicts = False

@@ -31,7 +31,7 @@ class Control(Protocol):
     """Chooses the end of the next step between 0 and 1.
 
     Attributes:
-        steps: What :meth:`ParticleProblem.solve` was given.
+        steps: What :meth:`Problem.solve` was given.
     """
 
     steps: Any

@@ -234,7 +234,7 @@ class Stepper:
         control: DisplacementControl | None,
         span: tuple[float, float] | None = None,
     ) -> Iterator[Step]:
-        """Apply the whole load: see :meth:`ParticleProblem.steps`.
+        """Apply the whole load: see :meth:`Problem.steps`.
 
         Args:
             steps: As there; ``"auto"`` with what goes with it is an :class:`ErrorControl`.
@@ -422,7 +422,7 @@ class Stepper:
         raise KeyboardInterrupt from None
 
     def step(self) -> Step:
-        """Make one increment to the present values: see :meth:`ParticleProblem.step`."""
+        """Make one increment to the present values: see :meth:`Problem.step`."""
         owner = self.owner
         with held() as hold:
             before = self.run, self.converged.parameter

@@ -1,0 +1,890 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What all problems have: bodies, steps, results, and a state that goes with them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ufl
+from dolfinx import fem
+
+from ..boundary.supports import Support
+from ..constitutive.points import MaterialPoints
+from ..contact.contact import Contact
+from ..contact.rigid_body import RigidBody
+from ..errors import MPMError, agree, warn
+from ..history import History, Step
+from ..io import checkpoint
+from ..io.files import as_path
+from ..io.series import Output
+from ..io.snapshot import Kept, spaces_of
+from ..parallel.boundary import Hooked, by_itself, collective
+from ..parallel.garbage import Cleaner
+from ..parallel.given import is_number, require_same
+from ..particles.field import CarriedField, ParticleField
+from ..particles.particles import Particles
+from ..solvers.newton import NewtonSolver
+from ..solvers.strategies import chosen
+from ..stepping.automatic import ErrorControl
+from ..stepping.diagnosis import crossed
+from ..stepping.displacement_control import DisplacementControl
+from ..stepping.loading import Mender, Recorder, Stepper
+from ..stepping.progress import with_bar
+from ..system.body import BodyTerm
+from ..system.conditions import force_at
+from ..system.predictor import Predictor
+from ..system.reduced import ReducedSystem
+from ..system.release import Release
+from ..system.term import PointMaterial, Term, UserTerm
+from ..system.value_field import ValueField
+from ..system.values import FieldTerm
+from .arguments import (
+    as_bodies,
+    as_conditions,
+    as_terms,
+    by_space,
+)
+from .errors import Errors, estimated
+from .parts import Contribution, Parts
+from .solver import Solver
+from .staging import Change, Staging
+from .state import ProblemState
+from .summary import in_one_line, on_a_screen
+
+__all__ = ["Law", "Problem"]
+
+#: What goes with automatic steps, and is of no meaning to others.
+AUTOMATIC = {"tolerance": 1e-2, "output_at": (), "first_step": 0.05, "length": None}
+
+
+type Law = tuple[str, dict[str, Any]]
+"""Name of a material, and its parameters: numbers, or indices and values of points."""
+
+
+class Problem(Hooked):
+    """Find the displacement of particles at which forces balance, in load steps.
+
+    What all problems have is here. Of what their bodies are made is told by
+    :class:`ParticleProblem` in UFL, by :class:`QuasiStaticProblem` with materials, and by those
+    through time. Each step's increment lives in the background space: ``d = d_n + T u``, residual
+    ``T^T R`` and tangent ``T^T J T``.
+
+    Args:
+        particles: The body or bodies.
+        bcs: Dirichlet conditions.
+        background: Form on the background.
+        solver: How it is solved.
+        terms: What else acts on the bodies.
+        fields: Unknowns besides displacements, with residuals of their own.
+        mender: What changes meshes between steps, if anything.
+
+    Attributes:
+        particles: The body or bodies, as given.
+        bodies: The bodies, as a list.
+        reduced: Residual and tangent in the free dofs of V.
+        history: Steps, counters and seconds; filled as a run goes on.
+        bcs: The Dirichlet conditions.
+        terms: As given.
+        fields: As given.
+        body_terms: What each body is made of and loaded by.
+    """
+
+    def __init__(
+        self,
+        particles: Particles | Sequence[Particles],
+        bcs: Sequence[fem.DirichletBC],
+        background: ufl.Form | Sequence[ufl.Form] | None,
+        solver: Solver,
+        terms: Sequence[Term],
+        fields: Sequence[ParticleField] = (),
+        mender: Mender | None = None,
+    ) -> None:
+        self.particles, self.fields = particles, fields
+        self.bodies = as_bodies(particles)
+        spaces = [*spaces_of(self.bodies), *self._spaces_of_fields()]
+        self.bcs = as_conditions(bcs, spaces)
+        self.terms = as_terms(terms, self.bodies)
+        self.history = History()
+        self._comm: MPI.Comm = self.bodies[0].V.mesh.comm
+        self._background, self._how = background, solver
+        self._output = Output()
+        self._held = Release()
+        self._stepper = Stepper(self, self._held, mender)
+        self._state = ProblemState(self, self._stepper, self._held, self._output, self._history_at)
+        self._staging = Staging(self, self._state, self._stepper, self._held)
+        self.body_terms: list[BodyTerm] = []
+        self._field_terms: Sequence[FieldTerm] = ()
+        self._constants: list[fem.Constant] = []
+        self._data: set[fem.Function] = set()
+        self._reign = object()
+        self._build()
+        self._state.keep_terms()
+
+    def _build(self) -> None:
+        """Make the system and its solver for the present meshes of the bodies (collective).
+
+        It is called again whenever these are other ones.
+        """
+        meshes = [group[0].V.mesh for group in by_space(self.bodies)]
+        clean_up = Cleaner(self._comm, [*meshes, *(body.mesh for body in self.bodies)])
+        try:
+            self._build_system(clean_up)
+        except BaseException:
+            clean_up.end()  # what is half built is freed by the next problem
+            raise
+        self._govern()
+
+    def _let_take_part(self, materials: Sequence[PointMaterial | None]) -> None:
+        """Tell terms of bodies and materials (collective)."""
+        for term in self.terms:
+            term.take_part(self._state.number(term), self.bodies, materials)
+
+    def _build_system(self, clean_up: Cleaner) -> None:
+        """Make the system and its solver (collective).
+
+        Args:
+            clean_up: Frees what is out of use.
+        """
+        how = self._how
+        contributions = self._contributions()
+        parts = Parts(
+            self.bodies,
+            contributions,
+            self.fields,
+            self._of_fields,
+            self._background,
+            how,
+            self._entity_maps,
+            [field for term in self.terms for field in term.solves],
+        )
+        parts.require_own_fields()
+        self.body_terms = parts.body_terms()
+        self._field_terms = self._couplings(parts)
+        carried = self.carried
+        self._let_take_part([given.material for given in contributions])
+        fields = [
+            *parts.displacement_fields(self.bcs, self._keeps_joints),
+            *(ValueField(group, self.bcs) for group in by_space(carried)),
+        ]
+        statistics = self.history.statistics
+        self._held.follow([*self.bodies, *carried], [field.V for field in fields])
+        reduced = ReducedSystem(
+            [*parts.moving, *carried],
+            fields,
+            [*self.body_terms, *self._field_terms, *self.terms, UserTerm(self), self._held],
+            statistics,
+            Predictor(how.predictor and self._predicts),
+        )
+        degree = max(body.V.ufl_element().degree for body in self.bodies)
+        newton = NewtonSolver(
+            self._comm,
+            how.petsc_options_prefix,
+            how.petsc_options or {},
+            all(given.symmetric for given in contributions)
+            and all(term.symmetric for term in (*self._field_terms, *self.terms)),
+            how.shift,
+            how.line_search,
+            statistics,
+            self.bodies[0].V.mesh.geometry.dim,
+            chosen(how.linear, degree),
+        )
+        self._stepper.follow(reduced, newton, clean_up)
+        for body in self.bodies:
+            known = [*self.fields, *parts.alternating]
+            body.attach_unknowns([one for one in known if one.particles is body])
+        self._constants, self._data = parts.constants(), parts.data_at_points()
+
+    def _contributions(self) -> list[Contribution]:
+        """Return the contribution of each body to the system, on its present mesh (collective)."""
+        raise NotImplementedError
+
+    #: How body meshes are related to others that forms have Functions on.
+    _entity_maps: Any = None
+    #: Whether bodies that bear on each other are kept together where the background would let go.
+    _keeps_joints = True
+    #: Whether steps may start from an extrapolation of those before.
+    _predicts = True
+    #: Whether a step ends in equilibrium.
+    _at_rest = True
+    #: Residuals of the fields.
+    _of_fields: Sequence[ufl.Form] = ()
+
+    def _spaces_of_fields(self) -> list[fem.FunctionSpace]:
+        """Return the background spaces of fields, in the order in which they come first."""
+        spaces: list[fem.FunctionSpace] = []
+        for field in self.fields:
+            if all(field.background is not V for V in spaces):
+                spaces.append(field.background)
+        return spaces
+
+    def _couplings(self, parts: Parts) -> Sequence[FieldTerm]:
+        """Return the terms that have unknowns besides displacements (collective).
+
+        Args:
+            parts: What the system is put together from.
+        """
+        return parts.field_terms()
+
+    def __copy__(self) -> NoReturn:
+        """Raise an error: a copy would have the bodies and their state in common."""
+        raise MPMError("A problem cannot be copied; make another one, of particles of its own.")
+
+    def __deepcopy__(self, memo: Any) -> NoReturn:
+        """Raise an error: a problem cannot be copied."""
+        self.__copy__()
+
+    def __del__(self) -> None:
+        """Leave PETSc's objects to the next clean-up; at the program's end PETSc drops them.
+
+        The meshes are let go of here too: see :meth:`Particles.__del__`.
+        """
+        if sys.is_finalizing():
+            return
+        if hasattr(self, "_stepper"):
+            self._release()
+        vars(self).clear()
+
+    def __repr__(self) -> str:
+        return in_one_line(self)
+
+    @collective()
+    def summary(self) -> str:
+        """Return a summary of the problem and of its run, a screen of text (collective).
+
+        Bodies with their materials, how far they have moved and yielded, background, solver, steps,
+        linear solves and seconds (mean of the ranks): ``print(problem.summary())``.
+        """
+        return on_a_screen(self, self._comm, self._how.in_words(), self._made_of())
+
+    def _made_of(self) -> list[str]:
+        """Return a description of each body: its material and its loads."""
+        raise NotImplementedError
+
+    def _release(self) -> None:
+        """Let go of what was built for the present meshes."""
+        for body in self.bodies:
+            body.forget_transfer()
+        for term in self._field_terms:
+            for field in term.fields:
+                field.forget_transfer()
+        self.body_terms = []
+        self._field_terms = []
+        self._stepper.release()
+
+    def renew(
+        self,
+        change: Callable[[], None],
+        carry: Callable[[checkpoint.Snapshot], checkpoint.Snapshot],
+        undo: Callable[[], None] | None = None,
+    ) -> None:
+        """Make the problem again, in the same state: on other meshes, of other things (collective).
+
+        Args:
+            change: Changes what the problem is made of: gives the particles their meshes.
+            carry: Makes of the state before the one of the problem as it is then.
+            undo: Takes the change back where something fails, and all stays as it was.
+        """
+        snapshot = self._state.capture()
+        seconds = self.history.statistics.seconds
+        self._release()
+        try:
+            change()
+            self._build()
+            self._state.adopt(carry(snapshot))
+        except BaseException:
+            if undo is not None:
+                undo()
+                self._release()
+                self._build()
+                self._state.adopt(snapshot)
+            raise
+        self.history.statistics.update(seconds)
+
+    # -- Stages ---------------------------------------------------------------------------
+
+    def begin_stage(self, name: str, change: Change, sudden: bool) -> None:
+        """Change what the problem is, in the same state, and let the next run be a stage.
+
+        What acts at once is held back and goes over the next run, unless the stage is sudden. Where
+        it cannot be changed all stays as it was (collective).
+
+        Args:
+            name: Name of the stage.
+            change: What changes.
+            sudden: Whether nothing is held back.
+
+        Raises:
+            MPMError: What is to be changed does not go together.
+        """
+        self._require_governing()
+        if not isinstance(name, str):
+            raise MPMError(f"The name of a stage must be a string, not {name!r}.")
+        self._staging.begin(name, change, bool(sudden))
+
+    @property
+    def held_back(self) -> float:
+        """How much of what the last stage changes is held back yet, from 1 to 0."""
+        return self._held.remaining
+
+    # -- PETSc objects --------------------------------------------------------------------
+
+    @property
+    def reduced(self) -> ReducedSystem:
+        """Residual and tangent in the free dofs of V."""
+        return self._stepper.reduced
+
+    @property
+    def solver(self) -> PETSc.SNES:
+        """The nonlinear solver."""
+        return self._stepper.newton.snes
+
+    @property
+    def A(self) -> PETSc.Mat | None:
+        """The reduced tangent of the last Newton iteration."""
+        return self._stepper.newton.K
+
+    @property
+    def b(self) -> PETSc.Vec | None:
+        """The reduced residual that was evaluated last."""
+        return self._stepper.newton.F
+
+    @property
+    def x(self) -> PETSc.Vec | None:
+        """The free dofs of the last step's increment."""
+        return self._stepper.newton.x
+
+    # -- Which problem governs the bodies -----------------------------------------------------
+
+    def _govern(self) -> None:
+        """Take the bodies over from problems that were made of them before."""
+        self._reign = object()
+        for body in self.bodies:
+            body.governed_by = self._reign
+
+    @property
+    def governs(self) -> bool:
+        """Whether no later problem was made of the bodies."""
+        return all(body.governed_by is self._reign for body in self.bodies)
+
+    def _require_governing(self) -> None:
+        """Raise an error where a later problem has taken a body over."""
+        if not self.governs:
+            raise MPMError(
+                "Another problem was made of these particles since, and governs them now; go on "
+                "with that one, or give each problem particles of its own."
+            )
+
+    # -- Loading --------------------------------------------------------------------------
+
+    @collective()
+    def solve(
+        self,
+        steps: int | str = 1,
+        update: Callable[[float], None] | None = None,
+        progress: bool = False,
+        repartition: float | None = None,
+        control: DisplacementControl | None = None,
+        *,
+        tolerance: float = 1e-2,
+        output_at: Sequence[float] = (),
+        first_step: float = 0.05,
+        length: float | None = None,
+    ) -> History:
+        """Apply the whole load.
+
+        Args:
+            steps: Number of equal load steps; a step that fails is halved, none is larger. With
+                ``"auto"`` their sizes are chosen by an estimate of their error, and steps
+                with too large a one are taken back.
+            update: The user's path: ``update(t)`` sets values of Dirichlet conditions,
+                Constants and Functions to their totals at t in (0, 1]. It may be called again
+                with a smaller t after a failure. The load factor goes from its present value
+                to 1 in proportion to t unless it sets another.
+            progress: Whether rank 0 shows a progress bar.
+            repartition: Share of the particles that makes them move to other ranks after a
+                step (:meth:`QuasiStaticProblem.repartition`); ``None`` leaves them.
+            control: A displacement of a body that goes to a value in these steps; the load
+                factor is found for each, which may fall again. Dirichlet values stay.
+            tolerance: With ``"auto"``: error of the displacement at the end that is aimed at,
+                relative to the motion of the run, as root mean squares over the nodes.
+            output_at: With ``"auto"``: shares t of the run in (0, 1] at which a step is to end, to
+                the last bit; ``step.output`` says so.
+            first_step: With ``"auto"``: size of the first step, at most 0.05 of the run.
+            length: With ``"auto"``: a motion to be expected, by which the error is measured instead
+                of the motion so far.
+
+        Returns:
+            The history of the run.
+
+        Raises:
+            MPMError: The run cannot go on; the state is that of the last converged step. With
+                ``outside="stop"`` a particle that leaves the background is no error: the run
+                ends, ``history.stopped`` and a warning say why.
+        """
+        path = self.steps(
+            steps,
+            update,
+            repartition,
+            control,
+            tolerance=tolerance,
+            output_at=output_at,
+            first_step=first_step,
+            length=length,
+        )
+        number = 1 if isinstance(steps, str) else steps
+        for _ in with_bar(path, number, lambda _: self._stepper.share) if progress and self._comm.rank == 0 else path:
+            pass
+        return self.history
+
+    @collective()
+    def steps(
+        self,
+        steps: int | str,
+        update: Callable[[float], None] | None = None,
+        repartition: float | None = None,
+        control: DisplacementControl | None = None,
+        *,
+        tolerance: float = 1e-2,
+        output_at: Sequence[float] = (),
+        first_step: float = 0.05,
+        length: float | None = None,
+    ) -> Iterator[Step]:
+        """Apply the whole load, one converged step at a time.
+
+        After :meth:`restore` it goes on with the run that was interrupted.
+
+        Args:
+            steps: As in :meth:`solve`.
+            update: As in :meth:`solve`.
+            repartition: As in :meth:`solve`.
+            control: As in :meth:`solve`.
+            tolerance: As in :meth:`solve`.
+            output_at: As in :meth:`solve`.
+            first_step: As in :meth:`solve`.
+            length: As in :meth:`solve`.
+
+        Yields:
+            Each converged step.
+
+        Raises:
+            MPMError: As in :meth:`solve`.
+        """
+        self._require_governing()
+        automatic = {
+            "tolerance": tolerance,
+            "output_at": output_at,
+            "first_step": first_step,
+            "length": length,
+        }
+        if isinstance(steps, str) and steps == "auto":
+            chosen: Any = ErrorControl(tolerance, output_at, first_step, length)
+        elif automatic != AUTOMATIC:
+            raise MPMError(
+                "tolerance=, output_at=, first_step= and length= are for steps='auto', not for "
+                f"steps={steps!r}."
+            )
+        else:
+            chosen = steps
+        return self._stepper.steps(chosen, update, repartition, control)
+
+    def _share(self, _: Step) -> float:
+        """Return how much of the run is done."""
+        return self._stepper.share
+
+    @collective()
+    def step(self) -> Step:
+        """Make one increment to the present values of loads and conditions.
+
+        Loads count times the load factor, which is that of the last step unless
+        ``particles.load`` is set, and so do displacements of supports before the first path;
+        Dirichlet values, and supports after a path, are taken as they are.
+
+        Returns:
+            The converged step.
+
+        Raises:
+            MPMError: It does not converge; the state is that of the last converged step.
+        """
+        self._require_governing()
+        return self._stepper.step()
+
+    # -- Results --------------------------------------------------------------------------
+
+    @collective()
+    def reaction(self, bc: fem.DirichletBC | Support | Contact | RigidBody) -> NDArray[np.float64]:
+        """Return the force of a support on the body at the last converged load.
+
+        The force at each dof of the condition counts once, however often the condition names
+        it; where two conditions share a dof, it is in the force of both.
+
+        Args:
+            bc: One of the problem's Dirichlet conditions, a support of
+                :mod:`mpm_dolfinx.boundary` on one of its bodies, or one of its contacts.
+
+        Returns:
+            Force, shape ``(gdim,)``, the same on all ranks.
+
+        Raises:
+            MPMError: The condition is not one of the problem's.
+        """
+        known: Sequence[Any]
+        if isinstance(bc, Contact | RigidBody):
+            what, known = "contacts", self.terms
+        elif isinstance(bc, Support):
+            what, known = "supports", [bc for body in self.bodies if bc.particles is body]
+        else:
+            what, known = "Dirichlet conditions", self.bcs
+        place = next((number for number, one in enumerate(known) if one is bc), None)
+        with agree(self._comm):
+            if place is None:
+                raise MPMError(f"reaction() needs one of the {what} of this problem.")
+        require_same(self._comm, bc=f"number {place} of the {what}")
+        if isinstance(bc, Contact | RigidBody | Support):
+            return bc.reaction
+        number, field = next(
+            (number, field)
+            for number, field in enumerate(self.reduced.fields)
+            if any(bc is known for known in field.conditions)
+        )
+        return force_at(bc, self._stepper.converged.reaction(number), field.V)
+
+    @collective()
+    def error(self) -> float:
+        """Return an estimate of the error of the last converged step (collective).
+
+        In equilibrium the background sees no force: ``T^T R = 0``. R itself, on the bodies' own
+        nodes, is what it could not balance; its energy, node by node, tells how far the bodies'
+        own finite elements are from here. It is kept as ``error`` of the last of
+        ``history.steps``. Loads, conditions and obstacles count as they are set now, so ask before
+        they are changed for the next step.
+
+        Not seen is what these elements cannot do themselves (shear or volumetric locking, a mesh
+        too coarse for the load), nor the error of load steps, for which ``steps="auto"`` has a
+        tolerance. A body of finite elements has none that it sees.
+
+        Returns:
+            Energy norm of the error over that of the deformation.
+
+        Raises:
+            MPMError: A motion, or a flow of water, which is in no equilibrium of its own, or
+                particles that do not hang together.
+        """
+        found = self._errors().total(self.bodies)
+        steps = self.history.steps
+        if steps:
+            steps[-1] = replace(steps[-1], error=found)
+        return found
+
+    @collective()
+    def error_of_particles(self, body: int = 0) -> NDArray[np.float64]:
+        """Return where :meth:`error` comes from, for pictures (collective).
+
+        Args:
+            body: Number of the body.
+
+        Returns:
+            Share of each particle of this rank, shape ``(n,)``; the squares of all bodies' add
+            up to the square of the error.
+
+        Raises:
+            MPMError: As for :meth:`error`, or there is no such body.
+        """
+        with agree(self._comm):
+            if not isinstance(body, int | np.integer) or body not in range(len(self.bodies)):
+                raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
+        return self._errors().of_particles(body, self.bodies[body])
+
+    def _errors(self) -> Errors:
+        if not self._at_rest:
+            raise MPMError(
+                f"A {type(self).__name__} is in no equilibrium of which an error could be told; "
+                "error() is for problems at rest."
+            )
+        alone = next((body for body in self.bodies if not body.shares_nodes), None)
+        if alone is not None:
+            raise MPMError(
+                f"Particles of method {alone.method!r} do not hang together, so that nothing tells "
+                "what their background cannot do; error() is for 'cpdi2' and finite elements."
+            )
+        self._require_governing()
+        return estimated(self.bodies, self.body_terms, self.reduced)
+
+    @collective()
+    def write(self, path: str | Path, time: float | None = None) -> None:
+        """Add the present state to a time series for ParaView (collective).
+
+        The domains are written at their current positions, with displacement, volume ratio
+        and, where there is a material, Cauchy stress, pressure and plastic strain; of a body with
+        water effective and total stress and the pore pressure; unknowns besides by their names.
+
+        Args:
+            path: A ``.pvd`` file; the first call replaces it, unless the problem was restored
+                from a checkpoint of the run that wrote it: then the series goes on, without
+                what is later than the checkpoint. With several bodies each has its own, numbered
+                from 0: ``name_0.pvd``. Each state has one file besides, ``name_000000.vtu``.
+            time: Time of the state, ``history.time`` by default. It replaces a state of the same
+                time that was written last.
+
+        Raises:
+            MPMError: The name does not end in ``.pvd``, the time lies before that of the state
+                that was written last, or a file cannot be written, or not all of it.
+        """
+        self._require_governing()
+        moment = self.history.time if time is None else time
+        with agree(self._comm):
+            if not is_number(moment) or not abs(moment) < np.inf:
+                raise MPMError(f"time must be a finite number, not {time!r}.")
+        self._output.write(as_path(path), self.bodies, float(moment), len(self.history.steps))
+
+    def keep_identity(self) -> None:
+        """Note what this problem is known by, before its body meshes change (collective)."""
+        self._state.before_remeshing()
+
+    def warn(self, sentence: str) -> None:
+        """Warn the user, on one rank (collective)."""
+        warn(self._comm, sentence, stacklevel=4)
+
+    @collective()
+    def repartition(self, threshold: float = 0.1) -> bool:
+        """Move particles with their history to where they are best now (collective).
+
+        Args:
+            threshold: Share of the particles that must be better elsewhere.
+
+        Returns:
+            Whether particles have moved.
+
+        Raises:
+            MPMError: The problem holds what cannot move: a residual in UFL.
+        """
+        raise NotImplementedError
+
+    @collective()
+    def save(self, path: str | Path, functions: Sequence[fem.Function] = ()) -> None:
+        """Write a checkpoint of the last converged step (collective).
+
+        Call it wherever one likes, also between the steps of :meth:`steps`. The file replaces
+        the one before when it is whole and on the disk; whatever interrupts that leaves the one
+        before.
+
+        Args:
+            path: Name of the file.
+            functions: Functions on the bodies' meshes that are part of the state, known by
+                their names: data at quadrature points that the residual holds, and whatever
+                else the run depends on.
+
+        Raises:
+            MPMError: The file cannot be written, or functions that cannot be kept.
+        """
+        self._require_governing()
+        self._state.save(as_path(path), functions)
+
+    @collective()
+    def capture(self) -> checkpoint.Snapshot:
+        """Return the state at the last converged step, for :meth:`return_to` (collective)."""
+        return self._state.capture()
+
+    @collective("snapshot")
+    def return_to(self, snapshot: checkpoint.Snapshot) -> None:
+        """Return to a state of this problem on the present meshes (collective)."""
+        self._state.adopt(snapshot)
+
+    @property
+    def carried(self) -> list[CarriedField]:
+        """The unknowns besides displacements, as the system moves them."""
+        return [one for term in self._field_terms for one in term.fields]
+
+    def record(self, recorder: Recorder) -> None:
+        """Let something follow the steps of runs, as :class:`mpm_dolfinx.Sensitivity` does.
+
+        Args:
+            recorder: Called when a step is solved; it is not kept alive.
+        """
+        self._stepper.record(recorder)
+
+    def constants(self) -> list[fem.Constant]:
+        """Return the Constants of all forms, without loads of bodies."""
+        return list(self._constants)
+
+    def begin_anew(self) -> None:
+        """Let bodies that have not moved be what parameters make of them now (collective)."""
+
+    def beginning(self) -> list[NDArray[np.float64]]:
+        """Return the arrays that a step begins with besides displacements and history, to be set.
+
+        They are values of fields, stiffness of supports, forces held back; of a motion velocities,
+        forces, and what stresses of a whole step begin with.
+        """
+        return [np.asarray(field.previous.x.array) for field in self.fields]
+
+    def at_end(self) -> list[NDArray[np.float64]]:
+        """Return :meth:`beginning` as it will be after the last evaluation (collective)."""
+        return [np.asarray(field.x.array) for field in self.fields]
+
+    def renew_external(self) -> None:
+        """Let forces take over what they depend on besides displacements (collective)."""
+        self.reduced.terms.renew_external()
+
+    @collective()
+    def keep(self, thing: Kept) -> None:
+        """Let something of the user's own go with the problem.
+
+        It is split and rebased with the bodies, moves to other ranks, and is saved and restored.
+
+        Args:
+            thing: An heir of :class:`mpm_dolfinx.io.Kept` with a key of its own.
+
+        Raises:
+            MPMError: It is something else, or its key is taken.
+        """
+        self._state.keep(thing)
+
+    @collective()
+    def restore(
+        self, path: str | Path, functions: Sequence[fem.Function] = (), resume: bool = True
+    ) -> None:
+        """Return to the state of a checkpoint, on any number of ranks (collective).
+
+        The problem must be made as the one that was saved: same meshes, space, method and
+        materials. Loads and Dirichlet conditions are not compared, so that a run may go on with
+        others.
+
+        Args:
+            path: A file that :meth:`save` wrote.
+            functions: As they were given to :meth:`save`; their values are restored.
+            resume: Whether :meth:`solve` or :meth:`steps`, with the same number of steps as
+                before, goes on with the run that was interrupted; else they begin a new one
+                from the present load.
+
+        Raises:
+            MPMError: The file is missing, no checkpoint, newer than this package, truncated,
+                damaged, or that of another problem, or a time series that it was writing cannot
+                be read; the state is what it was.
+        """
+        self._require_governing()
+        self._state.restore(as_path(path), functions, resume)
+
+    def cut_as(self, snapshot: checkpoint.Snapshot, functions: bool, source: str) -> None:
+        """Split the domains that were split in a state (collective).
+
+        Args:
+            snapshot: The state, one of this problem.
+            functions: Whether it is to be restored with Functions on the present mesh.
+            source: What to call it in an error.
+
+        Raises:
+            MPMError: Domains were split that are not, or the other way round.
+        """
+
+    # -- What a problem with a material adds -----------------------------------------------
+
+    def smooth(self) -> bool:
+        """Return whether no history changes in the last residual, nor contact (collective).
+
+        Newton steps that let the residual grow are taken on trust then. A problem that overrides
+        :meth:`evaluate` or :meth:`commit` has a history, unless it says otherwise here.
+        """
+        own = type(self)
+        return own.evaluate is Problem.evaluate and own.commit is Problem.commit
+
+    @by_itself
+    def evaluate(self) -> MPMError | None:
+        """Update what the forms hold besides the displacement; return why that cannot be.
+
+        Called before each assembly with ``particles.displacement`` set. Must not change the
+        history. A ``ConvergenceError`` or ``DomainDistortionError`` refuses this displacement, and
+        smaller steps are tried; all else, returned or raised, ends the step. It may differ between
+        ranks.
+        """
+        return None
+
+    def loads(self) -> Sequence[fem.Constant | fem.Function]:
+        """Return the loads that the load factor multiplies and the user may change, if known.
+
+        A residual in UFL says itself what it multiplies by ``particles.load``.
+        """
+        return ()
+
+    def masses(self, number: int) -> NDArray[np.float64] | None:
+        """Return the mass of each particle of a body that this rank owns, if it is known."""
+        return None
+
+    def begin_step(self) -> None:
+        """Look at what may have changed since the last step (collective).
+
+        Raises:
+            MPMError: The coordinates of a mesh have, other problems govern the bodies, or ranks
+                have different loads.
+        """
+        self._require_governing()
+        with agree(self._comm):
+            for body in self.bodies:
+                body.require_meshes_as_they_were()
+        load = [float(body.load.value) for body in self.bodies]
+        require_same(self._comm, load=load, bcs=self.bcs, constants=self._constants)
+
+    def improper(self) -> MPMError | None:
+        """Return why the domains as they are now cannot be those of a converged step (collective).
+
+        They may not cross themselves, nor reach across the axis of a body of revolution.
+        """
+        return crossed(self.bodies)
+
+    def commit(self) -> None:
+        """Make the last evaluation the converged one."""
+
+    def end_step(self) -> None:
+        """Do what is to be done between two steps."""
+
+    def mend(self, error: MPMError) -> bool:
+        """Change what made the smallest step fail; return whether to go on (collective)."""
+        return False
+
+    def roll_back(self) -> None:
+        """Return to the last converged evaluation."""
+
+    def material_points(self) -> list[MaterialPoints]:
+        """Return the materials at the points of each body; none where the residual is all."""
+        return []
+
+    #: Where arrays of :meth:`converged_state` live that do not say it; ``None``: they must.
+    _history_at: str | None = "cells"
+
+    def converged_state(self) -> list[dict[str, Any]]:
+        """Return the history at the last converged step, for a checkpoint.
+
+        Returns:
+            One dictionary for each body: arrays ``(n, ...)`` of its owned particles by name, or
+            :class:`mpm_dolfinx.io.Column`, which says where they live. A problem that can be
+            split needs the latter.
+        """
+        return [{} for _ in self.bodies]
+
+    def set_converged_state(self, states: list[dict[str, NDArray[Any]]]) -> None:
+        """Make what :meth:`converged_state` once returned the history.
+
+        :meth:`roll_back` is called after it.
+
+        Args:
+            states: As returned there.
+        """
+
+    def laws(self) -> list[list[Law]]:
+        """Return the materials of each body, for a checkpoint to know them by."""
+        return [[] for _ in self.bodies]
+
+    def data_at_points(self) -> set[fem.Function]:
+        """Return Functions at quadrature points that the forms hold and no history keeps."""
+        keeps = type(self).converged_state is not Problem.converged_state
+        return set() if keeps else self._data
