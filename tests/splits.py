@@ -66,7 +66,7 @@ def sums(problem):
     work.array_w.reshape(-1, p.mesh.geometry.dim)[:] = scenes.own(at_nodes)[:, None]
     forms = problem.body_terms[0].forms
     forms.assemble_external()
-    (stress,) = problem._stresses
+    (stress,) = problem.points
     strain = stress.strain.average(stress.last.variable("elastic_b_minus_identity"))
     return {
         "volume": scenes.total(p, volume),

@@ -195,7 +195,7 @@ class Adjoint:
             [field.u.array_r.copy() for field in stepper.reduced.fields],
             [
                 [{name: v.copy() for name, v in own.items()} for own in points.last.memories()]
-                for points in problem.material_points()
+                for points in problem.points
             ],
             [array.copy() for array in self._data()],
         )
@@ -243,7 +243,7 @@ class Adjoint:
         sides = []
         for sign in (1.0, -1.0, 0.0):
             parameter.shift(sign * parameter.change)
-            for points in problem.material_points():
+            for points in problem.points:
                 parameter.govern(points, sign * parameter.change)
             problem.begin_anew()
             if sign != 0.0:
@@ -279,12 +279,12 @@ class Adjoint:
     def _look(self) -> _First:
         """Return the values of what :class:`_First` has derivatives of (collective)."""
         problem, tangents = self.problem, []
-        for points in problem.material_points():
+        for points in problem.points:
             gdim = points.strain.particles.mesh.geometry.dim
             C = undeformed_tangent(points.laws)[:, :gdim, :gdim, :gdim, :gdim]
             tangents.append(points.weights.ravel()[:, None, None] * np.einsum("niJiJ->niJ", C))
         return _First(
-            [[varying(s) for s in points.last.states] for points in problem.material_points()],
+            [[varying(s) for s in points.last.states] for points in problem.points],
             [
                 [one.stiffness.copy() for one in problem.setup.supports_of(body)]
                 for body in problem.bodies
@@ -292,7 +292,7 @@ class Adjoint:
             tangents,
             [
                 None if points.averaging is None else points.averaging.modulus.copy()
-                for points in problem.material_points()
+                for points in problem.points
             ],
         )
 
@@ -320,7 +320,7 @@ class Adjoint:
         problem, data = self.problem, self._data()
         back = Backward(problem, self._stepper.newton)
         own = [array.copy() for array in data]
-        states = [points.last.states for points in problem.material_points()]
+        states = [points.last.states for points in problem.points]
         for one in self._many:
             one.zero()
         try:
@@ -330,7 +330,7 @@ class Adjoint:
                 array[...] = values
             for body, points, last, its in zip(
                 problem.bodies,
-                problem.material_points(),
+                problem.points,
                 self._records[-1].after,
                 states,
                 strict=True,
@@ -373,7 +373,7 @@ class Adjoint:
 
     def _add_law(self, place: int, law: Laws, motion: fem.Function, weights: Weights) -> None:
         """Add what the laws of a body depend on, and take weights to the step's beginning."""
-        points, body = self.problem.material_points()[place], self.problem.bodies[place]
+        points, body = self.problem.points[place], self.problem.bodies[place]
         seen, resists = law.seen(motion)
         work = points.weights.ravel()[:, None, None] * seen
         states = weights.states[place]
@@ -439,9 +439,7 @@ class Adjoint:
     ) -> None:
         """Add what a parameter of a law does before the first step (collective)."""
         problem = self.problem
-        for place, (body, points) in enumerate(
-            zip(problem.bodies, problem.material_points(), strict=True)
-        ):
+        for place, (body, points) in enumerate(zip(problem.bodies, problem.points, strict=True)):
             found = np.zeros(len(first.tangent[place]))
             for own, rates, part in zip(
                 weights.states[place], first.states[place], points.laws.governed, strict=True
@@ -506,7 +504,7 @@ class Adjoint:
 
     def _add_array(self, place: int, name: str, given: Any, weights: Weights) -> None:
         """Add derivatives by displacements or a variable of a body (not collective)."""
-        points, body = self.problem.material_points()[place], self.problem.bodies[place]
+        points, body = self.problem.points[place], self.problem.bodies[place]
         targets, shape = [weights.motion[place].x.array], weights.motion[place].x.array.shape
         places: Sequence[Any] = [slice(None)]
         if name != "displacement":

@@ -301,7 +301,7 @@ class Backward:
         for array, values in zip(data, record.data, strict=True):
             array[...] = values
         for body, points, before, memories in zip(
-            problem.bodies, problem.material_points(), record.before, record.memories, strict=True
+            problem.bodies, problem.points, record.before, record.memories, strict=True
         ):
             body.restore(before.copy().reshape(-1, body.mesh.geometry.dim))
             body.roll_back()
@@ -333,12 +333,12 @@ class Backward:
             MPMError: The end of the step cannot be evaluated.
         """
         problem, reduced = self._problem, self._reduced
-        laws = [Laws(points) for points in problem.material_points()]
+        laws = [Laws(points) for points in problem.points]
         r = reduced.terms.last_nodal_forces()
         tangents = []
         for law, points, term, motion, own in zip(
             laws,
-            problem.material_points(),
+            problem.points,
             problem.body_terms,
             weights.motion,
             weights.states,
@@ -350,10 +350,10 @@ class Backward:
             stress = law.effective(np.divide(slope, size, where=size > 0.0, out=0.0 * slope))
             _add_to(motion, term.forms.force_of(stress))
         with ExitStack() as blocks:
-            for points, tangent in zip(problem.material_points(), tangents, strict=True):
+            for points, tangent in zip(problem.points, tangents, strict=True):
                 blocks.enter_context(points.with_tangent(tangent))
             # (F-bar has been asked for other stresses since the step was evaluated)
-            averages = any(p.averaging is not None for p in problem.material_points())
+            averages = any(p.averaging is not None for p in problem.points)
             if averages or any(tangent is not None for tangent in tangents):
                 if (failure := reduced.balance.evaluate()) is not None:
                     raise failure
@@ -468,6 +468,6 @@ def no_weights(problem: QuasiStaticProblem) -> Weights:
     """Return derivatives of nothing."""
     states = [
         [{k: np.zeros_like(v) for k, v in varying(one).items()} for one in points.last.states]
-        for points in problem.material_points()
+        for points in problem.points
     ]
     return Weights([fem.Function(body.W) for body in problem.bodies], states)

@@ -328,7 +328,7 @@ class StepDerivative:
         change: _Change,
     ) -> _Side:
         """Return an evaluation on one side of the state, in the direction of a motion."""
-        points = self._problem.material_points()
+        points = self._problem.points
         arrays = [function.x.array for function in motion]
         self._nearby.go(parameter, sign * parameter.change, rates, arrays)
         with ExitStack() as blocks:

@@ -59,6 +59,55 @@ def followed(problem: Problem) -> list[Particles | CarriedField]:
     return [*problem.bodies, *problem.carried]
 
 
+class _Here:
+    """The state that a problem is in, to come back to (collective).
+
+    Args:
+        problem: The problem.
+
+    Attributes:
+        points: The materials at the points of each body.
+        arrays: Displacements, values of fields and what a step begins with, each with its values.
+        begun: Displacements at the last converged step.
+        states: What materials keep of it.
+        seen: ``F - I`` that they have seen.
+        moved: The parameter that was changed last, ``None`` where all have their own numbers.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._bodies = problem.bodies
+        self.points = problem.points
+        present = [np.asarray(one.displacement.x.array) for one in followed(problem)]
+        self.arrays = [(values, values.copy()) for values in (*present, *problem.beginning())]
+        self.begun = [body.converged_displacement.copy() for body in problem.bodies]
+        self.states = [points.last.states for points in self.points]
+        self.seen = [points.last.gradient for points in self.points]
+        self.moved: Parameter | None = None
+        self._own = [points.governing() for points in self.points]
+        self._governing: dict[tuple[int, float], list[Governing]] = {}
+
+    def return_to(self) -> None:
+        """Come back, but for parameters."""
+        for array, values in self.arrays:
+            array[...] = values
+        for body, values in zip(self._bodies, self.begun, strict=True):
+            body.begin_from(values)
+        for points, states in zip(self.points, self.states, strict=True):
+            points.go_from(states)
+
+    def govern(self, parameter: Parameter, amount: float) -> None:
+        """Let materials take over a changed parameter; what they make of it is kept."""
+        key = id(parameter), amount
+        known = self._own if amount == 0.0 else self._governing.get(key)
+        if known is None:
+            for points in self.points:
+                parameter.govern(points, amount)
+            self._governing[key] = [points.governing() for points in self.points]
+        else:
+            for points, governing in zip(self.points, known, strict=True):
+                points.govern_by(governing)
+
+
 class Nearby:
     """The state of a problem, and those beside it.
 
@@ -80,17 +129,7 @@ class Nearby:
 
         Displacements and fields come back, and history as it was converged.
         """
-        problem = self._problem
-        self._points = problem.material_points()
-        present = [np.asarray(one.displacement.x.array) for one in followed(problem)]
-        arrays = [*present, *problem.beginning()]
-        self._arrays = [(values, values.copy()) for values in arrays]
-        self._from = [body.converged_displacement.copy() for body in problem.bodies]
-        self._states = [points.last.states for points in self._points]
-        self._seen = [points.last.gradient for points in self._points]
-        self._own = [points.governing() for points in self._points]
-        self._governing: dict[tuple[int, float], list[Governing]] = {}
-        self._moved: Parameter | None = None
+        self._here = here = _Here(self._problem)
         with ExitStack() as blocks:
             if self._moving is not None:
                 blocks.enter_context(self._moving.inertia.held())
@@ -99,37 +138,21 @@ class Nearby:
             try:
                 yield
             finally:
-                self._back()
-
-    def _back(self) -> None:
-        for array, values in self._arrays:
-            array[...] = values
-        for body, values in zip(self._problem.bodies, self._from, strict=True):
-            body.begin_from(values)
-        for points, states in zip(self._points, self._states, strict=True):
-            points.go_from(states)
-        self._restore()
-        self._problem.renew_external()
+                here.return_to()
+                self._restore()
+                self._problem.renew_external()
 
     def _restore(self) -> None:
         """Give the parameter that was changed last its own value."""
-        if self._moved is not None:
-            self._shift(self._moved, 0.0)
-        self._moved = None
+        moved, self._here.moved = self._here.moved, None
+        if moved is not None:
+            self._shift(moved, 0.0)
 
     def _shift(self, parameter: Parameter, amount: float) -> None:
         """Change a parameter by an amount; what materials make of that is kept (collective)."""
         parameter.shift(amount)
         if parameter.of_law:
-            key = id(parameter), amount
-            known = self._own if amount == 0.0 else self._governing.get(key)
-            if known is None:
-                for points in self._points:
-                    parameter.govern(points, amount)
-                self._governing[key] = [points.governing() for points in self._points]
-            else:
-                for points, governing in zip(self._points, known, strict=True):
-                    points.govern_by(governing)
+            self._here.govern(parameter, amount)
         if parameter.outside and self._moving is not None and self._of_mass is not None:
             self._weigh(self._moving, self._of_mass, (id(parameter), amount))
         if parameter.outside and not self._has_past:
@@ -159,19 +182,20 @@ class Nearby:
             rates: Derivatives of the state.
             motion: Those of displacements and values of fields, if others, on local dofs of W.
         """
-        if self._moved is not parameter:
+        here = self._here
+        if here.moved is not parameter:
             self._restore()
-        self._moved = parameter
+        here.moved = parameter
         motions = motion or [function.x.array for function in rates.motion]
         # (forces that were held back are last, and gone where they have been let go)
-        arrays = zip(self._arrays, (*motions, *rates.kept), strict=False)
+        arrays = zip(here.arrays, (*motions, *rates.kept), strict=False)
         for (array, values), rate in arrays:
             array[...] = values + amount * rate
         for body, values, function in zip(
-            self._problem.bodies, self._from, rates.motion, strict=False
+            self._problem.bodies, here.begun, rates.motion, strict=False
         ):
             body.begin_from(values + amount * function.x.array)
-        for points, states, own in zip(self._points, self._states, rates.states, strict=True):
+        for points, states, own in zip(here.points, here.states, rates.states, strict=True):
             points.go_from([_moved(*pair, amount) for pair in zip(states, own, strict=True)])
         self._shift(parameter, amount)
         if self._has_past:
@@ -188,7 +212,8 @@ class Nearby:
         """
         before = [force.copy() for force in reactions]
         try:
-            for points, seen, rate in zip(self._points, self._seen, rates.seen, strict=True):
+            here = self._here
+            for points, seen, rate in zip(here.points, here.seen, rates.seen, strict=True):
                 points.see(seen + amount * rate)
             for force, rate in zip(reactions, rates.reactions, strict=True):
                 force += amount * rate
@@ -196,7 +221,7 @@ class Nearby:
         finally:
             for force, values in zip(reactions, before, strict=True):
                 force[:] = values
-            for points, seen in zip(self._points, self._seen, strict=True):
+            for points, seen in zip(self._here.points, self._here.seen, strict=True):
                 points.see(seen)
 
 

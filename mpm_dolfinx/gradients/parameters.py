@@ -161,7 +161,7 @@ def as_parameter(given: Any, problem: Problem, scale: float | None) -> Parameter
             thing, direction = value, np.ones(1)
         else:
             size = largest(np.abs(value), problem) if scale is None else scale
-            known = [law for points in problem.material_points() for law in points.given]
+            known = [law for points in problem.points for law in points.given]
             if all(law is not thing for law in known):
                 raise MPMError(f"{thing!r} is no material of this problem; name one as given.")
             return _OfLaw(thing, name, size)
@@ -200,7 +200,7 @@ def _along(
         raise MPMError(f"The direction of {name} must not be zero.")
     if scale is None:
         scale = largest(np.abs(values), problem) / size
-    laws = [law for points in problem.material_points() for law in points.given]
+    laws = [law for points in problem.points for law in points.given]
     numbers: list[Any] = [value for law in laws for value in law.parameters.values()]
     of_law = any(value is thing for value in numbers)
     elsewhere = any(load is thing for load in problem.loads())
@@ -226,7 +226,7 @@ def _is_in_none(thing: fem.Constant | fem.Function, problem: Problem) -> bool:
         b.initial_stress is not None or b.pore_pressure is not None for b in problem.setup.given
     ):
         return False
-    if not all(points.laws.are_own for points in problem.material_points()):
+    if not all(points.laws.are_own for points in problem.points):
         return False
     if isinstance(thing, fem.Function):
         return not any(problem.setup.supports_of(body) for body in problem.bodies)

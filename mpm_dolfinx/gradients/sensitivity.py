@@ -177,7 +177,7 @@ class Sensitivity:
             MPMError: There are none.
         """
         self._require_present()
-        problem, points = self.problem, self.problem.material_points()
+        problem, points = self.problem, self.problem.points
         assert isinstance(problem, MovingProblem)
         with self._nearby.held():
             for parameter, rates in zip(self._parameters, self._rates, strict=True):
@@ -196,7 +196,7 @@ class Sensitivity:
     def _beginning(self) -> tuple[list[Rates], Nearby]:
         """Return the derivatives of what the bodies begin with, and the state (collective)."""
         problem = self.problem
-        points, found = problem.material_points(), []
+        points, found = problem.points, []
         none = [np.zeros(len(f.bodies[0].increment.x.array)) for f in self._reduced.fields]
         for parameter in self._parameters:
             sides = []
@@ -314,7 +314,7 @@ def _not_in(problem: Problem) -> list[str]:
         ),
         "bodies with free nodes (free=)": any(b.free_nodes is not None for b in bodies),
         "bodies with a length=": any(
-            points.averages for points in problem.material_points() if points is not None
+            points.averages for points in problem.points if points is not None
         ),
         "fields that are solved in turn with the displacements": problem.reduced.terms.alternates,
         "bodies whose particles may be deleted": any(b.deletion is not None for b in bodies),

@@ -225,7 +225,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
 
     @override
     def _mass_form(self, number: int, product: Any) -> ufl.Form:
-        work, density = self._density[number]
+        work, density = self._built.densities[number]
         return work.mass(density.value, product)
 
 

@@ -443,7 +443,9 @@ class Problem(Hooked):
             length=length,
         )
         number = 1 if isinstance(steps, str) else steps
-        for _ in with_bar(path, number, lambda _: self._stepper.share) if progress and self._comm.rank == 0 else path:
+        if progress and self._comm.rank == 0:
+            path = with_bar(path, number, lambda _: self._stepper.share)
+        for _ in path:
             pass
         return self.history
 
@@ -497,10 +499,6 @@ class Problem(Hooked):
         else:
             chosen = steps
         return self._stepper.steps(chosen, update, repartition, control)
-
-    def _share(self, _: Step) -> float:
-        """Return how much of the run is done."""
-        return self._stepper.share
 
     @collective()
     def step(self) -> Step:
@@ -854,8 +852,9 @@ class Problem(Hooked):
     def roll_back(self) -> None:
         """Return to the last converged evaluation."""
 
-    def material_points(self) -> list[MaterialPoints]:
-        """Return the materials at the points of each body; none where the residual is all."""
+    @property
+    def points(self) -> list[MaterialPoints]:
+        """The materials at the points of each body; none where the residual is all."""
         return []
 
     #: Where arrays of :meth:`converged_state` live that do not say it; ``None``: they must.

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, override
 
 import numpy as np
@@ -52,6 +52,25 @@ __all__ = ["QuasiStaticProblem"]
 
 #: Mean share of a background cell that a domain fills, from which one point is too few.
 CROWDED = 0.5
+
+
+@dataclass(frozen=True)
+class _Built:
+    """Parts of a problem on the present meshes of its bodies.
+
+    Attributes:
+        new_pressures: The pressures in place of mean stresses that were not there before.
+        points: The materials at the points of each body.
+        acting: The stress that acts on each.
+        densities: The work on each and its density.
+        loads: Constants and Functions of all loads.
+    """
+
+    new_pressures: list[ParticleField]
+    points: list[MaterialPoints] = field(default_factory=list)
+    acting: list[MaterialPoints | StepStress] = field(default_factory=list)
+    densities: list[tuple[VirtualWork, Density]] = field(default_factory=list)
+    loads: list[fem.Constant | fem.Function] = field(default_factory=list)
 
 
 class QuasiStaticProblem(Problem):
@@ -197,7 +216,7 @@ class QuasiStaticProblem(Problem):
         """
         if all(stress is None for stress in stresses):
             return
-        for body, points, stress in zip(self.bodies, self._stresses, stresses, strict=True):
+        for body, points, stress in zip(self.bodies, self._built.points, stresses, strict=True):
             if stress is not None:
                 points.begin_with(initial_stress_at_points(stress, body))
         if self._gradual:
@@ -210,7 +229,7 @@ class QuasiStaticProblem(Problem):
     def begin_anew(self) -> None:
         super().begin_anew()
         self._held.let_go()
-        for body, points in zip(self.bodies, self._stresses, strict=True):
+        for body, points in zip(self.bodies, self._built.points, strict=True):
             points.follow_parameters()
             points.begin_anew()
             for support in self.setup.supports_of(body):
@@ -238,7 +257,7 @@ class QuasiStaticProblem(Problem):
             if id(function) not in self._left and all(function is not f for f in present):
                 self._left[id(function)] = function, function.x.array.copy()
         super()._build()
-        for body, stress in zip(self.bodies, self._stresses, strict=True):
+        for body, stress in zip(self.bodies, self._built.points, strict=True):
             body.attach(stress)
 
     @override
@@ -403,13 +422,13 @@ class QuasiStaticProblem(Problem):
         self._parameters = present
 
     @property
+    @override
     def points(self) -> list[MaterialPoints]:
-        """The materials at the points of each body."""
-        return self._stresses
+        return self._built.points
 
     @override
     def loads(self) -> list[fem.Constant | fem.Function]:
-        return self._loads
+        return self._built.loads
 
     def _functions(self) -> list[fem.Function]:
         """Return the parameters of materials that are Functions."""
@@ -417,14 +436,11 @@ class QuasiStaticProblem(Problem):
 
     @override
     def _contributions(self) -> list[Contribution]:
-        self._stresses: list[MaterialPoints] = []
-        self._acting: list[MaterialPoints | StepStress] = []
-        self._density: list[tuple[VirtualWork, Density]] = []
-        self._loads: list[fem.Constant | fem.Function] = []
         bodies = [given.particles for given in self.setup.bodies]
         known = self.pressure
         self.pressure = [self._pressure_of(body) for body in bodies if self.setup.mixed]
-        self._new_pressures = [p for p in self.pressure if all(p is not other for other in known)]
+        new = [field for field in self.pressure if all(field is not other for other in known)]
+        self._built = _Built(new)
         return [self._contribution(given) for given in self.setup.bodies]
 
     def _pressure_of(self, body: Particles) -> ParticleField:
@@ -453,17 +469,17 @@ class QuasiStaticProblem(Problem):
             next((field for field in self.pressure if field.particles is body), None),
             given.length,
         )
-        if any(field.particles is body for field in self._new_pressures):
+        if any(field.particles is body for field in self._built.new_pressures):
             assert history.mean_stress is not None
             history.mean_stress.begin_with(history.last.mean_stress())
-        self._stresses.append(history)
+        self._built.points.append(history)
         work = VirtualWork(strain)
         density = Density(1.0 if given.density is None else given.density, body)
         density.require()
-        self._density.append((work, density))
+        self._built.densities.append((work, density))
         mass = density.value * body.undeformed.mass_ratio
         acting, of_step = self._in_time(history, supports)
-        self._acting.append(acting)
+        self._built.acting.append(acting)
         symmetric = acting.symmetric and not given.pressures
         loads: list[ufl.Form] = []
         if given.body_force is not None:
@@ -474,12 +490,12 @@ class QuasiStaticProblem(Problem):
             loads.append(-work.tractions(given.tractions, given.facet_tags))
             symmetric = symmetric and not depends_on(loads[-1], body.displacement)
         for load in loads:
-            self._loads += changeable(load, body)
+            self._built.loads.extend(changeable(load, body))
         share = self._force_share(body)
         loads += [s.at_body(history.initial_modulus, strain.turn, share) for s in supports]
         if given.pressures:
             loads.append(work.pressures(given.pressures, given.facet_tags))
-            self._loads += changeable(loads[-1], body)
+            self._built.loads.extend(changeable(loads[-1], body))
         further, plain = self._further_work(given, strain)
         loads += further
         symmetric = symmetric and plain
@@ -525,10 +541,10 @@ class QuasiStaticProblem(Problem):
         if self.setup.mixed is None:
             return super()._couplings(parts)
         found: list[FieldTerm] = []
-        for body, field, acting, points in zip(
-            self.bodies, self.pressure, self._acting, self._stresses, strict=True
+        for body, pressure, acting, points in zip(
+            self.bodies, self.pressure, self._built.acting, self._built.points, strict=True
         ):
-            carried = CarriedField(field)
+            carried = CarriedField(pressure)
             found.append(PressureTerm(body, carried, acting))
             if self.setup.mixed == "stabilised pressure":
                 found.append(PressureSmoothing(carried, points, self._force_share(body) or 1.0))
@@ -546,15 +562,15 @@ class QuasiStaticProblem(Problem):
                         "the particles have left; make a new problem with a Function on "
                         "particles.mesh."
                     )
-        for _, density in self._density:
+        for _, density in self._built.densities:
             density.require()
-        for stress in self._stresses:
+        for stress in self._built.points:
             stress.follow_parameters()
 
     @override
     def improper(self) -> MPMError | None:
         found: MPMError | None = None
-        for stress in self._stresses:
+        for stress in self._built.points:
             found = found or DomainDistortionError.of(*stress.strain.beyond())
         return super().improper() or agreed(self._comm, found)
 
@@ -645,7 +661,7 @@ class QuasiStaticProblem(Problem):
 
     def nodal_masses(self, number: int) -> NDArray[np.float64]:
         """Return ``int density Q_c dX`` of each owned domain of a body, ``(n, k)`` (collective)."""
-        body, (work, density) = self.bodies[number], self._density[number]
+        body, (work, density) = self.bodies[number], self._built.densities[number]
         space = separate_nodes(body.W)
         test = body.undeformed.mass_ratio * ufl.TestFunction(space)
         vector = fem.assemble_vector(compiled_form(work.mass(density.value, test)))
@@ -656,7 +672,7 @@ class QuasiStaticProblem(Problem):
 
         Shares that masses have where domains were cut are left out.
         """
-        body, (work, density) = self.bodies[number], self._density[number]
+        body, (work, density) = self.bodies[number], self._built.densities[number]
         space = separate_nodes(body.W)
         product = body.undeformed.volume_ratio * (
             ufl.TrialFunction(space) * ufl.TestFunction(space)
@@ -672,21 +688,17 @@ class QuasiStaticProblem(Problem):
     _history_at = None
 
     @override
-    def material_points(self) -> list[MaterialPoints]:
-        return self._stresses
-
-    @override
     def converged_state(self) -> list[dict[str, Any]]:
-        return [dict(stress.converged_state()) for stress in self._stresses]
+        return [dict(stress.converged_state()) for stress in self._built.points]
 
     @override
     def set_converged_state(self, states: list[dict[str, NDArray[Any]]]) -> None:
-        for stress, arrays in zip(self._stresses, states, strict=True):
+        for stress, arrays in zip(self._built.points, states, strict=True):
             stress.set_converged_state(arrays)
 
     @override
     def laws(self) -> list[list[Law]]:
-        return [stress.identity() for stress in self._stresses]
+        return [stress.identity() for stress in self._built.points]
 
     @property
     def yield_function(self) -> NDArray[np.float64]:
@@ -695,7 +707,7 @@ class QuasiStaticProblem(Problem):
         In the unit of the material's own function; -1 where a material has none.
         With several bodies, their particles one body after the other.
         """
-        values = [s.last.yield_function().max(axis=1, initial=-np.inf) for s in self._stresses]
+        values = [s.last.yield_function().max(axis=1, initial=-np.inf) for s in self._built.points]
         return np.concatenate(values)
 
 

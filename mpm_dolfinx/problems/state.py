@@ -58,8 +58,9 @@ class Stateful(Protocol):
     def laws(self) -> list[list[tuple[str, dict[str, Any]]]]:
         """Return name and parameters of each body's materials."""
 
-    def material_points(self) -> list[MaterialPoints]:
-        """Return the materials at the points of each body."""
+    @property
+    def points(self) -> list[MaterialPoints]:
+        """The materials at the points of each body."""
 
     def converged_state(self) -> list[dict[str, Any]]:
         """Return the history at the points of each body."""
@@ -196,7 +197,7 @@ class ProblemState:
                 problem.converged_state,
                 problem.set_converged_state,
                 self._history_at,
-                problem.material_points(),
+                problem.points,
             ),
             kept.Functions(functions, problem.bodies, needed),
             kept.Values(carried, problem.reduced),

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, override
+from typing import Any, NamedTuple, override
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -27,6 +27,36 @@ from ..tolerances import NEGLIGIBLE
 from .term import Term
 
 __all__ = ["Tie"]
+
+
+class _Faces(NamedTuple):
+    """The points of a tied face in both bodies.
+
+    Attributes:
+        spaces: W of each body.
+        rows: Of each body: the matrix from dofs of W to values at the points.
+        weights: Of each component at each point.
+    """
+
+    spaces: tuple[fem.FunctionSpace, ...]
+    rows: list[PETSc.Mat]
+    weights: NDArray[np.float64]
+
+
+class _Springs(NamedTuple):
+    """Springs at the points where both bodies are still there.
+
+    Attributes:
+        held: Which components at points that is.
+        weights: Of each component at each point, zero elsewhere.
+        blocks: Tangents for a stiffness of one.
+        tangents: Matrices of the same patterns.
+    """
+
+    held: NDArray[np.bool_]
+    weights: NDArray[np.float64]
+    blocks: dict[tuple[int, int], PETSc.Mat]
+    tangents: dict[tuple[int, int], PETSc.Mat]
 
 
 class Tie(Term):
@@ -83,9 +113,8 @@ class Tie(Term):
         degree = 2 * a.W.ufl_element().degree if quadrature_degree is None else quadrature_degree
         require_whole("quadrature_degree of a Tie", degree, 100)  # 51 points each way
         self._degree, self.axisymmetric = int(degree), axisymmetric
-        self._spaces: tuple[fem.FunctionSpace, ...] = ()
-        self._held: NDArray[np.bool_] = np.zeros(0, dtype=bool)
-        self._settle()
+        self._faces = self._found()
+        self._springs = self._sprung(self._present())
 
     @property
     def one_sided(self) -> bool:
@@ -102,24 +131,26 @@ class Tie(Term):
 
     @override
     def begin(self) -> Sequence[PETSc.Vec]:
-        """Look for the points again where bodies have other meshes."""
-        self._settle()
+        """Look for the points again where bodies have other meshes, or lost domains."""
+        bodies = zip(self.bodies, self._faces.spaces, strict=True)
+        if any(body.W is not known for body, known in bodies):
+            self._faces = self._found()
+            self._springs = self._sprung(self._present())
+            return ()
+        held = self._present()
+        changed = not np.array_equal(held, self._springs.held)
+        if self.bodies[0].mesh.comm.allreduce(changed, MPI.LOR):
+            self._springs = self._sprung(held)
         return ()
 
-    def _settle(self) -> None:
-        """Find the points of the face in both bodies, unless that is done (collective)."""
+    def _found(self) -> _Faces:
+        """Return the points of the face in both bodies (collective)."""
         a, b = self.bodies
-        spaces = tuple(body.W for body in self.bodies)
-        if self._spaces and all(a is b for a, b in zip(spaces, self._spaces, strict=True)):
-            held = self._present()
-            if a.mesh.comm.allreduce(not np.array_equal(held, self._held), MPI.LOR):
-                self._held = held
-                self._multiply()
-            return
         points, weights = self._points(a, a.carry(self._tags))
-        self._at = [_interpolation(W, points, a.mesh.comm) for W in spaces]
+        spaces = a.W, b.W
+        at = [_interpolation(W, points, a.mesh.comm) for W in spaces]
         with agree(a.mesh.comm):
-            for body, (_, found) in zip((a, b), self._at, strict=True):
+            for body, (_, found) in zip((a, b), at, strict=True):
                 if not found.all():
                     where = tuple(float(f"{x:.6g}") for x in points[~found][0])
                     count = "no" if body is a else "only one"
@@ -127,15 +158,12 @@ class Tie(Term):
                         f"The point {where} of a Tie is in {count} body; "
                         "faces that are tied lie on each other in the undeformed bodies."
                     )
-        self._face = np.repeat(weights, points.shape[1])
-        self._held = self._present()
-        self._multiply()
-        self._spaces = spaces
+        return _Faces(spaces, [rows for rows, _ in at], np.repeat(weights, points.shape[1]))
 
     def _present(self) -> NDArray[np.bool_]:
         """Return at which rows of the points both bodies are still there (collective)."""
-        held = np.ones(len(self._face), dtype=bool)
-        for body, (rows, _) in zip(self.bodies, self._at, strict=True):
+        held = np.ones(len(self._faces.weights), dtype=bool)
+        for body, rows in zip(self.bodies, self._faces.rows, strict=True):
             if body.deletion is None:
                 continue
             nodes, points = rows.createVecs()
@@ -145,21 +173,21 @@ class Tie(Term):
             held &= np.abs(points.array_r) < NEGLIGIBLE
         return held
 
-    def _multiply(self) -> None:
-        """Make the tangents for a stiffness of one (collective)."""
-        self._weights = np.where(self._held, self._face, 0.0)
-        diagonal = self._at[0][0].createVecLeft()
-        diagonal.array_w[:] = self._weights
-        self._blocks: dict[tuple[int, int], PETSc.Mat] = {}
-        for j, (right, _) in enumerate(self._at):
+    def _sprung(self, held: NDArray[np.bool_]) -> _Springs:
+        """Return the springs at points that are held (collective)."""
+        weights = np.where(held, self._faces.weights, 0.0)
+        diagonal = self._faces.rows[0].createVecLeft()
+        diagonal.array_w[:] = weights
+        blocks: dict[tuple[int, int], PETSc.Mat] = {}
+        for j, right in enumerate(self._faces.rows):
             scaled = right.copy()
             scaled.diagonalScale(L=diagonal)
-            for i, (left, _) in enumerate(self._at):
+            for i, left in enumerate(self._faces.rows):
                 block = left.transposeMatMult(scaled)
                 if i != j:
                     block.scale(-1.0)
-                self._blocks[i, j] = block
-        self._tangents = {pair: block.copy() for pair, block in self._blocks.items()}
+                blocks[i, j] = block
+        return _Springs(held, weights, blocks, {pair: one.copy() for pair, one in blocks.items()})
 
     def _points(
         self, body: Particles, tags: mesh.MeshTags
@@ -187,20 +215,20 @@ class Tie(Term):
     def tractions(self) -> NDArray[np.float64]:
         """Return the pull of the springs on b at this rank's points, shape ``(n, gdim)``."""
         gaps = []
-        for body, (rows, _) in zip(self.bodies, self._at, strict=True):
+        for body, rows in zip(self.bodies, self._faces.rows, strict=True):
             d, gap = rows.createVecs()
             d.array_w[:] = body.displacement.x.array[: d.getLocalSize()]
             rows.mult(d, gap)
             gaps.append(gap.array_r)
         gdim = self.bodies[0].mesh.geometry.dim
-        pull = np.where(self._held, self.stiffness * (gaps[0] - gaps[1]), 0.0)
+        pull = np.where(self._springs.held, self.stiffness * (gaps[0] - gaps[1]), 0.0)
         return pull.reshape(-1, gdim)
 
     @override
     def residuals(self) -> Sequence[PETSc.Vec]:
-        pull = self._weights * self.tractions().ravel()
+        pull = self._springs.weights * self.tractions().ravel()
         forces = []
-        for sign, (rows, _) in zip((1.0, -1.0), self._at, strict=True):
+        for sign, rows in zip((1.0, -1.0), self._faces.rows, strict=True):
             force, at_points = rows.createVecs()
             at_points.array_w[:] = sign * pull
             rows.multTranspose(at_points, force)
@@ -209,10 +237,11 @@ class Tie(Term):
 
     @override
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
-        for pair, block in self._blocks.items():
-            block.copy(self._tangents[pair], structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-            self._tangents[pair].scale(self.stiffness)
-        return self._tangents
+        tangents = self._springs.tangents
+        for pair, block in self._springs.blocks.items():
+            block.copy(tangents[pair], structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+            tangents[pair].scale(self.stiffness)
+        return tangents
 
 
 def _interpolation(

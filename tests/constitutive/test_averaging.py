@@ -90,7 +90,7 @@ def averaged_energy(problem, displacement):
     dim = particles.mesh.geometry.dim
     F = np.eye(dim) + particles.displacement_gradient()
     J, weights = np.linalg.det(F), particles.quadrature.weights
-    history = problem._stresses[0].averaging
+    history = problem.points[0].averaging
     groups = np.concatenate(WORLD.allgather(history.groups.number))
     sizes = np.stack([weights.sum(axis=1), (weights * J).sum(axis=1)], axis=1)
     totals = np.zeros((groups.max() + 1, 2))

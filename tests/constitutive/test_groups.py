@@ -14,7 +14,7 @@ import mpm_dolfinx as mpm
 def members(problem):
     """Return the group of each particle by its smallest member, in the order of the input."""
     particles = problem.particles
-    averaging = problem._stresses[0].averaging
+    averaging = problem.points[0].averaging
     number = scenes.in_order(particles, averaging.groups.number)
     first = np.full(number.max() + 1, len(number))
     np.minimum.at(first, number, np.arange(len(number)))
@@ -25,7 +25,7 @@ def members(problem):
 def test_groups_do_not_depend_on_the_ranks(cell, f_bar, rule, axisymmetric):
     problem = block(cell, f_bar, rule, axisymmetric)
     alone = block(cell, f_bar, rule, axisymmetric, comm=scenes.MPI.COMM_SELF)
-    number = alone._stresses[0].averaging.groups.number
+    number = alone.points[0].averaging.groups.number
     order = np.argsort(alone.particles.global_index)
     first = np.full(number.max() + 1, len(number))
     np.minimum.at(first, number[order], np.arange(len(number)))
