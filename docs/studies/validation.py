@@ -119,6 +119,9 @@ ELASTIC = {
     "Rigid sphere on a half-space, force (Hertz 1882)": Error("error_force", *HERTZ),
     "Radius of its contact": Error("error_radius", *HERTZ),
     "Its pressure": Error("error_pressure", *HERTZ),
+    "Block on a rough plane, angle at which it slides (Coulomb)": Value(
+        "stick_angle", "exact", "incline --tilt 30 --steps 20", "--steps 50"
+    ),
 }
 PLASTIC = {
     "Column that yields between rollers, stress along; exact, finite strain": Error(

@@ -25,7 +25,7 @@ LONG = {
     *("slope", "vertical-cut", "footing-friction", "footing-weight-rough", "footing-edge"),
     *("finer-footing", "mixed-footing"),
     *("stiff-footing", "hertz", "hertz-penalty", "hertz-tets", "expansion-whole", "pile-deep"),
-    "wedge-fine",
+    *("wedge-fine", "ironing-stiff"),
     *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
 }
 COMMON = {"completed", "load", "iterations", "cutbacks", "failure"}
@@ -223,6 +223,21 @@ RUNS = {
         "--cells 3 --law nitsche --penalty 0.5",
         {"error_force": 0.04, "error_radius": 0.01, "error_pressure": 0.08},
     ),
+    "incline": (
+        "incline",
+        "--friction 0.5 --domain tri --tilt 20",
+        {"stick_angle": 26.5651, "ratio": 0.5 + 1e-9},
+    ),
+    "ironing": (
+        "ironing",
+        "",
+        {"cutbacks": 0, "iterations": 140, "scatter": 0.004, "ratio": 0.2995},
+    ),
+    "ironing-stiff": (
+        "ironing",
+        "--stiff",
+        {"cutbacks": 0, "iterations": 150, "scatter": 0.004, "ratio": 0.299},
+    ),
     "wedge": (
         "penetration",
         "--obstacle wedge --depth 0.5 --cell 0.25",
@@ -350,6 +365,8 @@ IN_TIME = {
     "colliding_discs",
     "column_dynamic",
 }
+#: Cases that end before their whole load.
+ENDS = {"snap_through", "expansion", "notch", "incline"}
 KEYS = {
     "compaction": {"error", "error_position", "particles"},
     "cantilever": {"shortening", "deflection", "error"},
@@ -379,6 +396,8 @@ KEYS = {
     "consolidation": {"error", "degree", "error_degree", "particles"},
     "mandel_cryer": {"peak", "exact", "error", "error_force"},
     "penetration": {"force", "depth", "ratio", "iterations_per_step", "penetration"},
+    "incline": {"stick_angle", "exact", "ratio"},
+    "ironing": {"force", "scatter", "ratio"},
     "hertz": {"force", "error_force", "error_radius", "error_pressure", "error_most"},
     "free_body": {"difference", "seconds_ratio", "unknowns"},
     "lshape": {"error", "estimate", "unknowns", "error_all_free", "unknowns_carried"},
@@ -419,7 +438,7 @@ def test_numbers(case, capfd):
     timed = {key for key in numbers if "time" in key or "seconds" in key}
     assert timed == ({"seconds_ratio"} if name in ("free_body", "gradient") else set())
     assert numbers["completed"] == 1 and numbers["failure"] is None
-    assert numbers["load"] == 1.0 or name in {"snap_through", "expansion", "notch", *IN_TIME}
+    assert numbers["load"] == 1.0 or name in ENDS | IN_TIME
     assert (numbers["iterations"] > 0) == (name != "domain_distortion")  # there all is prescribed
     for key, bound in bounds.items():
         assert numbers[key] <= bound, key
@@ -436,6 +455,10 @@ def test_numbers(case, capfd):
     if case == "softening":
         assert abs(numbers["width"] / (3.4389 * 0.25) - 1.0) < 0.04  # that of the closed form
         assert 0.9 < numbers["peak"] < 1.0
+    if name == "incline":
+        assert numbers["stick_angle"] > numbers["exact"] - 0.008 and numbers["ratio"] > 0.499
+    if name == "ironing":
+        assert numbers["ratio"] > 0.295
     if name == "embankment":
         assert numbers["built"] == 1 and numbers["factor"] > 1.9
     if name == "gradient":
@@ -569,6 +592,8 @@ def test_case_is_a_program(name, tmp_path):
         "sand_column": "--cells 4 --time 0.1 --steps 5",
         "hertz": "--cells 2 --steps 2",
         "penetration": "--cell 0.25 --depth 0.05 --steps 4",
+        "incline": "--steps 5",
+        "ironing": "--steps 4",
         "lshape": "--cells 2",
         "free_body": "--size 2 --steps 2",
         "gradient": "--parameters 1 --steps 2",
