@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from .._core import loops
 from ..meshes.quadrature import volume_ratio
 from ..particles.reference import Reference
+from .assignment import Assignment
 from .averaging import Linearised, LowRankTerm, VolumeAveraging
 from .discrete_gradient import Ends, Gradients, abandon, by_end, mean, mean_of_groups
 from .groups import Groups
@@ -415,6 +416,11 @@ class StepStress:
     def averages(self) -> bool:
         """Whether laws soften by an average over a length."""
         return self._points.averages
+
+    @property
+    def laws(self) -> Assignment:
+        """The materials, each at the points that it governs."""
+        return self._points.laws
 
     def expect(self) -> None:
         """Begin a step with the average that is expected at its end."""

@@ -21,7 +21,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 from petsc4py import PETSc
@@ -128,7 +127,7 @@ class StepDerivative:
         prescribed = self._prescribed(parameter, rates)
         turns = [self._turn(number, rates) for number in range(len(self._bases))]
         change = self._change(parameter, rates, turns, prescribed)
-        moduli = self._moduli(parameter, rates, turns, change)
+        moduli = self._moduli(parameter, rates)
         y_rate = self._lifts(prescribed, rates.prescribed)
         motion = [_copy(function) for function in rates.motion]
         for thing, number, field, turn in zip(
@@ -238,14 +237,8 @@ class StepDerivative:
             found.append(driven_on(field, total if whole else total - last))
         return found
 
-    def _moduli(
-        self,
-        parameter: Parameter,
-        rates: Rates,
-        turns: Sequence[PETSc.Mat],
-        change: _Change,
-    ) -> dict[int, Array]:
-        """Return derivatives of the moduli of penalties, which are those of their first step."""
+    def _moduli(self, parameter: Parameter, rates: Rates) -> dict[int, Array]:
+        """Return derivatives of the moduli of penalties, as their first step begins."""
         new = [
             number
             for number, field in enumerate(self._fields)
@@ -255,12 +248,9 @@ class StepDerivative:
             return rates.moduli
         bodies = self._problem.bodies
         offsets = [body.converged_displacement - body.displacement.x.array for body in bodies]
-        motion = [_copy(function) for function in rates.motion]
-        for number in new:
-            self._add_first_increment(number, offsets, motion, turns, change)
 
         def moduli(sign: float) -> list[Array]:
-            arrays = [function.x.array for function in motion]
+            arrays = [function.x.array for function in rates.motion]
             self._nearby.go(parameter, sign * parameter.change, rates, arrays)
             for body, offset in zip(bodies, offsets, strict=True):
                 body.displacement.x.array[:] += offset
@@ -270,31 +260,6 @@ class StepDerivative:
         pairs = zip(moduli(1.0), moduli(-1.0), strict=True)
         found = [parameter.slope(*pair) for pair in pairs]
         return rates.moduli | dict(zip(new, found, strict=True))
-
-    def _add_first_increment(
-        self,
-        number: int,
-        offsets: Sequence[Array],
-        motion: Sequence[fem.Function],
-        turns: Sequence[PETSc.Mat],
-        change: _Change,
-    ) -> None:
-        """Add to displacements and their derivatives the increment with a field's moduli."""
-        u = self._fields[number].moduli_at
-        assert u is not None
-        if u.norm() == 0.0:
-            return
-        if self._velocities is None or change.background is None:
-            raise MPMError("A Sensitivity needs a ghost penalty that was made in a step's start.")
-        rate = change.background[number].copy()
-        rate.scale(self._velocities.share_of(number, u))
-        for n, (body, turn) in enumerate(zip(self._problem.bodies, turns, strict=True)):
-            if self._of_fields[n] == number:
-                moved = fem.Function(body.W)
-                add_product(moved, body.T, u)
-                offsets[n][:] += moved.x.array
-                add_product(motion[n], body.T, rate)
-                add_product(motion[n], turn, u)
 
     def _held(
         self, parameter: Parameter, moduli: dict[int, Array], turns: Sequence[PETSc.Mat]
@@ -371,7 +336,7 @@ class StepDerivative:
     ) -> None:
         """Add to derivatives of forces what does not come of the bodies' motion."""
         for field, force, known, rate in zip(self._fields, forces, held, y_rate, strict=True):
-            field.add_product(rate, force, partial(self._reduced.terms.shear_moduli, field))
+            field.add_product(rate, force)
             force.axpy(1.0, known)
 
     def _move(self, motion: Sequence[fem.Function], changes: Sequence[PETSc.Vec]) -> None:

@@ -18,7 +18,6 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import MPMError
 from ..problems.motion import MovingProblem
 from ..system.field import Field
 from ..system.inertia import Projected
@@ -28,9 +27,6 @@ from .parameters import Parameter
 __all__ = ["TakenVelocities", "driven_on"]
 
 type Array = NDArray[np.float64]
-
-#: What of an increment may not be that of the velocities before.
-APART = 1e-6
 
 
 class TakenVelocities:
@@ -111,23 +107,6 @@ class TakenVelocities:
         body.T.mult(c_rate[place], moved)
         turn.multAdd(c[place], moved, moved)
         return moved
-
-    def share_of(self, number: int, u: PETSc.Vec) -> float:
-        """Return which multiple of c an increment of a background is.
-
-        Raises:
-            MPMError: None.
-        """
-        c = self._c[number]
-        share = float(u.dot(c)) / max(float(c.dot(c)), np.finfo(float).tiny)
-        rest = u.copy()
-        rest.axpy(-share, c)
-        if rest.norm() > APART * u.norm():
-            raise MPMError(
-                "The ghost penalty has the stiffness of the bodies in a motion that is not that of "
-                "their velocities; a Sensitivity cannot tell how it depends on the parameters."
-            )
-        return share
 
 
 def driven_on(field: Field, values: Array) -> PETSc.Vec:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 from petsc4py import PETSc
 
@@ -106,7 +105,7 @@ class Balance:
                 outer[number] += self._add_on_background(field)
             self._external = _External(self._external.staying, outer)
             for field in unknowns.fields:
-                field.add_residual(partial(self._terms.shear_moduli, field))
+                field.add_residual()
         return None
 
     def _add_on_background(self, field: Field) -> float:
@@ -148,9 +147,7 @@ class Balance:
     def works(self) -> NDArray[np.float64]:
         """Return :meth:`Field.works` of all displacements."""
         found = [
-            field.works(partial(self._terms.shear_moduli, field))
-            for field in self._unknowns.fields
-            if not isinstance(field, ValueField)
+            field.works() for field in self._unknowns.fields if not isinstance(field, ValueField)
         ]
         return np.asarray(np.sum(found, axis=0))
 

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from ..assembly.body_forms import BodyForms
 from ..assembly.low_rank import ReducedLowRank
-from ..errors import MPMError
+from ..constitutive.assignment import Assignment
+from ..constitutive.moduli import undeformed_tangent
+from ..errors import MPMError, agree
 from ..particles.particles import Particles
 from .term import Motion, PointMaterial, Term, Transfer
 
@@ -40,6 +42,10 @@ class PointHistory(PointMaterial, Protocol):
 
     def alternate(self) -> int:
         """Average what softens; return the linear solves that it took (collective)."""
+
+    @property
+    def laws(self) -> Assignment:
+        """The materials, each at the points that it governs."""
 
     def elastic(self) -> bool:
         """Return whether the history stays as it is in the last update."""
@@ -257,7 +263,7 @@ class BodyTerm(Term):
         return [self._counted(self.forms.stiffness_force(motions[0]))]
 
     def shear_modulus(self) -> float:
-        """Return the stiffness of the body to simple shear: its mean at the present state.
+        """Return the stiffness of the body to simple shear, undeformed where the law is known.
 
         It is the smallest positive energy ``g : C : g`` over uniform gradients g with one entry,
         for an isotropic elastic body its shear modulus, or the mean of it. What acts on facets,
@@ -270,7 +276,8 @@ class BodyTerm(Term):
         else:
             # (not around an axis, where a shear strains hoops by what is far from the middle)
             plane = (slice(particles.mesh.geometry.dim),) * 4
-            tangent = self._material.tangent[:, *plane]
+            with agree(particles.mesh.comm):
+                tangent = undeformed_tangent(self._material.laws)[:, *plane]
             energy = np.einsum("n,niJiJ->iJ", self._material.weights.ravel(), tangent)
         own = [particles.initial_volume.sum(), *energy.ravel()]
         volume, *energies = particles.mesh.comm.allreduce(np.array(own))

@@ -159,9 +159,8 @@ class Field:
         V: The space.
         bodies: As given.
         motions: How each body follows.
-        moduli: Shear modulus of each body at the first step with a penalty, which is scaled by
-            them; ``None`` before.
-        moduli_at: The increment at which they were found.
+        moduli: Shear modulus of each body as the first step with a penalty begins, which is scaled
+            by them; ``None`` before.
         u: The increment of the last residual, on this rank's own dofs of V.
         force: The residual on all dofs of V that was evaluated last: at supports, their force.
         free: The dofs that are unknowns; ``None`` until they are found.
@@ -187,7 +186,6 @@ class Field:
         self._conditions = conditions
         self.motions = [Motion(body) for body in bodies]
         self.moduli: list[float] | None = None
-        self.moduli_at: PETSc.Vec | None = None
         self.free: FreeDofs | None = None
         self._looked_up: list[fem.DirichletBC] | None = None
         self._lines: list[NDArray[np.float64]] | None = None
@@ -411,11 +409,8 @@ class Field:
         forces = np.where(self._fixed, self.force.array_r, 0.0)
         return joint_norm(forces, self._comm)
 
-    def works(self, stiffness: Callable[[], list[float]]) -> NDArray[np.float64]:
+    def works(self) -> NDArray[np.float64]:
         """Return the work of forces on the background over the last increment (collective).
-
-        Args:
-            stiffness: Returns the shear modulus of each body.
 
         Returns:
             Work done against what acts on the background itself, work of the residual at Dirichlet
@@ -425,7 +420,7 @@ class Field:
         own = self.u.duplicate()
         own.set(0.0)
         if self._sizes[1] > 0 and norm(self.u) > 0.0:
-            self.add_product(self.u, own, stiffness)
+            self.add_product(self.u, own)
         work = self.u.array_r * self.force.array_r
         found = [
             self.u.array_r @ own.array_r,
@@ -442,18 +437,19 @@ class Field:
 
     # -- What acts on the background itself ---------------------------------------------------
 
-    def add_residual(self, stiffness: Callable[[], list[float]]) -> None:
-        """Add what acts on the background to the force of the last increment.
+    def scale_penalty(self, moduli: Callable[[Field], list[float]]) -> None:
+        """Take the shear moduli of the bodies as the step begins, if the penalty needs them."""
+        if self._penalised and self.moduli is None:
+            self.moduli = moduli(self)
 
-        Args:
-            stiffness: Returns the shear modulus of each body.
-        """
+    def add_residual(self) -> None:
+        """Add what acts on the background to the force of the last increment."""
         if self._background is not None:
             self.force.axpy(1.0, self._background.assemble_residual())
         if self._penalised and self._sizes[1] > 0 and norm(self.u) > 0.0:
-            self._matrices(stiffness)[0].multAdd(self.u, self.force, self.force)
+            self._matrices()[0].multAdd(self.u, self.force, self.force)
 
-    def tangents(self, stiffness: Callable[[], list[float]]) -> list[PETSc.Mat]:
+    def tangents(self) -> list[PETSc.Mat]:
         """Return the tangents of what acts on the background, in the unknowns."""
         found = []
         if self._background is not None:
@@ -461,17 +457,15 @@ class Field:
             self._product = whole.ptap(self.prolongation, result=self._product)
             found.append(self._product)
         if self._penalised:
-            found.append(self._matrices(stiffness)[1])
+            found.append(self._matrices()[1])
         return found
 
-    def add_product(
-        self, u: PETSc.Vec, force: PETSc.Vec, stiffness: Callable[[], list[float]]
-    ) -> None:
+    def add_product(self, u: PETSc.Vec, force: PETSc.Vec) -> None:
         """Add the product of these tangents on all dofs of V with an increment."""
         if self._background is not None:
             self._background.assemble_tangent().multAdd(u, force, force)
         if self._penalised:
-            self._matrices(stiffness)[0].multAdd(u, force, force)
+            self._matrices()[0].multAdd(u, force, force)
 
     @property
     def _penalised(self) -> bool:
@@ -485,12 +479,10 @@ class Field:
             self._ghosts.penalty(moduli).mult(self.u, force)
         return force
 
-    def _matrices(self, stiffness: Callable[[], list[float]]) -> tuple[PETSc.Mat, PETSc.Mat]:
+    def _matrices(self) -> tuple[PETSc.Mat, PETSc.Mat]:
         """Return the step's penalty on all dofs of V and in the unknowns."""
         if self._penalty is None:
-            if self.moduli is None:
-                self.moduli, self.moduli_at = stiffness(), self.u.copy()
-            assert self._ghosts is not None
+            assert self._ghosts is not None and self.moduli is not None
             matrix = self._ghosts.penalty(self.moduli)
             self._penalty = matrix, matrix.ptap(self.prolongation)
         return self._penalty

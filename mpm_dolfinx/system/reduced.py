@@ -121,6 +121,8 @@ class ReducedSystem:
                 self._find_unknowns()
         with self._statistics.phase("assemble"):
             self.balance.begin()
+            for field in self.fields:
+                field.scale_penalty(self.terms.shear_moduli)
             if any(field.unit is None for field in unknowns.values):
                 self._find_units()
             starts = [term.start(unknowns.transfer, unknowns.prescribed) for term in self.terms]

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 from petsc4py import PETSc
 
 import numpy as np
@@ -48,7 +46,7 @@ class Resistance:
         for field, u in zip(fields, increments, strict=True):
             force = u.duplicate()
             force.set(0.0)
-            field.add_product(u, force, partial(self._terms.shear_moduli, field))
+            field.add_product(u, force)
             total += force.dot(u)
         for term in self._terms:
             motions = [self._unknowns.moved(body, increments) for body in term.bodies]

@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 
 from petsc4py import PETSc
 
@@ -161,7 +160,7 @@ class Tangent:
             ]
             parts += reduced
             for field in unknowns.fields:
-                parts += field.tangents(partial(self._terms.shear_moduli, field))
+                parts += field.tangents()
             if not self._has_diagonal:
                 made.zeros = made.zeros or self._zeros_on_diagonal()
                 parts.append(made.zeros)
@@ -215,7 +214,7 @@ class Tangent:
         unknowns = self._unknowns
         fields, forces = unknowns.fields, unknowns.zeros()
         for field, force in zip(fields, forces, strict=True):
-            field.add_product(field.lift(), force, partial(self._terms.shear_moduli, field))
+            field.add_product(field.lift(), force)
         loops = self.loops
         for number, one in enumerate(unknowns.subspaces):
             if loops is not None and one.prescribes:

@@ -66,3 +66,25 @@ def test_penalty_is_the_jump_of_normal_derivatives(degree):
     G.mult(x, y)
     # (u_1 - u_2)^2 = (x - 1)^(2 k) over both cells, G / h^2 = 3
     assert np.isclose(x.dot(y), PENALTY * 3.0 * 2.0 / (2 * degree + 1), rtol=1e-10)
+
+
+def test_a_penalty_that_comes_later_does_not_depend_on_where_a_step_starts():
+    """With degree 1 it comes where nodes enter cells; points may yield at the first guess then."""
+    found = []
+    for predictor in (True, False):
+        V = scenes.vectors(scenes.box([0.0, -1.0], [2.0, 2.0], [6, 9], QUADRILATERAL))
+        particles = mpm.Particles(scenes.unit(4, QUADRILATERAL), V)
+        law = mpm.materials.VonMises(1e3, 0.3, rho_y=8.0, hardening=50.0)
+        problem = mpm.QuasiStaticProblem(
+            mpm.Body(particles, law, body_force=(0.0, -10.0)),
+            bcs=[mpm.held(V, x=0.0)],
+            solver=mpm.Solver(predictor=predictor),
+        )
+        problem.solve(2)
+        assert problem.reduced.unknowns.moduli is None
+        particles.load.value = 1.05
+        problem.step()
+        assert problem.history.statistics["ghost_facets"] > 0
+        assert problem.reduced.unknowns.moduli == pytest.approx([1e3 / 2.6])
+        found.append(scenes.in_order(particles, particles.centroid))
+    np.testing.assert_allclose(*found, rtol=0.0, atol=1e-9)
