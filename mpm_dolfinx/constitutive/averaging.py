@@ -174,6 +174,9 @@ class VolumeAveraging:
         kind: As given.
         groups: The groups of domains.
         modulus: As given.
+        uneven: Mean stress that the points begin with, less its average over their group, shape
+            ``(n, nq)``. It acts against deviations as it is, so that what is in equilibrium with
+            the given stress point by point is so with averages.
 
     Raises:
         MPMError: Domains that the kind of average is not for.
@@ -193,6 +196,7 @@ class VolumeAveraging:
         self.modulus = modulus
         self.groups = self._grouped(kind, material)
         self.kind = kind
+        self.uneven = np.zeros((self._particles.num_local, self._particles.num_points))
         self._grouped_tangent: GroupedTangent | None = None
         self._low_rank: LowRankTerm | None = None
         self._last: _Averaged | None = None
@@ -218,6 +222,21 @@ class VolumeAveraging:
                 )
             return singles(body)
         return patches(body, material)
+
+    def begin_with(self, stress: Array) -> None:
+        """Let the points, which have not moved, carry a stress (collective).
+
+        Args:
+            stress: Cauchy stress, shape ``(n, nq, 3, 3)``.
+        """
+        own = slice(self._dim)
+        mean = np.einsum("nqii->nq", stress[:, :, own, own]) / self._dim
+        volumes = self._weights * ~self._particles.deleted[:, None]
+        sums = self.groups.sum(
+            np.stack([(volumes * mean).sum(axis=1), volumes.sum(axis=1)], axis=1)
+        )
+        of_group = sums[:, 0] / np.where(sums[:, 1] > 0.0, sums[:, 1], 1.0)
+        self.uneven[:] = mean - of_group[:, None]
 
     def average(self, gradient: Array) -> Array:
         """Return the displacement gradient that the material sees, Fbar - I (collective).
@@ -323,13 +342,13 @@ class VolumeAveraging:
     def energy(self) -> Array:
         """Return the energy per volume of deviations in the last evaluation, shape ``(n, nq)``."""
         cost = deviation_energy(self._averaged.deviation, *FREE[self.kind])
-        return np.asarray(self.modulus[:, None] * cost)
+        return np.asarray(self.modulus[:, None] * cost + self.uneven * self._averaged.deviation)
 
     def _resistance(self) -> tuple[Array, Array]:
         """Return force and stiffness, per volume, against deviations at the points."""
         modulus = self.modulus[:, None]
         force, stiffness = deviation(self._averaged.deviation, *FREE[self.kind])
-        return modulus * force, modulus * stiffness
+        return modulus * force + self.uneven, modulus * stiffness
 
     def counted(self) -> Array:
         """Return the volume of each point that counts in its group, shape ``(n, nq)``."""

@@ -224,6 +224,8 @@ class MaterialPoints:
     def begin_anew(self) -> None:
         """Let the points, which have not moved, be as they were made (collective)."""
         self.go_from(self._initial_states())
+        if self.averaging is not None:
+            self.averaging.uneven[:] = 0.0
 
     def go_from(self, states: list[State]) -> None:
         """Take states of the materials for those of the last converged step; all else stays."""
@@ -257,6 +259,8 @@ class MaterialPoints:
         carried = Carried(stress, np.zeros((len(stress), self.dim, self.dim)))
         if self.mean_stress is not None:
             self.mean_stress.begin_with(np.trace(stress, axis1=1, axis2=2) / 3.0)
+        if self.averaging is not None:
+            self.averaging.begin_with(cauchy_stress)
         with agree(self._comm):
             states = [
                 p.stressed_state(np.arange(len(p.points)), carried, {}) for p in self.laws.governed
@@ -279,6 +283,7 @@ class MaterialPoints:
         gradient, unchanged = self.strain.gradient(), np.ones(self.laws.num_points, dtype=bool)
         if self.averaging is not None and before.averaging is not None:
             gradient = self.averaging.average(gradient)
+            self.averaging.uneven[:] = before.averaging.uneven
             same = self.averaging.groups.same(before.averaging.groups)
             unchanged = np.repeat(same, self._particles.num_points)
         gap = None
@@ -520,11 +525,17 @@ class MaterialPoints:
 
     def converged_state(self) -> dict[str, Column]:
         """Return the history of the last converged step; see :meth:`Converged.columns`."""
-        return self.last.columns()
+        columns = self.last.columns()
+        if self.averaging is not None:
+            columns["uneven"] = Column(self.averaging.uneven, "points")
+        return columns
 
     def set_converged_state(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Make what :meth:`converged_state` once returned the history of the last step."""
-        self.last = self.trial = now = self.last.with_columns(arrays)
+        rest = {name: values for name, values in arrays.items() if name != "uneven"}
+        if self.averaging is not None and len(rest) < len(arrays):
+            self.averaging.uneven[:] = arrays["uneven"].reshape(self.averaging.uneven.shape)
+        self.last = self.trial = now = self.last.with_columns(rest)
         if self.softening is not None and now.average is not None:
             self.softening.begin(now.average)
 

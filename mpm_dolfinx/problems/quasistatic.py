@@ -245,9 +245,13 @@ class QuasiStaticProblem(Problem):
         return [*super().at_end(), *self._constant_arrays()]
 
     def _constant_arrays(self) -> list[NDArray[np.float64]]:
-        """Return the stiffness of supports and, as long as there are any, the forces held back."""
+        """Return what forces have from the beginning on: of supports, averages, those held back.
+
+        The last are there as long as they are held.
+        """
         supports = [one for body in self.bodies for one in self.setup.supports_of(body)]
-        return [*(support.stiffness for support in supports), *self._held.held]
+        averaged = [one.averaging.uneven for one in self.points if one.averaging is not None]
+        return [*(support.stiffness for support in supports), *averaged, *self._held.held]
 
     @override
     def _build(self) -> None:

@@ -117,10 +117,13 @@ class Loaded:
 
     Args:
         support: Kind of support on its base.
+        f_bar: With an average the initial stress grows with depth.
         **numbers: See ``LOADS``.
     """
 
-    def __init__(self, young, weight, push, pressure, moved, lifted, stress, support="fixed"):
+    def __init__(
+        self, young, weight, push, pressure, moved, lifted, stress, support="fixed", f_bar="none"
+    ):
         V = vectors(box([0.0, -0.5], [2.0, 2.5], [6, 9], QUADRILATERAL))
         body = box([0.0, 0.0], [1.0, 2.0], [6, 12], QUADRILATERAL)
         self.particles = particles = mpm.Particles(body, V, quadrature_degree=2)
@@ -151,7 +154,10 @@ class Loaded:
             tractions=[(ufl.as_vector([named["push"], 0.2 * named["push"]]), 1)],
             pressures=[(named["pressure"], 2)],
             facet_tags=tags,
-            initial_stress=-named["stress"] * ufl.Identity(3),
+            initial_stress=-named["stress"]
+            * (1.0 if f_bar == "none" else 2.0 - ufl.SpatialCoordinate(body)[1])
+            * ufl.Identity(3),
+            f_bar=f_bar,
         )
         self.problem = mpm.QuasiStaticProblem(
             given, self.bcs, supports=[rest], solver=mpm.Solver(petsc_options=EXACT)

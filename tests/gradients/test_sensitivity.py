@@ -137,6 +137,11 @@ def test_each_way_to_run(run):
     check(lambda **v: Loaded(**v), LOADS, ["young", "moved", "stress"], change=1e-5, run=RUNS[run])
 
 
+@pytest.mark.parametrize("f_bar", ["patch", "domain"])
+def test_an_initial_stress_that_averages_see(f_bar):
+    check(lambda **v: Loaded(f_bar=f_bar, **v), LOADS, ["young", "stress"], change=1e-5)
+
+
 @pytest.mark.parametrize("over", all_but([None, "patch"], [None, "domain", "patch"]))
 def test_a_residual_in_ufl(over):
     values = {"young": 2e4, "poisson": 0.3, "weight": 1e3}
