@@ -3,7 +3,8 @@
 """Strength of soils: a slope, a vertical cut, footings on soil with friction and on clay.
 
 `factor` is what is found and `exact` what is known: the factor of safety of Griffiths & Lane's
-first slope (1999); gamma H/c of a vertical cut in undrained soil (bounds 3.775 and 3.786), and at
+first slope (1999), dry or, as in their fifth example, under a level of water that was lowered
+slowly; gamma H/c of a vertical cut in undrained soil (bounds 3.775 and 3.786), and at
 most of a slope of 45 degrees on a firm base; of strips N_c and N_q of Prandtl and Reissner, and
 N_gamma of soil with weight and without cohesion (Martin 2005); N_c of a circular footing on clay
 (Cox, Eason & Hopkins 1961, Eason & Shield 1960). `--recommended` is the way to limit loads that
@@ -38,6 +39,9 @@ parser.add_argument(
 )
 parser.add_argument("--run", type=kit.positive, default=2.0, help="of the slope, for a rise of 1")
 parser.add_argument("--friction-angle", type=float, default=20.0, help="of slope and footing")
+parser.add_argument(
+    "--water", type=float, help="level of water below the slope's crest, over its height"
+)
 parser.add_argument("--tolerance", type=kit.positive, default=0.01, help="of the factor of safety")
 parser.add_argument(
     "--limit", type=kit.positive, default=2.0, help="displacement that stands, weight height^2/E"
@@ -61,6 +65,8 @@ parser.add_argument(
 parser.add_stabilisation()
 parser.add_argument("--dilation-angle", type=float, help="of the footing's soil, else associated")
 args = parser.parse()
+if args.water is not None and args.case != "slope":
+    parser.error("argument --water: of a slope alone")
 if not 1.0 <= args.fine <= 5.0:
     parser.error(f"argument --fine: {args.fine:g} is not from 1 to 5")
 
@@ -122,6 +128,7 @@ def floor(V: fem.FunctionSpace) -> list[fem.DirichletBC]:
 # Each but the last has a cohesion of 1, and a stiffness with which it hardly moves before it fails.
 
 young, weight, exact = 1e5, 0.0, np.nan
+water = None
 path = None  # of the strip's settlement over the load factor; none: in proportion
 friction = np.radians(args.friction_angle)
 tangent = np.tan(friction)
@@ -146,7 +153,12 @@ if args.case == "slope":
     if args.friction_angle == 0.0:
         weight, law = 3.0, mpm.materials.Tresca(young, 0.49, cohesion=1.0)
     bcs = [held(V, 0, 0.0), *floor(V)]
-    exact = {(20.0, 2.0): 1.40, (0.0, 1.0): 6.08}.get((args.friction_angle, args.run), np.nan)
+    known = {(20.0, 2.0, None): 1.40, (20.0, 2.0, 0.0): 1.85, (20.0, 2.0, 0.7): 1.30}
+    known[0.0, 1.0, None] = 6.08
+    exact = known.get((args.friction_angle, args.run, args.water), np.nan)
+    if args.water is not None:
+        # The weight of soil is 20 kN/m3, that of water 9.81.
+        water = mpm.WaterTable((1.0 - args.water) * height, 9.81 / 20.0 * weight / height)
 elif args.case == "vertical_cut":
     weight, wide, deep = 3.0, 2.25 * height, 1.375 * height
     wide, deep = h * round(wide / h), h * round(deep / h)
@@ -265,6 +277,7 @@ problem = mpm.QuasiStaticProblem(
         tractions=loads,
         facet_tags=tags if loads else None,
         f_bar=args.f_bar if args.mixed == "none" else "none",
+        pore_pressure=water,
         initial_stress=before if has_strip and (weight or loads) else None,
     ),
     bcs=bcs,

@@ -186,6 +186,12 @@ SOILS = {
     ),
 }
 WATER = {
+    "That slope under water, factor of safety (Griffiths & Lane 1999, example 5)": Value(
+        "factor", "exact", "strength --case slope --water 0 --cell 0.1", "--cell 0.05"
+    ),
+    "Water lowered slowly by 0.7 of its height": Value(
+        "factor", "exact", "strength --case slope --water 0.7 --cell 0.1", "--cell 0.05"
+    ),
     "Column, pressure (Terzaghi 1943)": Error(
         "error", "consolidation --cells 8 --steps 16", "--cells 16 --steps 64"
     ),

@@ -22,7 +22,14 @@ LONG = {
     *("vortex", "disc", "discs", "discs-contact", "column"),
     "indentation",
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
-    *("slope", "vertical-cut", "footing-friction", "footing-weight-rough", "footing-edge"),
+    *(
+        "slope",
+        "slope-water",
+        "vertical-cut",
+        "footing-friction",
+        "footing-weight-rough",
+        "footing-edge",
+    ),
     *("finer-footing", "mixed-footing"),
     *("stiff-footing", "hertz", "hertz-penalty", "hertz-tets", "expansion-whole", "pile-deep"),
     *("wedge-fine", "ironing-stiff"),
@@ -139,6 +146,7 @@ RUNS = {
         {"ratio": 1.04, "plateau": 0.005, "drop": 3e-3},
     ),
     "slope": ("strength", "--case slope --cell 0.2", {"ratio": 1.06}),
+    "slope-water": ("strength", "--case slope --water 0.7", {"factor": 1.33}),
     "vertical-cut": ("strength", "--case vertical_cut --cell 0.125", {"ratio": 1.08}),
     "embankment": (
         "embankment",
