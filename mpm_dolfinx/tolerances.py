@@ -4,15 +4,20 @@
 
 from __future__ import annotations
 
-__all__ = ["BLOCK", "EQUAL", "NEGLIGIBLE", "ROUND_OFF"]
+__all__ = ["BLOCK", "EQUAL", "LOCAL_ITERATIONS", "NEGLIGIBLE", "ROUND_OFF", "SMALL"]
 
 #: Share of what something is compared with that counts as nothing. Errors of sums and quotients of
 #: computed numbers are below it, and what users tell apart is above.
 NEGLIGIBLE = 1e-9
+#: Share that decides nothing: above what round-off leaves of derivatives, fits and distances, below
+#: what anybody measures.
+SMALL = 1e-6
 #: Relative difference of numbers that are equal but for their last places.
 EQUAL = 1e-12
 #: What is left, relative to its parts, of a sum that vanishes: some hundred times the last place.
 ROUND_OFF = 1e-13
+#: Most iterations for one number at a point, or one vector: more than any takes.
+LOCAL_ITERATIONS = 100
 #: Most points or domains that are looked at together, so that what is known of them stays in the
 #: cache of a core.
 BLOCK = 1 << 14

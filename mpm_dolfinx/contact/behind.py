@@ -24,14 +24,12 @@ import basix
 from ..constitutive.averaging import VolumeAveraging
 from ..meshes.quadrature import quadrature_rule
 from ..system.term import PointMaterial
+from ..tolerances import SMALL
 from .surface import Surface
 
 __all__ = ["At", "Behind", "extrapolation"]
 
 type Array = NDArray[np.float64]
-
-#: Least ratio of singular values with which a polynomial is fitted.
-FITTED = 1e-6
 
 
 def extrapolation(cell: basix.CellType, points: Array, places: Array, degree: int) -> Array:
@@ -56,7 +54,7 @@ def extrapolation(cell: basix.CellType, points: Array, places: Array, degree: in
             for x in (points, places)
         )
         sizes = np.linalg.svd(known, compute_uv=False)
-        if len(points) >= len(powers) and sizes.min() > FITTED * sizes.max():
+        if len(points) >= len(powers) and sizes.min() > SMALL * sizes.max():
             return np.asarray(asked @ np.linalg.pinv(known))
     return np.full((len(places), len(points)), 1.0 / len(points))
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from .._core import is_as_inherited, loops
 from ..errors import MPMError, as_ours
 from ..reals import as_reals
+from ..tolerances import EQUAL, LOCAL_ITERATIONS
 
 __all__ = [
     "Coulomb",
@@ -43,8 +44,6 @@ __all__ = [
 
 #: Step of differences of a user's law over the size of what is varied: the third root of eps.
 STEP = 6e-6
-#: Most iterations for the slip of a user's law, and its error over the bound.
-ITERATIONS, ERROR = 60, 1e-12
 #: Least length over which a user's law is varied, over the round-off of positions.
 LENGTH = 1e8
 
@@ -507,11 +506,11 @@ def _rubbing(law: Friction, points: Points, at: Separation) -> tuple[Rubbing, Ar
     # (points may touch at a gap of round-off)
     pressure = np.maximum(trial.pressure, 0.0)
     slip, low, high = np.zeros_like(way), np.zeros_like(way), way
-    for _ in range(ITERATIONS):
+    for _ in range(LOCAL_ITERATIONS):
         rubs = Rubbing(pressure, slip, at.gap, points.stretch, points.memory)
         bound = _bound(law, rubs)
         left = size - stiffness * slip - bound
-        done = np.abs(left) <= ERROR * size
+        done = np.abs(left) <= EQUAL * size
         moves = ~done & ((left > 0.0) | (slip > 0.0))
         if not moves.any():
             break

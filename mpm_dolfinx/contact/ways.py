@@ -25,9 +25,6 @@ from .surface import Surface
 
 __all__ = ["OPPOSITE", "crosses", "gets_deep", "passes"]
 
-#: Penetration, over the thickness of the domain behind, from which a body is in an obstacle
-#: rather than on it.
-DEEP = 1.0
 #: Most places on the way of a point that are looked at, of all points at once, and by steps of
 #: the distance.
 MOST_PLACES, MOST_AT_ONCE, MOST_STEPS = 1000, 100_000, 100
@@ -54,7 +51,7 @@ def passes(
         x: Where they end, shape ``(m, nq, gdim)``.
         pose: Where the obstacle ends.
     """
-    deep = DEEP * np.broadcast_to(surface.thickness[:, None], memory.gap.shape)
+    deep = np.broadcast_to(surface.thickness[:, None], memory.gap.shape)
     a = framed(shape, memory.pose, memory.outcome.positions)
     b = framed(shape, pose, x)
     way = np.linalg.norm(b - a, axis=2)
@@ -62,7 +59,7 @@ def passes(
     if gets_deep(shape, a, b, memory.gap, deep, reached & (surface.weights > 0.0)):
         return True
     near = (memory.gap < way) & (way > 0.0) & (surface.weights > 0.0)
-    thickness, gap, normal = deep[near] / DEEP, memory.gap[near], memory.normal[near]
+    thickness, gap, normal = deep[near], memory.gap[near], memory.normal[near]
     if len(gap) and not memory.exact:
         gap, normal = shape.distance(a[near])
     return crosses(shape, a[near], b[near], gap, normal, thickness)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
+from ..tolerances import NEGLIGIBLE
 from .base import (
     Field,
     Integration,
@@ -27,8 +28,6 @@ __all__ = ["ModifiedCamClay"]
 
 Array = NDArray[np.float64]
 
-NEARLY = 1e-9
-"""Residuals from which one more Newton step ends at round-off."""
 STEPS = 40
 """Newton steps before the bounded search."""
 HALVINGS = 80
@@ -304,8 +303,8 @@ class _Law(NamedTuple):
             y[active] = np.maximum(y[active] + dy, 0.0)
             flow, f = law.residual(volume[active], shape[active], x[active], y[active])
             size = law.pressure(x[active]) + law.growth(volume[active], x[active])
-            done = (np.abs(flow) <= NEARLY * self.swelling[active]) & (
-                np.abs(f) <= NEARLY * size**2
+            done = (np.abs(flow) <= NEGLIGIBLE * self.swelling[active]) & (
+                np.abs(f) <= NEGLIGIBLE * size**2
             )
             active = active[~(done & (y[active] > 0.0))]
             if len(active) == 0:

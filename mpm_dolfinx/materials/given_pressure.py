@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConvergenceError
+from ..tolerances import LOCAL_ITERATIONS
 from .kinematics import KINEMATICS
 from .mandel import trace
 
@@ -41,7 +42,6 @@ type Array = NDArray[np.float64]
 ALPHA = 1e-6
 #: How well the pressure is met, relative to the stresses at hand; or well enough for one more step.
 TOLERANCE, NEARLY = 1e-13, 1e-8
-ITERATIONS = 100
 #: Largest compression in the first iteration, twice as much in each that follows: stiffness grows
 #: under compression, so that Newton's method goes too far then.
 STRIDE = 0.05
@@ -148,7 +148,7 @@ def _solve(
     elastic = np.zeros((n, m))
     after = {name: values.copy() for name, values in variables.items()}
     active, near = np.arange(n), np.zeros(n, dtype=bool)
-    for iteration in range(ITERATIONS):
+    for iteration in range(LOCAL_ITERATIONS):
         law = material.at(active)
         strain = trial[active].copy()
         strain[:, :3] += ((volume - theta)[active] / 3.0)[:, None]

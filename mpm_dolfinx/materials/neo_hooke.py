@@ -11,6 +11,7 @@ from typing import ClassVar, override
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..tolerances import LOCAL_ITERATIONS
 from .base import Field, Integration, Parameter, State, check_parameter, per_row
 from .compiled import CompiledMaterial
 from .mandel import identity, to_tensor, to_vector, trace
@@ -18,9 +19,6 @@ from .mandel import identity, to_tensor, to_vector, trace
 __all__ = ["NeoHooke"]
 
 type Array = NDArray[np.float64]
-
-#: Newton steps for the volume of a given stress: far more than any takes.
-MOST = 60
 
 
 class NeoHooke(CompiledMaterial):
@@ -116,12 +114,14 @@ def _strains(tau: Array, ratio: Array) -> Array:
     end = np.where(ratio > 0.0, (1.0 + tau.min(axis=1, keepdims=True)) / ratio, np.inf)
     low, high = np.full_like(end, -np.inf), end
     x = np.where(beyond < end, beyond, end - 0.5 * (1.0 + np.abs(end)))
-    for _ in range(MOST):
+    for _ in range(LOCAL_ITERATIONS):
         growth = tau - ratio * x
         wrong = 0.5 * np.log1p(growth).sum(axis=1, keepdims=True) - x
         low, high = np.where(wrong > 0.0, x, low), np.where(wrong < 0.0, x, high)
         after = x + wrong / (1.0 + 0.5 * (ratio / (1.0 + growth)).sum(axis=1, keepdims=True))
-        x = np.where((after >= low) & (after <= high), after, 0.5 * (x + high))
+        before, x = x, np.where((after >= low) & (after <= high), after, 0.5 * (x + high))
+        if np.array_equal(before, x, equal_nan=True):
+            break
     return np.asarray(0.5 * np.log1p(tau - ratio * x))
 
 

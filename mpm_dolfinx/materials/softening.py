@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
+from ..tolerances import LOCAL_ITERATIONS
 from .base import Integration, Parameter, State, Update
 from .elastic import IsotropicElastic
 from .given_pressure import AtPressure
@@ -27,7 +28,6 @@ MIXTURE = 2.0
 #: Step of the derivatives by the strain that softens, over that in which strength falls by 1/e.
 STRIDE = 1e-5
 ROUND_OFF = 1e-15
-MOST = 100
 
 
 class SofteningMaterial(IsotropicElastic):
@@ -199,7 +199,7 @@ def _root(excess: Callable[[NDArray[np.int64], Array], Array], low: Array, high:
     size = ROUND_OFF * high
     rows = np.arange(len(low))
     f_low, f_high = high - low, excess(rows, high)
-    for _ in range(MOST):
+    for _ in range(LOCAL_ITERATIONS):
         far = np.flatnonzero(f_high > 0.0)
         if len(far) == 0:
             break
@@ -208,7 +208,7 @@ def _root(excess: Callable[[NDArray[np.int64], Array], Array], low: Array, high:
         f_high[far] = excess(far, high[far])
     best, least = high.copy(), np.abs(f_high)
     side = np.zeros(len(low), dtype=np.int64)
-    for _ in range(MOST):
+    for _ in range(LOCAL_ITERATIONS):
         rows = np.flatnonzero((least > size) & (high - low > size))
         if len(rows) == 0:
             break

@@ -18,12 +18,11 @@ from .. import _compat
 from ..errors import MPMError, agree
 from ..parallel.exchange import swap
 from ..reals import as_reals
+from ..tolerances import SMALL
 
 __all__ = ["BOX_CELLS", "mesh_of_boxes"]
 
 BOX_CELLS = (basix.CellType.quadrilateral, basix.CellType.hexahedron)
-#: Distance of centres, relative to the smallest side, below which they are in one place.
-SAME = 1e-6
 
 
 def mesh_of_boxes(comm: MPI.Comm, points: Any, lengths: Any, gdim: int) -> mesh.Mesh:
@@ -63,7 +62,7 @@ def mesh_of_boxes(comm: MPI.Comm, points: Any, lengths: Any, gdim: int) -> mesh.
 def _require_apart(comm: MPI.Comm, centres: NDArray[np.float64], sides: Any) -> None:
     """Raise an error where two boxes, of any ranks, are in one place (collective)."""
     least = comm.allreduce(float(sides.min(initial=np.inf)), MPI.MIN)
-    places = np.round(centres / (SAME * least)).astype(np.int64)
+    places = np.round(centres / (SMALL * least)).astype(np.int64)
     homes = (places @ np.array([7919, 104729, 1299709])[: centres.shape[1]]) % comm.size
     first = sum(comm.allgather(len(centres))[: comm.rank])
     rows = np.column_stack([places, np.arange(first, first + len(centres))])

@@ -17,6 +17,7 @@ from dolfinx import mesh
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
 from ..reals import as_reals
+from ..tolerances import EQUAL
 
 __all__ = ["grid", "grid_lines"]
 
@@ -26,8 +27,6 @@ type Array = NDArray[np.float64]
 GROWTH = 1.2
 #: Most cells along an axis, and most halvings: more is a mistake in units.
 MOST, DEEPEST = 1_000_000, 20
-#: Distance over the whole length within which two lines are one.
-SAME = 1e-12
 #: Cells by the number of axes, the first by default.
 CELLS = {
     2: (mesh.CellType.quadrilateral, mesh.CellType.triangle),
@@ -114,7 +113,7 @@ def _halved(along: Array, places: Array, times: int) -> Array:
             if 0 <= beside < len(along):
                 more.append(along[middle] + (along[beside] - along[middle]) * shares)
     every = np.sort(np.concatenate(more))
-    new = np.diff(every) > SAME * (along[-1] - along[0])
+    new = np.diff(every) > EQUAL * (along[-1] - along[0])
     return np.asarray(every[np.append(True, new)])
 
 

@@ -22,6 +22,7 @@ from dolfinx import fem, mesh
 
 from .. import _compat
 from ..parallel.exchange import RowExchange
+from ..tolerances import SMALL
 from .redistribution import Carrier, neighbour_ranks
 
 __all__ = ["HALVES", "HALVES_OF_MASS", "PLACES", "Column", "Cuts", "Place", "Remesh", "diagonals"]
@@ -60,8 +61,6 @@ class Column(NamedTuple):
 #: new vertex in the place of its last one.
 HALVES = np.array([[[0, 1, 3, 3], [0, 3, 2, 3]], [[1, 3, 2, 2], [1, 2, 0, 2]]])
 DOUBLED = (2, 1)
-#: Difference of areas, relative to the largest, that does not decide between diagonals.
-EQUAL = 1e-6
 #: What share of the mass at its corners each half gets.
 HALVES_OF_MASS = np.array([[0.5, 1.0, 0.25, 0.25], [0.5, 0.25, 1.0, 0.25]])
 
@@ -83,7 +82,7 @@ def diagonals(
     areas = np.stack(
         [corner_jacobians[:, [1, 2]].min(axis=1), corner_jacobians[:, [0, 3]].min(axis=1)], axis=1
     )
-    second = areas[:, 1] > areas[:, 0] + EQUAL * np.abs(corner_jacobians).max(axis=1)
+    second = areas[:, 1] > areas[:, 0] + SMALL * np.abs(corner_jacobians).max(axis=1)
     return second.astype(np.int64), np.where(second, areas[:, 1], areas[:, 0])
 
 

@@ -19,12 +19,11 @@ from typing import Any, cast
 from mpi4py import MPI
 
 from ..errors import agree, called_last, forget
-from .given import require_same
+from .given import PACKAGE, require_same
 from .kinds import explained, require_truths
 
 __all__ = ["Hooked", "asked", "by_itself", "collective", "hooks_of", "is_collective", "of_user"]
 
-PACKAGE = __name__.partition(".")[0]
 #: What tells the ranks of an object, one after the other.
 KNOWN_BY = ("comm", "mesh", "V", "function_space", "bodies", "particles", "problem")
 _COLLECTIVE, _OWN, _BY_ITSELF = "__collective__", "__own__", "__by_itself__"

@@ -24,8 +24,9 @@ from ufl.corealg.traversal import traverse_unique_terminals
 
 from ..errors import MPMError, gathered, met
 
-__all__ = ["as_positive", "is_number", "require_same", "require_truth", "require_whole"]
+__all__ = ["PACKAGE", "as_positive", "is_number", "require_same", "require_truth", "require_whole"]
 
+#: What all modules of this package begin with.
 PACKAGE = __name__.partition(".")[0]
 #: What describes a law besides its parameters.
 KINDS = ("symmetric", "kinematics", "inelastic")

@@ -15,6 +15,7 @@ from dolfinx import fem
 
 from ..errors import MPMError, agree
 from ..meshes.quadrature import means_around_axis, volume_ratio
+from ..tolerances import SMALL
 from .geometry import Geometry
 from .means import MeansInUFL
 from .reference import Reference
@@ -22,10 +23,6 @@ from .reference import Reference
 __all__ = ["Undeformed", "reach_behind_axis", "separate_nodes"]
 
 type Array = NDArray[np.float64]
-
-#: How far a node may be behind the axis of a body of revolution, over its domain's width: what
-#: soft supports there, and round-off, may leave.
-AXIS = 1e-6
 
 
 class Undeformed:
@@ -267,7 +264,8 @@ def reach_behind_axis(domains: Array) -> NDArray[np.bool_]:
     """
     radii = domains[:, :, 0]
     lowest = radii.min(axis=1, initial=np.inf)
-    return np.asarray(lowest < -AXIS * (radii.max(axis=1, initial=-np.inf) - lowest))
+    # (soft supports at the axis leave little, and so does round-off)
+    return np.asarray(lowest < -SMALL * (radii.max(axis=1, initial=-np.inf) - lowest))
 
 
 def separate_nodes(W: fem.FunctionSpace) -> fem.FunctionSpace:

@@ -14,6 +14,7 @@ from ..constitutive.moduli import undeformed_tangent
 from ..errors import TRIAL_ERRORS, MPMError, ParticleOutsideError
 from ..parallel.boundary import collective
 from ..parallel.interruption import held, interrupted, settle
+from ..tolerances import NEGLIGIBLE
 from .quasistatic import QuasiStaticProblem
 from .through_time import TimeProblem
 
@@ -21,8 +22,6 @@ __all__ = ["StrengthReduction", "strength_reduction"]
 
 type Array = NDArray[np.float64]
 
-#: Least step and tolerance of a factor.
-FINEST = 1e-9
 #: What says that there is no equilibrium, or none was found.
 FAILURES = (*TRIAL_ERRORS, ParticleOutsideError)
 
@@ -258,8 +257,8 @@ def _require(
         for n in numbers
     ):
         raise MPMError("step, tolerance, most and displacement must be positive numbers.")
-    if min(step, tolerance) < FINEST:
-        raise MPMError(f"step and tolerance must be at least {FINEST:g}.")
+    if min(step, tolerance) < NEGLIGIBLE:
+        raise MPMError(f"step and tolerance must be at least {NEGLIGIBLE:g}.")
     if most <= 1.0:
         raise MPMError(f"most= is a factor at which to stop, above 1, not {most:g}.")
     if any(body.load.value < 1.0 for body in problem.bodies) or problem.held_back > 0.0:

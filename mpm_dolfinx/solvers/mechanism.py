@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import ConvergenceError, MPMError
 from ..parallel.magnitudes import norm
+from ..tolerances import LOCAL_ITERATIONS
 from .linear import ShiftedFactor
 from .problem import Levels, Resisting
 
@@ -20,8 +21,6 @@ __all__ = ["mechanism", "not_held"]
 MECHANISM = 1e-5
 #: The same of values that are no displacements, whose stiffness is known to round-off alone.
 UNKNOWN = 0.1
-#: Most inverse iterations that look for such a motion.
-INVERSE_ITERATIONS = 100
 
 
 def mechanism(system: Resisting, factor: ShiftedFactor, y: PETSc.Vec) -> PETSc.Vec | None:
@@ -39,7 +38,7 @@ def mechanism(system: Resisting, factor: ShiftedFactor, y: PETSc.Vec) -> PETSc.V
     assert factor.D is not None
     mode, force = y.copy(), y.duplicate()
     before = np.inf
-    for _ in range(INVERSE_ITERATIONS):
+    for _ in range(LOCAL_ITERATIONS):
         force.pointwiseMult(mode, factor.D)
         force.scale(1.0 / norm(force))
         factor.solve(force, mode)

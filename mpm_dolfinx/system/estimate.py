@@ -17,14 +17,12 @@ from ..assembly.fused import FusedTangent, Restriction
 from ..background.basis import PointBasis
 from ..history import Statistics
 from ..particles.particles import Particles
+from ..tolerances import SMALL
 from ..transfer.matrix import transfer_matrix
 from ..transfer.touched import TouchedNodes
 from .term import Term
 
 __all__ = ["nodal_errors", "shares_of_domains"]
-
-#: Least eigenvalue of a node's stiffness over its largest: what yields is soft, not without any.
-SOFTEST = 1e-6
 
 
 def nodal_errors(
@@ -61,7 +59,8 @@ def nodal_errors(
     largest = np.abs(sizes).max(axis=1, initial=0.0, keepdims=True)
     along = np.einsum("nij,ni->nj", axes, residual)
     moves = largest > 0.0
-    stiffness = np.maximum(np.abs(sizes), SOFTEST * largest)
+    # (what yields is soft, not without any stiffness)
+    stiffness = np.maximum(np.abs(sizes), SMALL * largest)
     return np.asarray(
         (np.where(moves, along**2, 0.0) / np.where(moves, stiffness, 1.0)).sum(axis=1)
     )

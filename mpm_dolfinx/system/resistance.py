@@ -9,14 +9,12 @@ from petsc4py import PETSc
 import numpy as np
 
 from ..parallel.magnitudes import joint_norm, norm
+from ..tolerances import SMALL
 from .terms import Terms
 from .unknowns import Unknowns
 from .value_field import ValueField
 
 __all__ = ["Resistance"]
-
-#: What a motion of one field may be of others.
-ALONE = 1e-6
 
 
 class Resistance:
@@ -70,7 +68,7 @@ class Resistance:
         if not isinstance(field, ValueField) or max(sizes) == 0.0:
             return None
         others = [size for number, size in enumerate(sizes) if number != largest]
-        alone = joint_norm([0.0, *others]) <= ALONE * sizes[largest]
+        alone = joint_norm([0.0, *others]) <= SMALL * sizes[largest]
         return field.carried[0].field.name if alone else None
 
     def extent(self) -> float:
