@@ -117,11 +117,6 @@ class MaterialPoints:
 
     # -- The materials ---------------------------------------------------------------------
 
-    @property
-    def given(self) -> list[Material]:
-        """The materials as they were given."""
-        return self.laws.given
-
     def follow_parameters(self) -> None:
         """Take over the present values of parameters that are Functions or Constants (collective).
 
@@ -298,9 +293,9 @@ class MaterialPoints:
             was = before.last
             self.last = replace(self.last, average=was.average, growth=was.growth)
             self.softening.begin(before.last.average)
-        known = zip(before.given, before.laws.governed, before.last.states, strict=True)
+        known = zip(before.laws.given, before.laws.governed, before.last.states, strict=True)
         episodes = [Episode(*one) for one in known]
-        now = list(zip(self.given, self._present(), strict=True))
+        now = list(zip(self.laws.given, self._present(), strict=True))
         self._settle(states_after(episodes, now, carried, unchanged, self._comm))
 
     def _settle(self, states: list[State]) -> None:
@@ -523,15 +518,15 @@ class MaterialPoints:
             assert last.volume is not None and last.compliance is not None
             self.mean_stress.return_to(last.volume, last.compliance, last.gradient)
 
-    def converged_state(self) -> dict[str, Column]:
+    def columns(self) -> dict[str, Column]:
         """Return the history of the last converged step; see :meth:`Converged.columns`."""
         columns = self.last.columns()
         if self.averaging is not None:
             columns["uneven"] = Column(self.averaging.uneven, "points")
         return columns
 
-    def set_converged_state(self, arrays: dict[str, NDArray[Any]]) -> None:
-        """Make what :meth:`converged_state` once returned the history of the last step."""
+    def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
+        """Make what :meth:`columns` once returned the history of the last step."""
         rest = {name: values for name, values in arrays.items() if name != "uneven"}
         if self.averaging is not None and len(rest) < len(arrays):
             self.averaging.uneven[:] = arrays["uneven"].reshape(self.averaging.uneven.shape)

@@ -161,7 +161,7 @@ def as_parameter(given: Any, problem: Problem, scale: float | None) -> Parameter
             thing, direction = value, np.ones(1)
         else:
             size = largest(np.abs(value), problem) if scale is None else scale
-            known = [law for points in problem.points for law in points.given]
+            known = [law for points in problem.points for law in points.laws.given]
             if all(law is not thing for law in known):
                 raise MPMError(f"{thing!r} is no material of this problem; name one as given.")
             return _OfLaw(thing, name, size)
@@ -200,7 +200,7 @@ def _along(
         raise MPMError(f"The direction of {name} must not be zero.")
     if scale is None:
         scale = largest(np.abs(values), problem) / size
-    laws = [law for points in problem.points for law in points.given]
+    laws = [law for points in problem.points for law in points.laws.given]
     numbers: list[Any] = [value for law in laws for value in law.parameters.values()]
     of_law = any(value is thing for value in numbers)
     elsewhere = any(load is thing for load in problem.loads())

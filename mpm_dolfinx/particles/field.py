@@ -338,7 +338,7 @@ class CarriedField:
         """Return where this rank's own values live, shape ``(N, gdim)`` (collective)."""
         body, gdim = self.field.particles, self.mesh.geometry.dim
         if self.field.at == "points":
-            points = self._undeformed_points() if self.is_frozen else body.converged_points()
+            points = _undeformed_points(body) if self.is_frozen else body.converged_points()
             return points.reshape(-1, gdim)
         if self.is_frozen:
             x = self.W.tabulate_dof_coordinates()[:, :gdim]
@@ -386,18 +386,6 @@ class CarriedField:
             return moved.reshape(-1, gdim)
         return self._at_nodes(motion)
 
-    def _undeformed_points(self) -> NDArray[np.float64]:
-        """Return the undeformed positions of the history's points, ``(n, nq, gdim)``."""
-        gdim = self.mesh.geometry.dim
-        x = self.field.particles.quadrature_function("x", (gdim,))
-        points = x.function_space.ufl_element().custom_quadrature()[0]
-        where = compiled_expression(ufl.SpatialCoordinate(self.mesh), points, self.mesh.comm)
-        x.interpolate(where)
-        count = self.W.dofmap.index_map.size_local
-        return np.asarray(x.x.array[: count * gdim]).reshape(
-            -1, self.field.particles.num_points, gdim
-        )
-
     def _particles_at(self, rows: NDArray[np.bool_]) -> NDArray[np.int64]:
         touched = np.isin(self.domain_nodes, np.flatnonzero(rows)).any(axis=1)
         return np.asarray(self.global_index[touched])
@@ -435,3 +423,14 @@ class CarriedField:
         """Return to the converged values."""
         self.field.x.array[:] = self.field.previous.x.array
         self.increment.x.array[:] = 0.0
+
+
+def _undeformed_points(body: Body) -> NDArray[np.float64]:
+    """Return the undeformed positions of a body's points, ``(n, nq, gdim)`` (collective)."""
+    gdim = body.mesh.geometry.dim
+    x = body.quadrature_function("x", (gdim,))
+    points = x.function_space.ufl_element().custom_quadrature()[0]
+    where = compiled_expression(ufl.SpatialCoordinate(body.mesh), points, body.mesh.comm)
+    x.interpolate(where)
+    count = body.num_local * body.num_points * gdim
+    return np.asarray(x.x.array[:count]).reshape(-1, body.num_points, gdim)

@@ -217,7 +217,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         static = self.inertia.is_static(given.particles)
         return super()._contribution(given)._replace(static=static)
 
-    def _stored(self) -> tuple[float, float]:
+    def stored_and_done(self) -> tuple[float, float]:
         """Return elastic energy, and the work done against stress in the last step (collective)."""
         own = [(s.strain_energy(), s.stress_work) for s in self._step_stresses]
         energy, work = self._comm.allreduce(np.sum(own, axis=0))

@@ -19,7 +19,6 @@ import ufl
 from dolfinx import fem
 
 from .. import _compat
-from ..assembly.fused import Masses
 from ..assembly.inputs import as_expression
 from ..boundary.supports import Support
 from ..contact.contact import Contact
@@ -27,10 +26,9 @@ from ..contact.rigid_body import RigidBody
 from ..errors import MPMError, agree, as_ours
 from ..history import Energy
 from ..parallel.compilation import compiled_expression, compiled_form
-from ..parallel.garbage import weakly
 from ..particles.particles import Particles
 from ..reals import as_reals
-from ..system.inertia import Followed, Inertia
+from ..system.inertia import Inertia
 from ..system.term import PointMaterial
 from .arguments import as_bodies
 from .through_time import TimeProblem
@@ -62,17 +60,7 @@ class MovingProblem(TimeProblem):
         super()._build()
         self._stepper.newton.lets_go = self._stepper.newton.gives_up_early = True
         others = [*self.body_terms, *(term for term in self.terms if term is not self.inertia)]
-        followed = Followed(
-            others,
-            weakly(self._masses),
-            weakly(self._reduced_masses),
-            weakly(self._weigh),
-            weakly(self._works),
-            weakly(self._stored),
-            weakly(self._changes),
-            weakly(self._driven),
-        )
-        self.inertia.follow(followed)
+        self.inertia.follow(self, others)
 
     @override
     def _let_take_part(self, materials: Sequence[PointMaterial | None]) -> None:
@@ -82,27 +70,7 @@ class MovingProblem(TimeProblem):
             if term is not self.inertia:
                 term.pace(self.inertia.dt, self.inertia.scheme.share)
 
-    def _reduced_masses(self, masses: Masses) -> tuple[PETSc.Mat | None, list[Particles]]:
-        """Return :meth:`.Tangent.masses` (collective)."""
-        return self.reduced.tangent.masses(masses)
-
-    def _weigh(self, factor: float) -> None:
-        """Say how often tangents have the masses that the compiled loops have reduced."""
-        self.reduced.tangent.mass_factor = factor
-
-    def _works(self) -> NDArray[np.float64]:
-        """Return the works of the last increment on the backgrounds (collective)."""
-        return self.reduced.balance.works()
-
-    def _changes(self) -> list[NDArray[np.float64]]:
-        """Return the changes of Dirichlet values in the step, on own dofs of each background."""
-        return [field.changes() for field in self.reduced.fields]
-
-    def _driven(self, particles: Particles, values: Sequence[NDArray[np.float64]]) -> PETSc.Vec:
-        """Return how Dirichlet values move a body (collective)."""
-        return self.reduced.unknowns.driven(particles, values)
-
-    def _stored(self) -> tuple[float, float]:
+    def stored_and_done(self) -> tuple[float, float]:
         """Return elastic energy, and the work done against stress in the last step (collective).
 
         No number, and zero, where forms do not say what they store.
@@ -113,7 +81,7 @@ class MovingProblem(TimeProblem):
     def _mass_form(self, number: int, product: Any) -> ufl.Form:
         """Return the integral of a body's density times a product of functions."""
 
-    def _masses(self, number: int) -> NDArray[np.float64]:
+    def domain_masses(self, number: int) -> NDArray[np.float64]:
         """Return the consistent mass of each owned domain of a body, ``(n, k, k)`` (collective)."""
         body = self.bodies[number]
         (element,) = set(body.W.ufl_element().sub_elements)
@@ -158,7 +126,7 @@ class MovingProblem(TimeProblem):
 
     @override
     def at_end(self) -> list[NDArray[np.float64]]:
-        return self.after_motion(self._changes())
+        return self.after_motion([field.changes() for field in self.reduced.fields])
 
     def after_motion(
         self, changes: Sequence[NDArray[np.float64]], taken: Sequence[PETSc.Vec] | None = None

@@ -693,12 +693,12 @@ class QuasiStaticProblem(Problem):
 
     @override
     def converged_state(self) -> list[dict[str, Any]]:
-        return [dict(stress.converged_state()) for stress in self._built.points]
+        return [dict(points.columns()) for points in self._built.points]
 
     @override
     def set_converged_state(self, states: list[dict[str, NDArray[Any]]]) -> None:
         for stress, arrays in zip(self._built.points, states, strict=True):
-            stress.set_converged_state(arrays)
+            stress.restore(arrays)
 
     @override
     def laws(self) -> list[list[Law]]:

@@ -22,9 +22,10 @@ Dirichlet values move.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import NamedTuple, override
+from typing import NamedTuple, Protocol, override
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -41,49 +42,56 @@ from ..particles.particles import Particles
 from .account import Account
 from .mass import NodalMass, deleted, dot, nodal_mass
 from .projection import Projection
+from .reduced import ReducedSystem
 from .schemes import Factors, Kinematics, Rates, Scheme, rates_of
 from .term import Motion, Term, Transfer
 from .velocities import Velocities
 
-__all__ = ["Followed", "Inertia", "Projected"]
+__all__ = ["Inertia", "Moving", "Projected"]
 
-type DomainMasses = Callable[[int], NDArray[np.float64]]
-"""Returns the consistent mass of each owned domain of a body, ``(n, k, k)``, by its number."""
 type ReducedMasses = Callable[[Masses], tuple[PETSc.Mat | None, list[Particles]]]
 """Reduces masses of domains by compiled loops; see :meth:`.Tangent.masses`."""
-type Works = Callable[[], NDArray[np.float64]]
-"""Returns the works of the last increment on the backgrounds; see :meth:`Field.works`."""
-type Changes = Callable[[], list[NDArray[np.float64]]]
-"""Returns the changes of Dirichlet values in the step, on own dofs of each background."""
-type Driven = Callable[[Particles, Sequence[NDArray[np.float64]]], PETSc.Vec]
-"""Returns how such values move a body."""
-type Stored = Callable[[], tuple[float, float]]
-"""Returns the elastic energy of all bodies, and the work done against stress in the last step."""
 
 
-class Followed(NamedTuple):
-    """Rest of a problem, as inertia must know it, on the present meshes.
+class Moving(Protocol):
+    """Problem with inertia, as inertia must know it."""
+
+    @property
+    def reduced(self) -> ReducedSystem:
+        """The system."""
+
+    def domain_masses(self, number: int) -> NDArray[np.float64]:
+        """Return the consistent mass of each owned domain of a body, ``(n, k, k)``."""
+
+    def stored_and_done(self) -> tuple[float, float]:
+        """Return the elastic energy of all bodies, and the work against stress in the last step."""
+
+
+class _Rest:
+    """The rest of a problem on its present meshes.
+
+    Args:
+        problem: The problem, which is not kept alive.
+        terms: All other terms.
 
     Attributes:
-        terms: All other terms.
-        mass: Returns the mass of domains.
-        reduced: Reduces it by compiled loops.
-        weigh: Says how often tangents have what these have reduced.
-        works: Returns the works of the last increment on the backgrounds.
-        stored: Returns the elastic energy at the last converged step, and the work done against
-            stress in the last step.
-        changes: Returns the changes of Dirichlet values in the step.
-        driven: Returns how such values move a body.
+        terms: As given.
     """
 
-    terms: Sequence[Term]
-    mass: DomainMasses
-    reduced: ReducedMasses
-    weigh: Callable[[float], None]
-    works: Works
-    stored: Stored
-    changes: Changes
-    driven: Driven
+    def __init__(self, problem: Moving, terms: Sequence[Term]) -> None:
+        self._problem, self.terms = weakref.ref(problem), terms
+
+    @property
+    def problem(self) -> Moving:
+        """The problem."""
+        problem = self._problem()
+        assert problem is not None
+        return problem
+
+    @property
+    def reduced(self) -> ReducedSystem:
+        """Its system."""
+        return self.problem.reduced
 
 
 class _Beginning(NamedTuple):
@@ -181,7 +189,7 @@ class Inertia(Term):
         self._state = Velocities(bodies, velocities, scheme, rayleigh, static, self._account)
         self.velocities = self._state.velocities
         self.dt, self._end = 1.0, 1.0
-        self._followed: Followed | None = None
+        self._others: _Rest | None = None
         self._mass: NodalMass | None = None
         self._reduced: _Reduced | None = None
         self._beginning: _Beginning | None = None
@@ -194,14 +202,31 @@ class Inertia(Term):
         return self._state.is_static(body)
 
     @property
-    def _rest(self) -> Followed:
+    def _rest(self) -> _Rest:
         """The rest of the problem."""
-        assert self._followed is not None
-        return self._followed
+        assert self._others is not None
+        return self._others
 
-    def follow(self, followed: Followed) -> None:
-        """Take over the rest of the problem on the present meshes."""
-        self._followed, self._mass = followed, None
+    def follow(self, problem: Moving, terms: Sequence[Term]) -> None:
+        """Take over the rest of a problem on its present meshes.
+
+        Args:
+            problem: The problem, which is not kept alive.
+            terms: All other terms.
+        """
+        self._others, self._mass = _Rest(problem, terms), None
+
+    def _domain_masses(self) -> list[NDArray[np.float64] | None]:
+        """Return the mass of each body's domains by what densities are now (collective)."""
+        problem = self._rest.problem
+        return [
+            None if self.is_static(body) else problem.domain_masses(number)
+            for number, body in enumerate(self.bodies)
+        ]
+
+    def _changes(self) -> list[NDArray[np.float64]]:
+        """Return the changes of Dirichlet values in the step, on own dofs of each background."""
+        return [field.changes() for field in self._rest.reduced.fields]
 
     def join(self, bodies: Sequence[Particles]) -> None:
         """Act on some more bodies, which are at rest, or on fewer of the last (collective).
@@ -219,11 +244,7 @@ class Inertia(Term):
         """
         present = deleted(self.bodies)
         if self._mass is None or present != self._mass.deleted:
-            domains = [
-                None if self.is_static(body) else self._rest.mass(number)
-                for number, body in enumerate(self.bodies)
-            ]
-            self._mass = nodal_mass(self.bodies, domains, present)
+            self._mass = nodal_mass(self.bodies, self._domain_masses(), present)
             owned = [own.sum(axis=(1, 2)) for own in self._mass.domains]
             for term in self._rest.terms:
                 term.weigh([owned[self._state.number(body)] for body in term.bodies])
@@ -245,7 +266,9 @@ class Inertia(Term):
         for term in self._rest.terms:
             term.roll_back()
         self._state.note_forces(self._rest.terms)
-        self._account.begin(time, mass.kinetic(self.velocities), self._rest.stored()[0])
+        self._account.begin(
+            time, mass.kinetic(self.velocities), self._rest.problem.stored_and_done()[0]
+        )
 
     def resume(self) -> None:
         """Let forces of whole steps take note of where a restored run is (collective)."""
@@ -297,8 +320,8 @@ class Inertia(Term):
         reduced, step = self._reduce(transfer), self._step
         if self.scheme.reflects:
             return None
-        rates = self.driven(self._rest.changes())
-        driven = _driven(self.bodies, self._rest, rates)
+        rates = self.driven(self._changes())
+        driven = _driven(self.bodies, self._rest.reduced, rates)
         v = [v.copy() for v in step.fields[0]]
         for part, own in zip(v, driven or (), strict=False):
             part.axpy(-1.0, own)
@@ -372,11 +395,7 @@ class Inertia(Term):
     def weighed(self) -> NodalMass:
         """Return the mass by what densities are now (collective)."""
         known = self.mass()
-        domains = [
-            None if self.is_static(body) else self._rest.mass(number)
-            for number, body in enumerate(self.bodies)
-        ]
-        return nodal_mass(self.bodies, domains, known.deleted)
+        return nodal_mass(self.bodies, self._domain_masses(), known.deleted)
 
     def assume(self, mass: NodalMass) -> None:
         """Let the mass be another one in :meth:`held`."""
@@ -400,7 +419,7 @@ class Inertia(Term):
         Ts = [transfer(body) for body in self.bodies]
         known = self._reduced
         if known is None or any(T is not its for T, its in zip(Ts, known.transfers, strict=True)):
-            self._reduced = known = _reduced(self._step.mass, Ts, self._rest.reduced)
+            self._reduced = known = _reduced(self._step.mass, Ts, self._rest.reduced.tangent.masses)
         return known
 
     @override
@@ -423,7 +442,7 @@ class Inertia(Term):
     def reduced_tangents(self, transfer: Transfer) -> Sequence[PETSc.Mat]:
         """Return the mass of bodies that fused forms do not have."""
         reduced, factor = self._reduce(transfer), self._step.factor
-        self._rest.weigh(factor)
+        self._rest.reduced.tangent.mass_factor = factor
         if reduced.mass is None or reduced.scaled is None:
             return []
         reduced.mass.copy(reduced.scaled, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
@@ -458,10 +477,10 @@ class Inertia(Term):
             works["lost"] += account.missing(works, kinetic)
         parts = [moved.increment, *step.fields]
         kept = [_combined(factors, parts) for factors in step.rates.kept]
-        account.book(works, kinetic, self._rest.stored()[1])
-        self._state.commit([moved.after, *kept], self._rest.changes(), self._end)
+        account.book(works, kinetic, self._rest.problem.stored_and_done()[1])
+        self._state.commit([moved.after, *kept], self._changes(), self._end)
         self.mass()
-        account.note(self._end, self._rest.stored()[0])
+        account.note(self._end, self._rest.problem.stored_and_done()[0])
         return undo
 
     def _kinematics(self, projected: Sequence[PETSc.Vec] | None = None) -> Kinematics:
@@ -492,7 +511,7 @@ class Inertia(Term):
         step, share, state, terms = self._step, self.scheme.share, self._state, self._rest.terms
         w, mass = moved.increment, step.mass
         drag = _combined(self._damping * step.rates.damped, [w, *step.fields])
-        on_background, prescribed, left = share * self._rest.works()
+        on_background, prescribed, left = share * self._rest.reduced.balance.works()
         whole, resisted = np.sum([term.step_work() for term in terms], axis=0)
         parts = [state.forces, state.external]
         before = [mass.vectors(functions) for functions in parts]
@@ -549,13 +568,13 @@ def _combined(factors: Factors, parts: Sequence[Sequence[PETSc.Vec]]) -> list[PE
 
 
 def _driven(
-    bodies: Sequence[Particles], rest: Followed, rates: list[NDArray[np.float64]]
+    bodies: Sequence[Particles], reduced: ReducedSystem, rates: list[NDArray[np.float64]]
 ) -> list[PETSc.Vec] | None:
     """Return velocities by Dirichlet values that move, ``None`` where none does (collective)."""
     comm = bodies[0].V.mesh.comm
     if not comm.allreduce(any(bool(np.any(rate)) for rate in rates), MPI.LOR):
         return None
-    return [rest.driven(body, rates) for body in bodies]
+    return [reduced.unknowns.driven(body, rates) for body in bodies]
 
 
 def _reduced(mass: NodalMass, transfers: list[PETSc.Mat], by_loops: ReducedMasses) -> _Reduced:

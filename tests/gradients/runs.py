@@ -108,7 +108,7 @@ class Slump:
             "stress": lambda: self.particles.point_stress,
             "reaction": lambda: self.problem.reaction(self.bcs[0]),
         }
-        if getattr(points.given[0], "inelastic", False):
+        if getattr(points.laws.given[0], "inelastic", False):
             self.looks["plastic"] = lambda: points.last.variable("plastic_strain")
 
 

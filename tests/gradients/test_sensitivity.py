@@ -185,7 +185,7 @@ def test_numbers_of_laws_functions_and_directions():
 
     def made(young):
         scene = Slump(lambda: materials.Hencky(young, 0.3), {"weight": 1e3})
-        return scene, scene.problem.points[0].given[0]
+        return scene, scene.problem.points[0].laws.given[0]
 
     scene, law = made(2e4)
     gradient = mpm.Sensitivity(scene.problem, [(law, "young"), (scene.weight, 1.0)])
@@ -193,7 +193,7 @@ def test_numbers_of_laws_functions_and_directions():
     plain = gradient.of(lambda: scene.particles.displacement.x.array)
     assert size(plain[:, 0] - gradient.displacement[0].x.array) < 1e-8 * size(plain[:, 0])
     scene = Slump(lambda: None, {"weight": 1e3}, material=lambda body: _layered(body, 2e4))
-    young = scene.problem.points[0].given[0].parameters["young"]
+    young = scene.problem.points[0].laws.given[0].parameters["young"]
     upper = fem.Function(young.function_space)
     upper.interpolate(lambda x: 1.0 * (x[1] > 1.0))
     lower = fem.Function(young.function_space)
@@ -264,7 +264,7 @@ def test_it_is_the_same_on_any_number_of_ranks():
 def test_what_is_not_followed_is_refused():
     scene = Slump(von_mises, VON_MISES)
     problem, young = scene.problem, scene.named["young"]
-    law = problem.points[0].given[0]
+    law = problem.points[0].laws.given[0]
     for wrong, words in (
         ([], "Name a parameter"),
         ([3.0], "A parameter is"),
@@ -336,4 +336,4 @@ def test_free_nodes_are_not_followed():
         bcs=[mpm.held(V, y=0.0)],
     )
     with pytest.raises(mpm.MPMError, match="does not follow bodies with free nodes"):
-        mpm.Sensitivity(problem, [(problem.points[0].given[0], "young")])
+        mpm.Sensitivity(problem, [(problem.points[0].laws.given[0], "young")])

@@ -445,7 +445,7 @@ class Observer:
         if self.f_bar != "none":
             F = np.tile(np.eye(3), (*F.shape[:2], 1, 1))
             dim = 3 if domains.axisymmetric else domains.dim
-            kept = points.converged_state()["gradient"].values
+            kept = points.last.columns()["gradient"].values
             F[..., :dim, :dim] += kept.reshape(*F.shape[:2], dim, dim)
         sigma = points.last.cauchy_stress()
         if self.law == "small":
