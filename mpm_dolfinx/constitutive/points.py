@@ -459,11 +459,6 @@ class MaterialPoints:
         if self.mean_stress is not None:
             self.mean_stress.see(volumes)
 
-    @property
-    def averages(self) -> bool:
-        """Whether laws soften by an average over a length."""
-        return self.softening is not None
-
     def expect(self) -> None:
         """Begin a step with the average that is expected at its end."""
         last = self.last

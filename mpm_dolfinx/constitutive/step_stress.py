@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 from .._core import loops
 from ..meshes.quadrature import volume_ratio
 from ..particles.reference import Reference
-from .assignment import Assignment
 from .averaging import Linearised, LowRankTerm, VolumeAveraging
 from .discrete_gradient import Ends, Gradients, abandon, by_end, mean, mean_of_groups
 from .groups import Groups
@@ -411,32 +410,6 @@ class StepStress:
     def initial_modulus(self) -> Array:
         """Return :meth:`MaterialPoints.initial_modulus` (collective)."""
         return self._points.initial_modulus()
-
-    @property
-    def averages(self) -> bool:
-        """Whether laws soften by an average over a length."""
-        return self._points.averages
-
-    @property
-    def laws(self) -> Assignment:
-        """The materials, each at the points that it governs."""
-        return self._points.laws
-
-    def expect(self) -> None:
-        """Begin a step with the average that is expected at its end."""
-        self._points.expect()
-
-    def alternate(self) -> int:
-        """Average what softens; return the linear solves that it took (collective)."""
-        return self._points.alternate()
-
-    def elastic(self) -> bool:
-        """Return whether the history stays as it is in the last update."""
-        return self._points.elastic()
-
-    def yielding(self) -> NDArray[np.bool_]:
-        """Return :meth:`MaterialPoints.yielding`."""
-        return self._points.yielding()
 
     def commit(self) -> Callable[[], None]:
         """Make the last update the history, and take note of the work done in the step.

@@ -313,9 +313,7 @@ def _not_in(problem: Problem) -> list[str]:
             not (b.method == "cpdi2" or b.is_free) for b in bodies
         ),
         "bodies with free nodes (free=)": any(b.free_nodes is not None for b in bodies),
-        "bodies with a length=": any(
-            points.averages for points in problem.points if points is not None
-        ),
+        "bodies with a length=": any(points.softening is not None for points in problem.points),
         "fields that are solved in turn with the displacements": problem.reduced.terms.alternates,
         "bodies whose particles may be deleted": any(b.deletion is not None for b in bodies),
         "bodies whose domains are split": any(b.on_distortion == "split" for b in bodies),

@@ -85,8 +85,7 @@ class ParticleProblem(Problem):
                 "on_distortion='split' is for mpm.QuasiStaticProblem."
             )
         self._given = [
-            Contribution(r, j, None, None, symmetric)
-            for r, j in zip(residuals, tangents, strict=True)
+            Contribution(r, j, symmetric) for r, j in zip(residuals, tangents, strict=True)
         ]
         self._entity_maps = entity_maps
         super().__init__(particles, bcs, background, as_solver(solver), terms, fields)

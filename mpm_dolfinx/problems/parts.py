@@ -12,15 +12,15 @@ import ufl
 from dolfinx import fem
 
 from ..assembly.background_forms import BackgroundForms
-from ..assembly.body_forms import BodyForms, PointStress
+from ..assembly.body_forms import BodyForms
 from ..assembly.field_forms import FieldForms
 from ..assembly.rules import data_at_points
-from ..constitutive.averaging import Linearised
+from ..constitutive.points import MaterialPoints
 from ..errors import MPMError
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
 from ..stabilisation.choice import joints_of, stabilisation_of
-from ..system.body import BodyTerm, PointHistory, StepForce
+from ..system.body import ActingStress, BodyTerm, StepForce
 from ..system.field import Field
 from ..system.free_field import FreeField
 from ..system.values import FormsTerm
@@ -36,20 +36,18 @@ class Contribution(NamedTuple):
     Attributes:
         residual: Form on the body mesh, or ``None``.
         tangent: Form on the body mesh; ``None`` is the residual's derivative.
-        internal: Stress whose virtual work is not in the residual, or ``None``.
-        low_rank: What the tangent has besides forms and the pointwise one, or ``None``.
         symmetric: Whether the tangent is symmetric.
-        material: The material at its points, if the above hold one.
+        stress: Stress whose virtual work is not in the residual, or ``None``.
+        points: The material at its points, of which that is.
         of_step: What among its forces may be of a whole step in time.
         static: Whether the body is in equilibrium at each step's end, in a motion of others.
     """
 
     residual: ufl.Form | None
     tangent: ufl.Form | None
-    internal: PointStress | None
-    low_rank: Linearised | None
     symmetric: bool
-    material: PointHistory | None = None
+    stress: ActingStress | None = None
+    points: MaterialPoints | None = None
     of_step: Sequence[StepForce] = ()
     static: bool = False
 
@@ -102,7 +100,7 @@ class Parts:
 
     def _moves(self, given: Contribution) -> bool:
         """Return whether the displacement of a body is an unknown."""
-        return given.residual is not None or given.internal is not None or not self.residuals
+        return given.residual is not None or given.stress is not None or not self.residuals
 
     @property
     def moving(self) -> list[Particles]:
@@ -122,12 +120,13 @@ class Parts:
                     given.residual,
                     given.tangent,
                     body,
-                    given.internal,
-                    given.low_rank,
+                    given.stress,
+                    None if given.stress is None else given.stress.grouped,
                     [field for field in self._known if field.particles is body],
                     **self._form_options,
                 ),
-                given.material,
+                given.stress,
+                given.points,
                 given.of_step,
                 given.static,
             )

@@ -172,7 +172,7 @@ class Problem(Hooked):
         self.body_terms = parts.body_terms()
         self._field_terms = self._couplings(parts)
         carried = self.carried
-        self._let_take_part([given.material for given in contributions])
+        self._let_take_part([given.stress for given in contributions])
         fields = [
             *parts.displacement_fields(self.bcs, self._keeps_joints),
             *(ValueField(group, self.bcs) for group in by_space(carried)),

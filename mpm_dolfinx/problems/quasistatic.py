@@ -511,10 +511,9 @@ class QuasiStaticProblem(Problem):
         return Contribution(
             sum(loads[1:], loads[0]) if loads else None,
             sum(slopes[1:], slopes[0]) if slopes else None,
-            acting,
-            acting.grouped,
             symmetric,
             acting,
+            history,
             of_step,
         )
 

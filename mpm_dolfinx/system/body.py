@@ -12,46 +12,27 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from ..assembly.body_forms import BodyForms
+from ..assembly.body_forms import BodyForms, PointStress
 from ..assembly.low_rank import ReducedLowRank
-from ..constitutive.assignment import Assignment
+from ..constitutive.averaging import Linearised
 from ..constitutive.moduli import undeformed_tangent
+from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree
 from ..particles.particles import Particles
 from .term import Motion, PointMaterial, Term, Transfer
 
-__all__ = ["BodyTerm", "PointHistory", "StepForce"]
+__all__ = ["ActingStress", "BodyTerm", "StepForce"]
 
 
-class PointHistory(PointMaterial, Protocol):
-    """A material at a body's points, with its history. What is here is not collective."""
+class ActingStress(PointMaterial, PointStress, Protocol):
+    """The stress that acts at a body's points, with its history."""
 
     @property
-    def weights(self) -> NDArray[np.float64]:
-        """Undeformed volume of each point, shape ``(n, nq)``; 0 where deleted."""
+    def grouped(self) -> Linearised | None:
+        """The low-rank part of the tangent, from a group's other points; ``None`` without F-bar."""
 
     def update(self) -> None:
         """Update stress and tangent for the present displacement, or raise an MPMError."""
-
-    @property
-    def averages(self) -> bool:
-        """Whether laws soften by an average over a length, found in turn with displacements."""
-
-    def expect(self) -> None:
-        """Begin a step with the average that is expected at its end."""
-
-    def alternate(self) -> int:
-        """Average what softens; return the linear solves that it took (collective)."""
-
-    @property
-    def laws(self) -> Assignment:
-        """The materials, each at the points that it governs."""
-
-    def elastic(self) -> bool:
-        """Return whether the history stays as it is in the last update."""
-
-    def yielding(self) -> NDArray[np.bool_]:
-        """Whether the history of each particle changes in the last update."""
 
     def commit(self) -> Callable[[], None]:
         """Make the last update the history; return what takes that back."""
@@ -88,7 +69,8 @@ class BodyTerm(Term):
     Args:
         particles: The body.
         forms: Its residual and tangent.
-        material: Its material, if the forms hold one.
+        stress: The stress that acts on it, if the forms hold one.
+        points: The material at its points, of which that is.
         of_step: What among its forces may be of a whole step.
         static: Whether, in a motion of others, the body is in equilibrium at each step's end: its
             forces there count for the whole step.
@@ -105,7 +87,8 @@ class BodyTerm(Term):
         self,
         particles: Particles,
         forms: BodyForms,
-        material: PointHistory | None = None,
+        stress: ActingStress | None = None,
+        points: MaterialPoints | None = None,
         of_step: Sequence[StepForce] = (),
         static: bool = False,
     ) -> None:
@@ -114,7 +97,7 @@ class BodyTerm(Term):
         self._of_step = tuple(of_step)
         self.particles = particles
         self.forms = forms
-        self._material = material
+        self._stress, self._points = stress, points
         self._T: PETSc.Mat | None = None
         self._low_rank: ReducedLowRank | None = None
 
@@ -136,8 +119,8 @@ class BodyTerm(Term):
 
     @override
     def start(self, transfer: Transfer, prescribed: Motion) -> None:
-        if self._material is not None and self._material.averages:
-            self._material.expect()
+        if self._points is not None:
+            self._points.expect()
 
     @override
     def pace(self, dt: float, share: float) -> None:
@@ -185,10 +168,10 @@ class BodyTerm(Term):
 
     @override
     def update(self) -> MPMError | None:
-        if self._material is None:
+        if self._stress is None:
             return None
         try:
-            self._material.update()
+            self._stress.update()
         except MPMError as error:
             return error
         return None
@@ -196,20 +179,20 @@ class BodyTerm(Term):
     @property
     @override
     def alternates(self) -> bool:
-        return self._material is not None and self._material.averages
+        return self._points is not None and self._points.softening is not None
 
     @override
     def alternate(self) -> int:
-        return 0 if self._material is None else self._material.alternate()
+        return 0 if self._points is None else self._points.alternate()
 
     @override
     def smooth(self) -> bool:
         """Whether all points are smooth; it may differ between ranks."""
-        return self._material is None or self._material.elastic()
+        return self._points is None or self._points.elastic()
 
     @override
     def yielding(self) -> NDArray[np.bool_] | None:
-        return None if self._material is None else self._material.yielding()
+        return None if self._points is None else self._points.yielding()
 
     @override
     def residuals(self) -> Sequence[PETSc.Vec]:
@@ -271,14 +254,14 @@ class BodyTerm(Term):
         coordinates is does not matter.
         """
         particles = self.particles
-        if self._material is None:
+        if self._points is None:
             energy = self.forms.energies_of_gradients()
         else:
             # (not around an axis, where a shear strains hoops by what is far from the middle)
             plane = (slice(particles.mesh.geometry.dim),) * 4
             with agree(particles.mesh.comm):
-                tangent = undeformed_tangent(self._material.laws)[:, *plane]
-            energy = np.einsum("n,niJiJ->iJ", self._material.weights.ravel(), tangent)
+                tangent = undeformed_tangent(self._points.laws)[:, *plane]
+            energy = np.einsum("n,niJiJ->iJ", self._points.weights.ravel(), tangent)
         own = [particles.initial_volume.sum(), *energy.ravel()]
         volume, *energies = particles.mesh.comm.allreduce(np.array(own))
         positive = [float(energy / volume) for energy in energies if energy > 0.0]
@@ -286,10 +269,10 @@ class BodyTerm(Term):
 
     @override
     def commit(self) -> Callable[[], None] | None:
-        return None if self._material is None else self._material.commit()
+        return None if self._stress is None else self._stress.commit()
 
     @override
     def roll_back(self) -> None:
         self.forms.update_average()
-        if self._material is not None:
-            self._material.roll_back()
+        if self._stress is not None:
+            self._stress.roll_back()
