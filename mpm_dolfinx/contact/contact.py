@@ -96,6 +96,10 @@ class Contact(Term):
         self._joins = True
         self._gone = [contact for term in gone for contact in getattr(term, "contacts", ())]
 
+    def _has_joined(self) -> None:
+        """Note that it has begun: there is nothing of other contacts to take over any more."""
+        self._joins, self._gone = False, []
+
     @override
     def take_part(
         self,

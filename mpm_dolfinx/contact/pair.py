@@ -166,7 +166,7 @@ class Pair(Contact):
             gone = [contact for contact in self._gone if isinstance(contact, Pair)]
             self._stand_in([one for one in gone if set(one.bodies) == set(self.bodies)])
             _require_apart(self._comm, self._passes)
-            self._joins, self._gone = False, []
+            self._has_joined()
 
     def _stand_in(self, gone: Sequence[Pair]) -> None:
         """Take over where points stick from contacts that are gone (collective).

@@ -156,7 +156,7 @@ class Rigid(Obstacle):
                     self._stand_in(contact.grip())
             assert self._memory is not None
             self._require_apart(self._memory)
-            self._joins, self._gone = False, []
+            self._has_joined()
 
     @override
     def pace(self, dt: float, share: float) -> None:
