@@ -186,6 +186,9 @@ SOILS = {
     ),
 }
 WATER = {
+    "Seepage under a sheet pile, half as deep as its layer, discharge (Harr 1962)": Value(
+        "discharge", "exact", "seepage --cell 0.25", "--cell 0.125", 4
+    ),
     "That slope under water, factor of safety (Griffiths & Lane 1999, example 5)": Value(
         "factor", "exact", "strength --case slope --water 0 --cell 0.1", "--cell 0.05"
     ),
