@@ -36,7 +36,6 @@ CALLS = (
     "residuals",
     "tangents",
     "reduced_tangents",
-    "reduced_product",
     "commit",
     "roll_back",
     "end_forces",

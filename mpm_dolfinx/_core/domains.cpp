@@ -102,6 +102,41 @@ struct Revolution
   }
 };
 
+// Add K (rows x columns of dofs, line by line) to a block: that of a node with the one at a position
+// in its row, of whose dofs those of a mask have numbers.
+template <int height, int width>
+inline void add_to(const Target& target, std::int32_t node, std::int32_t position,
+                   std::uint8_t mask, const double* K)
+{
+  const std::int32_t place = target.places[target.rows[node] + position];
+  double* values = target.values[place & 3] + (place >> 2);
+  const std::int64_t* starts = target.starts + node * height * 2 + (place & 1);
+  for (int i = 0; i < height; ++i)
+  {
+    if (starts[2 * i] < 0)
+      continue;
+    double* out = values + starts[2 * i];
+    if (mask == (1 << width) - 1)
+      for (int j = 0; j < width; ++j)
+        out[j] += K[i * width + j];
+    else
+      for (int j = 0; j < width; ++j)
+        if (mask >> j & 1)
+          *out++ += K[i * width + j];
+  }
+}
+
+// Go through domains with their pairs.
+template <typename F>
+void for_each_domain(const Target& target, F&& f)
+{
+  for (std::size_t n = 0; n < target.count; ++n)
+  {
+    const std::size_t p = target.order[n];
+    f(p, static_cast<std::size_t>(target.offsets[p + 1] - target.offsets[p]), target.pairs[p]);
+  }
+}
+
 // Room for the products of one domain.
 struct Work
 {
@@ -111,10 +146,14 @@ struct Work
 
 // Add T^T K T of one domain; K is (nodes dim, nodes dim). T is sparse: zeros are passed over.
 template <int dim>
-void add_element(const double* K, int nodes, const double* transfer, std::size_t size,
-                 const std::int32_t* positions, double* values, Work& work)
+void add_element(const double* K, int nodes, const double* transfers, std::size_t p,
+                 const Target& target, Work& work)
 {
   constexpr int block = dim * dim;
+  const std::size_t size = target.offsets[p + 1] - target.offsets[p];
+  const double* transfer = transfers + target.offsets[p] * nodes;
+  const std::int32_t* seen = target.nodes + target.offsets[p];
+  const std::int64_t pairs = target.pairs[p];
   const int width = nodes * dim, column = nodes * block;
   work.blocks.resize((nodes + size) * column);
   work.weights.resize(size * nodes + 1);
@@ -151,9 +190,7 @@ void add_element(const double* K, int nodes, const double* transfer, std::size_t
       for (int n = a == 0 ? 0 : work.ends[a - 1]; n < work.ends[a]; ++n)
         for (int k = 0; k < block; ++k)
           sum[k] += work.weights[n] * right[b * column + work.places[n] * block + k];
-      double* out = values + static_cast<std::size_t>(positions[a * size + b]) * block;
-      for (int k = 0; k < block; ++k)
-        out[k] += sum[k];
+      add_to<dim, dim>(target, seen[a], target.positions[pairs + a * size + b], target.masks[seen[b]], sum);
     }
 }
 
@@ -175,19 +212,6 @@ inline void point_strains(const Domains& domains, const double* slope, std::size
         sum += S[8] * domains.hoop[point * domains.nodes + c];
       strains[c * dim + i] = domains.weights[point] * sum;
     }
-}
-
-// Go through domains with their supports.
-template <typename F>
-void for_each_support(std::size_t count, const Target& target, F&& f)
-{
-  std::size_t pairs = 0;
-  for (std::size_t p = 0; p < count; ++p)
-  {
-    const std::size_t size = target.offsets[p + 1] - target.offsets[p];
-    f(p, size, target.positions + pairs);
-    pairs += size * size;
-  }
 }
 } // namespace
 
@@ -308,27 +332,26 @@ HOT_LOOP void core::assemble_points(const Domains& domains, const double* suppor
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
     constexpr int block = dim * dim;
-    for_each_support(domains.count, target,
-                     [&](std::size_t p, std::size_t size, const std::int32_t* positions) {
+    for_each_domain(target, [&](std::size_t p, std::size_t size, std::int64_t pairs) {
       const double* S = support_gradients + target.offsets[p] * dim;
+      const std::int32_t* seen = target.nodes + target.offsets[p];
       double left[dim * block];
       for (std::size_t a = 0; a < size; ++a)
       {
+        const std::uint8_t mask = target.masks[seen[a]];
         contract<dim>(A + p * block * block, S + a * dim, domains.weights[p], left);
         for (std::size_t b = symmetric ? a : 0; b < size; ++b)
         {
           double K[block] = {};
           add_block<dim>(left, S + b * dim, K, dim);
-          double* out = target.values + static_cast<std::size_t>(positions[a * size + b]) * block;
-          for (int e = 0; e < block; ++e)
-            out[e] += K[e];
+          add_to<dim, dim>(target, seen[a], target.positions[pairs + a * size + b], target.masks[seen[b]], K);
           if (symmetric && b != a)
           {
-            double* mirror =
-                target.values + static_cast<std::size_t>(positions[b * size + a]) * block;
+            double mirror[block];
             for (int i = 0; i < dim; ++i)
               for (int j = 0; j < dim; ++j)
-                mirror[j * dim + i] += K[i * dim + j];
+                mirror[j * dim + i] = K[i * dim + j];
+            add_to<dim, dim>(target, seen[b], target.positions[pairs + b * size + a], mask, mirror);
           }
         }
       }
@@ -346,8 +369,7 @@ HOT_LOOP void core::assemble_domains(const Domains& domains, const double* trans
     const int width = domains.nodes * dim;
     std::vector<double> K(width * width);
     Work work;
-    for_each_support(domains.count, target,
-                     [&](std::size_t p, std::size_t size, const std::int32_t* positions) {
+    for_each_domain(target, [&](std::size_t p, std::size_t, std::int64_t) {
       std::fill(K.begin(), K.end(), 0.0);
       for (int q = 0; q < domains.points; ++q)
       {
@@ -381,20 +403,19 @@ HOT_LOOP void core::assemble_domains(const Domains& domains, const double* trans
           for (int s = 0; s < width; ++s)
             K[r * width + s] += left[r] * right[s];
       }
-      add_element<dim>(K.data(), domains.nodes, transfers + target.offsets[p] * domains.nodes, size,
-                       positions, target.values, work);
+      add_element<dim>(K.data(), domains.nodes, transfers, p, target, work);
     });
   });
 }
 
 HOT_LOOP void core::assemble_masses(const Domains& domains, const double* transfers,
-                                    const double* M, const Target& target)
+                                    const double* M, const Target& target, double* values)
 {
   const int nodes = domains.nodes;
   std::vector<double> weights, product(nodes);
   std::vector<int> places, ends;
-  for_each_support(domains.count, target,
-                   [&](std::size_t p, std::size_t size, const std::int32_t* positions) {
+  for_each_domain(target, [&](std::size_t p, std::size_t size, std::int64_t pairs) {
+    const std::int32_t* seen = target.nodes + target.offsets[p];
     const double* transfer = transfers + target.offsets[p] * nodes;
     const double* mass = M + p * nodes * nodes;
     weights.resize(size * nodes);
@@ -422,17 +443,36 @@ HOT_LOOP void core::assemble_masses(const Domains& domains, const double* transf
         double sum = 0.0;
         for (int n = ends[b]; n < ends[b + 1]; ++n)
           sum += weights[n] * product[places[n]];
-        target.values[positions[a * size + b]] += sum;
+        values[target.rows[seen[a]] + target.positions[pairs + a * size + b]] += sum;
         if (b != a)
-          target.values[positions[b * size + a]] += sum;
+          values[target.rows[seen[b]] + target.positions[pairs + b * size + a]] += sum;
       }
     }
   });
 }
 
+void core::add_diagonals(std::size_t num_nodes, int dim, const std::int32_t* nodes,
+                         const double* numbers, double factor, const Target& target)
+{
+  with_dimension(dim, [&](auto constant) {
+    constexpr int size = constant;
+    for (std::size_t node = 0; node < num_nodes; ++node)
+      for (std::int32_t e = target.rows[node]; e < target.rows[node + 1]; ++e)
+      {
+        double K[size * size] = {};
+        for (int i = 0; i < size; ++i)
+          K[i * size + i] = factor * numbers[e];
+        add_to<size, size>(target, static_cast<std::int32_t>(node),
+                           e - target.rows[node],
+                           target.masks[nodes[e]], K);
+      }
+  });
+}
+
 HOT_LOOP void core::assemble_slopes(const Domains& domains, const double* slope,
                                     const Transfers& displacement, const Transfers& pressure,
-                                    const Between& target)
+                                    const std::optional<Target>& of_pressure,
+                                    const std::optional<Target>& of_displacement)
 {
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
@@ -440,9 +480,10 @@ HOT_LOOP void core::assemble_slopes(const Domains& domains, const double* slope,
     std::vector<double> strains(nodes * dim), reduced, line; // strains of nodes of W; of V
     std::vector<double> weights;                             // T without its zeros
     std::vector<int> places, ends;
-    std::size_t pairs = 0;
-    for (std::size_t p = 0; p < domains.count; ++p)
+    const Target& some = of_pressure ? *of_pressure : *of_displacement;
+    for (std::size_t n = 0; n < some.count; ++n)
     {
+      const std::size_t p = some.order[n];
       const std::size_t size = displacement.offsets[p + 1] - displacement.offsets[p];
       const std::size_t rows = pressure.offsets[p + 1] - pressure.offsets[p];
       const double* T = displacement.values + displacement.offsets[p] * nodes;
@@ -482,31 +523,34 @@ HOT_LOOP void core::assemble_slopes(const Domains& domains, const double* slope,
           if (const double t = T_p[a * points + q]; t != 0.0)
             for (std::size_t k = 0; k < width; ++k)
               line[k] += t * reduced[q * width + k];
-        const auto add = [&](std::int32_t position, std::size_t b, double* values) {
-          double* out = values + static_cast<std::size_t>(position) * dim;
-          for (int i = 0; i < dim; ++i)
-            out[i] += line[b * dim + i];
-        };
-        if (target.of_pressure != nullptr)
+        if (of_pressure)
+        {
+          const Target& to = *of_pressure;
+          const std::int32_t* seen = to.column_nodes + to.column_offsets[p];
           for (std::size_t b = 0; b < size; ++b)
-            add(target.of_pressure[pairs + a * size + b], b, target.pressure_values);
-        if (target.of_displacement != nullptr)
+            add_to<1, dim>(to, to.nodes[to.offsets[p] + a],
+                           to.positions[to.pairs[p] + a * size + b], to.masks[seen[b]],
+                           line.data() + b * dim);
+        }
+        if (of_displacement)
+        {
+          const Target& to = *of_displacement;
+          const std::int32_t* seen = to.nodes + to.offsets[p];
+          const std::uint8_t mask = to.masks[to.column_nodes[to.column_offsets[p] + a]];
           for (std::size_t b = 0; b < size; ++b)
-            add(target.of_displacement[pairs + b * rows + a], b, target.displacement_values);
+            add_to<dim, 1>(to, seen[b], to.positions[to.pairs[p] + b * rows + a], mask,
+                           line.data() + b * dim);
+        }
       }
-      pairs += rows * size;
     }
   });
 }
 
-void core::assemble_diagonal(std::size_t count, int points, const double* factors,
-                             const Transfers& pressure, const std::int32_t* positions,
-                             double* values)
+void core::assemble_diagonal(int points, const double* factors, const Transfers& pressure,
+                             const Target& target)
 {
-  std::size_t pairs = 0;
-  for (std::size_t p = 0; p < count; ++p)
-  {
-    const std::size_t size = pressure.offsets[p + 1] - pressure.offsets[p];
+  for_each_domain(target, [&](std::size_t p, std::size_t size, std::int64_t pairs) {
+    const std::int32_t* seen = target.nodes + target.offsets[p];
     const double* T = pressure.values + pressure.offsets[p] * points;
     for (std::size_t a = 0; a < size; ++a)
       for (std::size_t b = 0; b < size; ++b)
@@ -514,10 +558,9 @@ void core::assemble_diagonal(std::size_t count, int points, const double* factor
         double sum = 0.0;
         for (int q = 0; q < points; ++q)
           sum += factors[p * points + q] * T[a * points + q] * T[b * points + q];
-        values[positions[pairs + a * size + b]] += sum;
+        add_to<1, 1>(target, seen[a], target.positions[pairs + a * size + b], target.masks[seen[b]], &sum);
       }
-    pairs += size * size;
-  }
+  });
 }
 
 void core::slope_sizes(const Domains& domains, const double* slope, const double* u, double* sizes)
@@ -539,33 +582,53 @@ void core::slope_sizes(const Domains& domains, const double* slope, const double
   });
 }
 
+namespace
+{
+// Call f(cell, K) with the element tensors of a form.
+template <typename F>
+void for_each_tensor(const core::Form& form, std::size_t width, F&& f)
+{
+  std::vector<double> K(width * width), x(form.geometry_nodes * 3);
+  for (std::size_t e = 0; e < form.count; ++e)
+  {
+    const std::int32_t cell = form.entities[form.facets ? 2 * e : e];
+    const int facet = form.facets ? form.entities[2 * e + 1] : 0;
+    for (int c = 0; c < form.geometry_nodes; ++c)
+      for (int i = 0; i < 3; ++i)
+        x[3 * c + i] = form.x[3 * form.geometry[cell * form.geometry_nodes + c] + i];
+    std::fill(K.begin(), K.end(), 0.0);
+    form.kernel(K.data(), form.coefficients + e * form.stride, form.constants, x.data(), &facet,
+                nullptr, nullptr);
+    f(cell, K);
+  }
+}
+} // namespace
+
 HOT_LOOP void core::assemble_form(const Form& form, const Domains& domains, const double* transfers,
-                                  const Target& target)
+                                  double factor, const Target& target)
 {
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
-    const int width = domains.nodes * dim;
-    std::vector<double> K(width * width), x(form.geometry_nodes * 3);
     Work work;
-    // Forms may live on some cells only, so pairs cannot be counted on the way.
-    std::vector<std::size_t> pairs(domains.count);
-    for_each_support(domains.count, target,
-                     [&](std::size_t p, std::size_t, const std::int32_t* positions) {
-      pairs[p] = static_cast<std::size_t>(positions - target.positions);
+    for_each_tensor(form, domains.nodes * dim, [&](std::int32_t cell, std::vector<double>& K) {
+      for (double& entry : K)
+        entry *= factor;
+      add_element<dim>(K.data(), domains.nodes, transfers, cell, target, work);
     });
-    for (std::size_t e = 0; e < form.count; ++e)
+  });
+}
+
+void core::multiply_form(const Form& form, const Domains& domains, const double* u, double* force)
+{
+  const int dim = domains.dim, width = domains.nodes * dim;
+  for_each_tensor(form, width, [&](std::int32_t cell, const std::vector<double>& K) {
+    const std::int32_t* nodes = domains.dofmap + static_cast<std::size_t>(cell) * domains.nodes;
+    for (int r = 0; r < width; ++r)
     {
-      const std::int32_t cell = form.entities[form.facets ? 2 * e : e];
-      const int facet = form.facets ? form.entities[2 * e + 1] : 0;
-      for (int c = 0; c < form.geometry_nodes; ++c)
-        for (int i = 0; i < 3; ++i)
-          x[3 * c + i] = form.x[3 * form.geometry[cell * form.geometry_nodes + c] + i];
-      std::fill(K.begin(), K.end(), 0.0);
-      form.kernel(K.data(), form.coefficients + e * form.stride, form.constants, x.data(), &facet,
-                  nullptr, nullptr);
-      add_element<dim>(K.data(), domains.nodes, transfers + target.offsets[cell] * domains.nodes,
-                       target.offsets[cell + 1] - target.offsets[cell],
-                       target.positions + pairs[cell], target.values, work);
+      double sum = 0.0;
+      for (int s = 0; s < width; ++s)
+        sum += K[r * width + s] * u[nodes[s / dim] * dim + s % dim];
+      force[nodes[r / dim] * dim + r % dim] += sum;
     }
   });
 }

@@ -5,6 +5,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <optional>
 #include <vector>
 
 namespace core
@@ -63,12 +64,39 @@ void local_transfers(const Dofmap& dofmap, const Rows& rows, const std::int64_t*
 void support_gradients(const Domains& domains, const Rows& rows, const std::int64_t* offsets,
                        const std::int32_t* nodes, double* gradients);
 
-// Where the tangents of domains go: blocks (dim, dim) of a matrix in compressed rows.
+// The place of each pair of nodes that a domain sees in the row of the first, in one byte or in two.
+class Positions
+{
+public:
+  Positions(const void* values, bool wide) : values_(values), wide_(wide) {}
+  std::int32_t operator[](std::size_t pair) const
+  {
+    return wide_ ? static_cast<const std::uint16_t*>(values_)[pair]
+                 : static_cast<const std::uint8_t*>(values_)[pair];
+  }
+
+private:
+  const void* values_;
+  bool wide_;
+};
+
+// Where the tangents of domains go: blocks between the nodes that they see, of one field's rows and
+// of one field's columns (sparsity.h).
 struct Target
 {
-  const std::int64_t* offsets;   // of the supports
-  const std::int32_t* positions; // of all pairs of a support's nodes
-  double* values;
+  std::size_t count;           // of domains
+  const std::int32_t* order;   // in which they are visited
+  const std::int64_t* pairs;   // where those of a domain begin
+  const std::int64_t* offsets; // of the supports
+  const std::int32_t* nodes;   // of the rows
+  const std::int64_t* column_offsets;
+  const std::int32_t* column_nodes;
+  Positions positions;
+  const std::int32_t* rows;   // of blocks
+  const std::int32_t* places; // of these
+  const std::int64_t* starts; // of rows of scalars
+  const std::uint8_t* masks;  // which dofs of the columns' nodes have a number
+  double* values[3];          // inside, outside, of rows of other ranks
 };
 
 // Add w S^T A S for domains of one point.
@@ -81,9 +109,13 @@ void assemble_domains(const Domains& domains, const double* transfers, const dou
                       const double* vectors, int pairs, const Target& target);
 
 // Add T^T M T with matrices M between the nodes of each domain, (count, nodes, nodes) and symmetric,
-// that are the same for all components: one number for each block in target.values.
+// that are the same for all components: one number for each of the pattern's blocks.
 void assemble_masses(const Domains& domains, const double* transfers, const double* M,
-                     const Target& target);
+                     const Target& target, double* values);
+
+// Add numbers for each of the pattern's blocks to the diagonals of the blocks, dim x dim.
+void add_diagonals(std::size_t num_nodes, int dim, const std::int32_t* nodes, const double* numbers,
+                   double factor, const Target& target);
 
 // T of a field on each domain, and its supports: (support size, nodes) one after the other.
 struct Transfers
@@ -92,22 +124,16 @@ struct Transfers
   const double* values;
 };
 
-// Where the blocks between a pressure and a displacement go, of which both may be null: those with
-// rows of the pressure, and those with rows of the displacement.
-struct Between
-{
-  const std::int32_t *of_pressure, *of_displacement;
-  double *pressure_values, *displacement_values;
-};
-
-// Add w T_p^T (S : G) T, and its transpose, for a slope S at the points (count, points, strain,
-// strain): what a pressure at the points does with the displacement.
+// Add w T_p^T (S : G) T for a slope S at the points (count, points, strain, strain), what a pressure
+// at the points does with the displacement, to blocks with rows of the pressure, and its transpose to
+// blocks with rows of the displacement; either may be none.
 void assemble_slopes(const Domains& domains, const double* slope, const Transfers& displacement,
-                     const Transfers& pressure, const Between& target);
+                     const Transfers& pressure, const std::optional<Target>& of_pressure,
+                     const std::optional<Target>& of_displacement);
 
 // Add T_p^T diag(factors) T_p with factors at the points, (count, points).
-void assemble_diagonal(std::size_t count, int points, const double* factors,
-                       const Transfers& pressure, const std::int32_t* positions, double* values);
+void assemble_diagonal(int points, const double* factors, const Transfers& pressure,
+                       const Target& target);
 
 // Set sizes at the points to w |S : G| |u|, term by term, with u at the nodes.
 void slope_sizes(const Domains& domains, const double* slope, const double* u, double* sizes);
@@ -130,7 +156,10 @@ struct Form
   int geometry_nodes;
 };
 
-// Add T^T K T with the element tensors K of a compiled form.
-void assemble_form(const Form& form, const Domains& domains, const double* transfers,
+// Add T^T K T with the element tensors K of a compiled form, times a factor.
+void assemble_form(const Form& form, const Domains& domains, const double* transfers, double factor,
                    const Target& target);
+
+// Add K u to the force at the nodes.
+void multiply_form(const Form& form, const Domains& domains, const double* u, double* force);
 } // namespace core

@@ -4,12 +4,14 @@
 // The compiled loops as Python functions: arrays and addresses of kernels, nothing else.
 
 #include <complex>
+#include <optional>
 #include <string>
 #include <tuple>
 #include <type_traits>
 #include <utility>
 #include <vector>
 
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
@@ -41,22 +43,84 @@ auto to_numpy(std::vector<T>&& values)
 
 auto to_numpy(Entries&& entries)
 {
-  return std::make_tuple(to_numpy(std::move(entries.offsets)), to_numpy(std::move(entries.columns)),
-                         to_numpy(std::move(entries.sources)));
+  return std::make_pair(to_numpy(std::move(entries.offsets)), to_numpy(std::move(entries.columns)));
 }
 
-// Offsets, nodes and dofs a node of a pattern, and the numbers of its columns.
-using Part = std::tuple<Indices, Indices, int, Indices>;
+// Rows of a field: numbers of its dofs, dofs a node, and starts to be set.
+using FieldRows = std::tuple<Indices, int, OffsetsOut>;
 
-Numbered numbered(const std::vector<Part>& parts, int dim, const Indices& numbers)
+// Blocks beside each other: offsets and nodes, dofs of these and their numbers, places to be set.
+using FieldColumns = std::tuple<Indices, Indices, int, Indices, IndicesOut>;
+
+Numbered numbered(const FieldRows& rows, const std::vector<FieldColumns>& parts)
 {
-  Numbered result{numbers.size() / dim, dim, numbers.data(), {}};
-  for (const auto& [offsets, nodes, columns, their_numbers] : parts)
+  const auto& [numbers, dim, starts] = rows;
+  Numbered result{numbers.size() / dim, dim, numbers.data(), starts.data(), {}};
+  require(starts.size() == 2 * numbers.size(), "starts of all rows (n, 2)");
+  for (const auto& [offsets, nodes, columns, their_numbers, places] : parts)
   {
     require(numbers.size() == (offsets.size() - 1) * dim, "numbers of all rows");
-    result.parts.push_back({offsets.data(), nodes.data(), columns, their_numbers.data()});
+    require(places.size() == nodes.size(), "places of all blocks");
+    result.parts.push_back(
+        {offsets.data(), nodes.data(), columns, their_numbers.data(), places.data()});
   }
   return result;
+}
+
+// Add entries to a matrix, of which columns of this rank and others are given with their values, if
+// it has places for all of them and this is what is asked for; return whether it has.
+template <typename Index>
+bool add_entries(const std::tuple<Array<const Index>, Array<const Index>, Reals>& entries,
+                 const std::tuple<Array<const Index>, Array<const Index>, RealsOut>& inside,
+                 const std::tuple<Array<const Index>, Array<const Index>, RealsOut>& outside,
+                 std::pair<Index, Index> own, bool add)
+{
+  const auto rows = [](const auto& matrix) {
+    return Compressed<Index>{std::get<0>(matrix).data(), std::get<1>(matrix).data()};
+  };
+  const std::size_t count = std::get<0>(entries).size();
+  require(count > 0 && std::get<0>(inside).size() == count && std::get<0>(outside).size() == count,
+          "as many rows of both");
+  const double* values = std::get<2>(entries).data();
+  double* const to[] = {std::get<2>(outside).data(), std::get<2>(inside).data()};
+  return for_each_place(count - 1, rows(entries), rows(inside), rows(outside), own.first,
+                        own.second, [&](Index e, bool within, Index place) {
+    if (add)
+      to[within][place] += values[e];
+  });
+}
+
+// Supports of rows and columns with the order of domains; pairs and positions; rows, places, starts
+// and masks of a pattern; values inside, outside, of rows of other ranks.
+using Bytes = Array<const std::uint8_t>;
+using Where = std::tuple<Indices, Offsets, Indices, Offsets, Indices, Offsets, Bytes, Indices,
+                         Indices, Offsets, Bytes, RealsOut, RealsOut, RealsOut>;
+
+Target target_of(const Where& where)
+{
+  const auto& [order, offsets, nodes, column_offsets, column_nodes, pairs, positions, rows, places,
+               starts, masks, inside, outside, sent]
+      = where;
+  const std::size_t count = order.size();
+  require(offsets.size() == count + 1 && column_offsets.size() == count + 1,
+          "offsets of supports (n + 1)");
+  require(pairs.size() == count + 1, "pairs of all domains (n + 1)");
+  const auto num_pairs = static_cast<std::size_t>(pairs.data()[count]);
+  require(positions.size() == num_pairs || positions.size() == 2 * num_pairs,
+          "positions of all pairs");
+  return {count,
+          order.data(),
+          pairs.data(),
+          offsets.data(),
+          nodes.data(),
+          column_offsets.data(),
+          column_nodes.data(),
+          Positions(positions.data(), positions.size() > num_pairs),
+          rows.data(),
+          places.data(),
+          starts.data(),
+          masks.data(),
+          {inside.data(), outside.data(), sent.data()}};
 }
 
 // Points that may touch: what is known of them, and the law of friction.
@@ -299,11 +363,26 @@ auto rows_of_transfer(Offsets nodes, Reals values, int bs, Array<Index> offsets)
   return std::make_pair(to_numpy(std::move(found.columns)), to_numpy(std::move(found.values)));
 }
 
-Target target_of(const Domains& domains, const Offsets& offsets, const Indices& positions,
-                 RealsOut& values)
+// A compiled form by the address of its kernel, with what it is given on its cells.
+using Compiled = std::tuple<std::uintptr_t, Indices, Reals, Reals, Reals, Indices>;
+
+Form form_of(const Compiled& compiled)
 {
-  require(offsets.size() == domains.count + 1, "offsets of supports (n + 1)");
-  return {offsets.data(), positions.data(), values.data()};
+  const auto& [kernel, entities, coefficients, constants, x, geometry] = compiled;
+  require(x.ndim() == 2 && x.shape(1) == 3 && geometry.ndim() == 2, "geometry");
+  require(coefficients.ndim() == 2
+              && (coefficients.size() == 0 || coefficients.shape(0) == entities.shape(0)),
+          "coefficients of each entity");
+  return {reinterpret_cast<Kernel>(kernel),
+          entities.shape(0),
+          entities.data(),
+          entities.ndim() == 2,
+          coefficients.data(),
+          coefficients.shape(1),
+          constants.data(),
+          x.data(),
+          geometry.data(),
+          static_cast<int>(geometry.shape(1))};
 }
 } // namespace
 
@@ -401,67 +480,66 @@ NB_MODULE(_loops, m)
                              {column_offsets.data(), column_nodes.data(), num_columns},
                              row_offsets.size() - 1);
     return std::make_tuple(to_numpy(std::move(result.offsets)), to_numpy(std::move(result.nodes)),
-                           to_numpy(std::move(result.positions)));
+                           to_numpy(std::move(result.pairs)),
+                           to_numpy(std::move(result.positions)), result.bytes);
   },
         "row_offsets"_a, "row_nodes"_a, "num_rows"_a, "column_offsets"_a, "column_nodes"_a,
         "num_columns"_a,
-        "Return the sparsity of a sum over domains, and the place of each pair of the nodes of "
-        "two fields that one sees.");
+        "Return the sparsity of a sum over domains; where the pairs of nodes of two fields that each "
+        "domain sees begin, and the place of each in the row of its first node, with the bytes that it takes.");
+
+  m.def("foreign_rows",
+        [](const FieldRows& rows, const std::vector<FieldColumns>& parts, std::pair<int, int> own) {
+    auto [blocks, values] = foreign_rows(numbered(rows, parts), {own.first, own.second});
+    std::vector<std::int32_t> flat;
+    flat.reserve(4 * blocks.size());
+    for (const Block& block : blocks)
+      flat.insert(flat.end(), {block.row, block.height, block.column, block.width});
+    return std::make_pair(to_numpy(std::move(flat)), values);
+  }, "rows"_a, "parts"_a, "own"_a,
+        "Set starts and places of rows that are numbered outside a range; return their blocks (row, "
+        "height, column, width), by rows, and the number of their values.");
 
   m.def("reduce",
-        [](const std::vector<Part>& parts, int dim, Indices numbers, std::pair<int, int> rows,
-           std::pair<int, int> rank, Indices further_offsets, Indices further_columns) {
-    require(further_offsets.size() == static_cast<std::size_t>(rows.second - rows.first) + 1,
-            "offsets of further entries, one for each row of the range");
-    Reduced result =
-        reduce(numbered(parts, dim, numbers), {rows.first, rows.second},
-               {rank.first, rank.second}, further_offsets.data(), further_columns.data());
+        [](const FieldRows& rows, const std::vector<FieldColumns>& parts, std::pair<int, int> own,
+           std::pair<int, int> rank, Indices further, Offsets runs) {
+    std::vector<Block> blocks(further.size() / 4);
+    for (std::size_t k = 0; k < blocks.size(); ++k)
+    {
+      const std::int32_t* values = further.data() + 4 * k;
+      blocks[k] = {values[0], values[1], values[2], values[3]};
+    }
+    Reduced result = reduce(numbered(rows, parts), {own.first, own.second},
+                            {rank.first, rank.second}, blocks,
+                            {runs.data(), runs.data() + runs.size()});
     return std::make_tuple(to_numpy(std::move(result.inside)), to_numpy(std::move(result.outside)),
                            to_numpy(std::move(result.places)));
   },
-        "parts"_a, "dim"_a, "numbers"_a, "rows"_a, "rank"_a, "further_offsets"_a,
-        "further_columns"_a,
-        "Return the rows of patterns of blocks that are numbered in a range: their columns of the "
-        "rank, the other columns, and the places of further entries among both.");
+        "rows"_a, "parts"_a, "own"_a, "rank"_a, "further"_a, "runs"_a,
+        "Set starts and places of rows that are numbered in a range; return their columns of the "
+        "rank, the other columns, and the places of the values of further blocks among both.");
 
-  m.def("foreign_rows",
-        [](const std::vector<Part>& parts, int dim, Indices numbers, std::pair<int, int> range) {
-    auto [rows, entries] = foreign_rows(numbered(parts, dim, numbers), {range.first, range.second});
-    return std::make_tuple(to_numpy(std::move(rows)), to_numpy(std::move(entries)));
-  }, "parts"_a, "dim"_a, "numbers"_a, "range"_a,
-        "Return the numbered rows of patterns of blocks that are not in a range.");
-
-  m.def("gather", [](Reals values, Array<const std::uint32_t> sources, RealsOut entries) {
-    require(entries.size() == sources.size(), "sources and entries");
-    for (std::size_t e = 0; e < sources.size(); ++e)
-      entries.data()[e] = values.data()[sources.data()[e]];
-  }, "values"_a, "sources"_a, "entries"_a.noconvert(), "Set entries to values[sources].");
-
-  m.def("multiply", [](Indices offsets, Indices nodes, int dim, Reals values, Reals x, RealsOut y) {
-    const std::size_t num_nodes = offsets.size() - 1;
-    require(x.size() == num_nodes * dim && y.size() == x.size()
-                && values.size() == nodes.size() * dim * dim,
-            "vectors and blocks of a pattern");
-    multiply(offsets.data(), nodes.data(), num_nodes, dim, values.data(), x.data(), y.data());
-  }, "offsets"_a, "nodes"_a, "dim"_a, "values"_a, "x"_a, "y"_a.noconvert(), "Set y to K x.");
+  const char* of_entries = "Add entries to a matrix if it has places for all; return whether.";
+  m.def("add_entries", add_entries<std::int32_t>, "entries"_a, "inside"_a, "outside"_a, "own"_a,
+        "add"_a, of_entries);
+  m.def("add_entries", add_entries<std::int64_t>, "entries"_a, "inside"_a, "outside"_a, "own"_a,
+        "add"_a, of_entries);
 
   m.def("assemble_points",
         [](Indices dofmap, Reals gradients, Reals weights, Reals support_gradients, Reals A,
-           bool symmetric, Offsets offsets, Indices positions, RealsOut values) {
+           bool symmetric, const Where& where) {
     const Domains domains = domains_of(dofmap, gradients, &weights);
     const int square = domains.dim * domains.dim;
     require(domains.points == 1 && A.size() == domains.count * square * square,
             "A (n, dim, dim, dim, dim) of domains with one point");
-    assemble_points(domains, support_gradients.data(), A.data(), symmetric,
-                    target_of(domains, offsets, positions, values));
+    assemble_points(domains, support_gradients.data(), A.data(), symmetric, target_of(where));
   },
         "dofmap"_a, "gradients"_a, "weights"_a, "support_gradients"_a, "A"_a, "symmetric"_a,
-        "offsets"_a, "positions"_a, "values"_a.noconvert(),
-        "Add the reduced tangents of domains with one point.");
+        "where"_a, "Add the reduced tangents of domains with one point.");
 
   m.def("assemble_domains",
         [](Indices dofmap, Reals gradients, Reals weights, Reals hoop, Reals transfers, Reals A,
-           Reals vectors, Offsets offsets, Indices positions, RealsOut values) {
+           Reals vectors, const Where& where) {
     Domains domains = domains_of(dofmap, gradients, &weights);
     revolve(domains, hoop);
     const int square = domains.strain() * domains.strain();
@@ -471,53 +549,58 @@ NB_MODULE(_loops, m)
     require(vectors.size() == domains.count * 2 * pairs * domains.nodes * domains.dim,
             "vectors (n, 2 m, k, dim), or none");
     assemble_domains(domains, transfers.data(), A.data(), vectors.data(), static_cast<int>(pairs),
-                     target_of(domains, offsets, positions, values));
+                     target_of(where));
   },
         "dofmap"_a, "gradients"_a, "weights"_a, "hoop"_a, "transfers"_a, "A"_a, "vectors"_a,
-        "offsets"_a, "positions"_a, "values"_a.noconvert(),
-        "Add the reduced tangents of domains with any number of points.");
+        "where"_a, "Add the reduced tangents of domains with any number of points.");
 
   m.def("assemble_masses",
-        [](Indices dofmap, Reals gradients, Reals transfers, Reals M, Offsets offsets,
-           Indices positions, RealsOut values) {
+        [](Indices dofmap, Reals gradients, Reals transfers, Reals M, const Where& where,
+           RealsOut values) {
     const Domains domains = domains_of(dofmap, gradients, nullptr);
     require(M.size() == domains.count * domains.nodes * domains.nodes, "M (n, k, k)");
-    assemble_masses(domains, transfers.data(), M.data(),
-                    target_of(domains, offsets, positions, values));
+    assemble_masses(domains, transfers.data(), M.data(), target_of(where), values.data());
   },
-        "dofmap"_a, "gradients"_a, "transfers"_a, "M"_a, "offsets"_a, "positions"_a,
-        "values"_a.noconvert(),
-        "Add the reduced masses of domains: one number for each block.");
+        "dofmap"_a, "gradients"_a, "transfers"_a, "M"_a, "where"_a, "values"_a.noconvert(),
+        "Add the reduced masses of domains to numbers, one for each block.");
+
+  m.def("add_diagonals",
+        [](int dim, Indices nodes, Reals numbers, double factor, const Where& where) {
+    const Indices& rows = std::get<7>(where);
+    require(nodes.size() == numbers.size() && rows.size() > 0, "numbers of all blocks");
+    add_diagonals(rows.size() - 1, dim, nodes.data(), numbers.data(), factor, target_of(where));
+  },
+        "dim"_a, "nodes"_a, "numbers"_a, "factor"_a, "where"_a,
+        "Add a number for each block to its diagonal.");
 
   m.def("assemble_slopes",
         [](Indices dofmap, Reals gradients, Reals weights, Reals hoop, Reals slope, Offsets offsets,
            Reals transfers, Offsets pressure_offsets, Reals pressure_transfers,
-           Indices of_pressure, RealsOut pressure_values, Indices of_displacement,
-           RealsOut displacement_values) {
+           const std::optional<Where>& of_pressure, const std::optional<Where>& of_displacement) {
     Domains domains = domains_of(dofmap, gradients, &weights);
     revolve(domains, hoop);
     const int strain = domains.strain();
     require(slope.size() == num_points(domains) * strain * strain, "slopes (n, nq, dim, dim)");
     require(offsets.size() == domains.count + 1 && pressure_offsets.size() == offsets.size(),
             "offsets of supports (n + 1)");
-    const Between target{of_pressure.size() > 0 ? of_pressure.data() : nullptr,
-                         of_displacement.size() > 0 ? of_displacement.data() : nullptr,
-                         pressure_values.data(), displacement_values.data()};
+    require(of_pressure || of_displacement, "somewhere to go");
     assemble_slopes(domains, slope.data(), {offsets.data(), transfers.data()},
-                    {pressure_offsets.data(), pressure_transfers.data()}, target);
+                    {pressure_offsets.data(), pressure_transfers.data()},
+                    of_pressure ? std::optional(target_of(*of_pressure)) : std::nullopt,
+                    of_displacement ? std::optional(target_of(*of_displacement)) : std::nullopt);
   },
         "dofmap"_a, "gradients"_a, "weights"_a, "hoop"_a, "slope"_a, "offsets"_a, "transfers"_a,
-        "pressure_offsets"_a, "pressure_transfers"_a, "of_pressure"_a,
-        "pressure_values"_a.noconvert(), "of_displacement"_a, "displacement_values"_a.noconvert(),
+        "pressure_offsets"_a, "pressure_transfers"_a, "of_pressure"_a.none(),
+        "of_displacement"_a.none(),
         "Add the blocks between a pressure at the points and the displacement.");
 
   m.def("assemble_diagonal",
-        [](Reals factors, Offsets offsets, Reals transfers, Indices positions, RealsOut values) {
+        [](Reals factors, Offsets offsets, Reals transfers, const Where& where) {
     require(factors.ndim() == 2 && offsets.size() == factors.shape(0) + 1, "factors (n, nq)");
-    assemble_diagonal(factors.shape(0), static_cast<int>(factors.shape(1)), factors.data(),
-                      {offsets.data(), transfers.data()}, positions.data(), values.data());
+    assemble_diagonal(static_cast<int>(factors.shape(1)), factors.data(),
+                      {offsets.data(), transfers.data()}, target_of(where));
   },
-        "factors"_a, "offsets"_a, "transfers"_a, "positions"_a, "values"_a.noconvert(),
+        "factors"_a, "offsets"_a, "transfers"_a, "where"_a,
         "Add the block of a pressure with factors at the points.");
 
   m.def("slope_sizes",
@@ -535,29 +618,21 @@ NB_MODULE(_loops, m)
         "Set sizes to those of slopes times strains at the points, summed up without signs.");
 
   m.def("assemble_form",
-        [](std::uintptr_t kernel, Indices entities, Reals coefficients, Reals constants, Reals x,
-           Indices geometry, Indices dofmap, Reals gradients, Reals transfers, Offsets offsets,
-           Indices positions, RealsOut values) {
-    const Domains domains = domains_of(dofmap, gradients, nullptr);
-    require(x.ndim() == 2 && x.shape(1) == 3 && geometry.ndim() == 2, "geometry");
-    require(coefficients.ndim() == 2
-                && (coefficients.size() == 0 || coefficients.shape(0) == entities.shape(0)),
-            "coefficients of each entity");
-    const Form form{reinterpret_cast<Kernel>(kernel),
-                    entities.shape(0),
-                    entities.data(),
-                    entities.ndim() == 2,
-                    coefficients.data(),
-                    coefficients.shape(1),
-                    constants.data(),
-                    x.data(),
-                    geometry.data(),
-                    static_cast<int>(geometry.shape(1))};
-    assemble_form(form, domains, transfers.data(), target_of(domains, offsets, positions, values));
+        [](const Compiled& form, Indices dofmap, Reals gradients, Reals transfers, double factor,
+           const Where& where) {
+    assemble_form(form_of(form), domains_of(dofmap, gradients, nullptr), transfers.data(), factor,
+                  target_of(where));
   },
-        "kernel"_a, "entities"_a, "coefficients"_a, "constants"_a, "x"_a, "geometry"_a, "dofmap"_a,
-        "gradients"_a, "transfers"_a, "offsets"_a, "positions"_a, "values"_a.noconvert(),
+        "form"_a, "dofmap"_a, "gradients"_a, "transfers"_a, "factor"_a, "where"_a,
         "Add the reduced element tensors of a compiled form on cells or (cell, local facet).");
+
+  m.def("multiply_form",
+        [](const Compiled& form, Indices dofmap, Reals gradients, Reals u, RealsOut force) {
+    require(u.size() == force.size(), "displacement and force at the nodes");
+    multiply_form(form_of(form), domains_of(dofmap, gradients, nullptr), u.data(), force.data());
+  },
+        "form"_a, "dofmap"_a, "gradients"_a, "u"_a, "force"_a.noconvert(),
+        "Add the product of the tensors of a compiled form and a displacement to the force.");
 
   m.def("update_elastic",
         [](const std::string& law, Reals gradient, const std::vector<Reals>& parameters, RealsOut P,

@@ -6,195 +6,274 @@
 #include <algorithm>
 #include <numeric>
 #include <stdexcept>
+#include <tuple>
+#include <type_traits>
 
 core::Pattern core::pattern(const Seen& rows, const Seen& columns, std::size_t count)
 {
-  // Which domains see a node, and as which of theirs.
+  // Which domains see a node.
   std::vector<std::int64_t> first(rows.num_nodes + 1, 0);
   for (std::int64_t e = 0; e < rows.offsets[count]; ++e)
     ++first[rows.nodes[e] + 1];
   std::partial_sum(first.begin(), first.end(), first.begin());
-  struct Visit
-  {
-    std::int64_t domain;
-    std::size_t pairs;
-    std::int32_t slot;
-  };
-  std::vector<Visit> visits(rows.offsets[count]);
+  std::vector<std::int32_t> visits(rows.offsets[count]);
   std::vector<std::int64_t> next(first.begin(), first.end() - 1);
-  std::size_t pairs = 0;
+  Pattern result;
+  result.pairs.reserve(count + 1);
+  result.pairs.push_back(0);
   for (std::size_t p = 0; p < count; ++p)
   {
-    const std::size_t size = rows.offsets[p + 1] - rows.offsets[p];
-    for (std::size_t a = 0; a < size; ++a)
-      visits[next[rows.nodes[rows.offsets[p] + a]]++] = {static_cast<std::int64_t>(p), pairs,
-                                                         static_cast<std::int32_t>(a)};
-    pairs += size * (columns.offsets[p + 1] - columns.offsets[p]);
+    const std::int64_t size = rows.offsets[p + 1] - rows.offsets[p];
+    for (std::int64_t e = rows.offsets[p]; e < rows.offsets[p + 1]; ++e)
+      visits[next[rows.nodes[e]]++] = static_cast<std::int32_t>(p);
+    result.pairs.push_back(result.pairs.back()
+                           + size * (columns.offsets[p + 1] - columns.offsets[p]));
   }
 
-  Pattern result;
-  result.offsets.reserve(rows.num_nodes + 1);
-  result.offsets.push_back(0);
-  result.positions.resize(pairs);
+  // Once for the rows, and once for the positions, of which it is known then how many bytes they take.
+  result.offsets.assign(1, 0);
   std::vector<std::int32_t> place(columns.num_nodes, -1);
+  std::size_t longest = 0;
   for (std::size_t row = 0; row < rows.num_nodes; ++row)
   {
-    const auto start = static_cast<std::int32_t>(result.nodes.size());
+    const std::size_t start = result.nodes.size();
     for (std::int64_t v = first[row]; v < first[row + 1]; ++v)
-    {
-      const std::int64_t p = visits[v].domain;
-      for (std::int64_t e = columns.offsets[p]; e < columns.offsets[p + 1]; ++e)
-        if (place[columns.nodes[e]] < start)
+      for (std::int64_t e = columns.offsets[visits[v]]; e < columns.offsets[visits[v] + 1]; ++e)
+        if (place[columns.nodes[e]] < 0)
         {
-          place[columns.nodes[e]] = start;
+          place[columns.nodes[e]] = 0;
           result.nodes.push_back(columns.nodes[e]);
         }
-    }
     std::sort(result.nodes.begin() + start, result.nodes.end());
     for (std::size_t e = start; e < result.nodes.size(); ++e)
-      place[result.nodes[e]] = static_cast<std::int32_t>(e);
-    for (std::int64_t v = first[row]; v < first[row + 1]; ++v)
-    {
-      const std::int64_t p = visits[v].domain;
-      const std::size_t size = columns.offsets[p + 1] - columns.offsets[p];
-      for (std::size_t b = 0; b < size; ++b)
-        result.positions[visits[v].pairs + visits[v].slot * size + b] =
-            place[columns.nodes[columns.offsets[p] + b]];
-    }
-    // Every place of a row is at or after its start, so the next row finds none of them new.
-    for (std::size_t e = start; e < result.nodes.size(); ++e)
       place[result.nodes[e]] = -1;
+    longest = std::max(longest, result.nodes.size() - start);
     result.offsets.push_back(static_cast<std::int32_t>(result.nodes.size()));
   }
+  if (longest > UINT16_MAX + 1)
+    throw std::overflow_error("a node of the background meets too many others");
+  result.bytes = longest <= UINT8_MAX + 1 ? 1 : 2;
+  result.positions.resize(result.bytes * result.pairs.back());
+  const auto set = [&](auto* positions) {
+    for (std::size_t row = 0; row < rows.num_nodes; ++row)
+    {
+      for (std::int32_t e = result.offsets[row]; e < result.offsets[row + 1]; ++e)
+        place[result.nodes[e]] = e - result.offsets[row];
+      std::int64_t before = -1, slot = 0; // a domain may see a node twice
+      for (std::int64_t v = first[row]; v < first[row + 1]; ++v)
+      {
+        const std::int32_t p = visits[v];
+        slot = p == before ? slot + 1 : rows.offsets[p];
+        before = p;
+        while (rows.nodes[slot] != static_cast<std::int32_t>(row))
+          ++slot;
+        const std::int64_t size = columns.offsets[p + 1] - columns.offsets[p];
+        auto* out = positions + result.pairs[p] + (slot - rows.offsets[p]) * size;
+        for (std::int64_t b = 0; b < size; ++b)
+          out[b] = static_cast<std::remove_reference_t<decltype(*out)>>(
+              place[columns.nodes[columns.offsets[p] + b]]);
+      }
+    }
+  };
+  if (result.bytes == 1)
+    set(result.positions.data());
+  else
+    set(reinterpret_cast<std::uint16_t*>(result.positions.data()));
   return result;
 }
 
 namespace
 {
-// The number of values of a pattern.
-std::size_t num_values(const core::Numbered& patterns, const core::Columns& part)
+// The numbers of a node: the first of them, or -1, and how many there are.
+std::pair<std::int32_t, std::int32_t> numbers_of(const std::int32_t* numbers, int dim)
 {
-  return static_cast<std::size_t>(part.offsets[patterns.num_nodes]) * patterns.dim * part.dim;
-}
-
-// The number of values of all patterns.
-std::size_t num_values(const core::Numbered& patterns)
-{
-  std::size_t count = 0;
-  for (const core::Columns& part : patterns.parts)
-    count += num_values(patterns, part);
-  if (count >= UINT32_MAX)
-    throw std::overflow_error("too many entries for one rank; use more ranks");
-  return count;
-}
-
-// Call f(column, source) for the entries of a row of scalars.
-template <typename F>
-void for_each_entry(const core::Numbered& patterns, std::size_t row, F&& f)
-{
-  const std::size_t rows = patterns.dim, node = row / rows, i = row % rows;
-  std::size_t first = 0;
-  for (const core::Columns& part : patterns.parts)
+  std::int32_t first = -1, count = 0;
+  for (int i = 0; i < dim; ++i)
   {
-    const std::size_t dim = part.dim;
-    for (std::int32_t e = part.offsets[node]; e < part.offsets[node + 1]; ++e)
-      for (std::size_t j = 0; j < dim; ++j)
-      {
-        const std::int32_t column = part.numbers[part.nodes[e] * dim + j];
-        if (column >= 0)
-          f(column, static_cast<std::uint32_t>(first + (e * rows + i) * dim + j));
-      }
-    first += num_values(patterns, part);
+    if (numbers[i] < 0)
+      continue;
+    if (first < 0)
+      first = numbers[i];
+    else if (numbers[i] != first + count)
+      throw std::invalid_argument("the unknowns of a node do not follow each other");
+    ++count;
   }
+  return {first, count};
+}
+
+// Set where the rows of a node begin in an array, each of a length.
+void set_starts(const core::Numbered& rows, std::size_t node, int array, std::int64_t start,
+                std::int64_t length)
+{
+  for (int i = 0; i < rows.dim; ++i)
+  {
+    const bool numbered = rows.numbers[node * rows.dim + i] >= 0;
+    rows.starts[(node * rows.dim + i) * 2 + array] = numbered ? start : -1;
+    start += numbered ? length : 0;
+  }
+}
+
+// Call f(first number, count, place) for the blocks in the rows of a node.
+template <typename F>
+void for_each_block(const core::Numbered& rows, std::size_t node, F&& f)
+{
+  for (const core::Columns& part : rows.parts)
+    for (std::int32_t e = part.offsets[node]; e < part.offsets[node + 1]; ++e)
+    {
+      const auto [first, count] = numbers_of(part.numbers + part.nodes[e] * part.dim, part.dim);
+      if (count > 0)
+        f(first, count, part.places + e);
+    }
+}
+
+std::int32_t as_place(std::int64_t place, core::Part part)
+{
+  return static_cast<std::int32_t>(4 * place + part);
 }
 } // namespace
 
-core::Reduced core::reduce(const Numbered& patterns, Range rows, Range rank,
-                           const std::int32_t* further_offsets, const std::int32_t* further_columns)
+std::pair<std::vector<core::Block>, std::int64_t> core::foreign_rows(const Numbered& rows,
+                                                                     Range own)
 {
-  const auto none = static_cast<std::uint32_t>(num_values(patterns));
-  const std::int32_t count = rows.last - rows.first;
-  std::vector<std::int64_t> row_of(count, -1);
-  for (std::size_t row = 0; row < patterns.num_nodes * patterns.dim; ++row)
-    if (patterns.numbers[row] >= rows.first && patterns.numbers[row] < rows.last)
-      row_of[patterns.numbers[row] - rows.first] = static_cast<std::int64_t>(row);
-
-  Reduced result;
-  result.places.reserve(further_offsets[count]);
-  std::vector<std::pair<std::int32_t, std::uint32_t>> line;
-  for (std::int32_t r = 0; r < count; ++r)
+  std::vector<std::tuple<std::int32_t, std::int32_t, std::size_t>> nodes;
+  for (std::size_t node = 0; node < rows.num_nodes; ++node)
   {
+    const auto [first, count] = numbers_of(rows.numbers + node * rows.dim, rows.dim);
+    if (count == 0)
+      set_starts(rows, node, 0, -1, 0), set_starts(rows, node, 1, -1, 0);
+    else if (first < own.first || first >= own.last)
+      nodes.emplace_back(first, count, node);
+  }
+  std::sort(nodes.begin(), nodes.end());
+  std::pair<std::vector<Block>, std::int64_t> result;
+  auto& [blocks, values] = result;
+  values = 0;
+  for (const auto& [row, height, node] : nodes)
+  {
+    std::int64_t length = 0;
+    for_each_block(rows, node, [&](std::int32_t column, std::int32_t width, std::int32_t* place) {
+      blocks.push_back({row, height, column, width});
+      *place = as_place(length, sent);
+      length += width;
+    });
+    set_starts(rows, node, 0, values, length);
+    values += height * length;
+  }
+  return result;
+}
+
+core::Reduced core::reduce(const Numbered& rows, Range own, Range rank,
+                           const std::vector<Block>& further,
+                           const std::vector<std::int64_t>& runs)
+{
+  const std::int32_t count = own.last - own.first;
+  std::vector<std::int32_t> node_of(count, -1);
+  for (std::size_t node = 0; node < rows.num_nodes; ++node)
+  {
+    const std::int32_t first = numbers_of(rows.numbers + node * rows.dim, rows.dim).first;
+    if (first >= own.first && first < own.last)
+      node_of[first - own.first] = static_cast<std::int32_t>(node);
+  }
+  std::vector<std::size_t> order(further.size());
+  std::iota(order.begin(), order.end(), 0);
+  std::stable_sort(order.begin(), order.end(),
+                   [&](auto a, auto b) { return further[a].row < further[b].row; });
+
+  // The columns of a row's blocks, in their order; those that domains see have a place to be set,
+  // further ones a place of theirs.
+  struct Item
+  {
+    std::int32_t column, width;
+    std::int32_t* place;
+    bool operator<(const Item& other) const { return column < other.column; }
+  };
+  std::vector<Item> line;
+  std::vector<std::int32_t> their_places(further.size());
+  const auto is_inside = [&](std::int32_t column) {
+    return column >= rank.first && column < rank.last;
+  };
+  std::size_t next = 0;
+  const auto read = [&](std::int32_t r) { // return the number of rows that are alike
+    std::int32_t height = 1;
     line.clear();
-    if (row_of[r] >= 0)
-      for_each_entry(patterns, row_of[r], [&](std::int32_t column, std::uint32_t source) {
-        line.emplace_back(column, source);
+    if (node_of[r] >= 0)
+    {
+      height = numbers_of(rows.numbers + node_of[r] * rows.dim, rows.dim).second;
+      for_each_block(rows, node_of[r], [&](std::int32_t column, std::int32_t width,
+                                           std::int32_t* place) {
+        line.push_back({column, width, place});
       });
-    for (std::int32_t e = further_offsets[r]; e < further_offsets[r + 1]; ++e)
-      line.emplace_back(further_columns[e], none);
+    }
+    for (; next < order.size() && further[order[next]].row == own.first + r; ++next)
+    {
+      const Block& block = further[order[next]];
+      height = block.height;
+      line.push_back({block.column, block.width, &their_places[order[next]]});
+    }
     if (!std::is_sorted(line.begin(), line.end()))
       std::sort(line.begin(), line.end());
-    const std::size_t start[] = {result.inside.columns.size(), result.outside.columns.size()};
-    std::int32_t last = -1;
-    for (const auto& [column, source] : line)
-    {
-      if (column == last)
-        continue;
-      last = column;
-      const bool inside = column >= rank.first && column < rank.last;
-      Entries& part = inside ? result.inside : result.outside;
-      part.columns.push_back(inside ? column - rank.first : column);
-      part.sources.push_back(source);
-    }
-    // Places outside are counted below zero until the number of those inside is known.
-    for (std::int32_t e = further_offsets[r]; e < further_offsets[r + 1]; ++e)
-    {
-      const std::int32_t column = further_columns[e];
-      const bool inside = column >= rank.first && column < rank.last;
-      const auto& columns = inside ? result.inside.columns : result.outside.columns;
-      const auto place = std::lower_bound(columns.begin() + start[inside ? 0 : 1], columns.end(),
-                                          inside ? column - rank.first : column)
-                         - columns.begin();
-      result.places.push_back(inside ? place : -1 - place);
-    }
-    result.inside.offsets.push_back(static_cast<std::int32_t>(result.inside.columns.size()));
-    result.outside.offsets.push_back(static_cast<std::int32_t>(result.outside.columns.size()));
-  }
-  const auto shift = static_cast<std::int64_t>(result.inside.columns.size());
-  for (std::int64_t& place : result.places)
-    if (place < 0)
-      place = shift - 1 - place;
-  return result;
-}
+    return height;
+  };
 
-std::pair<std::vector<std::int32_t>, core::Entries> core::foreign_rows(const Numbered& patterns,
-                                                                       Range range)
-{
-  num_values(patterns);
-  std::pair<std::vector<std::int32_t>, Entries> result;
-  auto& [rows, entries] = result;
-  for (std::size_t row = 0; row < patterns.num_nodes * patterns.dim; ++row)
+  // Once to count, so that nothing has more room than it needs, and once to set.
+  Reduced result;
+  Entries* const arrays[] = {&result.inside, &result.outside};
+  for (Entries* part : arrays)
+    part->offsets.assign(count + 1, 0);
+  for (std::int32_t r = 0; r < count;)
   {
-    const std::int32_t number = patterns.numbers[row];
-    if (number < 0 || (number >= range.first && number < range.last))
-      continue;
-    for_each_entry(patterns, row, [&](std::int32_t column, std::uint32_t source) {
-      entries.columns.push_back(column);
-      entries.sources.push_back(source);
-    });
-    rows.push_back(number);
-    entries.offsets.push_back(static_cast<std::int32_t>(entries.columns.size()));
+    const std::int32_t height = read(r);
+    std::int64_t lengths[] = {0, 0};
+    std::int32_t last = -1;
+    for (const auto& [column, width, place] : line)
+    {
+      std::int64_t& length = lengths[is_inside(column) ? inside : outside];
+      length += column == last ? 0 : width;
+      const std::int64_t at = length - width;
+      *place = as_place(at, is_inside(column) ? inside : outside);
+      last = column;
+    }
+    for (std::int32_t i = 0; i < height; ++i)
+      for (int side = 0; side < 2; ++side)
+      {
+        const std::int64_t end = arrays[side]->offsets[r + i] + lengths[side];
+        if (end > INT32_MAX)
+          throw std::overflow_error("too many entries for one rank; use more ranks");
+        arrays[side]->offsets[r + i + 1] = static_cast<std::int32_t>(end);
+      }
+    if (node_of[r] >= 0)
+      for (int side = 0; side < 2; ++side)
+        set_starts(rows, node_of[r], side, arrays[side]->offsets[r], lengths[side]);
+    r += height;
   }
-  return result;
-}
+  for (Entries* part : arrays)
+    part->columns.resize(part->offsets.back());
+  next = 0;
+  for (std::int32_t r = 0; r < count;)
+  {
+    const std::int32_t height = read(r);
+    for (std::int32_t i = 0; i < height; ++i)
+      for (const auto& [column, width, place] : line)
+      {
+        const bool within = is_inside(column);
+        std::int32_t* out = arrays[*place & 1]->columns.data()
+                            + arrays[*place & 1]->offsets[r + i] + (*place >> 2);
+        for (std::int32_t j = 0; j < width; ++j)
+          out[j] = column + j - (within ? rank.first : 0);
+      }
+    r += height;
+  }
 
-void core::multiply(const std::int32_t* offsets, const std::int32_t* nodes, std::size_t num_nodes,
-                    int dim, const double* values, const double* x, double* y)
-{
-  std::fill(y, y + num_nodes * dim, 0.0);
-  for (std::size_t row = 0; row < num_nodes; ++row)
-    for (std::int32_t e = offsets[row]; e < offsets[row + 1]; ++e)
-      for (int i = 0; i < dim; ++i)
-        for (int j = 0; j < dim; ++j)
-          y[row * dim + i] += values[(static_cast<std::size_t>(e) * dim + i) * dim + j]
-                              * x[static_cast<std::size_t>(nodes[e]) * dim + j];
+  const std::int64_t shift = result.inside.offsets.back();
+  for (std::size_t run = 0; run + 1 < runs.size(); ++run)
+    for (std::int32_t i = 0; i < (runs[run] < runs[run + 1] ? further[runs[run]].height : 0); ++i)
+      for (std::int64_t k = runs[run]; k < runs[run + 1]; ++k)
+      {
+        const int side = their_places[k] & 1;
+        const std::int64_t start = arrays[side]->offsets[further[k].row - own.first + i]
+                                   + (their_places[k] >> 2) + (side == outside ? shift : 0);
+        for (std::int32_t j = 0; j < further[k].width; ++j)
+          result.places.push_back(start + j);
+      }
+  return result;
 }

@@ -21,38 +21,53 @@ struct Seen
   std::size_t num_nodes;
 };
 
-// Sparsity of the sum over domains, and where each pair of the nodes that one sees is in it.
+// Sparsity of the sum over domains in compressed rows of blocks, which are sorted; where the pairs
+// of the nodes that each domain sees begin, and the place of each pair in the row of its first node,
+// in one byte if that is enough and in two otherwise.
 struct Pattern
 {
-  std::vector<std::int32_t> offsets, nodes, positions;
+  std::vector<std::int32_t> offsets, nodes;
+  std::vector<std::int64_t> pairs;
+  std::vector<std::uint8_t> positions;
+  std::size_t bytes; // of each of these
 };
 Pattern pattern(const Seen& rows, const Seen& columns, std::size_t count);
 
-// Entries of patterns of blocks by the numbers of their dofs (-1: none), in compressed rows of
-// scalars. Sources are their places among the values of the blocks, one behind these for entries
-// that are not of the patterns.
-struct Entries
+// A block between two nodes at the unknowns: the first number of its rows and how many there are,
+// and the same of its columns. Those of a node follow each other.
+struct Block
 {
-  std::vector<std::int32_t> offsets{0}, columns;
-  std::vector<std::uint32_t> sources;
+  std::int32_t row, height, column, width;
 };
 
-// A pattern whose columns are the nodes of one field, with that many dofs each and their numbers.
+// Blocks between the nodes of one field's rows and of one field's columns, which have dim dofs each
+// with their numbers (-1: none). Places say where the values of a block are: 4 times the place in
+// the rows of its node, and the array.
 struct Columns
 {
   const std::int32_t* offsets;
   const std::int32_t* nodes;
   int dim;
   const std::int32_t* numbers;
+  std::int32_t* places;
 };
 
-// The rows of one field, with patterns beside each other. Values are those of one pattern after
-// the other, in blocks (dim of the rows, dim of the columns).
+// Arrays of values: own rows in columns of this rank, own rows in others, rows of other ranks.
+enum Part : std::int32_t
+{
+  inside = 0,
+  outside = 1,
+  sent = 2
+};
+
+// The rows of one field, with blocks of several fields beside each other. Starts say where each row
+// begins in the array of values inside (or sent) and in that outside; -1 where a dof has no number.
 struct Numbered
 {
   std::size_t num_nodes;
   int dim;
   const std::int32_t* numbers;
+  std::int64_t* starts;
   std::vector<Columns> parts;
 };
 
@@ -62,20 +77,59 @@ struct Range
   std::int32_t first, last;
 };
 
-// The rows in a range, with further entries that other ranks have there: columns of this rank (less
-// the first of them), other columns, and the places of the further entries in both together.
+// Set places and starts of the rows of other ranks, which come by their numbers; return the blocks
+// and the number of values.
+std::pair<std::vector<Block>, std::int64_t> foreign_rows(const Numbered& rows, Range own);
+
+// Rows of scalars.
+struct Entries
+{
+  std::vector<std::int32_t> offsets, columns;
+};
+
+// The rows in a range, with further blocks that other ranks have there: columns of this rank (less
+// the first of them), other columns, and the places of the further values in both arrays together.
 struct Reduced
 {
   Entries inside, outside;
   std::vector<std::int64_t> places;
 };
-Reduced reduce(const Numbered& patterns, Range rows, Range rank,
-               const std::int32_t* further_offsets, const std::int32_t* further_columns);
 
-// The rows outside the range, and their numbers.
-std::pair<std::vector<std::int32_t>, Entries> foreign_rows(const Numbered& patterns, Range range);
+// Set places and starts of the rows in a range. Of the further blocks the first ones, in runs of one
+// row each, have values that come from other ranks.
+Reduced reduce(const Numbered& rows, Range own, Range rank, const std::vector<Block>& further,
+               const std::vector<std::int64_t>& runs);
 
-// y = K x with blocks in compressed rows.
-void multiply(const std::int32_t* offsets, const std::int32_t* nodes, std::size_t num_nodes,
-              int dim, const double* values, const double* x, double* y);
+// Compressed rows of a matrix, with sorted columns and PETSc's kind of integer.
+template <typename Index>
+struct Compressed
+{
+  const Index *offsets, *columns;
+};
+
+// Call f(entry, whether inside, place) for the entries of rows of which a matrix has columns of this
+// rank, less the first of them, inside and others outside; return whether it has places for all.
+template <typename Index, typename F>
+bool for_each_place(std::size_t count, const Compressed<Index>& entries,
+                    const Compressed<Index>& inside, const Compressed<Index>& outside, Index first,
+                    Index last, F&& f)
+{
+  for (std::size_t row = 0; row < count; ++row)
+  {
+    Index places[] = {outside.offsets[row], inside.offsets[row]};
+    for (Index e = entries.offsets[row]; e < entries.offsets[row + 1]; ++e)
+    {
+      const bool own = entries.columns[e] >= first && entries.columns[e] < last;
+      const Compressed<Index>& matrix = own ? inside : outside;
+      const Index column = entries.columns[e] - (own ? first : 0);
+      Index& place = places[own];
+      while (place < matrix.offsets[row + 1] && matrix.columns[place] < column)
+        ++place;
+      if (place == matrix.offsets[row + 1] || matrix.columns[place] != column)
+        return false;
+      f(e, own, place);
+    }
+  }
+  return true;
+}
 } // namespace core

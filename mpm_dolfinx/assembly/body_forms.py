@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ufl
-from dolfinx import fem, la
+from dolfinx import fem, la, mesh
 from dolfinx.fem import petsc as fem_petsc
 
 from .. import _compat
@@ -29,9 +29,21 @@ from .petsc import assemble_into, assemble_matrix
 from .rules import couples_cells, depends_on, follows, form_of_rank, is_zero, split_by_rule
 from .volume_ratio import average_in
 
-__all__ = ["BodyForms", "PointStress", "no_values"]
+__all__ = ["BodyForms", "PointStress", "integrals_of", "no_values"]
 
 no_values: NDArray[np.float64] = np.zeros(0)
+
+
+def integrals_of(form: fem.Form, body: mesh.Mesh) -> Iterator[tuple[Any, ...]]:
+    """Yield the integrals of a form on a body over cells and exterior facets, for compiled loops.
+
+    Coefficients are those of now.
+    """
+    geometry = (body.geometry.x, _compat.geometry_dofmap(body))
+    constants, packed = _compat.packed(form)
+    for integral in _compat.compiled_integrals(form):
+        values = packed[integral.key], constants
+        yield integral.kernel, integral.entities, *values, *geometry
 
 
 class PointStress(Protocol):
@@ -240,8 +252,7 @@ class BodyForms:
         force: NDArray[np.float64] = np.zeros(len(particles.displacement.x.array))
         loops.internal_force(
             np.ascontiguousarray(first_piola),
-            particles.domain_nodes,
-            particles.quadrature.gradients,
+            *self._domains,
             internal.weights,
             no_values if internal.hoop is None else internal.hoop,
             force,
@@ -289,16 +300,15 @@ class BodyForms:
         total.set(0.0)
         if self.stock:
             self.K.multAdd(w, total, total)
+        nodal, force = self._local(w), np.zeros(len(self._particles.displacement.x.array))
         for form in self.fused:
-            matrix = fem_petsc.create_matrix(form)
-            assemble_matrix(matrix, form)
-            matrix.assemble()
-            matrix.multAdd(w, total, total)
-            matrix.destroy()
+            for compiled in integrals_of(form, self._body):
+                loops.multiply_form(compiled, *self._domains, nodal, force)
         if self.internal is not None:
-            part = self.r.duplicate()
-            assemble_into(part, [], self._internal_stiffness_force(self.internal, w))
-            total.axpy(1.0, part)
+            force += self._internal_stiffness_force(self.internal, nodal)
+        part = self.r.duplicate()
+        assemble_into(part, [], force)
+        total.axpy(1.0, part)
         if self._low_rank is not None:
             total.axpy(1.0, self.low_rank_force(w))
         return total
@@ -336,28 +346,39 @@ class BodyForms:
             energies[i, j] = sum(float(np.real(fem.assemble_scalar(form))) for form in forms)
         return energies
 
-    def _nodal(self, w: PETSc.Vec) -> NDArray[np.float64]:
-        """Return a vector on W at the domains' nodes, shape ``(n, k, gdim)`` (collective)."""
+    @property
+    def _domains(self) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        """Nodes and gradients of the domains, for the compiled loops."""
+        return self._particles.domain_nodes, self._particles.quadrature.gradients
+
+    def _local(self, w: PETSc.Vec) -> NDArray[np.float64]:
+        """Return a vector on W at this rank's own and ghost dofs (collective)."""
         values = fem.Function(self._particles.W)
         values.x.array[: w.getLocalSize()] = w.array_r
         values.x.scatter_forward()
-        nodal = values.x.array.reshape(-1, self._element.block_size)
+        return np.asarray(values.x.array)
+
+    def _at_domains(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return local values on W at the domains' nodes, shape ``(n, k, gdim)``."""
+        nodal = values.reshape(-1, self._element.block_size)
         return np.asarray(nodal[self._particles.domain_nodes])
 
     def low_rank_force(self, w: PETSc.Vec) -> PETSc.Vec:
         """Return the low-rank part of the tangent times a vector on W (collective)."""
         assert self._low_rank is not None
         force = np.zeros(len(self._particles.displacement.x.array))
-        contributions = self._low_rank.times(self._nodal(w))
+        contributions = self._low_rank.times(self._at_domains(self._local(w)))
         nodes = self._particles.domain_nodes
         np.add.at(force.reshape(-1, self._element.block_size), nodes, contributions)
         total = self.r.duplicate()
         assemble_into(total, [], force)
         return total
 
-    def _internal_stiffness_force(self, internal: PointStress, w: PETSc.Vec) -> NDArray[np.float64]:
-        """Return the internal pointwise tangent times a vector on W, at own and ghost dofs."""
-        nodal = self._nodal(w)
+    def _internal_stiffness_force(
+        self, internal: PointStress, values: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the internal pointwise tangent times local values on W, at own and ghost dofs."""
+        nodal = self._at_domains(values)
         gradient = self._particles.quadrature.displacement_gradient(nodal)
         if internal.hoop is not None:
             gradient = with_hoop(gradient, internal.hoop, nodal)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple, Protocol
 
 from mpi4py import MPI
@@ -18,12 +19,13 @@ from .. import _compat
 from .._core import loops
 from ..constitutive.averaging import LowRankTerm
 from ..history import Statistics
+from ..meshes.order import morton_order
 from ..parallel.exchange import swap
 from ..parallel.totals import over_ranks
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..transfer.touched import JointNodes, TouchedNodes, TransferRows
-from .body_forms import BodyForms, no_values
+from .body_forms import BodyForms, integrals_of, no_values
 
 __all__ = [
     "CoupledBlocks",
@@ -31,7 +33,14 @@ __all__ = [
     "FusedTangent",
     "Masses",
     "Restriction",
+    "no_ties",
 ]
+
+#: No further blocks.
+no_ties: NDArray[np.int32] = np.zeros((0, 4), dtype=np.int32)
+
+#: Where domains go, for the compiled loops: their order, supports, pairs and a pattern's values.
+type Where = tuple[Any, ...]
 
 #: Most room for the entries of a matrix, in what they need.
 ROOM = 1.1
@@ -42,15 +51,17 @@ class Support:
 
     Args:
         dofmap: Local nodes of W of each domain, shape ``(n, k)``.
+        order: In which domains are visited, neighbours one after the other, shape ``(n,)``.
 
     Attributes:
+        order: As given.
         offsets: Where the nodes of each domain begin, shape ``(n + 1,)``.
         nodes: Numbers of these among the touched nodes.
         changes: How often they have become others.
     """
 
-    def __init__(self, dofmap: NDArray[np.int32]) -> None:
-        self._dofmap = dofmap
+    def __init__(self, dofmap: NDArray[np.int32], order: NDArray[np.int32]) -> None:
+        self._dofmap, self.order = dofmap, order
         self.changes = 0
         self.offsets: NDArray[np.int64] = np.zeros(1, dtype=np.int64)
         self.nodes: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
@@ -83,13 +94,11 @@ class _Loops:
         self._points = internal is not None and one and internal.hoop is None
         whole = bool(forms.fused) or (internal is not None and not self._points)
         self._whole = whole or coupled
-        self.support = Support(particles.domain_nodes)
+        body = particles.mesh
+        first = _compat.geometry_dofmap(body)[: len(particles.domain_nodes), 0]
+        order = morton_order(body.geometry.x[first, : body.geometry.dim])
+        self.support = Support(particles.domain_nodes, order)
         self.transfers: NDArray[np.float64] = no_values
-
-    @property
-    def factor(self) -> float:
-        """How often the tangent counts."""
-        return self._forms.factor
 
     def transfer(self, rows: TransferRows) -> None:
         """Take over the values of T."""
@@ -101,63 +110,56 @@ class _Loops:
         if self._whole:
             self.transfers = support.transfers(rows)
 
-    @staticmethod
-    def _vectors(term: LowRankTerm | None) -> NDArray[np.float64]:
+    def _vectors(self, term: LowRankTerm | None) -> NDArray[np.float64]:
         """Return left and right vectors of each domain in turn, ``(n, 2 m, k, gdim)``; or none."""
         if term is None:
             return no_values
-        pairs = zip(term.left, term.right, strict=True)
+        left = [self._counted(vector) for vector in term.left]
+        pairs = zip(left, term.right, strict=True)
         return np.stack([vector for pair in pairs for vector in pair], axis=1)
 
     def add_masses(
         self,
         masses: NDArray[np.float64],
         rows: TransferRows,
-        positions: NDArray[np.int32],
+        where: Where,
         values: NDArray[np.float64],
     ) -> None:
         """Add the body's reduced mass, one number for each of the pattern's blocks."""
         transfers = self.transfers if self._whole else self.support.transfers(rows)
-        offsets = self.support.offsets
-        loops.assemble_masses(*self._domains, transfers, masses, offsets, positions, values)
+        loops.assemble_masses(*self._domains, transfers, masses, where, values)
 
-    def add(self, positions: NDArray[np.int32], values: NDArray[np.float64]) -> None:
-        """Add the body's reduced tangent to the values of the pattern's blocks."""
-        target = (self.support.offsets, positions, values)
+    def _counted(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return values as often as the tangent counts."""
+        factor = self._forms.factor
+        return values if factor == 1.0 else factor * values
+
+    def add(self, where: Where) -> None:
+        """Add the body's reduced tangent."""
         internal = self._forms.internal
         if internal is not None and self._points:
             loops.assemble_points(
                 *self._domains,
-                internal.weights,
+                self._counted(internal.weights),
                 self._gradients,
                 internal.tangent,
                 internal.symmetric,
-                *target,
+                where,
             )
         elif internal is not None:
             loops.assemble_domains(
                 *self._domains,
-                internal.weights,
+                self._counted(internal.weights),
                 no_values if internal.hoop is None else internal.hoop,
                 self.transfers,
                 internal.tangent,
                 self._vectors(self._forms.low_rank_of_domains()),
-                *target,
+                where,
             )
-        body = self.particles.mesh
-        geometry = (body.geometry.x, _compat.geometry_dofmap(body))
         for form in self._forms.fused:
-            constants, packed = _compat.packed(form)
-            for integral in _compat.compiled_integrals(form):
+            for compiled in integrals_of(form, self.particles.mesh):
                 loops.assemble_form(
-                    integral.kernel,
-                    integral.entities,
-                    packed[integral.key],
-                    constants,
-                    *geometry,
-                    *self._domains,
-                    self.transfers,
-                    *target,
+                    compiled, *self._domains, self.transfers, self._forms.factor, where
                 )
 
 
@@ -173,21 +175,21 @@ class Coupling(Protocol):
 
 
 class CoupledBlocks(NamedTuple):
-    """Where a coupling goes: T of each domain, and places and values of three blocks.
+    """Where a coupling goes: T of each domain, and places of three blocks.
 
     Attributes:
         displacement: T of the body's nodes, and where that of each domain begins.
         field: T of the field's values, the same way.
-        of_field: Positions and values of the block with rows of the field.
-        of_displacement: Those of the block with rows of the displacement.
-        alone: Those of the field's own block.
+        of_field: Where the block with rows of the field goes.
+        of_displacement: Where that with rows of the displacement goes.
+        alone: Where the field's own block goes.
     """
 
     displacement: tuple[NDArray[np.int64], NDArray[np.float64]]
     field: tuple[NDArray[np.int64], NDArray[np.float64]]
-    of_field: tuple[NDArray[np.int32], NDArray[np.float64]]
-    of_displacement: tuple[NDArray[np.int32], NDArray[np.float64]]
-    alone: tuple[NDArray[np.int32], NDArray[np.float64]]
+    of_field: Where
+    of_displacement: Where
+    alone: Where
 
 
 class Restriction(NamedTuple):
@@ -199,6 +201,8 @@ class Restriction(NamedTuple):
         numbers: For each own dof of V, and of the spaces of free nodes, its number among all
             unknowns, or -1.
         part: Where the field's unknowns are among this rank's.
+        ties: Further blocks of the field, in rows of any rank, that the matrix is to have places
+            for: first row, height, first column and width of each, shape ``(n, 4)``.
         factor: Value on V of an unknown of size 1.
     """
 
@@ -206,6 +210,7 @@ class Restriction(NamedTuple):
     rows: Sequence[TransferRows]
     numbers: NDArray[np.int32]
     part: slice
+    ties: NDArray[np.int32] = no_ties
     factor: float = 1.0
 
 
@@ -216,11 +221,11 @@ type Masses = Sequence[tuple[Particles, NDArray[np.float64]]]
 class FusedTangent:
     """``T^T K T`` of all bodies of some fields at the unknowns, without ever forming K.
 
-    Each rank adds its own domains' ``T_p^T K_p T_p`` to blocks between the background nodes
-    that they touch, of whatever rank. The pattern, and with it the matrix, lasts until a node
-    of a body enters another cell. Off-rank rows travel once for each assembly. The fields are
-    blocks on the diagonal of one matrix, into which each writes; what couples a body and a field on
-    it has blocks beside these.
+    Each rank adds its own domains' ``T_p^T K_p T_p`` to the entries of the matrix, and what belongs
+    to rows of other ranks to values that it sends these, once for each assembly. The pattern, and
+    with it the matrix, lasts until a node of a body enters another cell. The fields are blocks on
+    the diagonal of one matrix, into which each writes; what couples a body and a field on it has
+    blocks beside these.
 
     Args:
         comm: The ranks.
@@ -248,6 +253,7 @@ class FusedTangent:
         ]
         self._statistics = statistics
         self._A: PETSc.Mat | None = None
+        self._rows: tuple[Any, Any] = (), ()  # of the matrix, in columns of this rank and in others
         self._room = [no_values, no_values]  # for entries in columns of this rank, and in others
 
     def restrict(self, fields: Sequence[Restriction], sizes: tuple[int, int]) -> None:
@@ -280,18 +286,15 @@ class FusedTangent:
             for block, field in zip(self._blocks, fields, strict=True)
         ]
         parts = [field.part for field in fields]
-        inside = [own for own, _ in found]
-        outside = [others for _, others in found]
-        csr = [_stacked(parts, entries, sizes[0]) for entries in (inside, outside)]
+        csr = [_stacked(parts, [rows[side] for rows in found], sizes[0]) for side in range(2)]
         values = [self._entries(side, len(columns)) for side, (_, columns) in enumerate(csr)]
-        ends = [0, 0]
-        for block, entries in zip(self._blocks, zip(inside, outside, strict=True), strict=True):
-            mine = []
-            for side, (_, columns) in enumerate(entries):
-                mine.append(values[side][ends[side] : ends[side] + len(columns)])
-                ends[side] += len(columns)
-            block.entries = mine[0], mine[1]
+        ends = [np.cumsum([len(rows[side][1]) for rows in found])[:-1] for side in range(2)]
+        split = zip(*(np.split(*each) for each in zip(values, ends, strict=True)), strict=True)
+        for block, (inside, outside) in zip(self._blocks, split, strict=True):
+            block.inside, block.outside = inside, outside
         matrices = [(*one, data) for one, data in zip(csr, values, strict=True)]
+        offsets, columns, entries = matrices[1]
+        self._rows = matrices[0], (offsets, columns.copy(), entries)  # (PETSc numbers them anew)
         self._A = PETSc.Mat().createAIJWithArrays(
             (sizes, sizes),
             matrices[0] if self._comm.size == 1 else tuple(matrices),
@@ -328,11 +331,10 @@ class FusedTangent:
         csr = (ends.astype(PETSc.IntType), columns[kept], values[kept])
         return PETSc.Mat().createAIJ(self._A.getSizes(), csr=csr, comm=self._comm)
 
-    def assemble(self, keep: Sequence[bool], factor: float = 0.0) -> PETSc.Mat:
+    def assemble(self, factor: float = 0.0) -> PETSc.Mat:
         """Return ``T^T K T``; the same object as long as the pattern lasts (collective).
 
         Args:
-            keep: Whether :meth:`multiply` will be called, for each field.
             factor: How often the masses of :meth:`weigh` are added, if there are any.
         """
         assert self._A is not None
@@ -340,21 +342,27 @@ class FusedTangent:
             block.begin()
         for coupled in self._couplings:
             coupled.add()
-        for block, kept in zip(self._blocks, keep, strict=True):
-            block.assemble(kept, factor)
+        for block in self._blocks:
+            block.assemble(factor)
         self._A.assemble()
         return self._A
 
-    def multiply(self, field: int, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a field's last ``T^T K T u`` on all active dofs, fixed ones too (collective).
-
-        What couples it with other fields has no part in it.
+    def add(self, part: PETSc.Mat) -> bool:
+        """Add to the last tangent, if it has a place for each entry (collective).
 
         Args:
-            field: Its number.
-            u: An increment on this rank's own dofs of its spaces.
+            part: A matrix in all unknowns.
+
+        Returns:
+            Whether it has; nothing is added otherwise.
         """
-        return self._blocks[field].multiply(u)
+        assert self._A is not None
+        given = part.getValuesCSR(), *self._rows, self._A.getOwnershipRange()
+        if not over_ranks(self._comm, loops.add_entries(*given, False), MPI.LAND):
+            return False
+        loops.add_entries(*given, True)
+        self._A.assemble()
+        return True
 
 
 def _stacked(
@@ -366,7 +374,8 @@ def _stacked(
     counts = np.zeros(count + 1, dtype=PETSc.IntType)
     for part, (starts, _) in zip(parts, entries, strict=True):
         counts[part.start + 1 : part.stop + 1] = np.diff(starts)
-    columns = np.concatenate([columns for _, columns in entries])
+    whole = [columns for _, columns in entries if len(columns) > 0]
+    columns = whole[0] if len(whole) == 1 else np.concatenate([entries[0][1][:0], *whole])
     return np.cumsum(counts, dtype=PETSc.IntType), columns.astype(PETSc.IntType, copy=False)
 
 
@@ -385,7 +394,6 @@ class _Pattern:
         self._references = weakref.ref(rows), weakref.ref(columns)
         self._pairs: list[tuple[Support, Support]] = []
         self._made_of: tuple[Any, ...] = ()
-        self.values: NDArray[np.float64] = no_values
 
     @property
     def _rows(self) -> _Block:
@@ -415,31 +423,43 @@ class _Pattern:
         if made_of == self._made_of:
             return
         self._made_of = made_of
+        self._positions: list[NDArray[np.uint8]] = []  # (the old ones need room no more)
         rows, columns = (_joined([pair[side] for pair in self._pairs]) for side in range(2))
         found = loops.pattern(*rows, self._rows.num_touched, *columns, self.columns.num_touched)
-        self.offsets, self.nodes, positions = found
-        counts = [
-            int((np.diff(one.offsets) * np.diff(other.offsets)).sum()) for one, other in self._pairs
-        ]
-        self.positions = np.split(positions, np.cumsum(counts)[:-1])
+        self._offsets, self.nodes, pairs, positions, size = found
+        ends = np.cumsum([0, *(len(rows.order) for rows, _ in self._pairs)])
+        self._first = [pairs[a : b + 1] - pairs[a] for a, b in pairwise(ends)]
+        self._positions = np.split(positions, size * pairs[ends[1:-1]])
 
-    @property
-    def size(self) -> int:
-        """Number of values."""
-        return len(self.nodes) * self._rows.bs * self.columns.bs
-
-    def of(self, number: int) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-        """Return positions of the domains that were taken over with this number, and the values."""
-        return self.positions[number], self.values
-
-    @property
     def part(self) -> tuple[Any, ...]:
-        """Arguments of the compiled loops."""
-        return self.offsets, self.nodes, self.columns.bs, self.columns.numbers
+        """Return what compiled loops find places of blocks by, which are forgotten."""
+        self._places = np.zeros(len(self.nodes), dtype=np.int32)
+        columns = self.columns
+        return self._offsets, self.nodes, columns.bs, columns.numbers, self._places
+
+    def where(self, number: int) -> Where:
+        """Return where domains go that were taken over with this number."""
+        rows, columns = self._pairs[number]
+        return (
+            rows.order,
+            rows.offsets,
+            rows.nodes,
+            columns.offsets,
+            columns.nodes,
+            self._first[number],
+            self._positions[number],
+            self._offsets,
+            self._places,
+            self._rows.starts,
+            self.columns.masks,
+            *self._rows.values,
+        )
 
 
 def _joined(supports: Sequence[Support]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """Return offsets and nodes of supports one after the other."""
+    if len(supports) == 1:
+        return supports[0].offsets, supports[0].nodes
     ends = np.cumsum([0, *(one.offsets[-1] for one in supports)])
     offsets = [one.offsets[1:] + end for one, end in zip(supports, ends, strict=False)]
     nodes = np.concatenate([one.nodes for one in supports])
@@ -453,7 +473,7 @@ class _Coupled:
         self._coupling = coupling
         particles, carried = coupling.places
         self._body = moving.loops_of(particles)
-        self._number = other.take(carried)
+        self._number = other.take(carried, self._body.support.order)
         self._other = other
         mine, its = self._body.support, other.supports[self._number]
         self._of_field = other.beside(moving), other.beside(moving).take(its, mine)
@@ -464,7 +484,7 @@ class _Coupled:
         """Add the blocks to the values of the patterns."""
         its = self._other.supports[self._number]
         places = [
-            pattern.of(number)
+            pattern.where(number)
             for pattern, number in (self._of_field, self._of_displacement, self._alone)
         ]
         self._coupling.add(
@@ -484,7 +504,10 @@ class _Block:
         bodies: Bodies with their forms, all on one V; there may be none.
 
     Attributes:
-        entries: Values of the field's rows in the matrix: in columns of this rank, and in others.
+        inside: Values of the field's rows in columns of this rank.
+        outside: Those in other columns.
+        starts: Where rows of the touched dofs begin in one of these, or among values to be sent.
+        masks: Which dofs of each touched node are unknowns, as bits.
         bs: Number of dofs at a node.
         numbers: Number of the unknown of each touched dof, or -1.
         num_touched: Number of touched nodes.
@@ -492,14 +515,18 @@ class _Block:
         transfers: T of these values.
     """
 
-    entries: tuple[NDArray[np.float64], NDArray[np.float64]]
+    inside: NDArray[np.float64]
+    outside: NDArray[np.float64]
 
     def __init__(self, comm: MPI.Comm, bodies: Sequence[_Loops]) -> None:
         self._comm = comm
         self._loops = list(bodies)
+        self._ties = no_ties
+        self._sent = no_values  # values of rows of other ranks, by these
+        self.starts: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+        self.masks: NDArray[np.uint8] = np.zeros(0, dtype=np.uint8)
         self._masses: NDArray[np.float64] | None = None
         self.bs = 1
-        self._touched: TouchedNodes | JointNodes | None = None
         self.numbers: NDArray[np.int32] = np.zeros(0, dtype=np.int32)
         self.num_touched = 0
         self.supports = [body.support for body in self._loops]
@@ -512,9 +539,9 @@ class _Block:
         """Return the loops of a body."""
         return next(body for body in self._loops if body.particles is particles)
 
-    def take(self, carried: CarriedField) -> int:
+    def take(self, carried: CarriedField, order: NDArray[np.int32]) -> int:
         """Take over values on a body; return their number among those of the field."""
-        self.supports.append(Support(carried.domain_nodes))
+        self.supports.append(Support(carried.domain_nodes, order))
         return len(self.supports) - 1
 
     def beside(self, other: _Block) -> _Pattern:
@@ -527,13 +554,17 @@ class _Block:
 
     def restrict(self, field: Restriction) -> bool:
         """Take over the present unknowns; return whether their pattern is the old one."""
-        self._touched = field.touched
         if not self.supports:
             return True
         self.bs = field.touched.block_size
         numbers = field.touched.spread(field.numbers.reshape(-1, self.bs)).ravel()
-        same = bool(np.array_equal(numbers, self.numbers))
+        same = bool(
+            np.array_equal(numbers, self.numbers) and np.array_equal(field.ties, self._ties)
+        )
+        self._ties = field.ties
         self.numbers, self.num_touched = numbers, field.touched.count
+        bits = np.uint8(1) << np.arange(self.bs, dtype=np.uint8)
+        self.masks = ((numbers.reshape(-1, self.bs) >= 0) * bits).sum(axis=1, dtype=np.uint8)
         for support, rows in zip(self.supports, field.rows, strict=True):
             same &= support.find(rows)
         return same
@@ -561,17 +592,15 @@ class _Block:
             for number, (body, rows) in enumerate(zip(self._loops, self._rows, strict=True)):
                 for particles, mass in masses:
                     if particles is body.particles:
-                        body.add_masses(mass, rows, own.positions[number], self._masses)
+                        body.add_masses(mass, rows, own.where(number), self._masses)
             self._add_masses(1.0)
-        self._write()
+        self._exchange()
 
     def _add_masses(self, factor: float) -> None:
-        """Add the masses, if any, to the values of the pattern's blocks."""
-        if self._masses is None:
-            return
-        blocks = self.beside(self).values.reshape(-1, self.bs, self.bs)
-        for i in range(self.bs):
-            blocks[:, i, i] += factor * self._masses
+        """Add the masses, if any, to the values."""
+        if self._masses is not None:
+            own = self.beside(self)
+            loops.add_diagonals(self.bs, own.nodes, self._masses, factor, own.where(0))
 
     def make_patterns(self) -> None:
         """Find the blocks of the field's rows."""
@@ -596,88 +625,70 @@ class _Block:
         if not self.supports:
             none = np.zeros(own[1] - own[0] + 1, dtype=np.int32), np.zeros(0, dtype=np.int32)
             return none, none
-        self._kept: NDArray[np.float64] | None = None
-        blocks = ([pattern.part for pattern in self._patterns], self.bs, self.numbers)
-        starts, columns = self._exchange_rows(blocks, own, lasts)
+        self.starts = np.empty(2 * len(self.numbers), dtype=np.int64)
+        rows = self.numbers, self.bs, self.starts
+        parts = [pattern.part() for pattern in self._patterns]
+        flat, count = loops.foreign_rows(rows, parts, own)
+        self._sent = np.empty(count)
+        told, runs = self._exchange_blocks(flat.reshape(-1, 4), lasts)
+        owner = np.searchsorted(lasts, self._ties[:, 0], side="right")
+        ties = swap(self._comm, [self._ties[owner == r] for r in range(self._comm.size)])
         rank = start, int(lasts[self._comm.rank])
-        inside, outside, places = loops.reduce(*blocks, own, rank, starts, columns)
-        self._sources = inside[2], outside[2]
-        shift = len(inside[2])
+        further = np.concatenate([told, *ties])
+        inside, outside, places = loops.reduce(rows, parts, own, rank, further, runs)
+        shift = len(inside[1])
         self._within = places < shift
-        self._places = places[self._within], places[~self._within] - shift
-        return inside[:2], outside[:2]
+        self._further = places[self._within], places[~self._within] - shift
+        return inside, outside
 
-    def _exchange_rows(
-        self, blocks: tuple[Any, ...], own: tuple[int, int], lasts: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Tell other ranks the places of their entries; return what they tell, by own row."""
-        rows, (starts, columns, sources) = loops.foreign_rows(*blocks, own)
-        row = np.repeat(rows, np.diff(starts))
-        owner = np.searchsorted(lasts, row, side="right")
-        order = np.argsort(owner, kind="stable")
-        self._sent = np.split(
-            sources[order], np.searchsorted(owner[order], np.arange(1, self._comm.size))
-        )
-        ends = np.cumsum([len(part) for part in self._sent])[:-1]
-        pairs = np.column_stack([row, columns])[order]
-        received = np.concatenate(swap(self._comm, np.split(pairs, ends)))
-        self._order = np.argsort(received[:, 0], kind="stable")
-        counts = np.bincount(received[:, 0] - own[0], minlength=own[1] - own[0])
-        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-        return offsets, np.ascontiguousarray(received[self._order, 1])
+    def _exchange_blocks(
+        self, blocks: NDArray[np.int32], lasts: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+        """Tell other ranks the blocks in their rows; return what they tell, and where rows begin.
+
+        Args:
+            blocks: First row, height, first column, width of each, by rows, shape ``(n, 4)``.
+            lasts: End of the range of all unknowns of each rank.
+        """
+        ends = np.searchsorted(blocks[:, 0], lasts[:-1])
+        sizes = np.concatenate([[0], np.cumsum(blocks[:, 1].astype(np.int64) * blocks[:, 3])])
+        self._sent_ends = sizes[ends]
+        received = swap(self._comm, np.split(blocks, ends))
+        whole = np.concatenate(received)
+        new = np.ones(len(whole) + 1, dtype=bool)
+        new[1:-1] = whole[1:, 0] != whole[:-1, 0]
+        new[np.cumsum([len(part) for part in received])] = True
+        return whole, np.flatnonzero(new)
+
+    @property
+    def values(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Values inside, outside, and those that are sent."""
+        return self.inside, self.outside, self._sent
 
     def begin(self) -> None:
         """Begin an assembly: no domain has added anything."""
-        if not self.supports:
-            return
-        ends = np.cumsum([pattern.size for pattern in self._patterns])
-        self._all: NDArray[np.float64] = np.zeros(ends[-1] + 1)
-        values = np.split(self._all[:-1], ends[:-1])
-        for pattern, part in zip(self._patterns, values, strict=True):
-            pattern.values = part
+        if self.supports:
+            for values in self.values:
+                values[:] = 0.0
 
-    def assemble(self, keep: bool, factor: float) -> None:
-        """Write the field's rows (collective).
+    def assemble(self, factor: float) -> None:
+        """Make the field's rows (collective).
 
         Args:
-            keep: Whether :meth:`multiply` will be called.
             factor: Of the masses.
         """
         if not self.supports:
             return
         for number, body in enumerate(self._loops):
-            positions, values = self.beside(self).of(number)
-            if body.factor == 1.0:
-                body.add(positions, values)
-            else:
-                own = np.zeros_like(values)
-                body.add(positions, own)
-                values += body.factor * own
+            body.add(self.beside(self).where(number))
         if factor != 0.0:
             self._add_masses(factor)
-        self._kept = self.beside(self).values if keep and self._loops else None
-        self._write()
+        self._exchange()
 
-    def _write(self) -> None:
-        """Write the values of the patterns, summed over ranks, into the field's rows."""
-        for sources, entries in zip(self._sources, self.entries, strict=True):
-            loops.gather(self._all, sources, entries)
+    def _exchange(self) -> None:
+        """Add to the field's rows what other ranks have there (collective)."""
         if self._comm.size > 1:
-            received = np.concatenate(swap(self._comm, [self._all[part] for part in self._sent]))
-            received = received[self._order]
-            np.add.at(self.entries[0], self._places[0], received[self._within])
-            np.add.at(self.entries[1], self._places[1], received[~self._within])
-        self._all = no_values
-        for pattern in self._patterns:
-            pattern.values = no_values
-
-    def multiply(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the last ``T^T K T u`` on all active dofs, fixed ones too (collective)."""
-        if not self._loops:
-            return np.zeros_like(u)
-        assert self._kept is not None and self._touched is not None
-        local = self._touched.spread(u.reshape(-1, self.bs))
-        result = np.empty_like(local)
-        own = self.beside(self)
-        loops.multiply(own.offsets, own.nodes, self.bs, self._kept, local, result)
-        return np.asarray(self._touched.collect(result).ravel())
+            sent = np.split(self._sent, self._sent_ends)
+            received = np.concatenate(swap(self._comm, sent))
+            np.add.at(self.inside, self._further[0], received[self._within])
+            np.add.at(self.outside, self._further[1], received[~self._within])

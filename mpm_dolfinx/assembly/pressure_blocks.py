@@ -20,9 +20,6 @@ from .fused import CoupledBlocks
 
 __all__ = ["PressureBlocks", "PressurePoints"]
 
-#: Where nothing is to be added.
-NOWHERE: tuple[NDArray[np.int32], NDArray[np.float64]] = np.zeros(0, dtype=np.int32), no_values
-
 
 class PressurePoints(Protocol):
     """A material whose mean stress is a pressure of its own."""
@@ -82,14 +79,14 @@ class PressureBlocks:
     def add(self, blocks: CoupledBlocks) -> None:
         """Add the blocks (see :class:`~mpm_dolfinx.assembly.fused.Coupling`)."""
         found, places = self._material.volume_strain, (*blocks.displacement, *blocks.field)
-        beside = NOWHERE if not self._material.symmetric else blocks.of_displacement
-        loops.assemble_slopes(*self._domains, found.slope, *places, *blocks.of_field, *beside)
+        beside = None if not self._material.symmetric else blocks.of_displacement
+        loops.assemble_slopes(*self._domains, found.slope, *places, blocks.of_field, beside)
         if not self._material.symmetric:
             slope = np.ascontiguousarray(self._material.by_pressure)
-            loops.assemble_slopes(*self._domains, slope, *places, *NOWHERE, *blocks.of_displacement)
+            loops.assemble_slopes(*self._domains, slope, *places, None, blocks.of_displacement)
         weights = self._material.weights
         factors = -weights * found.compliance.reshape(weights.shape)
-        loops.assemble_diagonal(factors, *blocks.field, *blocks.alone)
+        loops.assemble_diagonal(factors, *blocks.field, blocks.alone)
 
     def sizes(
         self, moved: NDArray[np.float64], pressed: NDArray[np.float64]

@@ -20,7 +20,7 @@ from ..meshes.remesh import Column
 from ..particles.field import ParticleField
 from .assignment import Assignment, Materials
 from .averaging import VolumeAveraging
-from .governed import Answer, Carried, Governed
+from .governed import NO_TANGENT, Answer, Carried, Governed
 from .moduli import axial_modulus, resisting_modulus
 from .point_state import Converged, PointState
 from .pressure import MeanStress, VolumeStrain
@@ -413,8 +413,10 @@ class MaterialPoints:
         Raises:
             MPMError: An update fails; ``particles`` are global indices.
         """
-        # Two tries at a time would be the most that a step holds in memory.
+        # Two tries, or two tangents, at a time would be the most that a step holds in memory.
         self.trial = self.last
+        if self._asks_tangents and len(self.laws.governed) == 1:
+            self.tangent = NO_TANGENT
         gradient = self.strain.gradient()
         if self.averaging is None:
             gradient = gradient.reshape(-1, self.dim, self.dim)

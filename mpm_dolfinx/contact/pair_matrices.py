@@ -210,7 +210,11 @@ def _pattern(
         widths = np.concatenate([np.full(len(nodes), nodes.shape[1]) for _, nodes in side])
         ends = np.concatenate([[0], np.cumsum(widths)]).astype(np.int64)
         seen += [ends, np.concatenate([nodes.ravel() for _, nodes in side]), count]
-    ends, nodes, places = loops.pattern(*seen)
+    ends, nodes, _, positions, size = loops.pattern(*seen)
+    places = positions.view(np.uint8 if size == 1 else np.uint16)
     splits = np.split(places, np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1])
-    parts = [part.reshape(shape) for part, shape in zip(splits, shapes, strict=True)]
+    parts = [
+        ends[own][:, :, None] + part.reshape(shape)
+        for (_, own), part, shape in zip(rows, splits, shapes, strict=True)
+    ]
     return ends, nodes, parts

@@ -97,20 +97,26 @@ class GhostPenalty:
         self._marked = marked(self._V, cells.nodes[chosen])
         self._num_chosen: int = over_ranks(self._V.mesh.comm, len(chosen))
 
+    @property
+    def tied(self) -> NDArray[np.int64]:
+        """Global nodes of each pair of cells that are tied together, shape ``(n, 2 k)``."""
+        nodes = self._cells.nodes
+        return nodes[self._chosen].reshape(len(self._chosen), 2 * nodes.shape[1])
+
     def penalty(self, moduli: Sequence[float]) -> PETSc.Mat:
         """Return the addition to the tangent on all dofs of V; its product is one to the residual.
 
         Args:
             moduli: Shear modulus of each body.
         """
-        chosen, cells, bs = self._chosen, self._cells, self._V.dofmap.index_map_bs
+        chosen, bs = self._chosen, self._V.dofmap.index_map_bs
         body = np.asarray(moduli)
         total = self._shares.sum(axis=1)
         mean = self._shares @ body / np.where(total > 0.0, total, 1.0)
         modulus = PENALTY * np.where(total > 0.0, mean, body.min())
-        nodes = cells.nodes[chosen].reshape(len(chosen), 2 * cells.nodes.shape[1])
+        nodes = self.tied
         if self._unit is None:
-            self._unit = self._penalties(cells.vertices[chosen])
+            self._unit = self._penalties(self._cells.vertices[chosen])
         values = modulus[:, None, None] * self._unit
         rows = np.broadcast_to(nodes[:, :, None], values.shape)
         columns = np.broadcast_to(nodes[:, None, :], values.shape)

@@ -227,12 +227,6 @@ class BodyTerm(Term):
         return [self._counted(part) for part in self._low_rank.parts]
 
     @override
-    def reduced_product(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
-        if self.forms.low_rank is None:
-            return []
-        return [self._counted(self.forms.low_rank_force(motions[0]))]
-
-    @override
     def absolute_contributions(self) -> Sequence[PETSc.Vec]:
         return [self._counted(self.forms.absolute_contributions(self.particles.domain_nodes))]
 

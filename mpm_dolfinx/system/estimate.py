@@ -90,7 +90,7 @@ def _tangents(particles: Particles, terms: Iterable[Term]) -> list[PETSc.Mat]:
         every = Restriction(touched, touched.rows * len(fused), numbers, slice(0, own))
         loops = FusedTangent(W.mesh.comm, [fused], [], Statistics())
         loops.restrict([every], (own, layout.size_global * bs))
-        found.append(loops.assemble([False]))
+        found.append(loops.assemble())
     return found
 
 

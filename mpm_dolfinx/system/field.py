@@ -19,7 +19,7 @@ from dolfinx import fem
 
 from .. import _compat
 from ..assembly.background_forms import BackgroundForms
-from ..assembly.fused import Restriction
+from ..assembly.fused import Restriction, no_ties
 from ..background.grids import cell_lines, coarser, grid_lines
 from ..meshes.boxes import BOX_CELLS
 from ..parallel.magnitudes import joint_norm, norm
@@ -284,8 +284,26 @@ class Field:
         """Return where a tangent goes that is reduced by rows of T, and its size."""
         numbers = np.full(self._owned, -1, dtype=np.int32)
         numbers[self.dofs] = self._numbers
-        found = Restriction(self.touched, rows, numbers, self.part, self.factor)
+        ties = self._ties(numbers.reshape(-1, self._bs))
+        found = Restriction(self.touched, rows, numbers, self.part, ties, self.factor)
         return found, self._sizes
+
+    def _ties(self, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return the blocks of the penalty: first row, height, first column, width of each.
+
+        Args:
+            numbers: Number of the unknown of each own dof of V, or -1, shape ``(n, bs)``.
+        """
+        if self._ghosts is None or not self._ghosts.acts:
+            return no_ties
+        counts = np.count_nonzero(numbers >= 0, axis=1)
+        firsts = np.where(numbers >= 0, numbers, numbers.max(axis=1, keepdims=True)).min(axis=1)
+        known = self.touched.at_nodes(firsts.astype(np.int64) * 8 + counts, self._ghosts.tied)
+        pairs = np.broadcast_arrays(known[:, :, None], known[:, None, :])
+        span = 8 * self._sizes[1]
+        rows, columns = np.divmod(np.unique(pairs[0] * span + pairs[1]), span)
+        blocks = np.column_stack([rows >> 3, rows & 7, columns >> 3, columns & 7])
+        return blocks[(blocks[:, 1] > 0) & (blocks[:, 3] > 0)].astype(np.int32)
 
     @property
     def prolongation(self) -> PETSc.Mat:

@@ -119,14 +119,12 @@ class _Reduced(NamedTuple):
 
     Attributes:
         transfers: T of each body, by which it is reduced.
-        apart: The bodies whose mass the compiled loops do not have.
-        mass: Theirs, or ``None``.
+        mass: That of bodies whose mass the compiled loops do not have, or ``None``.
         scaled: Room for a multiple of it.
         projection: Solves with the mass of all.
     """
 
     transfers: list[PETSc.Mat]
-    apart: list[bool]
     mass: PETSc.Mat | None
     scaled: PETSc.Mat | None
     projection: Projection
@@ -450,15 +448,6 @@ class Inertia(Term):
         return [reduced.scaled]
 
     @override
-    def reduced_product(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
-        forces = self.stiffness_force(motions)
-        assert self._reduced is not None
-        for force, own in zip(forces, self._reduced.apart, strict=True):
-            if not own:
-                force.set(0.0)
-        return forces
-
-    @override
     def stiffness_force(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
         forces = self._step.mass.times(motions)
         for force in forces:
@@ -580,11 +569,14 @@ def _driven(
 def _reduced(mass: NodalMass, transfers: list[PETSc.Mat], by_loops: ReducedMasses) -> _Reduced:
     """Return the mass in all unknowns (collective)."""
     known, bodies = by_loops(list(zip(mass.bodies, mass.domains, strict=True)))
-    apart = [all(body is not one for one in bodies) for body in mass.bodies]
-    others = [M.ptap(T) for M, T, own in zip(mass.matrices, transfers, apart, strict=True) if own]
+    others = [
+        M.ptap(T)
+        for M, T, body in zip(mass.matrices, transfers, mass.bodies, strict=True)
+        if all(body is not one for one in bodies)
+    ]
     left = _sum(others) if others else None
     projection = Projection(_sum([one for one in (known, left) if one is not None]))
-    return _Reduced(transfers, apart, left, None if left is None else left.copy(), projection)
+    return _Reduced(transfers, left, None if left is None else left.copy(), projection)
 
 
 def _sum(parts: Sequence[PETSc.Mat]) -> PETSc.Mat:

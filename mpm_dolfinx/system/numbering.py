@@ -60,9 +60,10 @@ class FreeDofs:
             return
         homes = np.full(touched.num_own, comm.rank, dtype=np.int64)
         homes[touched.active] = touched.homes
-        self.owners = even(comm, homes[free // bs])
+        nodes, number = np.unique(free // bs, return_inverse=True)
         owner = np.full(touched.num_own, -1, dtype=np.int64)
-        owner[free // bs] = self.owners
+        owner[nodes] = even(comm, homes[nodes])  # (dofs of a node stay together)
+        self.owners = owner[nodes][number]
         self.off_rank = touched.off_rank(owner) * (1, 1, bs)
         self._order = np.argsort(self.owners, kind="stable")
         self._sent = np.searchsorted(self.owners[self._order], np.arange(1, comm.size))

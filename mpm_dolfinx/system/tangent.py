@@ -38,6 +38,7 @@ class _Made:
     Attributes:
         products: A matrix of a term, ``K T`` and ``T^T K T``, by the term's number and places.
         matrices: All matrices of terms, by the same; they are those of the last tangent.
+        whole: Whether a term has more in the last tangent than these.
         sizes: Their absolute values, as far as asked for.
         zeros: Zeros on the diagonal, where a shift has its place though a block may be empty.
         total: Their sum.
@@ -45,6 +46,7 @@ class _Made:
 
     products: dict[tuple[int, Pair], Products] = dataclasses.field(default_factory=dict)
     matrices: list[Mapping[Pair, PETSc.Mat]] = dataclasses.field(default_factory=list)
+    whole: list[bool] = dataclasses.field(default_factory=list)
     sizes: dict[tuple[int, Pair], PETSc.Mat] = dataclasses.field(default_factory=dict)
     zeros: PETSc.Mat | None = None
     total: MatrixSum = dataclasses.field(default_factory=MatrixSum)
@@ -141,14 +143,16 @@ class Tangent:
         """Return the tangent at the last residual, one object within a step."""
         unknowns, made = self._unknowns, self._made
         with self._statistics.phase("assemble"):
-            reduced = [K for term in self._terms for K in term.reduced_tangents(unknowns.transfer)]
-            parts = []
-            if self.loops is not None:
-                keep = [one.prescribes for one in unknowns.subspaces]
-                parts.append(self.loops.assemble(keep, self.mass_factor))
+            reduced = [term.reduced_tangents(unknowns.transfer) for term in self._terms]
+            whole = [] if self.loops is None else [self.loops.assemble(self.mass_factor)]
+            parts: list[PETSc.Mat] = []
             made.matrices = [
                 {} if coupled else term.tangents()
                 for term, coupled in zip(self._terms, self._coupled, strict=True)
+            ]
+            made.whole = [
+                coupled or bool(own) or bool(term.fused)
+                for term, coupled, own in zip(self._terms, self._coupled, reduced, strict=True)
             ]
             made.sizes = {}
             parts += [
@@ -158,13 +162,15 @@ class Tangent:
                 )
                 for pair, K in matrices.items()
             ]
-            parts += reduced
+            parts += [K for own in reduced for K in own]
             for field in unknowns.fields:
                 parts += field.tangents()
             if not self._has_diagonal:
                 made.zeros = made.zeros or self._zeros_on_diagonal()
                 parts.append(made.zeros)
-            return made.total.of(parts)
+            if self.loops is not None:
+                parts = [part for part in parts if not self.loops.add(part)]
+            return made.total.of(whole + parts)
 
     @property
     def _has_diagonal(self) -> bool:
@@ -215,15 +221,14 @@ class Tangent:
         fields, forces = unknowns.fields, unknowns.zeros()
         for field, force in zip(fields, forces, strict=True):
             field.add_product(field.lift(), force)
-        loops = self.loops
-        for number, one in enumerate(unknowns.subspaces):
-            if loops is not None and one.prescribes:
-                product = one.split(loops.multiply(number, one.increment()))
-                for field, part in zip(one.fields, product, strict=True):
-                    forces[fields.index(field)].array_w[:] += part
         lifts = [field.u for field in fields]
         on_own: list[tuple[OwnUnknowns, PETSc.Vec]] = []
-        for term, matrices in zip(self._terms, self._made.matrices, strict=True):
+        made = self._made
+        for term, matrices, whole in zip(self._terms, made.matrices, made.whole, strict=True):
+            if whole or not matrices:
+                motions = [unknowns.moved(body, lifts) for body in term.bodies]
+                unknowns.add(term.bodies, term.stiffness_force(motions), forces)
+                continue
             count = len(term.bodies)
             for (a, b), K in matrices.items():
                 if b == count:
@@ -234,11 +239,6 @@ class Tangent:
                     unknowns.add([term.bodies[a]], [force], forces)
                 elif term.own is not None:
                     on_own.append((term.own, force))
-        for term, coupled in zip(self._terms, self._coupled, strict=True):
-            motions = [unknowns.moved(body, lifts) for body in term.bodies]
-            unknowns.add(term.bodies, term.reduced_product(motions), forces)
-            if coupled:
-                unknowns.add(term.bodies, term.stiffness_force(motions), forces)
         reduced = unknowns.restricted(forces)
         for own, force in on_own:
             own.selection.multTransposeAdd(force, reduced, reduced)

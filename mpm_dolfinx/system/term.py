@@ -296,14 +296,6 @@ class Term(Hooked):
         """
         return ()
 
-    def reduced_product(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
-        """Return the forces on W of each body by what :meth:`reduced_tangents` had last, if any.
-
-        Args:
-            motions: Displacements on W of each body.
-        """
-        return ()
-
     def derivatives(self) -> Mapping[tuple[int, int], PETSc.Mat]:
         """Return the derivatives of the forces, where :meth:`tangents` are others to begin with."""
         return self.tangents()

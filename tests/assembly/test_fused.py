@@ -15,6 +15,7 @@ import ufl
 from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx._core import loops
 
 QUADRILATERAL, TRIANGLE = mesh.CellType.quadrilateral, mesh.CellType.triangle
 HEXAHEDRON, TETRAHEDRON = mesh.CellType.hexahedron, mesh.CellType.tetrahedron
@@ -134,6 +135,47 @@ def test_degree_two(cell):
 def test_stabilised():
     particles = mpm.Particles(bent(QUADRILATERAL), space(2, 2), degree=2)
     compare(lambda: quasi_static(particles, stabilisation="ghost"))
+
+
+def test_motion_with_moving_supports():
+    particles = mpm.Particles(bent(QUADRILATERAL), space(2))
+    compare(
+        lambda: posed(
+            mpm.DynamicProblem,
+            particles,
+            PLASTIC,
+            density=2.0,
+            body_force=(0.5, 0.5),
+            bcs=[floor(particles.V)],
+        )
+    )
+
+
+def test_the_tangent_is_one_matrix_where_a_penalty_ties_cells():
+    for corner in (0.0, 0.1, 0.26):
+        particles = mpm.Particles(bent(QUADRILATERAL, corner), space(2))
+        problem = quasi_static(particles, stabilisation="ghost")
+        K = evaluated(lambda made=problem: made, False)[1]
+        assert problem.history.statistics["ghost_facets"] > 0
+        bare = problem.reduced.tangent.loops.assemble()
+        whole = problem.reduced.tangent()
+        assert whole is bare  # no sum of two matrices
+        whole.axpy(-1.0, K)
+        assert whole.norm() < 1e-13 * K.norm()
+
+
+@pytest.mark.parametrize(("count", "size"), [(40, 1), (300, 2)])
+def test_positions_take_as_many_bytes_as_rows_are_long(count, size):
+    nodes = np.arange(0, 2 * count, 2, dtype=np.int32)
+    offsets = np.array([0, count, 2 * count], dtype=np.int64)
+    seen = offsets, np.concatenate([nodes, nodes + 1]), 2 * count
+    ends, columns, pairs, positions, found = loops.pattern(*seen, *seen)
+    assert found == size and pairs.tolist() == [0, count**2, 2 * count**2]
+    places = positions.view(f"u{size}").reshape(2, count, count)
+    for domain in range(2):
+        for row in (0, count - 1):
+            begin = ends[2 * row + domain]
+            assert np.array_equal(columns[begin + places[domain, row]], nodes + domain)
 
 
 def boundary_tags(body):
