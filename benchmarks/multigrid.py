@@ -7,12 +7,14 @@ The column is a quarter of an elastoplastic block of 8 x 8 x 4 on hexahedra, who
 elasticity of stock DOLFINx on a mesh of about as many unknowns with GAMG, as DOLFINx's demo of
 elasticity does, in the same process, and compares it with multigrid on the column's last tangent.
 ``--saddle`` runs scenes with a pressure or water beside the displacements instead. The solver
-``full`` is ``direct`` without blocks of low rank. Seconds are this process's CPU time.
+``full`` is ``direct`` without blocks of low rank. Seconds are this process's CPU time. ``--bytes``
+lists what the problem keeps after the last step, in bytes an unknown.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import resource
 import time
@@ -76,6 +78,44 @@ def run(n: int, solver: str, steps: int) -> tuple[mpm.QuasiStaticProblem, dict[s
         "sink": COMM.allreduce(float(moved.min()), MPI.MIN),
         "megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
+
+
+def kept(problem: mpm.QuasiStaticProblem, least: float = 0.05) -> dict[str, float]:
+    """Return the bytes an unknown of what a problem holds: arrays of numbers, and matrices.
+
+    What DOLFINx and PETSc hold besides is not among them.
+
+    Args:
+        problem: The problem.
+        least: Bytes an unknown over 1000 below which nothing is listed.
+
+    Returns:
+        By the classes on the way to it, the largest first.
+    """
+    unknowns = problem.history.statistics["free_dofs"]
+    found: dict[str, float] = {}
+    seen, left = {id(problem), problem.A.handle}, [(problem, "problem")]  # (of A the arrays)
+    while left:
+        one, name = left.pop()
+        for other in gc.get_referents(one):
+            while isinstance(other, np.ndarray) and isinstance(other.base, np.ndarray):
+                other = other.base
+            shared = isinstance(other, type | str) or type(other).__module__.startswith("ufl")
+            key = other.handle if isinstance(other, PETSc.Mat) else id(other)
+            if shared or key in seen:
+                continue
+            seen.add(key)
+            if isinstance(other, PETSc.Mat | np.ndarray):
+                matrix = isinstance(other, PETSc.Mat)
+                size = 12.0 * other.getInfo()["nz_used"] if matrix else float(other.nbytes)
+                kind = "matrix" if matrix else f"{other.dtype} {other.shape[1:]}"
+                key = f"{name} {kind}"
+                found[key] = found.get(key, 0.0) + size / unknowns
+            elif not callable(other) or hasattr(other, "__dict__"):
+                plain = isinstance(other, dict | list | tuple)
+                left.append((other, name if plain else f"{name[-60:]}.{type(other).__name__}"))
+    large = sorted(found.items(), key=lambda pair: -pair[1])
+    return {name: size for name, size in large if size > 1e3 * least}
 
 
 def timed(ksp: PETSc.KSP, K: PETSc.Mat, b: PETSc.Vec, make: Any) -> dict[str, Any]:
@@ -289,6 +329,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=3, help="load steps of four")
     parser.add_argument("--solver", choices=["direct", "multigrid", "full"], action="append")
     parser.add_argument("--fem", action="store_true", help="stock finite elements beside it")
+    parser.add_argument("--bytes", action="store_true", help="what the problem keeps, listed")
     parser.add_argument("--saddle", action="store_true", help="scenes with a pressure or water")
     args = parser.parse_args()
     quiet = args.json or COMM.rank > 0
@@ -302,6 +343,7 @@ def main() -> None:
         for solver in args.solver or ["direct", "multigrid"]:
             problem, row = run(n, solver, 2 if args.smoke else args.steps)
             results["runs"].append(row)
+            row["bytes"] = kept(problem) if args.bytes else {}
             if not quiet:
                 steps = ", ".join(
                     f"{s['seconds']:.2f} s ({s['newton']}/{s['krylov']:.0f})" for s in row["steps"]
@@ -311,6 +353,8 @@ def main() -> None:
                     f"{row['seconds']:.2f} s, {row['megabytes']:.0f} MB, sink {row['sink']!r}",
                     flush=True,
                 )
+                for name, size in row["bytes"].items():
+                    print(f"  {size:7.0f}  {name}")
             if args.fem and solver == "multigrid":
                 pair = {"multigrid": tangent(problem), "GAMG": elasticity(row["unknowns"])}
                 results["tangents"].append(pair)
