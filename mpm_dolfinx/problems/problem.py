@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What all problems have: bodies, steps, results, and a state that goes with them."""
+"""A problem: bodies, steps, results, and a state that goes with them."""
 
 from __future__ import annotations
 

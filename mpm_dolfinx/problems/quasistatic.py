@@ -245,7 +245,7 @@ class QuasiStaticProblem(Problem):
         return [*super().at_end(), *self._constant_arrays()]
 
     def _constant_arrays(self) -> list[NDArray[np.float64]]:
-        """Return what forces have from the beginning on: of supports, averages, those held back.
+        """Return arrays that forces begin with: of supports, averages, and those held back.
 
         The last are there as long as they are held.
         """
