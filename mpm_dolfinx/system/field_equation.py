@@ -93,6 +93,11 @@ class FieldEquation(Term):
         self.field, self.lower, self.upper = field, lower, upper
         for bound in (lower, upper):
             self._require_bound(bound)
+        numbers: list[Any] = [bound for bound in (lower, upper) if is_number(bound)]
+        if numbers != sorted(numbers):
+            raise MPMError(
+                f"The field '{field.name}' has nothing between its bounds {lower} and {upper}."
+            )
         self._forms = FieldForms(body, [field], None, [residual])
         self._own = field.W.dofmap.index_map.size_local * field.W.dofmap.index_map_bs
         self._comm: MPI.Comm = body.mesh.comm
@@ -100,13 +105,13 @@ class FieldEquation(Term):
         self._ksp = conjugate_gradients(self._comm, MOST_ITERATIONS)
 
     def _require_bound(self, bound: Any) -> None:
-        known = bound is None or bound == "previous" or is_number(bound)
+        known = bound is None or bound == "previous" or (is_number(bound) and np.isfinite(bound))
         if isinstance(bound, fem.Function):
             known = bound.function_space is self.field.W
         if not known:
             raise MPMError(
-                f"A bound of the field '{self.field.name}' must be a number, a Function on its W "
-                f"or 'previous', not {bound!r}."
+                f"A bound of the field '{self.field.name}' must be a finite number, a Function on "
+                f"its W or 'previous', not {bound!r}; omit one that there is not."
             )
 
     # -- What a problem asks ---------------------------------------------------------------------

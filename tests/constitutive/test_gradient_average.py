@@ -79,3 +79,17 @@ def test_domains_without_common_nodes_are_refused():
     law = mpm.materials.Tresca(1e3, 0.3, 1.0, cohesion_residual=0.5, decay=10.0)
     with pytest.raises(mpm.MPMError, match="length= averages over neighbours"):
         mpm.QuasiStaticProblem(mpm.Body(particles, law, length=0.1))
+
+
+def test_what_is_taken_away_neither_gives_nor_takes_from_then_on():
+    particles = body_of(1, mesh.CellType.quadrilateral, 2)
+    average = GradientAverage(
+        strain_of(particles, False), LENGTH, np.ones(particles.num_local, dtype=bool)
+    )
+    gone = particles.initial_centroid[:, 0] > 1.0
+    values = np.where(gone[:, None], 7.0, 2.0) * np.ones((1, particles.num_points))
+    assert comm.allreduce(average.of(values)[~gone].max(initial=0.0), MPI.MAX) > 2.1
+    particles.remove(np.flatnonzero(gone))
+    found = average.of(values)
+    np.testing.assert_allclose(found[~gone], 2.0, rtol=1e-11)
+    assert (found[gone] == 0.0).all()

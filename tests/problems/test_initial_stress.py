@@ -144,6 +144,20 @@ def test_averages_leave_level_ground_at_rest_whatever_comes_after(cell, options,
         assert largest(problem.particles.displacement.x.array) <= 1e-12 * HEIGHT, change
 
 
+@pytest.mark.parametrize("scheme", ["conserving", "midpoint"])
+def test_averages_account_for_all_energy_of_stressed_ground_that_shakes(scheme):
+    whole = off_the_lines(TRIANGLE)
+    (body,) = whole.setup.given
+    body = body.replace(material=materials.Hencky(YOUNG, 0.3), velocity=(0.5, -0.5))
+    problem = mpm.DynamicProblem(body, whole.bcs, scheme=scheme)
+    problem.solve(0.05, 0.01)
+    energies = problem.history.energies
+    size = max(energy.kinetic for energy in energies)
+    assert np.ptp([energy.balance for energy in energies]) < 1e-9 * size
+    if scheme == "conserving":
+        assert abs(energies[-1].dissipated) < 1e-9 * size
+
+
 def test_averages_keep_no_pressure_that_there_is_not_at_first():
     """Ground without a stress settles as ever, and one that carries its weight feels a new load."""
     moved = []

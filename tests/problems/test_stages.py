@@ -174,6 +174,24 @@ def strip(supported=True, **options):
     )
 
 
+def test_a_stage_while_a_prop_still_goes_changes_nothing_at_once():
+    problem, free = strip(), strip(supported=False)
+    free.solve()
+    problem.solve()
+    clamp = problem.bcs[0]
+    problem.stage("no prop", bcs=problem.bcs[:1])
+    next(problem.steps(2))
+    half = problem.reaction(clamp)[1]
+    problem.stage("the same", bcs=problem.bcs)
+    for _ in problem.steps(1000):
+        break
+    assert problem.reaction(clamp)[1] == pytest.approx(half, rel=5e-3)
+    problem.stage("the same again", bcs=problem.bcs)
+    problem.solve(1)
+    mine, its = (largest(np.abs(p.particles.displacement.x.array)) for p in (problem, free))
+    assert mine == pytest.approx(its, rel=1e-6)
+
+
 def test_a_prop_is_taken_away():
     problem, free = strip(), strip(supported=False)
     free.solve()

@@ -13,6 +13,7 @@ from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD, at
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import NeoHooke, VonMises
+from mpm_dolfinx.stepping.freeing import carried_after
 
 STEPS = 20
 
@@ -126,6 +127,23 @@ def test_single_steps_and_one_that_is_made_again():
         assert lowest(own) > -1e-9 and float(own.load.value) == load
     reasons = [attempt.reason for attempt in problem.history.taken_back]
     assert reasons == ["free nodes left the background"]
+
+
+def test_a_step_is_too_late_for_whichever_body_leaves():
+    V = scenes.vectors(scenes.box([0.0, 0.0], [3.0, 2.0], [6, 4], QUADRILATERAL))
+    leaves, stays = (
+        mpm.Particles(
+            scenes.box([x, 0.5], [x + 1.0, 1.5], [2, 2], QUADRILATERAL),
+            V,
+            free="auto",
+            quadrature_degree=2,
+        )
+        for x in (0.25, 1.5)
+    )
+    assert not carried_after([leaves, stays]).too_late
+    scenes.move(leaves, lambda X: np.broadcast_to([0.0, -0.6], X.shape), commit=False)
+    assert carried_after([leaves, stays]).too_late
+    assert carried_after([stays, leaves]).too_late
 
 
 def test_a_run_goes_on_from_a_checkpoint_as_it_was(mpi_tmp_path):

@@ -188,6 +188,38 @@ def test_bounds_hold_where_the_equation_does_not() -> None:
     assert equation.alternate() == 0
 
 
+def test_an_equation_that_is_not_linear_is_solved_to_round_off() -> None:
+    body = mesh.create_rectangle(comm, [[0, 0], [1, 1]], [3, 3], QUADRILATERAL)
+    particles = mpm.Particles(body)
+    p = particles.field(
+        fem.functionspace(body, ("Lagrange", 1)), at="nodes", kind="body", name="root"
+    )
+    residual = (p**3 + p - 10.0) * ufl.TestFunction(p.W) * ufl.dx(body)
+    equation = mpm.FieldEquation(p, residual)
+    assert equation.alternate() > 3
+    np.testing.assert_allclose(p.x.array, 2.0, rtol=1e-9)
+    assert equation.alternate() == 0
+
+
+def test_an_upper_bound_below_what_never_heals_gives_way() -> None:
+    body = mesh.create_rectangle(comm, [[0, 0], [1, 1]], [3, 3], QUADRILATERAL)
+    particles = mpm.Particles(body)
+    p = particles.field(
+        fem.functionspace(body, ("Lagrange", 1)), at="nodes", kind="body", name="height"
+    )
+    upper = fem.Function(p.W)
+    upper.x.array[:] = 1.0
+    residual = (p - 0.7) * ufl.TestFunction(p.W) * ufl.dx(body)
+    equation = mpm.FieldEquation(p, residual, lower="previous", upper=upper)
+    equation.alternate()
+    equation.commit()
+    np.testing.assert_allclose(p.x.array, 0.7, rtol=1e-9)
+    reached = p.x.array.copy()
+    upper.x.array[:] = 0.4
+    equation.alternate()
+    np.testing.assert_array_equal(p.x.array, reached)
+
+
 def test_what_cannot_be_alternated_is_refused() -> None:
     body = mesh.create_rectangle(comm, [[0, 0], [1, 1]], [4, 4], QUADRILATERAL)
     grid = mesh.create_rectangle(comm, [[0, 0], [1, 1]], [2, 2], QUADRILATERAL)
@@ -200,8 +232,11 @@ def test_what_cannot_be_alternated_is_refused() -> None:
         mpm.FieldEquation(3, residual)  # type: ignore[arg-type]
     own = particles.field(fem.functionspace(body, ("Lagrange", 1)), "nodes", "body", "own")
     residual = own * ufl.TestFunction(own.W) * particles.dx
-    with pytest.raises(mpm.MPMError, match="must be a number"):
-        mpm.FieldEquation(own, residual, lower="last")
+    for wrong in ("last", np.nan, np.inf, True):
+        with pytest.raises(mpm.MPMError, match="must be a finite number"):
+            mpm.FieldEquation(own, residual, lower=wrong)
+    with pytest.raises(mpm.MPMError, match="nothing between its bounds"):
+        mpm.FieldEquation(own, residual, lower=1.0, upper=0.5)
     growing = -residual + ufl.TestFunction(own.W) * particles.dx
     with pytest.raises(mpm.ConvergenceError, match="own"):
         mpm.FieldEquation(own, growing).alternate()

@@ -12,6 +12,7 @@ from dolfinx import fem
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import Hencky, LinearElastic, VonMises
+from mpm_dolfinx.particles.free import chosen_nodes
 
 YOUNG, POISSON = 1e3, 0.3
 
@@ -344,3 +345,16 @@ def test_free_nodes_of_removed_cells_alone_are_no_unknowns():
     problem.solve(1)
     assert problem.history.statistics["free_dofs"] == 2 * (4 - 1) * 3
     assert np.isfinite(own.displacement.x.array).all()
+
+
+@pytest.mark.mpi
+def test_nodes_that_one_rank_alone_chooses_are_free_on_their_owner():
+    particles = mpm.Particles(scenes.unit(6, QUADRILATERAL), quadrature_degree=2)
+    layout = particles.W.dofmap.index_map
+    ghosts = np.arange(layout.size_local, layout.size_local + layout.num_ghosts)
+    chosen = chosen_nodes(particles.W, ghosts)
+    every = np.unique(scenes.gather(layout.ghosts))
+    assert len(every) > 0
+    own = np.flatnonzero(chosen[: layout.size_local]) + layout.local_range[0]
+    np.testing.assert_array_equal(np.sort(scenes.gather(own)), every)
+    assert chosen[ghosts].all()
