@@ -24,10 +24,12 @@ SUFFICIENT = 0.8
 LEAST = 1e-4
 #: Halvings after which a step is taken if its end can be evaluated, in a solve that hurries.
 FEW_HALVINGS = 3
-#: Share of its start that the work may keep where a potential is followed, and most evaluations
-#: that look for such a step.
+#: Share of its start that the work may keep where points yield, and most evaluations that look
+#: for such a step.
 SHARP = 0.3
 SECANTS = 4
+#: Growth of the norm up to which a step goes on over a fold.
+FOLD = 10.0
 #: Steps that may follow one which is taken on trust until the residual is below that before it.
 TRUST = 7
 #: Iterations within which the smallest residual must fall, in a solve that hurries too, and to what
@@ -46,6 +48,7 @@ class _Step(NamedTuple):
         direction: The step, or a multiple of it with which products are numbers of the machine.
         norm: Norm of the residual at the unknowns.
         work: Product of that residual with the direction.
+        reversed: Whether it goes against Newton's own step.
     """
 
     x: PETSc.Vec
@@ -53,12 +56,13 @@ class _Step(NamedTuple):
     direction: PETSc.Vec
     norm: float
     work: float
+    reversed: bool = False
 
     @classmethod
-    def of(cls, x: PETSc.Vec, y: PETSc.Vec, F: PETSc.Vec) -> _Step:
+    def of(cls, x: PETSc.Vec, y: PETSc.Vec, F: PETSc.Vec, reversed: bool = False) -> _Step:
         """Return the step y from unknowns with the residual F (collective)."""
         direction, _ = unit_sized(y)
-        return cls(x, y, direction, norm(F), F.dot(direction))
+        return cls(x, y, direction, norm(F), F.dot(direction), reversed)
 
     def halved(self) -> _Step:
         """Halve the step."""
@@ -85,6 +89,11 @@ class LineSearch:
     direction is then that of a damped tangent which is (a modified Newton step: Nocedal &
     Wright 2006, section 3.4).
 
+    Where the tangent has no symmetry and the residual's work on a step is negative, so is the
+    second-order work (Hill 1958): soil that dilates less than its friction has passed a fold, where
+    Newton's method goes to and fro between the side that resists and the side that gives way. The
+    way on is forward, against the Newton step, as far as the norm grows no more than tenfold.
+
     Otherwise, where the response is smooth, the whole step is taken on trust: a step that turns
     a stiff body leaves the residual far larger, and Newton's method has forgotten that some
     iterations later. If seven have not brought the residual below what it was, or before that a
@@ -92,15 +101,15 @@ class LineSearch:
     search withdraws to where it was (the watchdog of Chamberlain, Powell, Lemarechal & Pedersen
     1982), once in a solve. What is left is halved.
 
-    Where the residual is the gradient of a potential and points yield, the step then goes on to
-    where the work is at most 0.3 of its start, by the secants of regula falsi: the potential of a
-    body that flows has kinks, and Newton steps that are only just accepted go to and fro over
-    them.
+    Where points yield, the step then goes on to where the work is at most 0.3 of its start, by the
+    secants of regula falsi: a body that flows has kinks, and Newton steps that are only just
+    accepted go to and fro over them.
 
     Args:
         evaluate: Evaluates the residual at unknowns into ``F``; returns a failure or ``None``.
         uphill: Says whether the step for a residual is not that of a positive definite tangent.
-        redirect: Replaces it by a damped one that is.
+        redirect: Replaces it by a damped one that is, or reverses it; returns whether it is
+            reversed.
         smooth: Says whether no history changes in the residual evaluated last.
         statistics: Where to count.
     """
@@ -109,7 +118,7 @@ class LineSearch:
         self,
         evaluate: Callable[[PETSc.Vec], MPMError | None],
         uphill: Callable[[PETSc.Vec, PETSc.Vec], bool],
-        redirect: Callable[[PETSc.Vec, PETSc.Vec], None],
+        redirect: Callable[[PETSc.Vec, PETSc.Vec], bool],
         smooth: Callable[[], bool],
         statistics: Statistics,
     ) -> None:
@@ -154,9 +163,8 @@ class LineSearch:
         if self._reduces(step, F, trial) and not self._overdue(F):
             return self._sharpen(step, 1.0, F, trial)
         if self._trusted is None and self._uphill(start, y):
-            self._redirect(start, y)
             self._statistics.count("redirections")
-            step = _Step.of(x, y, start)
+            step = _Step.of(x, y, start, self._redirect(start, y))
             if not self._reduces(step, F, trial):
                 self._halve(step, F, trial)
             return True
@@ -203,10 +211,14 @@ class LineSearch:
         trial.waxpy(-1.0, step.y, step.x)
         if self._evaluate(trial) is not None:
             return False
+        size = norm(F)
+        if step.reversed:
+            return size <= FOLD * step.norm
         if self._rules.by_norm:
-            return norm(F) <= (1.0 - LEAST) * step.norm
-        work = abs(F.dot(step.direction))
-        return bool(work <= SUFFICIENT * abs(step.work) or norm(F) <= step.norm)
+            return size <= (1.0 - LEAST) * step.norm
+        tells = step.work > 0.0 or self._rules.potential
+        falls = tells and abs(F.dot(step.direction)) <= SUFFICIENT * abs(step.work)
+        return bool(falls or size <= step.norm)
 
     def _halve(self, step: _Step, F: PETSc.Vec, trial: PETSc.Vec) -> None:
         """Halve the step until norm or work fall far enough."""
@@ -220,7 +232,7 @@ class LineSearch:
                 break
 
     def _sharpen(self, step: _Step, longest: float, F: PETSc.Vec, trial: PETSc.Vec) -> bool:
-        """Go on to where the work has fallen far enough, where there is a potential.
+        """Go on to where the work has fallen far enough.
 
         Args:
             step: The step that is accepted; changed.
@@ -233,7 +245,7 @@ class LineSearch:
         """
         work = F.dot(step.direction)
         far = abs(work) > SHARP * abs(step.work)
-        if not (self._rules.potential and far and step.work > 0.0 and self._trusted is None):
+        if not far or step.work <= 0.0 or step.reversed or self._trusted is not None:
             return False
         if self._smooth():
             return False

@@ -709,22 +709,30 @@ class NewtonSolver:
 
     def _uphill(self, F: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Return whether a step for the residual F is not that of a positive definite tangent."""
-        if not self._symmetric or self._factor.shift == 0.0:
+        if self._factor.shift == 0.0:
             return False
-        expected = self._now.negative + self._factor.num_negative
         uphill = self._factor.num_negative == 0 and sign_of_product(F, y) <= 0.0
+        if not self._symmetric:
+            return uphill and not self._smooth()
+        expected = self._now.negative + self._factor.num_negative
         return uphill or self._factor.negative_pivots() > expected
 
-    def _redirect(self, F: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Solve for the step with a damped tangent that is positive definite.
+    def _redirect(self, F: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Solve for the step with a damped tangent that is positive definite, or reverse it.
 
         Args:
             F: The residual.
             y: The step; replaced.
 
+        Returns:
+            Whether it is reversed: without symmetry, damping leads over a fold too slowly.
+
         Raises:
             Indefinite: A smaller load step is to be tried instead.
         """
+        if not self._symmetric:
+            y.scale(-1.0)
+            return True
         assert self.K is not None
         self._factor.give_up(self._shortens)
         for damping in DAMPINGS:
@@ -733,7 +741,8 @@ class NewtonSolver:
             self._now.negative = self._problem.constrain(y, self._now.origin, self._factor.solve)
             self.iterations += 1
             if not self._uphill(F, y):
-                return
+                break
+        return False
 
 
 def _unbalanced(share: float) -> ConvergenceError:

@@ -45,13 +45,13 @@ def fill(lifts, rows, cutoff=None, **options):
     return problem
 
 
-@pytest.mark.parametrize("lifts", [1, 2])
-def test_what_a_prediction_is_too_far_from_is_found_from_zero(lifts):
-    """Newton's method goes round from the prediction, and takes few solves from zero."""
+@pytest.mark.parametrize(("lifts", "seconds", "solves"), [(1, 0, 30), (2, 1, 60)])
+def test_what_a_prediction_is_too_far_from_is_found(lifts, seconds, solves):
+    """Newton's method goes forward over folds; where it goes round still, it begins at zero."""
     problem = fill(lifts, 4 // lifts, stabilisation=None)
     assert problem.history.cutbacks == 0
-    assert problem.history.statistics["second_attempts"] > 0
-    assert problem.history.total_iterations <= 75
+    assert problem.history.statistics["second_attempts"] >= seconds
+    assert problem.history.total_iterations <= solves
 
 
 def test_a_node_that_is_hardly_held_is_named():

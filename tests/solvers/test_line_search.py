@@ -41,6 +41,25 @@ def test_no_redirection_without_its_conditions(options):
     assert solver.statistics["redirections"] == 0
 
 
+class Softening(DoubleWell):
+    """The same with a history."""
+
+    def smooth(self):
+        return False
+
+
+def test_a_fold_is_passed_forward():
+    # Without symmetry nothing but the sign of the second-order work tells the side that gives way,
+    # from which Newton's own step leads back to a maximum, or to the fold.
+    problem = Softening([1.0, 5.0, 0.3], 0.1)
+    solver = newton(symmetric=False)
+    solver.solve(problem, (3, 3), shorten=False)
+    assert solver.statistics["redirections"] >= 1 and solver.iterations < 15
+    x = solver.x.array_r + problem.start
+    assert np.all(3.0 * x**2 > 1.0) and np.all(x > 0.0)  # stable, and on the way
+    np.testing.assert_allclose(problem.c * (x**3 - x), 0.1, atol=1e-8)
+
+
 class Rod(DoubleWell):
     """A stiff rod from the origin to (1, 0), its end held by a soft spring and pulled sideways.
 
