@@ -76,6 +76,7 @@ class _Rules(NamedTuple):
     """Rules of a search in one solve; see :meth:`LineSearch.begin`."""
 
     potential: bool
+    works: bool
     hurries: bool
     by_norm: bool
 
@@ -127,20 +128,21 @@ class LineSearch:
         self._redirect = redirect
         self._smooth = smooth
         self._statistics = statistics
-        self._rules = _Rules(False, False, False)
+        self._rules = _Rules(False, False, False, False)
         self._trusted: _Step | None = None
         self._since, self._may_trust = 0, True
 
-    def begin(self, potential: bool, hurries: bool, by_norm: bool) -> None:
+    def begin(self, potential: bool, works: bool, hurries: bool, by_norm: bool) -> None:
         """Begin a solve.
 
         Args:
             potential: Whether the residual is the gradient of a potential.
+            works: Whether its work on a step tells if that is stable.
             hurries: Whether a solve that is hard is better given up: see :func:`stalled`.
             by_norm: Whether steps are judged by the residual's norm alone where there is no
                 potential, so that its work on them means nothing.
         """
-        self._rules = _Rules(potential, hurries, by_norm and not potential)
+        self._rules = _Rules(potential, works, hurries, by_norm and not potential)
         self._trusted, self._since, self._may_trust = None, 0, True
 
     def __call__(self, x: PETSc.Vec, y: PETSc.Vec, F: PETSc.Vec, trial: PETSc.Vec) -> bool:
@@ -216,7 +218,7 @@ class LineSearch:
             return size <= FOLD * step.norm
         if self._rules.by_norm:
             return size <= (1.0 - LEAST) * step.norm
-        tells = step.work > 0.0 or self._rules.potential
+        tells = step.work > 0.0 or self._rules.potential or not self._rules.works
         falls = tells and abs(F.dot(step.direction)) <= SUFFICIENT * abs(step.work)
         return bool(falls or size <= step.norm)
 
@@ -245,9 +247,9 @@ class LineSearch:
         """
         work = F.dot(step.direction)
         far = abs(work) > SHARP * abs(step.work)
-        if not far or step.work <= 0.0 or step.reversed or self._trusted is not None:
+        if not (self._rules.works and far and step.work > 0.0) or step.reversed:
             return False
-        if self._smooth():
+        if self._trusted is not None or self._smooth():
             return False
         low, high = (0.0, step.work), None
         share, found = 1.0, (abs(work), 1.0)

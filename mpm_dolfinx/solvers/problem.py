@@ -129,4 +129,7 @@ class ReducedProblem(Protocol):
         """Return the size of external forces and reactions, by which a residual F is judged."""
 
     def has_potential(self) -> bool:
-        """Return whether a symmetric K means that equilibrium makes a potential least."""
+        """Return whether a symmetric K means that equilibrium makes a potential least.
+
+        Without symmetry: whether a residual's work on a Newton step tells if that is stable.
+        """

@@ -233,6 +233,9 @@ class ReducedSystem:
     def has_potential(self) -> bool:
         """Return whether the residual is the gradient of a potential that equilibrium makes least.
 
-        That is if the tangent is symmetric; with fields besides displacements it is a saddle.
+        That is if the tangent is symmetric; with fields besides displacements it is a saddle. Of a
+        tangent that is not, the work of the residual on a Newton step is still the second-order
+        work of what resists it, but for Nitsche's method, which adds the stress's own change.
         """
-        return all(isinstance(body, Particles) for body in self.bodies)
+        displaced = all(isinstance(body, Particles) for body in self.bodies)
+        return displaced and not self.terms.take_stress

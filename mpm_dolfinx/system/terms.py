@@ -49,6 +49,11 @@ class Terms:
         return any(term.one_sided for term in self._terms)
 
     @property
+    def take_stress(self) -> bool:
+        """Whether a term's forces are the stress of a body, as in Nitsche's method."""
+        return any(term.takes_stress for term in self._terms)
+
+    @property
     def alternates(self) -> bool:
         """Whether a term has equations that are solved in turn with the displacements."""
         return any(term.alternates for term in self._terms)

@@ -525,9 +525,9 @@ def test_column_goes_on_from_its_checkpoint(mpi_tmp_path, capfd, monkeypatch):
         if len(saved) == 3:
             raise KeyboardInterrupt
 
-    original = mpm.ParticleProblem.save
+    original = mpm.Problem.save
     with monkeypatch.context() as patch:
-        patch.setattr(mpm.ParticleProblem, "save", save)
+        patch.setattr(mpm.Problem, "save", save)
         with pytest.raises(KeyboardInterrupt):
             run("column_free", arguments, capfd)
     capfd.readouterr()

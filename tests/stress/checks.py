@@ -1017,7 +1017,7 @@ class Observer:
             alive = ~body.deleted
             _, _, tau, _ = self._points(i)
             dev = tau - np.trace(tau, axis1=-2, axis2=-1)[..., None, None] / 3 * np.eye(3)
-            kappa = body._response.plastic_strain()
+            kappa = body._response.last.plastic_strain()
             if "cohesion" in data:
                 f, strength = frictional(data, tau, self.run.young)
             else:
