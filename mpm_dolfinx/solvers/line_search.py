@@ -107,6 +107,7 @@ class LineSearch:
     accepted go to and fro over them.
 
     Args:
+        symmetric: Whether tangents are symmetric.
         evaluate: Evaluates the residual at unknowns into ``F``; returns a failure or ``None``.
         uphill: Says whether the step for a residual is not that of a positive definite tangent.
         redirect: Replaces it by a damped one that is, or reverses it; returns whether it is
@@ -117,12 +118,14 @@ class LineSearch:
 
     def __init__(
         self,
+        symmetric: bool,
         evaluate: Callable[[PETSc.Vec], MPMError | None],
         uphill: Callable[[PETSc.Vec, PETSc.Vec], bool],
         redirect: Callable[[PETSc.Vec, PETSc.Vec], bool],
         smooth: Callable[[], bool],
         statistics: Statistics,
     ) -> None:
+        self._symmetric = symmetric
         self._evaluate = evaluate
         self._uphill = uphill
         self._redirect = redirect
@@ -132,16 +135,17 @@ class LineSearch:
         self._trusted: _Step | None = None
         self._since, self._may_trust = 0, True
 
-    def begin(self, potential: bool, works: bool, hurries: bool, by_norm: bool) -> None:
+    def begin(self, works: bool, hurries: bool, by_norm: bool) -> None:
         """Begin a solve.
 
         Args:
-            potential: Whether the residual is the gradient of a potential.
-            works: Whether its work on a step tells if that is stable.
+            works: Whether the residual's work on a step tells if that is stable; where tangents
+                are symmetric too, it is the gradient of a potential.
             hurries: Whether a solve that is hard is better given up: see :func:`stalled`.
             by_norm: Whether steps are judged by the residual's norm alone where there is no
                 potential, so that its work on them means nothing.
         """
+        potential = self._symmetric and works
         self._rules = _Rules(potential, works, hurries, by_norm and not potential)
         self._trusted, self._since, self._may_trust = None, 0, True
 

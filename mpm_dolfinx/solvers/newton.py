@@ -110,6 +110,7 @@ class NewtonSolver:
         self._symmetric = symmetric
         self._search = (
             LineSearch(
+                symmetric,
                 weakly(self._evaluate),
                 weakly(self._uphill),
                 weakly(self._redirect),
@@ -218,11 +219,10 @@ class NewtonSolver:
         self.gave_up = self.has_another_way = False
         now = self._attempt = Attempt(problem, shorten, not again and self._predictions.lead)
         if self._search is not None:
-            works = problem.has_potential()
-            potential = self._symmetric and works
+            potential = self._symmetric and problem.work_tells()
             self.has_another_way = not potential
             now.hurries = self.gives_up_early and shorten and not potential
-            self._search.begin(potential, works, now.hurries, again)
+            self._search.begin(problem.work_tells(), now.hurries, again)
         self._factor.begin(sizes[1], problem.levels, self.lets_go)
         # What an iterative solve that fails means is for _pre_check to say.
         self.snes.setMaxLinearSolveFailures(1000 if self._factor.iterates else 1)
@@ -265,8 +265,7 @@ class NewtonSolver:
         last = self._now
         now = self._attempt = Attempt(last.problem, last.shorten, False)
         if self._search is not None:
-            works = now.problem.has_potential()
-            self._search.begin(self._symmetric and works, works, False, False)
+            self._search.begin(now.problem.work_tells(), False, False)
         self._factor.begin(self.x.getSize(), now.problem.levels, self.lets_go)
         now.centre, now.first = self.x.copy(), norm(self.F)
         now.enough = share * now.first
@@ -715,7 +714,7 @@ class NewtonSolver:
             return False
         uphill = self._factor.num_negative == 0 and sign_of_product(F, y) <= 0.0
         if not self._symmetric:
-            return uphill and self._problem.has_potential() and not self._smooth()
+            return uphill and self._problem.work_tells() and not self._smooth()
         expected = self._now.negative + self._factor.num_negative
         return uphill or self._factor.negative_pivots() > expected
 

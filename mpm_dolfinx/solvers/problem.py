@@ -128,8 +128,8 @@ class ReducedProblem(Protocol):
     def scale(self, F: PETSc.Vec | None = None) -> float:
         """Return the size of external forces and reactions, by which a residual F is judged."""
 
-    def has_potential(self) -> bool:
-        """Return whether a symmetric K means that equilibrium makes a potential least.
+    def work_tells(self) -> bool:
+        """Return whether a residual's work on a Newton step tells if that is stable.
 
-        Without symmetry: whether a residual's work on a Newton step tells if that is stable.
+        Where K is symmetric too, equilibrium makes a potential least.
         """

@@ -353,8 +353,8 @@ class ControlledSystem:
         """Return the size of external forces and reactions, by which a residual is judged."""
         return max(self._reduced.scale(F), abs(self.load) * _norm(self._on_all))
 
-    def has_potential(self) -> bool:
-        """Return that the residual is no gradient, since the load factor follows the unknowns."""
+    def work_tells(self) -> bool:
+        """Return that work tells nothing, since the load factor follows the unknowns."""
         return False
 
 

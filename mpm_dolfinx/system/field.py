@@ -296,13 +296,13 @@ class Field:
         """
         if self._ghosts is None or not self._ghosts.acts:
             return no_ties
-        counts = np.count_nonzero(numbers >= 0, axis=1)
+        counts, step = np.count_nonzero(numbers >= 0, axis=1), self._bs + 1
         firsts = np.where(numbers >= 0, numbers, numbers.max(axis=1, keepdims=True)).min(axis=1)
-        known = self.touched.at_nodes(firsts.astype(np.int64) * 8 + counts, self._ghosts.tied)
+        known = self.touched.at_nodes(firsts.astype(np.int64) * step + counts, self._ghosts.tied)
         pairs = np.broadcast_arrays(known[:, :, None], known[:, None, :])
-        span = 8 * self._sizes[1]
+        span = step * self._sizes[1]
         rows, columns = np.divmod(np.unique(pairs[0] * span + pairs[1]), span)
-        blocks = np.column_stack([rows >> 3, rows & 7, columns >> 3, columns & 7])
+        blocks = np.column_stack([*np.divmod(rows, step), *np.divmod(columns, step)])
         return blocks[(blocks[:, 1] > 0) & (blocks[:, 3] > 0)].astype(np.int32)
 
     @property

@@ -230,12 +230,12 @@ class ReducedSystem:
         """Return the size by which a residual is judged: see :meth:`.Balance.scale`."""
         return self.balance.scale(F)
 
-    def has_potential(self) -> bool:
-        """Return whether the residual is the gradient of a potential that equilibrium makes least.
+    def work_tells(self) -> bool:
+        """Return whether a residual's work on a Newton step tells if that is stable.
 
-        That is if the tangent is symmetric; with fields besides displacements it is a saddle. Of a
-        tangent that is not, the work of the residual on a Newton step is still the second-order
-        work of what resists it, but for Nitsche's method, which adds the stress's own change.
+        It is the second-order work of what resists the step, and where the tangent is symmetric
+        equilibrium makes a potential least. With fields besides displacements it is a saddle's,
+        and Nitsche's method adds the stress's own change.
         """
         displaced = all(isinstance(body, Particles) for body in self.bodies)
         return displaced and not self.terms.take_stress

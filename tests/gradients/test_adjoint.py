@@ -201,42 +201,52 @@ class Wearing(materials.Hencky):
         return materials.Integration(stress * left[:, None], D, strain, {"wear": worn})
 
 
-def test_a_law_that_remembers_without_being_inelastic():
-    names, ends = ("young", "weight"), []
+def both_ways(prepared):
+    """Return a form's derivatives by Adjoint and by Sensitivity, of a scene prepared for each.
+
+    Args:
+        prepared: Returns a problem, parameters, a form and a call that runs the problem.
+    """
+    ends = []
     for follows in (mpm.Adjoint, mpm.Sensitivity):
-        scene = Slump(lambda young: Wearing(young, 0.3), {"young": 5e4, "weight": 1e3})
-        d, comm = scene.particles.displacement, scene.particles.mesh.comm
-        form = 0.5 * ufl.inner(d, d) * ufl.dx
-        compiled = fem.form(form)
-        gradient = follows(scene.problem, [scene.named[name] for name in names])
-        scene.problem.solve(3)
+        problem, parameters, form, run = prepared()
+        compiled, comm = fem.form(form), problem.bodies[0].mesh.comm
+        gradient = follows(problem, parameters)
+        run()
 
         def value(compiled=compiled, comm=comm):
             return comm.allreduce(fem.assemble_scalar(compiled))
 
         ends.append(np.array(gradient.of(form if follows is mpm.Adjoint else value)))
-    assert np.abs(ends[0] / ends[1] - 1.0).max() < 1e-8, ends
+    return ends
+
+
+def test_a_law_that_remembers_without_being_inelastic():
+    def prepared():
+        scene = Slump(lambda young: Wearing(young, 0.3), {"young": 5e4, "weight": 1e3})
+        d = scene.particles.displacement
+        parameters = [scene.named[name] for name in ("young", "weight")]
+        form = 0.5 * ufl.inner(d, d) * ufl.dx
+        return scene.problem, parameters, form, lambda: scene.problem.solve(3)
+
+    one, other = both_ways(prepared)
+    assert np.abs(one / other - 1.0).max() < 1e-8, (one, other)
 
 
 def test_bodies_that_stick_by_their_joints():
-    names, ends = ("below", "above"), []
-    for follows in (mpm.Adjoint, mpm.Sensitivity):
+    def prepared():
         scene = Stacked(below=2e4, above=1e4, weight=300.0)
-        d, comm = scene.problem.bodies[1].displacement, scene.problem.bodies[1].mesh.comm
-        form = 0.5 * ufl.inner(d, d) * ufl.dx
-        compiled = fem.form(form)
-        gradient = follows(scene.problem, [scene.named[name] for name in names])
-        counts = [scene.problem.history.statistics["joint_nodes"] for _ in scene.problem.steps(6)]
-        assert max(counts) > 0
-        if follows is mpm.Adjoint:
-            ends.append(np.array(gradient.of(form)))
-        else:
+        problem, d = scene.problem, scene.problem.bodies[1].displacement
 
-            def value(compiled=compiled, comm=comm):
-                return comm.allreduce(fem.assemble_scalar(compiled))
+        def run():
+            counts = [problem.history.statistics["joint_nodes"] for _ in problem.steps(6)]
+            assert max(counts) > 0
 
-            ends.append(gradient.of(value))
-    assert np.abs(ends[0] / ends[1] - 1.0).max() < 1e-7, ends
+        parameters = [scene.named[name] for name in ("below", "above")]
+        return problem, parameters, 0.5 * ufl.inner(d, d) * ufl.dx, run
+
+    one, other = both_ways(prepared)
+    assert np.abs(one / other - 1.0).max() < 1e-7, (one, other)
 
 
 def test_it_goes_on_after_a_look_and_is_the_same_on_any_number_of_ranks():
@@ -258,21 +268,16 @@ def test_it_goes_on_after_a_look_and_is_the_same_on_any_number_of_ranks():
 
 def test_a_functional_with_parameters_in_itself():
     """Terms of a cost that have a Constant, or a Function along a direction, besides motion."""
-    ends = []
-    for follows in (mpm.Adjoint, mpm.Sensitivity):
+
+    def prepared():
         scene = Layered(law="Hencky")
-        weight, young = scene.named["weight"], scene.named["young"]
-        d, comm = scene.particles.displacement, scene.particles.mesh.comm
+        weight, young, d = scene.named["weight"], scene.named["young"], scene.particles.displacement
         form = weight**2 * young * ufl.inner(d, d) * ufl.dx
-        compiled = fem.form(form)
-        gradient = follows(scene.problem, [weight, (young, ways(scene)["young"])])
-        scene.problem.solve(2)
+        parameters = [weight, (young, ways(scene)["young"])]
+        return scene.problem, parameters, form, lambda: scene.problem.solve(2)
 
-        def value(compiled=compiled, comm=comm):
-            return comm.allreduce(fem.assemble_scalar(compiled))
-
-        ends.append(np.array(gradient.of(form if follows is mpm.Adjoint else value)))
-    assert np.abs(ends[0] / ends[1] - 1.0).max() < 1e-7, ends
+    one, other = both_ways(prepared)
+    assert np.abs(one / other - 1.0).max() < 1e-7, (one, other)
 
 
 def test_wrong_functionals_and_parameters_are_told():

@@ -95,7 +95,7 @@ class DoubleWell:
     def is_rigid(self, x):
         return True
 
-    def has_potential(self):
+    def work_tells(self):
         return True
 
 
