@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The kernel of T in the free column, for docs/solver.md: python docs/studies/kernel.py
+"""The kernel of T in the free column, for docs/solver-measured.md: python docs/studies/kernel.py
 
 Prints how many combinations of free background dofs move no node of the body, at each converged
 step, and draws one of them.

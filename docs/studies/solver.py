@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The tables of docs/solver.md."""
+"""The tables of docs/solver-measured.md."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def tables() -> dict[str, Table]:
         ("default", "Default", False),
     ):
         found[f"solver/{name}"] = Table(
-            "solver",
+            "solver-measured",
             [title, *loads],
             {
                 f"{kind}, {factor}": partial(factors, domain, petsc, plain)
@@ -92,7 +92,7 @@ def tables() -> dict[str, Table]:
         )
     for domain in DOMAINS:
         found[f"solver/alone-{domain}"] = Table(
-            "solver",
+            "solver-measured",
             ["", "20 kN/m³", "80 kN/m³", "160 kN/m³"],
             {
                 label: partial(alone, domain, shift, search)
@@ -106,13 +106,13 @@ def tables() -> dict[str, Table]:
         )
     scenes = {f"{DOMAINS[s[0]]}, {s[1] / 1e3:g} kN/m³": s for s in SCENES}
     found["solver/predictor"] = Table(
-        "solver",
+        "solver-measured",
         ["free column: solves, cutbacks", "from zero", "predicted", "steps from a prediction"],
         {label: partial(predicted, *scene) for label, scene in scenes.items()},
         quick=list(scenes)[-2:-1],
     )
     found["solver/kernel"] = Table(
-        "solver",
+        "solver-measured",
         [
             "",
             "states with a kernel",
