@@ -45,9 +45,9 @@ def test_examples_of_a_page_run(page, tmp_path, monkeypatch, logging_as_before):
 def test_law_by_jax():
     """The example that needs a package of its own, where there is one."""
     pytest.importorskip("jax", reason="the example is of a law that JAX differentiates")
-    example = re.search(r"^```py\n(.*?)^```", PAGES["materials.md"], re.MULTILINE | re.DOTALL)
+    example = re.search(r"^```py\n(.*?)^```", PAGES["law-contract.md"], re.MULTILINE | re.DOTALL)
     names = {"__name__": "__main__"}
-    exec(compile(example[1], "materials.md", "exec"), names)
+    exec(compile(example[1], "law-contract.md", "exec"), names)
     for dim in (2, 3):
         assert names["check_tangent"](names["rubber"], dim=dim, strain=0.1) < 1e-8
 
@@ -56,8 +56,8 @@ def test_law_by_jax():
 def test_law_by_numba():
     """The loop that numba compiles, beside the same law in NumPy, where there is numba."""
     pytest.importorskip("numba", reason="the example is of a law that numba compiles")
-    page = PAGES["materials.md"]
-    blocks = re.findall(r"^```py(?:thon)?\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    pages = PAGES["own-laws.md"] + PAGES["law-contract.md"]
+    blocks = re.findall(r"^```py(?:thon)?\n(.*?)^```", pages, re.MULTILINE | re.DOTALL)
     by_numba = {"__name__": "__main__"}
     by_numpy = {"np": np, "mandel": mandel, "check_tangent": check_tangent}
     exec(next(b for b in blocks if "class CompiledClay" in b), by_numba)
