@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The tables of docs/locking.md."""
+"""The tables of docs/locking-measured.md."""
 
 from __future__ import annotations
 
@@ -131,31 +131,31 @@ def tables() -> dict[str, Table]:
     beside = ["cells of 0.25 m", "solves", "0.125 m", "solves"]
     return {
         "locking/footing": Table(
-            "locking",
+            "locking-measured",
             ["", *beside],
             {name: partial(footing, options) for name, options in FOOTING.items()},
             cases=["footing"],
         ),
         "locking/strip": Table(
-            "locking",
+            "locking-measured",
             ["the strip holds", *beside],
             {name: partial(strip, options) for name, options in STRIPS.items()},
             cases=["footing"],
         ),
         "locking/edge": Table(
-            "locking",
+            "locking-measured",
             ["domains in a cell, `stabilisation`", *beside],
             {name: partial(strip, *asked) for name, asked in EDGES.items()},
             cases=["footing"],
         ),
         "locking/cantilever": Table(
-            "locking",
+            "locking-measured",
             ["", "cells of 0.5 m", "0.25 m", "linear solves"],
             {name: partial(beam, options) for name, options in BEAM.items()},
             cases=["cantilever"],
         ),
         "locking/mixed": Table(
-            "locking",
+            "locking-measured",
             ["cells; the beam is lower by", "larger error", "linear solves", "cutbacks"],
             {
                 f"{h:g} m; {scientific(o, 0) if 0.0 < o < 1e-3 else format(o, 'g')} cells": partial(
@@ -167,21 +167,21 @@ def tables() -> dict[str, Table]:
             cases=["cantilever"],
         ),
         "locking/expansion": Table(
-            "locking",
+            "locking-measured",
             ["", "radius 1.02", "1.5 to 8.5, largest", "linear solves", "cutbacks"],
             {name: partial(tube, options) for name, options in TUBE.items()},
             quick=list(TUBE)[:1],
             cases=["expansion"],
         ),
         "locking/columns": Table(
-            "locking",
+            "locking-measured",
             ["", "stress along", "across"],
             {name: partial(columns, options) for name, options in COLUMNS.items()},
             quick=list(COLUMNS)[:1],
             cases=["column_roller"],
         ),
         "locking/collapse": Table(
-            "locking",
+            "locking-measured",
             ["average, domains in a cell", "cells of 1 m: top, toe", "solves", "2 m", "solves"],
             {name: partial(block, options) for name, options in BLOCK.items()},
             quick=list(BLOCK)[:1],
