@@ -19,7 +19,7 @@ The first number is a hash of the scripts that made the table, the second one of
 does not follow where the scripts have changed since, where it was edited by hand, or where its
 quick rows come out otherwise. ``--stamp`` writes both numbers of one table anew, for one copied by
 hand from what another program has printed: TABLE is its name, or its page and line, as complaints
-tell them, ``docs/dynamics.md:169``.
+tell them, ``docs/locking-measured.md:169``.
 """
 
 from __future__ import annotations

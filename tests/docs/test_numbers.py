@@ -37,7 +37,7 @@ def test_tables_of_the_documentation_come_from_somewhere():
 def test_one_table_of_a_page_is_stamped(tmp_path):
     shutil.copytree(ROOT / "docs", tmp_path / "docs", ignore=shutil.ignore_patterns("images"))
     (tmp_path / "benchmarks").symlink_to(ROOT / "benchmarks")
-    page = tmp_path / "docs" / "dynamics.md"
+    page = tmp_path / "docs" / "dynamics-measured.md"
     lines = page.read_text("utf-8").splitlines()
     marks = [i for i, text in enumerate(lines) if text.startswith("<!-- table by benchmarks/")]
     assert len(marks) > 1
@@ -46,10 +46,11 @@ def test_one_table_of_a_page_is_stamped(tmp_path):
     page.write_text("\n".join(lines) + "\n", "utf-8")
     program = f"""
 import make
-make.stamp("docs/dynamics.md:{marks[1] + 3}")
-make.stamp("docs/dynamics.md")
+make.stamp("docs/dynamics-measured.md:{marks[1] + 3}")
+make.stamp("docs/dynamics-measured.md")
 """
     done = programs.run("-c", program, cwd=tmp_path / "docs" / "studies")
-    assert "'docs/dynamics.md' names 0 tables where one is stamped.\n" in done.stderr, done.stderr
+    told = "'docs/dynamics-measured.md' names 0 tables where one is stamped.\n"
+    assert told in done.stderr, done.stderr
     stamped = page.read_text("utf-8").splitlines()
     assert [i for i, text in enumerate(stamped) if text != lines[i]] == marks[1:2]
