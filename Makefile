@@ -39,11 +39,11 @@ demo: ## Install what is needed, run the first demo, make its picture
 	@echo "The picture is output/column_roller.png"
 
 test: ## Six minutes: the quick tests on 1, then on NP="2 3" ranks (ARGS=tests/materials: seconds)
-	@$(SETUP) wheel plot test
+	@$(SETUP) wheel plot test adjoint
 	@bash scripts/run_tests.sh $(ARGS)
 
 test-all: ## An hour: all tests on 1, then on NP="2 3 4" ranks, and without ARGS the stress suite
-	@$(SETUP) wheel plot test
+	@$(SETUP) wheel plot test adjoint
 	@bash scripts/run_tests.sh --all $(ARGS)
 	@$(if $(ARGS),,cd tests && "$(abspath $(BIN)/python)" -m stress.run)
 

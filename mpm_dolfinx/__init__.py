@@ -16,6 +16,7 @@ from .errors import (  # noqa: E402
 )
 from .gradients.adjoint import Adjoint  # noqa: E402
 from .gradients.sensitivity import Sensitivity  # noqa: E402
+from .gradients.tape import taped  # noqa: E402
 from .history import Energy, History, Loss, Stage, Statistics, Step  # noqa: E402
 from .meshes.grid import grid, grid_lines  # noqa: E402
 from .meshes.regions import cell_tags, facet_tags, held, region  # noqa: E402
@@ -90,6 +91,7 @@ __all__ = [
     "plot",
     "region",
     "strength_reduction",
+    "taped",
 ]
 
 

@@ -101,6 +101,9 @@ fi
 echo "Installing this package with [$extras] into $venv (the first time this takes a minute or so)"
 rm -f "$installed"
 "$py" -m pip install --quiet --disable-pip-version-check --editable ".[$extras]"
+case ",$extras," in
+*,adjoint,*) "$py" -m pip install --quiet --disable-pip-version-check --no-deps dolfinx-adjoint fenicsx-compat ;;
+esac
 {
     echo "$key"
     printf '%s\n' "$@"

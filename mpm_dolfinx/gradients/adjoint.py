@@ -177,6 +177,11 @@ class Adjoint:
         self._values = [one.function.x.array.copy() if one.function else None for one in self._many]
         problem.record(self)
 
+    @property
+    def displacements(self) -> list[list[Array]]:
+        """Displacements of the bodies, on the local dofs of W, at the end of each step so far."""
+        return [record.after for record in self._records]
+
     # -- What follows the run -----------------------------------------------------------------
 
     def begins(self) -> None:

@@ -53,6 +53,21 @@ def test_law_by_jax():
 
 
 @pytest.mark.skip_in_parallel
+def test_a_run_on_the_tape():
+    """The example that needs dolfinx-adjoint, after those before it on its page."""
+    pytest.importorskip("dolfinx_adjoint", reason="the example is of its tape")
+    pyadjoint = pytest.importorskip("pyadjoint")
+    page, of = PAGES["gradients.md"], re.MULTILINE | re.DOTALL
+    blocks = re.findall(r"^```py(?:thon)?\n(.*?)^```", page, of)
+    names = {"__name__": "__main__"}
+    with pyadjoint.set_working_tape(pyadjoint.Tape()):
+        for block in blocks[: next(i for i, b in enumerate(blocks) if "mpm.taped" in b) + 1]:
+            exec(compile(block, "gradients.md", "exec"), names)
+        pyadjoint.pause_annotation()
+    assert (names["slope"].x.array < 0.0).all()  # stiffer is nearer
+
+
+@pytest.mark.skip_in_parallel
 def test_law_by_numba():
     """The loop that numba compiles, beside the same law in NumPy, where there is numba."""
     pytest.importorskip("numba", reason="the example is of a law that numba compiles")
