@@ -80,6 +80,12 @@ class Governed:
         """Whether the law is one of this package, which gives its answers away for good."""
         return _of_package(type(self.material))
 
+    @cached_property
+    def inelastic_variables(self) -> tuple[str, ...]:
+        """Internal variables that change where a point yields."""
+        own = getattr(self.material, "internal_variables", ())
+        return tuple(name for name in own if name not in self.material.reversible)
+
     def given_away(self, state: State) -> State:
         """Return an answered state that the law will not write into any more."""
         return state if self.is_own else {name: values.copy() for name, values in state.items()}

@@ -80,7 +80,7 @@ class PointState:
             rule = getattr(softened(part, self.average).material, "yield_function", None)
             if rule is None:
                 return -1.0
-            names = getattr(part.material, "internal_variables", ()) or ("plastic_strain",)
+            names = part.inelastic_variables or ("plastic_strain",)
             return rule(state["stress"], *(state[name] for name in names))
 
         return self._collect((), value, "yield_function")
@@ -117,7 +117,7 @@ class PointState:
         for part, was, now in zip(self.laws.governed, before.states, self.states, strict=True):
             if was.keys() == {"stress"} or not getattr(part.material, "inelastic", True):
                 continue
-            variables = getattr(part.material, "internal_variables", ())
+            variables = part.inelastic_variables
             if not variables or not all(np.array_equal(was[v], now[v]) for v in variables):
                 return False
         return True
@@ -126,7 +126,7 @@ class PointState:
         """Return whether an internal variable of each particle is another one, shape ``(n,)``."""
         result = np.zeros(self.laws.num_points, dtype=bool)
         for part, was, now in zip(self.laws.governed, before.states, self.states, strict=True):
-            for name in getattr(part.material, "internal_variables", ()):
+            for name in part.inelastic_variables:
                 changed = was[name] != now[name]
                 result[part.points] |= changed.any(axis=tuple(range(1, changed.ndim)))
         return self.laws.by_domain(result).any(axis=1)

@@ -22,6 +22,7 @@ from .mohr_coulomb import FrictionalMaterial, MohrCoulomb, Tresca
 from .mu_i import MuIRheology
 from .neo_hooke import NeoHooke
 from .return_mapping import ReturnMapping
+from .undrained import Undrained
 from .von_mises import SmallStrainVonMises, VonMises
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "State",
     "StrainMaterial",
     "Tresca",
+    "Undrained",
     "Update",
     "VonMises",
     "check_parameter",

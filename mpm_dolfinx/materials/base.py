@@ -132,6 +132,7 @@ class Material(ABC):
             strain, and nothing else in the law depends on either; each class says so for itself,
             as ``mixed="pressure"`` needs it (with ``young``, ``poisson``, ``bulk``, ``shear``).
         limits: What the values of a parameter must be: keywords of ``check_parameter`` by name.
+        reversible: Internal variables that change where nothing yields.
         parameters: Parameters by name: numbers, or arrays ``(n,)`` with one value per point.
             A piecewise constant Function or a Constant may stand here; the problem works with
             a copy of the material that has its values instead (:meth:`with_parameters`).
@@ -140,6 +141,7 @@ class Material(ABC):
     symmetric: bool
     linear_in_volume: ClassVar[bool] = False
     limits: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType({})
+    reversible: ClassVar[tuple[str, ...]] = ()
     _parameters: Parameters = Parameters({})
 
     @property

@@ -78,7 +78,7 @@ class MaterialDomains(Domains):
         super()._live_on(geometry, undeformed, deletable)
         self._response: Response | None = None
         self._unknowns: Sequence[Unknown] = ()
-        self._pore_pressure: Unknown | None = None
+        self._water: Sequence[Unknown] = ()
 
     def attach(self, response: Response) -> None:
         """Let a response answer for stress and internal variables."""
@@ -88,9 +88,13 @@ class MaterialDomains(Domains):
         """Let unknowns of a problem, besides displacements, be among the fields."""
         self._unknowns = unknowns
 
-    def fill_pores(self, pressure: Unknown) -> None:
-        """Let the pores be full of water with a pressure: the response's stress is effective."""
-        self._pore_pressure = pressure
+    def fill_pores(self, water: Sequence[Unknown]) -> None:
+        """Let the pores be full of water: the response's stress is effective then.
+
+        Args:
+            water: The pore pressure, and parts of it that are fields too; none of a dry body.
+        """
+        self._water = water
 
     def _average(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return volume averages of values ``(n, nq, ...)`` over the undeformed domains."""
@@ -163,17 +167,19 @@ class MaterialDomains(Domains):
 
         Of a body with water in its pores ``stress`` is the effective stress,
         ``mean_effective_stress`` its mean (compression positive); ``total_stress`` is that less
-        ``pore_pressure``. Nothing is called ``pressure`` there.
+        ``pore_pressure``. Nothing is called ``pressure`` there. Of an undrained material
+        ``excess_pore_pressure`` is what it has found, a part of ``pore_pressure``.
         """
         values = {"volume_ratio": self.volume / self.initial_volume}
-        unknowns = {one.name: self._average(one.at_points()) for one in self._unknowns}
+        besides = {one.name: one for one in (*self._unknowns, *self._water)}
+        unknowns = {name: self._average(one.at_points()) for name, one in besides.items()}
         if self.has_material:
             stress = values["stress"] = self.stress
             mean = -np.trace(stress, axis1=1, axis2=2) / 3.0
-            if self._pore_pressure is None:
+            if not self._water:
                 values["pressure"] = mean
             else:
-                water = unknowns[self._pore_pressure.name]
+                water = unknowns[self._water[0].name]
                 values["mean_effective_stress"] = mean
                 values["total_stress"] = stress - water[:, None, None] * np.eye(3)
             values["plastic_strain"] = self.plastic_strain

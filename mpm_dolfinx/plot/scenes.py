@@ -124,12 +124,12 @@ def scene(
         field: ``"displacement"`` (its length), ``"displacement_x"`` and so on, ``"volume_ratio"``;
             with a material ``"stress_xx"`` and so on, ``"mises"``, ``"pressure"``,
             ``"plastic_strain"``; with water in its pores ``"pore_pressure"``,
-            ``"mean_effective_stress"`` instead of ``"pressure"``, ``"total_stress_xx"`` and so on;
-            unknowns besides by their names; of a moving body ``"velocity"``;
-            ``"contact_pressure"`` at points of contact. A body that has no such field is grey. Or
-            values of your own, shape ``(n,)``, one for each particle that this rank owns, or a
-            Function on the body's mesh, of which each domain shows the mean; for several bodies a
-            list. ``None``: no colours.
+            ``"mean_effective_stress"`` instead of ``"pressure"``, ``"total_stress_xx"`` and so on,
+            of an undrained material ``"excess_pore_pressure"``; unknowns besides by their names;
+            of a moving body ``"velocity"``; ``"contact_pressure"`` at points of contact. A body
+            that has no such field is grey. Or values of your own, shape ``(n,)``, one for each
+            particle that this rank owns, or a Function on the body's mesh, of which each domain
+            shows the mean; for several bodies a list. ``None``: no colours.
         path: Where to save it, e.g. ``"scene.png"``.
         ax: Axes of matplotlib to draw on; only those of rank 0 count. A figure is made without.
         warp: Factor on the displacement.

@@ -199,7 +199,7 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
     def _build(self) -> None:
         super()._build()
         for filled in self._filled:
-            filled.particles.fill_pores(filled.field)
+            filled.particles.fill_pores([filled.field])
 
     def _water(self, body: Particles) -> _Filled:
         """Return the water of a body, with the same pressure while its mesh is the same.

@@ -41,6 +41,7 @@ from .arguments import as_bodies, as_supports, as_terms, require_no_conditions_o
 from .body import INITIAL, Body, as_given
 from .initial_stress import initial_stress_at_points
 from .parts import Contribution, Parts
+from .pore_water import water_in
 from .problem import Law, Problem
 from .remeshing import Remeshing, as_indices
 from .setup import Setup
@@ -477,6 +478,7 @@ class QuasiStaticProblem(Problem):
             assert history.mean_stress is not None
             history.mean_stress.begin_with(history.last.mean_stress())
         self._built.points.append(history)
+        body.fill_pores(water_in(body, given.pore_pressure, history))
         work = VirtualWork(strain)
         density = Density(1.0 if given.density is None else given.density, body)
         density.require()

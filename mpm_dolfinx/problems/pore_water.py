@@ -1,0 +1,91 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Water in a body's pores whose pressure is no unknown: known, in excess of that, or both."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import fem
+
+from ..assembly.inputs import as_expression
+from ..constitutive.points import MaterialPoints
+from ..materials.undrained import EXCESS
+from ..meshes.quadrature import quadrature_rule
+from ..parallel.compilation import compiled_expression
+from ..particles.particles import Particles
+
+__all__ = ["Excess", "PoreWater", "water_in"]
+
+type Array = NDArray[np.float64]
+
+
+class Excess:
+    """The pore pressure that undrained materials have found.
+
+    Args:
+        points: The materials.
+
+    Attributes:
+        name: Among the fields of the body.
+    """
+
+    name = EXCESS
+
+    def __init__(self, points: MaterialPoints) -> None:
+        self._points = points
+
+    def at_points(self) -> Array:
+        """Return it at the last converged step, shape ``(n, nq)``."""
+        return self._points.last.variable(EXCESS)
+
+
+class PoreWater:
+    """All of the pore pressure of a body.
+
+    Args:
+        particles: The body.
+        known: The pressure at full load, or ``None``.
+        excess: What comes to it, or ``None``.
+
+    Attributes:
+        name: Among the fields of the body.
+    """
+
+    name = "pore_pressure"
+
+    def __init__(self, particles: Particles, known: Any, excess: Excess | None) -> None:
+        self._particles, self._excess = particles, excess
+        self._known: fem.Expression | None = None
+        if known is not None:
+            p = as_expression(known, particles, self.name, ())
+            p = fem.Constant(particles.mesh, 1.0) * p  # (a constant one knows no ranks)
+            rule, _ = quadrature_rule(particles.mesh.basix_cell(), particles.quadrature_degree)
+            self._known = compiled_expression(p, rule, particles.mesh.comm)
+
+    def at_points(self) -> Array:
+        """Return it at the last converged step, shape ``(n, nq)``."""
+        body = self._particles
+        found: Array = np.zeros((body.num_local, body.num_points))
+        if self._known is not None:
+            values = self._known.eval(body.mesh, np.arange(body.num_local, dtype=np.int32))
+            found += float(body.load.value) * np.asarray(values).reshape(found.shape)
+        return found if self._excess is None else found + self._excess.at_points()
+
+
+def water_in(particles: Particles, known: Any, points: MaterialPoints) -> list[PoreWater | Excess]:
+    """Return the pore pressure of a body and what it has in excess, if it has any (collective).
+
+    Args:
+        particles: The body.
+        known: A pressure that is given, at full load, or ``None``.
+        points: Its materials.
+    """
+    undrained = any(EXCESS in state for state in points.last.states)
+    excess = Excess(points) if undrained else None
+    if known is None and excess is None:
+        return []
+    return [PoreWater(particles, known, excess), *([excess] if excess else [])]
