@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Any two features of a problem together: they work, or a sentence says that they do not.
 
-``docs/combinations.md`` has the table; each of its cells is built and run here.
+``docs/combinations.md`` has what is refused; each pair of features is built and run here.
 """
 
+import contextlib
+import itertools
 import re
 from pathlib import Path
 
@@ -84,7 +86,7 @@ FEATURES = {
     "mixed pressure": {"mixed": "pressure", "degree": 2},
     "multigrid": {"linear_solver": "multigrid"},
     "contact": {"contact": "penalty"},
-    "contact, Nitsche": {"contact": "nitsche"},
+    "Nitsche's contact": {"contact": "nitsche"},
     "stabilised pressure": {"mixed": "stabilised pressure"},
     "RigidBody": {"contact": "rigid body"},
     "finite elements": {"method": "fem"},
@@ -461,32 +463,73 @@ def finish(scene, steps):
 # -- The page ----------------------------------------------------------------------------
 
 
+#: What is the same in motion, has no sense there, or is refused for the same reason as at rest.
+STILL = ("path", "control", "automatic steps")
+SCHEMES = ("midpoint", "conserving", "euler")
+#: Of motions: by a scheme, or in equilibrium below a body that moves.
+KINDS = (*SCHEMES, "quasi_static")
+
+
+@contextlib.contextmanager
+def saying(what):
+    """Tell what was run where a test fails."""
+    try:
+        yield
+    except BaseException as error:
+        error.add_note(what)
+        raise
+
+
+def refused_by(sentence):
+    """Expect an error with a sentence, or none."""
+    if sentence is None:
+        return contextlib.nullcontext()
+    return pytest.raises(mpm.MPMError, match=re.escape(sentence))
+
+
 def excludes(one, other):
     """Return whether two features want different values of one option."""
     return any(one[key] is not other[key] for key in one.keys() & other.keys())
 
 
-def page():
-    """Return the rows of the page's table by feature, and its sentences by letter."""
-    text = PAGE.read_text(encoding="utf-8")
-    rows = re.findall(r"^\| (\d+) \| (.+?) \| (.+) \|$", text, re.MULTILINE)
-    assert [int(number) for number, _, _ in rows] == list(range(1, len(rows) + 1))
-    table = {feature.replace("`", ""): cells.split(" | ") for _, feature, cells in rows}
-    return table, dict(re.findall(r"^- \*\*([a-z])\*\*: `([^`]+)`", text, re.MULTILINE))
+def rows_of(title, columns):
+    """Return the cells of the page's table below a title, without marks of code."""
+    section = PAGE.read_text(encoding="utf-8").split(f"\n## {title}\n")[1].split("\n## ")[0]
+    below = re.split(r"^\| --- .*$", section, flags=re.MULTILINE)[1]
+    return re.findall(rf"^\|{columns * ' (.*?) [|]'}$", below, re.MULTILINE)
 
 
-def test_the_page_has_each_pair():
-    table, sentences = page()
-    assert list(table) == list(FEATURES)
-    cells = np.array(list(table.values()))
-    assert np.array_equal(cells, cells.T)
-    used = {*cells.ravel(), *(cell for row in motions().values() for cell in row)}
-    used |= {*waters().values()}
-    assert used == {"+", "-", *sentences}
-    assert (cells.diagonal() == "+").all()
-    for row, wanted in zip(cells, FEATURES.values(), strict=True):
-        for cell, other in zip(row, FEATURES.values(), strict=True):
-            assert (cell == "-") == excludes(wanted, other)
+def names_in(cell):
+    """Return the names that a cell lists."""
+    return cell.replace("`", "").split(", ")
+
+
+def refusals(title):
+    """Return the sentences by which a table of the page refuses pairs of names."""
+    found = {}
+    for these, others, sentence in rows_of(title, 3):
+        for pair in itertools.product(names_in(these), names_in(others)):
+            assert frozenset(pair) not in found, pair
+            found[frozenset(pair)] = re.match("`([^`]+)`", sentence)[1]
+    return found
+
+
+AT_REST, IN_MOTION, WITH_WATER = map(refusals, ("At rest", "In motion", "With water"))
+
+
+def test_the_page_has_each_feature_and_no_other():
+    listed = [name for cell, _ in rows_of("The features", 2) for name in names_in(cell)]
+    assert listed == list(FEATURES)
+    kinds = {*KINDS, "water"}
+    assert {name for pair in AT_REST for name in pair} <= {*FEATURES}
+    for table in (IN_MOTION, WITH_WATER):
+        for pair in table:
+            assert len(pair & kinds) == 1 and pair - kinds <= {*FEATURES} - {*STILL}
+
+
+def test_nothing_is_refused_that_excludes_itself():
+    for one, other in AT_REST:
+        assert not excludes(FEATURES[one], FEATURES[other])
 
 
 @pytest.mark.parametrize("sixth", SIXTHS)
@@ -494,26 +537,16 @@ def test_the_page_has_each_pair():
 @pytest.mark.filterwarnings("ignore:The run is complete, but the domains")
 def test_a_feature_with_those_before_it(feature, sixth, mpi_tmp_path, monkeypatch):
     monkeypatch.setattr(linear, "COARSEST", 12)
-    table, sentences = page()
     before = list(FEATURES)[: list(FEATURES).index(feature) + 1]
-    for other, cell in list(zip(before, table[feature], strict=False))[::-1][sixth::6]:
-        options = FEATURES[other]
-        wanted = FEATURES[feature] | options
-        try:
-            if cell == "+":
-                run(wanted, mpi_tmp_path)
-            elif cell != "-":
-                with pytest.raises(mpm.MPMError, match=re.escape(sentences[cell])):
-                    run(wanted, mpi_tmp_path)
-        except BaseException as error:
-            error.add_note(f"{feature} with {other}: {cell}")
-            raise
+    for other in before[::-1][sixth::6]:
+        if excludes(FEATURES[feature], FEATURES[other]):
+            continue
+        refused = AT_REST.get(frozenset((feature, other)))
+        with saying(f"{feature} with {other}"), refused_by(refused):
+            run(FEATURES[feature] | FEATURES[other], mpi_tmp_path)
 
 
 # -- In motion ---------------------------------------------------------------------------
-
-#: What is the same in motion, has no sense there, or is refused for the same reason as at rest.
-STILL = ("path", "control", "automatic steps")
 
 
 class Moving(Scene):
@@ -575,45 +608,19 @@ def move(wanted, scheme, directory):
         assert np.array_equal(one.centroid, two.centroid)
 
 
-def rows_of(title, columns):
-    """Return the rows of one of the page's tables of features, by feature."""
-    text = PAGE.read_text(encoding="utf-8")
-    rows = re.findall(rf"^\|{columns * r' ([^|]+?) \|'}$", text, re.MULTILINE)
-    rows = [row for row in rows if row[0] not in ("---", title)]
-    return {feature.replace("`", ""): cells for feature, *cells in rows}
-
-
-def motions():
-    """Return the rows of the page's table of motions."""
-    return rows_of("in motion", 5)
-
-
-def test_the_page_has_each_feature_in_motion():
-    table, sentences = motions(), page()[1]
-    assert list(table) == [feature for feature in FEATURES if feature not in STILL]
-    assert {cell for cells in table.values() for cell in cells} <= {"+", *sentences}
-
-
 @pytest.mark.parametrize(
     "feature", all_but(("Tie", "support"), [f for f in FEATURES if f not in STILL])
 )
 @pytest.mark.filterwarnings("ignore:The run is complete, but the domains")
 def test_a_feature_in_motion(feature, mpi_tmp_path, monkeypatch):
     monkeypatch.setattr(linear, "COARSEST", 12)
-    sentences = page()[1]
-    wanted = FEATURES[feature]
-    kinds = [(wanted, scheme) for scheme in ("midpoint", "conserving", "euler")]
-    kinds.append(({"bodies": "one V"} | wanted | {"quasi_static": True}, "midpoint"))
-    for cell, (options, scheme) in zip(motions()[feature], kinds, strict=True):
-        try:
-            if cell == "+":
-                move(options, scheme, mpi_tmp_path)
-            else:
-                with pytest.raises(mpm.MPMError, match=re.escape(sentences[cell])):
-                    move(options, scheme, mpi_tmp_path)
-        except BaseException as error:
-            error.add_note(f"{feature} with scheme={scheme!r}, {list(options)}: {cell}")
-            raise
+    for kind in KINDS:
+        options, scheme = FEATURES[feature], kind
+        if kind == "quasi_static":
+            options, scheme = {"bodies": "one V"} | options | {"quasi_static": True}, "midpoint"
+        refused = IN_MOTION.get(frozenset((feature, kind)))
+        with saying(f"{feature}, {kind}"), refused_by(refused):
+            move(options, scheme, mpi_tmp_path)
 
 
 # -- With water --------------------------------------------------------------------------
@@ -667,28 +674,13 @@ def consolidate(wanted, directory):
         assert np.array_equal(one.centroid, two.centroid)
 
 
-def waters():
-    """Return the rows of the page's table of consolidation."""
-    return {feature: cell for feature, (cell,) in rows_of("with water", 2).items()}
-
-
-def test_the_page_has_each_feature_with_water():
-    table, sentences = waters(), page()[1]
-    assert list(table) == [feature for feature in FEATURES if feature not in STILL]
-    assert set(table.values()) <= {"+", *sentences}
-
-
 @pytest.mark.parametrize(
     "feature", all_but(("support", "repartition"), [f for f in FEATURES if f not in STILL])
 )
 def test_a_feature_with_water(feature, mpi_tmp_path, monkeypatch):
     monkeypatch.setattr(linear, "COARSEST", 12)
-    cell, wanted = waters()[feature], FEATURES[feature]
-    if cell == "+":
-        consolidate(wanted, mpi_tmp_path)
-        return
-    with pytest.raises(mpm.MPMError, match=re.escape(page()[1][cell])):
-        consolidate(wanted, mpi_tmp_path)
+    with refused_by(WITH_WATER.get(frozenset((feature, "water")))):
+        consolidate(FEATURES[feature], mpi_tmp_path)
 
 
 # -- Stages ------------------------------------------------------------------------------
@@ -852,14 +844,17 @@ def test_equals_change_nothing_at_rest(feature, monkeypatch):
 @pytest.mark.filterwarnings("ignore:The run is complete, but the domains")
 def test_equals_change_nothing_in_motion(feature, monkeypatch):
     monkeypatch.setattr(linear, "COARSEST", 12)
-    for cell, scheme in zip(motions()[feature], ("midpoint", "conserving", "euler"), strict=False):
-        if cell == "+":
+    for scheme in SCHEMES:
+        if frozenset((feature, scheme)) not in IN_MOTION:
             require_no_event(in_motion, FEATURES[feature], scheme)
 
 
 @pytest.mark.parametrize(
     "feature",
-    all_but(("MohrCoulomb",), [f for f, cell in waters().items() if cell == "+"]),
+    all_but(
+        ("MohrCoulomb",),
+        [f for f in FEATURES if f not in STILL and frozenset((f, "water")) not in WITH_WATER],
+    ),
 )
 @pytest.mark.filterwarnings("ignore:The run is complete, but the domains")
 def test_equals_change_nothing_with_water(feature, monkeypatch):
