@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The tables of docs/high-order.md."""
+"""The tables of docs/high-order-measured.md."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def tables() -> dict[str, Table]:
     flows = [(g, h) for g, h in ((20, 1.0), (20, 0.5), (80, 1.0), (80, 0.5), (160, 1.0))]
     found = {
         f"high-order/pairs-{name}": Table(
-            "high-order",
+            "high-order-measured",
             head,
             {
                 f"{k} / {m}{' *refused*' if m < k else ''}": partial(pair, kind, k, m)
@@ -195,26 +195,26 @@ def tables() -> dict[str, Table]:
         for name, kind in CELLS.items()
     }
     found["high-order/condition"] = Table(
-        "high-order",
+        "high-order-measured",
         ["degree 2 where no other is named", "smallest", "largest", "ratio"],
         {name: partial(conditions, *options) for name, options in CONDITIONS.items()},
     )
     found["high-order/beam"] = Table(
-        "high-order",
+        "high-order-measured",
         ["degree, cells", "0", "0.1 h", "0.37 h", "1e-9", "solves, at most"],
         {f"{k}, {h:g} m": partial(beam, k, h) for k, h in beams},
         quick=["1, 0.5 m"],
         cases=["cantilever"],
     )
     found["high-order/front"] = Table(
-        "high-order",
+        "high-order-measured",
         ["", "ne 16", "32", "64", "solves, ne 16"],
         {name: partial(front, options) for name, options in FRONTS.items()},
         quick=["degree 2"],
         cases=["column_roller"],
     )
     found["high-order/flow"] = Table(
-        "high-order",
+        "high-order-measured",
         ["kN/m³, cells, domains", "cutbacks", "solves", "toe, m", "mean height, m"],
         {
             f"{g}, {h:g} m, {name}": partial(flow, g, h, domain, "auto")
