@@ -212,6 +212,18 @@ def test_what_says_where_it_lives_goes_with_the_problem(mpi_tmp_path):
         start()[0].restore(mpi_tmp_path / "without.ckpt")
 
 
+@pytest.mark.parametrize("name", ["number", "strength", "slip"])
+def test_values_of_another_shape_are_refused(name, mpi_tmp_path):
+    problem, _ = start()
+    problem.save(mpi_tmp_path / "whole.ckpt")
+    other, its = start()
+    before = np.repeat(getattr(its, name)[..., None], 2, axis=-1)
+    setattr(its, name, before)
+    with pytest.raises(mpm.MPMError, match=r"under the key 'own'.*or values of other shapes"):
+        other.restore(mpi_tmp_path / "whole.ckpt")
+    assert getattr(its, name) is before
+
+
 @pytest.mark.filterwarnings("ignore:The domains have one")
 def test_both_diagonals():
     for turn in (1.0, -1.0):

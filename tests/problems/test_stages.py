@@ -13,6 +13,7 @@ from scenes import (
     at,
     box,
     cell_tags,
+    everywhere,
     facet_tags,
     fix,
     gather,
@@ -206,6 +207,31 @@ def test_a_prop_is_taken_away():
     assert half == pytest.approx((before + after) / 2, rel=1e-6)
     mine, its = (in_order(p.particles, p.particles.centroid) for p in (problem, free))
     np.testing.assert_allclose(mine, its, atol=1e-6 * bent)
+
+
+def test_what_conditions_let_go_is_a_force_by_which_residuals_are_judged():
+    """It is alone where what still holds, three rollers under a stretched square, bears nothing."""
+    V = vectors(box([0.0, 0.0], [1.75, 1.75], [7, 7], QUADRILATERAL))
+    body = mpm.Particles(box([0.0, 0.0], [1.125, 1.125], [9, 9], QUADRILATERAL), V)
+    all_dofs, values = everywhere(V)
+    values.interpolate(lambda x: np.array([0.01 * x[0], 0.0 * x[0]]))
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(body, materials.LinearElastic(1e3, 0.0)), bcs=[all_dofs]
+    )
+    problem.solve(1)
+    before = problem.reduced.scale()
+
+    def roller(component, *corner):
+        space = V.sub(component)
+        nodes = fem.locate_dofs_geometrical(
+            (space, space.collapse()[0]), lambda x: np.isclose(x[:2].T, corner).all(axis=1)
+        )
+        return fem.dirichletbc(0.0, nodes[0], space)
+
+    problem.stage(bcs=[roller(0, 0.0, 0.0), roller(1, 0.0, 0.0), roller(1, 1.0, 0.0)])
+    shares = [problem.reduced.scale() / before for _ in problem.steps(4)]
+    np.testing.assert_allclose(shares, [0.75, 0.5, 0.25, 0.0], atol=0.1)
+    assert max(np.abs(problem.reaction(bc)).max() for bc in problem.bcs) < 1e-8 * before
 
 
 def test_loads_are_changed():

@@ -88,3 +88,21 @@ def test_a_penalty_that_comes_later_does_not_depend_on_where_a_step_starts():
         assert problem.reduced.unknowns.moduli == pytest.approx([1e3 / 2.6])
         found.append(scenes.in_order(particles, particles.centroid))
     np.testing.assert_allclose(*found, rtol=0.0, atol=1e-9)
+
+
+def test_a_penalty_beside_forces_that_count_for_the_whole_step_counts_as_often():
+    """Of the midpoint rule a body without inertia counts twice, as its forces are of the end."""
+    V, other = (
+        scenes.vectors(scenes.box([0.0, -1.0], [2.0, 2.0], [6, 9], QUADRILATERAL)) for _ in range(2)
+    )
+    mine, its = (mpm.Particles(scenes.unit(4, QUADRILATERAL), one) for one in (V, other))
+    law = mpm.materials.Hencky(1e3, 0.3)
+    problem = mpm.DynamicProblem(
+        [mpm.Body(one, law, 1.0, (0.0, -1.0)) for one in (mine, its)],
+        bcs=[mpm.held(V, x=0.0), mpm.held(other, x=0.0)],
+        solver=mpm.Solver(stabilisation="ghost"),
+        scheme="midpoint",
+        quasi_static=[mine],
+    )
+    problem.step(0.1)
+    assert problem.reduced.unknowns.moduli == pytest.approx([2e3 / 2.6, 1e3 / 2.6])
