@@ -483,7 +483,7 @@ class NewtonSolver:
             self._now.norms, self._now.hurries and not self._search.trusts
         ):
             self.gave_up = True
-            lowest = min(self.residuals)
+            lowest = min(self.residuals[-len(self._now.norms) :])
             self._now.failure = ConvergenceError(
                 f"Newton's method makes no headway: in {self.iterations} linear solves the "
                 f"relative residual did not stay below {lowest:.1e}"

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Newton's method: convergence, the proximal term, what nothing holds."""
 
+import re
+
 import numpy as np
 import pytest
 import scenes
@@ -109,3 +111,31 @@ def test_round_off_counts_as_converged():
     assert history.cutbacks == 0
     assert history.statistics["converged_at_round_off"] >= 1
     assert max(step.residuals[-1] for step in history.steps) < 1e-12
+
+
+@pytest.mark.skip_in_parallel
+def test_a_solve_that_goes_on_and_makes_no_headway_tells_its_own_residuals():
+    class NoRoot(DoubleWell):
+        there = True
+
+        def residual(self, x, F):
+            super().residual(x, F)
+            if not self.there:
+                F.array_w[:] = self.x**2 + 1.0
+
+        def tangent(self):
+            super().tangent()
+            if not self.there:
+                self.K.setValue(0, 0, 2.0 * self.x[0])
+                self.K.assemble()
+            return self.K
+
+    well, solver = NoRoot([1.0], 0.0, start=0.9), newton(symmetric=False)
+    solver.snes.setTolerances(max_it=1000)
+    solver.solve(well, (1, 1), shorten=False)
+    assert min(solver.residuals) < 1e-9
+    well.there = False
+    solver.unbalanced()
+    with pytest.raises(mpm.ConvergenceError, match="did not stay below") as error:
+        solver.go_on(0.1)
+    assert float(re.search(r"below ([0-9.e+-]+)$", str(error.value))[1]) >= 1.0

@@ -193,6 +193,21 @@ class Domains:
         slopes = np.einsum("jqk,nqji->nqki", table[1:], np.linalg.inv(J))
         return table[0], slopes, weights * np.abs(np.linalg.det(J))
 
+    def height(self):
+        """Return the largest volume over the area of a facet."""
+        high = 0.0
+        for facet in basix.topology(self.cell)[-2]:
+            x = self.X[self.nodes[:, facet]]
+            if self.dim == 2:
+                area = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
+            else:  # (of a quadrilateral by its diagonals)
+                a, b = (x[:, 3] - x[:, 0], x[:, 2] - x[:, 1]) if len(facet) == 4 else (
+                    x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
+                )  # fmt: skip
+                area = 0.5 * np.linalg.norm(np.cross(a, b), axis=1)
+            high = max(high, float((self.volume / area).max(initial=0.0)))
+        return high
+
     def _mean(self, nodal):
         shapes, _, weights = self.fine
         return np.einsum("nq,qk,nki->ni", weights, shapes, nodal) / self.volume[:, None]
@@ -855,8 +870,8 @@ class Observer:
     def _check_gaps(self, found, figures):
         """Look at how far apart points in contact may be, by the stiffness that holds them.
 
-        With the penalty -g = p h / (gamma M), M the confined modulus and h no more than the
-        largest domain is wide. By Nitsche's method p = <s - gamma M / h g>, where the pressure s
+        With the penalty -g = p h / (gamma M), M the confined modulus and h the volume of the domain
+        over the area of its facet. By Nitsche's method p = <s - gamma M / h g>, where the pressure s
         of the stress behind the facet is carried on from the points of the domain.
         """
         data, touch = self.scene["contact"], self.run.touch
@@ -864,8 +879,8 @@ class Observer:
             return  # (means of steps are told)
         poisson = self.scene["material"]["poisson"]
         confined = self.run.young * (1 - poisson) / (1 + poisson) / (1 - 2 * poisson)
-        wide = max(float(np.ptp(d.X[d.nodes], axis=1).max(initial=0.0)) for d in self.domains)
-        soft = self.comm.allreduce(wide, MPI.MAX) / (data["penalty"] * confined)
+        high = max(d.height() for d in self.domains)
+        soft = self.comm.allreduce(high, MPI.MAX) / (data["penalty"] * confined)
         pressure, gap = touch.pressure, touch.gap
         if self.pair:
             # two bodies one behind the other, in two passes with a fifth of the stiffness or more
