@@ -94,7 +94,7 @@ class Support:
         self._whole_step = False
         self._scale = fem.Constant(body, 1.0)
         self._share = 1.0
-        self._sums: list[fem.Form] | None = None
+        self._sum: tuple[fem.Constant, fem.Form] | None = None
         self._power: fem.Form | None = None
         self._works: tuple[fem.Function, fem.Form] | None = None
 
@@ -289,13 +289,18 @@ class Support:
     @property
     def reaction(self) -> NDArray[np.float64]:
         """Force of the support on the body now, shape ``(gdim,)``, on all ranks (collective)."""
-        if self._sums is None:
-            gdim = self.particles.mesh.geometry.dim
-            forms = [self._turn * self._traction[i] * self._ds for i in range(gdim)]
+        gdim = self.particles.mesh.geometry.dim
+        if self._sum is None:
+            along = fem.Constant(self.particles.mesh, np.zeros(gdim))
+            form = self._turn * ufl.inner(self._traction, along) * self._ds
             if self.particles.deletion is not None:
-                forms = [self.particles.deletion.present_only(form) for form in forms]
-            self._sums = [compiled_form(form) for form in forms]
-        mine = np.array([fem.assemble_scalar(form) for form in self._sums])
+                form = self.particles.deletion.present_only(form)
+            self._sum = along, compiled_form(form)
+        along, total = self._sum
+        mine = np.zeros(gdim)
+        for i, direction in enumerate(np.eye(gdim)):
+            along.value[:] = direction
+            mine[i] = np.real(fem.assemble_scalar(total))
         return np.asarray(self.particles.mesh.comm.allreduce(mine))
 
 

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import numpy as np
@@ -130,7 +130,8 @@ class Sensitivity:
                 for sign in (1.0, -1.0):
                     amount = sign * parameter.change
                     self._nearby.go(parameter, amount, rates)
-                    with self._nearby.shown(amount, rates, self._reactions()):
+                    shown = self._nearby.shown(amount, rates, self._reactions())
+                    with shown, self._supported():
                         sides.append(_numbers(look()))
                 if sides[0].shape != sides[1].shape:
                     raise MPMError("A function of Sensitivity.of must always return one shape.")
@@ -140,6 +141,20 @@ class Sensitivity:
     def _reactions(self) -> list[Array]:
         """Return the reactions of the last step, to be set."""
         return [] if self._stepper is None else self._stepper.converged.reactions or []
+
+    @contextmanager
+    def _supported(self) -> Iterator[None]:
+        """Let the forces of supports be those of the state now, in the block (collective)."""
+        if self._stepper is None:
+            yield
+            return
+        converged = self._stepper.converged
+        before = converged.supports
+        try:
+            converged.supports = self.problem.forces_of_supports()
+            yield
+        finally:
+            converged.supports = before
 
     # -- What follows the run --------------------------------------------------------------
 

@@ -298,6 +298,11 @@ class DynamicParticleProblem(MovingProblem, ParticleProblem):
         self.history.energies = self._energies
         self.inertia.mass()
 
+    @property
+    @override
+    def supports(self) -> tuple[Support, ...]:
+        return tuple(self._supports)
+
     @override
     def _contributions(self) -> list[Contribution]:
         return [

@@ -385,6 +385,9 @@ class Standing(Kept):
             "parameter": converged.parameter,
             "proportional": converged.proportional,
             "reactions": converged.reactions is not None,
+            "supports": None
+            if converged.supports is None
+            else np.array(converged.supports).tolist(),
             "run": None if run is None else run.numbers(),
             "experience": self.progress.experience,
         }
@@ -419,6 +422,7 @@ class Standing(Kept):
             for name in ("prescribed", "reactions", "base")
         }
         reactions = [_owned(f) for f in totals["reactions"]] if numbers["reactions"] else None
+        supports = numbers.get("supports")
         converged = Converged(
             numbers["load"],
             numbers["parameter"],
@@ -429,6 +433,7 @@ class Standing(Kept):
                 _owned(_filled(V, columns["followed"])) if "followed" in columns else None
                 for V, columns in zip(self._spaces, taken.backgrounds, strict=True)
             ],
+            None if supports is None else [np.array(force) for force in supports],
         )
         run = None
         if numbers["run"] is not None:

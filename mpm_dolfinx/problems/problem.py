@@ -524,7 +524,8 @@ class Problem(Hooked):
         """Return the force of a support on the body at the last converged load.
 
         The force at each dof of the condition counts once, however often the condition names
-        it; where two conditions share a dof, it is in the force of both.
+        it; where two conditions share a dof, it is in the force of both. A support that stands in a
+        residual in UFL has the force of what is set now.
 
         Args:
             bc: One of the problem's Dirichlet conditions, a support of
@@ -548,7 +549,11 @@ class Problem(Hooked):
             if place is None:
                 raise MPMError(f"reaction() needs one of the {what} of this problem.")
         require_same(self._comm, bc=f"number {place} of the {what}")
-        if isinstance(bc, Contact | RigidBody | Support):
+        if isinstance(bc, Support):
+            own, known = self.supports, self._stepper.converged.supports or ()
+            number = next((i for i, one in enumerate(own) if one is bc), len(own))
+            return known[number].copy() if number < len(known) == len(own) else bc.reaction
+        if isinstance(bc, Contact | RigidBody):
             return bc.reaction
         number, field = next(
             (number, field)
@@ -813,6 +818,15 @@ class Problem(Hooked):
         A residual in UFL says itself what it multiplies by ``particles.load``.
         """
         return ()
+
+    @property
+    def supports(self) -> tuple[Support, ...]:
+        """The supports that hold, but for those that a residual in UFL has."""
+        return ()
+
+    def forces_of_supports(self) -> list[NDArray[np.float64]]:
+        """Return the forces of :attr:`supports` on the bodies, by what is set now (collective)."""
+        return [support.reaction for support in self.supports]
 
     def masses(self, number: int) -> NDArray[np.float64] | None:
         """Return the mass of each particle of a body that this rank owns, if it is known."""

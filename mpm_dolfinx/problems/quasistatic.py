@@ -435,6 +435,11 @@ class QuasiStaticProblem(Problem):
     def loads(self) -> list[fem.Constant | fem.Function]:
         return self._built.loads
 
+    @property
+    @override
+    def supports(self) -> tuple[Support, ...]:
+        return self.setup.supports
+
     def _functions(self) -> list[fem.Function]:
         """Return the parameters of materials that are Functions."""
         return [f for body in self.setup.bodies for f in functions_of(body.material)]

@@ -156,7 +156,7 @@ class Staging:
                 return belongs(name, gone) or change.renews(body, name)
 
             found = merged(snapshot, state.capture(), numbers, backgrounds, renewed)
-            found.numbers.update({"past": [], "release remaining": 0.0})
+            found.numbers.update({"past": [], "release remaining": 0.0, "supports": None})
             return found
 
         def undo() -> None:

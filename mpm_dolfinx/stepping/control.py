@@ -180,6 +180,8 @@ class Converged:
         followed: What free nodes add to these, for each field, or ``None`` for none; see
             :meth:`.Balance.followed`.
         proportional: Whether supports have moved in proportion to the load, else to totals.
+        supports: Forces of the supports that the problem was given, in their order; ``None`` where
+            there was no step with them.
     """
 
     load: float
@@ -188,6 +190,7 @@ class Converged:
     reactions: list[NDArray[np.float64]] | None = None
     proportional: bool = True
     followed: Sequence[NDArray[np.float64] | None] = ()
+    supports: list[NDArray[np.float64]] | None = None
 
     def reaction(self, number: int) -> NDArray[np.float64] | None:
         """Return the forces at supports on own dofs of V of a field, if any are known."""

@@ -86,6 +86,9 @@ class Owner(Protocol):
     def loads(self) -> Sequence[fem.Constant | fem.Function]:
         """Return the loads that the load factor multiplies and the user may change."""
 
+    def forces_of_supports(self) -> list[NDArray[np.float64]]:
+        """Return the forces of the supports that it was given, by what is set now."""
+
 
 class Mender(Protocol):
     """Changes of the bodies' meshes between steps. All calls are collective."""
@@ -589,6 +592,7 @@ class Stepper:
             self.converged = Converged(
                 load, parameter, prescribed, reactions, proportional, reduced.balance.followed()
             )
+            self.converged.supports = owner.forces_of_supports()
             reduced.end()
             for take in taken:
                 take()

@@ -316,3 +316,77 @@ def test_a_stage_with_a_material_too_stiff_for_its_support():
     assert all("1e+03 times" in one and "modulus=" in one for one in sentences)
     problem.solve(steps=1)
     np.testing.assert_allclose(problem.reaction(base), [0.0, 10.0], atol=1e-6)
+
+
+def pressed(kind=mpm.QuasiStaticProblem):
+    """Return a block on its base, a plate on it that a Constant moves, and that; in motion a rest.
+
+    What is asked of the plate is what holds the block below.
+    """
+    V = scenes.vectors(scenes.box([-0.5, 0.0], [1.5, 1.5], [8, 6], QUADRILATERAL))
+    p = mpm.Particles(scenes.unit(8, QUADRILATERAL), V)
+    tags = scenes.facet_tags(p.mesh, scenes.at(1, 1.0), scenes.at(0, 0.0))
+    moved = fem.Constant(p.mesh, np.zeros(2))
+    plate, side = fixed(p, tags, 1, value=moved), roller(p, tags, 2, (-1.0, 0.0))
+    supports = [plate, side]
+    if kind is mpm.DynamicProblem:
+        supports.append(mpm.boundary.dashpot(p, tags, 2, 50.0, 20.0))
+    body = mpm.Body(p, Hencky(1e3, 0.3), density=1.0)
+    base = scenes.fix(V, scenes.at(1, 0.0))
+    problem = kind(body, bcs=[base], supports=supports)
+
+    def update(t):
+        moved.value[:] = (0.01 * t, -0.05 * t)
+
+    return problem, moved, update
+
+
+def borne(problem):
+    """Return the forces of all supports."""
+    return np.array([problem.reaction(one) for one in problem.supports])
+
+
+def test_forces_of_supports_are_of_the_last_converged_step_whatever_is_set_since(mpi_tmp_path):
+    problem, moved, update = pressed()
+    problem.solve(2, update=update)
+    found, below = borne(problem), problem.reaction(problem.bcs[0])
+    np.testing.assert_allclose(found.sum(axis=0), -below, atol=1e-6)
+    assert abs(below[1]) > 10.0
+    problem.save(mpi_tmp_path / "pressed.ckpt")
+    # a step that fails, with values that no step has reached
+    moved.value[:] = (0.0, -2.0)
+    with pytest.raises(mpm.MPMError):
+        problem.step()
+    assert np.array_equal(borne(problem), found)
+
+    # a path that ends in the middle
+    def stops(t):
+        update(1.0 + t)
+        if t == 1.0:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        problem.solve(2, update=stops)
+    assert not np.array_equal(borne(problem), found)
+    np.testing.assert_allclose(
+        borne(problem).sum(axis=0), -problem.reaction(problem.bcs[0]), atol=1e-6
+    )
+    # another process, whose path has set nothing yet
+    for other in (problem, pressed()[0]):
+        other.restore(mpi_tmp_path / "pressed.ckpt")
+        np.testing.assert_allclose(borne(other), found, rtol=1e-12)
+    # supports in another order
+    problem.stage(supports=problem.supports[::-1])
+    update(1.0)
+    np.testing.assert_allclose(borne(problem), found[::-1], rtol=1e-9, atol=1e-9)
+
+
+def test_a_dashpot_has_its_force_after_a_restart(mpi_tmp_path):
+    problem, _, update = pressed(mpm.DynamicProblem)
+    problem.solve(0.02, 0.01, update=lambda t: update(50.0 * t))
+    found = borne(problem)
+    assert abs(found[2]).max() > 1e-3
+    problem.save(mpi_tmp_path / "pressed.ckpt")
+    other, *_ = pressed(mpm.DynamicProblem)
+    other.restore(mpi_tmp_path / "pressed.ckpt")
+    np.testing.assert_allclose(borne(other), found, rtol=1e-12)

@@ -38,10 +38,10 @@ def public(of_kind):
 
 CLASSES = [c for c in public(inspect.isclass) if is_collective(c.__init__)]
 FUNCTIONS = [f for f in public(inspect.isfunction) if is_collective(f)]
-#: What users call on one rank, or for what is not spread over ranks yet.
+#: What users call on one rank, for what is not spread over ranks yet, or with calls of their own.
 LOCAL = {"geostatic", "grid_lines", "region", "of_cells", "read_surface", "signed_distance"}
 LOCAL |= {"box", "cavity", "cylinder", "disc", "plane", "polygon", "polyline", "sphere"}
-LOCAL |= {"terrain", "triangulated"}
+LOCAL |= {"terrain", "triangulated", "taped"}
 
 
 def particles(lower=(0.0, 0.0), upper=(1.0, 1.0)):
