@@ -870,9 +870,9 @@ class Observer:
     def _check_gaps(self, found, figures):
         """Look at how far apart points in contact may be, by the stiffness that holds them.
 
-        With the penalty -g = p h / (gamma M), M the confined modulus and h the volume of the domain
-        over the area of its facet. By Nitsche's method p = <s - gamma M / h g>, where the pressure s
-        of the stress behind the facet is carried on from the points of the domain.
+        With the penalty -g = p h / (gamma M), M the confined modulus and h the volume of the
+        domain over the area of its facet. By Nitsche's method p = <s - gamma M / h g>, where the
+        pressure s of the stress behind the facet is carried on from the points of the domain.
         """
         data, touch = self.scene["contact"], self.run.touch
         if self.run.time is not None and self.scene["motion_of"]["scheme"] != "euler":
