@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """A column of soil that settles as the water leaves its pores (Terzaghi 1943, Biot 1941).
 
-docs/porous.md has the equations. Lengths are over the height, stresses over the load, and times
+docs/porous-ufl.md has the equations. Lengths are over the height, stresses over the load, and times
 over `H^2 / c_v`.
 """
 
