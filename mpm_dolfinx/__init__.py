@@ -33,6 +33,9 @@ from .problems.solver import Solver  # noqa: E402
 from .problems.strength import StrengthReduction, strength_reduction  # noqa: E402
 from .problems.water_table import WaterTable  # noqa: E402
 from .stepping.displacement_control import DisplacementControl  # noqa: E402
+from .structures.bond import Bond  # noqa: E402
+from .structures.membrane import Membrane  # noqa: E402
+from .structures.truss import Truss  # noqa: E402
 from .system.coupling import Tie  # noqa: E402
 from .system.damage import Damage  # noqa: E402
 from .system.field_equation import FieldEquation  # noqa: E402
@@ -46,6 +49,7 @@ __all__ = [
     "Adjoint",
     "AveragedVolumeRatio",
     "Body",
+    "Bond",
     "ConvergenceError",
     "Damage",
     "DisplacementControl",
@@ -58,6 +62,7 @@ __all__ = [
     "Kinematics",
     "Loss",
     "MPMError",
+    "Membrane",
     "ParticleField",
     "ParticleOutsideError",
     "ParticleProblem",
@@ -76,6 +81,7 @@ __all__ = [
     "StrengthReduction",
     "Term",
     "Tie",
+    "Truss",
     "WaterTable",
     "Weights",
     "__version__",

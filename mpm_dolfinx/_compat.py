@@ -204,6 +204,7 @@ def equispaced_element(cell: basix.CellType, degree: int, gdim: int) -> Any:
 
 #: VTK's types of cells of degree 1, the order of their corners, and the types of Lagrange cells.
 _VTK = {
+    "interval": (3, [0, 1], 68),
     "triangle": (5, [0, 1, 2], 69),
     "quadrilateral": (9, [0, 1, 3, 2], 70),
     "tetrahedron": (10, [0, 1, 2, 3], 71),

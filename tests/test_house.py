@@ -26,7 +26,7 @@ FLOORS = (
     ("assembly",),
     ("stabilisation", "boundary"),
     ("system",),
-    ("contact",),
+    ("contact", "structures"),
     ("stepping",),
     ("problems",),
     ("gradients",),

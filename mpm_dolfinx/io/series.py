@@ -5,22 +5,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
 
+import basix
+
 from .. import _compat
 from ..errors import MPMError, agree
 from ..particles.particles import Particles
 from .files import kind_of, replace, require_ordinary
 
-__all__ = ["Output", "TimeSeries", "read_series"]
+__all__ = ["Drawing", "Drawn", "Output", "TimeSeries", "drawing", "read_series"]
 
 #: VTK's names of types.
 TYPES = {"float64": "Float64", "int64": "Int64", "uint8": "UInt8"}
@@ -42,6 +44,21 @@ class Entry(NamedTuple):
     step: int = -1
 
 
+type Drawing = dict[str, dict[str, NDArray[Any]]]
+"""A rank's part of the arrays of VTK's unstructured grid."""
+
+
+class Drawn(Protocol):
+    """What can be written besides bodies."""
+
+    @property
+    def comm(self) -> MPI.Comm:
+        """The ranks."""
+
+    def grid(self) -> Drawing:
+        """Return this rank's part of it as it is now (collective)."""
+
+
 class TimeSeries:
     """A ``.pvd`` file that grows by one state at each call.
 
@@ -52,24 +69,26 @@ class TimeSeries:
 
     Args:
         path: Name of the file (collective).
-        particles: The body.
+        thing: The body, or what else is drawn.
         past: States of the file that is there which stay in it.
 
     Attributes:
         path: Name of the file.
         states: What is in it.
+        thing: As given.
 
     Raises:
         MPMError: The name does not end in ``.pvd``, or is that of something else than a file.
     """
 
-    def __init__(self, path: Path, particles: Particles, past: Sequence[Entry] = ()) -> None:
+    def __init__(self, path: Path, thing: Particles | Drawn, past: Sequence[Entry] = ()) -> None:
         if path.suffix != ".pvd":
             raise MPMError(f"A time series is written to a '.pvd' file, not to '{path}'.")
-        require_ordinary(particles.mesh.comm, path)
+        self._comm = thing.mesh.comm if isinstance(thing, Particles) else thing.comm
+        require_ordinary(self._comm, path)
         self.path = path
         self.states = list(past)
-        self._particles = particles
+        self.thing = thing
 
     def write(self, time: float, step: int = -1) -> None:
         """Add the present state, or replace one of the same time (collective).
@@ -82,8 +101,7 @@ class TimeSeries:
             MPMError: The time lies before that of the last state, or a file cannot be written;
                 the series is what it was.
         """
-        comm = self._particles.mesh.comm
-        states = self.states
+        comm, thing, states = self._comm, self.thing, self.states
         if states and time < states[-1].time:
             raise MPMError(
                 f"The last state in '{self.path}' has the time {states[-1].time:g}, so none can "
@@ -92,14 +110,43 @@ class TimeSeries:
         if states and states[-1].time == time:
             states = states[:-1]
         part = self.path.with_name(f"{self.path.stem}_{len(states):06d}.vtu")
-        _write_grid(comm, part, _grid(self._particles))
+        _write_grid(comm, part, _grid(thing) if isinstance(thing, Particles) else thing.grid())
         states = [*states, Entry(time, part.name, step)]
         index = _index(states)
         replace(comm, self.path, len(index), [(0, index)] if comm.rank == 0 else [])
         self.states = states
 
 
-def _grid(particles: Particles) -> dict[str, dict[str, NDArray[Any]]]:
+def drawing(
+    kind: basix.CellType,
+    cells: NDArray[np.int64],
+    places: tuple[NDArray[np.float64], NDArray[np.float64]],
+    fields: Mapping[str, NDArray[np.float64]],
+) -> Drawing:
+    """Return straight cells that one rank has.
+
+    Args:
+        kind: Their kind.
+        cells: Their nodes, shape ``(m, k)``.
+        places: Of the nodes now and at first, shape ``(N, gdim)``.
+        fields: Values of each cell by name, shape ``(m,)``.
+    """
+    now, start = (np.pad(x, ((0, 0), (0, 3 - x.shape[1]))) for x in places)
+    m, k = cells.shape
+    number, order = _compat.vtk_cell(kind, 1, k)
+    return {
+        "Points": {"Points": now},
+        "Cells": {
+            "connectivity": cells[:, order].astype(np.int64).ravel(),
+            "offsets": k * (1 + np.arange(m, dtype=np.int64)),
+            "types": np.full(m, number, dtype=np.uint8),
+        },
+        "PointData": {"displacement": now - start},
+        "CellData": {name: np.asarray(v, dtype=np.float64)[:, None] for name, v in fields.items()},
+    }
+
+
+def _grid(particles: Particles) -> Drawing:
     """Return this rank's part of the arrays of VTK's unstructured grid (collective).
 
     Neighbours share points where they share nodes, and where none of them has stayed behind.
@@ -142,7 +189,7 @@ def _grid(particles: Particles) -> dict[str, dict[str, NDArray[Any]]]:
     }
 
 
-def _write_grid(comm: MPI.Comm, path: Path, grid: dict[str, dict[str, NDArray[Any]]]) -> None:
+def _write_grid(comm: MPI.Comm, path: Path, grid: Drawing) -> None:
     """Write a grid as one ``.vtu`` file, to which all ranks add their rows (collective)."""
     from xml.etree import ElementTree as ET
 
@@ -196,34 +243,42 @@ class Output:
     """The time series that a problem writes."""
 
     def __init__(self) -> None:
-        self._series: dict[Path, list[TimeSeries]] = {}
+        self._series: dict[Path, dict[Path, TimeSeries]] = {}
         self._past: dict[str, list[Entry]] = {}
 
-    def write(self, path: Path, bodies: Sequence[Particles], time: float, step: int) -> None:
+    def write(
+        self,
+        path: Path,
+        bodies: Sequence[Particles],
+        others: Mapping[str, Drawn],
+        time: float,
+        step: int,
+    ) -> None:
         """Add the present state, each body's to its file (collective).
 
         Args:
             path: Name of the series; with several bodies their number is added to it.
             bodies: The bodies.
+            others: What else is drawn, by what is added to the name.
             time: Time of the state.
             step: Number of converged steps before it.
 
         Raises:
             MPMError: As :class:`TimeSeries` and :meth:`TimeSeries.write`.
         """
-        if path not in self._series:
-            files = [path]
-            if len(bodies) > 1:
-                files = [path.with_stem(f"{path.stem}_{i}") for i in range(len(bodies))]
-            self._series[path] = [
-                TimeSeries(file, body, self._past.get(str(file), ()))
-                for file, body in zip(files, bodies, strict=True)
-            ]
-        for series in self._series[path]:
-            series.write(time, step)
+        files: dict[Path, Particles | Drawn] = {path: bodies[0]}
+        if len(bodies) > 1:
+            files = {path.with_stem(f"{path.stem}_{i}"): body for i, body in enumerate(bodies)}
+        files |= {path.with_stem(f"{path.stem}_{name}"): one for name, one in others.items()}
+        known = self._series.setdefault(path, {})
+        for file, thing in files.items():
+            past = known[file].states if file in known else self._past.get(str(file), ())
+            if file not in known or known[file].thing is not thing:
+                known[file] = TimeSeries(file, thing, past)
+            known[file].write(time, step)
 
     def _every(self) -> list[TimeSeries]:
-        return [series for files in self._series.values() for series in files]
+        return [series for files in self._series.values() for series in files.values()]
 
     def written(self) -> dict[str, int]:
         """Return the number of states in each file."""

@@ -392,6 +392,16 @@ class StrainMaterial(Material):
         """
         raise MPMError(f"{type(self).__name__} does not know its stored energy of a strain.")
 
+    @override
+    def weakened(self, factor: float) -> Self:
+        """Return this material with its strength divided by a factor: an elastic law as it is."""
+        return self if self.is_elastic else super().weakened(factor)
+
+    @property
+    def is_elastic(self) -> bool:
+        """Whether its stress is a function of the strain alone."""
+        return not self.inelastic and not self.internal_variables
+
     @property
     def _kinematics(self) -> type[Kinematics]:
         """The strain measure at work."""

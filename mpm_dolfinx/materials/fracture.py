@@ -83,7 +83,7 @@ class Fracture(StrainMaterial):
         model: str = "AT1",
         split: str = "volumetric",
     ) -> None:
-        if not isinstance(law, StrainMaterial) or law.inelastic or law.internal_variables:
+        if not isinstance(law, StrainMaterial) or not law.is_elastic:
             raise MPMError(
                 "Fracture is of an elastic law in strain space, such as Hencky, LinearElastic or "
                 f"NeoHooke, not of {law!r}."

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -18,7 +18,7 @@ from ..errors import MPMError, agree
 from ..particles.particles import Particles
 from .outlines import owned_values
 
-__all__ = ["LABELS", "bodies_of", "values_of"]
+__all__ = ["LABELS", "Lines", "bodies_of", "lines_of", "values_of"]
 
 #: What colour bars say.
 LABELS = {
@@ -45,6 +45,37 @@ def bodies_of(problem: Any) -> list[Particles]:
     return list(bodies)
 
 
+class Lines(NamedTuple):
+    """A structure of lower dimension as it is drawn.
+
+    Attributes:
+        points: Where its nodes are, shape ``(N, gdim)``.
+        cells: Nodes of its cells, in VTK's order, shape ``(m, k)``.
+        values: Of each cell, ``None`` where it has no such field.
+    """
+
+    points: NDArray[np.float64]
+    cells: NDArray[np.int64]
+    values: NDArray[np.float64] | None
+
+
+def lines_of(problem: Any, field: Field, warp: float) -> list[Lines]:
+    """Return the structures of a problem (collective)."""
+    found = []
+    for term in _structures(problem):
+        points = term.nodes + warp * (term.positions - term.nodes)
+        cells = term.cells[:, [0, 1, 3, 2]] if term.cells.shape[1] == 4 else term.cells
+        found.append(
+            Lines(points, cells, term.fields().get(field if isinstance(field, str) else ""))
+        )
+    return found
+
+
+def _structures(problem: Any) -> list[Any]:
+    """Return the terms of a problem that are drawn as cells of lower dimension."""
+    return [term for term in getattr(problem, "terms", ()) if hasattr(type(term), "positions")]
+
+
 def values_of(
     problem: Any, bodies: Sequence[Particles], field: Field
 ) -> list[NDArray[np.float64]] | None:
@@ -66,7 +97,9 @@ def values_of(
     comm: MPI.Comm = bodies[0].mesh.comm
     with agree(comm):
         if isinstance(field, str):
-            return _named([_known(problem, bodies, n) for n in range(len(bodies))], bodies, field)
+            known = [_known(problem, bodies, n) for n in range(len(bodies))]
+            besides = [name for term in _structures(problem) for name in term.fields()]
+            return _named(known, bodies, field, besides)
         several = isinstance(field, list | tuple) and len(bodies) > 1
         each: Sequence[Any] = field if several else [field]  # type: ignore[assignment]
         if len(each) != len(bodies):
@@ -91,10 +124,13 @@ def _of_function(body: Particles, function: fem.Function) -> NDArray[np.float64]
 
 
 def _named(
-    known: Sequence[dict[str, NDArray[np.float64]]], bodies: Sequence[Particles], name: str
+    known: Sequence[dict[str, NDArray[np.float64]]],
+    bodies: Sequence[Particles],
+    name: str,
+    besides: Sequence[str],
 ) -> list[NDArray[np.float64]]:
     """Return the values of a field by its name, no numbers in bodies that have no such field."""
-    names: set[str] = set().union(*known)
+    names: set[str] = set(besides).union(*known)
     if name not in names:
         raise MPMError(f"There is no field {name!r}; there are {', '.join(sorted(names))}.")
     none = (np.full(body.num_local, np.nan) for body in bodies)

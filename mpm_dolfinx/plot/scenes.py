@@ -21,7 +21,7 @@ from ..parallel.boundary import collective
 from ..parallel.given import is_number
 from ..particles.particles import Particles
 from ..reals import as_reals
-from .fields import LABELS, Field, bodies_of, values_of
+from .fields import LABELS, Field, Lines, bodies_of, lines_of, values_of
 from .outlines import (
     edges,
     grid,
@@ -41,6 +41,9 @@ FLAT = 0.4
 #: Colour of obstacles; in the plane and in space, how far they are shown around the bodies, over
 #: the extent of these, and samples of their distance along the longest side.
 OBSTACLE = "#b9b2a6"
+#: Colour of structures without a field, and their width in points and in pixels of space. In
+#: space bodies are as transparent as this where a field is that of structures within them.
+STRUCTURE, WIDE, WIDE_IN_SPACE, CLEAR = "0.1", 2.0, 6.0, 0.2
 #: Grey of bodies without a field.
 NO_FIELD = "0.8"
 NEAR, SAMPLES = {2: 0.3, 3: 0.2}, {2: 300, 3: 60}
@@ -76,6 +79,7 @@ class Shot:
         extent: Corners of the box around all domains, shape ``(2, gdim)``.
         around: That around the backgrounds, if they are drawn.
         obstacles: What rigid obstacles tell of where they are: signed distance, bounds and facets.
+        structures: Lines and surfaces of lower dimension.
     """
 
     bodies: list[Any]
@@ -85,11 +89,13 @@ class Shot:
     extent: NDArray[np.float64]
     around: NDArray[np.float64] | None
     obstacles: list[Any]
+    structures: list[Lines]
 
     @property
     def range(self) -> tuple[float, float]:
         """Smallest and largest value."""
-        arrays = [self.marks[1]] if self.marks is not None else (self.values or [])
+        arrays = [self.marks[1]] if self.marks is not None else list(self.values or [])
+        arrays += [lines.values for lines in self.structures if lines.values is not None]
         shown = np.concatenate([a[np.isfinite(a)] for a in arrays]) if arrays else np.zeros(0)
         return (float(shown.min()), float(shown.max())) if shown.size else (0.0, 1.0)
 
@@ -126,10 +132,12 @@ def scene(
             ``"plastic_strain"``; with water in its pores ``"pore_pressure"``,
             ``"mean_effective_stress"`` instead of ``"pressure"``, ``"total_stress_xx"`` and so on,
             of an undrained material ``"excess_pore_pressure"``; unknowns besides by their names;
-            of a moving body ``"velocity"``; ``"contact_pressure"`` at points of contact. A body
-            that has no such field is grey. Or values of your own, shape ``(n,)``, one for each
-            particle that this rank owns, or a Function on the body's mesh, of which each domain
-            shows the mean; for several bodies a list. ``None``: no colours.
+            of a moving body ``"velocity"``; ``"contact_pressure"`` at points of contact; of a
+            :class:`Truss` ``"axial_force"``, of a :class:`Membrane` ``"membrane_force"`` and
+            ``"membrane_force_across"``. A body that has no such field is grey, a structure black.
+            Or values of your own, shape ``(n,)``, one for each particle that this rank owns, or a
+            Function on the body's mesh, of which each domain shows the mean; for several bodies a
+            list. ``None``: no colours.
         path: Where to save it, e.g. ``"scene.png"``.
         ax: Axes of matplotlib to draw on; only those of rank 0 count. A figure is made without.
         warp: Factor on the displacement.
@@ -261,10 +269,14 @@ def take(
     marks = (
         _marks(problem, comm) if isinstance(field, str) and field == "contact_pressure" else None
     )
+    structures = lines_of(problem, field, warp)
     if comm.rank > 0:
         return None
     terms = getattr(problem, "terms", ())
     obstacles = [t.placed() for t in terms if hasattr(type(t), "placed")]
+    for lines in structures:
+        low = np.minimum(low, lines.points.min(axis=0))
+        high = np.maximum(high, lines.points.max(axis=0))
     extent = _with_obstacles(np.array([low, high]), obstacles)
     return Shot(
         shapes,
@@ -276,6 +288,7 @@ def take(
         if background
         else None,
         obstacles,
+        structures,
     )
 
 
@@ -410,6 +423,14 @@ def _draw_plane(shot: Shot, look: Look, limits: tuple[float, float], ax: Any) ->
         width = float(np.clip(12.0 / np.sqrt(max(count, 1)), 0.1, 0.5))
         style = {"edgecolors": "0.2" if lines else "face", "linewidths": width}
         ax.add_collection(collections.PolyCollection(polygons, facecolors=filled, **style))
+    for one in shot.structures:
+        style = (
+            {"color": STRUCTURE} if one.values is None else {"colors": colours.to_rgba(one.values)}
+        )
+        pieces = collections.LineCollection(
+            one.points[one.cells], linewidths=WIDE, capstyle="round", zorder=2.5, **style
+        )
+        ax.add_collection(pieces)
     if shot.marks is not None:
         points, pressures = shot.marks
         ax.scatter(*points.T, s=9.0, c=colours.to_rgba(pressures), zorder=3)
@@ -433,6 +454,22 @@ def _sampled(
     axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     return axes, obstacle.distance(points.reshape(-1, len(low))).reshape(counts)
+
+
+def _thin(pyvista: Any, one: Lines) -> Any:
+    """Return a structure in space."""
+    count = one.cells.shape[1]
+    cells = np.column_stack([np.full(len(one.cells), count), one.cells]).ravel()
+    whole = {"lines": cells} if count == 2 else {"faces": cells}
+    return pyvista.PolyData(one.points, **whole)
+
+
+def _paint(one: Lines, look: Look, limits: tuple[float, float]) -> dict[str, Any]:
+    """Return how a structure in space is drawn."""
+    tubes = {"line_width": WIDE_IN_SPACE, "render_lines_as_tubes": True, "show_scalar_bar": False}
+    if one.values is None:
+        return {"color": "#1a1a1a", **tubes}
+    return {"scalars": one.values, "cmap": look.cmap, "clim": limits, "ambient": 0.45, **tubes}
 
 
 def _solid(pyvista: Any, obstacle: Any, box: NDArray[np.float64]) -> Any:
@@ -470,6 +507,7 @@ def _rendered(shot: Shot, look: Look, limits: tuple[float, float]) -> NDArray[np
     pixels = [max(1, round(PIXELS * side / max(wide, high))) for side in (wide, high)]
     with _quiet():
         plotter = pyvista.Plotter(off_screen=True, window_size=pixels, lighting="three lights")
+        within = any(one.values is not None for one in shot.structures)
         for number, body in enumerate(shot.bodies):
             body = body.copy()
             colour: dict[str, Any] = {"color": "lightgrey", "nan_color": "lightgrey"}
@@ -493,8 +531,11 @@ def _rendered(shot: Shot, look: Look, limits: tuple[float, float]) -> NDArray[np
                 ambient=0.45,
                 diffuse=0.6,
                 specular=0.0,
+                opacity=CLEAR if within else 1.0,
                 **colour,
             )
+        for one in shot.structures:
+            plotter.add_mesh(_thin(pyvista, one), **_paint(one, look, limits))
         if shot.marks is not None and len(shot.marks[0]):
             cloud = pyvista.PolyData(shot.marks[0])
             cloud["shown"] = shot.marks[1]

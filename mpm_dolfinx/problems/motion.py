@@ -21,15 +21,13 @@ from dolfinx import fem
 from .. import _compat
 from ..assembly.inputs import as_expression
 from ..boundary.supports import Support
-from ..contact.contact import Contact
-from ..contact.rigid_body import RigidBody
 from ..errors import MPMError, agree, as_ours
 from ..history import Energy
 from ..parallel.compilation import compiled_expression, compiled_form
 from ..particles.particles import Particles
 from ..reals import as_reals
 from ..system.inertia import Inertia
-from ..system.term import PointMaterial
+from ..system.term import PointMaterial, Term
 from .arguments import as_bodies
 from .through_time import TimeProblem
 
@@ -205,15 +203,15 @@ class MovingProblem(TimeProblem):
     def _resume_run(self) -> None:
         self.inertia.resume()
 
-    def reaction(self, bc: fem.DirichletBC | Support | Contact | RigidBody) -> NDArray[np.float64]:
+    def reaction(self, bc: fem.DirichletBC | Support | Term) -> NDArray[np.float64]:
         """Return the force of a support on the body: of a Dirichlet condition in the last step.
 
         That is the mean over the step, but with ``scheme="euler"``, as is that of a contact;
-        supports of :mod:`mpm_dolfinx.boundary` have that at its end. See
+        supports of :mod:`mpm_dolfinx.boundary`, ties and structures have that at its end. See
         :meth:`Problem.reaction`.
         """
         force = super().reaction(bc)
-        if isinstance(bc, Support | Contact | RigidBody):
+        if isinstance(bc, Support | Term):
             return force
         return self.inertia.scheme.share * force
 

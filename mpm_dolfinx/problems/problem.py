@@ -21,8 +21,6 @@ from dolfinx import fem
 
 from ..boundary.supports import Support
 from ..constitutive.points import MaterialPoints
-from ..contact.contact import Contact
-from ..contact.rigid_body import RigidBody
 from ..errors import MPMError, agree, warn
 from ..history import History, Step
 from ..io import checkpoint
@@ -41,6 +39,7 @@ from ..stepping.diagnosis import crossed
 from ..stepping.displacement_control import DisplacementControl
 from ..stepping.loading import Mender, Recorder, Stepper
 from ..stepping.progress import with_bar
+from ..structures.structure import Structure
 from ..system.body import BodyTerm
 from ..system.conditions import force_at
 from ..system.predictor import Predictor
@@ -520,7 +519,7 @@ class Problem(Hooked):
     # -- Results --------------------------------------------------------------------------
 
     @collective()
-    def reaction(self, bc: fem.DirichletBC | Support | Contact | RigidBody) -> NDArray[np.float64]:
+    def reaction(self, bc: fem.DirichletBC | Support | Term) -> NDArray[np.float64]:
         """Return the force of a support on the body at the last converged load.
 
         The force at each dof of the condition counts once, however often the condition names
@@ -529,17 +528,19 @@ class Problem(Hooked):
 
         Args:
             bc: One of the problem's Dirichlet conditions, a support of
-                :mod:`mpm_dolfinx.boundary` on one of its bodies, or one of its contacts.
+                :mod:`mpm_dolfinx.boundary` on one of its bodies, or one of its terms that tells its
+                ``reaction``: a contact, a :class:`Tie` (the pull on its first body), a
+                :class:`Truss` or :class:`Membrane` (the force that holds its nodes).
 
         Returns:
             Force, shape ``(gdim,)``, the same on all ranks.
 
         Raises:
-            MPMError: The condition is not one of the problem's.
+            MPMError: The condition is not one of the problem's, or a term tells no reaction.
         """
         known: Sequence[Any]
-        if isinstance(bc, Contact | RigidBody):
-            what, known = "contacts", self.terms
+        if isinstance(bc, Term):
+            what, known = "terms", self.terms
         elif isinstance(bc, Support):
             what, known = "supports", [bc for body in self.bodies if bc.particles is body]
         else:
@@ -553,8 +554,11 @@ class Problem(Hooked):
             own, known = self.supports, self._stepper.converged.supports or ()
             number = next((i for i, one in enumerate(own) if one is bc), len(own))
             return known[number].copy() if number < len(known) == len(own) else bc.reaction
-        if isinstance(bc, Contact | RigidBody):
-            return bc.reaction
+        if isinstance(bc, Term):
+            if not hasattr(type(bc), "reaction"):
+                raise MPMError(f"A {type(bc).__name__} tells no reaction.")
+            told: Any = bc
+            return np.asarray(told.reaction)
         number, field = next(
             (number, field)
             for number, field in enumerate(self.reduced.fields)
@@ -635,7 +639,9 @@ class Problem(Hooked):
             path: A ``.pvd`` file; the first call replaces it, unless the problem was restored
                 from a checkpoint of the run that wrote it: then the series goes on, without
                 what is later than the checkpoint. With several bodies each has its own, numbered
-                from 0: ``name_0.pvd``. Each state has one file besides, ``name_000000.vtu``.
+                from 0: ``name_0.pvd``; a :class:`Truss` or :class:`Membrane` has one by its name or
+                number: ``name_structure0.pvd``. Each state has one file besides,
+                ``name_000000.vtu``.
             time: Time of the state, ``history.time`` by default. It replaces a state of the same
                 time that was written last.
 
@@ -648,7 +654,10 @@ class Problem(Hooked):
         with agree(self._comm):
             if not is_number(moment) or not abs(moment) < np.inf:
                 raise MPMError(f"time must be a finite number, not {time!r}.")
-        self._output.write(as_path(path), self.bodies, float(moment), len(self.history.steps))
+        others = {term.label: term for term in self.terms if isinstance(term, Structure)}
+        self._output.write(
+            as_path(path), self.bodies, others, float(moment), len(self.history.steps)
+        )
 
     def keep_identity(self) -> None:
         """Note what this problem is known by, before its body meshes change (collective)."""

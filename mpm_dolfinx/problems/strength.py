@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..constitutive.moduli import undeformed_tangent
 from ..errors import TRIAL_ERRORS, MPMError, ParticleOutsideError
+from ..materials.base import StrainMaterial
 from ..parallel.boundary import collective
 from ..parallel.interruption import held, interrupted, settle
 from ..tolerances import NEGLIGIBLE
@@ -136,7 +137,7 @@ def strength_reduction(
 
     Raises:
         MPMError: The problem is not at its whole load, a step there with the strength that it has
-            fails, its steps have a duration (PorousProblem, DynamicProblem), a material has no
+            fails, its steps have a duration (PorousProblem, DynamicProblem), no material has a
             strength, or domains may be split.
     """
     _require(problem, step, tolerance, most, displacement)
@@ -148,7 +149,7 @@ def strength_reduction(
     factor = 1.0
     try:
         for points in problem.points:
-            points.weaken(search.next())  # laws without a strength refuse that
+            points.weaken(search.next())  # laws that do not say what it is refuse that
         while True:
             for points in problem.points:
                 points.weaken(factor)
@@ -263,6 +264,12 @@ def _require(
         raise MPMError(f"most= is a factor at which to stop, above 1, not {most:g}.")
     if any(body.load.value < 1.0 for body in problem.bodies) or problem.held_back > 0.0:
         raise MPMError("strength_reduction() begins at the whole load; call solve() first.")
+    laws = [law for points in problem.points for law in points.laws.given]
+    if all(isinstance(law, StrainMaterial) and law.is_elastic for law in laws):
+        raise MPMError(
+            "strength_reduction() needs a body whose law has a strength; those of this problem are "
+            f"elastic: {', '.join(sorted({type(law).__name__ for law in laws}))}."
+        )
     if any(body.on_distortion == "split" for body in problem.bodies):
         raise MPMError(
             "strength_reduction() follows the nodes of the bodies, which a split of domains "

@@ -26,7 +26,7 @@ from ..particles.particles import Particles
 from ..tolerances import NEGLIGIBLE
 from .term import Term
 
-__all__ = ["Tie"]
+__all__ = ["Tie", "at_present", "interpolation"]
 
 
 class _Faces(NamedTuple):
@@ -148,7 +148,7 @@ class Tie(Term):
         a, b = self.bodies
         points, weights = self._points(a, a.carry(self._tags))
         spaces = a.W, b.W
-        at = [_interpolation(W, points, a.mesh.comm) for W in spaces]
+        at = [interpolation(W, points, a.mesh.comm) for W in spaces]
         with agree(a.mesh.comm):
             for body, (_, found) in zip((a, b), at, strict=True):
                 if not found.all():
@@ -164,13 +164,7 @@ class Tie(Term):
         """Return at which rows of the points both bodies are still there (collective)."""
         held = np.ones(len(self._faces.weights), dtype=bool)
         for body, rows in zip(self.bodies, self._faces.rows, strict=True):
-            if body.deletion is None:
-                continue
-            nodes, points = rows.createVecs()
-            dim = body.mesh.geometry.dim
-            nodes.array_w[:] = np.repeat(body.deletion.dead, dim)[: nodes.getLocalSize()]
-            rows.mult(nodes, points)
-            held &= np.abs(points.array_r) < NEGLIGIBLE
+            held &= at_present(body, rows)
         return held
 
     def _sprung(self, held: NDArray[np.bool_]) -> _Springs:
@@ -224,6 +218,13 @@ class Tie(Term):
         pull = np.where(self._springs.held, self.stiffness * (gaps[0] - gaps[1]), 0.0)
         return pull.reshape(-1, gdim)
 
+    @property
+    def reaction(self) -> NDArray[np.float64]:
+        """Force on the first body, shape ``(gdim,)`` (collective)."""
+        pull = -self._springs.weights * self.tractions().ravel()
+        own = pull.reshape(-1, self.bodies[0].mesh.geometry.dim).sum(axis=0)
+        return np.asarray(self.bodies[0].mesh.comm.allreduce(own))
+
     @override
     def residuals(self) -> Sequence[PETSc.Vec]:
         pull = self._springs.weights * self.tractions().ravel()
@@ -244,7 +245,23 @@ class Tie(Term):
         return tangents
 
 
-def _interpolation(
+def at_present(body: Particles, rows: PETSc.Mat) -> NDArray[np.bool_]:
+    """Return at which points a body is still there, for each component (collective).
+
+    Args:
+        body: The body.
+        rows: The matrix from dofs of W to values at this rank's points.
+    """
+    if body.deletion is None:
+        return np.ones(rows.getLocalSize()[0], dtype=bool)
+    nodes, points = rows.createVecs()
+    dim = body.mesh.geometry.dim
+    nodes.array_w[:] = np.repeat(body.deletion.dead, dim)[: nodes.getLocalSize()]
+    rows.mult(nodes, points)
+    return np.asarray(np.abs(points.array_r) < NEGLIGIBLE)
+
+
+def interpolation(
     W: fem.FunctionSpace, points: NDArray[np.float64], comm: Any
 ) -> tuple[PETSc.Mat, NDArray[np.bool_]]:
     """Return the matrix from dofs of W to values at points, and which points are in its mesh.
