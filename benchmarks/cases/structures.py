@@ -28,10 +28,12 @@ parser.add_argument(
 )
 parser.add_argument("--degree", type=int, choices=(1, 2), help="of both spaces: 2 for the bar")
 parser.add_argument("--cells", type=kit.whole, default=16, help="of the body along the structure")
+parser.add_argument("--steps", type=kit.whole, help="1; 12 to pull out, 4 for each metre of cut")
 args = parser.parse()
 
 comm, quadrilateral = MPI.COMM_WORLD, mesh.CellType.quadrilateral
 degree = args.degree or (2 if args.case == "bar" else 1)
+steps = args.steps or {"pull-out": 12, "cut": 4}.get(args.case, 1)
 
 
 def particles(body: mesh.Mesh, lower, upper, cells, layer) -> mpm.Particles:
@@ -77,7 +79,7 @@ def bar() -> tuple[mpm.QuasiStaticProblem, float, float]:
         bcs=[mpm.held(soil.V, 1, y=0.0), mpm.held(soil.V, 0, x=0.0), mpm.held(soil.V, 0, x=2.0)],
         terms=[truss],
     )
-    problem.solve()
+    problem.solve(steps)
     middle = truss.nodes[truss.cells][:, :, 0].mean(axis=1)
     exact = size * stiffness * k * np.cos(k * middle)
     return problem, float(np.abs(truss.force).max()), float(np.abs(truss.force - exact).max())
@@ -116,7 +118,7 @@ def lining() -> tuple[mpm.QuasiStaticProblem, float, float]:
         bcs=[mpm.held(ring.V, 0, x=0.0), mpm.held(ring.V, 1, y=0.0)],
         terms=[sheet],
     )
-    problem.solve()
+    problem.solve(steps)
     c = 2.0 * law.shear
     soft = c / (1.0 - 2.0 * 0.3)
     A, B = np.linalg.solve(
@@ -147,7 +149,7 @@ def pull_out() -> tuple[mpm.QuasiStaticProblem, float, float]:
         supports=[mpm.boundary.fixed(soil, tags, tag) for tag in (1, 2)],
         terms=[nail],
     )
-    problem.solve(12, update=lambda t: nail.move((-reach * t, 0.0)))
+    problem.solve(steps, update=lambda t: nail.move((-reach * t, 0.0)))
     pull = -float(problem.reaction(nail)[0])
     return problem, pull, abs(pull - limit * length)
 
@@ -169,12 +171,12 @@ def cut() -> tuple[mpm.QuasiStaticProblem, float, float]:
     problem = mpm.QuasiStaticProblem(
         given, bcs=[mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=10.0), mpm.held(V, y=0.0)]
     )
-    problem.solve(4)
+    problem.solve(steps)
     nails: list[mpm.Truss] = []
     for row in range(4):
         top = 7.0 - row
         problem.remove(lambda x, top=top: (x[0] < 4.0) & (x[1] > top - 1.0), name=f"dig {row}")
-        problem.solve(4)
+        problem.solve(steps)
         head = np.array([4.0, top - 0.5])
         tip = head + 3.5 * np.array([np.cos(0.2), -np.sin(0.2)])
         bond = mpm.Bond(2e4, 30.0)

@@ -16,6 +16,7 @@ PICTURES = {
     "column_free": ("column_free", "--g0", "all"),
     "column_stop": ("column_free", "--domain", "quad", "--g0", 80e3, "--plain-solver"),
     "snap_through": ("snap_through",),
+    "nails": ("structures", "--case", "cut"),
     "column_whole": ("column_free", "--domain", "quad", "--g0", 80e3),
     "column_split": (
         *("column_free", "--domain", "quad", "--particles-per-cell", 1),

@@ -56,6 +56,9 @@ RUNS = {
         {"error": 0.0585, "error_all_free": 0.0585, "unknowns": 2070, "iterations": 2},
     ),
     "wall-degree-1": ("wall", "--degree 1", {"iterations": 1}),
+    "structures": ("structures", "", {"error": 5e-4, "iterations": 1}),
+    "structures-lining": ("structures", "--case lining", {"error": 1.2e-3}),
+    "structures-pull-out": ("structures", "--case pull-out", {"error": 1e-6}),
     "consolidation": (
         "consolidation",
         "--settlement 0.3",
@@ -423,6 +426,7 @@ KEYS = {
     "indentation": {"stiffness", "inverse_runs", "inverse_error"},
     "snap_through": {"limit", "valley", "crown", "error"},
     "wall": {"head", "reference", "error", "unknowns", "unknowns_carried"},
+    "structures": {"force", "error"},
     "softening": {"peak", "energy", "width", "forces", "alternations"},
 }
 
@@ -620,6 +624,7 @@ def test_case_is_a_program(name, tmp_path):
         "gradient": "--parameters 1 --steps 2",
         "indentation": "--steps 1",
         "wall": "--cell 1",
+        "structures": "--cells 4",
         "softening": "--cells 6 --length 0.3 --steps 2",
     }.get(name, "--elements 4 --steps 4")
     done = programs.run(CASES / f"{name}.py", *small.split(), "--json", cwd=tmp_path)
