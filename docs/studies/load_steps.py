@@ -204,8 +204,8 @@ def tables() -> dict[str, Table]:
     driven = ["", "0.02: steps, solves", "error", "0.01: steps, solves", "error"]
     driven += ["60 equal steps: solves, error", "120"]
     return {
-        "load-steps/errors": Table("load-steps", head, rows, quick=["elastic cantilever"]),
+        "load-steps/errors": Table("load-steps-measured", head, rows, quick=["elastic cantilever"]),
         "load-steps/driven": Table(
-            "load-steps", driven, {case: partial(driven_cells, case) for case in DRIVEN}
+            "load-steps-measured", driven, {case: partial(driven_cells, case) for case in DRIVEN}
         ),
     }
