@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from mpi4py import MPI
@@ -19,7 +20,7 @@ from ..parallel.boundary import collective
 from ..reals import as_reals
 from ..tolerances import NEGLIGIBLE
 
-__all__ = ["cell_tags", "facet_tags", "held", "region"]
+__all__ = ["cell_tags", "facet_tags", "held", "marked", "region"]
 
 type Where = Callable[[NDArray[np.float64]], Any]
 
@@ -74,6 +75,32 @@ def region(
         return found if corners is None else found & _in_polygon(places, corners, near)
 
     return inside
+
+
+def marked(where: Where, points: NDArray[np.float64], what: str) -> NDArray[np.bool_]:
+    """Return at which points a function of coordinates holds.
+
+    Args:
+        where: The function, a user's.
+        points: Shape ``(3, n)``.
+        what: What to call it in an error.
+
+    Raises:
+        MPMError: It fails, or returns something else than a bool for each of the points.
+    """
+    try:
+        inside = np.asarray(where(points))
+    except MPMError:
+        raise
+    except Exception as error:
+        raise as_ours(error, what) from error
+    told = inside.dtype == np.bool_ or inside.size == 0  # of no points a list has no type
+    if inside.shape != points.shape[1:] or not told:
+        raise MPMError(
+            f"{what} must return one bool for each of the coordinates (3, n), such as x[0] < 1.0, "
+            f"not an array of shape {inside.shape} and type {inside.dtype}."
+        )
+    return inside.astype(np.bool_)
 
 
 def _bounds(name: str, value: Any) -> tuple[float, float] | None:
@@ -154,7 +181,7 @@ def cell_tags(domain: mesh.Mesh, where: Mapping[int, Where]) -> Any:
     middle = mesh.compute_midpoints(domain, dim, every).T
 
     def found(inside: Where) -> NDArray[np.int32]:
-        return np.flatnonzero(np.asarray(inside(middle), dtype=bool)).astype(np.int32)
+        return np.flatnonzero(inside(middle)).astype(np.int32)
 
     return _tags(domain, dim, where, found, "cell")
 
@@ -182,10 +209,7 @@ def _tags(
     values: dict[int, int] = {}
     for tag, inside in where.items():
         with agree(comm):
-            try:
-                chosen = found(inside)
-            except Exception as error:
-                raise as_ours(error, f"The function of tag {tag}") from error
+            chosen = found(partial(marked, inside, what=f"The function of tag {tag}"))
         if not comm.allreduce(len(chosen)):
             raise MPMError(f"No {noun} of the mesh is where tag {tag} is asked for.")
         values.update(dict.fromkeys(chosen.tolist(), int(tag)))
@@ -235,12 +259,9 @@ def held(
     dim = domain.topology.dim - 1
     domain.topology.create_connectivity(dim, dim + 1)
     with agree(comm):
-        try:
-            facets = mesh.locate_entities(domain, dim, inside)
-        except MPMError:
-            raise
-        except Exception as error:
-            raise as_ours(error, "The function where=") from error
+        facets = mesh.locate_entities(
+            domain, dim, partial(marked, inside, what="The function where=")
+        )
     if not comm.allreduce(len(facets), MPI.SUM):
         raise MPMError(
             f"No facet of the background lies where it is to be held{_of_planes(planes, domain)}."

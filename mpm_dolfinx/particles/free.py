@@ -16,7 +16,8 @@ from dolfinx import fem, la, mesh
 
 from .. import _compat
 from ..background.basis import PointBasis
-from ..errors import MPMError, agree, as_ours
+from ..errors import MPMError, agree
+from ..meshes.regions import marked
 from ..parallel.given import require_same
 from ..reals import as_wholes
 from ..transfer.matrix import transfer_matrix
@@ -201,17 +202,8 @@ def _local_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.integer[Any]]:
         return np.arange(count)
     if callable(where):
         x = W.tabulate_dof_coordinates()[:count].T
-        try:
-            inside = np.asarray(where(x), dtype=bool)
-        except Exception as error:
-            raise as_ours(error, "The function free=") from error
-        if inside.shape != (count,):
-            raise MPMError(
-                f"The function free= must return a bool for each of n points (3, n), shape (n,), "
-                f"not {inside.shape}."
-            )
-        inside[layout.size_local :] = False  # whose owners know
-        return np.flatnonzero(inside)
+        inside = marked(where, x, "The function free=")
+        return np.flatnonzero(inside[: layout.size_local])  # owners of the others know them
     if _is_listed(where):
         nodes = as_wholes(where)
         if len(nodes) and (nodes.min() < 0 or nodes.max() >= count):

@@ -19,8 +19,9 @@ from dolfinx import fem
 
 from ..constitutive.moduli import mean_shear_modulus
 from ..constitutive.points import MaterialPoints
-from ..errors import MPMError, agree, as_ours
+from ..errors import MPMError, agree
 from ..io.snapshot import spaces_of
+from ..meshes.regions import marked
 from ..particles.particles import Particles
 from ..reals import as_wholes
 from ..system.reduced import ReducedSystem
@@ -300,15 +301,4 @@ def _where(particles: Particles, which: Callable[[NDArray[np.float64]], Any]) ->
     x = np.zeros((3, particles.num_local))
     centroid = particles.initial_centroid
     x[: centroid.shape[1]] = centroid.T
-    try:
-        chosen = np.asarray(which(x))
-    except MPMError:
-        raise
-    except Exception as error:
-        raise as_ours(error, "The function that chooses particles") from error
-    if chosen.shape != (particles.num_local,) or chosen.dtype != np.bool_:
-        raise MPMError(
-            "The function that chooses particles must return one bool for each of the coordinates "
-            f"(3, n), not an array of shape {chosen.shape} and type {chosen.dtype}."
-        )
-    return chosen
+    return marked(which, x, "The function that chooses particles")

@@ -109,3 +109,30 @@ def test_what_is_not_there_is_refused(domain):
     for wrong in ({}, {"x": "a"}, {"x": (1.0, 0.0)}, {"x": np.nan}, {"polygon": [(0, 0)]}):
         with pytest.raises(mpm.MPMError):
             mpm.region(**wrong)
+
+
+MARKERS = {
+    "a level": lambda x: x[0] - 0.5,
+    "numbers": lambda x: (x[0] > 0.5).astype(int),
+    "all coordinates": lambda x: x > 0.5,
+    "one for all": lambda x: True,
+    "nothing": lambda x: None,
+}
+
+
+@pytest.mark.parametrize("marker", MARKERS.values(), ids=MARKERS)
+def test_markers_that_return_no_bool_for_each_point_are_refused(marker):
+    """A level that is zero almost nowhere held all of a mesh, and all coordinates any cells."""
+    body, V = scenes.unit(4, QUADRILATERAL), scenes.vectors(scenes.unit(4, QUADRILATERAL))
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(mpm.Particles(body, V), mpm.materials.Hencky(1.0, 0.3)), bcs=[mpm.held(V, y=0.0)]
+    )
+    for call in (
+        lambda: mpm.held(V, where=marker),
+        lambda: mpm.facet_tags(body, {1: marker}),
+        lambda: mpm.facet_tags(body, {1: marker}, interior=True),
+        lambda: mpm.cell_tags(body, {1: marker}),
+        lambda: mpm.Particles(body, V, quadrature_degree=2, free=marker),
+        lambda: problem.remove(marker),
+    ):
+        raises(call, mpm.MPMError, r"must return one bool for each of the coordinates \(3, n\)")

@@ -13,7 +13,8 @@ from scenes import QUADRILATERAL
 from solvers.double_well import DoubleWell, newton
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.solvers.line_search import stalled
+from mpm_dolfinx.history import Statistics
+from mpm_dolfinx.solvers.line_search import LineSearch, stalled
 
 
 def test_a_step_uphill_is_redirected():
@@ -58,6 +59,29 @@ def test_a_fold_is_passed_forward():
     x = solver.x.array_r + problem.start
     assert np.all(3.0 * x**2 > 1.0) and np.all(x > 0.0)  # stable, and on the way
     np.testing.assert_allclose(problem.c * (x**3 - x), 0.1, atol=1e-8)
+
+
+@pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("works", [True, False])
+def test_work_that_tells_nothing_judges_a_step_by_its_size(works):
+    # With water or Nitsche's method the work on a step may begin below zero; where it falls in
+    # size the step is taken, though the residual grows across it. Where it tells stability it is
+    # a fold, and the step is shortened.
+    def vector(*values):
+        return PETSc.Vec().createWithArray(np.array(values, dtype=float), comm=MPI.COMM_SELF)
+
+    def evaluate(trial):
+        F.array_w[:] = np.array([1.0, 0.0]) + trial.array_r[0] ** 2 * np.array([-0.9, 5.0])
+
+    statistics = Statistics()
+    search = LineSearch(
+        False, evaluate, lambda *_: False, lambda *_: False, lambda: False, statistics
+    )
+    search.begin(works, False, False)
+    x, y, F, trial = vector(0, 0), vector(-1, 0), vector(1, 0), vector(0, 0)
+    assert search(x, y, F, trial) == works
+    assert (statistics["halvings"] > 0) == works
+    assert (trial.array_r[0] == 1.0) != works
 
 
 class Rod(DoubleWell):
