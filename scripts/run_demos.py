@@ -2,15 +2,17 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Run demos and keep what they print and draw for their pages and their test.
 
-usage: run_demos.py [NAME ...]    all of them, or demos/demo_NAME.py
+usage: run_demos.py [--models] [NAME ...]    all of them, or demos/demo_NAME.py
 
 Each runs in a directory of its own, on one rank. Its picture NAME.png (and NAME.gif, where it makes
-a movie) and its output NAME.txt go to docs/images/demos.
+a movie), a sketch NAME_model.png of the first problem that it runs, and its output NAME.txt go to
+docs/images/demos. With --models it ends with the sketch, which alone is kept.
 """
 
 from __future__ import annotations
 
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -18,16 +20,54 @@ import tempfile
 import time
 from pathlib import Path
 
+from PIL import Image
+
 ROOT = Path(__file__).resolve().parents[1]
 DEMOS, KEPT = ROOT / "demos", ROOT / "docs" / "images" / "demos"
 
 
-def run(name: str) -> None:
+class Drawn(BaseException):
+    """The model is drawn, and nothing else was asked for."""
+
+
+def follow(script: str, picture: str, model: bool) -> None:
+    """Run a script, and draw the first problem that it runs before that does."""
+    import mpm_dolfinx as mpm
+
+    kinds = [mpm.Problem]
+    for kind in kinds:
+        kinds += [k for k in kind.__subclasses__() if k not in kinds]
+    running = ("solve", "steps", "step")
+    own = [
+        (kind, name, vars(kind)[name]) for kind in kinds for name in running if name in vars(kind)
+    ]
+
+    def first_of(method):
+        def first(problem, *args, **options):
+            for known in own:
+                setattr(*known)
+            mpm.plot.sketch(problem, picture)
+            if model:
+                raise Drawn
+            return method(problem, *args, **options)
+
+        return first
+
+    for kind, name, method in own:
+        setattr(kind, name, first_of(method))
+    try:
+        runpy.run_path(script, run_name="__main__")
+    except Drawn:
+        pass
+
+
+def run(name: str, model: bool) -> None:
     """Run a demo and keep what it leaves."""
     with tempfile.TemporaryDirectory() as folder:
         begin = time.perf_counter()
+        parts = ("--follow", str(DEMOS / f"demo_{name}.py"), f"{name}_model.png", str(int(model)))
         done = subprocess.run(
-            [sys.executable, str(DEMOS / f"demo_{name}.py")],
+            [sys.executable, __file__, *parts],
             cwd=folder,
             env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"},
             stdout=subprocess.PIPE,
@@ -35,19 +75,26 @@ def run(name: str) -> None:
         )
         if done.returncode != 0:
             sys.exit(f"demo_{name}.py failed.")
-        picture = Path(folder) / f"{name}.png"
-        if not picture.exists():
-            sys.exit(f"demo_{name}.py must leave a picture {name}.png in the working directory.")
+        wanted = [f"{name}_model.png", *([] if model else [f"{name}.png"])]
+        for picture in wanted:
+            if not (Path(folder) / picture).exists():
+                sys.exit(f"demo_{name}.py must run a problem and leave a picture {picture}.")
         KEPT.mkdir(parents=True, exist_ok=True)
-        for kind in ("png", "gif"):
-            made = Path(folder) / f"{name}.{kind}"
-            if made.exists():
-                shutil.copyfile(made, KEPT / made.name)
-        (KEPT / f"{name}.txt").write_text(done.stdout, "utf-8")
+        for made in (f"{name}_model.png", f"{name}.png", f"{name}.gif"):
+            if (Path(folder) / made).exists():
+                shutil.copyfile(Path(folder) / made, KEPT / made)
+        sketch = KEPT / f"{name}_model.png"
+        Image.open(sketch).convert("RGB").quantize(48).save(sketch, optimize=True)
+        if not model:
+            (KEPT / f"{name}.txt").write_text(done.stdout, "utf-8")
         print(f"{name}: {time.perf_counter() - begin:.1f} s", flush=True)
 
 
 if __name__ == "__main__":
+    if sys.argv[1:2] == ["--follow"]:
+        follow(sys.argv[2], sys.argv[3], bool(int(sys.argv[4])))
+        sys.exit()
+    given = [name for name in sys.argv[1:] if name != "--models"]
     every = sorted(path.stem.removeprefix("demo_") for path in DEMOS.glob("demo_*.py"))
-    for chosen in sys.argv[1:] or every:
-        run(chosen)
+    for chosen in given or every:
+        run(chosen, "--models" in sys.argv)

@@ -37,7 +37,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         if level is None:
             log.warning("%s has no line '# Level: 1', 2 or 3 below its licence.", script.name)
         name = script.stem.removeprefix("demo_")
-        title, text = page(script.name, source, results(root / "docs", name))
+        model = root / "docs" / "images" / "demos" / f"{name}_model.png"
+        sketch = f"![The model](../images/demos/{model.name})\n" if model.exists() else ""
+        title, text = page(script.name, source, sketch, results(root / "docs", name))
         files.append(File.generated(config, f"demos/{script.stem}.md", content=text))
         files.append(File.generated(config, f"demos/{script.name}", content=source))
         notebook = jupytext.reads(HEADER.sub("", source), fmt="py:light")
@@ -95,7 +97,7 @@ def results(docs: Path, name: str) -> str:
     return "\n".join(part for part in parts if part)
 
 
-def page(script: str, source: str, shown: str) -> tuple[str, str]:
+def page(script: str, source: str, sketch: str, shown: str) -> tuple[str, str]:
     """Return a demo's title and its page."""
     blocks: list[str] = []
     last = ""
@@ -118,4 +120,5 @@ def page(script: str, source: str, shown: str) -> tuple[str, str]:
     body = before + shown + exercises + after
     stem = script.removesuffix(".py")
     note = f"*The script: [{script}]({script}); as a notebook: [{stem}.ipynb]({stem}.ipynb).*"
-    return title[1].strip(), f"{title[0]}\n{note}\n{body[title.end() :]}\n"
+    text, code, rest = body[title.end() :].partition("\n```python")
+    return title[1].strip(), f"{title[0]}\n{note}\n{text}\n{sketch}{code}{rest}\n"

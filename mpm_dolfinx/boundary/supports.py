@@ -68,6 +68,7 @@ class Support:
         penalty: float,
     ) -> None:
         self.particles = particles
+        self._tagged = None if tag is None else (facet_tags, tag)
         body = particles.mesh
         metadata = particles.dx_exact.metadata()
         if tag is None:
@@ -97,6 +98,13 @@ class Support:
         self._sum: tuple[fem.Constant, fem.Form] | None = None
         self._power: fem.Form | None = None
         self._works: tuple[fem.Function, fem.Form] | None = None
+
+    def facets(self) -> NDArray[np.int32]:
+        """Return this rank's facets of the body that are on the support (collective)."""
+        if self._tagged is None:
+            return self.particles.boundary()
+        tags, tag = self._tagged
+        return np.asarray(tags.find(tag))
 
     def scale(self, modulus: Any) -> None:
         """Set the modulus that the penalty is relative to (collective).

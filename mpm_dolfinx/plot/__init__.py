@@ -4,8 +4,8 @@
 
 :func:`scene` draws the bodies of a problem in the plane or in space, coloured by a field;
 :func:`movie` does so after each step of a run; :func:`history` shows loads, energies, linear
-solves and cutbacks. :func:`domains` and :func:`background` add to axes of matplotlib, :func:`grid`
-gives the domains to pyvista.
+solves and cutbacks; :func:`sketch` draws what a problem is made of, before it runs. :func:`domains`
+and :func:`background` add to axes of matplotlib, :func:`grid` gives the domains to pyvista.
 
 Both packages are optional (``pip install 'mpm-dolfinx[plot]'``) and imported on rank 0 only,
 when a picture is asked for. All functions are collective.
@@ -15,8 +15,9 @@ from .movies import movie
 from .outlines import background, domains, grid
 from .runs import history
 from .scenes import scene
+from .sketches import sketch
 
-__all__ = ["background", "domains", "grid", "history", "movie", "scene"]
+__all__ = ["background", "domains", "grid", "history", "movie", "scene", "sketch"]
 
 
 def __dir__() -> list[str]:
