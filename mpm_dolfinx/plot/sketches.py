@@ -23,7 +23,7 @@ from ..parallel.boundary import collective
 from ..particles.particles import Particles
 from .fields import bodies_of
 from .outlines import imported, require_axes
-from .scenes import OBSTACLE, Look, Shot, corners, draw, framed, new_figure, take
+from .scenes import OBSTACLE, STRUCTURE, Look, Shot, corners, draw, framed, new_figure, take
 
 __all__ = ["sketch"]
 
@@ -325,6 +325,8 @@ def _explain(
         point = kind.startswith(("held", "moved")) or shot.extent.shape[1] == 3
         style = {"marker": "s", "linestyle": "", "markersize": 4} if point else {"linewidth": 2.2}
         handles.append(line([], [], color=COLOURS[kind], label=kind, **style))
+    if shot.structures:
+        handles.append(line([], [], color=STRUCTURE, linewidth=2.2, label="structure"))
     if shot.obstacles:
         handles.append(patch(facecolor=OBSTACLE, edgecolor="0.25", label="obstacle"))
     if _tables(given):
