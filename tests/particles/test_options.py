@@ -146,7 +146,7 @@ PARTICLES = {
         r"free= is 'auto', a function of coordinates.*not 'wall'",
     ),
     "free, broken": (vectors(free=lambda x: x[5]), r"The function free= failed with IndexError"),
-    "free, one for all": (vectors(free=lambda x: True), r"shape \(n,\), not \(\)"),
+    "free, one for all": (vectors(free=lambda x: True), r"free= must return one bool for each"),
     "free, foreign tags": (
         vectors(free=(scenes.cell_tags(scenes.unit(1, TRIANGLE), lambda x: x[:, 0]), 1)),
         r"must be those of cells of the body mesh",
