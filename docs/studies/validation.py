@@ -181,6 +181,12 @@ SOILS = {
     "Vertical cut, $\\gamma H / c$ (bounds 3.775 and 3.786)": Value(
         "factor", "exact", f"{STRIP} vertical_cut --cell 0.125", "--cell 0.0625"
     ),
+    "Pipe deep in clay, smooth (Randolph & Houlsby 1984)": Value(
+        "factor", "exact", "pipe --cell 0.166667", "--cell 0.083333"
+    ),
+    "Pipe deep in clay, rough (Randolph & Houlsby 1984)": Value(
+        "factor", "exact", "pipe --rough --cell 0.166667", "--cell 0.083333"
+    ),
     "Slope 2:1, factor of safety (Griffiths & Lane 1999, example 1)": Value(
         "factor", "exact", "strength --case slope --cell 0.1", "--cell 0.05"
     ),

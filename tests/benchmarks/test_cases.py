@@ -32,7 +32,7 @@ LONG = {
     ),
     *("finer-footing", "mixed-footing"),
     *("stiff-footing", "hertz", "hertz-penalty", "hertz-tets", "expansion-whole", "pile-deep"),
-    *("wedge-fine", "ironing-stiff"),
+    *("pipe-rough", "wedge-fine", "ironing-stiff"),
     *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
 }
 COMMON = {"completed", "load", "iterations", "cutbacks", "failure"}
@@ -255,6 +255,12 @@ RUNS = {
         "--depth 0.5 --cell 0.5 --steps 12",
         {"cutbacks": 0, "iterations": 85, "factor": 6.2},
     ),
+    "pipe": ("pipe", "--steps 6", {"ratio": 1.03, "cutbacks": 0, "iterations": 120}),
+    "pipe-rough": (
+        "pipe",
+        "--rough --free",
+        {"ratio": 1.01, "plateau": 2e-3, "cutbacks": 0, "iterations": 210},
+    ),
     "wedge": (
         "penetration",
         "--obstacle wedge --depth 0.5 --cell 0.25",
@@ -414,6 +420,7 @@ KEYS = {
     "consolidation": {"error", "degree", "error_degree", "particles"},
     "seepage": {"discharge", "exact", "error"},
     "cone": {"factor", "exact", "rise"},
+    "pipe": {"factor", "exact", "ratio", "plateau"},
     "mandel_cryer": {"peak", "exact", "error", "error_force"},
     "penetration": {"force", "depth", "ratio", "iterations_per_step", "penetration"},
     "incline": {"stick_angle", "exact", "ratio"},
