@@ -118,6 +118,8 @@ def _of_mesh(given: mesh.Mesh, comm: MPI.Comm, gdim: int, what: str, surfaces: b
     """Return the layout of a mesh (collective)."""
     kind, dim = given.basix_cell(), given.topology.dim
     with agree(comm):
+        if given.comm.size != comm.size:
+            raise MPMError(f"The mesh of a {what} must be on the same ranks as its bodies.")
         if given.geometry.dim != gdim:
             raise MPMError(
                 f"The mesh of a {what} lies in {given.geometry.dim} dimensions, and its bodies in "

@@ -101,12 +101,17 @@ class Structure(Term):
         bond: What holds it along its length; ``None``: its nodes do not slip.
 
     Attributes:
-        layout: Its nodes and cells as they are drawn, in the undeformed bodies.
+        layout: All its nodes, also within cells, and its cells.
+        nodes: Its nodes as they are drawn, in the undeformed bodies, shape ``(N, gdim)``.
+        cells: Nodes at the corners of its cells, shape ``(m, k)``.
         law: As given.
         state: At the last converged step.
+        comm: The ranks.
+        label: What it is called in checkpoints and files: its name, or its number among terms.
     """
 
     evaluation = "The structure"
+    symmetric = True
 
     def __init__(
         self,
@@ -121,77 +126,46 @@ class Structure(Term):
         bond: Bond | None = None,
     ) -> None:
         super().__init__(_as_bodies(bodies, type(self).__name__))
-        self._comm: MPI.Comm = self.bodies[0].mesh.comm
+        self.comm: MPI.Comm = self.bodies[0].mesh.comm
         gdim, what = self.bodies[0].mesh.geometry.dim, type(self).__name__
-        self.axisymmetric, self.law, self._count, self._number = axisymmetric, law, count, 0
-        drawn = layout_of(shape, self._comm, gdim, what, surfaces)
-        self._sizes = len(drawn.nodes), drawn.cells.shape[1]
+        self.axisymmetric, self.law, self._count, self.label = axisymmetric, law, count, ""
+        drawn = layout_of(shape, self.comm, gdim, what, surfaces)
+        self.nodes: Array = drawn.nodes
+        self.cells: NDArray[np.int64] = drawn.cells
         if degree is None:
             degree = max(body.W.ufl_element().degree for body in self.bodies)
         require_whole(f"degree of a {what}", degree, 3, 1)
         self.layout: Layout = drawn.raised(degree)
-        with agree(self._comm):
-            self._alone = self._held(held)
-            self._grip = None if bond is None else Grip(bond, self.layout, axisymmetric, self._comm)
+        with agree(self.comm):
+            if axisymmetric:
+                _require_around(drawn, what)
+            self._alone = _held(self.layout, held, what)
+            self._grip = None if bond is None else Grip(bond, self.layout, axisymmetric, self.comm)
             if self._grip is not None and self._alone[self._grip.nodes].any():
                 raise MPMError("Nodes that are held have no bond; leave them out by where=.")
         self._hosts: Hosts = find_hosts(self.bodies, self.layout.nodes, self._alone, what)
         self._path = np.zeros(gdim)
         self.state = self._drawn()
-        self._rule = self._ruled()
-        self._step = self._begun()
+        self._rule = self._ruled(self.state.reference)
         self._now: _Now | None = None
         self._slipped = np.zeros(len(self.state.bond))
         self._matrices: Matrices | None = None
-
-    def _held(self, held: Callable[..., Any] | None) -> NDArray[np.bool_]:
-        """Return which nodes are held."""
-        what, nodes = type(self).__name__, self.layout.nodes
-        if self.axisymmetric and nodes.shape[1] != 2:
-            raise MPMError(f"An axisymmetric {what} lies in the (r, z) plane.")
-        if self.axisymmetric and nodes[:, 0].min() < 0.0:
-            raise MPMError(f"A node of an axisymmetric {what} has a negative radius.")
-        if held is None:
-            return np.zeros(len(nodes), dtype=bool)
-        alone = chosen(held, nodes, "held=")
-        if not alone.any():
-            raise MPMError(f"held= holds at no node of the {what}.")
-        return alone
+        self._step = _Step(np.ones(len(self.cells)), np.zeros((len(self.state.bond), gdim)))
 
     # -- What it is -------------------------------------------------------------------------------
 
     @property
-    def nodes(self) -> Array:
-        """Its nodes as they are drawn, in the undeformed bodies, shape ``(N, gdim)``."""
-        return self.layout.nodes[: self._sizes[0]]
-
-    @property
-    def cells(self) -> NDArray[np.int64]:
-        """Nodes at the corners of its cells, shape ``(m, k)``."""
-        return self.layout.cells[:, : self._sizes[1]]
-
-    @property
     def positions(self) -> Array:
         """Places of its nodes at the last converged step, shape ``(N, gdim)`` (collective)."""
-        return self.places()[: self._sizes[0]]
+        return self.places()[: len(self.nodes)]
 
     def places(self) -> Array:
         """Return the places of all nodes, also within cells; see :attr:`positions`."""
         return self.layout.nodes + self._hosts.displacement() + self.state.slip
 
-    @property
-    def label(self) -> str:
-        """What it is called in checkpoints and files: its name, or its number among terms."""
-        return self.name or f"structure{self._number}"
-
-    @property
-    def comm(self) -> MPI.Comm:
-        """The ranks."""
-        return self._comm
-
     def grid(self) -> Drawing:
         """Return this rank's part of it for a file: the first has all (collective)."""
-        now, rank = self.positions, self._comm.rank
+        now, rank = self.positions, self.comm.rank
         cells = self.cells if rank == 0 else self.cells[:0]
         places = (now, self.nodes) if rank == 0 else (now[:0], now[:0])
         fields = {name: values[: len(cells)] for name, values in self.fields().items()}
@@ -226,9 +200,10 @@ class Structure(Term):
 
     def _drawn(self) -> State:
         """Return the state of a structure without stress where its bodies are now (collective)."""
-        rule = rule_of(self.layout, self.layout.nodes, self._count, bool(self.axisymmetric))
+        reference = self._hosts.displacement()
+        rule = self._ruled(reference)
         return State(
-            self._hosts.displacement(),
+            reference,
             np.zeros(rule.weights.shape),
             np.zeros_like(self.layout.nodes),
             np.zeros(0 if self._grip is None else len(self._grip.nodes)),
@@ -236,15 +211,17 @@ class Structure(Term):
             np.zeros(self.layout.nodes.shape[1]),
         )
 
-    def _ruled(self) -> Rule:
-        """Return its points where it has no stretch."""
-        places = self.layout.nodes + self.state.reference
+    def _ruled(self, reference: Array) -> Rule:
+        """Return its points where it is displaced to have no stretch."""
+        places = self.layout.nodes + reference
         return rule_of(self.layout, places, self._count, bool(self.axisymmetric))
 
     def take(self, state: State) -> None:
         """Take a state for that of the last converged step."""
         self.state, self._now = state, None
-        self._rule = self._ruled()
+        self._rule = self._ruled(state.reference)
+        if state.slip[self._alone].any():
+            self._path = state.slip[self._alone][0].copy()
 
     def continued(self, other: Self) -> State:
         """Return the state with which it goes on in place of one that is drawn alike (collective).
@@ -277,7 +254,7 @@ class Structure(Term):
         materials: Sequence[PointMaterial | None],
     ) -> None:
         """Take note of its number, and find its nodes where bodies have other meshes."""
-        self._number = number
+        self.label = self.name or f"structure{number}"
         if not self._hosts.known:
             what = type(self).__name__
             self._hosts = find_hosts(self.bodies, self.layout.nodes, self._alone, what)
@@ -289,28 +266,21 @@ class Structure(Term):
 
     # -- A step -----------------------------------------------------------------------------------
 
-    def _begun(self) -> _Step:
-        """Return what a step begins with (collective)."""
-        there = self._hosts.present() | self._alone
-        along = np.zeros((0, 0))
-        if self._grip is not None:
-            along = self._grip.directions(self.places())
-        return _Step(there[self.layout.cells].all(axis=1).astype(np.float64), along)
-
     @override
     def begin(self) -> Sequence[PETSc.Vec]:
-        require_same(self._comm, offset=self._path)
-        self._step = self._begun()
+        require_same(self.comm, offset=self._path)
+        there = (self._hosts.present() | self._alone)[self.layout.cells].all(axis=1)
+        along = self._step.along
+        if self._grip is not None:
+            along = self._grip.directions(self.places())
+        self._step = _Step(there.astype(np.float64), along)
         self.roll_back()
         return ()
 
     def _evaluated(self) -> _Now:
         """Return the structure at the present displacements (collective)."""
-        if self._now is None:
-            self._now = self._evaluate()
-        return self._now
-
-    def _evaluate(self) -> _Now:
+        if self._now is not None:
+            return self._now
         slip, skin = self.state.slip.copy(), None
         slip[self._alone] = self._path
         if self._grip is not None:
@@ -320,13 +290,15 @@ class Structure(Term):
         nodal = stretched(self._rule, self.law, places, self.state.offset, self._step.present)
         forces = np.zeros_like(self.layout.nodes)
         np.add.at(forces, self.layout.cells, nodal.forces)
-        return _Now(nodal, forces, skin, slip)
+        self._now = _Now(nodal, forces, skin, slip)
+        return self._now
 
     @override
     def update(self) -> MPMError | None:
         if self._grip is not None:
             self._slipped = self._grip.own.values.copy()
-        self._now = now = self._evaluate()
+        self._now = None
+        now = self._evaluated()
         if self._grip is not None and now.skin is not None:
             pull = np.sum(now.forces[self._grip.nodes] * self._step.along, axis=1)
             sizes = np.zeros(len(self.layout.nodes))
@@ -346,7 +318,7 @@ class Structure(Term):
         if self._matrices is None:
             slips = np.zeros(0, dtype=np.int64) if grip is None else grip.nodes
             layout = None if grip is None else grip.own.layout
-            self._matrices = Matrices(self._hosts, self.layout.cells, slips, layout, self._comm)
+            self._matrices = Matrices(self._hosts, self.layout.cells, slips, layout, self.comm)
         bond = np.zeros(0) if now.skin is None else now.skin.tangent
         return self._matrices.of(now.nodal.tangent, self._step.along, bond)
 
@@ -362,7 +334,11 @@ class Structure(Term):
             now.forces[self._alone].sum(axis=0),
         )
         self.roll_back()
-        return lambda: self.take(before)
+
+        def undo() -> None:
+            self.state, self._now = before, None
+
+        return undo
 
     @override
     def roll_back(self) -> None:
@@ -372,11 +348,6 @@ class Structure(Term):
     @override
     def own(self) -> OwnUnknowns | None:
         return None if self._grip is None else self._grip.own
-
-    @property
-    @override
-    def symmetric(self) -> bool:
-        return True
 
     @property
     @override
@@ -391,6 +362,29 @@ class Structure(Term):
     @override
     def drives(self) -> bool:
         return bool(np.any(self.state.slip[self._alone] != self._path))
+
+
+def _require_around(drawn: Layout, what: str) -> None:
+    """Raise an error unless all cells lie around the axis of a body of revolution."""
+    if drawn.nodes.shape[1] != 2:
+        raise MPMError(f"An axisymmetric {what} lies in the (r, z) plane.")
+    radius = drawn.nodes[:, 0]
+    if radius.min() < 0.0:
+        raise MPMError(f"A node of an axisymmetric {what} has a negative radius.")
+    if (radius[drawn.cells] == 0.0).all(axis=1).any():
+        raise MPMError(
+            f"A cell of an axisymmetric {what} lies on the axis, with nothing around it."
+        )
+
+
+def _held(layout: Layout, held: Callable[..., Any] | None, what: str) -> NDArray[np.bool_]:
+    """Return which nodes are held."""
+    if held is None:
+        return np.zeros(len(layout.nodes), dtype=bool)
+    alone = chosen(held, layout.nodes, "held=")
+    if not alone.any():
+        raise MPMError(f"held= holds at no node of the {what}.")
+    return alone
 
 
 def _as_bodies(bodies: Any, what: str) -> list[Particles]:

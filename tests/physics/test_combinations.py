@@ -93,6 +93,7 @@ FEATURES = {
     "free nodes": {"method": "cpdi2", "free": True},
     "length": {"law": softening(), "length": 0.6},
     "Fracture": {"law": Fracture(Hencky(YOUNG, POISSON), 10.0, 1.2, model="AT2")},
+    "Truss": {"truss": True},
 }
 
 
@@ -237,7 +238,10 @@ class Scene:
         if "term" in wanted:
             self.springs = Springs(first)
             terms.append(self.springs)
-        self.contact = None
+        self.nail = self.contact = None
+        if "truss" in wanted:
+            self.nail = self.nailed(first)
+            terms.append(self.nail)
         if "contact" in wanted:
             self.contact = self.touching(bodies)
             terms.append(self.contact)
@@ -267,6 +271,14 @@ class Scene:
             petsc_options={"snes_rtol": wanted.get("rtol", 1e-11)},
             **{name: wanted[name] for name in names if name in wanted},
         )
+
+    def nailed(self, body):
+        """Return a nail that goes up through a body and slips in it."""
+        lower, upper = np.full(self.dim, 0.1), np.full(self.dim, 0.8)
+        bond = mpm.Bond(100.0, 0.5)
+        axisymmetric = "axisymmetric" in self.wanted
+        points = np.linspace(lower, upper, 7)
+        return mpm.Truss(body, points, 30.0, bond=bond, axisymmetric=axisymmetric)
 
     def tags(self):
         """Return the tags of a side of the first body, on its present mesh."""
@@ -338,6 +350,11 @@ class Scene:
             old = self.contact
             self.contact = self.touching(problem.bodies, old)
             given["terms"] = [self.contact if term is old else term for term in problem.terms]
+        if self.nail is not None:
+            old = self.nail
+            self.nail = self.nailed(first)
+            terms = given.get("terms", problem.terms)
+            given["terms"] = [self.nail if term is old else term for term in terms]
         up = np.zeros(self.dim)
         up[-1] = -GRAVITY
         bcs = [*self.bases, *(side_of(V) for V in spaces)]

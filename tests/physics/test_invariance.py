@@ -288,6 +288,35 @@ def tied(frame):
     return scene
 
 
+def nailed(frame):
+    """A block with a nail that slips and yields, and a cable."""
+    scene = Scene(frame)
+    body, unit = scene.body(scene.background()), frame.stress * frame.length
+    points = frame.point(np.linspace((0.2, 1.3), (1.5, 0.5), 9))
+    bond = mpm.Bond(1e3 * frame.stress / frame.length, 2.0 * frame.stress)
+    nail = mpm.Truss(body, points, 200.0 * unit, yield_force=unit, bond=bond)
+    across = frame.point(np.linspace((0.3, 0.2), (1.4, 0.3), 7))
+    cable = mpm.Truss(body, across, 100.0 * unit, compression=False)
+    scene.terms += [nail, cable]
+    scene.problem(load=3.0).solve(3)
+    assert np.isclose(np.abs(nail.state.bond).max(), 2.0 * frame.stress)
+    scene.seen["forces"] = np.concatenate([nail.force, cable.force]) / unit
+    return scene
+
+
+def wrapped(frame):
+    """A block in space with a sheet on its top."""
+    scene = Scene(frame, 3)
+    body = scene.body(scene.background())
+    tags = scene.top(body)
+    surface = mesh.create_submesh(body.mesh, 2, tags.find(1))[0]
+    sheet = mpm.Membrane(body, surface, 50.0 * frame.stress * frame.length, 0.3, compression=False)
+    scene.terms.append(sheet)
+    scene.problem().solve(2)
+    scene.seen["forces"] = np.sort(sheet.force, axis=0) / (frame.stress * frame.length)
+    return scene
+
+
 def two(frame):
     """Two blocks that share a background."""
     scene = Scene(frame)
@@ -551,6 +580,8 @@ SCENES = {
     "Pair, penalty": of(pair, "penalty"),
     "Pair, nitsche": of(pair, "nitsche"),
     "Tie": tied,
+    "Truss": nailed,
+    "Membrane": wrapped,
     "bodies": two,
     "RigidBody": of(resting, kind=mpm.DynamicProblem),
     "midpoint": moving,

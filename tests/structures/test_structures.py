@@ -374,7 +374,7 @@ def test_a_prestress_comes_over_a_stage_and_is_locked_off():
     assert np.abs(soil.displacement.x.array - d).max() < 1e-12
 
 
-def built():
+def built(name=None):
     """Return soil under its weight, with a nail that slips and yields and a cloth, in a stage."""
     problem = pit()
     problem.solve(2)
@@ -386,6 +386,7 @@ def built():
         yield_force=0.5,
         bond=mpm.Bond(1e3, 1.0, where=mpm.region(x=(0.15, 2))),
     )
+    nail.name = name
     cloth = mpm.Membrane(soil, line((0.2, 0.3), (1.9, 0.3), 9), 50.0, 0.2, compression=False)
     heavier = problem.body().replace(body_force=(0.0, -50.0))
     problem.stage("built", heavier, terms=[nail, cloth])
@@ -407,6 +408,30 @@ def test_a_run_goes_on_from_a_checkpoint_bit_for_bit(tmp_path):
     assert np.array_equal(its_cloth.force, cloth.force)
     d, its = problem.particles.displacement.x.array, other.particles.displacement.x.array
     assert np.array_equal(its, d)
+
+
+def test_held_nodes_stay_where_they_were_after_a_restart(tmp_path):
+    path = WORLD.bcast(tmp_path) / "state"
+
+    def made():
+        body = mpm.Particles(box([0, 0], [1, 1], [2, 2], QUADRILATERAL))
+        rope = mpm.Truss(body, [(0.5, 1.0), (0.5, 2.0)], 50.0, held=lambda x: x[1] > 1.5)
+        problem = mpm.QuasiStaticProblem(
+            mpm.Body(body, Hencky(1e3, 0.3)), bcs=[mpm.held(body.W, y=0.0)], terms=[rope]
+        )
+        return problem, rope
+
+    problem, rope = made()
+    problem.solve(2, update=lambda t: rope.move((0.0, 0.1 * t)))
+    problem.save(path)
+    problem.step()
+    assert 3.0 < problem.reaction(rope)[1] < 5.0
+    other, its = made()
+    other.restore(path)
+    other.step()
+    assert np.array_equal(its.force, rope.force)
+    rope.move((0.0, 0.2))
+    assert np.array_equal(its.reaction, rope.reaction)  # of the last converged step
 
 
 def test_structures_follow_particles_to_other_ranks():
@@ -488,8 +513,7 @@ def test_the_factor_of_safety_of_soil_beside_what_is_elastic():
 
 def test_structures_are_written_and_drawn(tmp_path):
     path = WORLD.bcast(tmp_path)
-    problem, nail, cloth = built()
-    nail.name = "nail"
+    problem, nail, cloth = built("nail")
     problem.solve(1)
     problem.write(path / "pit.pvd")
     files = sorted(file.name for file in path.iterdir() if file.suffix == ".pvd")
@@ -544,6 +568,7 @@ def test_what_makes_no_sense_is_refused():
             lambda: mpm.Truss(body, points, 1.0, held=lambda x: x[0] > 0.9, bond=mpm.Bond(1.0)),
             "leave them out by where=",
         ),
+        (lambda: mpm.Truss(body, line((0, 0), (0, 0.5), 2), 1.0, axisymmetric=True), "on the axis"),
         (lambda: mpm.Bond(-1.0), "stiffness of a Bond"),
         (lambda: mpm.Membrane(body, points, 1.0, 1.0), "between -1 and 1"),
         (lambda: truss.move((1.0, 0.0)), "No node of this Truss is held"),
