@@ -145,6 +145,7 @@ class Step:
             end of the run.
         error: What :meth:`Problem.error` found at its end, ``None`` where it was not asked.
         alternations: How often equations of fields were solved in turn with the displacements.
+        freed: How many nodes were freed at its end (``adapt=``), after which it was solved on.
     """
 
     load: float
@@ -155,6 +156,7 @@ class Step:
     output: bool = False
     error: float | None = None
     alternations: int = 0
+    freed: int = 0
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ The energy of the load tells the error, as nothing else does work: for linear el
 norm of the error is `sqrt(W - W_h)`, where the limit W is extrapolated from finite elements of
 degree 2 on three meshes.
 
-With `--adapt SHARE` so many of the body's nodes are freed once, those that the estimate names.
+With `--adapt TOLERANCE` nodes of the body are freed until the estimate is at most that, or as near
+to the error of the body's own elements as it can come.
 """
 
 from mpi4py import MPI
@@ -22,14 +23,13 @@ import ufl
 from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.problems.errors import estimated
 
 parser = kit.Parser("L-shaped elastic body: the error, and its estimate.")
 parser.add_argument("--cells", type=kit.whole, default=8, help="background cells a unit length")
 parser.add_argument("--offset", type=float, default=0.0, help="of the background, in cells")
 parser.add_argument("--space", type=int, choices=(2, 3), default=2, help="dimensions")
 parser.add_argument("--steps", type=kit.whole, default=1, help="load steps")
-parser.add_argument("--adapt", type=kit.positive, help="share of the body's nodes to be freed")
+parser.add_argument("--adapt", type=kit.positive, help="error at which no more nodes are freed")
 parser.add_order()
 args = parser.parse()
 
@@ -73,18 +73,8 @@ def solved(
     else:
         supports = [mpm.boundary.fixed(body, tags, 1)]
         problem = mpm.QuasiStaticProblem(given, supports=supports, solver=how)
-    problem.solve(args.steps)
-    if body.free_nodes is not None:
-        body.free = worst_nodes(problem, args.adapt)
-        problem.step()
+    problem.solve(args.steps, adapt=None if body.free_nodes is None else args.adapt)
     return problem, work(problem, tags)
-
-
-def worst_nodes(problem: mpm.QuasiStaticProblem, share: float) -> np.ndarray:
-    """This rank's own nodes among those with a share of the body's that the background errs at."""
-    errors = estimated(problem.bodies, problem.body_terms, problem.reduced).nodal[0]
-    every = np.sort(np.concatenate(comm.allgather(errors)))
-    return np.flatnonzero(errors >= every[-max(1, round(share * len(every)))])
 
 
 # The limit, by finite elements of degree 2.

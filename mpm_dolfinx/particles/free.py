@@ -64,6 +64,7 @@ class FreeNodes:
         W: The same.
         increment: Their increment in the step being solved.
         chosen: Which of this rank's nodes of W are free, ghosts too.
+        spent: Which have been free until the domains around them were bad, and stay carried.
     """
 
     def __init__(self, particles: Body) -> None:
@@ -74,7 +75,7 @@ class FreeNodes:
         layout = self.W.dofmap.index_map
         local = np.arange(layout.size_local + layout.num_ghosts, dtype=np.int32)
         self._nodes: NDArray[np.int64] = layout.local_to_global(local)
-        self.chosen = np.zeros(len(local), dtype=bool)
+        self.chosen, self.spent = (np.zeros(len(local), dtype=bool) for _ in range(2))
         self._dead = np.zeros(len(local), dtype=bool)
         self._basis: PointBasis | None = None
         self._T: PETSc.Mat | None = None
@@ -89,9 +90,9 @@ class FreeNodes:
         """Whether neighbours share their nodes."""
         return self.particles.shares_nodes
 
-    def choose(self, chosen: NDArray[np.bool_]) -> None:
-        """Let others of this rank's nodes of W, ghosts too, be free."""
-        self.chosen = chosen
+    def choose(self, chosen: NDArray[np.bool_], spent: NDArray[np.bool_]) -> None:
+        """Let others of this rank's nodes of W, ghosts too, be free, and others stay carried."""
+        self.chosen, self.spent = chosen, spent
 
     def take(self, rows: PointBasis) -> None:
         """Take the free nodes out of the rows of the background, in place.

@@ -187,7 +187,7 @@ class Particles(MaterialDomains):
         if self.free_nodes is not None:
             if isinstance(free, tuple):
                 free = tuple(self.carry(part) for part in free)
-            self.free_nodes.choose(chosen_nodes(self.W, free))
+            self.choose_free(chosen_nodes(self.W, free))
         self._method.require(body, self.initial_domains, self.global_index)
         self.geometry.require_volume(self.quadrature)
         self.locate()
@@ -432,10 +432,17 @@ class Particles(MaterialDomains):
         self.frees_by_itself = _is_auto(where)
         self.choose_free(chosen_nodes(self.W, where))
 
-    def choose_free(self, chosen: NDArray[np.bool_]) -> None:
-        """Let others of this rank's nodes of W, ghosts too, be free from the next step on."""
+    def choose_free(
+        self, chosen: NDArray[np.bool_], spent: NDArray[np.bool_] | None = None
+    ) -> None:
+        """Let others of this rank's nodes of W, ghosts too, be free from the next step on.
+
+        Args:
+            chosen: The free ones.
+            spent: Those that stay carried, as the domains around them were bad; ``None``: none.
+        """
         assert self.free_nodes is not None
-        self.free_nodes.choose(chosen)
+        self.free_nodes.choose(chosen, np.zeros_like(chosen) if spent is None else spent)
         self._transfer = None
 
     @property
@@ -756,7 +763,8 @@ class Particles(MaterialDomains):
         nodal = self._converged[self.domain_nodes]
         columns = {"displacement": Column(nodal, "nodes")}
         if self.free_nodes is not None:
-            columns["free"] = Column(self.free[self.domain_nodes].astype(np.float64), "nodes")
+            state = self.free_nodes.chosen.astype(np.float64) - self.free_nodes.spent
+            columns["free"] = Column(state[self.domain_nodes], "nodes")
         if self.deletion is not None:
             columns["deleted"] = Column(self.deletion.mask, "cells")
             columns["kept"] = Column(self.deletion.kept(nodal), "nodes")
@@ -773,8 +781,9 @@ class Particles(MaterialDomains):
         d.array.reshape(-1, self.geometry.gdim)[self.domain_nodes] = arrays["displacement"]
         d.scatter_forward()
         if self.free_nodes is not None:
-            nodes = np.unique(self.domain_nodes[arrays["free"] > 0.5])
-            self.choose_free(chosen_nodes(self.W, nodes))
+            states = (arrays["free"] > 0.5, arrays["free"] < -0.5)
+            nodes = (np.unique(self.domain_nodes[state]) for state in states)
+            self.choose_free(*(chosen_nodes(self.W, some) for some in nodes))
         if self.deletion is not None:
             self.deletion.restore(np.zeros_like(self.deletion.mask), arrays["kept"])
             self.deletion.restore(arrays["deleted"], arrays["kept"])

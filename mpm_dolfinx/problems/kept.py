@@ -328,7 +328,7 @@ class Past(Kept):
             "steps": [
                 [
                     *(s.load, s.iterations, s.residuals, s.displacement),
-                    *(s.time, s.output, s.error, s.alternations),
+                    *(s.time, s.output, s.error, s.alternations, s.freed),
                 ]
                 for s in history.steps
             ],

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem
 
+from .. import _compat
 from ..boundary.supports import Support
 from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree, warn
@@ -34,6 +35,7 @@ from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
 from ..solvers.newton import NewtonSolver
 from ..solvers.strategies import chosen
+from ..stepping.adaptivity import Adaptivity
 from ..stepping.automatic import ErrorControl
 from ..stepping.diagnosis import crossed
 from ..stepping.displacement_control import DisplacementControl
@@ -42,6 +44,7 @@ from ..stepping.progress import with_bar
 from ..structures.structure import Structure
 from ..system.body import BodyTerm
 from ..system.conditions import force_at
+from ..system.errors import Errors, estimated
 from ..system.predictor import Predictor
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
@@ -54,7 +57,6 @@ from .arguments import (
     as_terms,
     by_space,
 )
-from .errors import Errors, estimated
 from .parts import Contribution, Parts
 from .solver import Solver
 from .staging import Change, Staging
@@ -399,6 +401,7 @@ class Problem(Hooked):
         output_at: Sequence[float] = (),
         first_step: float = 0.05,
         length: float | None = None,
+        adapt: float | None = None,
     ) -> History:
         """Apply the whole load.
 
@@ -422,6 +425,10 @@ class Problem(Hooked):
             first_step: With ``"auto"``: size of the first step, at most 0.05 of the run.
             length: With ``"auto"``: a motion to be expected, by which the error is measured instead
                 of the motion so far.
+            adapt: What :meth:`error` may be. Where it is more at the end of a step, nodes of bodies
+                made with ``free=`` are freed and the step is solved on, until it is not, or until
+                next to all of it is the error of the bodies' own elements. Nodes are carried again
+                where the domains around them distort.
 
         Returns:
             The history of the run.
@@ -440,6 +447,7 @@ class Problem(Hooked):
             output_at=output_at,
             first_step=first_step,
             length=length,
+            adapt=adapt,
         )
         number = 1 if isinstance(steps, str) else steps
         if progress and self._comm.rank == 0:
@@ -460,6 +468,7 @@ class Problem(Hooked):
         output_at: Sequence[float] = (),
         first_step: float = 0.05,
         length: float | None = None,
+        adapt: float | None = None,
     ) -> Iterator[Step]:
         """Apply the whole load, one converged step at a time.
 
@@ -474,6 +483,7 @@ class Problem(Hooked):
             output_at: As in :meth:`solve`.
             first_step: As in :meth:`solve`.
             length: As in :meth:`solve`.
+            adapt: As in :meth:`solve`.
 
         Yields:
             Each converged step.
@@ -497,7 +507,25 @@ class Problem(Hooked):
             )
         else:
             chosen = steps
-        return self._stepper.steps(chosen, update, repartition, control)
+        adaptivity = None if adapt is None else self._adaptivity(adapt)
+        return self._stepper.steps(chosen, update, repartition, control, adaptivity=adaptivity)
+
+    def _adaptivity(self, tolerance: float) -> Adaptivity:
+        """Return what frees nodes, or raise an error where it cannot."""
+        adaptivity = Adaptivity(tolerance)
+        self._require_error()
+        adapted = [body for body in self.bodies if adaptivity.adapts(body)]
+        if not adapted:
+            raise MPMError(
+                "adapt= frees nodes of bodies whose particles may have free ones; make them with "
+                "free=[]."
+            )
+        if any(_compat.is_condition_on(bc, body.W) for bc in self.bcs for body in adapted):
+            raise MPMError(
+                "A Dirichlet condition on particles.W holds nodes that adapt= may let the "
+                "background carry; hold them by conditions on V or a support."
+            )
+        return adaptivity
 
     @collective()
     def step(self) -> Step:
@@ -613,6 +641,12 @@ class Problem(Hooked):
         return self._errors().of_particles(body, self.bodies[body])
 
     def _errors(self) -> Errors:
+        self._require_error()
+        self._require_governing()
+        return estimated(self.bodies, self.body_terms, self.reduced)
+
+    def _require_error(self) -> None:
+        """Raise an error unless an error can be told."""
         if not self._at_rest:
             raise MPMError(
                 f"A {type(self).__name__} is in no equilibrium of which an error could be told; "
@@ -624,8 +658,6 @@ class Problem(Hooked):
                 f"Particles of method {alone.method!r} do not hang together, so that nothing tells "
                 "what their background cannot do; error() is for 'cpdi2' and finite elements."
             )
-        self._require_governing()
-        return estimated(self.bodies, self.body_terms, self.reduced)
 
     @collective()
     def write(self, path: str | Path, time: float | None = None) -> None:

@@ -88,6 +88,10 @@ def _state(body: Particles, comm: MPI.Comm) -> str:
     parts.append(f"volume {before:.4g}, now {now:.4g}")
     if body.has_material:
         parts.append(f"plastic strain up to {_most(comm, body.plastic_strain[kept]):.3g}")
+    if body.free_nodes is not None:
+        layout = body.W.dofmap.index_map
+        free = comm.allreduce(int(body.free[: layout.size_local].sum()))
+        parts.append(f"{free} of {layout.size_global} nodes free")
     gone = comm.allreduce(int(np.count_nonzero(~kept)))
     return "; ".join([*parts, f"{gone} deleted"] if gone else parts)
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
+from .adaptivity import Adaptivity
 
 __all__ = ["Control", "Converged", "Progress", "Run", "StepControl"]
 
@@ -214,6 +215,7 @@ class Run:
         end: Time at its end, ``None`` unless it is through time.
         held: How much of what a stage changes was held back at its beginning.
         warned: Whether it has warned of loads that its path sets.
+        adaptivity: Frees nodes at the end of steps; ``None``: nothing does.
     """
 
     control: Control
@@ -225,6 +227,7 @@ class Run:
     end: float | None = None
     held: float = 0.0
     warned: bool = False
+    adaptivity: Adaptivity | None = None
 
     @property
     def remaining(self) -> float:
@@ -300,18 +303,31 @@ class Run:
         return [base + (total - base) * t for base, total in zip(self.base, totals, strict=True)]
 
     def require(
-        self, control: Control, path: bool, goal: float | None, end: float | None = None
+        self,
+        control: Control,
+        path: bool,
+        goal: float | None,
+        end: float | None = None,
+        adaptivity: Adaptivity | None = None,
     ) -> None:
         """Raise an error unless this run has such steps, and such a path, control or end."""
-        asked = control.asked, path, goal, end
-        if asked != (self.control.asked, self.path, self.goal, self.end):
+        adapt = None if adaptivity is None else adaptivity.tolerance
+        asked = control.asked, path, goal, end, adapt
+        if asked != (self.control.asked, self.path, self.goal, self.end, self.adapt):
             kind = "update=..." if self.path else "no path (update=None)"
             if self.goal is not None:
                 kind = f"displacement control to {self.goal:g}"
+            if self.adapt is not None:
+                kind += f" and adapt={self.adapt:g}"
             raise MPMError(
                 f"The checkpoint was made in a run of {self.control!s} with {kind}; "
                 "go on with these, or restore it with resume=False to begin a new run."
             )
+
+    @property
+    def adapt(self) -> float | None:
+        """The error that is allowed, ``None`` where no nodes are freed."""
+        return None if self.adaptivity is None else self.adaptivity.tolerance
 
     def numbers(self) -> dict[str, Any]:
         """Return all but the Dirichlet values, for a checkpoint."""
@@ -323,6 +339,7 @@ class Run:
             "began": self.began,
             "end": self.end,
             "held": self.held,
+            "adapt": self.adapt,
         }
 
     @classmethod
@@ -344,8 +361,10 @@ class Run:
         control = make(numbers["control"])
         began = numbers.get("began", time - control.share)
         goal, end = numbers.get("goal"), numbers.get("end")
-        held = numbers.get("held", 0.0)
-        return cls(control, numbers["path"], numbers["start"], base, goal, began, end, held)
+        held, adapt = numbers.get("held", 0.0), numbers.get("adapt")
+        run = cls(control, numbers["path"], numbers["start"], base, goal, began, end, held)
+        run.adaptivity = None if adapt is None else Adaptivity(adapt)
+        return run
 
 
 @dataclass

@@ -330,7 +330,7 @@ class ControlledSystem:
         """Return unknowns to expect, with the prescribed displacement, if the past says any."""
         x = self._reduced.prediction()
         moved = 0.0 if x is None else self._row.dot(x)
-        if x is None or not 0.5 < moved / self._gap < 2.0:
+        if x is None or self._gap == 0.0 or not 0.5 < moved / self._gap < 2.0:
             return None
         x.scale(self._gap / moved)
         return x

@@ -15,7 +15,7 @@ from ..particles.free import chosen_nodes
 from ..particles.particles import Particles
 from ..transfer.matrix import transfer_matrix
 
-__all__ = ["Carried", "carried_after", "relieve"]
+__all__ = ["Carried", "bad_nodes", "carried_after", "relieve"]
 
 #: Mean ratio of the deformation (1 undeformed, 0 flat) below which a domain is distorted: that of a
 #: simple shear by 2.4 in the plane, where finite elements begin to stiffen.
@@ -34,9 +34,10 @@ class Carried(NamedTuple):
     too_late: bool
 
     def apply(self) -> None:
-        """Carry them."""
+        """Carry them, for good."""
         for body, free in self.free:
-            body.choose_free(free)
+            assert body.free_nodes is not None
+            body.choose_free(free, body.free_nodes.spent | (body.free & ~free))
 
 
 def carried_after(bodies: Sequence[Particles]) -> Carried:
@@ -47,11 +48,11 @@ def carried_after(bodies: Sequence[Particles]) -> Carried:
     them: a node that it carries alone is as free as before. What is carried stays so.
 
     Args:
-        bodies: All bodies, not yet committed.
+        bodies: Those with nodes that are free as long as domains are good, not yet committed.
     """
     found, too_late = [], False
     for body in bodies:
-        if not (body.frees_by_itself and _any(body, body.free)):
+        if not _any(body, body.free):
             continue
         free, moved = body.free, body.displacement.x.array.reshape(len(body.free), -1)
         before = body.node_positions
@@ -65,8 +66,7 @@ def carried_after(bodies: Sequence[Particles]) -> Carried:
         here = before if left else after
         seeds = np.zeros(len(free), dtype=bool)
         seeds[nodes] = was & ~stays if left else stays & ~remains
-        quality = np.minimum(*(body.geometry.quality(x[body.domain_nodes]) for x in (after, ahead)))
-        seeds[body.domain_nodes[(quality < LEAST_QUALITY) & ~body.deleted]] = True
+        seeds |= bad_nodes(body, after) | bad_nodes(body, ahead)
         if (rest := _without(body, seeds & free, here)) is not None:
             found.append((body, rest))
     return Carried(found, too_late)
@@ -76,18 +76,31 @@ def relieve(bodies: Sequence[Particles], error: MPMError) -> Carried:
     """Return the free nodes of domains that an error names, which are to be carried (collective).
 
     Args:
-        bodies: All bodies, at their last converged step.
+        bodies: Those with nodes that are free as long as domains are good, at their last converged
+            step.
         error: Why a step has failed.
     """
     found = []
     for body in bodies:
-        if body.frees_by_itself:
-            named = np.isin(body.global_index, error.particles)
-            seeds = np.zeros(len(body.free), dtype=bool)
-            seeds[body.domain_nodes[named]] = True
-            if (rest := _without(body, seeds & body.free, body.node_positions)) is not None:
-                found.append((body, rest))
+        named = np.isin(body.global_index, error.particles)
+        seeds = np.zeros(len(body.free), dtype=bool)
+        seeds[body.domain_nodes[named]] = True
+        if (rest := _without(body, seeds & body.free, body.node_positions)) is not None:
+            found.append((body, rest))
     return Carried(found, False)
+
+
+def bad_nodes(body: Particles, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return the local nodes of a body's own domains that are distorted.
+
+    Args:
+        body: The body.
+        positions: Where its nodes are.
+    """
+    bad = np.zeros(len(positions), dtype=bool)
+    quality = body.geometry.quality(positions[body.domain_nodes])
+    bad[body.domain_nodes[(quality < LEAST_QUALITY) & ~body.deleted]] = True
+    return bad
 
 
 def _any(body: Particles, mask: NDArray[np.bool_]) -> bool:

@@ -7,7 +7,8 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from typing import NoReturn, Protocol
+from dataclasses import replace
+from typing import NamedTuple, NoReturn, Protocol
 
 from mpi4py import MPI
 
@@ -31,9 +32,12 @@ from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
 from ..solvers.newton import NewtonSolver
 from ..solvers.problem import ReducedProblem
+from ..system.body import BodyTerm
 from ..system.conditions import dirichlet_values
+from ..system.errors import estimated
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
+from .adaptivity import Adaptivity
 from .automatic import ErrorControl, error_of_step
 from .control import Control, Converged, Progress, Run, StepControl
 from .diagnosis import count_folded, placed
@@ -51,6 +55,8 @@ INEXACT = 0.1
 JUMP = 10.0
 #: Alternations after which a step is given up.
 MOST_ALTERNATIONS = 5000
+#: How often nodes are freed at the end of a step.
+MOST_FREED = 10
 
 type Path = Callable[[float], None]
 """A path of the user's: sets loads and conditions to their totals at t in (0, 1]."""
@@ -60,6 +66,7 @@ class Owner(Protocol):
     """Problem, as its load steps need it. All calls are collective."""
 
     bodies: list[Particles]
+    body_terms: list[BodyTerm]
     history: History
 
     def masses(self, number: int) -> NDArray[np.float64] | None:
@@ -120,6 +127,26 @@ class Recorder(Protocol):
         """
 
 
+class Goal(NamedTuple):
+    """Where a step goes.
+
+    Attributes:
+        parameter: Load factor, parameter of the path or, if that is controlled, displacement.
+        values: Dirichlet totals, for each field.
+        time: Time at its end.
+        last: Whether it is the last of a run, or alone: it may take particles off the background.
+        output: Whether it ends at a level that was asked for.
+        again: Whether the step before has ended there, and this one corrects it.
+    """
+
+    parameter: float
+    values: list[NDArray[np.float64]]
+    time: float
+    last: bool = True
+    output: bool = True
+    again: bool = False
+
+
 class Stepper:
     """Takes a problem from one converged step to the next.
 
@@ -143,7 +170,7 @@ class Stepper:
         self._mender = mender
         self.run: Run | None = None
         #: Free nodes of the last converged step, where others are tried since.
-        self._free: list[tuple[Particles, NDArray[np.bool_]]] = []
+        self._free: list[tuple[Particles, NDArray[np.bool_], NDArray[np.bool_]]] = []
         self._resumes = self._follows = self._begins = False
         self._moved: float | None = None
         self._recorders: list[weakref.ref[Recorder]] = []
@@ -236,6 +263,7 @@ class Stepper:
         repartition: float | None,
         control: DisplacementControl | None,
         span: tuple[float, float] | None = None,
+        adaptivity: Adaptivity | None = None,
     ) -> Iterator[Step]:
         """Apply the whole load: see :meth:`Problem.steps`.
 
@@ -245,8 +273,9 @@ class Stepper:
             repartition: As there.
             control: As there.
             span: Times at beginning and end; ``None``: not through time.
+            adaptivity: Frees nodes at the end of steps; ``None``: nothing does.
         """
-        return self._steps(self.owner, steps, update, repartition, control, span)
+        return self._steps(self.owner, steps, update, repartition, control, span, adaptivity)
 
     @property
     def interrupted(self) -> Run | None:
@@ -261,6 +290,7 @@ class Stepper:
         repartition: float | None,
         control: DisplacementControl | None,
         span: tuple[float, float] | None,
+        adaptivity: Adaptivity | None,
     ) -> Iterator[Step]:
         if isinstance(steps, ErrorControl):
             chosen: Control = steps
@@ -279,7 +309,7 @@ class Stepper:
         # them out of what the others go on with.
         with held() if comm.size > 1 else nullcontext(Hold()) as hold:
             last = Hold()
-            run = self._begin(chosen, update, control, span)
+            run = self._begin(chosen, update, control, span, adaptivity)
             may_split = any(body.on_distortion == "split" for body in owner.bodies)
             if control is not None and (repartition is not None or may_split):
                 control.require_movable()
@@ -305,6 +335,9 @@ class Stepper:
                     self._require_governing(run)
             self.run = None
             self._warn_of_outside()
+            if adaptivity is not None and (found := owner.history.steps[-1].error) is not None:
+                if (sentence := adaptivity.complaint(found)) is not None:
+                    owner.warn(sentence)
             if interrupted(comm, last.left):
                 self._leave()
         if hold.left:
@@ -329,6 +362,7 @@ class Stepper:
         """
         owner = self.owner
         t, end = run.control.target, run.parameter
+        goal = Goal(end, [], run.time, t == 1.0, run.control.lands)
         try:
             self._release.aim(run.remaining)
             if control is None:
@@ -339,14 +373,14 @@ class Stepper:
                 update(t if run.end is None else run.time)
                 if grows:
                     self._look_at_loads(owner, run, before)
-            values = self.prescribed()
-            step = self._advance(end, values, run, control)
+            goal = goal._replace(values=self.prescribed())
+            step = self._advance(goal, run, control)
         except Interrupted:
             self._give_up()
             self._leave(update)
         except TRIAL_ERRORS as error:
             self._take_back(run.size, end, str(error))
-            if self._carry(relieve(owner.bodies, error)):
+            if self._carry(relieve(self._looked_after, error)):
                 return None
             gave_up = self.newton.gave_up
             if run.control.cut_back(gave_up):
@@ -376,7 +410,75 @@ class Stepper:
             raise
         if step is not None:
             run.control.accept(step.iterations)
+            if run.adaptivity is not None:
+                step = self._free_nodes(run.adaptivity, step, goal, update, control)
         return step
+
+    def _free_nodes(
+        self,
+        adaptivity: Adaptivity,
+        step: Step,
+        goal: Goal,
+        update: Path | None,
+        control: DisplacementControl | None,
+    ) -> Step:
+        """Free nodes after a step, which finds a better equilibrium each time; return it.
+
+        Where it finds none, nodes are what they were and the step is as it was.
+
+        Raises:
+            MPMError: The run cannot go on.
+            BaseException: What a user's code has raised, or Ctrl-C.
+        """
+        owner, steps = self.owner, self.owner.history.steps
+        for tries in range(MOST_FREED + 1):
+            try:
+                with owner.history.statistics.phase("assemble"):
+                    errors = estimated(owner.bodies, owner.body_terms, self._reduced)
+            except ParticleOutsideError:  # as the last step of a run may leave them
+                break
+            steps[-1] = step = replace(step, error=errors.total(owner.bodies))
+            chosen = adaptivity.chosen(owner.bodies, errors)
+            if not chosen or tries == MOST_FREED:
+                break
+            before = self._count_free()
+            self._keep_free()
+            for body, free in chosen:
+                assert body.free_nodes is not None
+                body.choose_free(free, body.free_nodes.spent)
+            freed = self._count_free() - before
+            try:
+                better = self._advance(goal._replace(again=True), None, control)
+            except Interrupted:
+                self._give_up()
+                self._leave(update)
+            except (*TRIAL_ERRORS, ParticleOutsideError) as error:
+                self._take_back(0.0, goal.parameter, str(error))
+                self._give_up(update)
+                break
+            except BaseException:
+                self._give_up()
+                raise
+            if better is None:
+                break
+            steps[-2:] = [
+                step := replace(
+                    better,
+                    iterations=step.iterations + better.iterations,
+                    alternations=step.alternations + better.alternations,
+                    freed=step.freed + freed,
+                )
+            ]
+        return step
+
+    def _count_free(self) -> int:
+        """Return the number of free nodes of all bodies that may have others too (collective)."""
+        own = [
+            int(body.free[: body.W.dofmap.index_map.size_local].sum())
+            for body in self.owner.bodies
+            if body.free_nodes is not None
+        ]
+        return int(self._comm.allreduce(sum(own)))
 
     def _placed(self, error: MPMError, reached: float, limit: str | None = None) -> MPMError:
         """Return an error that says where and why its step failed (collective)."""
@@ -429,6 +531,7 @@ class Stepper:
         owner = self.owner
         with held() as hold:
             before = self.run, self.converged.parameter
+            time = owner.history.stage + 1.0
             self.run, self.converged.parameter = None, self.converged.load
             try:
                 load = float(owner.bodies[0].load.value)
@@ -437,10 +540,10 @@ class Stepper:
                     self._release.aim(self._release.remaining)
                     self._set_load(load, self.converged.proportional)
                     try:
-                        step = self._advance(load, self.prescribed())
+                        step = self._advance(Goal(load, self.prescribed(), time))
                     except TRIAL_ERRORS as error:
                         self.go_back()
-                        if not self._carry(relieve(owner.bodies, error)):
+                        if not self._carry(relieve(self._looked_after, error)):
                             raise
             except BaseException as error:
                 self._give_up()
@@ -473,16 +576,34 @@ class Stepper:
 
     def _carry(self, carried: Carried) -> bool:
         """Carry free nodes before a step is tried again; return whether any are (collective)."""
-        if carried.free and not self._free:
-            bodies = [body for body in self.owner.bodies if body.frees_by_itself]
-            self._free = [(body, body.free.copy()) for body in bodies]
+        if carried.free:
+            self._keep_free()
         carried.apply()
         return bool(carried.free)
 
+    def _keep_free(self) -> None:
+        """Note which nodes are free, unless that is done since the last converged step."""
+        if not self._free:
+            self._free = [
+                (body, body.free_nodes.chosen, body.free_nodes.spent)
+                for body in self.owner.bodies
+                if body.free_nodes is not None
+            ]
+
+    @property
+    def _looked_after(self) -> list[Particles]:
+        """Bodies with nodes that are free as long as the domains around them are good."""
+        adapts = self.run is not None and self.run.adaptivity is not None
+        return [
+            body
+            for body in self.owner.bodies
+            if body.frees_by_itself or (adapts and body.free_nodes is not None)
+        ]
+
     def _give_up(self, update: Path | None = None) -> None:
         """Return to the last converged step, and to the free nodes that it had (collective)."""
-        for body, free in self._free:
-            body.choose_free(free)
+        for body, free, spent in self._free:
+            body.choose_free(free, spent)
         self._free = []
         self.go_back(update)
 
@@ -497,6 +618,7 @@ class Stepper:
         update: Path | None,
         control: DisplacementControl | None,
         span: tuple[float, float] | None,
+        adaptivity: Adaptivity | None,
     ) -> Run:
         """Return a new run, or the one that a checkpoint interrupted."""
         goal = self._moved = None
@@ -504,7 +626,8 @@ class Stepper:
             control.require_for(self.owner.bodies, update is not None)
             goal = control.value
         if self._resumes and self.run is not None:
-            self.run.require(steps, update is not None, goal, None if span is None else span[1])
+            end = None if span is None else span[1]
+            self.run.require(steps, update is not None, goal, end, adaptivity)
             self._resumes = False
             return self.run
         start = self.converged.load if control is None else control.present()
@@ -533,34 +656,37 @@ class Stepper:
             began,
             end,
             self._release.remaining,
+            adaptivity=adaptivity,
         )
         if span is None:
             self.converged.parameter = 0.0 if self.run.shares else self.converged.load
         return self.run
 
     def _advance(
-        self,
-        parameter: float,
-        values: list[NDArray[np.float64]],
-        run: Run | None = None,
-        control: DisplacementControl | None = None,
+        self, goal: Goal, run: Run | None = None, control: DisplacementControl | None = None
     ) -> Step | None:
-        """Solve one step to Dirichlet totals, and commit it, or return ``None``: it is rejected.
+        """Solve one step, and commit it, or return ``None``: it is rejected.
 
         Unless it is the last one of a run, or alone, it must leave all particles inside the
-        background. Under displacement control the parameter is the displacement.
+        background.
+
+        Args:
+            goal: Where it goes.
+            run: The run by whose control it may be rejected, if any.
+            control: What is controlled.
         """
         owner, reduced = self.owner, self._reduced
         owner.begin_step()
-        size = parameter - self.converged.parameter
-        if control is not None:
+        parameter = goal.parameter
+        size = 0.0 if goal.again else parameter - self.converged.parameter
+        if control is not None and not goal.again:
             size = abs(parameter - control.present())
         displacement = None if control is None else parameter
         experience = self.newton.experience
-        alternations = self._find_equilibrium(values, size, control, parameter)
+        alternations = self._find_equilibrium(goal, size, control)
         if (failure := owner.improper()) is not None:
             raise failure
-        carried = carried_after(owner.bodies)
+        carried = carried_after(self._looked_after)
         if carried.too_late:
             self._take_back(size, parameter, "free nodes left the background")
             self._carry(carried)
@@ -570,13 +696,11 @@ class Stepper:
             return None
         taken = [recorder.solved(self) for recorder in self.recorders]
         if control is not None:
-            self._look_for_jump(owner, size, parameter)
+            if not goal.again:
+                self._look_for_jump(owner, size, parameter)
             parameter = float(owner.bodies[0].load.value)
         before = [body.converged_displacement for body in owner.bodies]
-        last = run is None or run.control.target == 1.0
-        time = owner.history.stage + 1.0 if run is None else run.time
-        output = run is None or run.control.lands
-        move_bodies(owner.bodies, owner.history, owner.masses, parameter, last)
+        move_bodies(owner.bodies, owner.history, owner.masses, parameter, goal.last)
         with owner.history.statistics.phase("commit"):
             try:
                 reduced.terms.commit()
@@ -587,13 +711,13 @@ class Stepper:
                 raise
             load = float(owner.bodies[0].load.value)
             reactions = [force.array_r.copy() for force in reduced.unknowns.forces]
-            prescribed = [total.copy() for total in values]
+            prescribed = [total.copy() for total in goal.values]
             proportional = bool(owner.bodies[0].proportional.value)
             self.converged = Converged(
                 load, parameter, prescribed, reactions, proportional, reduced.balance.followed()
             )
             self.converged.supports = owner.forces_of_supports()
-            reduced.end()
+            reduced.end(goal.again)
             for take in taken:
                 take()
             self._free = []
@@ -607,8 +731,8 @@ class Stepper:
             newton.iterations,
             residuals,
             displacement,
-            time,
-            output,
+            goal.time,
+            goal.output,
             alternations=alternations,
         )
         owner.history.steps.append(step)
@@ -617,7 +741,7 @@ class Stepper:
             STEPS,
             "step %d: %s, %d iterations, relative residual %.1e",
             len(owner.history.steps),
-            f"time {time:.6g}" if displacement is None else f"displacement {displacement:.6g}",
+            f"time {step.time:.6g}" if displacement is None else f"displacement {displacement:.6g}",
             step.iterations,
             step.residuals[-1] if step.residuals else 0.0,
         )
@@ -625,10 +749,9 @@ class Stepper:
 
     def _find_equilibrium(
         self,
-        values: list[NDArray[np.float64]],
+        goal: Goal,
         size: float,
         control: DisplacementControl | None,
-        goal: float,
     ) -> int:
         """Solve one step from where it is expected to end, or else from where it begins.
 
@@ -641,13 +764,13 @@ class Stepper:
         """
         reduced, newton, again = self._reduced, self.newton, False
         before = self.converged.prescribed
-        changes = [new - old for new, old in zip(values, before, strict=True)]
+        changes = [new - old for new, old in zip(goal.values, before, strict=True)]
         while True:
             newton.forget()
             reduced.begin(changes, size, before)
             system: ReducedProblem = reduced
             if control is not None:
-                system = ControlledSystem(reduced, control, goal, self.owner.bodies)
+                system = ControlledSystem(reduced, control, goal.parameter, self.owner.bodies)
             try:
                 newton.solve(system, reduced.unknowns.sizes, self.run is not None, again)
                 return self._alternate()

@@ -148,7 +148,10 @@ class OwnUnknowns:
             guess = extrapolated(self.past, size)[0] if self.past else np.zeros(self.total)
         x.array_w[self.part] = (guess - self.start)[: self.count]
 
-    def record(self, size: float) -> None:
-        """Take note of a step of some size that has converged."""
+    def record(self, size: float, again: bool = False) -> None:
+        """Take note of a step of some size that has converged, or of its correction."""
         ends = self.start + self.values
+        if again and self.past:
+            self.past = [*self.past[:-1], (self.past[-1][0], [ends])]
+            return
         self.past = [*self.past[-1:], (size, [ends])] if size > 0.0 else []

@@ -61,16 +61,19 @@ class Predictor:
         self._past = []
         self.moved = [] if measures else None
 
-    def record(self, size: float, increments: Increments) -> None:
+    def record(self, size: float, increments: Increments, again: bool = False) -> None:
         """Take note of a converged step.
 
         Args:
             size: Its size, in load factor or parameter of the path.
             increments: Change of displacement on this rank's own dofs of W, for each body.
+            again: Whether it corrects the step before, of which no next one is a continuation.
         """
         if self.moved is not None:
             before = self.moved or [np.zeros_like(u) for u in increments]
             self.moved = [d + u for d, u in zip(before, increments, strict=True)]
+        if again:
+            return
         if size <= 0.0:
             self._past = []
         elif self._predicts or self.moved is not None:

@@ -167,12 +167,16 @@ class ReducedSystem:
         particles = sum(motion.particles.num_local for _, motion in unknowns.places)
         statistics["particle_imbalance"] = imbalance(unknowns.comm, particles)
 
-    def end(self) -> None:
-        """Take note of the increments; forget the unknowns, since the bodies have moved."""
+    def end(self, again: bool = False) -> None:
+        """Take note of the increments; forget the unknowns, since the bodies have moved.
+
+        Args:
+            again: Whether it was the step before that was solved on, with more unknowns.
+        """
         self.unknowns.forget()
-        self.predictor.record(self._step.size, self.unknowns.increments())
+        self.predictor.record(self._step.size, self.unknowns.increments(), again)
         for own in self.unknowns.own:
-            own.record(self._step.size)
+            own.record(self._step.size, again)
 
     # -- As the solver asks -----------------------------------------------------------------------
 

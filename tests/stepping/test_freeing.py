@@ -13,7 +13,7 @@ from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD, at
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import NeoHooke, VonMises
-from mpm_dolfinx.stepping.freeing import carried_after
+from mpm_dolfinx.stepping.freeing import LEAST_QUALITY, carried_after
 
 STEPS = 20
 
@@ -180,6 +180,22 @@ def test_nodes_that_a_failed_step_left_may_be_freed():
         problem.step()
         ends.append(scenes.in_order(own, own.centroid))
     np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-8)
+
+
+def test_what_was_bad_is_not_freed_again_by_its_error():
+    """A run that frees nodes by their error (``adapt=``) carries them where domains are bad."""
+    problem, own = column([])
+    seen = [own.free_nodes.spent]
+    for step in problem.steps(STEPS, adapt=0.05):
+        quality = own.geometry.quality(own.node_positions[own.domain_nodes])
+        assert not own.free[own.domain_nodes[quality < LEAST_QUALITY]].any()
+        assert not (own.free & own.free_nodes.spent).any()
+        assert (own.free_nodes.spent >= seen[-1]).all()
+        seen.append(own.free_nodes.spent)
+    assert scenes.gather(seen[-1]).any() and share_free(own) > 0.0
+    assert step.error is not None and problem.history.cutbacks == 0
+    own.free = np.flatnonzero(seen[-1])
+    assert not own.free_nodes.spent.any()
 
 
 @pytest.mark.parametrize("how", ["step", "run"])

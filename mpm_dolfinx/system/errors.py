@@ -16,10 +16,10 @@ from ..assembly.petsc import absolute
 from ..constitutive.points import MaterialPoints
 from ..constitutive.recovery import stress_errors
 from ..particles.particles import Particles
-from ..system.body import BodyTerm
-from ..system.conditions import fixed_dofs
-from ..system.estimate import nodal_errors, shares_of_domains
-from ..system.reduced import ReducedSystem
+from .body import BodyTerm
+from .conditions import fixed_dofs
+from .estimate import nodal_errors, shares_of_domains
+from .reduced import ReducedSystem
 
 __all__ = ["Errors", "estimated"]
 

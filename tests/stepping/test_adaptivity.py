@@ -1,0 +1,293 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Nodes that are freed until the estimated error is what was asked for."""
+
+import warnings
+
+from mpi4py import MPI
+
+import numpy as np
+import pytest
+import scenes
+from compare import raises
+from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD, at, box, facet_tags, vectors
+
+from dolfinx import mesh
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.materials import Hencky, LinearElastic, Tresca
+
+ELASTIC = LinearElastic(1e3, 0.25)
+
+
+def angle(free=(), degree=1, cell=QUADRILATERAL, n=4, comm=WORLD, law=ELASTIC, kind=None, load=0.1):
+    """An L-shaped body under its own weight, its upper end held across the cells of the background.
+
+    ``free=None`` is carried alone, and ``"elements"`` finite elements.
+    """
+    dim, h = (3 if cell == HEXAHEDRON else 2), 1.0 / n
+    square = box([0.0] * dim, [2.0, 2.0, 0.5][:dim], [4 * n, 4 * n, n][:dim], cell, comm)
+    cells = np.arange(square.topology.index_map(dim).size_local, dtype=np.int32)
+    middle = mesh.compute_midpoints(square, dim, cells)
+    kept = cells[(middle[:, 0] < 1.0) | (middle[:, 1] < 1.0)]
+    body = mesh.create_submesh(square, dim, kept)[0]
+    lower = np.array([-1.37 * h, -1.37 * h, -h][:dim])
+    counts = np.array([2 * n + 3, 2 * n + 3, n // 2 + 2][:dim])
+    around = HEXAHEDRON if dim == 3 else QUADRILATERAL
+    V = vectors(box(lower, lower + h * counts, counts.tolist(), around, comm), degree)
+    order = {"degree": degree, "quadrature_degree": 2 * degree}
+    if isinstance(free, str) and free == "elements":
+        own = mpm.Particles(body, **order)
+    else:
+        own = mpm.Particles(body, V, free=free if free is None else list(free), **order)
+    tags = facet_tags(own.mesh, at(1, 2.0))
+    given = mpm.Body(own, law, density=1.0, body_force=(0.0, -load, 0.0)[:dim])
+    held = [mpm.boundary.fixed(own, tags, 1)]
+    return (kind or mpm.QuasiStaticProblem)(given, supports=held), own
+
+
+def sag(problem):
+    """The work of the weight, but for a factor: what the energy of the error is a part of."""
+    body = problem.particles
+    volume = body.initial_volume
+    moved = (body.centroid - body.initial_centroid)[:, 1]
+    return -scenes.total(body, volume * moved)
+
+
+def freed(problem):
+    """How many nodes were freed at the end of each step."""
+    return [step.freed for step in problem.history.steps]
+
+
+@pytest.mark.parametrize(
+    "cell, degree, tolerance",
+    [(QUADRILATERAL, 1, 0.18), (QUADRILATERAL, 2, 0.1), (TRIANGLE, 1, 0.25), (HEXAHEDRON, 1, 0.35)],
+    ids=str,
+)
+def test_the_error_is_what_was_asked_for(cell, degree, tolerance):
+    n = 2 if cell == HEXAHEDRON else 4
+    carried, _ = angle(None, degree, cell, n)
+    carried.solve(1)
+    elements, _ = angle("elements", degree, cell, n)
+    elements.solve(1)
+    finer, _ = angle("elements", 2, cell, n if cell == HEXAHEDRON else 2 * n)
+    finer.solve(1)
+    problem, own = angle((), degree, cell, n)
+    problem.solve(1, adapt=tolerance)
+    (step,) = problem.history.steps
+    assert step.error == problem.error() <= tolerance < carried.error()
+    nodes = own.mesh.comm.allreduce(int(own.free[: own.W.dofmap.index_map.size_local].sum()))
+    assert step.freed == nodes > 0
+    assert f"{nodes} of {own.W.dofmap.index_map.size_global} nodes free" in problem.summary()
+    unknowns = [one.history.statistics["free_dofs"] for one in (carried, problem, elements)]
+    assert unknowns[0] < unknowns[1] < unknowns[2]
+    # The energy of the true error, by finite elements that are much finer, is no larger either.
+    whole = sag(finer)
+    assert np.sqrt(1.0 - sag(problem) / whole) < 1.25 * tolerance
+    gap = (sag(elements) - sag(problem)) / (sag(elements) - sag(carried))
+    assert 0.0 < gap < 0.4
+
+
+def test_where_the_elements_err_more_the_background_stops_and_it_is_said():
+    elements, _ = angle("elements")
+    elements.solve(1)
+    problem, own = angle()
+    with pytest.warns(UserWarning, match=r"adapt=0\.01 is not met") if WORLD.rank == 0 else quiet():
+        problem.solve(1, adapt=0.01)
+    assert elements.error() < problem.error() < 1.2 * elements.error()
+    assert 1.0 - sag(problem) / sag(elements) < 0.2 * problem.error() ** 2
+    assert not scenes.gather(own.free).all()
+
+
+def quiet():
+    """Nothing warns on the other ranks."""
+    return warnings.catch_warnings()
+
+
+def test_body_of_revolution():
+    """A plate held at its rim: the estimate and the nodes are those of the whole of it."""
+    found = []
+    for adapt in (None, 0.17):
+        grid = box([0.0, -0.4], [2.2, 0.8], [11, 6], QUADRILATERAL)
+        V = vectors(grid)
+        body = box([0.0, 0.0], [2.0, 0.3], [32, 6], QUADRILATERAL)
+        own = mpm.Particles(body, V, free=[])
+        tags = facet_tags(own.mesh, at(0, 2.0))
+        given = mpm.Body(own, ELASTIC, density=1.0, body_force=(0.0, -0.1))
+        problem = mpm.QuasiStaticProblem(
+            given,
+            bcs=[mpm.held(V, 0, x=0.0)],
+            supports=[mpm.boundary.fixed(own, tags, 1)],
+            axisymmetric=True,
+        )
+        problem.solve(2, adapt=adapt)
+        found.append((problem.error(), sag(problem)))
+    assert found[1][0] <= 0.17 < 0.25 < found[0][0]
+    assert found[1][1] > 1.05 * found[0][1]
+
+
+def strip(free=(), comm=WORLD, **options):
+    """A strip presses on clay that yields; returns the problem and its support."""
+    body = box([0.0, 0.0], [2.0, 1.0], [16, 8], QUADRILATERAL, comm)
+    V = vectors(box([0.0, 0.0], [2.0, 1.5], [8, 6], QUADRILATERAL, comm))
+    own = mpm.Particles(body, V, free=free, quadrature_degree=2)
+    tags = mpm.facet_tags(own.mesh, {1: mpm.region(x=(0.0, 0.5), y=1.0)})
+    under = mpm.boundary.roller(own, tags, 1, normal=(0.0, -1.0), value=0.012)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(own, Tresca(1e3, 0.45, cohesion=1.0), f_bar="patch"),
+        bcs=[mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=2.0), mpm.held(V, y=0.0)],
+        supports=[under],
+        **options,
+    )
+    return problem, under
+
+
+def test_plastic_steps():
+    """The edge of a strip: a few nodes, chosen early, give what all of them would."""
+    pressures = []
+    for free in (None, [], lambda x: np.ones(x.shape[1], bool)):
+        problem, under = strip(free)
+        problem.solve(8, adapt=0.15 if free == [] else None)
+        pressures.append(-problem.reaction(under)[1])
+        if free == []:
+            errors = [step.error for step in problem.history.steps]
+            counts, unknowns = freed(problem), problem.history.statistics["free_dofs"]
+            assert problem.history.cutbacks == 0
+    carried, adapted, all_free = pressures
+    assert abs(adapted - all_free) < 0.15 * (carried - all_free)
+    assert counts[0] > 0 and np.count_nonzero(counts) <= 3
+    assert errors[-1] <= 0.15 and unknowns < 0.5 * problem.history.statistics["free_dofs"]
+
+
+def test_steps_chosen_by_their_error_and_levels():
+    problem, under = strip([])
+    problem.solve("auto", tolerance=0.05, output_at=[0.5], adapt=0.15)
+    assert [step.load for step in problem.history.steps if step.output] == [0.5, 1.0]
+    assert problem.error() <= 0.15 and sum(freed(problem)) > 0
+    equal, other = strip([])
+    equal.solve(16, adapt=0.15)
+    ends = [p.reaction(s)[1] for p, s in ((problem, under), (equal, other))]
+    assert ends[0] == pytest.approx(ends[1], rel=0.02)
+
+
+def test_a_controlled_displacement():
+    """The load is found for the displacement, with nodes freed at the end of the step too."""
+    problem, own = angle()
+    control = mpm.DisplacementControl(own, -1e-4, point=(2.0, 0.5), direction=(0.0, 1.0))
+    problem.solve(3, control=control, adapt=0.2)
+    assert control.present() == pytest.approx(-1e-4, rel=1e-8)
+    assert problem.error() <= 0.2 and sum(freed(problem)) > 0
+    steps = problem.history.steps
+    assert [step.load for step in steps] == sorted(step.load for step in steps)
+    assert float(own.load.value) == steps[-1].load
+    again, _ = angle()
+    again.solve(1, update=lambda t: setattr(again.particles.load, "value", steps[-1].load * t))
+    again.particles.free = own.free.nonzero()[0]
+    again.step()
+    assert again.particles.displacement.x.array == pytest.approx(
+        own.displacement.x.array, rel=1e-6, abs=1e-9
+    )
+
+
+def test_a_path_and_a_stage():
+    """A stage that turns the load frees other nodes, and those from before stay free."""
+    problem, own = angle()
+    push = {"value": 0.0}
+    problem.solve(2, update=lambda t: push.update(value=t), adapt=0.2)
+    assert push["value"] == 1.0 and problem.error() <= 0.2
+    before = own.free
+    problem.stage("turned", problem.body().replace(body_force=(2.0, 0.0)))
+    problem.solve(2, adapt=0.2)
+    assert problem.error() <= 0.2
+    assert (own.free >= before).all()
+
+
+def test_several_bodies_and_contact():
+    """Only bodies that were made so have nodes freed; finite elements bear on one of them."""
+    ground = box([0.0, 0.0], [2.0, 1.0], [16, 8], QUADRILATERAL)
+    V = vectors(box([-0.3, -0.2], [2.2, 1.4], [10, 7], QUADRILATERAL))
+    soil = mpm.Particles(ground, V, free=[])
+    steel = mpm.Particles(box([0.6, 1.0], [1.2, 1.5], [6, 5], QUADRILATERAL))
+    tags = facet_tags(soil.mesh, at(1, 0.0))
+    down = mpm.held(steel.W, value=(0.0, -0.01), y=1.5)
+    problem = mpm.QuasiStaticProblem(
+        [mpm.Body(soil, Hencky(1e3, 0.3)), mpm.Body(steel, Hencky(1e4, 0.3))],
+        bcs=[down],
+        supports=[mpm.boundary.fixed(soil, tags, 1)],
+        terms=[mpm.contact.Pair(steel, soil)],
+    )
+    problem.solve(2)
+    carried = problem.error()
+    problem.solve(2, update=lambda t: None, adapt=0.95 * carried)
+    assert problem.error() <= 0.95 * carried
+    assert sum(freed(problem)) == np.count_nonzero(soil.free) > 0 or WORLD.size > 1
+    assert problem.reaction(down)[1] < 0.0
+
+
+def test_a_better_equilibrium_that_is_not_found_leaves_the_step_as_it_was():
+    class Reluctant(mpm.QuasiStaticProblem):
+        def evaluate(self):
+            if scenes.gather(self.particles.free).any():
+                return mpm.ConvergenceError("no")
+            return None
+
+    ends = []
+    for kind in (mpm.QuasiStaticProblem, Reluctant):
+        problem, own = angle(kind=kind)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            problem.solve(3, adapt=0.2 if kind is Reluctant else None)
+        ends.append(scenes.in_order(own, own.centroid))
+        assert problem.history.load == pytest.approx([1 / 3, 2 / 3, 1.0])
+    assert freed(problem) == [0, 0, 0] and not own.free.any()
+    assert problem.history.cutbacks == 0
+    np.testing.assert_allclose(ends[1], ends[0], rtol=0.0, atol=1e-12)
+
+
+def test_a_run_goes_on_from_a_checkpoint_as_it_was(mpi_tmp_path):
+    whole, under = strip([])
+    steps = whole.steps(6, adapt=0.15)
+    next(steps)
+    next(steps)
+    whole.save(mpi_tmp_path / "state")
+    for _ in steps:
+        pass
+    again, other = strip([])
+    again.restore(mpi_tmp_path / "state")
+    raises(lambda: again.solve(6), mpm.MPMError, "6 steps with no path .* and adapt=0.15; go on")
+    again.solve(6, adapt=0.15)
+    assert freed(again) == freed(whole)
+    assert [s.error for s in again.history.steps] == pytest.approx(
+        [s.error for s in whole.history.steps], rel=1e-8
+    )
+    if WORLD.size == 1:
+        scenes.assert_same_state(scenes.state(whole), scenes.state(again))
+        assert np.array_equal(whole.reaction(under), again.reaction(other))
+
+
+def test_any_number_of_ranks_frees_the_same_nodes():
+    found = []
+    for comm in (WORLD, MPI.COMM_SELF):
+        problem, under = strip([], comm)
+        problem.solve(4, adapt=0.15)
+        found.append((freed(problem), problem.reaction(under)[1], problem.error()))
+    assert found[0][0] == found[1][0]
+    assert found[0][1:] == pytest.approx(found[1][1:], rel=1e-7)
+
+
+def test_what_cannot_be_is_refused():
+    problem, _ = angle()
+    for wrong in (0.0, 1.0, -0.1, True, "a", np.nan):
+        raises(
+            lambda wrong=wrong: problem.solve(1, adapt=wrong),
+            mpm.MPMError,
+            "adapt must be an error between 0 and 1",
+        )
+    carried, _ = angle(None)
+    raises(lambda: carried.solve(1, adapt=0.1), mpm.MPMError, r"make them with free=\[\]")
+    _, own = angle(range(3))
+    one = mpm.QuasiStaticProblem(
+        mpm.Body(own, ELASTIC),
+        bcs=[mpm.held(own.W, where=lambda x: own.free[: x.shape[1]])],
+    )
+    raises(lambda: one.solve(1, adapt=0.1), mpm.MPMError, "condition on particles.W holds nodes")
