@@ -140,7 +140,8 @@ class Adjoint:
     them backward, at the cost of about one run whatever the number of parameters::
 
         young = fem.Function(fem.functionspace(body, ("DG", 0)))
-        problem = mpm.QuasiStaticProblem(mpm.Body(particles, mpm.materials.Hencky(young, 0.3)), bcs)
+        law = mpm.materials.Hencky(young, 0.3)
+        problem = mpm.QuasiStaticProblem(mpm.Body(particles, law), bcs)
         adjoint = mpm.Adjoint(problem, [young])
         problem.solve(steps=20)
         d = particles.displacement

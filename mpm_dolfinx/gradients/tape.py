@@ -34,11 +34,14 @@ def taped(
 
         def made():
             law = mpm.materials.Hencky(young, 0.3)
-            return mpm.QuasiStaticProblem(mpm.Body(mpm.Particles(body, V), law, ...), bcs)
+            soil = mpm.Body(mpm.Particles(body, V), law, ...)
+            return mpm.QuasiStaticProblem(soil, bcs)
 
         (d,) = mpm.taped(made, [young], lambda problem: problem.solve(steps=10))
-        misfit = dolfinx_adjoint.assemble_scalar(ufl.inner(d - measured, d - measured) * ds(1))
-        slope = pyadjoint.ReducedFunctional(misfit, pyadjoint.Control(young)).derivative()
+        gap = d - measured
+        misfit = dolfinx_adjoint.assemble_scalar(ufl.inner(gap, gap) * ds(1))
+        reduced = pyadjoint.ReducedFunctional(misfit, pyadjoint.Control(young))
+        slope = reduced.derivative()
 
     Args:
         made: Returns a new problem that an :class:`Adjoint` can follow, made of the controls.
