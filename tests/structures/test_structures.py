@@ -511,6 +511,31 @@ def test_the_factor_of_safety_of_soil_beside_what_is_elastic():
     assert found.factor >= 1.0 and len(found.factors) > 1
 
 
+def factor_of_a_cut(nailed):
+    """Return the factor of safety of a vertical cut of 2 m, with two rows of nails or without."""
+    V = vectors(box([0, 0], [8, 4], [16, 8], QUADRILATERAL))
+    soil = mpm.Particles(box([0, 0], [8, 3], [32, 12], QUADRILATERAL), V, quadrature_degree=2)
+    law = mpm.materials.MohrCoulomb(30e3, 0.3, cohesion=8.0, friction_angle=25.0)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(soil, law, density=1.8, body_force=(0.0, -9.81), f_bar="patch"),
+        bcs=[mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=8.0), mpm.held(V, y=0.0)],
+    )
+    problem.solve(3)
+    problem.remove(lambda x: (x[0] < 3.0) & (x[1] > 1.0), name="dig")
+    if nailed:
+        bond = mpm.Bond(2e4, 30.0)
+        rows = [line((3.0, y), (6.0, y - 0.4), 12) for y in (1.5, 2.5)]
+        problem.stage("nail", terms=[mpm.Truss(soil, points, 4e4, bond=bond) for points in rows])
+    problem.solve(3)
+    return mpm.strength_reduction(problem, tolerance=0.05)
+
+
+def test_nails_hold_a_cut():
+    bare, nailed = factor_of_a_cut(False), factor_of_a_cut(True)
+    assert bare.reason == nailed.reason == "displacement"
+    assert 1.3 < bare.factor < 1.45 and nailed.factor > 1.75
+
+
 def test_structures_are_written_and_drawn(tmp_path):
     path = WORLD.bcast(tmp_path)
     problem, nail, cloth = built("nail")
