@@ -11,6 +11,7 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
+from ..assembly.petsc import absolute
 from ..errors import MPMError
 from ..parallel.given import is_number
 from ..particles.free import chosen_nodes
@@ -69,7 +70,7 @@ class Adaptivity:
             errors: Their errors there.
         """
         comm: MPI.Comm = bodies[0].mesh.comm
-        every = [_can_be_freed(body) if self.adapts(body) else None for body in bodies]
+        every = [_can_be_freed(body, bodies) if self.adapts(body) else None for body in bodies]
         nodal = [
             np.where(can[: len(error)], error, 0.0)
             for can, error in zip(every, errors.nodal, strict=True)
@@ -107,11 +108,35 @@ class Adaptivity:
         )
 
 
-def _can_be_freed(body: Particles) -> NDArray[np.bool_]:
-    """Return the local nodes that are carried, and not so because of bad domains (collective)."""
+def _can_be_freed(body: Particles, bodies: Sequence[Particles]) -> NDArray[np.bool_]:
+    """Return the local nodes that are carried, and not so for good reasons (collective).
+
+    Domains around them may be bad, or they stick to another body by what carries both.
+
+    Args:
+        body: The body.
+        bodies: All bodies.
+    """
     assert body.free_nodes is not None
-    bad = chosen_nodes(body.W, np.flatnonzero(bad_nodes(body, body.node_positions)))
-    return ~(body.free | body.free_nodes.spent | bad)
+    kept = bad_nodes(body, body.node_positions)
+    if others := [other for other in bodies if other is not body and other.V is body.V]:
+        sticking = _nodes_beside(body, others)
+        kept[: len(sticking)] |= sticking
+    return ~(body.free | body.free_nodes.spent | chosen_nodes(body.W, np.flatnonzero(kept)))
+
+
+def _nodes_beside(body: Particles, others: Sequence[Particles]) -> NDArray[np.bool_]:
+    """Return this rank's own nodes that share a function of V with other bodies (collective)."""
+    T = absolute(body.T)
+    touched = T.createVecRight()
+    touched.set(0.0)
+    for other in others:
+        its = absolute(other.T)
+        one = its.createVecLeft()
+        one.set(1.0)
+        its.multTransposeAdd(one, touched, touched)
+    beside = (T * touched).array_r.reshape(-1, body.W.dofmap.index_map_bs)
+    return np.asarray((beside > 0.0).any(axis=1))
 
 
 def _threshold(values: NDArray[np.float64], wanted: float, comm: MPI.Comm) -> float:

@@ -224,6 +224,30 @@ def test_several_bodies_and_contact():
     assert problem.reaction(down)[1] < 0.0
 
 
+def test_bodies_that_stick_are_not_parted():
+    """A lift on the ground, on one background: what carries both keeps their nodes together."""
+    V = vectors(box([-0.3, -0.2], [2.2, 1.7], [10, 8], QUADRILATERAL))
+    ground = mpm.Particles(box([0.0, 0.0], [2.0, 1.0], [16, 8], QUADRILATERAL), V, free=[])
+    lift = mpm.Particles(box([0.0, 1.0], [1.0, 1.25], [8, 2], QUADRILATERAL), V, free=[])
+    tags = facet_tags(ground.mesh, at(1, 0.0))
+    law = Hencky(1e3, 0.3)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(ground, law, density=1.0, body_force=(0.0, -5.0)),
+        supports=[mpm.boundary.fixed(ground, tags, 1)],
+    )
+    problem.solve(1)
+    problem.add(mpm.Body(lift, law, density=1.0, body_force=(0.0, -5.0)))
+    carried = problem.capture()
+    problem.solve(2)
+    before, sunk = problem.error(), scenes.total(lift, lift.centroid[:, 1])
+    problem.return_to(carried)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        problem.solve(2, adapt=0.5 * before)
+    assert sum(freed(problem)) > 0 and problem.error() < before
+    assert scenes.total(lift, lift.centroid[:, 1]) == pytest.approx(sunk, abs=2e-3 * abs(sunk))
+
+
 def test_a_better_equilibrium_that_is_not_found_leaves_the_step_as_it_was():
     class Reluctant(mpm.QuasiStaticProblem):
         def evaluate(self):
