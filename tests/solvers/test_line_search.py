@@ -61,6 +61,17 @@ def test_a_fold_is_passed_forward():
     np.testing.assert_allclose(problem.c * (x**3 - x), 0.1, atol=1e-8)
 
 
+@pytest.mark.parametrize("tells", [True, False])
+def test_steps_are_reversed_only_where_work_tells_stability(tells):
+    problem, solver = Softening([1.0, 5.0, 0.3], 0.1), newton(symmetric=False)
+    problem.work_tells = lambda: tells
+    try:
+        solver.solve(problem, (3, 3), shorten=False)
+    except mpm.ConvergenceError:
+        assert not tells
+    assert (solver.statistics["redirections"] > 0) == tells
+
+
 @pytest.mark.skip_in_parallel
 @pytest.mark.parametrize("works", [True, False])
 def test_work_that_tells_nothing_judges_a_step_by_its_size(works):
