@@ -9,8 +9,10 @@ from typing import Any
 
 import ufl
 from dolfinx import fem
+from ufl.algorithms.analysis import extract_coefficients
 
 from ..constitutive.strain import Strain
+from ..errors import MPMError, agree
 from ..particles.particles import Particles
 from .inputs import as_expression, facet_measure
 
@@ -46,8 +48,18 @@ class VirtualWork:
         return self._at_load([work])
 
     def seepage(self, pressure: Any) -> ufl.Form:
-        """Return the virtual work of the gradient of a pore pressure, in the undeformed body."""
+        """Return the virtual work of the gradient of a pore pressure, in the undeformed body.
+
+        Raises:
+            MPMError: It is no pressure, or one that jumps between cells.
+        """
         p = as_expression(pressure, self._body, "pore_pressure", ())
+        with agree(self._body.mesh.comm):
+            if any(f.ufl_element() not in ufl.H1 for f in extract_coefficients(p)):
+                raise MPMError(
+                    "pore_pressure acts by its gradient, which a Function that jumps between cells "
+                    "does not have; give one of a continuous space, such as ('Lagrange', 1)."
+                )
         force = -ufl.grad(p) * self._body.undeformed.mass_ratio
         work: ufl.Form = self._strain.turn * ufl.inner(force, self._v) * self._body.dx_exact
         return self._at_load([work])

@@ -17,6 +17,7 @@ from dolfinx import mesh
 from ..errors import agree
 from ..materials.base import Material, Parameter, State, Update
 from ..meshes.remesh import Column
+from ..parallel.given import options_of
 from ..particles.field import ParticleField
 from .assignment import Assignment, Materials
 from .averaging import VolumeAveraging
@@ -191,6 +192,8 @@ class MaterialPoints:
                 for name, value in material.parameters.items()
             }
             whole = {**parameters, "points": (where, np.ones(len(where))), **common}
+            if options := _told(material):
+                whole["options"] = options
             found.append((type(material).__name__, whole))
         return found
 
@@ -545,3 +548,14 @@ def _at_pressure(
     (stress, tangent, new), strain = mean_stress.replace(points, gradient, own)
     assert tangent is not None
     return Answer(stress, tangent, new), strain
+
+
+def _told(law: Material) -> str:
+    """Return what a law is besides its class and its parameters, in words."""
+    found = options_of(law).items()
+    return ", ".join(
+        f"{name}={type(one).__name__}({_told(one)})"
+        if isinstance(one, Material)
+        else f"{name}={one}"
+        for name, one in found
+    )

@@ -122,7 +122,8 @@ class Sensitivity:
             One more axis than what it returns: the last one is that of parameters.
         """
         self._require_present()
-        look = of_user(self.problem.bodies[0].mesh.comm, function)
+        comm = self.problem.bodies[0].mesh.comm
+        look = of_user(comm, function)
         columns = []
         with self._nearby.held():
             for parameter, rates in zip(self._parameters, self._rates, strict=True):
@@ -132,9 +133,12 @@ class Sensitivity:
                     self._nearby.go(parameter, amount, rates)
                     shown = self._nearby.shown(amount, rates, self._reactions())
                     with shown, self._supported():
-                        sides.append(_numbers(look()))
-                if sides[0].shape != sides[1].shape:
-                    raise MPMError("A function of Sensitivity.of must always return one shape.")
+                        found = look()
+                        with agree(comm):
+                            sides.append(_numbers(found))
+                with agree(comm):
+                    if sides[0].shape != sides[1].shape:
+                        raise MPMError("A function of Sensitivity.of must always return one shape.")
                 columns.append(parameter.slope(*sides))
         return np.stack(columns, axis=-1)
 

@@ -24,7 +24,15 @@ from ufl.corealg.traversal import traverse_unique_terminals
 
 from ..errors import MPMError, gathered, met
 
-__all__ = ["PACKAGE", "as_positive", "is_number", "require_same", "require_truth", "require_whole"]
+__all__ = [
+    "PACKAGE",
+    "as_positive",
+    "is_number",
+    "options_of",
+    "require_same",
+    "require_truth",
+    "require_whole",
+]
 
 #: What all modules of this package begin with.
 PACKAGE = __name__.partition(".")[0]
@@ -106,6 +114,16 @@ def as_positive(value: Any, name: str) -> float:
     return float(value)
 
 
+def options_of(law: Any) -> dict[str, Any]:
+    """Return the words, truths and laws that a law was given besides its parameters, by name."""
+    kinds = str | bool | np.bool_
+    return {
+        name: value
+        for name, value in sorted(vars(law).items())
+        if isinstance(value, kinds) or hasattr(value, "initial_state")
+    }
+
+
 def _parts(name: str, value: Any) -> Iterator[tuple[str, str]]:
     """Yield the parts of a value, each with a name and a description."""
     if isinstance(value, Mapping):
@@ -119,6 +137,8 @@ def _parts(name: str, value: Any) -> Iterator[tuple[str, str]]:
     elif hasattr(value, "initial_state"):
         kinds = ", ".join(f"{kind}={getattr(value, kind, None)}" for kind in KINDS)
         yield name, f"{type(value).__name__} ({kinds})"
+        for key, option in options_of(value).items():
+            yield from _parts(f"{key} of {type(value).__name__}", option)
         for key, parameter in sorted(getattr(value, "parameters", {}).items()):
             own = isinstance(parameter, np.ndarray) and parameter.ndim > 0
             yield from [(key, "an array")] if own else _parts(key, parameter)

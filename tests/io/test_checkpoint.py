@@ -18,6 +18,7 @@ import ufl
 from dolfinx import fem
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx import materials
 from mpm_dolfinx.io import checkpoint, files
 from mpm_dolfinx.materials import Hencky, VonMises
 
@@ -489,6 +490,39 @@ def test_another_problem(mpi_tmp_path):
     twins.save(young)
     with pytest.raises(mpm.MPMError, match="the material of body 0 is not the same"):
         two_bodies(young=1.1e3).restore(young)
+
+
+def of_fracture(law="Hencky", **options):
+    return materials.Fracture(getattr(materials, law)(1e3, 0.3), 1.0, 0.5, **options)
+
+
+def drained(law):
+    return materials.Undrained(getattr(materials, law)(1e3, 0.3, 5.0, 20.0, 5.0), 1e3)
+
+
+@pytest.mark.parametrize(
+    ("law", "other"),
+    [
+        (of_fracture(), of_fracture(model="AT2")),
+        (of_fracture(), of_fracture(split="spectral")),
+        (of_fracture(), of_fracture("NeoHooke")),
+        (drained("MohrCoulomb"), drained("DruckerPrager")),
+        (
+            materials.DruckerPrager(1e3, 0.3, 5.0, 20.0),
+            materials.DruckerPrager(1e3, 0.3, 5.0, 20.0, match="plane_strain"),
+        ),
+    ],
+    ids=["model", "split", "elastic law", "law of the effective stress", "match"],
+)
+def test_a_law_of_other_options(law, other, mpi_tmp_path):
+    def made(law):
+        V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
+        body = mpm.Particles(scenes.unit(4, QUADRILATERAL), V, quadrature_degree=2)
+        return mpm.QuasiStaticProblem(mpm.Body(body, law), bcs=[mpm.held(V, y=0.0)])
+
+    made(law).save(mpi_tmp_path / "law.ckpt")
+    refuse(made(other), mpi_tmp_path / "law.ckpt", "the material is not the same")
+    made(law).restore(mpi_tmp_path / "law.ckpt")
 
 
 def test_a_file_that_cannot_be_written(mpi_tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from scenes import QUADRILATERAL
 import mpm_dolfinx as mpm
 from mpm_dolfinx import boundary, contact, io, plot
 from mpm_dolfinx.io import Column, Kept, fill, of_cells
-from mpm_dolfinx.materials import Hencky, VonMises
+from mpm_dolfinx.materials import Fracture, Hencky, NeoHooke, VonMises
 from mpm_dolfinx.parallel.boundary import collective, hooks_of, is_collective
 from mpm_dolfinx.system.schemes import Euler
 
@@ -358,6 +358,37 @@ def test_arguments_that_are_wrong_on_one_rank(what):
         caught = error
     ended = scenes.WORLD.allgather(f"{type(caught).__name__}: {caught}")
     assert caught is not None and len(set(ended)) == 1, ended
+
+
+@pytest.mark.mpi
+def test_options_of_laws_that_differ():
+    def law(**options):
+        return Fracture(Hencky(1e3, 0.3), 1.0, 0.5, **options)
+
+    other = Fracture(NeoHooke(1e3, 0.3), 1.0, 0.5)
+    fails(lambda: made(law=law(model=differing("AT1", "AT2"))), "^model of Fracture differs")
+    fails(lambda: made(law=law(split=differing("none", "spectral"))), "^split of Fracture differs")
+    fails(lambda: made(law=differing(law(), other)), "^law of Fracture differs .*Hencky")
+
+
+@pytest.mark.parametrize("found", [np.ones(2), "nothing"], ids=["shape", "kind"])
+def test_what_a_function_of_derivatives_returns_on_one_rank(found):
+    """Wrong on the last rank: words, or in the second of two states an array of another shape."""
+    body = particles()
+    young = mpm.particles.particles.fem.Constant(body.mesh, 1e3)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(body, Hencky(young, 0.3), body_force=(0.0, -1.0)),
+        bcs=[scenes.fix(body.V, scenes.at(0, 0.0))],
+    )
+    gradient = mpm.Sensitivity(problem, [young])
+    problem.solve(1)
+    calls = []
+
+    def look():
+        calls.append(0)
+        return found if LAST and len(calls) == 2 else np.ones(1)
+
+    fails(lambda: gradient.of(look), "^A function of Sensitivity.of must")
 
 
 @pytest.mark.mpi

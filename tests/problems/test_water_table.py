@@ -8,6 +8,7 @@ from compare import raises
 from scenes import QUADRILATERAL, at, box, fix, in_order, largest, vectors
 
 import ufl
+from dolfinx import fem
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import materials
@@ -116,6 +117,13 @@ def test_factors_of_safety_of_a_slope_with_water(level, known):
     assert abs(slope(level).factor - known) < 0.03
 
 
+def by_cells(body):
+    """Return a pressure with a value in each cell, whose gradient is nothing."""
+    p = fem.Function(fem.functionspace(body, ("Discontinuous Lagrange", 0)))
+    p.interpolate(lambda x: 10.0 * (4.0 - x[1]))
+    return p
+
+
 def test_what_makes_no_sense_is_said():
     for build, words in (
         (lambda: mpm.WaterTable("high", 10.0), "level"),
@@ -126,5 +134,6 @@ def test_what_makes_no_sense_is_said():
         (lambda: mpm.geostatic(4.0, 2.0, 0.5, G, water=3.0), "WaterTable"),
         (lambda: ground(4.0, pore_pressure=(1.0, 2.0)), "pore_pressure"),
         (lambda: ground(4.0, pore_fluid=mpm.PoreFluid(1.0)), "pore_fluid"),
+        (lambda: ground(4.0, pore_pressure=by_cells), "gradient, which a Function that jumps"),
     ):
         raises(build, mpm.MPMError, words)
