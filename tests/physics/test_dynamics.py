@@ -1214,6 +1214,26 @@ def test_a_mass_on_a_spring_without_inertia_swings_in_its_period(tmp_path):
     raises(lambda: other.restore(path), mpm.MPMError, "other bodies without inertia than quasi_st")
 
 
+@pytest.mark.parametrize("scheme", ["midpoint", "conserving", "euler"])
+def test_what_a_dashpot_on_a_body_without_inertia_takes_counts_once(scheme):
+    V = vectors(box([0.0, 0.0], [2.0, 3.0], [8, 12], QUADRILATERAL))
+    low = mpm.Particles(box([0.3, 0.0], [1.3, 1.0], [8, 8], QUADRILATERAL), V)
+    high = mpm.Particles(box([0.3, 1.0], [1.3, 1.5], [8, 4], QUADRILATERAL), V)
+    tags = mpm.facet_tags(low.mesh, {1: mpm.region(x=0.3)})
+    law = Hencky(100.0, 0.3)
+    problem = mpm.DynamicProblem(
+        [mpm.Body(low, law, 1.0), mpm.Body(high, law, 1.0, velocity=(0.5, -1.0))],
+        bcs=[mpm.held(V, y=0.0)],
+        supports=[mpm.boundary.dashpot(low, tags, 1, 20.0, 10.0)],
+        quasi_static=[low],
+        scheme=scheme,
+        solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
+    )
+    energies = problem.solve(0.3, 0.03).energies
+    assert energies[-1].dissipated > 0.2 * energies[0].kinetic
+    assert np.ptp([energy.balance for energy in energies]) < 1e-10 * energies[0].kinetic
+
+
 @pytest.mark.parametrize(
     ("message", "options"),
     [

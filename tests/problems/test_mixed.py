@@ -872,3 +872,15 @@ def test_a_motion_from_a_file_and_on_other_ranks(mpi_tmp_path, scheme, law):
         ends.append(outcome(problem))
     same_run(ends[1], ends[0], EXACT)
     same_run(ends[2], ends[0], 1e-9)
+
+
+@pytest.mark.parametrize("mixed", [None, "pressure", "stabilised pressure"])
+def test_the_work_on_a_step_tells_stability_where_no_saddle_is_solved_for(mixed):
+    """A pressure makes the potential largest: work below zero is no fold there."""
+    degree = 2 if mixed == "pressure" else 1
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL), degree)
+    body = mpm.Particles(scenes.unit(4, QUADRILATERAL), V, degree=degree)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(body, MohrCoulomb(1e3, 0.3, 5.0, 30.0)), bcs=[mpm.held(V, y=0.0)], mixed=mixed
+    )
+    assert problem.reduced.work_tells() == (mixed is None)
