@@ -432,7 +432,7 @@ class _Pattern:
         self._positions = np.split(positions, size * pairs[ends[1:-1]])
 
     def part(self) -> tuple[Any, ...]:
-        """Return what compiled loops find places of blocks by, which are forgotten."""
+        """Return the arrays by which compiled loops find places of blocks; they are forgotten."""
         self._places = np.zeros(len(self.nodes), dtype=np.int32)
         columns = self.columns
         return self._offsets, self.nodes, columns.bs, columns.numbers, self._places

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What a problem is made of in one picture: materials, conditions, loads, obstacles, water."""
+"""A problem in one picture: its materials, conditions, loads, obstacles and water."""
 
 from __future__ import annotations
 
@@ -230,7 +230,7 @@ def _on_facets(setup: Any) -> list[_Marks]:
 
 
 def _of_facets(kind: str, body: Particles, facets: NDArray[np.int32], value: Any = None) -> _Marks:
-    """Return what acts on facets, local numbers, of which the owned ones count."""
+    """Return the marks on facets, local numbers, of which the owned ones count."""
     domain = body.mesh
     gdim, dim = domain.geometry.dim, domain.topology.dim - 1
     own = facets[facets < domain.topology.index_map(dim).size_local]

@@ -511,7 +511,7 @@ class Problem(Hooked):
         return self._stepper.steps(chosen, update, repartition, control, adaptivity=adaptivity)
 
     def _adaptivity(self, tolerance: float) -> Adaptivity:
-        """Return what frees nodes, or raise an error where it cannot."""
+        """Return the rule by which nodes are freed, or raise an error where they cannot be."""
         adaptivity = Adaptivity(tolerance)
         self._require_error()
         adapted = [body for body in self.bodies if adaptivity.adapts(body)]
