@@ -7,6 +7,10 @@ shaft, and is pushed down by two diameters. Lu et al. (2004) found 3.4 + 1.6 ln(
 one. As in demos/demo_pile.py the clay has a hole on the axis, filled by a thin smooth rod, so that
 it parts below the tip.
 
+What the cone displaces must go somewhere: clay that hardly changes volume, held on all sides, takes
+it up as a pressure that grows with the way. So the side and the top bear the pressure of the ground
+instead, and the cone is steady from three radii of way on.
+
 `factor` is the resistance over section and strength in the mean of the last radius, `rise` what it
 has grown by from the radius before, relative: it is not steady where that is not small.
 """
@@ -22,9 +26,9 @@ parser = kit.Parser("A cone is pushed into clay: cone factor.")
 parser.add_argument("--rigidity", type=kit.positive, default=100.0, help="shear modulus over c")
 parser.add_argument("--cell", type=kit.positive, default=0.25, help="background cell over radius")
 parser.add_argument("--friction", type=float, default=0.0, help="coefficient of friction")
-parser.add_argument("--depth", type=kit.positive, default=4.0, help="how far, in radii")
+parser.add_argument("--depth", type=kit.positive, default=5.0, help="how far, in radii")
 parser.add_argument("--hole", type=kit.positive, default=0.25, help="radius of the rod")
-parser.add_argument("--before", type=kit.positive, default=5.0, help="pressure in the clay, over c")
+parser.add_argument("--before", type=kit.positive, default=8.0, help="pressure in the clay, over c")
 parser.add_argument("--steps", type=kit.whole, help="25 for a radius by default")
 parser.add_f_bar("patch")
 args = parser.parse()
@@ -33,20 +37,23 @@ h, depth, hole, before = args.cell, args.depth, args.hole, args.before
 shear, poisson = args.rigidity, 0.49
 steps = args.steps or round(25.0 * depth)
 height = 1.0 / np.tan(np.radians(30.0))  # of the cone
-wide, above, below = 2.0 * np.sqrt(args.rigidity), 8.0, 16.0 + depth
+wide, above, below = round(4.0 * np.sqrt(args.rigidity)), 14.0, 20.0 + depth
 
 # The clay's lines bend around the cone: where it stands they begin at its surface.
 
 across = mpm.grid_lines(0.0, wide, h, equal=(0.0, 2.5))
 up = mpm.grid_lines(-below, above, h, equal=(-depth - 1.5, height + 0.5))
-V = fem.functionspace(kit.grid([across, up], mesh.CellType.quadrilateral), ("Lagrange", 1, (2,)))
+room = [np.append(along, 2.0 * along[-1] - along[-2]) for along in (across, up)]
+V = fem.functionspace(kit.grid(room, mesh.CellType.quadrilateral), ("Lagrange", 1, (2,)))
 clay = kit.grid([kit.divided(across, 2), kit.divided(up, 2)], mesh.CellType.quadrilateral)
 r, z = clay.geometry.x[:, 0], clay.geometry.x[:, 1]
 inner = np.clip(z / height, hole, 1.0)
 clay.geometry.x[:, 0] = inner + (wide - inner) * (r / wide) ** (1.0 + 0.1 * inner)
 
 particles = mpm.Particles(clay, V, quadrature_degree=args.quadrature_degree or 2)
-tags = mpm.facet_tags(clay, {1: lambda x: x[0] <= np.clip(x[1] / height, hole, 1.0) + 1e-9})
+aside, top = mpm.region(x=wide), mpm.region(y=above)
+inside = {1: lambda x: x[0] <= np.clip(x[1] / height, hole, 1.0) + 1e-9}
+tags = mpm.facet_tags(clay, inside | {2: lambda x: aside(x) | top(x)})
 look = {"facet_tags": tags, "tag": 1, "axisymmetric": True, "modulus": 4.0 * shear}
 outline = [(0.0, 0.0), (1.0, height), (1.0, 60.0), (-1.0, 60.0), (-1.0, height)]
 steel = mpm.contact.polygon(outline, radius=0.3)
@@ -56,10 +63,12 @@ problem = mpm.QuasiStaticProblem(
     mpm.Body(
         particles,
         mpm.materials.Tresca(2.0 * (1.0 + poisson) * shear, poisson, 1.0),
+        pressures=[(before, 2)],
+        facet_tags=tags,
         f_bar=args.f_bar,
         initial_stress=-before * np.eye(3),
     ),
-    bcs=[mpm.held(V, 0, x=wide), mpm.held(V, 1, y=-below), mpm.held(V, 1, y=above)],
+    bcs=[mpm.held(V, 1, y=-below)],
     terms=[cone, rod],
     axisymmetric=True,
 )

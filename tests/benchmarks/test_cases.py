@@ -32,7 +32,7 @@ LONG = {
     ),
     *("finer-footing", "mixed-footing"),
     *("stiff-footing", "hertz", "hertz-penalty", "hertz-tets", "expansion-whole", "pile-deep"),
-    *("pipe-rough", "wedge-fine", "ironing-stiff"),
+    *("taylor-whole", "pipe-rough", "wedge-fine", "ironing-stiff"),
     *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
 }
 COMMON = {"completed", "load", "iterations", "cutbacks", "failure"}
@@ -375,6 +375,16 @@ RUNS = {
         "--mode adjoint --parameters 20 --steps 4",
         {"difference": 1e-6, "trend": 0.02, "cutbacks": 0},
     ),
+    "taylor": (
+        "taylor",
+        "--time 10",
+        {"length": 30.3, "radius": 5.3, "strain": 1.3, "lift": 0.2, "cutbacks": 0},
+    ),
+    "taylor-whole": (
+        "taylor",
+        "--f-bar domain",
+        {"length": 21.7, "radius": 7.24, "strain": 3.6, "lift": 0.3, "cutbacks": 0},
+    ),
     "column": ("column_dynamic", "--time 0.4", {"cutbacks": 0, "balance_error": 1e-12}),
 }
 #: Cases that go through time, whose load is that.
@@ -388,6 +398,7 @@ IN_TIME = {
     "colliding_discs",
     "column_dynamic",
     "seepage",
+    "taylor",
 }
 #: Cases that end before their whole load.
 ENDS = {"snap_through", "expansion", "notch", "incline"}
@@ -415,6 +426,7 @@ KEYS = {
     "colliding_discs": {"energy_change", "rebound", "momentum_error"},
     "vortex": {"displacement_error", "velocity_error"},
     "column_dynamic": {"toe", "top"},
+    "taylor": {"length", "radius", "strain", "lift"},
     "sand_column": {"run_out", "experiment", "ratio", "deposit", "front", "height_at_wall"},
     "strength": {"factor", "exact", "ratio", "plateau", "particles"},
     "consolidation": {"error", "degree", "error_degree", "particles"},
@@ -484,7 +496,7 @@ def test_numbers(case, capfd):
         assert abs(numbers["width"] / (3.4389 * 0.25) - 1.0) < 0.04  # that of the closed form
         assert 0.9 < numbers["peak"] < 1.0
     if name == "cone":
-        assert numbers["factor"] > 6.0 and numbers["rise"] is None  # on so short a way
+        assert numbers["factor"] > 5.8 and numbers["rise"] is None  # on so short a way
     if name == "incline":
         assert numbers["stick_angle"] > numbers["exact"] - 0.008 and numbers["ratio"] > 0.499
     if name == "ironing":
