@@ -76,7 +76,7 @@ class Membrane(Structure):
         Of a surface the larger and the smaller; of a line that along it, and that around the axis
         or out of the plane. Means over the cell's points.
         """
-        return np.asarray(self.state.forces.mean(axis=1))
+        return self._rule.means(self.state.forces)
 
     @override
     def fields(self) -> dict[str, NDArray[np.float64]]:

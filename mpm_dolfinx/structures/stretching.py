@@ -45,6 +45,11 @@ class Rule(NamedTuple):
     around: Array | None
     components: int
 
+    def means(self, values: Array) -> Array:
+        """Return means over each cell, shape ``(m, c)``, of values at points ``(m, q, c)``."""
+        shares = self.weights / self.weights.sum(axis=1)[:, None]
+        return np.asarray(np.einsum("mq,mqc->mc", shares, values))
+
 
 class Nodal(NamedTuple):
     """What a structure does at its nodes.

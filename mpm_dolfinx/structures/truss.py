@@ -104,7 +104,7 @@ class Truss(Structure):
     @property
     def force(self) -> NDArray[np.float64]:
         """Axial force of each cell at the last converged step, tension positive, ``(m,)``."""
-        return np.asarray(self.state.forces[:, :, 0].mean(axis=1))
+        return self._rule.means(self.state.forces)[:, 0]
 
     @override
     def fields(self) -> dict[str, NDArray[np.float64]]:

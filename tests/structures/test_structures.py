@@ -273,6 +273,44 @@ def test_a_bar_yields_goes_slack_and_keeps_its_prestress():
     assert np.allclose(forces["jack"], 0.3)
 
 
+def test_a_sheet_without_compression_is_taut_along_one_axis_or_slack():
+    cloth, plate = Sheet(10.0, 0.3, False), Sheet(10.0, 0.3, True)
+    none = np.zeros(1)
+
+    def forces(sheet, *stretches):
+        return sheet.respond(np.array([stretches]), none).forces[0]
+
+    assert np.allclose(forces(cloth, 1.1, 1.05), forces(plate, 1.1, 1.05))
+    assert np.allclose(forces(cloth, 1.1, 0.98), forces(plate, 1.1, 0.98))  # it would be narrower
+    assert np.allclose(forces(cloth, 1.1, 0.9), [1.0, 0.0])
+    assert np.allclose(forces(cloth, 0.2, 1.1), [0.0, 1.0])
+    assert np.allclose(forces(cloth, 0.9, 0.95), 0.0)
+
+
+def test_a_nail_slips_alike_however_its_cells_are_drawn():
+    points = np.concatenate([line((0, 0.5), (3, 0.5), 6), [(-1.0, 0.5)]])
+    forces = []
+    for turned in (6, 2):  # every so many cells
+        body = mpm.Particles(box([0, 0], [3, 1], [6, 2], QUADRILATERAL))
+        cells = [[i + 1, i] if i % turned == 1 else [i, i + 1] for i in range(6)]
+        nail = mpm.Truss(
+            body,
+            mesh_of(points, [*cells, [7, 0]]),
+            100.0,
+            bond=mpm.Bond(50.0, 0.4, where=mpm.region(x=(0, 3))),
+            held=mpm.region(x=-1.0),
+        )
+        problem = mpm.QuasiStaticProblem(
+            mpm.Body(body, Hencky(1e3, 0.3)), bcs=[mpm.held(body.W, x=3.0)], terms=[nail]
+        )
+        problem.solve(3, update=lambda t, nail=nail: nail.move((-0.02 * t, 0.0)))
+        middle = nail.nodes[nail.cells][:, :, 0].mean(axis=1)
+        forces.append(nail.force[np.argsort(middle)])
+    assert np.abs(nail.state.bond).max() == pytest.approx(0.4)
+    assert np.allclose(forces[0], forces[1], rtol=1e-8)
+    assert forces[0][0] == pytest.approx(forces[0].max()) and forces[0][-1] < forces[0][1]
+
+
 TRI, QUAD, LINE = basix.CellType.triangle, basix.CellType.quadrilateral, basix.CellType.interval
 CORNERS = np.array([[1.0, 1.0, 0.0], [2.0, 1.0, 0.1], [1.1, 2.0, 0.0], [2.1, 2.2, 0.3]])
 
