@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The table of docs/supports.md: a penalty and Nitsche's method on the body's own boundary."""
+"""A penalty beside Nitsche's method on the body's own boundary: docs/supports-measured.md."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def tables() -> dict[str, Table]:
     }
     return {
         "supports/penalty": Table(
-            "supports",
+            "supports-measured",
             ["", *(f"{h:g}" for h in CELLS)],
             {label: partial(way, *values) for label, values in rows.items()},
             quick=["penalty, $\\gamma = 10^3$"],
