@@ -8,7 +8,9 @@ down on it.
 
 from __future__ import annotations
 
+import difflib
 import inspect
+import re
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -36,6 +38,8 @@ NUMBERS: dict[Any, tuple[type, ...]] = {
     int: (int, np.integer),
     float: (int, float, np.integer, np.floating),
 }
+#: Parameters that stand for several arguments.
+SEVERAL = inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL
 #: What truths are called in a message.
 TRUTHS: dict[Any, str] = {bool: "True or False", bool | None: "True, False or None"}
 
@@ -51,13 +55,16 @@ def explained(function: Callable[..., Any], args: Any, given: Any) -> Iterator[N
 
     Raises:
         MPMError: One of them is not what the annotation says, and the block fails for it.
+        TypeError: One has a name that the call does not know.
     """
     try:
         yield
     except CONFUSED as error:
-        if (told := _misfit(function, args, given)) is None:
-            raise
-        raise MPMError(told) from error
+        if (told := _misfit(function, args, given)) is not None:
+            raise MPMError(told) from error
+        if (told := _unknown(error, function, args, given)) is not None:
+            raise TypeError(told) from None
+        raise
 
 
 def require_truths(function: Callable[..., Any], args: Any, given: Any) -> None:
@@ -102,6 +109,31 @@ def _misfit(
     return None
 
 
+def _unknown(error: Exception, function: Callable[..., Any], args: Any, given: Any) -> str | None:
+    """Return Python's sentence about an argument by a name that a call does not know.
+
+    It has the user's class, where Python's has the base that came to it at last, and what is known.
+    """
+    found = re.search(r"got an unexpected keyword argument '(\w+)'", str(error))
+    if not isinstance(error, TypeError) or found is None or found[1] not in given:
+        return None
+    called, takers = function.__qualname__, [function]
+    if "." in called:
+        kind = type(args[0])
+        called = f"{kind.__name__}.{function.__name__}".removesuffix(".__init__")
+        if function.__name__ == "__init__":
+            takers = [vars(k)["__init__"] for k in kind.__mro__ if "__init__" in vars(k)]
+    names: dict[str, None] = {}
+    for taker in takers:
+        parameters = inspect.signature(taker).parameters.values()
+        names |= {p.name: None for p in parameters if p.kind not in SEVERAL and p.name != "self"}
+        if all(p.kind is not inspect.Parameter.VAR_KEYWORD for p in parameters):
+            break
+    near = difflib.get_close_matches(found[1], names, 1)
+    hint = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(names)}."
+    return f"{called}() got an unexpected keyword argument {found[1]!r}; {hint}"
+
+
 @cache
 def _kinds_of(function: Callable[..., Any]) -> dict[str, Any]:
     """Return the annotations of a function's arguments by their names, as far as they are known."""
@@ -109,9 +141,8 @@ def _kinds_of(function: Callable[..., Any]) -> dict[str, Any]:
         kinds = get_type_hints(function)
     except (TypeError, NameError):
         return {}
-    several = inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL
     parameters = inspect.signature(function).parameters.values()
-    return {p.name: kinds[p.name] for p in parameters if p.name in kinds and p.kind not in several}
+    return {p.name: kinds[p.name] for p in parameters if p.name in kinds and p.kind not in SEVERAL}
 
 
 def _fits(value: Any, kind: Any) -> bool:

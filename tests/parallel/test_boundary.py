@@ -405,3 +405,21 @@ def test_stiffnesses_and_permeabilities_that_differ():
 
     fails(tie, "^stiffness differs between the ranks: 1000.0 on rank 0, 100000.0")
     fails(water, "permeability differs between the ranks")
+
+
+@pytest.mark.parametrize(
+    "call, sentence",
+    [
+        (
+            lambda body: mpm.DynamicProblem(body, dt=0.1),
+            r"^DynamicProblem\(\).*; it has b",
+        ),
+        (lambda body: mpm.DynamicProblem(body, support=[]), "did you mean 'supports'"),
+        (lambda body: mpm.QuasiStaticProblem(body).solve(step=3), "Problem.solve.*mean 'steps'"),
+    ],
+)
+def test_an_argument_by_a_wrong_name_is_told_of_the_class_that_is_called(call, sentence):
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL), 1)
+    particles = mpm.Particles(scenes.box([0.0, 0.0], [1.0, 1.0], [4, 4], QUADRILATERAL), V)
+    body = mpm.Body(particles, mpm.materials.Hencky(1e3, 0.3), density=1.0)
+    fails(lambda: call(body), sentence, TypeError)
