@@ -90,7 +90,8 @@ FEATURES = {
     "stabilised pressure": {"mixed": "stabilised pressure"},
     "RigidBody": {"contact": "rigid body"},
     "finite elements": {"method": "fem"},
-    "free nodes": {"method": "cpdi2", "free": True},
+    "free nodes": {"method": "cpdi2", "free": "some"},
+    "adaptivity": {"method": "cpdi2", "free": "found"},
     "length": {"law": softening(), "length": 0.6},
     "Fracture": {"law": Fracture(Hencky(YOUNG, POISSON), 10.0, 1.2, model="AT2")},
     "Truss": {"truss": True},
@@ -213,7 +214,7 @@ class Scene:
             degree=self.degree,
             quadrature_degree=self.wanted.get("quadrature") if self.degree == 1 else None,
             outside="delete" if "delete" in self.wanted else "error",
-            free=free if "free" in self.wanted else None,
+            free={"some": free, "found": []}.get(self.wanted.get("free")),
         )
 
     def base(self, V, bottom, value):
@@ -377,7 +378,9 @@ class Scene:
         count, options = 2, {}
         if "automatic" in self.wanted:
             count, options = "auto", {"tolerance": 0.5, "output_at": [0.5]}
-        if stage == "path" or (stage is None and "automatic" in self.wanted):
+        if self.wanted.get("free") == "found":
+            options["adapt"] = 0.02
+        if stage == "path" or (stage is None and (count == "auto" or options)):
             return self.problem.steps(count, update=path, **options)
         if stage == "control":
             point, direction = corner(body), [*[0.0] * (self.dim - 1), 1.0]
@@ -457,7 +460,7 @@ def run(wanted, directory):
     if "checkpoint" not in wanted:
         finish(scene, steps)
         return
-    if "stage" in wanted or "automatic" in wanted:
+    if "stage" in wanted or "automatic" in wanted or wanted.get("free") == "found":
         next(steps)
     scene.problem.save(directory / "state")
     finish(scene, steps)
@@ -481,7 +484,7 @@ def finish(scene, steps):
 
 
 #: What is the same in motion, has no sense there, or is refused for the same reason as at rest.
-STILL = ("path", "control", "automatic steps")
+STILL = ("path", "control", "automatic steps", "adaptivity")
 SCHEMES = ("midpoint", "conserving", "euler")
 #: Of motions: by a scheme, or in equilibrium below a body that moves.
 KINDS = (*SCHEMES, "quasi_static")
@@ -551,6 +554,7 @@ def test_nothing_is_refused_that_excludes_itself():
 
 @pytest.mark.parametrize("sixth", SIXTHS)
 @pytest.mark.parametrize("feature", FEATURES)
+@pytest.mark.filterwarnings("ignore:adapt=0.02 is not met")
 @pytest.mark.filterwarnings("ignore:The run is complete, but the domains")
 def test_a_feature_with_those_before_it(feature, sixth, mpi_tmp_path, monkeypatch):
     monkeypatch.setattr(linear, "COARSEST", 12)

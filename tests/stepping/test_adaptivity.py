@@ -159,6 +159,35 @@ def test_plastic_steps():
     assert errors[-1] <= 0.15 and unknowns < 0.5 * problem.history.statistics["free_dofs"]
 
 
+@pytest.mark.slow
+def test_bearing_capacity_of_a_strip_on_an_even_background():
+    """Cells of a quarter of the half width b; the body's halved once at the edge, on no line."""
+    half, h, lengths = 0.5, 0.125, (3.0, 2.0)
+    lines = [
+        mpm.grid_lines(0.0, length, 0.5 * h, finer_at=edge, halvings=1)
+        for length, edge in zip(lengths, (half, lengths[1]), strict=True)
+    ]
+    found = []
+    for adapt in (None, 0.13):
+        counts = [round(lengths[0] / h), round(lengths[1] / h) + 2]
+        V = vectors(box([0.0, 0.0], [lengths[0], lengths[1] + 2.0 * h], counts, QUADRILATERAL))
+        own = mpm.Particles(mpm.grid(WORLD, lines), V, quadrature_degree=2, free=[])
+        tags = mpm.facet_tags(own.mesh, {1: mpm.region(x=(0.0, half), y=lengths[1])})
+        under = mpm.boundary.roller(own, tags, 1, normal=(0.0, -1.0), value=0.004)
+        problem = mpm.QuasiStaticProblem(
+            mpm.Body(own, Tresca(1e4, 0.49, cohesion=1.0), f_bar="patch"),
+            bcs=[mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=lengths[0]), mpm.held(V, y=0.0)],
+            supports=[under],
+        )
+        pressure = 0.0
+        for _ in problem.steps(30, adapt=adapt):
+            before, pressure = pressure, -problem.reaction(under)[1] / half
+        assert pressure < 1.005 * before
+        found.append((pressure / (2.0 + np.pi), problem.history.statistics["free_dofs"]))
+    assert found[0][0] > 1.2 and abs(found[1][0] - 1.0) < 0.015
+    assert found[1][1] < 1.1 * found[0][1]
+
+
 def test_steps_chosen_by_their_error_and_levels():
     problem, under = strip([])
     problem.solve("auto", tolerance=0.05, output_at=[0.5], adapt=0.15)
