@@ -2,10 +2,14 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Ground that is loaded without drainage: strength by effective stress, and its pore pressure."""
 
+from mpi4py import MPI
+
 import numpy as np
 import pytest
 from compare import raises
 from scenes import QUADRILATERAL, box, largest, vectors
+
+from dolfinx import fem
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import materials
@@ -89,6 +93,47 @@ def test_strength_is_that_of_the_effective_stress_before():
     assert np.allclose(total, stress - fields["pore_pressure"][:, None, None] * np.eye(3))
     assert mean(soil, total[:, 0, 0]) == pytest.approx(-p0, rel=6e-3)
     assert problem.points[0].last.yield_function().max() > -1e-6 * strength
+
+
+@pytest.mark.parametrize(("poisson", "above"), [(0.495, 0.032), (0.4995, 0.007)])
+def test_a_strip_bears_prandtl_s_load_of_that_strength(poisson, above):
+    """In the recommended way to limit loads; water that gives way lets a part of the load in.
+
+    The mean effective stress rises by ``(K + G / 3) / K_w`` of the total one, and strength with it.
+    """
+    half, depth, width, c, p0 = 1.0, 3.0, 5.0, 3.0, 20.0
+    phi = np.radians(25.0)
+    strength = c * np.cos(phi) + p0 * np.sin(phi)
+    across = mpm.grid_lines(0, width, 0.25, equal=(0, 1.75), finer_at=half, halvings=3)
+    up = mpm.grid_lines(0, depth, 0.25, equal=(1.75, depth), finer_at=depth, halvings=3)
+    room = up[-1] + (up[-1] - up[-2]) * np.array([1, 2])
+    V = vectors(mpm.grid(MPI.COMM_WORLD, [across, [*up, *room]]), 2)
+    ground = mpm.grid(MPI.COMM_WORLD, [across, up])
+    soil = mpm.Particles(ground, V, degree=2, quadrature_degree=3)
+    under, beside = (mpm.region(x=x, y=depth) for x in ((0, half), (half, width)))
+    tags = mpm.facet_tags(ground, {1: under, 2: beside})
+    law = MohrCoulomb(1e5 * strength, 0.3, c, 25.0)
+    shear, bulk = law.shear, law.bulk
+    water = 2.0 * shear * (1.0 + poisson) / (3.0 * (1.0 - 2.0 * poisson)) - bulk
+    down = fem.Constant(ground, 0.0)
+    strip = mpm.boundary.roller(soil, tags, 1, normal=(0, -1), value=down)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(
+            soil,
+            Undrained(law, water),
+            tractions=[((0.0, -p0), 2)],
+            facet_tags=tags,
+            initial_stress=-p0 * np.eye(3),
+        ),
+        bcs=[mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=width), mpm.held(V, y=0.0)],
+        supports=[strip],
+        solver=mpm.Solver(stabilisation=None),
+    )
+    problem.solve(1)
+    problem.solve(12, update=lambda t: setattr(down, "value", 4e-4 * t**2))
+    found = (-problem.reaction(strip)[1] / half - p0) / strength
+    assert found / (2.0 + np.pi) - 1.0 == pytest.approx(above, abs=2e-3)
+    assert problem.history.cutbacks == 0
 
 
 def test_water_takes_its_share_of_a_load():
@@ -184,4 +229,6 @@ def test_what_makes_no_sense_is_said():
     law = Hencky(1e3, 0.3)
     raises(lambda: Undrained(Undrained(law, 1.0), 1.0), mpm.MPMError, "law of effective stress")
     raises(lambda: Undrained("clay", 1.0), mpm.MPMError, "law of effective stress")
+    mixed = mpm.Body(block(law).bodies[0], Undrained(law, 1.0))
+    raises(lambda: mpm.QuasiStaticProblem(mixed, mixed="pressure"), mpm.MPMError, "strain space")
     raises(lambda: Undrained(law, 0.0), mpm.MPMError, "water_bulk is 0 but must be")
