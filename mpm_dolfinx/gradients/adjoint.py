@@ -24,6 +24,7 @@ from ..errors import MPMError, agree
 from ..materials.base import Material, State
 from ..parallel.boundary import collective, of_user
 from ..parallel.compilation import compiled_form
+from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..problems.quasistatic import QuasiStaticProblem
 from ..problems.through_time import TimeProblem
@@ -304,7 +305,7 @@ class Adjoint:
 
     # -- Backward -------------------------------------------------------------------------------
 
-    @collective("functional")
+    @collective()
     def of(self, functional: Any) -> list[Array]:
         """Return the derivatives of a functional by all parameters (collective).
 
@@ -489,19 +490,22 @@ class Adjoint:
 
     def _add_functional(self, given: Any, weights: Weights) -> None:
         """Add derivatives of a functional at the end of a step (collective)."""
+        bodies, is_form = self.problem.bodies, isinstance(given, ufl.Form)
+        comm = bodies[0].mesh.comm
+        kind = given if given is None or is_form else "derivatives as arrays"
+        require_same(comm, functional=kind)
         if given is None:
             return
-        if isinstance(given, ufl.Form):
+        if is_form:
             self._add_form(given, weights)
             return
-        bodies = self.problem.bodies
         listed = given if isinstance(given, list | tuple) else [given]
-        if len(listed) != len(bodies) or not all(isinstance(own, Mapping) for own in listed):
-            raise MPMError(
-                "Derivatives of a functional are a dictionary of arrays (a list of them where "
-                "there is a list of bodies) by 'displacement' and names of variables."
-            )
-        with agree(bodies[0].mesh.comm):
+        with agree(comm):
+            if len(listed) != len(bodies) or not all(isinstance(own, Mapping) for own in listed):
+                raise MPMError(
+                    "Derivatives of a functional are a dictionary of arrays (a list of them where "
+                    "there is a list of bodies) by 'displacement' and names of variables."
+                )
             for place, own in enumerate(listed):
                 for name, values in own.items():
                     self._add_array(place, name, values, weights)

@@ -12,6 +12,9 @@ from posed import posed
 from ranks import LAST, differing, fails
 from scenes import QUADRILATERAL
 
+import ufl
+from dolfinx import fem
+
 import mpm_dolfinx as mpm
 from mpm_dolfinx import boundary, contact, io, plot
 from mpm_dolfinx.io import Column, Kept, fill, of_cells
@@ -219,7 +222,7 @@ class Own(Kept):
 
     def __init__(self, problem, where):
         self.problem, self.where = problem, where
-        self.values = mpm.particles.particles.fem.Function(problem.particles.W)
+        self.values = fem.Function(problem.particles.W)
 
     def fail(self, where):
         if LAST and where == self.where:
@@ -375,7 +378,7 @@ def test_options_of_laws_that_differ():
 def test_what_a_function_of_derivatives_returns_on_one_rank(found):
     """Wrong on the last rank: words, or in the second of two states an array of another shape."""
     body = particles()
-    young = mpm.particles.particles.fem.Constant(body.mesh, 1e3)
+    young = fem.Constant(body.mesh, 1e3)
     problem = mpm.QuasiStaticProblem(
         mpm.Body(body, Hencky(young, 0.3), body_force=(0.0, -1.0)),
         bcs=[scenes.fix(body.V, scenes.at(0, 0.0))],
@@ -389,6 +392,33 @@ def test_what_a_function_of_derivatives_returns_on_one_rank(found):
         return found if LAST and len(calls) == 2 else np.ones(1)
 
     fails(lambda: gradient.of(look), "^A function of Sensitivity.of must")
+
+
+@pytest.mark.mpi
+def test_functionals_that_differ():
+    body = particles()
+    young = fem.Constant(body.mesh, 1e3)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(body, Hencky(young, 0.3), body_force=(0.0, -1.0)),
+        bcs=[scenes.fix(body.V, scenes.at(0, 0.0))],
+    )
+    adjoint = mpm.Adjoint(problem, [young])
+    problem.solve(2)
+    misfit = ufl.inner(body.displacement, body.displacement) * ufl.dx
+    zero = np.zeros_like(body.displacement.x.array)
+    for functional in (
+        differing(misfit, 3.0),
+        differing(misfit, 2.0 * misfit),
+        {differing(0, 1): misfit},
+        lambda step: differing(misfit, None),
+        lambda step: differing(misfit, {"displacement": zero}),
+    ):
+        fails(lambda functional=functional: adjoint.of(functional), "functional.* differs between")
+    fails(
+        lambda: adjoint.of(lambda step: {"displacement": differing(zero, zero[1:])}), "of the shape"
+    )
+    fails(lambda: adjoint.of(lambda step: differing({"displacement": zero}, 3.0)), "by 'displace")
+    assert np.isfinite(adjoint.of(misfit)[0]).all()
 
 
 @pytest.mark.mpi
