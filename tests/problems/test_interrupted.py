@@ -17,7 +17,7 @@ from dolfinx import fem
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import contact
-from mpm_dolfinx.materials import Hencky, VonMises
+from mpm_dolfinx.materials import Fracture, Hencky, NeoHooke, VonMises
 
 TIGHT = {"snes_rtol": 1e-12}
 #: What tells of attempts, also of those that fail.
@@ -38,14 +38,14 @@ class Interrupts(mpm.Term):
             raise self.kind("enough")
 
 
-def body(degree=1, low=0.0, V=None):
+def body(degree=1, low=0.0, V=None, **options):
     """Return a unit square that is cut by the cells of its background."""
     if V is None:
         V = scenes.vectors(
             scenes.box([-0.6, low - 0.4], [1.8, low + 1.6], [6, 5], QUADRILATERAL), degree
         )
     mesh = scenes.box([0.0, low], [1.0, low + 1.0], [4, 4], QUADRILATERAL)
-    return mpm.Particles(mesh, V, degree=degree)
+    return mpm.Particles(mesh, V, degree=degree, **options)
 
 
 def held(particles, where=lambda x: x[1] < 0.01, value=None):
@@ -107,6 +107,25 @@ def of_materials(terms, **options):
         **options,
     )
     return problem, loaded
+
+
+def of_law(terms, law, particles=None, load=(4.0, -16.0), **options):
+    p = body(quadrature_degree=2, **(particles or {}))
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(p, law, body_force=load, **options),
+        bcs=[held(p)],
+        terms=terms([p]),
+        solver=mpm.Solver(petsc_options=TIGHT),
+    )
+    return problem, loaded
+
+
+def with_free_nodes(terms):
+    return of_law(terms, NeoHooke(1e2, 0.3), {"free": "auto"}, (12.0, -50.0))
+
+
+def cracking(terms):
+    return of_law(terms, Fracture(Hencky(1e3, 0.3), 0.05, 0.4, model="AT2"), load=(2.0, -6.0))
 
 
 def with_water(terms):
@@ -182,6 +201,11 @@ KINDS = {
     "plastic": of_materials,
     "pressure": lambda terms: of_materials(terms, mixed="pressure"),
     "F-bar": lambda terms: of_materials(terms, f_bar="patch"),
+    "free nodes": with_free_nodes,
+    "fracture": cracking,
+    "water table": lambda terms: of_law(
+        terms, Hencky(1e3, 0.3), pore_pressure=mpm.WaterTable(0.7, 10.0)
+    ),
     "water": with_water,
     "obstacle": on_an_obstacle,
     "motion": in_motion,
