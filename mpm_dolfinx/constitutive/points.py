@@ -551,7 +551,7 @@ def _at_pressure(
 
 
 def _told(law: Material) -> str:
-    """Return what a law is besides its class and its parameters, in words."""
+    """Return the traits of a law besides its class and its parameters, in words."""
     found = options_of(law).items()
     return ", ".join(
         f"{name}={type(one).__name__}({_told(one)})"

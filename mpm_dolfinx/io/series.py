@@ -49,7 +49,7 @@ type Drawing = dict[str, dict[str, NDArray[Any]]]
 
 
 class Drawn(Protocol):
-    """What can be written besides bodies."""
+    """A structure that is written beside bodies."""
 
     @property
     def comm(self) -> MPI.Comm:

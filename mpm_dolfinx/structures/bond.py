@@ -145,7 +145,7 @@ class Grip:
         return np.asarray(mine / np.linalg.norm(mine, axis=1)[:, None])
 
     def skin(self, before: NDArray[np.float64], slip: NDArray[np.float64]) -> Skin:
-        """Return what the bond bears after slips of a step.
+        """Return the forces of the bond per length after slips of a step.
 
         Args:
             before: Its forces per length at the last converged step, shape ``(b,)``.

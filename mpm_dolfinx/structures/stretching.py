@@ -52,7 +52,7 @@ class Rule(NamedTuple):
 
 
 class Nodal(NamedTuple):
-    """What a structure does at its nodes.
+    """Forces of a stretched structure at its nodes, and their derivatives.
 
     Attributes:
         forces: On the nodes of each cell, shape ``(m, k, gdim)``.
@@ -98,7 +98,7 @@ def rule_of(layout: Layout, nodes: Array, count: int, axisymmetric: bool) -> Rul
 
 
 def stretched(rule: Rule, law: Law, nodes: Array, offset: Array, present: Array) -> Nodal:
-    """Return what a structure does that is stretched.
+    """Return the forces of a structure whose nodes are where they are.
 
     Args:
         rule: Its points.
@@ -115,7 +115,7 @@ def stretched(rule: Rule, law: Law, nodes: Array, offset: Array, present: Array)
 
 
 def _line(rule: Rule, law: Law, nodes: Array, a: Array, offset: Array, weights: Array) -> Nodal:
-    """Return what a line does, or the sheet of which it is the section."""
+    """Return the forces of a line, or of the sheet of which it is the section."""
     (m, q, gdim), k = a.shape, rule.cells.shape[1]
     stretches = np.ones((m, q, rule.components))
     stretches[..., 0] = np.maximum(np.linalg.norm(a, axis=2), LEAST)
@@ -139,7 +139,7 @@ def _line(rule: Rule, law: Law, nodes: Array, a: Array, offset: Array, weights: 
 
 
 def _surface(rule: Rule, law: Law, a: Array, offset: Array, weights: Array) -> Nodal:
-    """Return what a surface does."""
+    """Return the forces of a surface."""
     m, q, gdim, _ = a.shape
     squares, axes = np.linalg.eigh(np.einsum("mqgs,mqgt->mqst", a, a))
     stretches = np.maximum(np.sqrt(np.maximum(squares, 0.0)), LEAST)

@@ -172,7 +172,7 @@ class Structure(Term):
         return drawing(self.layout.kind, cells, places, fields)
 
     def fields(self) -> dict[str, Array]:
-        """Return what it tells of each cell at the last converged step, ``(m,)``, by name."""
+        """Return fields of its cells at the last converged step, ``(m,)``, by name."""
         raise NotImplementedError
 
     def move(self, offset: Any) -> None:
