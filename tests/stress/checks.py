@@ -194,8 +194,8 @@ class Domains:
         return table[0], slopes, weights * np.abs(np.linalg.det(J))
 
     def height(self):
-        """Return the largest volume over the area of a facet."""
-        high = 0.0
+        """Return the largest height of a domain over a facet, by its volume."""
+        high, simplex = 0.0, len(basix.geometry(self.cell)) == self.dim + 1
         for facet in basix.topology(self.cell)[-2]:
             x = self.X[self.nodes[:, facet]]
             if self.dim == 2:
@@ -206,7 +206,7 @@ class Domains:
                 )  # fmt: skip
                 area = 0.5 * np.linalg.norm(np.cross(a, b), axis=1)
             high = max(high, float((self.volume / area).max(initial=0.0)))
-        return high
+        return self.dim * high if simplex else high
 
     def _mean(self, nodal):
         shapes, _, weights = self.fine
@@ -870,8 +870,8 @@ class Observer:
     def _check_gaps(self, found, figures):
         """Look at how far apart points in contact may be, by the stiffness that holds them.
 
-        With the penalty -g = p h / (gamma M), M the confined modulus and h the volume of the
-        domain over the area of its facet. By Nitsche's method p = <s - gamma M / h g>, where the
+        With the penalty -g = p h / (gamma M), M the confined modulus and h the height of the
+        domain over its facet. By Nitsche's method p = <s - gamma M / h g>, where the
         pressure s of the stress behind the facet is carried on from the points of the domain.
         """
         data, touch = self.scene["contact"], self.run.touch
