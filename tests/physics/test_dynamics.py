@@ -716,7 +716,8 @@ def test_a_pushed_bar_carries_the_wave(tmp_path, out):
     # The background's left end pushes; the account has its work; a restart goes on bit for bit.
     def pushed():
         V = vectors(box([0.0, 0.0], [1.5, 3 / 16], [24, 3], QUADRILATERAL))
-        body = box([0.0, 1 / 16], [1.0, 2 / 16], [32, 2], QUADRILATERAL)
+        # (off the grid's lines: on one, round-off says which nodes beyond it are touched)
+        body = box([0.0, 1 / 16 + 0.004], [1.0, 2 / 16 + 0.004], [32, 2], QUADRILATERAL)
         end = fem.Function(V)
         left = mesh.locate_entities_boundary(V.mesh, 1, at(0, 0.0))
         bc = fem.dirichletbc(end, fem.locate_dofs_topological(V, 1, left))
@@ -741,7 +742,7 @@ def test_a_pushed_bar_carries_the_wave(tmp_path, out):
     x = problem.particles.W.tabulate_dof_coordinates()[:, 0]
     exact = 0.002 * np.sin(np.pi * np.clip(0.9 - x, 0.0, 1.0)) ** 2
     error = nodal(problem.particles.displacement)[:, 0] - exact
-    assert largest(error) < 0.12 * 0.002
+    assert largest(error) < 0.03 * 0.002
     work = problem.history.energies[-1].prescribed
     assert work > 0.0
     assert change_of_balance_of(problem.history, work) < 1e-11
