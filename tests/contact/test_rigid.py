@@ -439,7 +439,7 @@ def test_moves_and_questions_that_make_no_sense_are_refused():
     with pytest.raises(mpm.MPMError, match="is about 2 coordinates"):
         die.moment((0.0, 0.0, 0.0))
     other = contact.Rigid(problem.particles, contact.disc((0.7, 5.0), 0.6))
-    with pytest.raises(mpm.MPMError, match="one of the contacts of this problem"):
+    with pytest.raises(mpm.MPMError, match="one of the terms of this problem"):
         problem.reaction(other)
     with pytest.raises(mpm.MPMError, match="belongs to no problem yet"):
         _ = other.gap
