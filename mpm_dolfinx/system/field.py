@@ -300,7 +300,7 @@ class Field:
         firsts = np.where(numbers >= 0, numbers, numbers.max(axis=1, keepdims=True)).min(axis=1)
         known = self.touched.at_nodes(firsts.astype(np.int64) * step + counts, self._ghosts.tied)
         pairs = np.broadcast_arrays(known[:, :, None], known[:, None, :])
-        span = step * self._sizes[1]
+        span = step * max(self._sizes[1], 1)
         rows, columns = np.divmod(np.unique(pairs[0] * span + pairs[1]), span)
         blocks = np.column_stack([*np.divmod(rows, step), *np.divmod(columns, step)])
         return blocks[(blocks[:, 1] > 0) & (blocks[:, 3] > 0)].astype(np.int32)
