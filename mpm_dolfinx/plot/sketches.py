@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 import basix
 
 from .. import _compat
-from ..errors import agree
+from ..errors import MPMError, agree
 from ..parallel.boundary import collective
 from ..particles.particles import Particles
 from .fields import bodies_of
@@ -107,6 +107,8 @@ def sketch(problem: Any, path: str | Path | None = None, *, ax: Any = None, box:
     comm: MPI.Comm = bodies[0].mesh.comm
     gdim = bodies[0].mesh.geometry.dim
     with agree(comm):
+        if not hasattr(problem, "bcs"):
+            raise MPMError("A sketch is of a problem; draw particles by mpm.plot.scene.")
         shown = corners(box, gdim)
     figures = imported("matplotlib.figure", comm)
     setup = getattr(problem, "setup", None)
@@ -187,7 +189,7 @@ def _conditions(problem: Any, bodies: Sequence[Particles]) -> list[_Marks]:
         own = body.W.dofmap.index_map.size_local
         if not body.is_free:
             still = np.zeros(())
-            spaces.setdefault(id(body.V), (body.V, still, []))[2].append(body.active_nodes)
+            spaces.setdefault(id(body.V), (body.V, still, []))[2].append(_carrying(body))
         if body.is_free or body.free_nodes is not None:
             moves = body.displacement.x.array.reshape(-1, gdim)[:own]
             spaces[id(body.W)] = (body.W, moves, [np.flatnonzero(body.free[:own])])
@@ -211,6 +213,19 @@ def _conditions(problem: Any, bodies: Sequence[Particles]) -> list[_Marks]:
             what = u if kind == "moved" else held.astype(float)
             found.append(_Marks(kind, x[which, None], what[which]))
     return found
+
+
+def _carrying(body: Particles) -> NDArray[np.int64]:
+    """Return this rank's nodes of V that carry a body, or lie around free nodes (collective)."""
+    active = np.asarray(body.active_nodes, dtype=np.int64)
+    if body.free_nodes is None:
+        return active
+    beneath = body.free_nodes.beneath
+    first, last = body.V.dofmap.index_map.local_range
+    around = np.unique(beneath.nodes[beneath.values != 0.0])
+    every = np.unique(np.concatenate(body.mesh.comm.allgather(around))).astype(np.int64)
+    mine = every[(every >= first) & (every < last)] - first
+    return np.union1d(active, mine)
 
 
 def _on_facets(setup: Any) -> list[_Marks]:
@@ -241,6 +256,8 @@ def _of_facets(kind: str, body: Particles, facets: NDArray[np.int32], value: Any
     )
     layout = body.W.dofmap.dof_layout
     cells = np.array([around.links(f)[0] for f in own], dtype=np.int64)
+    there = ~np.append(body.deleted, np.zeros(1, dtype=bool))[np.minimum(cells, body.num_local)]
+    own, cells = own[there], cells[there]
     places = [int(np.flatnonzero(within.links(c) == f)[0]) for c, f in zip(cells, own, strict=True)]
     count = len(basix.topology(domain.basix_cell())[dim][0])
     ends = [layout.entity_closure_dofs(dim, place)[:count] for place in places]

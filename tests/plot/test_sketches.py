@@ -135,6 +135,32 @@ def test_two_bodies_on_one_background_are_held_once():
         assert sorted(x for _, x, _ in kinds(figure, "#a8a8a8")) == [1.5, 3.5, 4.0]
 
 
+def test_free_nodes_are_held_with_the_background_and_removed_facets_bear_no_load():
+    collections = pytest.importorskip("matplotlib.collections")
+    V = vectors(box([0.0, 0.0], [4.0, 3.0], [8, 6], QUADRILATERAL), 1)
+    body = box([0.0, 0.0], [2.0, 2.0], [8, 8], QUADRILATERAL)
+    particles = mpm.Particles(body, V, free=mpm.region(x=(0, 1)), quadrature_degree=2)
+    tags = mpm.facet_tags(body, {1: mpm.region(y=2.0)})
+    given = mpm.Body(
+        particles,
+        mpm.materials.Hencky(1e6, 0.3),
+        density=1.0,
+        tractions=[((0.0, -1.0), 1)],
+        facet_tags=tags,
+    )
+    problem = mpm.QuasiStaticProblem(given, [mpm.held(V, 0, x=0.0), mpm.held(V, y=0.0)])
+    problem.solve(1)
+    problem.remove(lambda x: (x[0] > 1.0) & (x[1] > 1.0))
+    figure = mpm.plot.sketch(problem)
+    if WORLD.rank == 0:
+        held = kinds(figure, "#222222")
+        assert sorted(y for _, x, y in held if x == 0.0) == [0.0, 0.5, 1.0, 1.5, 2.0]
+        (line,) = (
+            c for c in figure.axes[0].collections if isinstance(c, collections.LineCollection)
+        )
+        assert len(line.get_segments()) == 4
+
+
 def test_in_space_conditions_are_points():
     pytest.importorskip("pyvista")
     V = vectors(box([0.0] * 3, [2.0] * 3, [4] * 3, HEXAHEDRON), 1)
@@ -155,4 +181,5 @@ def test_in_space_conditions_are_points():
 def test_what_is_no_problem_is_told():
     problem = ground()
     fails(lambda: mpm.plot.sketch("problem"), "Pictures are of a problem")
+    fails(lambda: mpm.plot.sketch(problem.particles), "A sketch is of a problem")
     fails(lambda: mpm.plot.sketch(problem, box=[[0.0, 0.0]]), "box must be")
