@@ -220,11 +220,21 @@ def ends_of(limits: Any) -> tuple[float | None, float | None] | None:
     return given[0], given[1]
 
 
-def framed(extent: NDArray[np.float64], around: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """Return a box with some room around the bodies, and in space around a background near them."""
-    if around is not None and extent.shape[1] == 3:
-        if np.ptp(around, axis=0).max() <= 2.0 * np.ptp(extent, axis=0).max():
-            extent = np.array([np.minimum(extent[0], around[0]), np.maximum(extent[1], around[1])])
+def framed(
+    extent: NDArray[np.float64], around: NDArray[np.float64] | None, most: float | None = None
+) -> NDArray[np.float64]:
+    """Return a box with some room around the bodies, and around a background near them.
+
+    Args:
+        extent: Box around the bodies.
+        around: That around the background, if it is drawn.
+        most: Its size over theirs up to which it is in the picture; by default 2 in space, and in
+            the plane it is not.
+    """
+    if most is None:
+        most = 2.0 if extent.shape[1] == 3 else 0.0
+    if around is not None and np.ptp(around, axis=0).max() <= most * np.ptp(extent, axis=0).max():
+        extent = np.array([np.minimum(extent[0], around[0]), np.maximum(extent[1], around[1])])
     room = MARGIN * float((extent[1] - extent[0]).max())
     return np.array([extent[0] - room, extent[1] + room])
 

@@ -127,7 +127,7 @@ def sketch(problem: Any, path: str | Path | None = None, *, ax: Any = None, box:
         cmap = import_module("matplotlib.colors").ListedColormap(colours)
         limits = (-0.5, len(colours) - 0.5)
         if shown is None and gdim == 2:
-            shown = _frame(shot)
+            shown = framed(shot.extent, shot.around, WHOLE)
         look = Look("", cmap, limits, box=shown, lines=sum(map(len, shot.values or ())) < LINED)
         if gdim == 3:
             shot = _with_points(shot, marks, len(names))
@@ -148,14 +148,6 @@ def sketch(problem: Any, path: str | Path | None = None, *, ax: Any = None, box:
         if path is not None:
             figure.savefig(path, dpi=160, bbox_inches="tight")
         return figure
-
-
-def _frame(shot: Shot) -> Array:
-    """Return the box of a picture in the plane: of the background, if that is not far larger."""
-    extent, around = shot.extent, shot.around
-    if around is not None and np.ptp(around, axis=0).max() <= WHOLE * np.ptp(extent, axis=0).max():
-        extent = np.array([np.minimum(extent[0], around[0]), np.maximum(extent[1], around[1])])
-    return framed(extent, None)
 
 
 def _materials(bodies: Sequence[Particles], given: Sequence[Any]) -> tuple[list[Array], list[str]]:

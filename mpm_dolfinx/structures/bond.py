@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,12 +14,12 @@ from numpy.typing import NDArray
 
 import basix
 
-from ..errors import MPMError, as_ours
+from ..errors import MPMError
 from ..parallel.given import as_positive
 from ..system.own import OwnUnknowns
-from .layout import Layout
+from .layout import Layout, chosen
 
-__all__ = ["Bond", "Grip", "Skin", "chosen"]
+__all__ = ["Bond", "Grip", "Skin"]
 
 #: Stiffness of a bond that gives way, over its own: no change of force, but a tangent that can be
 #: solved where a whole bar slips.
@@ -58,30 +57,6 @@ class Bond:
             as_positive(self.limit, "limit of a Bond")
 
 
-def chosen(where: Callable[..., Any], nodes: NDArray[np.float64], what: str) -> NDArray[np.bool_]:
-    """Return at which nodes a function of the user holds.
-
-    Args:
-        where: The function.
-        nodes: Shape ``(N, gdim)``.
-        what: What it is called.
-
-    Raises:
-        MPMError: It is none, or returns something else.
-    """
-    if not callable(where):
-        raise MPMError(f"{what} is a function of coordinates such as mpm.region(...).")
-    x = np.zeros((3, len(nodes)))
-    x[: nodes.shape[1]] = nodes.T
-    try:
-        found = np.asarray(where(x))
-    except Exception as error:
-        raise as_ours(error, f"The function {what}") from error
-    if found.shape != (len(nodes),) or found.dtype != np.bool_:
-        raise MPMError(f"The function {what} must return one bool for each point, shape (n,).")
-    return found
-
-
 class Skin(NamedTuple):
     """Forces of a bond in a step.
 
@@ -115,7 +90,7 @@ class Grip:
     def __init__(self, bond: Bond, layout: Layout, axisymmetric: bool, comm: MPI.Comm) -> None:
         here = np.ones(len(layout.nodes), dtype=bool)
         if bond.where is not None:
-            here = chosen(bond.where, layout.nodes, "where= of a Bond")
+            here = chosen(bond.where, layout, "where= of a Bond")
         cells = layout.cells[here[layout.cells].all(axis=1)]
         if len(cells) == 0:
             raise MPMError("where= of a Bond holds at all nodes of no cell of the bar.")

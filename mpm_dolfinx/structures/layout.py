@@ -16,9 +16,10 @@ from dolfinx import mesh
 
 from .. import _compat
 from ..errors import MPMError, agree
+from ..meshes.regions import marked
 from ..reals import as_reals
 
-__all__ = ["Layout", "layout_of"]
+__all__ = ["Layout", "chosen", "layout_of"]
 
 #: Kinds of cells by the dimension of a structure.
 KINDS = {
@@ -70,6 +71,24 @@ class Layout(NamedTuple):
     def is_same(self, other: Layout) -> bool:
         """Return whether another structure is drawn in the same way."""
         return np.array_equal(self.nodes, other.nodes) and np.array_equal(self.cells, other.cells)
+
+
+def chosen(where: Any, layout: Layout, what: str) -> NDArray[np.bool_]:
+    """Return at which nodes a function of the user holds, shape ``(N,)``.
+
+    Args:
+        where: The function.
+        layout: The structure.
+        what: What it is called.
+
+    Raises:
+        MPMError: It is none, or returns something else.
+    """
+    if not callable(where):
+        raise MPMError(f"{what} is a function of coordinates such as mpm.region(...).")
+    x = np.zeros((3, len(layout.nodes)))
+    x[: layout.nodes.shape[1]] = layout.nodes.T
+    return marked(where, x, f"The function {what}")
 
 
 def layout_of(given: Any, comm: MPI.Comm, gdim: int, what: str, surfaces: bool) -> Layout:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, override
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,8 @@ class Membrane(Structure):
         MPMError: Nodes that lie in no body, curved cells, or numbers that make no sense.
     """
 
+    results = ("membrane_force", "membrane_force_across")
+
     @collective()
     def __init__(
         self,
@@ -65,7 +67,7 @@ class Membrane(Structure):
         if not is_number(poisson) or not -1.0 < poisson < 1.0:
             raise MPMError(f"poisson of a Membrane must be between -1 and 1, not {poisson!r}.")
         law = Sheet(float(stiffness), float(poisson), compression)
-        super().__init__(bodies, shape, law, 2, degree, True, held, axisymmetric)
+        super().__init__(bodies, shape, law, degree, True, held, axisymmetric)
         if self.layout.dim < self.nodes.shape[1] - 1:
             raise MPMError("A Membrane in space is a surface; a line there is a Truss.")
 
@@ -77,8 +79,3 @@ class Membrane(Structure):
         or out of the plane. Means over the cell's points.
         """
         return self._rule.means(self.state.forces)
-
-    @override
-    def fields(self) -> dict[str, NDArray[np.float64]]:
-        first, second = self.force.T
-        return {"membrane_force": first, "membrane_force_across": second}

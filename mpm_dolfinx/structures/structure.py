@@ -11,7 +11,7 @@ the forces of stretches on the nodes, K their tangent and w those of the bond, t
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Self, override
+from typing import Any, ClassVar, NamedTuple, Self, override
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -26,10 +26,10 @@ from ..parallel.given import require_same, require_whole
 from ..particles.particles import Particles
 from ..system.own import OwnUnknowns
 from ..system.term import PointMaterial, Term
-from .bond import Bond, Grip, Skin, chosen
+from .bond import Bond, Grip, Skin
 from .hosts import Hosts, find_hosts
 from .laws import Law
-from .layout import Layout, layout_of
+from .layout import Layout, chosen, layout_of
 from .matrices import Matrices
 from .stretching import Nodal, Rule, rule_of, stretched
 
@@ -93,7 +93,6 @@ class Structure(Term):
         bodies: The body that it lies in, or several.
         shape: A mesh of lower dimension, or the points of a polyline.
         law: Forces by stretches.
-        count: Number of principal forces at a point.
         degree: Of shape functions in its cells; ``None``: that of the bodies.
         surfaces: Whether it may be a surface.
         held: A function of undeformed coordinates: which of its nodes are held in space.
@@ -101,6 +100,7 @@ class Structure(Term):
         bond: What holds it along its length; ``None``: its nodes do not slip.
 
     Attributes:
+        results: What the principal forces at a point are called.
         layout: All its nodes, also within cells, and its cells.
         nodes: Its nodes as they are drawn, in the undeformed bodies, shape ``(N, gdim)``.
         cells: Nodes at the corners of its cells, shape ``(m, k)``.
@@ -110,6 +110,7 @@ class Structure(Term):
         label: What it is called in checkpoints and files: its name, or its number among terms.
     """
 
+    results: ClassVar[tuple[str, ...]]
     evaluation = "The structure"
     symmetric = True
 
@@ -118,7 +119,6 @@ class Structure(Term):
         bodies: Particles | Sequence[Particles],
         shape: Any,
         law: Law,
-        count: int,
         degree: int | None,
         surfaces: bool,
         held: Callable[..., Any] | None,
@@ -128,7 +128,7 @@ class Structure(Term):
         super().__init__(_as_bodies(bodies, type(self).__name__))
         self.comm: MPI.Comm = self.bodies[0].mesh.comm
         gdim, what = self.bodies[0].mesh.geometry.dim, type(self).__name__
-        self.axisymmetric, self.law, self._count, self.label = axisymmetric, law, count, ""
+        self.axisymmetric, self.law, self.label = axisymmetric, law, ""
         drawn = layout_of(shape, self.comm, gdim, what, surfaces)
         self.nodes: Array = drawn.nodes
         self.cells: NDArray[np.int64] = drawn.cells
@@ -173,7 +173,7 @@ class Structure(Term):
 
     def fields(self) -> dict[str, Array]:
         """Return fields of its cells at the last converged step, ``(m,)``, by name."""
-        raise NotImplementedError
+        return dict(zip(self.results, self._rule.means(self.state.forces).T, strict=True))
 
     def move(self, offset: Any) -> None:
         """Say where the nodes that are held are to be at the end of the next step.
@@ -207,14 +207,14 @@ class Structure(Term):
             np.zeros(rule.weights.shape),
             np.zeros_like(self.layout.nodes),
             np.zeros(0 if self._grip is None else len(self._grip.nodes)),
-            np.zeros((*rule.weights.shape, self._count)),
+            np.zeros((*rule.weights.shape, len(self.results))),
             np.zeros(self.layout.nodes.shape[1]),
         )
 
     def _ruled(self, reference: Array) -> Rule:
         """Return its points where it is displaced to have no stretch."""
         places = self.layout.nodes + reference
-        return rule_of(self.layout, places, self._count, bool(self.axisymmetric))
+        return rule_of(self.layout, places, len(self.results), bool(self.axisymmetric))
 
     def take(self, state: State) -> None:
         """Take a state for that of the last converged step."""
@@ -381,7 +381,7 @@ def _held(layout: Layout, held: Callable[..., Any] | None, what: str) -> NDArray
     """Return which nodes are held."""
     if held is None:
         return np.zeros(len(layout.nodes), dtype=bool)
-    alone = chosen(held, layout.nodes, "held=")
+    alone = chosen(held, layout, "held=")
     if not alone.any():
         raise MPMError(f"held= holds at no node of the {what}.")
     return alone

@@ -54,6 +54,7 @@ class Truss(Structure):
     """
 
     law: Bar
+    results = ("axial_force",)
 
     @collective()
     def __init__(
@@ -79,7 +80,7 @@ class Truss(Structure):
             raise MPMError(f"bond of a Truss is an mpm.Bond, not a {type(bond).__name__}.")
         self._prestress = None if prestress is None else float(prestress)
         law = Bar(float(stiffness), limit, compression)
-        super().__init__(bodies, shape, law, 1, degree, False, held, axisymmetric, bond)
+        super().__init__(bodies, shape, law, degree, False, held, axisymmetric, bond)
 
     @override
     def _drawn(self) -> State:
@@ -105,7 +106,3 @@ class Truss(Structure):
     def force(self) -> NDArray[np.float64]:
         """Axial force of each cell at the last converged step, tension positive, ``(m,)``."""
         return self._rule.means(self.state.forces)[:, 0]
-
-    @override
-    def fields(self) -> dict[str, NDArray[np.float64]]:
-        return {"axial_force": self.force}
