@@ -374,15 +374,21 @@ def test_options_of_laws_that_differ():
     fails(lambda: made(law=differing(law(), other)), "^law of Fracture differs .*Hencky")
 
 
-@pytest.mark.parametrize("found", [np.ones(2), "nothing"], ids=["shape", "kind"])
-def test_what_a_function_of_derivatives_returns_on_one_rank(found):
-    """Wrong on the last rank: words, or in the second of two states an array of another shape."""
+def hanging():
+    """A body under its weight, Young's modulus of it, and the problem."""
     body = particles()
     young = fem.Constant(body.mesh, 1e3)
     problem = mpm.QuasiStaticProblem(
         mpm.Body(body, Hencky(young, 0.3), body_force=(0.0, -1.0)),
         bcs=[scenes.fix(body.V, scenes.at(0, 0.0))],
     )
+    return body, young, problem
+
+
+@pytest.mark.parametrize("found", [np.ones(2), "nothing"], ids=["shape", "kind"])
+def test_what_a_function_of_derivatives_returns_on_one_rank(found):
+    """Wrong on the last rank: words, or in the second of two states an array of another shape."""
+    _, young, problem = hanging()
     gradient = mpm.Sensitivity(problem, [young])
     problem.solve(1)
     calls = []
@@ -396,12 +402,7 @@ def test_what_a_function_of_derivatives_returns_on_one_rank(found):
 
 @pytest.mark.mpi
 def test_functionals_that_differ():
-    body = particles()
-    young = fem.Constant(body.mesh, 1e3)
-    problem = mpm.QuasiStaticProblem(
-        mpm.Body(body, Hencky(young, 0.3), body_force=(0.0, -1.0)),
-        bcs=[scenes.fix(body.V, scenes.at(0, 0.0))],
-    )
+    body, young, problem = hanging()
     adjoint = mpm.Adjoint(problem, [young])
     problem.solve(2)
     misfit = ufl.inner(body.displacement, body.displacement) * ufl.dx
