@@ -220,7 +220,7 @@ def falling(solver: str, n: int) -> Made:
         bcs=rollers(V, (0, 0.0), (1, 0.0), (2, 0.0)),
         solver=mpm.Solver(linear=solver),
     )
-    return problem, lambda: problem.solve(0.08, 0.02)
+    return problem, lambda: problem.solve(time=0.08, dt=0.02)
 
 
 class Scene(NamedTuple):

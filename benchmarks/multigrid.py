@@ -292,7 +292,7 @@ def saddles(small: bool) -> list[dict[str, Any]]:
             problem = make(solver)
             before = time.process_time()
             if isinstance(problem, mpm.PorousProblem):
-                problem.solve(0.2, 0.2 / steps)
+                problem.solve(time=0.2, dt=0.2 / steps)
             else:
                 problem.solve(steps=steps)
             counts = problem.history.statistics

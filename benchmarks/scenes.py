@@ -571,7 +571,7 @@ def vortex(
     count = steps or vortex_steps(size, degree)
 
     def run() -> None:
-        problem.solve(0.5, 0.5 / count, motion.at)
+        problem.solve(time=0.5, dt=0.5 / count, update=motion.at)
 
     return Scene(problem, count, lambda: {"error": error()}, run)
 

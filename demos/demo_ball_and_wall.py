@@ -66,7 +66,7 @@ problem = mpm.DynamicProblem(heavy, terms=contacts, scheme="conserving", rayleig
 
 mass = density * comm.allreduce(bodies[0].initial_volume.sum())
 rows, shapes, pushed, rolls = [], [], [0.0], []
-for step in problem.steps(1.4, 0.02, output_at=[0.5, 0.9, 1.1]):
+for step in problem.steps(time=1.4, dt=0.02, output_at=[0.5, 0.9, 1.1]):
     energy, duration = problem.history.energies[-1], step.time - (rows[-1][0] if rows else 0.0)
     pushed.append(duration * sum(problem.reaction(base)[0] for base in grounds))
     rows.append((step.time, energy.kinetic, energy.internal, energy.damping, energy.external))
@@ -117,4 +117,4 @@ assert abs(ratio / 1.4 - 1.0) < 0.05
 #
 # 1. Without friction the ball slides. When does it hit the wall?
 # 2. Take `scheme="euler"`. How much energy does the scheme take (`lost`) besides?
-# 3. Make a movie of it: `mpm.plot.movie(problem, problem.steps(1.4, 0.02), "wall.gif", "mises")`.
+# 3. Make a movie of it: `mpm.plot.movie(problem, problem.steps(time=1.4, dt=0.02), "wall.gif", "mises")`.

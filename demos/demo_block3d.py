@@ -80,7 +80,7 @@ def update(t):
 
 
 curve = [(0.0, 0.0)]
-for step in problem.steps(40, update):
+for step in problem.steps(40, update=update):
     curve.append((squeeze * step.load, 4.0 * problem.reaction(plate)[2]))
 
 # ## Result

@@ -73,7 +73,7 @@ def largest(values):
 fig, axes = plt.subplots(3, 1, figsize=(7, 8), layout="constrained")
 rows = []
 for end, dt in ((60, 10), (180, 30), (1000, 100), (5000, 500), (30000, 2500)):
-    for step in problem.steps(end, dt, construction):
+    for step in problem.steps(time=end, dt=dt, update=construction):
         down = particles.initial_centroid[:, 1] - particles.centroid[:, 1]
         rows.append((step.time, largest(down), largest(-down), largest(pressure.x.array)))
     if end in (60, 1000):

@@ -79,7 +79,7 @@ def collide(scheme, draws):
     )
     if draws:
         draw(axes[0], problem, 0.0)
-    for step in problem.steps(end, dt, output_at=looked_at):
+    for step in problem.steps(time=end, dt=dt, output_at=looked_at):
         if draws and step.time in looked_at:
             draw(axes[1 + looked_at.index(step.time)], problem, step.time)
     return problem

@@ -78,7 +78,7 @@ def moved(method):
     def update(t):
         value.x.array[:] = total + (swirl(x, t - last) - x).ravel()
 
-    for step in problem.steps(20, update):
+    for step in problem.steps(20, update=update):
         total[:] = value.x.array
         last = step.load
     return particles

@@ -96,7 +96,7 @@ def centre():
 
 track, dt = [(*centre(), 0.0)], 0.07
 shapes = [mpm.plot.grid(particles)]
-for step in problem.steps(6.0, dt):
+for step in problem.steps(time=6.0, dt=dt):
     speed = np.linalg.norm(problem.momentum) / (2.0 * volume)
     track.append((*centre(), speed))
     if len(track) in (14, 20, 27):

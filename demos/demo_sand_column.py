@@ -79,7 +79,7 @@ X = particles.W.tabulate_dof_coordinates()[:, 0]
 times, fronts = [0.0], [0.0]
 figure, axes = plt.subplots(2, 2, figsize=(13, 6.5), layout="constrained")
 views = iter(axes.flat)
-for step in problem.steps(end, dt, output_at=[0.3, 0.6]):
+for step in problem.steps(time=end, dt=dt, output_at=[0.3, 0.6]):
     times.append(step.time)
     x = X + particles.displacement.x.array[::2]
     fronts.append(comm.allreduce(x.max(initial=0.0), MPI.MAX) / r0 - 1.0)

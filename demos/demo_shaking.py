@@ -109,7 +109,7 @@ def height():
 
 
 first, times, below, above = height(), [0.0], [0.0], [0.0]
-for step in problem.steps(end, dt, update):
+for step in problem.steps(time=end, dt=dt, update=update):
     times.append(step.time)
     below.append(mean_velocity(0, lambda x: x[1] < 1.01))
     above.append(mean_velocity(1, lambda x: x[1] > 14.99))

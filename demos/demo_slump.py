@@ -69,7 +69,7 @@ mpm.QuasiStaticProblem(still, bcs).solve(steps=40)
 moving = column()
 problem = mpm.DynamicProblem(moving, bcs, scheme="conserving")
 times, toes = [0.0], [4.0]
-for step in problem.steps(end, dt):
+for step in problem.steps(time=end, dt=dt):
     times.append(step.time)
     toes.append(toe(moving))
 

@@ -88,7 +88,7 @@ def run(degree, n, steps, draws):
     problem = mpm.DynamicParticleProblem(residual, particles, rho, velocity=g_t * H * across)
     centre, found = particles.initial_centroid, []
     sector = np.arctan2(centre[:, 1], centre[:, 0]) // (np.pi / 8) % 2
-    for step in problem.steps(1.0, 1.0 / steps, update, output_at=[0.25, 0.5]):
+    for step in problem.steps(time=1.0, dt=1.0 / steps, update=update, output_at=[0.25, 0.5]):
         found.append((step.time, size(d - (x - X)), size(x - X)))
         if draws and step.time in (0.25, 0.5, 1.0):
             ax = axes[[0.25, 0.5, 1.0].index(step.time)]

@@ -93,7 +93,7 @@ def update(t):
 curve = [(0.0, 0.0)]
 failure = None
 try:
-    for step in kit.progress(problem.steps(args.steps, update), args.steps, args):
+    for step in kit.progress(problem.steps(args.steps, update=update), args.steps, args):
         curve.append((squeeze * step.load, problem.reaction(plate)[2]))
 except mpm.MPMError as error:
     failure = error

@@ -89,7 +89,7 @@ scale = 1000.0 * np.pi * 0.04 * speed
 momentum, turning = problem.momentum, problem.angular_momentum
 gap, first_gap = smallest_gap(), -np.inf
 try:
-    for _ in kit.progress(problem.steps(steps * args.dt, args.dt), steps, args):
+    for _ in kit.progress(problem.steps(time=steps * args.dt, dt=args.dt), steps, args):
         drift = max(drift, float(np.abs(problem.momentum - momentum).max()) / scale)
         turned = max(turned, float(np.abs(problem.angular_momentum - turning).max()) / scale / 0.2)
         before, gap = gap, smallest_gap()

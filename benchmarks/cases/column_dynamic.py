@@ -47,7 +47,7 @@ if args.static:
     run = problem.steps(args.steps or 40)
 else:
     problem = mpm.DynamicProblem(column, bcs, scheme=args.scheme, out_of_range=args.out_of_range)
-    run = problem.steps(args.time, args.time / steps)
+    run = problem.steps(time=args.time, dt=args.time / steps)
 X = particles.W.tabulate_dof_coordinates()
 path = [(0.0, 4.0, 8.0)]
 began = process_time()

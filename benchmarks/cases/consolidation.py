@@ -81,7 +81,7 @@ def terzaghi(z: np.ndarray, time: float) -> np.ndarray:
 failure = None
 depth = 1.0 + low - p.W.tabulate_dof_coordinates()[:, 1]
 profiles = []
-run = problem.steps(args.time, args.time / args.steps)
+run = problem.steps(time=args.time, dt=args.time / args.steps)
 try:
     for number, step in enumerate(run, start=1):
         if args.plot and number % max(1, args.steps // 4) == 0:

@@ -113,7 +113,7 @@ def moved(name, method):
         increment.interpolate(move)
         value.x.array[:] = total + increment.x.array
 
-    for step in problem.steps(args.steps, update):
+    for step in problem.steps(args.steps, update=update):
         total[:] = value.x.array
         last = step.load
 

@@ -76,7 +76,7 @@ period = max(1, round(2.0 / args.dt))
 errors = {"displacement": 0.0, "velocity": 0.0}
 drift, failure = 0.0, None
 try:
-    run = problem.steps(args.steps * args.dt, args.dt)
+    run = problem.steps(time=args.steps * args.dt, dt=args.dt)
     for number, step in enumerate(kit.progress(run, args.steps, args), 1):
         drift = max(drift, abs(problem.momentum[0] - momentum) / mass)
         if number <= args.steps - period:

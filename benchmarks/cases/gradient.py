@@ -181,7 +181,7 @@ def pressed(particles, named, solver):
 def run(problem):
     """Make all steps."""
     if args.kind in DURATIONS:
-        problem.solve(DURATIONS[args.kind], DURATIONS[args.kind] / args.steps)
+        problem.solve(time=DURATIONS[args.kind], dt=DURATIONS[args.kind] / args.steps)
     else:
         problem.solve(args.steps)
 

@@ -69,7 +69,7 @@ def pressed(modulus, differentiates=True):
         return -problem.reaction(footing)[2]
 
     curve, slopes = [], []
-    for _ in problem.steps(args.steps * DURATION, DURATION, path):
+    for _ in problem.steps(time=args.steps * DURATION, dt=DURATION, update=path):
         curve.append(force())
         if gradient is not None:
             slopes.append(float(gradient.of(force)[0]))

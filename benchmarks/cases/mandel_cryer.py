@@ -133,7 +133,7 @@ found, forces, failure = [], [], None
 try:
     for begin, end in pairwise(periods):
         update = None if sphere else path
-        for step in problem.steps(end, (end - begin) / args.steps, update):
+        for step in problem.steps(time=end, dt=(end - begin) / args.steps, update=update):
             value = kit.largest(p.x.array[middle]) / start
             found.append((step.time, value, pressure(step.time)))
             if not sphere:

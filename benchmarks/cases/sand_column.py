@@ -128,7 +128,7 @@ steps = args.steps or ceil(end / args.dt)
 X = particles.W.tabulate_dof_coordinates()[:, :2]
 path, failure = [(0.0, 0.0)], None
 try:
-    for step in kit.progress(problem.steps(end, end / steps), steps, args):
+    for step in kit.progress(problem.steps(time=end, dt=end / steps), steps, args):
         x = X + particles.displacement.x.array.reshape(-1, 2)
         path.append((step.time, kit.largest(x[:, 0]) / width - 1.0))
 except mpm.MPMError as error:

@@ -50,7 +50,7 @@ problem = mpm.PorousProblem(
 )
 failure = None
 try:
-    for _ in kit.progress(problem.steps(1e6 * args.steps, 1e6), args.steps, args):
+    for _ in kit.progress(problem.steps(time=1e6 * args.steps, dt=1e6), args.steps, args):
         pass
 except mpm.MPMError as error:
     failure = error

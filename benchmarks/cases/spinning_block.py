@@ -54,7 +54,7 @@ problem = mpm.DynamicProblem(
 turning, momentum = problem.angular_momentum[-1], problem.momentum
 spins, failure, drift = [turning], None, 0.0
 try:
-    for _ in kit.progress(problem.steps(steps * dt, dt), steps, args):
+    for _ in kit.progress(problem.steps(time=steps * dt, dt=dt), steps, args):
         spins.append(problem.angular_momentum[-1])
         drift = max(drift, float(np.abs(problem.momentum - momentum).max()))
 except mpm.MPMError as error:

@@ -303,7 +303,7 @@ try:
         steps = args.steps or (20 if not path else 50 if weight else 30)
         area = np.pi * height**2 if args.case == "circle" else height
         unit = weight * height if weight else 1.0  # or the cohesion
-        run = problem.steps(steps, settle if path else None)
+        run = problem.steps(steps, update=settle if path else None)
         for step in kit.progress(run, steps, args):
             pressure = -problem.reaction(supports[0])[1] / area
             curve.append((step.load ** (path or 1.0) * settlement, pressure / unit))

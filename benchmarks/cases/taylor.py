@@ -86,7 +86,7 @@ problem = mpm.DynamicProblem(
 failure, path = None, [(0.0, length)]
 steps = args.steps or round(2.0 * args.time)
 try:
-    for step in kit.progress(problem.steps(args.time, args.time / steps), steps, args):
+    for step in kit.progress(problem.steps(time=args.time, dt=args.time / steps), steps, args):
         path.append((step.time, kit.largest(kit.nodes(rod)[:, 1]) - base))
 except mpm.MPMError as error:
     failure = error

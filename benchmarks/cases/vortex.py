@@ -124,7 +124,9 @@ largest = size(x - X)
 update(0.0)
 error_d, failure = [0.0], None
 try:
-    for step in kit.progress(problem.steps(1.0, 1.0 / args.steps, update), args.steps, args):
+    for step in kit.progress(
+        problem.steps(time=1.0, dt=1.0 / args.steps, update=update), args.steps, args
+    ):
         if step.time in (0.5, 1.0):
             error_d.append(size(d - (x - X)) / largest)
 except mpm.MPMError as error:

@@ -47,7 +47,7 @@ def flight(speed: float, cells: float, degree: int, out: str) -> tuple[float, fl
         out_of_range=out,
         solver=mpm.Solver(stabilisation=None),
     )
-    energies = problem.solve(STEPS * dt, dt).energies
+    energies = problem.solve(time=STEPS * dt, dt=dt).energies
     whole = np.array([energy.kinetic + energy.strain for energy in energies]) / (
         energies[0].kinetic + energies[0].strain
     )

@@ -78,7 +78,7 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
     Displacement and pore pressure are unknowns together (the pair of Taylor & Hood 1973), in finite
     strain where the materials are of finite strain. ``material`` is the law of the effective stress
     (Terzaghi 1943): total stress is that of the law less the pore pressure. Loads act in full from
-    the beginning unless a path sets others: ``problem.solve(time, dt, update)``.
+    the beginning unless a path sets others: ``problem.solve(time=..., dt=..., update=...)``.
 
     Args:
         bodies: One :class:`Body`, or a list, of degree 2 or 3 on a background of degree 2 or 3

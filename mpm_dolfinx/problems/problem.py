@@ -392,11 +392,11 @@ class Problem(Hooked):
     def solve(
         self,
         steps: int | str = 1,
+        *,
         update: Callable[[float], None] | None = None,
         progress: bool = False,
         repartition: float | None = None,
         control: DisplacementControl | None = None,
-        *,
         tolerance: float = 1e-2,
         output_at: Sequence[float] = (),
         first_step: float = 0.05,
@@ -440,9 +440,9 @@ class Problem(Hooked):
         """
         path = self.steps(
             steps,
-            update,
-            repartition,
-            control,
+            update=update,
+            repartition=repartition,
+            control=control,
             tolerance=tolerance,
             output_at=output_at,
             first_step=first_step,
@@ -460,10 +460,10 @@ class Problem(Hooked):
     def steps(
         self,
         steps: int | str,
+        *,
         update: Callable[[float], None] | None = None,
         repartition: float | None = None,
         control: DisplacementControl | None = None,
-        *,
         tolerance: float = 1e-2,
         output_at: Sequence[float] = (),
         first_step: float = 0.05,

@@ -41,6 +41,7 @@ class TimeProblem(Problem):
     @collective()
     def solve(  # type: ignore[override]
         self,
+        *,
         time: float,
         dt: float,
         update: Path_ | None = None,
@@ -72,7 +73,9 @@ class TimeProblem(Problem):
             MPMError: The run cannot go on; the state is that of the last converged step.
         """
         began = self.history.time
-        path = self.steps(time, dt, update, output_at, repartition)
+        path = self.steps(
+            time=time, dt=dt, update=update, output_at=output_at, repartition=repartition
+        )
         if output is not None and not self.history.steps:
             self.write(output)
 
@@ -89,6 +92,7 @@ class TimeProblem(Problem):
     @collective()
     def steps(  # type: ignore[override]
         self,
+        *,
         time: float,
         dt: float,
         update: Path_ | None = None,
@@ -189,6 +193,6 @@ class TimeProblem(Problem):
             MPMError: As in :meth:`solve`.
         """
         dt = as_positive(dt, "dt")
-        for _ in self.steps(self.history.time + dt, 2.0 * dt):
+        for _ in self.steps(time=self.history.time + dt, dt=2.0 * dt):
             pass
         return self.history.steps[-1]

@@ -383,7 +383,7 @@ def test_forces_of_supports_are_of_the_last_converged_step_whatever_is_set_since
 
 def test_a_dashpot_has_its_force_after_a_restart(mpi_tmp_path):
     problem, _, update = pressed(mpm.DynamicProblem)
-    problem.solve(0.02, 0.01, update=lambda t: update(50.0 * t))
+    problem.solve(time=0.02, dt=0.01, update=lambda t: update(50.0 * t))
     found = borne(problem)
     assert abs(found[2]).max() > 1e-3
     problem.save(mpi_tmp_path / "pressed.ckpt")

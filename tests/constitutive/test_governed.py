@@ -129,7 +129,7 @@ def spun(law):
         ),
         scheme="conserving",
     )
-    problem.solve(0.1, 0.02)
+    problem.solve(time=0.1, dt=0.02)
     return problem
 
 

@@ -150,7 +150,7 @@ def test_a_motion_after_rest_begins_at_rest(scheme, mixed, law):
     still = body.displacement.x.array.copy()
     other = law.with_parameters()
     motion = posed(mpm.DynamicProblem, body, other, 10.0, after=problem, scheme=scheme, **given)
-    motion.solve(0.1, 0.02)
+    motion.solve(time=0.1, dt=0.02)
     assert scenes.largest(np.abs(body.displacement.x.array - still)) < 1e-9
 
 

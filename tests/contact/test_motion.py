@@ -62,7 +62,7 @@ def falling(shape, friction=0.0, comm=WORLD, turn=0.0, **options):
 def test_a_block_bounces_off_an_obstacle_with_all_its_energy(shape, turn):
     problem, ground = falling(shape, turn=turn, scheme="conserving", out_of_range="reflect")
     before, pushed = problem.momentum, 0
-    for _ in problem.steps(0.6, 0.02):
+    for _ in problem.steps(time=0.6, dt=0.02):
         force = problem.reaction(ground)
         assert np.abs(problem.momentum - before - 0.02 * force).max() < 1e-11
         before, pushed = problem.momentum, pushed + bool(np.abs(force).max() > 0.0)
@@ -79,7 +79,7 @@ def test_an_obstacle_that_moves_throws_a_block():
     problem, wall = falling(contact.plane((0.0, 0.5), (0.0, 1.0)), scheme="midpoint")
     problem.inertia.velocities[0].x.array[:] = 0.0
     work, at = 0.0, 0.0
-    for _ in problem.steps(0.44, 0.02, update=lambda t: wall.move((0.0, t))):
+    for _ in problem.steps(time=0.44, dt=0.02, update=lambda t: wall.move((0.0, t))):
         work += problem.reaction(wall)[1] * (wall.offset[1] - at)
         at = wall.offset[1]
     last = problem.history.energies[-1]
@@ -93,7 +93,7 @@ def test_friction_takes_energy_and_says_how_much():
     problem, ground = falling(
         contact.disc((0.3, 0.2), 0.3), 0.4, scheme="conserving", out_of_range="reflect"
     )
-    for _ in problem.steps(0.6, 0.02):
+    for _ in problem.steps(time=0.6, dt=0.02):
         normal = ground.points - [0.3, 0.2]
         normal /= np.linalg.norm(normal, axis=1)[:, None]
         shear = ground.traction - (ground.traction * normal).sum(axis=1)[:, None] * normal
@@ -132,7 +132,7 @@ def test_a_block_falls_on_a_mat_without_inertia(scheme):
     problem, _ = on_a_mat(0.3, scheme=scheme)
     mat, floor = problem.bodies[1], problem.bcs[0]
     before, pushed, lowest = problem.momentum, 0, 0.0
-    for step in problem.steps(0.8, 0.02):
+    for step in problem.steps(time=0.8, dt=0.02):
         force = problem.reaction(floor)
         np.testing.assert_allclose((problem.momentum - before)[1], 0.02 * force[1], atol=1e-10)
         before, pushed = problem.momentum, pushed + bool(force[1] > 0.0)
@@ -153,7 +153,7 @@ def test_corners_are_pressed_into_a_mat(static, friction, split):
     # is no motion.
     problem, touch = on_a_mat(1.0, friction, QUADRILATERAL, static, scheme="conserving")
     before, pushed = problem.momentum, 0
-    for number, _ in enumerate(problem.steps(0.5, 0.02)):
+    for number, _ in enumerate(problem.steps(time=0.5, dt=0.02)):
         force = problem.reaction(problem.bcs[0])
         if static:  # (else the floor's nodes have a mass of their own)
             np.testing.assert_allclose((problem.momentum - before)[1], 0.02 * force[1], atol=1e-10)
@@ -175,7 +175,7 @@ def test_points_that_rub_across_a_kink_end_their_steps_on_the_facet_that_is_ther
     # with: a force that grew as steps were halved, at bends of four degrees too.
     problem, touch = on_a_mat(1.5, 0.8, QUADRILATERAL, sideways=-0.8, scheme="conserving")
     block, pushed = problem.bodies[0], 0
-    for number, _ in enumerate(problem.steps(0.5, 0.02)):
+    for number, _ in enumerate(problem.steps(time=0.5, dt=0.02)):
         pushed += bool(problem.reaction(touch)[1] > 0.0)
         if number == 10:
             x = block.initial_domains.mean(axis=1)
@@ -205,10 +205,10 @@ class Worn(contact.Friction):
 def test_tangent_is_the_derivative_of_the_forces(what, friction):
     if what == "rigid":
         problem, term = falling(contact.disc((0.4, 0.2), 0.3), friction, scheme="midpoint")
-        steps = problem.steps(0.14, 0.02)
+        steps = problem.steps(time=0.14, dt=0.02)
     else:
         problem, term = colliding(friction, scheme="midpoint")
-        steps = problem.steps(0.6, 0.04)
+        steps = problem.steps(time=0.6, dt=0.04)
     for _ in steps:
         if np.abs(problem.reaction(term)).max() > 0.0:
             break
@@ -255,7 +255,7 @@ def test_bodies_that_collide_keep_momentum_and_energy(friction, passes):
     problem, touch = colliding(friction, passes=passes)
     momentum, turning = problem.momentum, problem.angular_momentum
     reach, near, pushed = 0.02 * 0.3, np.inf, 0
-    for _ in problem.steps(0.44, 0.04):
+    for _ in problem.steps(time=0.44, dt=0.04):
         assert np.abs(problem.momentum - momentum).max() < 1e-11
         assert np.abs(problem.angular_momentum - turning).max() < 1e-11
         gap = WORLD.allreduce(touch.gap.min(initial=np.inf), scenes.MPI.MIN)
@@ -278,7 +278,7 @@ def test_a_corner_that_passes_the_other_gives_no_energy(passes):
     # multiply the energy by 1.45.
     problem, touch = colliding(passes=passes)
     momentum = problem.momentum
-    problem.solve(1.0, 0.04)
+    problem.solve(time=1.0, dt=0.04)
     assert np.abs(problem.momentum - momentum).max() < 1e-11
     assert energies(problem.history).max() < 1.0 + 1e-9
     assert energies(problem.history)[-1] > 0.98
@@ -290,8 +290,8 @@ def test_a_corner_that_passes_the_other_gives_no_energy(passes):
 def test_a_collision_is_the_same_on_any_number_of_ranks():
     problem, touch = colliding(0.3)
     other, alone = colliding(0.3, comm=scenes.MPI.COMM_SELF)
-    problem.solve(0.28, 0.04)
-    other.solve(0.28, 0.04)
+    problem.solve(time=0.28, dt=0.04)
+    other.solve(time=0.28, dt=0.04)
     force = other.reaction(alone)
     assert np.abs(force).max() > 0.0
     assert np.abs(problem.reaction(touch) - force).max() < 1e-9 * np.abs(force).max()
@@ -303,7 +303,7 @@ def test_the_account_closes_where_points_have_stayed_with_their_facets(monkeypat
     monkeypatch.setattr("mpm_dolfinx.contact.one_pass.FREEZE", 1)
     problem, touch = colliding(0.3, scheme="euler", out_of_range="project")
     pushed = 0
-    for _ in problem.steps(0.4, 0.04):
+    for _ in problem.steps(time=0.4, dt=0.04):
         pushed += bool(np.abs(problem.reaction(touch)).max() > 0.0)
     balance = np.array([energy.balance for energy in problem.history.energies])
     assert pushed > 3 and np.ptp(balance) < 1e-12 * balance[0]
@@ -318,7 +318,7 @@ def test_a_checkpoint_in_the_middle_of_an_impact_goes_on_as_the_run_does(what, m
 
     problem, touch = made()
     half, dt = (0.24, 0.04) if what == "pair" else (0.16, 0.02)
-    for _ in problem.steps(2 * half, dt, output_at=[half]):
+    for _ in problem.steps(time=2 * half, dt=dt, output_at=[half]):
         if problem.history.time == half:
             problem.save(mpi_tmp_path / "half.ckpt")
             force = problem.reaction(touch)
@@ -326,7 +326,7 @@ def test_a_checkpoint_in_the_middle_of_an_impact_goes_on_as_the_run_does(what, m
     other, again = made()
     other.restore(mpi_tmp_path / "half.ckpt")
     assert np.abs(other.reaction(again) - force).max() <= 1e-14 * np.abs(force).max()
-    other.solve(2 * half, dt, output_at=[half])
+    other.solve(time=2 * half, dt=dt, output_at=[half])
     end = problem.momentum
     assert np.abs(other.momentum - end).max() < 1e-9
     for body, copy in zip(problem.bodies, other.bodies, strict=True):
@@ -336,7 +336,7 @@ def test_a_checkpoint_in_the_middle_of_an_impact_goes_on_as_the_run_does(what, m
 
 def test_a_run_that_is_interrupted_leaves_everything_as_it_was():
     problem, touch = colliding(0.3)
-    for _ in problem.steps(0.2, 0.04):
+    for _ in problem.steps(time=0.2, dt=0.04):
         pass
     force = problem.reaction(touch)
     d = [body.displacement.x.array.copy() for body in problem.bodies]
@@ -349,8 +349,8 @@ def test_a_run_that_is_interrupted_leaves_everything_as_it_was():
     for key, column in touch.columns(0).items():
         assert np.array_equal(before[key], column.values), key
     other, again = colliding(0.3)
-    problem.solve(0.32, 0.04)
-    other.solve(0.32, 0.04)
+    problem.solve(time=0.32, dt=0.04)
+    other.solve(time=0.32, dt=0.04)
     end = other.reaction(again)
     assert np.abs(problem.reaction(touch) - end).max() < 1e-9 * np.abs(end).max()
 
@@ -370,13 +370,13 @@ def test_an_equal_pair_put_in_during_an_impact_changes_nothing(scheme, law, pass
     for replaced in (False, True):
         problem, touch = colliding(0.2, scheme=scheme, law=law, passes=passes)
         problem.solver.setTolerances(rtol=1e-13)
-        problem.solve(0.26, 0.02)
+        problem.solve(time=0.26, dt=0.02)
         if replaced:
             assert WORLD.allreduce(int(touch.sticks.sum())) > 2
             new = contact.Pair(*touch.bodies, 0.2, law=law, passes=passes)
             problem.stage(terms=[new if term is touch else term for term in problem.terms])
             problem.solver.setTolerances(rtol=1e-13)
-        problem.solve(0.32, 0.02)
+        problem.solve(time=0.32, dt=0.02)
         places = [scenes.in_order(body, body.centroid) for body in problem.bodies]
         found.append((np.concatenate(places), problem.momentum))
     for one, two in zip(*found, strict=True):
@@ -424,7 +424,7 @@ def test_cubes_collide_in_space(cell):
         **TIGHT,
     )
     momentum, turning = problem.momentum, problem.angular_momentum
-    problem.solve(0.4, 0.04)
+    problem.solve(time=0.4, dt=0.04)
     assert np.abs(problem.momentum - momentum).max() < 1e-11
     assert np.abs(problem.angular_momentum - turning).max() < 1e-11
     assert account(problem.history) < 1e-9

@@ -331,7 +331,7 @@ def test_it_goes_with_implicit_euler():
         scheme="euler",
         terms=[ground],
     )
-    problem.solve(0.5, 0.05)
+    problem.solve(time=0.5, dt=0.05)
     assert problem.reaction(ground)[1] == pytest.approx(10.0, rel=1e-6)
     # domains have the mean of their stress, 7.5: the penalty bears a quarter of the weight
     assert scenes.largest(ground.gap[ground.touches]) < 0.3 * 10.0 * 0.5 / CONFINED
@@ -361,7 +361,7 @@ def test_an_impact_wins_no_energy(cell, steps, friction):
         scheme="euler",
         terms=[ground],
     )
-    problem.solve(0.75, 0.75 / steps)
+    problem.solve(time=0.75, dt=0.75 / steps)
     energies = problem.history.energies
     whole = np.array([energy.kinetic + energy.strain for energy in energies])
     assert np.diff([energy.kinetic for energy in energies]).max() > 0.01 * whole[0]  # it bounces

@@ -345,7 +345,7 @@ def test_it_goes_with_implicit_euler():
         bcs=[fem.dirichletbc(np.zeros(2), base, Vb)],
         terms=[touch],
     )
-    problem.solve(0.5, 0.05)
+    problem.solve(time=0.5, dt=0.05)
     assert problem.reaction(touch)[1] == pytest.approx(4.0, rel=1e-6)
 
 
@@ -364,7 +364,7 @@ def test_an_impact_wins_no_energy(passes, steps):
         scheme="euler",
         terms=[contact.Pair(a, b, 0.6, law="nitsche", passes=passes)],
     )
-    problem.solve(0.75, 0.75 / steps)
+    problem.solve(time=0.75, dt=0.75 / steps)
     energies = problem.history.energies
     whole = np.array([energy.kinetic + energy.strain for energy in energies])
     assert np.diff([energy.kinetic for energy in energies]).max() > 0.005 * whole[0]  # they bounce

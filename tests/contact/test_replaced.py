@@ -161,13 +161,13 @@ def test_a_new_rigid_body_moves_as_it_was_made(scheme):
     problem = mpm.DynamicProblem(
         mpm.Body(particles, Hencky(1e3, 0.3), density=1.0), scheme=scheme, terms=[old], bcs=base
     )
-    problem.solve(0.02, 0.01)
+    problem.solve(time=0.02, dt=0.01)
     new = boulder((2.2, 1.5), velocity=(0.5, 0.0))
     new.push((0.0, 4.0))
     problem.stage(terms=[new])
     assert np.all(new.centre == (2.2, 1.5)) and np.all(new.velocity == (0.5, 0.0))
     assert np.all(new.spin == 0.0)
-    problem.solve(0.03, 0.01)
+    problem.solve(time=0.03, dt=0.01)
     share = 0.5 if scheme == "conserving" else 1.0  # (its force was nothing to begin with)
     np.testing.assert_allclose(new.velocity, (0.5, 0.04 * share), rtol=1e-12)
 

@@ -318,7 +318,7 @@ def test_a_block_slides_down_an_incline_or_stays(friction, scheme):
     )
     exact = 10.0 * max(0.5 - friction * np.sqrt(0.75), 0.0)
     speeds, reactions = [], []
-    for _ in problem.steps(0.2, 0.01):
+    for _ in problem.steps(time=0.2, dt=0.01):
         speeds.append(problem.momentum @ -t / 0.5)
         reactions.append(problem.reaction(ground))
     if exact > 0.0:

@@ -68,7 +68,7 @@ def test_an_impact_keeps_energy_momentum_and_angular_momentum(shape, friction):
     momentum = problem.momentum + ball.momentum
     turning = problem.angular_momentum + ball.angular_momentum
     whole, pushed, before = ball.kinetic_energy, 0, ball.momentum
-    for _ in problem.steps(0.28, 0.02):
+    for _ in problem.steps(time=0.28, dt=0.02):
         assert energy(problem, ball) == pytest.approx(whole, rel=1e-10)
         assert np.abs(problem.momentum + ball.momentum - momentum).max() < 1e-12
         assert np.abs(problem.angular_momentum + ball.angular_momentum - turning).max() < 1e-12
@@ -91,7 +91,7 @@ def test_an_impact_on_metal_takes_what_yielding_takes(strength):
     law = VonMises(YOUNG, POISSON, yield_stress=strength, hardening=10.0)
     problem, ball = thrown("box", law=law)
     volumes, whole, taken = problem.points[0].weights.ravel(), ball.kinetic_energy, 0.0
-    for _ in problem.steps(0.28, 0.02):
+    for _ in problem.steps(time=0.28, dt=0.02):
         kappa = problem.points[0].last.plastic_strain().ravel()
         taken = WORLD.allreduce(float(volumes @ ((strength + 5.0 * kappa) * kappa)))
         assert energy(problem, ball) + taken == pytest.approx(whole, rel=1e-10)
@@ -105,7 +105,7 @@ def test_an_impact_at_the_coordinates_of_a_map_takes_the_same_steps(shape):
     found = []
     for origin in (0.0, 4e6):
         problem, ball = thrown(shape, 0.4, origin=origin, petsc_options={"snes_rtol": 1e-8})
-        problem.solve(0.24, 0.02)
+        problem.solve(time=0.24, dt=0.02)
         assert problem.history.cutbacks == 0
         found.append(np.concatenate([ball.offset, ball.velocity]))
     # (points touch at a gap of 1e-12 of the coordinates)
@@ -134,7 +134,7 @@ def test_a_body_falls_and_spins_as_nothing_touches_it():
             mpm.Body(particles, Hencky(1e3, 0.3), density=1.0), terms=[stone]
         )
         momentum, kinetic = J @ start, 0.5 * start @ J @ start
-        for _ in problem.steps(2.0, dt):
+        for _ in problem.steps(time=2.0, dt=dt):
             t = problem.history.time
             place = t * np.array([1.0, 0.0, 2.0]) + 0.5 * t**2 * np.array([0.0, 1.0, -10.0])
             assert np.abs(stone.offset - place).max() < 1e-12 * (1.0 + 5.0 * t**2)
@@ -237,7 +237,7 @@ def test_a_disc_rolls_down_an_incline_with_two_thirds_of_the_acceleration(n, dt,
         terms=[wheel],
     )
     times, speeds, spins = [], [], []
-    for _ in problem.steps(0.5, dt):
+    for _ in problem.steps(time=0.5, dt=dt):
         times.append(problem.history.time)
         speeds.append(wheel.velocity[0])
         spins.append(wheel.spin[0])
@@ -347,7 +347,7 @@ def test_it_touches_several_bodies_and_goes_with_splitting_and_plasticity():
         **TIGHT,
     )
     momentum = problem.momentum + tool.momentum
-    for _ in problem.steps(0.2, 0.02):
+    for _ in problem.steps(time=0.2, dt=0.02):
         assert np.abs(problem.momentum + tool.momentum - momentum).max() < 1e-12
         if problem.history.time == pytest.approx(0.1):
             problem.split(np.arange(0, bodies[0].num_global, 2))
@@ -357,7 +357,7 @@ def test_it_touches_several_bodies_and_goes_with_splitting_and_plasticity():
 
 def test_a_checkpoint_in_an_impact_goes_on_as_the_run_does(mpi_tmp_path):
     problem, ball = thrown("box", 0.3)
-    for _ in problem.steps(0.12, 0.02, output_at=[0.06]):
+    for _ in problem.steps(time=0.12, dt=0.02, output_at=[0.06]):
         if problem.history.time == 0.06:
             problem.save(mpi_tmp_path / "half.ckpt")
             force = problem.reaction(ball)
@@ -365,7 +365,7 @@ def test_a_checkpoint_in_an_impact_goes_on_as_the_run_does(mpi_tmp_path):
     other, again = thrown("box", 0.3)
     other.restore(mpi_tmp_path / "half.ckpt")
     assert np.abs(other.reaction(again) - force).max() <= 1e-14 * np.abs(force).max()
-    other.solve(0.12, 0.02, output_at=[0.06])
+    other.solve(time=0.12, dt=0.02, output_at=[0.06])
     for name in ("offset", "angle", "velocity", "spin", "reaction"):
         assert np.abs(getattr(again, name) - getattr(ball, name)).max() < 1e-9, name
     same_run(outcome(other), outcome(problem), 1e-9)
@@ -382,7 +382,7 @@ def test_what_follows_a_path_has_its_velocity_from_the_first_step_on(scheme):
     problem = mpm.DynamicProblem(
         mpm.Body(particles, Hencky(YOUNG, POISSON), density=1.0), terms=[tool], scheme=scheme
     )
-    for _ in problem.steps(0.1, 0.02, update=lambda t: tool.move((0.5 * t, 0.0), 0.1 * t)):
+    for _ in problem.steps(time=0.1, dt=0.02, update=lambda t: tool.move((0.5 * t, 0.0), 0.1 * t)):
         assert np.abs(tool.velocity - (0.5, 0.3)).max() < 1e-12
         assert tool.spin[0] == pytest.approx(0.1, rel=1e-9)
 
@@ -399,21 +399,21 @@ def test_what_turns_on_a_path_turns_by_less_than_half_a_turn_in_a_step():
     tool.move((0.0, 0.0), 4.0)
     raises(lambda: problem.step(0.1), mpm.ConvergenceError, "half a turn or more in one step")
     assert tool.angle[0] == 0.0
-    problem.solve(0.4, 0.1, update=lambda t: tool.move((0.0, 0.0), 20.0 * t))
+    problem.solve(time=0.4, dt=0.1, update=lambda t: tool.move((0.0, 0.0), 20.0 * t))
     assert tool.angle[0] == pytest.approx(8.0, rel=1e-12)
 
 
 def test_a_step_that_fails_leaves_it_where_it_was():
     problem, ball = thrown("box", 0.3)
-    problem.solve(0.06, 0.02)
+    problem.solve(time=0.06, dt=0.02)
     names = ("offset", "angle", "velocity", "spin", "reaction", "kinetic_energy")
     before = {name: getattr(ball, name) for name in names}
     breaks(ball, lambda: problem.step(0.02))
     for name, value in before.items():
         assert np.array_equal(getattr(ball, name), value), name
     other, again = thrown("box", 0.3)
-    problem.solve(0.1, 0.02)
-    other.solve(0.1, 0.02)
+    problem.solve(time=0.1, dt=0.02)
+    other.solve(time=0.1, dt=0.02)
     assert np.abs(ball.velocity - again.velocity).max() < 1e-10
 
 
@@ -421,10 +421,10 @@ def test_a_step_that_fails_leaves_it_where_it_was():
 def test_it_is_the_same_on_any_number_of_ranks():
     problem, ball = thrown("box", 0.3)
     other, alone = thrown("box", 0.3, comm=scenes.MPI.COMM_SELF)
-    problem.solve(0.06, 0.02)
+    problem.solve(time=0.06, dt=0.02)
     problem.repartition()
-    problem.solve(0.12, 0.02)
-    other.solve(0.12, 0.02)
+    problem.solve(time=0.12, dt=0.02)
+    other.solve(time=0.12, dt=0.02)
     for name in ("offset", "angle", "velocity", "spin", "reaction"):
         one, two = getattr(ball, name), getattr(alone, name)
         assert np.abs(one - two).max() < 1e-9 * max(1.0, np.abs(two).max()), name
@@ -457,7 +457,7 @@ def test_a_drop_weight_on_a_column_of_revolution():
         **TIGHT,
     )
     whole, before = weight.kinetic_energy, weight.momentum
-    for _ in problem.steps(0.2, 0.01):
+    for _ in problem.steps(time=0.2, dt=0.01):
         assert energy(problem, weight) == pytest.approx(whole, rel=1e-10)
         force = problem.reaction(weight)[1]
         assert weight.momentum[1] - before[1] == pytest.approx(-0.01 * force, abs=1e-13)
@@ -489,7 +489,7 @@ def test_a_ball_rolls_down_an_incline_with_five_sevenths_of_the_acceleration():
         terms=[ball],
     )
     times, speeds = [], []
-    for _ in problem.steps(0.5, 0.01):
+    for _ in problem.steps(time=0.5, dt=0.01):
         times.append(problem.history.time)
         speeds.append(ball.velocity[0])
     found = np.polyfit(times[15:], speeds[15:], 1)[0]

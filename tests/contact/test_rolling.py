@@ -61,7 +61,7 @@ def rolled(dim, friction, n, cell, dt, steps, scheme="euler", rests=False):
     )
     mass = 1000.0 * WORLD.allreduce(particles.initial_volume.sum())
     speeds, ratios = [], []
-    for _ in problem.steps(steps * dt, dt):
+    for _ in problem.steps(time=steps * dt, dt=dt):
         speeds.append(problem.momentum @ along / mass)
         force = problem.reaction(ground)
         ratios.append(-(force @ along) / (force @ normal))

@@ -318,7 +318,7 @@ def test_terrain_is_the_same_on_any_number_of_ranks():
     runs = []
     for comm in (WORLD, scenes.MPI.COMM_SELF):
         problem, ground, _ = on_slope(3, comm)
-        for _ in problem.steps(0.05, 0.01):
+        for _ in problem.steps(time=0.05, dt=0.01):
             pass
         runs.append((outcome(problem), ground.reaction))
     same_run(runs[0][0], runs[1][0], 1e-9)
@@ -353,7 +353,7 @@ def test_a_block_slides_over_triangles_as_over_their_plane():
     speeds = []
     for triangles in (True, False):
         problem, ground, normal = on_slope(3, triangles=triangles)
-        for _ in problem.steps(0.1, 0.01):
+        for _ in problem.steps(time=0.1, dt=0.01):
             pass
         speeds.append(problem.momentum)
         reaction = ground.reaction

@@ -75,6 +75,6 @@ def test_a_body_that_spins_fast_turns_as_far_as_it_should(scheme):
     problem = mpm.DynamicProblem(
         mpm.Body(body, Hencky(1e3, 0.3), density=1.0), scheme=scheme, terms=[disc]
     )
-    problem.solve(0.2, 0.1)
+    problem.solve(time=0.2, dt=0.1)
     assert disc.angle == pytest.approx(10.0, rel=0.02) and disc.spin == pytest.approx(50.0)
     assert problem.history.cutbacks > 0

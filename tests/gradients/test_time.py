@@ -75,7 +75,7 @@ class Thrown:
 
 
 def thrown(scene):
-    scene.problem.solve(0.3, 0.05)
+    scene.problem.solve(time=0.3, dt=0.05)
 
 
 MOTIONS = {
@@ -151,7 +151,7 @@ SOILS = {
 @pytest.mark.parametrize("law", all_but(["von Mises"], SOILS))
 def test_each_soil_with_water(law):
     def run(scene):
-        scene.problem.solve(0.4, 0.1)
+        scene.problem.solve(time=0.4, dt=0.1)
 
     names = ["young", "push", "flow"] if law != "von Mises" else None
     check(lambda **numbers: Wet(**numbers, law=SOILS[law]), WATER, names, run=run)
@@ -209,7 +209,7 @@ def test_a_motion_is_what_it_is_without():
         if follows:
             named = [scene.named[name] for name in ("young", "density")]
             gradient = mpm.Sensitivity(scene.problem, named)
-        for _ in scene.problem.steps(0.1, 0.02):
+        for _ in scene.problem.steps(time=0.1, dt=0.02):
             if follows:
                 gradient.of(lambda scene=scene: scene.particles.stress)
         energies = [(e.kinetic, e.lost, e.external) for e in scene.problem.history.energies]
@@ -223,11 +223,11 @@ def test_motion_and_water_are_the_same_on_any_number_of_ranks():
     for comm in (WORLD, MPI.COMM_SELF):
         scene = Thrown(**MOTION, law="von Mises", comm=comm)
         gradient = mpm.Sensitivity(scene.problem, [scene.named["young"], scene.named["density"]])
-        scene.problem.solve(0.1, 0.05)
+        scene.problem.solve(time=0.1, dt=0.05)
         moved = gradient.of(lambda s=scene: s.particles.stress)
         wet = Wet(**WATER, comm=comm)
         slopes = mpm.Sensitivity(wet.problem, [wet.named["young"], wet.named["flow"]])
-        wet.problem.solve(0.2, 0.1)
+        wet.problem.solve(time=0.2, dt=0.1)
         pressed = slopes.of(lambda s=wet: s.particles.stress)
         pairs = ((scene.particles, moved), (wet.particles, pressed))
         found.append([in_order(*pair) for pair in pairs])

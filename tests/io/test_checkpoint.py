@@ -33,7 +33,7 @@ def whole_outcome(problem):
 def interrupt(make, steps, path, after, other=None, update=None):
     """Compare a run with one that begins anew from a checkpoint after some of its steps."""
     problem = make()
-    for number, _ in enumerate(problem.steps(steps, update and update(problem))):
+    for number, _ in enumerate(problem.steps(steps, update=update and update(problem))):
         if number == after:
             before = whole_outcome(problem)
             problem.save(path)
@@ -41,7 +41,7 @@ def interrupt(make, steps, path, after, other=None, update=None):
     resumed = (other or make)()
     resumed.restore(path)
     same_run(whole_outcome(resumed), before, 0.0 if other is None else 1e-12)
-    history = resumed.solve(steps, update and update(resumed))
+    history = resumed.solve(steps, update=update and update(resumed))
     assert history.iterations == problem.history.iterations
     assert history.cutbacks == problem.history.cutbacks
     assert history.failed_iterations == problem.history.failed_iterations

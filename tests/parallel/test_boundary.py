@@ -111,7 +111,7 @@ def run(problem):
 
 
 def in_motion(terms):
-    made(mpm.DynamicProblem, terms=terms).solve(0.2, 0.1)
+    made(mpm.DynamicProblem, terms=terms).solve(time=0.2, dt=0.1)
 
 
 REACHED = {

@@ -94,7 +94,9 @@ def moving():
     V = scenes.vectors(scenes.box([-0.5] * 2, [1.5] * 2, [4, 4], scenes.QUADRILATERAL))
     body = mpm.Particles(scenes.unit(4, scenes.TRIANGLE), V)
     law = mpm.materials.Hencky(1e3, 0.3)
-    mpm.DynamicProblem(mpm.Body(body, law, density=2.0, body_force=(0.0, -1.0))).solve(1e-3, 1e-3)
+    mpm.DynamicProblem(mpm.Body(body, law, density=2.0, body_force=(0.0, -1.0))).solve(
+        time=1e-3, dt=1e-3
+    )
 
 
 def with_a_pressure():

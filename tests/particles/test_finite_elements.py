@@ -135,7 +135,7 @@ def settled(law, options, kind, free):
     if kind is mpm.QuasiStaticProblem:
         problem.solve(1)
     else:
-        problem.solve(0.05, 0.05)
+        problem.solve(time=0.05, dt=0.05)
     return problem
 
 

@@ -187,7 +187,7 @@ def test_a_cylinder_swings_as_a_bar():
         axisymmetric=True,
         solver=mpm.Solver(petsc_options={"snes_rtol": 1e-13}),
     )
-    problem.solve(0.02, 0.005)
+    problem.solve(time=0.02, dt=0.005)
     at, stress = gather(particles.initial_centroid), gather(particles.stress)[:, 1, 1]
     for level in np.unique(at[:, 1].round(6)):
         row = stress[np.isclose(at[:, 1], level)]

@@ -610,13 +610,13 @@ def move(wanted, scheme, directory):
 
     scene = Moving(wanted, scheme)
     dt = 0.1 if "delete" in wanted else 0.01
-    scene.problem.solve(2 * dt, dt, path)
+    scene.problem.solve(time=2 * dt, dt=dt, update=path)
     if "delete" in wanted:
         assert scene.problem.history.statistics["lost_particles"] > 0
     scene.change()
     if "checkpoint" in wanted:
         scene.problem.save(directory / "state")
-    scene.problem.solve(4 * dt, dt, path)
+    scene.problem.solve(time=4 * dt, dt=dt, update=path)
     energies = scene.problem.history.energies
     size = max(max(energy.kinetic, abs(energy.external)) for energy in energies)
     assert np.ptp([energy.balance for energy in energies]) < 1e-9 * size
@@ -624,7 +624,7 @@ def move(wanted, scheme, directory):
     if "checkpoint" in wanted:
         whole, scene = scene, Moving(wanted, scheme)
         scene.problem.restore(directory / "state")
-        scene.problem.solve(4 * dt, dt, path)
+        scene.problem.solve(time=4 * dt, dt=dt, update=path)
         one, two = (s.problem.bodies[0] for s in (whole, scene))
         assert np.array_equal(one.centroid, two.centroid)
 
@@ -679,18 +679,18 @@ def consolidate(wanted, directory):
         scene.wall.value[-1] = -0.3 * t if "delete" in wanted else 0.02 * t
 
     scene = Wet(wanted)
-    scene.problem.solve(0.2, 0.1, path)
+    scene.problem.solve(time=0.2, dt=0.1, update=path)
     scene.require_equilibrium()
     scene.change()
     if "checkpoint" in wanted:
         scene.problem.save(directory / "state")
-    scene.problem.solve(0.4, 0.1, path)
+    scene.problem.solve(time=0.4, dt=0.1, update=path)
     scene.require_equilibrium()
     scene.require_its_volume()
     if "checkpoint" in wanted:
         whole, scene = scene, Wet(wanted)
         scene.problem.restore(directory / "state")
-        scene.problem.solve(0.4, 0.1, path)
+        scene.problem.solve(time=0.4, dt=0.1, update=path)
         one, two = (s.problem.bodies[0] for s in (whole, scene))
         assert np.array_equal(one.centroid, two.centroid)
 
@@ -811,10 +811,10 @@ def in_motion(wanted, between, scheme="midpoint"):
 
     scene = Moving({"rtol": 1e-13} | wanted, scheme)
     dt = 0.1 if "delete" in wanted else 0.01
-    scene.problem.solve(2 * dt, dt, path)
+    scene.problem.solve(time=2 * dt, dt=dt, update=path)
     scene.change()
     between(scene)
-    scene.problem.solve(4 * dt, dt, path)
+    scene.problem.solve(time=4 * dt, dt=dt, update=path)
     return scene
 
 
@@ -825,10 +825,10 @@ def with_water(wanted, between):
         scene.wall.value[-1] = -0.3 * t if "delete" in wanted else 0.02 * t
 
     scene = Wet({"rtol": 1e-13} | wanted)
-    scene.problem.solve(0.2, 0.1, path)
+    scene.problem.solve(time=0.2, dt=0.1, update=path)
     scene.change()
     between(scene)
-    scene.problem.solve(0.4, 0.1, path)
+    scene.problem.solve(time=0.4, dt=0.1, update=path)
     return scene
 
 

@@ -106,7 +106,7 @@ def test_a_free_body_flies_on(scheme, out, degree):
     momentum, turning, energy = problem.momentum, problem.angular_momentum, problem.kinetic_energy
     np.testing.assert_allclose(momentum, [0.6, -0.4], rtol=1e-13)
     np.testing.assert_allclose(turning, 1.73 * -0.4 - 2.01 * 0.6, rtol=1e-13)
-    history = problem.solve(2.0, 0.1)
+    history = problem.solve(time=2.0, dt=0.1)
     most = 0 if out == "project" and scheme != "euler" and degree == 1 else 1
     assert all(step.iterations <= most for step in history.steps)
     moved = nodal(problem.particles.displacement) - [0.6, -0.4]
@@ -126,7 +126,7 @@ def test_dust_that_spins_flies_apart_in_straight_lines(scheme, out, degree):
     )
     velocity = nodal(problem.velocity).copy()
     momentum, turning, energy = problem.momentum, problem.angular_momentum, problem.kinetic_energy
-    problem.solve(0.7, 0.1)
+    problem.solve(time=0.7, dt=0.1)
     assert largest(nodal(problem.particles.displacement) - 0.7 * velocity) < 1e-10
     np.testing.assert_allclose(problem.momentum, momentum, atol=1e-11)
     np.testing.assert_allclose(problem.angular_momentum, turning, atol=1e-11)
@@ -136,7 +136,7 @@ def test_dust_that_spins_flies_apart_in_straight_lines(scheme, out, degree):
 @pytest.mark.parametrize("cell", [TRIANGLE, QUADRILATERAL])
 def test_a_body_falls_on_a_parabola(cell):
     problem = spinning(square(cell), velocity=(0.1, 0.4), body_force=(0.0, -1.0))
-    history = problem.solve(1.0, 0.13)  # the steps are 1/8
+    history = problem.solve(time=1.0, dt=0.13)  # the steps are 1/8
     assert [step.time for step in history.steps] == [k / 8 for k in range(1, 9)]
     for energy in history.energies:
         t = energy.time
@@ -154,7 +154,7 @@ def test_a_load_in_time_gives_the_momentum_of_its_trapezium():
     def update(t):
         force.value = (3.0 * t**2, 1.0)
 
-    problem.solve(1.0, 0.25, update)
+    problem.solve(time=1.0, dt=0.25, update=update)
     mean = np.mean([3.0 * (a**2 + (a + 0.25) ** 2) / 2 for a in (0.0, 0.25, 0.5, 0.75)])
     np.testing.assert_allclose(problem.momentum, [2.0 * mean, 2.0], rtol=1e-11)
     force.value = (0.0, -1.0)
@@ -169,7 +169,7 @@ def test_a_load_in_time_gives_the_momentum_of_its_trapezium():
 def test_a_spinning_body_keeps_momentum_and_its_account(scheme, out):
     problem = spinning(scheme=scheme, out_of_range=out)
     momentum, turning = problem.momentum, problem.angular_momentum
-    history = problem.solve(2.0, 0.05)
+    history = problem.solve(time=2.0, dt=0.05)
     np.testing.assert_allclose(problem.momentum, momentum, atol=1e-11)
     if scheme != "euler":  # midpoint: to second order; the spin of the whole run is two radians
         rtol = 1e-3 if scheme == "midpoint" else 1e-10
@@ -207,7 +207,7 @@ def test_with_f_bar_an_elastic_body_keeps_its_energy(law, cell, f_bar):
         f_bar=f_bar,
     )
     turning = problem.angular_momentum
-    history = problem.solve(0.4, 0.04)
+    history = problem.solve(time=0.4, dt=0.04)
     np.testing.assert_allclose(problem.angular_momentum, turning, rtol=1e-11)
     whole = np.array([e.kinetic + e.strain for e in history.energies])
     assert np.abs(whole / whole[0] - 1.0).max() < 1e-10
@@ -243,7 +243,7 @@ def test_with_a_stabilised_pressure_no_energy_is_won(scheme, time):
     assert all("use out_of_range='project'" in one for one in sentences)
     moving = problem("project")
     momentum, turning = moving.momentum, moving.angular_momentum
-    history = moving.solve(time, 0.05)
+    history = moving.solve(time=time, dt=0.05)
     np.testing.assert_allclose(moving.momentum, momentum, atol=1e-11)
     if scheme == "conserving":
         np.testing.assert_allclose(moving.angular_momentum, turning, rtol=1e-11)
@@ -258,7 +258,7 @@ def test_a_body_that_yields_keeps_its_angular_momentum(cell):
     law = VonMises(100.0, 0.3, rho_y=0.2)
     problem = spinning(square(cell), law, scheme="conserving", petsc_options={})
     turning = problem.angular_momentum
-    history = problem.solve(1.0, 0.04)
+    history = problem.solve(time=1.0, dt=0.04)
     assert problem.particles.plastic_strain.max() > 1e-4
     np.testing.assert_allclose(problem.angular_momentum, turning, rtol=1e-9)
     assert change_of_balance(history) < 1e-12
@@ -273,7 +273,7 @@ def test_both_routes_conserve_alike():
     for route in ROUTES:
         with on_route(route):
             problem = thrown(scheme="conserving", rayleigh=(0.1, 0.01))
-            problem.solve(0.2, 0.05)
+            problem.solve(time=0.2, dt=0.05)
         runs.append(run_of(problem))
     require_same(*runs, 1e-9)
 
@@ -317,7 +317,7 @@ def test_masses_reduced_domain_by_domain_are_those_of_stock_forms(cell, degree, 
             velocity=lambda x: np.stack([np.sin(7 * x[i] + i) for i in range(gdim)]),
             stabilisation=None,
         )
-        problem.solve(0.02, 0.01)
+        problem.solve(time=0.02, dt=0.01)
         assert [step.iterations for step in problem.history.steps] == [1, 1]
         found = zip(bodies, problem.velocity, strict=True)
         runs.append([in_order(body, nodal(v)[body.domain_nodes]) for body, v in found])
@@ -340,7 +340,7 @@ def test_sand_that_falls_apart_gives_back_no_more_than_it_has():
         bcs=bcs,
         scheme="conserving",
     )
-    energies = problem.solve(0.6, 0.01).energies
+    energies = problem.solve(time=0.6, dt=0.01).energies
     dissipated = np.array([energy.dissipated for energy in energies])
     assert np.diff(dissipated).min() > -1e-6 and 700.0 < dissipated[-1] < 1100.0
     assert np.ptp([energy.balance for energy in energies]) < 1e-10 * dissipated[-1]
@@ -363,7 +363,7 @@ def test_rayleigh_damping_lets_a_mode_decay_as_it_must(beta):
         out_of_range="reflect",
         rayleigh=(alpha, beta),
     )
-    history = problem.solve(t, 0.02)
+    history = problem.solve(time=t, dt=0.02)
     first, last = history.energies[0], history.energies[-1]
     assert change_of_balance(history) < 1e-12
     whole = last.kinetic + last.strain
@@ -375,7 +375,7 @@ def test_damping_by_stiffness_resists_no_rotation():
     # Rigid spins, exact: the damping of a soft dust is that of its strain rates alone.
     problem = spinning(rayleigh=(0.0, 0.02), scheme="conserving")
     turning = problem.angular_momentum
-    history = problem.solve(1.0, 0.05)
+    history = problem.solve(time=1.0, dt=0.05)
     np.testing.assert_allclose(problem.angular_momentum, turning, rtol=1e-10)
     assert 0.0 < history.energies[-1].damping < 2e-3 * history.energies[0].kinetic
 
@@ -406,7 +406,7 @@ def bounced(n, dt):
     )
     masses, heights = problem.nodal_masses(0), []
     mass = WORLD.allreduce(float(masses.sum()))
-    for _ in problem.steps(1.1, dt):
+    for _ in problem.steps(time=1.1, dt=dt):
         z = particles.node_positions[:, 2][particles.domain_nodes[: particles.num_local]]
         heights.append(WORLD.allreduce(float((masses * z).sum())) / mass)
     energies, scale = problem.history.energies, 0.1 * mass
@@ -444,7 +444,7 @@ def test_a_bar_bounces_off_a_plane(scheme, out):
         terms=[wall(particles, (0.2, 0.0), (1.0, 0.0))],
     )
     momentum = problem.momentum
-    history = problem.solve(3.6, 0.04)
+    history = problem.solve(time=3.6, dt=0.04)
     np.testing.assert_allclose(problem.momentum / momentum[0], [-1.0, 0.0], atol=0.06)
     whole = np.array([energy.kinetic + energy.internal for energy in history.energies])
     assert whole.max() <= whole[0] * (1.0 + 1e-9)
@@ -475,7 +475,7 @@ def test_a_quiet_boundary_lets_a_pulse_go(scheme):
     )
     momentum = problem.momentum[0]
     impulse = 0.0
-    for _ in problem.steps(0.6, 0.01):
+    for _ in problem.steps(time=0.6, dt=0.01):
         impulse += 0.01 * problem.reaction(quiet)[0]
     history = problem.history
     # Half of it runs to the right, with half of the energy.
@@ -509,7 +509,7 @@ def test_a_quiet_boundary_resists_motions_across_and_along_it(scheme):
     sides = [fem.form(change[i] * ds) for i in (0, 1)]
     change.x.array[:] = 0.0
     momentum = problem.momentum
-    for _ in problem.steps(0.1, 0.02):
+    for _ in problem.steps(time=0.1, dt=0.02):
         change.x.array[:] = (particles.displacement.x.array - change.x.array) / 0.02
         across, along = (WORLD.allreduce(fem.assemble_scalar(side)) for side in sides)
         force = [-3.0 * across, -0.7 * along]
@@ -529,7 +529,7 @@ def test_a_plane_that_moves_throws_a_body():
     problem = mpm.DynamicProblem(
         mpm.Body(particles, LinearElastic(1.0, 0.0), density=1.0), terms=[plate]
     )
-    history = problem.solve(2.6, 0.04, lambda t: plate.move((0.1 * t, 0.0)))
+    history = problem.solve(time=2.6, dt=0.04, update=lambda t: plate.move((0.1 * t, 0.0)))
     np.testing.assert_allclose(problem.momentum, [0.2 / 8, 0.0], rtol=0.03, atol=1e-6)
     work = -history.energies[-1].internal + history.energies[-1].strain
     assert work == pytest.approx(0.5 * 0.2**2 / 8, rel=0.05)
@@ -553,7 +553,7 @@ def test_an_elastic_bar_wins_no_energy_at_any_speed(speed, dt, out):
         ),
         out_of_range=out,
     )
-    history = problem.solve(50 * dt if speed * 50 * dt < 7.0 else 5.0, dt)
+    history = problem.solve(time=50 * dt if speed * 50 * dt < 7.0 else 5.0, dt=dt)
     whole = np.array([energy.kinetic + energy.internal for energy in history.energies])
     assert whole.max() <= whole[0] * (1.0 + 1e-10)
     assert whole.min() >= whole[0] * (1.0 - (1e-3 if out == "reflect" else 0.05))
@@ -577,7 +577,7 @@ def test_momentum_does_not_wander_from_step_to_step():
         solver=mpm.Solver(petsc_options={"snes_rtol": 1e-13}),
     )
     first = problem.momentum
-    problem.solve(1.4, 0.02)
+    problem.solve(time=1.4, dt=0.02)
     assert abs(problem.momentum - first)[0] < 1e-13 * h
 
 
@@ -607,7 +607,7 @@ def test_a_bar_wins_no_energy_in_a_long_flight(speed, degree, out):
             out_of_range=out,
             solver=mpm.Solver(stabilisation=None),
         )
-        history = problem.solve(steps * dt, dt)
+        history = problem.solve(time=steps * dt, dt=dt)
         whole = np.array([energy.kinetic + energy.strain for energy in history.energies])
         assert whole.max() <= whole[0] * (1.0 + 1e-10)
         if out == "reflect":
@@ -628,7 +628,7 @@ def vibrating(steps, scheme):
     problem = mpm.DynamicProblem(
         mpm.Body(particles, LinearElastic(1.0, 0.0), density=1.0, velocity=velocity), scheme=scheme
     )
-    problem.solve(end, end / steps)
+    problem.solve(time=end, dt=end / steps)
     x = particles.W.tabulate_dof_coordinates()[:, 0] - 0.3
     exact = 0.1 * np.sin(w * end) * np.cos(np.pi * x)
     return largest(nodal(particles.displacement)[:, 0] - speed * end - exact) / 0.1
@@ -662,7 +662,7 @@ def test_a_bar_that_is_shaken_at_its_end_carries_the_wave():
     def update(t):
         shaken.value[0] = path(t)
 
-    problem.solve(0.9, 0.9 / 60, update)
+    problem.solve(time=0.9, dt=0.9 / 60, update=update)
     x = particles.W.tabulate_dof_coordinates()[:, 0] - 0.2
     assert largest(nodal(particles.displacement)[:, 0] - path(0.9 - x)) < 0.03 * 0.02
 
@@ -680,7 +680,7 @@ def test_the_reaction_is_the_force_that_moves_a_body(scheme):
         nodal(value)[:] = (0.1 * t**2, -0.05 * t**2)
 
     forces = []
-    for step in problem.steps(0.5, 0.1, update):
+    for step in problem.steps(time=0.5, dt=0.1, update=update):
         if scheme == "midpoint":
             np.testing.assert_allclose(
                 problem.momentum, 2.0 * step.time * np.array([0.2, -0.1]), atol=1e-11
@@ -700,7 +700,7 @@ def test_dirichlet_values_that_move_are_followed_by_what_projects():
     def update(t):
         nodal(value)[:] = (0.1 * t**2, -0.05 * t**2)
 
-    for number, step in enumerate(problem.steps(0.5, 0.1, update)):
+    for number, step in enumerate(problem.steps(time=0.5, dt=0.1, update=update)):
         if number > 0:
             expected = 2.0 * step.time * np.array([0.2, -0.1])
             np.testing.assert_allclose(problem.momentum, expected, atol=1e-11)
@@ -736,7 +736,7 @@ def test_a_pushed_bar_carries_the_wave(tmp_path, out):
 
     problem, update = pushed()
     path = WORLD.bcast(tmp_path) / "run.ckpt"
-    for step in problem.steps(0.9, 0.015, update):
+    for step in problem.steps(time=0.9, dt=0.015, update=update):
         if len(problem.history.steps) == 30:
             problem.save(path)
     x = problem.particles.W.tabulate_dof_coordinates()[:, 0]
@@ -748,7 +748,7 @@ def test_a_pushed_bar_carries_the_wave(tmp_path, out):
     assert change_of_balance_of(problem.history, work) < 1e-11
     again, update = pushed()
     again.restore(path)
-    again.solve(0.9, 0.015, update)
+    again.solve(time=0.9, dt=0.015, update=update)
     require_same(run_of(again), run_of(problem), EXACT)
 
 
@@ -763,7 +763,7 @@ def test_a_body_of_revolution_falls_and_keeps_its_account():
         body_force=(0.0, -1.0),
     )
     mass = 2.0 * np.pi
-    history = problem.solve(0.5, 0.05)
+    history = problem.solve(time=0.5, dt=0.05)
     np.testing.assert_allclose(problem.momentum[1], -0.5 * mass, rtol=1e-10)
     assert change_of_balance(history) < 1e-9
     assert history.energies[-1].external == pytest.approx(mass * 0.125, rel=1e-10)
@@ -783,7 +783,7 @@ def test_a_cube_spins_in_space():
     )
     momentum, turning = problem.momentum, problem.angular_momentum
     assert turning.shape == (3,)
-    history = problem.solve(0.2, 0.05)
+    history = problem.solve(time=0.2, dt=0.05)
     np.testing.assert_allclose(problem.momentum, momentum, atol=1e-11)
     np.testing.assert_allclose(problem.angular_momentum, turning, atol=2e-4)
     assert change_of_balance(history) < 1e-10
@@ -794,7 +794,7 @@ def test_backward_euler_brings_a_body_to_rest_on_a_plane():
     floor = wall(particles, (0.0, 1.0), (0.0, 1.0))
     options = {"body_force": (0.0, -1.0), "terms": [floor], "velocity": None}
     problem = spinning(particles, scheme="euler", **options)
-    problem.solve(4.0, 0.1)
+    problem.solve(time=4.0, dt=0.1)
     assert problem.kinetic_energy < 1e-6
     np.testing.assert_allclose(problem.reaction(floor), [0.0, 2.0], atol=1e-3)
 
@@ -837,13 +837,13 @@ def thrown(comm=WORLD, out="project", scheme="midpoint", **options):
 def test_a_run_that_is_restored_goes_on_bit_for_bit(tmp_path, out, scheme):
     path = WORLD.bcast(tmp_path) / "run.ckpt"
     whole = thrown(out=out, scheme=scheme)
-    for step in whole.steps(0.5, 0.05, output_at=[0.33]):
+    for step in whole.steps(time=0.5, dt=0.05, output_at=[0.33]):
         if step.time == 0.25 or len(whole.history.steps) == 5:
             whole.save(path)
     restored = thrown(out=out, scheme=scheme)
     restored.restore(path)
     assert len(restored.history.steps) == 5
-    restored.solve(0.5, 0.05, output_at=[0.33])
+    restored.solve(time=0.5, dt=0.05, output_at=[0.33])
     assert [s.time for s in restored.history.steps] == [s.time for s in whole.history.steps]
     require_same(run_of(restored), run_of(whole), EXACT)
     raises(
@@ -868,9 +868,9 @@ def test_a_run_that_is_restored_goes_on_bit_for_bit(tmp_path, out, scheme):
 def test_ranks_and_moves_between_them_change_nothing(scheme):
     options = {"scheme": scheme, "rayleigh": (0.1, 0.002)}
     alone = thrown(mesh_comm(), **options) if WORLD.size > 1 else thrown(**options)
-    alone.solve(0.5, 0.05)
+    alone.solve(time=0.5, dt=0.05)
     moving = thrown(**options)
-    for number, _ in enumerate(moving.steps(0.5, 0.05)):
+    for number, _ in enumerate(moving.steps(time=0.5, dt=0.05)):
         if number % 3 == 0:
             ranks = anywhere(moving.particles.mesh, number)
             moving.renew(lambda ranks=ranks: moving.particles.move(ranks), lambda state: state)
@@ -889,14 +889,14 @@ def mesh_comm():
 )
 def test_split_and_rebase_keep_momentum(out, scheme):
     problem = thrown(out=out, scheme=scheme)
-    problem.solve(0.2, 0.05)
+    problem.solve(time=0.2, dt=0.05)
     expected = problem.momentum
     problem.split([3, 17, 40])
     np.testing.assert_allclose(problem.momentum, expected, atol=1e-12)
     problem.rebase()
     np.testing.assert_allclose(problem.momentum, expected, atol=1e-12)
     turning = problem.angular_momentum
-    history = problem.solve(0.4, 0.05)
+    history = problem.solve(time=0.4, dt=0.05)
     np.testing.assert_allclose(problem.momentum, expected - [0.0, 0.2 * 2.0], atol=1e-11)
     if scheme == "conserving":  # the weight turns it about the origin
         turned = problem.angular_momentum - turning
@@ -914,14 +914,14 @@ def test_a_rebase_keeps_kinetic_energy(cell, degree):
     body = box([1.23, 1.51], [2.23, 2.51], [2, 2], cell)
     particles = mpm.Particles(body, plate(degree=degree), degree=degree)
     problem = spinning(particles, velocity=torn)
-    problem.solve(0.2, 0.05)
+    problem.solve(time=0.2, dt=0.05)
     strain = np.abs(particles.deformation_gradient - np.eye(3)).max(initial=0.0)
     assert WORLD.allreduce(strain, MPI.MAX) > 0.3
     before = problem.kinetic_energy, *problem.momentum
     problem.rebase()
     after = problem.kinetic_energy, *problem.momentum
     np.testing.assert_allclose(after, before, rtol=0, atol=1e-13 * before[0])
-    problem.solve(0.3, 0.05)
+    problem.solve(time=0.3, dt=0.05)
     assert change_of_balance(problem.history) < 1e-9
 
 
@@ -931,10 +931,10 @@ def test_a_motion_goes_on_as_it_was_after_a_rebase(options):
     runs = []
     for rebased in (False, True):
         problem = spinning(velocity=lambda x: 0.3 * x[:2], scheme="conserving", **options)
-        problem.solve(0.2, 0.05)
+        problem.solve(time=0.2, dt=0.05)
         if rebased:
             problem.rebase()
-        problem.solve(0.4, 0.05)
+        problem.solve(time=0.4, dt=0.05)
         assert change_of_balance(problem.history) < 1e-9
         runs.append(problem)
     one, two = runs
@@ -949,7 +949,7 @@ def test_a_split_between_two_steps_keeps_momentum(scheme):
     # The forces at the beginning of the next step are those of before.
     problem = thrown(scheme=scheme, petsc_options={"snes_rtol": 1e-12})
     expected = problem.momentum
-    for step in problem.steps(0.3, 0.05):
+    for step in problem.steps(time=0.3, dt=0.05):
         if step.time == pytest.approx(0.15):
             problem.split(np.arange(0, problem.particles.num_global, 2))
         fallen = [0.0, step.time * 2.0]
@@ -970,13 +970,13 @@ def test_other_meshes_between_two_steps_are_no_other_run(what, damping):
     for once in (True, False):
         problem = thrown(scheme="conserving", rayleigh=(0.0, damping))
         if once:
-            for step in problem.steps(0.3, 0.05):
+            for step in problem.steps(time=0.3, dt=0.05):
                 if step.time == pytest.approx(0.15):
                     change(problem)
         else:
-            problem.solve(0.15, 0.05)
+            problem.solve(time=0.15, dt=0.05)
             change(problem)
-            problem.solve(0.3, 0.05)
+            problem.solve(time=0.3, dt=0.05)
         assert change_of_balance(problem.history) < 1e-9
         runs.append(problem.particles)
     assert np.abs(runs[0].domains - runs[1].domains).max(initial=0.0) < 1e-9
@@ -994,7 +994,7 @@ def test_two_bodies_collide_on_one_background():
         velocity=[(0.5, 0.0), (-0.5, 0.0)],
         petsc_options={"snes_rtol": 1e-12},
     )
-    history = problem.solve(0.8, 0.01)  # (the gap to contact is known to a step)
+    history = problem.solve(time=0.8, dt=0.01)  # (the gap to contact is known to a step)
     np.testing.assert_allclose(problem.momentum, 0.0, atol=1e-11)
     speeds = []
     for body, velocity in zip(bodies, problem.velocity, strict=True):
@@ -1027,7 +1027,7 @@ def test_other_methods_and_options_keep_momentum_and_the_account(name, take):
     take(options.pop("route", "loops"))
     problem = spinning(square(**of_particles), velocity=lambda x: 0.3 + 0.5 * spin(x), **options)
     momentum, turning = problem.momentum, problem.angular_momentum
-    history = problem.solve(0.4, 0.05)
+    history = problem.solve(time=0.4, dt=0.05)
     np.testing.assert_allclose(problem.momentum, momentum, atol=1e-10)
     atol = 1e-10 if options.get("scheme") == "conserving" else 2e-4
     np.testing.assert_allclose(problem.angular_momentum, turning, atol=atol)
@@ -1060,7 +1060,7 @@ def test_a_pressure_and_a_tie_give_the_account_their_work():
         facet_tags=tags,
         petsc_options={"snes_rtol": 1e-12},
     )
-    history = problem.solve(0.5, 0.025)
+    history = problem.solve(time=0.5, dt=0.025)
     # A pressure of 1 on a face that is about as long as at first drives both to the left.
     np.testing.assert_allclose(problem.momentum, [-0.5, 0.0], atol=0.01)
     means = [nodal(v)[:, 0].mean() for v in problem.velocity]
@@ -1074,11 +1074,11 @@ def test_two_fields_fly_apart_as_if_each_were_alone():
     alone = []
     for speed in (0.4, -0.3):
         problem = spinning(velocity=lambda x, s=speed: s * spin(x))
-        problem.solve(0.5, 0.05)
+        problem.solve(time=0.5, dt=0.05)
         alone.append(run_of(problem))
     pair = [square(), square()]
     together = spinning(pair, velocity=[lambda x, s=s: s * spin(x) for s in (0.4, -0.3)])
-    together.solve(0.5, 0.05)
+    together.solve(time=0.5, dt=0.05)
     found = run_of(together)
     for number, own in enumerate(alone):
         for name in ("positions", "stress", "velocity"):
@@ -1139,12 +1139,12 @@ def test_a_body_without_inertia_beside_one_that_moves(scheme, out, f_bar):
         particles.load.value = 1.0
         push.value = load(s * times[-1])
 
-    for _ in static.steps(len(times), path):
+    for _ in static.steps(len(times), update=path):
         alone.append(nodal(particles.displacement).copy())
     rule = 2 if f_bar == "domain" else None
     given = {"scheme": scheme, "out_of_range": out, **options}
     free = spinning(square(quadrature_degree=rule), law, **given)
-    free.solve(times[-1], times[0])
+    free.solve(time=times[-1], dt=times[0])
 
     body, weight, tractions, tags, bcs = standing(f_bar)
     pair = [square(quadrature_degree=rule), body]
@@ -1163,7 +1163,7 @@ def test_a_body_without_inertia_beside_one_that_moves(scheme, out, f_bar):
         weight.value = load(t)
 
     found = []
-    for _ in problem.steps(times[-1], times[0], update):
+    for _ in problem.steps(time=times[-1], dt=times[0], update=update):
         found.append(nodal(body.displacement).copy())
     np.testing.assert_allclose(found, alone, atol=1e-9)
     assert WORLD.allreduce(float(body.plastic_strain.max(initial=0.0)), MPI.MAX) > 1e-3
@@ -1199,7 +1199,7 @@ def test_a_mass_on_a_spring_without_inertia_swings_in_its_period(tmp_path):
 
     problem = made([bar])
     omega = 1.0  # of the mass 0.25 on the stiffness 0.25
-    history = problem.solve(np.pi / omega / 2.0, 0.02)
+    history = problem.solve(time=np.pi / omega / 2.0, dt=0.02)
     middle = nodal(block.displacement)[:, 0].mean()
     if WORLD.size == 1:
         assert middle == pytest.approx(0.02 / omega, rel=0.015)
@@ -1230,7 +1230,7 @@ def test_what_a_dashpot_on_a_body_without_inertia_takes_counts_once(scheme):
         scheme=scheme,
         solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
     )
-    energies = problem.solve(0.3, 0.03).energies
+    energies = problem.solve(time=0.3, dt=0.03).energies
     assert energies[-1].dissipated > 0.2 * energies[0].kinetic
     assert np.ptp([energy.balance for energy in energies]) < 1e-10 * energies[0].kinetic
 
@@ -1291,7 +1291,7 @@ def test_a_body_in_equilibrium_stays_at_rest(scheme, out, f_bar):
         **given,
     )
     np.testing.assert_array_equal(particles.plastic_strain, yielded)
-    history = problem.solve(0.5, 0.1)
+    history = problem.solve(time=0.5, dt=0.1)
     assert WORLD.allreduce(float(yielded.sum())) > 1e-3
     assert largest(nodal(particles.displacement) - settled) < 1e-9
     assert problem.kinetic_energy < 1e-16
@@ -1318,7 +1318,7 @@ def test_what_was_weakened_in_equilibrium_stays_weak_in_motion():
     assert strength * 0.9 < most() < 1.05 * strength
     given["body_force"] = (0.0, -3.0)
     problem = posed(mpm.DynamicProblem, particles, law, 2.0, scheme="euler", after=static, **given)
-    problem.solve(0.2, 0.05)
+    problem.solve(time=0.2, dt=0.05)
     assert problem.points[0].weakening == 1.5
     assert strength * 0.95 < most() < 1.05 * strength  # (means over domains)
 
@@ -1339,7 +1339,7 @@ def test_a_body_with_a_pressure_of_its_own_stays_at_rest_in_equilibrium(scheme):
     pressure = static.pressure[0].x.array.copy()
     problem = posed(mpm.DynamicProblem, particles, law, 2.0, scheme=scheme, after=static, **given)
     np.testing.assert_array_equal(problem.pressure[0].x.array, pressure)
-    history = problem.solve(0.2, 0.05)
+    history = problem.solve(time=0.2, dt=0.05)
     assert largest(nodal(particles.displacement) - settled) < 1e-8
     np.testing.assert_allclose(problem.pressure[0].x.array, pressure, atol=1e-6)
     assert problem.kinetic_energy < 1e-14 and WORLD.allreduce(float(pressure.min())) < -1.0
@@ -1361,7 +1361,7 @@ def test_a_body_let_go_from_equilibrium_moves_as_its_energy_says():
         after=static,
         **given,
     )
-    history = problem.solve(0.3, 0.02)
+    history = problem.solve(time=0.3, dt=0.02)
     first, last = history.energies[0], history.energies[-1]
     assert first.kinetic == 0.0 and first.strain > 1e-3
     assert last.kinetic > 0.3 * first.strain
@@ -1398,7 +1398,7 @@ def test_what_a_motion_cannot_begin_with_is_refused():
         mpm.MPMError,
         "needs a QuasiStaticProblem",
     )
-    moving.solve(0.1, 0.1)  # particles are elsewhere now than that history knows
+    moving.solve(time=0.1, dt=0.1)  # particles are elsewhere now than that history knows
     raises(
         lambda: posed(mpm.DynamicProblem, particles, law, 2.0, after=static, **given),
         mpm.MPMError,
@@ -1410,7 +1410,7 @@ def test_times_asked_for_are_hit_and_written(tmp_path):
     path = WORLD.bcast(tmp_path) / "run.pvd"
     problem = thrown()
     wanted = [0.1, 1.0 / 3.0, 0.37]
-    history = problem.solve(0.4, 0.06, output_at=wanted, output=path)
+    history = problem.solve(time=0.4, dt=0.06, output_at=wanted, output=path)
     times = [step.time for step in history.steps]
     assert set(wanted) <= set(times) and times[-1] == 0.4 == history.time
     assert np.diff([0.0, *times]).max() <= 0.06 * (1 + 1e-12)
@@ -1432,7 +1432,7 @@ def test_a_step_that_fails_is_halved_and_later_ones_recover():
 
     calls = []
     problem.evaluate = evaluate
-    history = problem.solve(0.3, 0.05, update=calls.append)
+    history = problem.solve(time=0.3, dt=0.05, update=calls.append)
     assert history.cutbacks >= 1
     assert history.time == 0.3
     lengths = np.diff([energy.time for energy in history.energies])
@@ -1448,7 +1448,7 @@ def momentum_of_spin():
 def test_particles_that_leave_take_their_momentum_with_them():
     V = plate()
     problem = spinning(square(V=V, corner=(2.53, 1.51), outside="delete"), velocity=(1.0, 0.0))
-    history = problem.solve(1.0, 0.05)
+    history = problem.solve(time=1.0, dt=0.05)
     left = history.statistics["lost_mass"]
     assert 0.5 < left < 2.0
     np.testing.assert_allclose(problem.momentum, [2.0 - left, 0.0], atol=1e-9)
@@ -1502,7 +1502,7 @@ def test_a_residual_in_ufl_moves_as_its_material(scheme, out, tmp_path):
     for kind in ("material", "UFL"):
         problem = both(kind)
         momentum = problem.momentum
-        for _ in problem.steps(0.6, 0.03):
+        for _ in problem.steps(time=0.6, dt=0.03):
             if kind == "UFL" and len(problem.history.steps) == 10:
                 problem.save(WORLD.bcast(tmp_path) / "run.ckpt")
         assert change_of_balance(problem.history) < 1e-11
@@ -1520,7 +1520,7 @@ def test_a_residual_in_ufl_moves_as_its_material(scheme, out, tmp_path):
     assert ends[0].internal > ends[0].strain > 0.0  # the floor has a share
     again = both("UFL")
     again.restore(WORLD.bcast(tmp_path) / "run.ckpt")
-    again.solve(0.6, 0.03)
+    again.solve(time=0.6, dt=0.03)
     assert largest(nodal(again.particles.displacement) - e) == 0.0
 
 
@@ -1572,14 +1572,19 @@ def test_what_does_not_go_with_inertia_is_refused():
     refused("form on the background has no past", particles=particles, background=form)
     problem = spinning()
     for call, sentence in (
-        (lambda: problem.solve(-1.0, 0.1), "give a later time"),
-        (lambda: problem.solve(1.0, 0.0), "dt must be positive"),
-        (lambda: problem.solve(np.nan, 0.1), "time must be a finite number"),
-        (lambda: problem.solve(1.0, 0.1, output_at=[2.0]), "later than the end"),
-        (lambda: problem.solve(1.0, 0.1, output_at=3), "must be a list of times"),
+        (lambda: problem.solve(time=-1.0, dt=0.1), "give a later time"),
+        (lambda: problem.solve(time=1.0, dt=0.0), "dt must be positive"),
+        (lambda: problem.solve(time=np.nan, dt=0.1), "time must be a finite number"),
+        (lambda: problem.solve(time=1.0, dt=0.1, output_at=[2.0]), "later than the end"),
+        (lambda: problem.solve(time=1.0, dt=0.1, output_at=3), "must be a list of times"),
         (lambda: problem.step(-0.1), "dt must be a positive number"),
     ):
         raises(call, mpm.MPMError, sentence)
+    # A number of steps, as in a problem at rest, is not taken for a time.
+    for go in (problem.solve, problem.steps):
+        raises(lambda go=go: go(60, dt=0.01), TypeError, "positional argument")
+        raises(lambda go=go: go(steps=60, dt=0.01), TypeError, "steps")
+    assert problem.history.time == 0.0
 
 
 def let_go(start=True, monkeypatch=None):
@@ -1601,7 +1606,7 @@ def let_go(start=True, monkeypatch=None):
         bcs=bcs,
         scheme="euler",
     )
-    problem.solve(0.25, 0.01)
+    problem.solve(time=0.25, dt=0.01)
     return problem
 
 

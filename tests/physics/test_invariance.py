@@ -344,7 +344,7 @@ def resting(frame, **options):
     scene.terms.append(plate)
     problem = scene.problem(load=0.0, **options)
     if options.get("kind") is mpm.DynamicProblem:
-        problem.solve(0.08 * frame.time, 0.02 * frame.time)
+        problem.solve(time=0.08 * frame.time, dt=0.02 * frame.time)
     else:
         problem.solve(2)
     scene.seen["centre"] = frame.back(np.array(plate.centre, dtype=float))
@@ -357,7 +357,7 @@ def moving(frame, scene=None, **options):
     scene.body(scene.background())
     start = np.array(frame.vector(*[1.0, -2.0, 0.0][: scene.dim])) * frame.length / frame.time
     problem = scene.problem(mpm.DynamicProblem, velocity=tuple(start), **options)
-    problem.solve(0.08 * frame.time, 0.02 * frame.time)
+    problem.solve(time=0.08 * frame.time, dt=0.02 * frame.time)
     energy = problem.history.energies[-1]
     around = options.get("axisymmetric", False)
     unit = frame.stress * frame.length ** (3 if around else scene.dim)
@@ -379,7 +379,7 @@ def wet(frame):
         tractions=[(force, 1)],
         facet_tags=scene.top(body),
     )
-    problem.solve(0.2 * f.time, 0.1 * f.time)
+    problem.solve(time=0.2 * f.time, dt=0.1 * f.time)
     water = problem.pore_pressure[0]
     values = water.x.array[water.W.dofmap.list[: body.num_local]]
     scene.seen["pore pressure"] = scenes.in_order(body, values) / f.stress

@@ -88,7 +88,7 @@ def test_bdf2_is_of_second_order_and_its_account_closes(uneven):
         errors.append(error_of(problem))
     assert 1.95 < np.log2(errors[0] / errors[1]) < 2.1
     euler = bar("euler")
-    euler.solve(2.25, 2.25 / 72)
+    euler.solve(time=2.25, dt=2.25 / 72)
     assert errors[1] < 0.1 * error_of(euler)
 
 
@@ -135,25 +135,25 @@ def require_same(one, other, tolerance):
 @pytest.mark.parametrize(("share", "known"), [(0.5, "midpoint"), (1.0, "euler"), (0.6, None)])
 def test_a_family_of_schemes_has_midpoint_and_euler_at_its_ends(share, known, options):
     found = bouncing(Theta(share), rayleigh=(0.1, 1e-3), **options)
-    found.solve(0.3, 0.03)
+    found.solve(time=0.3, dt=0.03)
     contact = [energy.internal for energy in found.history.energies]
     assert change_of_balance(found) < 1e-9
     assert max(contact) > 0.01 * found.history.energies[0].kinetic
     if known is not None:
         same = bouncing(known, rayleigh=(0.1, 1e-3), **options)
-        same.solve(0.3, 0.03)
+        same.solve(time=0.3, dt=0.03)
         require_same(found, same, 1e-8)
 
 
 def test_what_a_scheme_keeps_is_restored_bit_for_bit(tmp_path):
     path = WORLD.bcast(tmp_path) / "run.ckpt"
     whole = bouncing(BDF2())
-    for _ in whole.steps(0.3, 0.03):
+    for _ in whole.steps(time=0.3, dt=0.03):
         if len(whole.history.steps) == 5:
             whole.save(path)
     restored = bouncing(BDF2())
     restored.restore(path)
-    restored.solve(0.3, 0.03)
+    restored.solve(time=0.3, dt=0.03)
     require_same(restored, whole, EXACT)
     sentence = "was made with scheme='bdf2', out_of_range='project', and this problem with 'euler'"
     raises(lambda: bouncing("euler").restore(path), mpm.MPMError, sentence)
@@ -161,8 +161,8 @@ def test_what_a_scheme_keeps_is_restored_bit_for_bit(tmp_path):
 
 def test_what_a_scheme_keeps_goes_with_bodies_to_other_ranks_and_meshes():
     there, moving = bouncing(BDF2(), False), bouncing(BDF2(), False)
-    there.solve(0.2, 0.02)
-    for number, _ in enumerate(moving.steps(0.2, 0.02)):
+    there.solve(time=0.2, dt=0.02)
+    for number, _ in enumerate(moving.steps(time=0.2, dt=0.02)):
         ranks = anywhere(moving.particles.mesh, number)
         moving.renew(lambda ranks=ranks: moving.particles.move(ranks), lambda state: state)
     require_same(moving, there, 1e-9)

@@ -187,7 +187,7 @@ def test_history_of_a_motion_shows_energies():
     problem = mpm.DynamicProblem(
         mpm.Body(particles, mpm.materials.Hencky(1e4, 0.3), density=1.0, body_force=(0.0, -1.0))
     )
-    problem.solve(0.1, 0.05)
+    problem.solve(time=0.1, dt=0.05)
     figure = mpm.plot.history(problem)
     speed = mpm.plot.scene(problem, "velocity_y")
     if WORLD.rank == 0:

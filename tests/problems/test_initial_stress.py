@@ -100,7 +100,7 @@ def test_other_ways(cell, options, take):
         cell = QUADRILATERAL  # gimp has boxes, a triangle one point
     problem = ground(LAWS[4], cell, **options)
     if "problem" in options:
-        problem.solve(0.1, 0.05)
+        problem.solve(time=0.1, dt=0.05)
     else:
         problem.solve(3)
     stays(problem)
@@ -150,7 +150,7 @@ def test_averages_account_for_all_energy_of_stressed_ground_that_shakes(scheme):
     (body,) = whole.setup.given
     body = body.replace(material=materials.Hencky(YOUNG, 0.3), velocity=(0.5, -0.5))
     problem = mpm.DynamicProblem(body, whole.bcs, scheme=scheme)
-    problem.solve(0.05, 0.01)
+    problem.solve(time=0.05, dt=0.01)
     energies = problem.history.energies
     size = max(energy.kinetic for energy in energies)
     assert np.ptp([energy.balance for energy in energies]) < 1e-9 * size
@@ -342,7 +342,7 @@ def punched(water):
     drained = {"facet_tags": tags, "drained": [(0.0, 1)], "permeability": 1e-3, "storage": 1e-4}
     problem = posed(mpm.PorousProblem, body, law, **given, **drained)
     return problem, lambda: problem.steps(
-        0.4, 0.1, update=lambda t: np.put(way.value, 1, -0.25 * t)
+        time=0.4, dt=0.1, update=lambda t: np.put(way.value, 1, -0.25 * t)
     )
 
 

@@ -637,7 +637,7 @@ def test_soil_in_a_stage(name, mpi_tmp_path):
 def test_soil_in_motion():
     """By backward Euler, whose stress is that at the step's end."""
     problem = turning("euler", SOILS["drucker-prager"].with_parameters(young=30.0, cohesion=0.05))
-    problem.solve(0.06, 0.03)
+    problem.solve(time=0.06, dt=0.03)
     assert problem.particles.plastic_strain.max() > 0.0
     assert error_of_blocks(problem, step=1e-8, size=1e-6) <= 1e-5
 
@@ -806,7 +806,7 @@ def test_a_body_that_turns(scheme):
     """The volume stays, so does energy, and angular momentum by the conserving scheme."""
     problem = turning(scheme)
     begin = problem.angular_momentum
-    history = problem.solve(0.4, 0.02)
+    history = problem.solve(time=0.4, dt=0.02)
     assert history.cutbacks == 0 and np.mean(history.iterations) <= 3.0
     lost = problem.angular_momentum / begin - 1.0
     assert scenes.largest(lost) < (1e-10 if scheme == "conserving" else 1e-4)
@@ -827,7 +827,7 @@ def test_soil_that_turns_and_yields(name, scheme):
     for mixed in ("pressure", None):
         problem = turning(scheme, SOILS[name], mixed)
         begin = problem.angular_momentum
-        energies = problem.solve(0.16, 0.02).energies
+        energies = problem.solve(time=0.16, dt=0.02).energies
         assert problem.history.cutbacks <= 2 and np.mean(problem.history.iterations) < 12.0
         total = energies[0].kinetic + energies[0].strain
         assert np.ptp([e.balance for e in energies]) < 1e-12 * total
@@ -842,7 +842,7 @@ def test_soil_that_turns_and_yields(name, scheme):
 @pytest.mark.parametrize("scheme", ["midpoint", "conserving"])
 def test_the_tangent_of_soil_in_motion(scheme):
     problem = turning(scheme, SOILS["mohr-coulomb"], rayleigh=(0.5, 1e-3))
-    problem.solve(0.06, 0.03)
+    problem.solve(time=0.06, dt=0.03)
     assert scenes.largest(problem.particles.plastic_strain) > 1e-3
     assert error_of_blocks(problem, step=1e-6, size=1e-4) <= 1e-6
 
@@ -851,7 +851,7 @@ def test_the_tangent_of_soil_in_motion(scheme):
 @pytest.mark.parametrize("scheme", ["midpoint", "conserving", "euler"])
 def test_the_tangent_in_motion(scheme, law):
     problem = turning(scheme, law, rayleigh=(0.5, 1e-3))
-    problem.solve(0.06, 0.03)
+    problem.solve(time=0.06, dt=0.03)
     assert error_of_blocks(problem, step=1e-6, size=1e-4) <= 1e-6
 
 
@@ -866,7 +866,7 @@ def test_a_motion_from_a_file_and_on_other_ranks(mpi_tmp_path, scheme, law):
         problem = turning(scheme, law)
         if how == "restored":
             problem.restore(mpi_tmp_path / "motion")
-        for _ in problem.steps(0.1, 0.025, repartition=0.0 if how == "moved" else None):
+        for _ in problem.steps(time=0.1, dt=0.025, repartition=0.0 if how == "moved" else None):
             if how == "straight" and len(problem.history.steps) == 2:
                 problem.save(mpi_tmp_path / "motion")
         ends.append(outcome(problem))

@@ -98,7 +98,7 @@ def worst(p, exact):
 def test_a_column(options):
     """Terzaghi's column in the plane, around an axis and in space, and small ones of Hencky's."""
     problem, p, y = column(**options)
-    problem.solve(0.1, 0.025)
+    problem.solve(time=0.1, dt=0.025)
     assert worst(p, terzaghi(1.0 - y, 0.1)) < 0.06
     if "law" not in options:
         assert problem.history.iterations == [1, 1, 1, 1]
@@ -144,7 +144,7 @@ def test_the_same_as_in_ufl():
         problem.stage(bcs=[*problem.bcs, fem.dirichletbc(0.0, dofs, V.sub(1))])
         ends.append((problem, p))
     (problem, p), (other, _) = ends  # the second for its bodies and conditions alone
-    problem.solve(0.06, 0.02)
+    problem.solve(time=0.06, dt=0.02)
     body, k, dt = other.particles, 1.0 / confined(SOIL), 0.02
     V_p = fem.functionspace(body.V.mesh, ("Lagrange", 1))
     field = body.field(V_p, at="nodes", name="pore_pressure")
@@ -195,7 +195,7 @@ def test_a_large_settlement():
         problem, p, y = column(
             Hencky(modulus, 0.0), lambda J: J**3 / modulus / (1.0 - ufl.ln(J)), load, n
         )
-        history = problem.solve(time, time / steps)
+        history = problem.solve(time=time, dt=time / steps)
         assert history.cutbacks == 0
         body = problem.particles
         d = body.displacement.x.array.reshape(-1, 2)[:, 1]
@@ -254,7 +254,7 @@ def squeeze(n, *schedule):
     middle = np.isclose(X, 0.37 / n)
     found = []
     for end, dt in schedule:
-        for step in problem.steps(end, dt, path):
+        for step in problem.steps(time=end, dt=dt, update=path):
             exact = pressure(X, step.time)
             centre = WORLD.allreduce(float(p.x.array[middle].max(initial=0.0)), MPI.MAX)
             (true,) = pressure(np.array([0.37 / n]), step.time)
@@ -299,7 +299,7 @@ def test_water_at_rest(law):
         initial_stress=lambda x: _tensor(x, -10.0 * (1.0 + 0.37 / 4 - x[1])),
         pore_pressure=lambda x: 10.0 * (1.0 + 0.37 / 4 - x[1]),
     )
-    problem.solve(0.2, 0.1)
+    problem.solve(time=0.2, dt=0.1)
     assert worst(p, 10.0 * (1.0 - y)) < 1e-9
     d = scenes.own(problem.particles.displacement).reshape(-1, 2)
     sunk = 2.0 * 10.0 / (1e3 * confined(law) / 0.125)  # into the penalty of its support
@@ -329,7 +329,7 @@ def test_flat_domains_on_a_drained_top():
         bcs=[*walls, scenes.fix(body.V, scenes.at(1, 0.0), component=1)],
     )
     (p,) = problem.pore_pressure
-    largest = [scenes.largest(p.x.array) for _ in problem.steps(5e-3, 5e-4)]
+    largest = [scenes.largest(p.x.array) for _ in problem.steps(time=5e-3, dt=5e-4)]
     assert max(largest) < 1.01
     z = 1.0 - p.W.tabulate_dof_coordinates()[:, 1]
     assert worst(p, terzaghi(z, 5e-3)) < 0.15
@@ -379,7 +379,7 @@ def test_water_flows_in():
     every = np.arange(body.V.dofmap.index_map.size_local + body.V.dofmap.index_map.num_ghosts)
     walls = fem.dirichletbc(np.zeros(2), every.astype(np.int32), body.V)
     problem.stage(bcs=[walls])
-    problem.solve(1.0, 0.25)
+    problem.solve(time=1.0, dt=0.25)
     water, volume = (
         WORLD.allreduce(fem.assemble_scalar(fem.form(f * body.dx)))
         for f in (p, fem.Constant(body.mesh, 1.0))
@@ -405,7 +405,7 @@ def test_the_tangent_against_differences(law, axisymmetric):
         body_force=(0.0, -1.0),
         axisymmetric=axisymmetric,
     )
-    problem.solve(0.1, 0.05)
+    problem.solve(time=0.1, dt=0.05)
     assert law.inelastic is bool(scenes.largest(problem.particles.plastic_strain) > 0.0)
     assert error_of_blocks(problem, step=1e-7, size=1e-4) <= 1e-6
 
@@ -413,14 +413,14 @@ def test_the_tangent_against_differences(law, axisymmetric):
 def test_a_dry_lift_on_wet_ground():
     """What is put on the ground is carried by the water first."""
     problem, p, y = column(load=0.0, n=4, offset=0.0)
-    problem.solve(1e-6, 1e-6)
+    problem.solve(time=1e-6, dt=1e-6)
     V = problem.particles.V
     lift = mpm.Particles(scenes.box([0.0, 1.0], [0.5, 1.25], (4, 1), QUADRILATERAL), V, degree=2)
     problem.add(mpm.Body(lift, SOIL, density=4.0, body_force=(0.0, -1.0)))
     assert len(problem.pore_pressure) == 1 and problem.pore_pressure[0] is p
-    problem.solve(2e-6, 1e-6)
+    problem.solve(time=2e-6, dt=1e-6)
     assert scenes.largest(p.x.array[y < 0.6] - 1.0) < 1e-4
-    problem.solve(5.0, 1.0)
+    problem.solve(time=5.0, dt=1.0)
     assert scenes.largest(p.x.array) < 0.02
     held = problem.reaction(problem.setup.supports[0])
     assert held[1] == pytest.approx(0.5, rel=1e-6)
@@ -428,12 +428,12 @@ def test_a_dry_lift_on_wet_ground():
 
 def test_results_do_not_depend_on_the_ranks():
     problem, p, y = column(LAWS[1], load=1.5)
-    problem.solve(0.1, 0.05)
+    problem.solve(time=0.1, dt=0.05)
     together = outcome(problem)
     values = scenes.gather(np.column_stack([y, p.x.array]))
     if WORLD.rank == 0:
         alone, its, height = column(LAWS[1], load=1.5, comm=MPI.COMM_SELF)
-        alone.solve(0.1, 0.05)
+        alone.solve(time=0.1, dt=0.05)
         index = np.argsort(alone.particles.global_index)
         for name in ("centroid", "stress"):
             expected = getattr(alone.particles, name)[index]
@@ -446,7 +446,7 @@ def test_results_do_not_depend_on_the_ranks():
 
 def test_restart_and_a_step_that_fails(mpi_tmp_path):
     problem, p, _ = column(LAWS[1], load=1.5)
-    for step in problem.steps(0.1, 0.025):
+    for step in problem.steps(time=0.1, dt=0.025):
         if step.time == 0.05:
             problem.save(mpi_tmp_path / "half")
     end, pressure = outcome(problem), p.x.array.copy()
@@ -455,14 +455,14 @@ def test_restart_and_a_step_that_fails(mpi_tmp_path):
     before = its.x.array.copy()
     other.particles.V.mesh.comm.Barrier()
     assert scenes.largest(before) > 0.0
-    other.solve(0.1, 0.025)
+    other.solve(time=0.1, dt=0.025)
     same_run(outcome(other), end, EXACT)
     assert scenes.largest(its.x.array - pressure) <= EXACT
     for change in ({"permeability": 0.5}, {"storage": 1e-3}, {"fluid_density": 1.0}):
         another, _, _ = column(LAWS[1], load=1.5, **change)
         raises(lambda a=another: a.restore(mpi_tmp_path / "half"), mpm.MPMError, "material is not")
     tired, its, _ = column(LAWS[1], load=1.5, petsc_options={"snes_max_it": 1})
-    raises(lambda: tired.solve(1.0, 1.0), mpm.ConvergenceError, "Newton")
+    raises(lambda: tired.solve(time=1.0, dt=1.0), mpm.ConvergenceError, "Newton")
     assert not its.x.array.any() and not its.previous.x.array.any()
 
 
@@ -508,7 +508,7 @@ def test_what_does_not_go_together_is_refused():
     )
     raises(lambda: problem.remove([0]), mpm.MPMError, "cannot be taken from a body with water")
     problem, _, _ = column()
-    raises(lambda: problem.solve(0.0, 0.1), mpm.MPMError, "give a later time")
+    raises(lambda: problem.solve(time=0.0, dt=0.1), mpm.MPMError, "give a later time")
 
 
 def soaked(comm=WORLD, **options):
@@ -547,15 +547,15 @@ def test_a_rebased_body_goes_on_as_one_that_is_not(options):
     results = []
     for changes in (False, True):
         problem = soaked(**options)
-        problem.solve(0.2, 0.1)
+        problem.solve(time=0.2, dt=0.1)
         if changes:
             problem.rebase()
             assert scenes.largest(problem.particles.displacement.x.array) == 0.0
-        problem.solve(0.3, 0.1)
+        problem.solve(time=0.3, dt=0.1)
         if changes:
             problem.repartition(0.0)
             problem.rebase()
-        problem.solve(0.4, 0.1)
+        problem.solve(time=0.4, dt=0.1)
         (p,) = problem.pore_pressure
         where = CarriedField(p).converged_nodes()
         own = p.W.dofmap.list[: problem.particles.num_local]
@@ -592,7 +592,7 @@ def test_what_lies_on_the_mesh_of_before_is_refused(name):
 def test_fields_of_a_body_with_water(mpi_tmp_path):
     """Total stress bears the load at any time; pictures and files have it, and pore pressure."""
     problem, p, _ = column()
-    problem.solve(0.02, 0.005)
+    problem.solve(time=0.02, dt=0.005)
     body = problem.particles
     fields = body.fields()
     assert "pressure" not in fields

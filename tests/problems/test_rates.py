@@ -47,7 +47,7 @@ def test_a_sheared_block_has_the_friction_of_its_rate(scheme):
     inertial = GRAIN * rate / np.sqrt(pressure / DENSITY)
     expected = STATIC + (LIMIT - STATIC) * inertial / (NUMBER + inertial)
     frictions = []
-    for _ in problem.steps(20 * dt, dt, update=shear, output_at=[15.1 * dt]):
+    for _ in problem.steps(time=20 * dt, dt=dt, update=shear, output_at=[15.1 * dt]):
         found = mandel.to_vector(particles.stress, 2)
         np.testing.assert_allclose(-found[:, :3].mean(axis=1), pressure, rtol=1e-9)
         q = np.linalg.norm(mandel.deviator(found), axis=1) / np.sqrt(2.0)
@@ -90,14 +90,14 @@ def state_of(problem):
 def test_a_flow_goes_on_after_a_restart_and_on_other_ranks(tmp_path, f_bar):
     path = WORLD.bcast(tmp_path) / "flow.ckpt"
     whole = collapse(f_bar=f_bar)
-    for number, _ in enumerate(whole.steps(0.2, 0.02), 1):
+    for number, _ in enumerate(whole.steps(time=0.2, dt=0.02), 1):
         if number == 6:
             whole.save(path)
     restored = collapse(f_bar=f_bar)
     restored.restore(path)
-    restored.solve(0.2, 0.02)
+    restored.solve(time=0.2, dt=0.02)
     alone = collapse(MPI.COMM_SELF, f_bar=f_bar)
-    alone.solve(0.2, 0.02)
+    alone.solve(time=0.2, dt=0.02)
     for mine, again, single in zip(*map(state_of, (whole, restored, alone)), strict=True):
         np.testing.assert_array_equal(again, mine)
         np.testing.assert_allclose(mine, single, atol=1e-9 * np.abs(single).max())
@@ -112,7 +112,7 @@ def test_friction_by_rate_slows_the_flow_and_vanishes_with_the_grains():
     fine = LAW.with_parameters(grain_size=0.0)
     problems = [collapse(law=law) for law in (cone, fine, LAW, coarse)]
     for problem in problems:
-        problem.solve(0.12, 0.02)
+        problem.solve(time=0.12, dt=0.02)
     centres = [np.concatenate(WORLD.allgather(p.particles.centroid[:, 0])) for p in problems]
     np.testing.assert_allclose(centres[1], centres[0], rtol=1e-7)
     assert centres[3].mean() < centres[2].mean() < centres[1].mean()
@@ -120,7 +120,7 @@ def test_friction_by_rate_slows_the_flow_and_vanishes_with_the_grains():
 
 def test_a_stage_leaves_the_stress_of_what_flows():
     problem = collapse()
-    problem.solve(0.12, 0.02)
+    problem.solve(time=0.12, dt=0.02)
     before = problem.points[0].first_piola.copy()
     over = problem.points[0].last.yield_function()
     assert WORLD.allreduce(over.max(initial=0.0), MPI.MAX) > 0.1
@@ -128,7 +128,7 @@ def test_a_stage_leaves_the_stress_of_what_flows():
     np.testing.assert_allclose(
         problem.points[0].first_piola, before, atol=1e-12 * np.abs(before).max()
     )
-    problem.solve(0.16, 0.02)
+    problem.solve(time=0.16, dt=0.02)
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ def test_a_stage_leaves_the_stress_of_what_flows():
 def test_friction_stays_between_its_ends_with(options):
     """With each option, and after a rebase and a move of all particles to other ranks."""
     problem = collapse(**{"petsc_options": {}, **options})
-    for number, _ in enumerate(problem.steps(0.1, 0.02)):
+    for number, _ in enumerate(problem.steps(time=0.1, dt=0.02)):
         points = problem.points[0]
         pressure = -points.last.mean_stress()
         over = points.last.yield_function().ravel()

@@ -429,7 +429,7 @@ def test_split_and_repartition_in_a_stage():
 def test_dynamics():
     """Mass and momentum of what stays do not change, whatever is taken away or comes."""
     problem = layer(problem=mpm.DynamicProblem, velocity=(0.0, -0.1))
-    problem.solve(0.02, 0.01)
+    problem.solve(time=0.02, dt=0.01)
     body = problem.bodies[0]
     v = problem.velocity
     before = problem.momentum
@@ -440,7 +440,7 @@ def test_dynamics():
     lift = mpm.Particles(box([0, 10], [2, 11], [4, 2], QUADRILATERAL), body.V)
     problem.add(mpm.Body(lift, materials.Hencky(STIFF, POISSON), DENSITY, (0.0, -G)))
     np.testing.assert_allclose(problem.momentum, rest, rtol=1e-12)
-    problem.solve(0.04, 0.01)
+    problem.solve(time=0.04, dt=0.01)
     assert problem.history.time == 0.04
     energies = [e.balance for e in problem.history.energies]
     np.testing.assert_allclose(energies, energies[0], rtol=1e-6)

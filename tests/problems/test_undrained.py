@@ -212,7 +212,7 @@ def test_it_moves_without_losing_energy():
         out_of_range="reflect",
         solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
     )
-    problem.solve(0.4, 0.05)
+    problem.solve(time=0.4, dt=0.05)
     balances = np.array([e.balance for e in problem.history.energies])
     assert np.ptp(balances) < 1e-9 * problem.history.energies[0].kinetic
 

@@ -191,7 +191,7 @@ def test_water_in_the_pores():
             supports=[mpm.boundary.roller(body, tags, 2, (0.0, -1.0))],
             solver=mpm.Solver(petsc_options=TIGHT, linear=name),
         )
-        problem.solve(0.2, 0.1)
+        problem.solve(time=0.2, dt=0.1)
         results.append((problem, scenes.own(problem.pore_pressure[0])))
     (direct, a), (multigrid, b) = results
     assert_same(direct, multigrid)

@@ -191,5 +191,5 @@ def test_a_filled_cell_beyond_the_reach_of_all_nodes(motion):
     }
     kind = mpm.DynamicProblem if motion else mpm.QuasiStaticProblem
     problem = posed(kind, mpm.Particles(body, V), mpm.materials.Hencky(1e3, 0.3), **given)
-    problem.solve(*((0.02, 0.01) if motion else (2,)))
+    problem.solve(**({"time": 0.02, "dt": 0.01} if motion else {"steps": 2}))
     assert problem.history.cutbacks == 0

@@ -118,5 +118,5 @@ def test_bodies_in_motion_have_no_joints():
         body_force=(0.0, -GRAVITY),
         bcs=[scenes.fix(bodies[0].V, scenes.at(1, 0.0))],
     )
-    problem.solve(0.05, 0.005)
+    problem.solve(time=0.05, dt=0.005)
     assert problem.history.statistics["joint_nodes"] == 0

@@ -339,7 +339,7 @@ def test_displacement_control_and_paths():
     def path(t):
         value.value[0] = 0.2 * t
 
-    loads = [step.load for step in problem.steps("auto", path, output_at=[0.5])]
+    loads = [step.load for step in problem.steps("auto", update=path, output_at=[0.5])]
     assert 0.5 in loads and loads[-1] == 1.0
     other = scenes.block(force=(0.0, -1.0))
     top = mpm.DisplacementControl(other.particles, -0.01, point=(1.0, 1.0), direction=(0.0, 1.0))
@@ -360,7 +360,7 @@ def test_a_second_stage_is_measured_by_its_own_motion():
             value.value[1] = 0.02 * t
             value.value[0] = begin
 
-        return [step.load for step in problem.steps("auto", path)]
+        return [step.load for step in problem.steps("auto", update=path)]
 
     assert 0.4 < len(second(True)) / len(second(False)) < 2.5
 

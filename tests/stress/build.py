@@ -34,7 +34,7 @@ class Run(NamedTuple):
         youngs: Young's modulus of each domain of each body, or that of all.
         second: What sets the loads at t in a second stage, or None.
         contact: The contact, or None.
-        time: End and step of a motion, or None.
+        time: End and step of a motion, as arguments, or None.
         rigid: What drives a rigid body and what it is, or None.
     """
 
@@ -410,7 +410,7 @@ def make(scene, comm) -> Run:
             "velocity": speeds if len(bodies) > 1 else speeds[0],
             **{k: about[k] for k in ("scheme", "out_of_range")},
         }
-        time = about["time"], about["time"] / scene["steps"]
+        time = {"time": about["time"], "dt": about["time"] / scene["steps"]}
     problem = posed(
         kind,
         bodies if len(bodies) > 1 else bodies[0],

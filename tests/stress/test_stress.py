@@ -71,7 +71,7 @@ def test_checks_find_what_is_wrong(number, tamper, complaint):
     scene = generator.scene(number)
     run = build.make(scene, WORLD)
     observer = checks.Observer(scene, run)
-    for _ in run.problem.steps(scene["steps"], run.update):
+    for _ in run.problem.steps(scene["steps"], update=run.update):
         observer.step()
     assert observer.judge()[0] == []
     tamper(observer)

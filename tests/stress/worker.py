@@ -46,11 +46,11 @@ def run(scene, comm=MPI.COMM_WORLD):
             observer = checks.Observer(scene, made)
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", message="The run ")
-                ends = (scene["steps"],) if made.time is None else made.time
-                for _ in problem.steps(*ends, made.update):
+                ends = {"steps": scene["steps"]} if made.time is None else made.time
+                for _ in problem.steps(**ends, update=made.update):
                     observer.step()
                 if made.second is not None:
-                    for _ in problem.steps(scene["second_steps"], made.second):
+                    for _ in problem.steps(scene["second_steps"], update=made.second):
                         observer.step()
         except mpm.MPMError as failure:
             error = failure

@@ -523,7 +523,7 @@ def test_a_block_on_a_spring_swings_with_its_period(scheme):
     period, n = 2.0 * np.pi * np.sqrt(2.0 / (2 * 40.0 / 2.0)), 40
     lowest = [
         float(springs.positions[:, 1].min()) - 1.0
-        for _ in problem.steps(0.5 * period, 0.5 * period / n)
+        for _ in problem.steps(time=0.5 * period, dt=0.5 * period / n)
     ]
     whole = 2.0 * 2.0 / 40.0  # twice the displacement at rest
     assert np.isclose(lowest[-1], -whole, rtol=0.2 if scheme == "euler" else 0.01)

@@ -159,7 +159,7 @@ def test_a_body_that_flies_keeps_its_momenta(scheme):
     x = x0 + own.displacement
     forms = [v[0] * own.dx_exact, v[1] * own.dx_exact, (x[0] * v[1] - x[1] * v[0]) * own.dx_exact]
     compiled = [fem.form(form) for form in forms]
-    for _ in problem.steps(0.2, 0.02):
+    for _ in problem.steps(time=0.2, dt=0.02):
         rows.append([WORLD.allreduce(fem.assemble_scalar(form)) for form in compiled])
     rows = np.array(rows)
     assert len(rows) == 10
