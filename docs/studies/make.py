@@ -4,6 +4,7 @@
 
     python docs/studies/make.py NAME ...      run these tables, write them into their pages
     python docs/studies/make.py               all but those of run times
+    python docs/studies/make.py --stale ...   of these only the rows that no longer follow
     python docs/studies/make.py --check       what does not follow: runs the quick rows
     python docs/studies/make.py --still       the same without any run
     python docs/studies/make.py --stamp TABLE scripts have changed in what does not matter to it
@@ -11,21 +12,21 @@
 NAME is a table, as ``locking/cantilever``, or the beginning of several, as ``locking``. A comment
 above each table of measured numbers tells where it comes from:
 
-    <!-- table locking/cantilever: 0123abcd 4567ef89 -->     made by this program
-    <!-- table by benchmarks/skip.py: 0123abcd 4567ef89 -->  by another one, copied by hand
-    <!-- table once: abcdef0, REASON -->                     not made again; the commit it is of
+    <!-- table locking/cantilever: 01ab 23cd 45ef 6789abcd -->  made by this program
+    <!-- table by benchmarks/skip.py: 0123abcd 4567ef89 -->     by another one, copied by hand
+    <!-- table once: abcdef0, REASON -->                        not made again; of this commit
 
-The first number is a hash of the scripts that made the table, the second one of its rows. A table
-does not follow where the scripts have changed since, where it was edited by hand, or where its
-quick rows come out otherwise. ``--stamp`` writes both numbers of one table anew, for one copied by
-hand from what another program has printed: TABLE is its name, or its page and line, as complaints
-tell them, ``docs/locking-measured.md:169``.
+The last number is a hash of the table's rows, those before it are of what it is made of: the code
+of the scripts, or for each row that of its function, of what that uses, and of the cases that it
+runs (``ingredients.py``). A table does not follow where these have changed since, where it was
+edited by hand, or where its quick rows come out otherwise. ``--stamp`` writes the numbers of one
+table anew, for one copied by hand from what another program has printed: TABLE is its name, or its
+page and line, as complaints tell them, ``docs/locking-measured.md:169``.
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
 import re
 import shlex
 from collections.abc import Iterator
@@ -34,6 +35,7 @@ from typing import NamedTuple
 
 import error
 import high_order
+import ingredients
 import load_steps
 import locking
 import methods
@@ -44,6 +46,7 @@ import step_size
 import supports
 import validation
 from case_runs import ROOT, Table, head, row
+from ingredients import digest
 
 DOCS = ROOT / "docs"
 SCRIPTS = (
@@ -88,10 +91,6 @@ class Found(NamedTuple):
         return f"docs/{self.page}.md:{self.start + 1}"
 
 
-def digest(*parts: bytes) -> str:
-    return hashlib.sha256(b"\0".join(parts)).hexdigest()[:8]
-
-
 def scripts_of(source: str) -> list[Path]:
     """Return the scripts that a table comes from."""
     if source.startswith("by "):
@@ -101,13 +100,39 @@ def scripts_of(source: str) -> list[Path]:
     return [script, *(ROOT / f"benchmarks/cases/{case}.py" for case in table.cases)]
 
 
-def inputs(source: str) -> str:
-    """Return a hash of the scripts that a table is made of."""
-    return digest(*(path.read_bytes() for path in scripts_of(source)))
+def inputs(source: str) -> list[str]:
+    """Return a hash of what each row of a table is made of, or one of its scripts."""
+    if source in TABLES:
+        table, _ = TABLES[source]
+        return [ingredients.of_row(table, label) for label in table.rows]
+    return [digest("\n".join(map(ingredients.plain, scripts_of(source))))]
 
 
 def rows_hash(rows: list[str]) -> str:
-    return digest("\n".join(rows).encode())
+    return digest("\n".join(rows))
+
+
+def kept(found: Found) -> tuple[list[str], str]:
+    """Return the hashes that a table was marked with: of what it is made of, and of its rows."""
+    *made_of, rows = (found.mark["rest"] or "").split() if found.mark else ()
+    return made_of, rows
+
+
+def late(found: Found) -> list[str]:
+    """Return the labels of the rows of a table that have to be made again."""
+    table, _ = TABLES[found.source]
+    new, old = inputs(found.source), kept(found)[0]
+    if found.rows[:2] != head(table) or len(new) != len(old) or len(found.rows) != len(new) + 2:
+        return list(table.rows)
+    begins = [
+        text.startswith(f"| {label} |")
+        for text, label in zip(found.rows[2:], table.rows, strict=True)
+    ]
+    return [
+        label
+        for label, a, b, here in zip(table.rows, new, old, begins, strict=True)
+        if a != b or not here
+    ]
 
 
 def found_in(page: str) -> Iterator[Found]:
@@ -139,7 +164,7 @@ def all_found() -> list[Found]:
 
 
 def marked(source: str, rows: list[str]) -> str:
-    return f"<!-- table {source}: {inputs(source)} {rows_hash(rows)} -->"
+    return f"<!-- table {source}: {' '.join([*inputs(source), rows_hash(rows)])} -->"
 
 
 def put(found: Found, rows: list[str]) -> None:
@@ -163,41 +188,44 @@ def stamp(name: str) -> None:
     put(chosen[0], chosen[0].rows)
 
 
-def make(name: str) -> bool:
-    """Run a table and write it into its page. Return whether that changed it."""
+def make(name: str, stale: bool = False) -> bool:
+    """Run a table, or its stale rows, and write them. Return whether that changed the page."""
     table, _ = TABLES[name]
+    here = next(f for f in found_in(table.page) if f.source == name)
+    chosen = late(here) if stale else list(table.rows)
     rows = head(table)
-    for label in table.rows:
-        rows.append(row(table, label))
-        print(rows[-1], flush=True)
-    here = [f for f in found_in(table.page) if f.source == name]
-    if not here:
-        raise SystemExit(
-            f"docs/{table.page}.md has no comment <!-- table {name}: --> above a table"
-        )
-    put(here[0], rows)
-    return rows != here[0].rows
+    for place, label in enumerate(table.rows, 2):
+        rows.append(row(table, label) if label in chosen else here.rows[place])
+        if label in chosen:
+            print(rows[-1], flush=True)
+    if chosen:
+        put(next(f for f in found_in(table.page) if f.source == name), rows)
+    return rows != here.rows
 
 
 def complaints(found: Found, still: bool) -> list[str]:
     """Return what does not follow of a table."""
     if found.mark is None:
         return ["no comment says where its numbers come from"] if measured(found.rows) else []
-    source, rest = found.source, (found.mark["rest"] or "")
+    source = found.source
     if source == "once":
-        return [] if rest else ["no reason is given"]
+        return [] if found.mark["rest"] else ["no reason is given"]
     if not source.startswith("by ") and source not in TABLES:
         return [f"there is no table {source!r}"]
     missing = [str(p.relative_to(ROOT)) for p in scripts_of(source) if not p.exists()]
     if missing or not scripts_of(source):
         return [f"{source!r} names no script that exists"]
-    kept = rest.split()
-    if len(kept) != 2:
+    if not found.mark["rest"]:
         return ["it has not been made yet"]
+    made_of, rows = kept(found)
     new = []
-    if kept[0] != inputs(source):
-        new.append(f"the scripts of {source!r} have changed since it was made")
-    if kept[1] != rows_hash(found.rows):
+    if source in TABLES:
+        labels = late(found)
+        changed = [f"{len(labels)} of {len(TABLES[source][0].rows)} rows"] if labels else []
+    else:
+        changed = ["the scripts"] if made_of != inputs(source) else []
+    new += [f"{what} of {source!r} have changed since it was made" for what in changed]
+    if rows != rows_hash(found.rows):
         copied = f"the rows of {source!r} have changed since it was made"
         new.append("its rows were changed by hand" if source in TABLES else copied)
     if source in TABLES and not still and not TABLES[source][0].times:
@@ -232,6 +260,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help="a table, or its beginning")
     parser.add_argument("--check", action="store_true", help="change nothing, run the quick rows")
     parser.add_argument("--still", action="store_true", help="change nothing, run nothing")
+    parser.add_argument("--stale", action="store_true", help="make only rows that do not follow")
     parser.add_argument("--stamp", metavar="TABLE", help="write the hashes of one table")
     parser.add_argument("--times", action="store_true", help="also tables of run times")
     args = parser.parse_args()
@@ -252,7 +281,7 @@ def main() -> None:
         named = any(name.startswith(n) for n in args.names)
         if named or not (args.names or (table.times and not args.times)):
             print(f"\n{name}", flush=True)
-            changed += [name] if make(name) else []
+            changed += [name] if make(name, args.stale) else []
     for name in changed:
         print(f"{name} has changed: read what docs/{TABLES[name][0].page}.md says about it")
 

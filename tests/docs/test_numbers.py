@@ -54,3 +54,48 @@ make.stamp("docs/dynamics-measured.md")
     assert told in done.stderr, done.stderr
     stamped = page.read_text("utf-8").splitlines()
     assert [i for i, text in enumerate(stamped) if text != lines[i]] == marks[1:2]
+
+
+@pytest.mark.skip_in_parallel
+def test_a_table_is_stale_by_what_its_rows_are_made_of(tmp_path):
+    shutil.copytree(ROOT / "docs", tmp_path / "docs", ignore=shutil.ignore_patterns("images"))
+    shutil.copytree(ROOT / "benchmarks" / "cases", tmp_path / "benchmarks" / "cases")
+
+    def edit(path, old, new):
+        text = (tmp_path / path).read_text("utf-8")
+        assert text.count(old) == 1
+        (tmp_path / path).write_text(text.replace(old, new), "utf-8")
+
+    study, case = "docs/studies/validation.py", "benchmarks/cases/pipe.py"
+    program = """
+import ingredients, validation
+for table in validation.tables().values():
+    print(*(ingredients.of_row(table, label) for label in table.rows))
+"""
+
+    def hashes():
+        done = programs.run("-c", program, cwd=tmp_path / "docs" / "studies")
+        assert done.returncode == 0, done.stderr
+        return [line.split() for line in done.stdout.splitlines()]
+
+    def changed(before, after):
+        return [
+            sum(a != b for a, b in zip(*rows, strict=True))
+            for rows in zip(before, after, strict=True)
+        ]
+
+    before = hashes()
+    assert sum(map(len, before)) > 30
+    edit(study, "\nCLAMPED = ", "\n# One more comment.\nCLAMPED = ")
+    edit(study, '"""Return a relative error, in percent', '"""Return an error, in percent')
+    edit(case, "# SPDX-License-Identifier", "# A licence\n# SPDX-License-Identifier")
+    assert hashes() == before
+    edit(study, "incline --tilt 30 --steps 20", "incline --tilt 30 --steps 25")
+    one = hashes()
+    assert changed(before, one) == [1, 0, 0, 0, 0]
+    with (tmp_path / case).open("a", encoding="utf-8") as file:
+        file.write("\nCELLS = 1\n")
+    two = hashes()
+    assert changed(one, two) == [0, 0, 2, 0, 0]
+    edit(study, "if abs(share) >= 5e-5", "if abs(share) >= 6e-5")
+    assert changed(two, hashes()) == [len(rows) for rows in two]
