@@ -117,4 +117,4 @@ assert abs(ratio / 1.4 - 1.0) < 0.05
 #
 # 1. Without friction the ball slides. When does it hit the wall?
 # 2. Take `scheme="euler"`. How much energy does the scheme take (`lost`) besides?
-# 3. Make a movie of it: `mpm.plot.movie(problem, problem.steps(time=1.4, dt=0.02), "wall.gif", "mises")`.
+# 3. Make a movie: `mpm.plot.movie(problem, problem.steps(time=1.4, dt=0.02), "wall.gif", "mises")`.
