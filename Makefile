@@ -25,7 +25,7 @@ SETUP := sh scripts/setup_env.sh
 BENCHMARKS := $(wildcard $(patsubst %,benchmarks/%.py,assembly step contact skip solvers multigrid choice scaling ranks cantilever_reference))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo demos test test-all test-debian stress bench bench-smoke studies lint docs serve dist
+.PHONY: help demo demos test test-all test-debian stress bench bench-smoke studies lint docs paper serve dist
 .PHONY: test-dist clean
 
 help: ## This list
@@ -96,6 +96,10 @@ docs: ## Build the documentation into site/
 	@$(SETUP) docs
 	NO_MKDOCS_2_WARNING=1 "$(BIN)/python" -m mkdocs build --strict
 	@echo "The documentation starts at site/index.html"
+
+paper: ## Make the paper's PDF, output/paper.pdf
+	@$(SETUP) paper
+	@"$(BIN)/python" scripts/make_paper.py
 
 serve: ## Show the documentation, with its search, at http://127.0.0.1:8000
 	@$(SETUP) docs

@@ -5,7 +5,11 @@
 import re
 from pathlib import Path
 
-PAPER = Path(__file__).resolve().parents[2] / "paper"
+import programs
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAPER = ROOT / "paper"
 
 
 def test_references_resolve():
@@ -26,3 +30,21 @@ def test_sections_that_are_asked_for_are_there():
     for section in ("Summary", "Statement of need", "State of the field", "References"):
         assert f"\n# {section}\n" in text
     assert 750 < len(re.findall(r"\w+", text.split("---", 2)[2])) < 1750
+
+
+@pytest.mark.skip_in_parallel
+def test_the_pdf_is_made_and_a_lost_reference_is_told(tmp_path):
+    for name in ("pypandoc", "typst"):
+        pytest.importorskip(name, reason="the paper needs pip install '.[paper]'")
+    done = programs.run(ROOT / "scripts" / "make_paper.py", tmp_path / "paper.pdf")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "paper.pdf").read_bytes()[:5] == b"%PDF-"
+    for part in ("paper", "scripts", "docs/images"):
+        (tmp_path / part).mkdir(parents=True)
+    for path in ("paper/paper.bib", "scripts/make_paper.py", "docs/images/work_precision.png"):
+        (tmp_path / path).write_bytes((ROOT / path).read_bytes())
+    text = (PAPER / "paper.md").read_text("utf-8")
+    (tmp_path / "paper" / "paper.md").write_text(text.replace("[@ample]", "[@nobody]"), "utf-8")
+    done = programs.run(tmp_path / "scripts" / "make_paper.py", tmp_path / "other.pdf")
+    assert done.returncode != 0 and "nobody" in done.stderr
+    assert not (tmp_path / "other.pdf").exists()
