@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 3.7
+# Level: 3.7: Rubber bodies in space: impacts and friction, energy kept account of
 
 # # A ball rolls down and hits a wall
 #

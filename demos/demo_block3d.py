@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2.6
+# Level: 2.6: Von Mises in space, hexahedra, rough plates
 
 # # A block squeezed between plates
 #

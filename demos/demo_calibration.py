@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 3.10
+# Level: 3.10: E and c of clay from a settlement curve, by derivatives of the run
 
 # # Stiffness and strength of clay from a loading test
 #

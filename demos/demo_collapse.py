@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 1.7
+# Level: 1.7: Von Mises under its weight, beside AMPLE's result
 
 # # Collapse of an elasto-plastic block
 #

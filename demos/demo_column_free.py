@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 1.4
+# Level: 1.4: Von Mises, many times its limit load; cutbacks
 
 # # An elasto-plastic column that collapses
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 1.3
+# Level: 1.3: Von Mises, finite strain, beside an exact stress
 
 # # An elasto-plastic column between rollers
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 1.2
+# Level: 1.2: Hencky's material to half its height, beside an exact stress
 
 # # Compaction of an elastic column under its own weight
 #

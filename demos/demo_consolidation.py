@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2.9
+# Level: 2.9: Biot in finite strain: pore pressure, years of settlement
 
 # # Soft clay under an embankment
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2.10
+# Level: 2.10: Elastic impact: momentum, angular momentum and energy
 
 # # Two discs collide
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 3.3
+# Level: 3.3: How domains of each method tile a sheared body
 
 # # What becomes of particle domains
 #

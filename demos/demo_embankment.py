@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2.11
+# Level: 2.11: Lifts on soft ground, stage by stage, and the factor of safety
 
 # # An embankment in lifts on soft clay
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2.3
+# Level: 2.3: Undrained clay: the limit load beside Prandtl's
 
 # # Bearing capacity of a strip footing
 #

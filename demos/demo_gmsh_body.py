@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2.4
+# Level: 2.4: A plate with stiffened holes bends; unstructured triangles
 
 # # A body with holes, from gmsh
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2.8
+# Level: 2.8: Motion in space over a triangulated hillside, friction
 
 # # A block slides over terrain
 #

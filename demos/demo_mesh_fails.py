@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2.1
+# Level: 2.1: Rubber under its weight: finite elements end at 55 % of the load
 
 # # Where the body's own mesh fails, and particles go on
 #

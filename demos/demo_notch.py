@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 3.11
+# Level: 3.11: Rubber cracks: a phase field at stretches beyond 2
 
 # # A rubber sheet with a notch tears
 #

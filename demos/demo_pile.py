@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 3.8
+# Level: 3.8: Undrained clay, adhesion, six radii deep; axisymmetric
 
 # # A pile is pressed into clay
 #

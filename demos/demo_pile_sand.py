@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 3.9
+# Level: 3.9: Mohr-Coulomb, a hole widened to four times its radius
 
 # # A pile is pressed into sand
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2.5
+# Level: 2.5: Axisymmetric, a pressure that follows the surface; exact
 
 # # A cylinder under inner pressure
 #

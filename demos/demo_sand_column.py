@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 3.4
+# Level: 3.4: Friction that rises with the rate, beside an experiment
 
 # # A column of sand is let go
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2.12
+# Level: 2.12: Waves come in and leave through dashpots; plastic settlement
 
 # # An embankment is shaken
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 3.12
+# Level: 3.12: Softening with a length of its own, on turned grids
 
 # # A shear band that does not follow the mesh
 #

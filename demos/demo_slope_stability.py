@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 1.8
+# Level: 1.8: Mohr-Coulomb, strength reduction: a weak seam decides
 
 # # The factor of safety of a layered slope
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2.7
+# Level: 2.7: Von Mises in motion: inertia carries the toe further
 
 # # A column slumps in time
 #

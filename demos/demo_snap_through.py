@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 3.2
+# Level: 3.2: Displacement control beyond a limit load
 
 # # A shallow arch that snaps through
 #

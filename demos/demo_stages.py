@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 1.5
+# Level: 1.5: Layers; weight, a strip load on the crest, unloading
 
 # # A layered slope, loaded in stages
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2.13
+# Level: 2.13: Finite elements beside particles, contact, an estimate of the error
 
 # # A steel footing pushed deep into clay
 #

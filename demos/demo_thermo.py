@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 3.6
+# Level: 3.6: Heat and large bending in UFL, coupled both ways
 
 # # A strip of two metals curls as it warms up
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 1.1
+# Level: 1.1: Von Mises clay under its own weight, twenty lines
 
 # # A first run: a block of clay slumps
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 3.1
+# Level: 3.1: Rubber in space, rotation of 270 degrees
 
 # # A rubber bar is twisted by three quarters of a turn
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 2.2
+# Level: 2.2: A neo-Hookean energy, grips that ride on the body
 
 # # Your own material in UFL: a rubber block is squeezed and turned
 #

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-# Level: 3.5
+# Level: 3.5: A ring that shears in time, beside an exact motion
 
 # # Generalised vortex
 #

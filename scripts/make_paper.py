@@ -26,6 +26,7 @@ def numbered(text: str) -> str:
 
 
 def main() -> None:
+    """Write the PDF."""
     pdf = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "output" / "paper.pdf").resolve()
     pdf.parent.mkdir(parents=True, exist_ok=True)
     options = ["--standalone", "--citeproc", "--fail-if-warnings", f"--resource-path={PAPER}"]

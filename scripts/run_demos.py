@@ -5,8 +5,9 @@
 usage: run_demos.py [--models] [NAME ...]    all of them, or demos/demo_NAME.py
 
 Each runs in a directory of its own, on one rank. Its picture NAME.png (and NAME.gif, where it makes
-a movie), a sketch NAME_model.png of the first problem that it runs, and its output NAME.txt go to
-docs/images/demos. With --models it ends with the sketch, which alone is kept.
+a movie), one panel of that for the gallery, NAME_card.png, a sketch NAME_model.png of the first
+problem that it runs, and its output NAME.txt go to docs/images/demos.
+With --models it ends with the sketch, which alone is kept.
 """
 
 from __future__ import annotations
@@ -30,9 +31,33 @@ class Drawn(BaseException):
     """The model is drawn, and nothing else was asked for."""
 
 
+def keep_card(name: str) -> None:
+    """Let the figure that is saved as NAME.png leave the panel with the largest body besides."""
+    from matplotlib.figure import Figure
+
+    save = Figure.savefig
+
+    def weight(axes):
+        bars = axes.get_label() == "<colorbar>"
+        box = axes.get_position()
+        return not bars, bool(axes.images or axes.collections), round(box.width * box.height, 3)
+
+    def both(figure, target, *args, **options):
+        save(figure, target, *args, **options)
+        if Path(str(target)).name == f"{name}.png":
+            figure.canvas.draw()
+            *_, chosen = sorted(figure.axes, key=weight)
+            panel = chosen.get_window_extent().transformed(figure.dpi_scale_trans.inverted())
+            save(figure, f"{name}_card.png", bbox_inches=panel, dpi=200)
+
+    Figure.savefig = both
+
+
 def follow(script: str, picture: str, model: bool) -> None:
     """Run a script, and draw the first problem that it runs before that does."""
     import mpm_dolfinx as mpm
+
+    keep_card(picture.removesuffix("_model.png"))
 
     kinds = [mpm.Problem]
     for kind in kinds:
@@ -80,11 +105,15 @@ def run(name: str, model: bool) -> None:
             if not (Path(folder) / picture).exists():
                 sys.exit(f"demo_{name}.py must run a problem and leave a picture {picture}.")
         KEPT.mkdir(parents=True, exist_ok=True)
-        for made in (f"{name}_model.png", f"{name}.png", f"{name}.gif"):
+        small = (f"{name}_model.png", f"{name}_card.png")
+        for made in (*small, f"{name}.png", f"{name}.gif"):
             if (Path(folder) / made).exists():
                 shutil.copyfile(Path(folder) / made, KEPT / made)
-        sketch = KEPT / f"{name}_model.png"
-        Image.open(sketch).convert("RGB").quantize(48).save(sketch, optimize=True)
+        for made in (KEPT / each for each in small if (Path(folder) / each).exists()):
+            image = Image.open(made).convert("RGB")
+            if made.name.endswith("_card.png"):
+                image.thumbnail((480, 300))
+            image.quantize(64).save(made, optimize=True)
         if not model:
             (KEPT / f"{name}.txt").write_text(done.stdout, "utf-8")
         print(f"{name}: {time.perf_counter() - begin:.1f} s", flush=True)

@@ -34,10 +34,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         PACKAGE, search_paths=[root], allow_inspection=False, resolve_aliases=True
     )
     pages: dict[str, str] = {}
-    nav = module_pages(package, "api", pages, members)
+    index, *entries = module_pages(package, "api", pages, members)
+    names = [entry for entry in entries if isinstance(next(iter(entry.values())), str)]
+    modules = [entry for entry in entries if entry not in names]
     for name, text in pages.items():
         files.append(File.generated(config, name, content=text))
-    config.nav.append({"Reference": nav})
+    config.nav.append({"Reference": [index, {PACKAGE: names}, *modules]})
     return files
 
 

@@ -4,8 +4,8 @@
 
 What the script printed and drew is in ``images/demos``, kept by ``scripts/run_demos.py``; it comes
 before the exercises. Beside each page are the script and a notebook made of it. The gallery has the
-demos by the level that stands below their licence, as ``# Level: 1.2``: the second of the first
-level.
+demos by the level that stands below their licence, as ``# Level: 1.2: Clay under its weight``: the
+second of the first level, and what stands below its title there.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from mkdocs.structure.files import File, Files
 log = logging.getLogger("mkdocs.hooks.demos")
 
 HEADER = re.compile(r"\A(?:#!.*\n)?(?:# (?:Copyright|SPDX-|Level:).*\n)+(?:#?\n)*")
-LEVEL = re.compile(r"^# Level: ([123])(?:\.(\d+))?$", re.MULTILINE)
+LEVEL = re.compile(r"^# Level: ([123])\.(\d+): (.+)$", re.MULTILINE)
 LEVELS = ("First steps", "Standard problems", "Further on")
 EXERCISES = "\n## Exercises\n"
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     root = Path(config.config_file_path).parent
-    levels: list[list[tuple[int, str, str]]] = [[] for _ in LEVELS]
+    levels: list[list[tuple[int, str, str, str]]] = [[] for _ in LEVELS]
     for script in sorted((root / "demos").glob("demo_*.py")):
         source = script.read_text("utf-8")
         level = LEVEL.search(source)
         if level is None:
-            log.warning("%s has no line '# Level: 1', 2 or 3 below its licence.", script.name)
+            log.warning("%s has no '# Level: 1.2: its physics' below its licence.", script.name)
         name = script.stem.removeprefix("demo_")
         model = root / "docs" / "images" / "demos" / f"{name}_model.png"
         sketch = f"![The model](../images/demos/{model.name})\n" if model.exists() else ""
@@ -52,8 +52,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             cell["id"] = f"cell-{number}"
         text = jupytext.writes(notebook, fmt="ipynb")
         files.append(File.generated(config, f"demos/{script.stem}.ipynb", content=text))
-        place = int(level[2] or 99) if level else 99
-        levels[int(level[1]) - 1 if level else -1].append((place, title, name))
+        place, told = (int(level[2]), level[3]) if level else (99, "")
+        levels[int(level[1]) - 1 if level else -1].append((place, title, name, told))
     nav: list[object] = ["demos/index.md"]
     parts = ["# Demos", "Each is a script that runs alone, and a notebook of the same text."]
     for heading, entries in zip(LEVELS, levels, strict=True):
@@ -63,11 +63,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         entries.sort()
         cards = [
             f'<a href="demo_{name}.html">{thumbnail(root / "docs", name)}'
-            f"<strong>{html.escape(title)}</strong></a>"
-            for _, title, name in entries
+            f"<strong>{html.escape(title)}</strong><span>{html.escape(told)}</span></a>"
+            for _, title, name, told in entries
         ]
         parts.append('<div class="gallery">\n' + "\n".join(cards) + "\n</div>")
-        nav.append({heading: [{title: f"demos/demo_{name}.md"} for _, title, name in entries]})
+        nav.append({heading: [{title: f"demos/demo_{name}.md"} for _, title, name, _ in entries]})
     files.append(File.generated(config, "demos/index.md", content="\n\n".join(parts) + "\n"))
     config.nav.append({"Demos": nav})
     return files
@@ -75,9 +75,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def thumbnail(docs: Path, name: str) -> str:
     """Return a demo's picture for the gallery, if it is kept."""
-    if not (docs / "images" / "demos" / f"{name}.png").exists():
-        return ""
-    return f'<img src="../images/demos/{name}.png" alt="" loading="lazy">'
+    card = f"images/demos/{name}_card.png"
+    return f'<img src="../{card}" alt="" loading="lazy">' if (docs / card).exists() else ""
 
 
 def results(docs: Path, name: str) -> str:

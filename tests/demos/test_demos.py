@@ -28,7 +28,7 @@ NUMBER = re.compile(r"-?\d+(?:\.\d*)?(?:e[+-]?\d+)?")
 @pytest.mark.parametrize("name", NAMES)
 def test_text_is_a_lecture_note(name):
     text = (DEMOS / f"{name}.py").read_text("utf-8")
-    assert re.search(r"^# Level: [123]\.\d+$", text, re.MULTILINE)
+    assert re.search(r"^# Level: [123]\.\d+: .{20,80}$", text, re.MULTILINE)
     assert "# It illustrates how to:\n" in text
     assert "\nassert " in text and "\n# ## Exercises\n" in text
     assert "argparse" not in text
