@@ -429,6 +429,8 @@ class BodyForms:
         total = self.r.duplicate()
         with total.localForm() as local:
             local.set(0.0)
-            np.add.at(local.array_w.reshape(-1, gdim), domain_nodes, own)
+            nodes, count = domain_nodes.ravel(), local.getLocalSize() // gdim
+            for i in range(gdim):
+                local.array_w[i::gdim] = np.bincount(nodes, own[:, :, i].ravel(), count)
         total.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
         return total

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DomainDistortionError
-from .mandel import num_components
+from .mandel import POSITIONS, WEIGHTS, num_components
 from .tensors import (
     determinant,
     eigen,
@@ -149,9 +149,12 @@ class SmallStrain(Kinematics):
 
     def tangent(self, stress: Array, tangent: Array) -> Array:
         """Return the law's tangent as a fourth-order tensor."""
-        left = unpack(np.moveaxis(tangent, 0, -1), self._dim)
-        both = unpack(np.moveaxis(left, 2, 0), self._dim)
-        return points_first(np.moveaxis(both, (0, 1), (2, 3)))
+        n, dim, m = len(tangent), self._dim, tangent.shape[1]
+        at = POSITIONS[:dim, :dim].ravel()
+        weights = WEIGHTS[:dim, :dim].ravel()
+        entries = tangent.reshape(n, m * m)[:, (m * at[:, None] + at).ravel()]
+        entries *= np.outer(weights, weights).ravel()
+        return entries.reshape(n, dim, dim, dim, dim)
 
     @staticmethod
     def volume_ratio(displacement_gradient: Array) -> Array:

@@ -206,12 +206,17 @@ def nodal_forces(
         gradients: Those of the shape functions, shape ``(n, nq, k, gdim)``.
         hoop: In a body of revolution ``N / r``, shape ``(n, nq, k)``; dim is 3 then.
     """
-    gdim = gradients.shape[3]
-    weighted = weights[:, :, None, None] * stress
-    forces = np.einsum("nqiJ,nqkJ->nki", weighted[:, :, :gdim, :gdim], gradients)
-    if hoop is not None:
-        forces[:, :, 0] += np.einsum("nq,nqk->nk", weighted[:, :, 2, 2], hoop)
-    return np.asarray(forces)
+    n, _, k, gdim = gradients.shape
+    forces: NDArray[np.float64] = np.zeros((n, k, gdim))
+    loops.internal_force(
+        np.ascontiguousarray(stress),
+        np.arange(n * k, dtype=np.int32).reshape(n, k),
+        gradients,
+        weights,
+        np.zeros(0) if hoop is None else hoop,
+        forces.reshape(-1),
+    )
+    return forces
 
 
 def with_hoop(
