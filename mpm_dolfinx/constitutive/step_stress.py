@@ -247,6 +247,11 @@ class StepStress:
         self._begin, self._found = self._settled(first)
 
     @property
+    def points(self) -> MaterialPoints:
+        """The material with its history."""
+        return self._points
+
+    @property
     def weights(self) -> Array:
         """Undeformed volume of each point, shape ``(n, nq)``; 0 where deleted."""
         return self._points.weights

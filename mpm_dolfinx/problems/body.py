@@ -166,10 +166,15 @@ class Body:
             )
 
     @property
+    def laws(self) -> list[Any]:
+        """Its laws, as they are given."""
+        each = isinstance(self.material, Mapping)
+        return list(self.material.values()) if each else [self.material]
+
+    @property
     def may_crack(self) -> bool:
         """Whether a law of it is a :class:`mpm_dolfinx.materials.Fracture`."""
-        laws = self.material.values() if isinstance(self.material, Mapping) else [self.material]
-        return any(isinstance(law, Fracture) for law in laws)
+        return any(isinstance(law, Fracture) for law in self.laws)
 
     def replace(self, **changes: Any) -> Body:
         """Return the same body with some things changed, such as ``tractions=[...]`` for a stage.

@@ -164,7 +164,15 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
                 raise MPMError(f"after= is a problem with {name}={its_own!r}; give the same here.")
 
     _further = ("velocity",)
-    _may_crack = False
+
+    @override
+    def _not_for_cracks(self) -> dict[str, bool]:
+        # (that stress makes up for any change of the energy, also that which goes into cracks, and
+        # this damping is that of bodies which are whole)
+        return {
+            f"scheme={self.inertia.scheme.name!r}; use 'euler'": self.inertia.scheme.stress_of_step,
+            "a part of the stiffness in rayleigh=; omit it": self._viscosity > 0.0,
+        }
 
     @override
     def _initial_velocities(self) -> list[fem.Function]:

@@ -99,7 +99,10 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
     _gradual = False
 
     _further = ("pore_fluid",)
-    _may_crack = False
+
+    @override
+    def _not_for_cracks(self) -> dict[str, bool]:
+        return {"a PorousProblem": True}
 
     @collective()
     def __init__(
@@ -288,6 +291,8 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
     def _aim(self, t: float) -> None:
         for filled in self._filled:
             np.copyto(filled.dt.value, t - self.history.time)
+        for points in self.points:
+            points.laws.pace(t - self.history.time)
 
     @override
     def begin_step(self) -> None:

@@ -172,20 +172,31 @@ class QuasiStaticProblem(Problem):
             f"method={body.particles.method!r}": not body.particles.shares_nodes,
             "outside='delete'": body.particles.deletion is not None,
             "on_distortion='split'": body.particles.on_distortion == "split",
-            f"a {type(self).__name__}": not self._may_crack,
+            **self._not_for_cracks(),
         }
         for what, given in refused.items():
             if given:
                 raise MPMError(f"Fracture does not go with {what}.")
 
-    #: Whether bodies may crack.
-    _may_crack = True
+    def _not_for_cracks(self) -> dict[str, bool]:
+        """Return what does not go with cracks, and whether it is there."""
+        return {}
 
     #: What bodies may have besides, which is for some problems alone.
     _further: tuple[str, ...] = ()
 
+    #: Whether time passes in steps.
+    _has_time = False
+
     def _require_given(self, bodies: Sequence[Body]) -> None:
         """Raise an error where bodies have what is for other problems alone."""
+        laws = [law for body in bodies for law in body.laws]
+        if not self._has_time and any(getattr(law, "needs_time", False) for law in laws):
+            raise MPMError(
+                "A law with a relaxation_time needs steps with a duration, which a "
+                f"{type(self).__name__} does not have; make a DynamicProblem or a PorousProblem, "
+                "or omit it: that is the law of loads that last."
+            )
         for name, kind in (("velocity", "DynamicProblem"), ("pore_fluid", "PorousProblem")):
             if name not in self._further and any(getattr(b, name) is not None for b in bodies):
                 raise MPMError(

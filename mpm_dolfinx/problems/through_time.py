@@ -26,6 +26,7 @@ type Path_ = Callable[[float], None]
 class TimeProblem(Problem):
     """A problem whose steps have a duration. Loads act in full unless a path says otherwise."""
 
+    _has_time = True
     _predicts = False
     _at_rest = False
 

@@ -19,6 +19,7 @@ from dolfinx import fem, mesh
 from ..constitutive.assignment import in_cells, per_cell
 from ..constitutive.groups import background_cells
 from ..constitutive.points import MaterialPoints
+from ..constitutive.step_stress import StepStress
 from ..errors import MPMError, agree, warn
 from ..materials.fracture import Fracture
 from ..meshes.quadrature import exact_degree
@@ -130,7 +131,8 @@ class Damage(FieldEquation):
         materials: Sequence[PointMaterial | None],
     ) -> None:
         super().take_part(number, bodies, materials)
-        points = materials[self._body_number]
+        own = materials[self._body_number]
+        points = own.points if isinstance(own, StepStress) else own
         assert isinstance(points, MaterialPoints)
         self._points = points
         self._tell()

@@ -35,9 +35,11 @@ type Bound = float | fem.Function | str | None
 
 #: Step of Jacobi's method, relative to the largest value, below which an equation is solved.
 SOLVED = 1e-10
-#: Solves with other sets of active bounds after which a solution is given up, and the most
-#: iterations of one.
+#: Solves after which a solution is given up, and the most iterations of one.
 MOST, MOST_ITERATIONS = 200, 10000
+#: Times that a step is halved, and which share of the fall of energy that its slope promises it
+#: must have.
+HALVINGS, ENOUGH = 20, 1e-4
 
 
 class FieldEquation(Term):
@@ -50,8 +52,8 @@ class FieldEquation(Term):
     hold together.
 
     With bounds the energy is made least between them: the residual vanishes where the field is
-    between its bounds, and points into the bound where it is at one (a primal-dual active set:
-    Hintermüller, Ito & Kunisch 2002, SIAM J. Optim. 13).
+    between its bounds, and points into the bound where it is at one (Newton's method, projected,
+    with a line search: Bertsekas 1982, SIAM J. Control Optim. 20).
 
     Args:
         field: The field, made by ``particles.field(Q, at="nodes", kind="body")``.
@@ -152,32 +154,61 @@ class FieldEquation(Term):
         self._forms.assemble_external()
         p, own = self.field.x, self._own
         lower, upper = self._bounds()
+        p.array[:own] = np.clip(p.array[:own], lower, upper)
+        p.scatter_forward()
         for solves in range(MOST):
             (residual,) = self._forms.assemble_residuals()
             matrix = self._forms.assemble_tangents()[1, 1]
             diagonal = matrix.getDiagonal().array_r
             if over_ranks(self._comm, bool(np.any(diagonal <= 0.0)), MPI.LOR):
                 raise self._indefinite()
-            step = residual.array_r / diagonal
-            values = p.array[:own]
-            low, high = values - step <= lower, values - step >= upper
-            change = np.where(low, lower - values, np.where(high, upper - values, 0.0))
-            missed = np.where(low | high, np.abs(change), np.abs(step))
-            size = float(np.abs(values + change).max(initial=0.0))
-            missing = float(missed.max(initial=0.0))
+            values, slope = p.array[:own].copy(), residual.array_r
+            missed = np.abs(np.clip(values - slope / diagonal, lower, upper) - values)
+            size, missing = (float(np.abs(one).max(initial=0.0)) for one in (values, missed))
             # (what MPI makes of the larger one of a number and NaN depends on their order)
             if over_ranks(self._comm, not np.isfinite(missing), MPI.LOR):
                 break
             missing, size = (over_ranks(self._comm, one, MPI.MAX) for one in (missing, size))
             if missing <= SOLVED * size:
-                p.array[:own] = np.clip(values, lower, upper)
-                p.scatter_forward()
                 return solves
-            p.array[:own] += self._solved(matrix, residual, low | high, change)
+            held = ((values <= lower) & (slope >= 0.0)) | ((values >= upper) & (slope <= 0.0))
+            step = self._solved(matrix, residual, held | (lower == upper))
+            p.array[:own] = self._projected(matrix, slope, values, step, (lower, upper))
             p.scatter_forward()
         raise ConvergenceError(
             f"The equation of the field '{self.field.name}' was not solved in {MOST} solves"
         )
+
+    def _projected(
+        self,
+        matrix: PETSc.Mat,
+        slope: NDArray[np.float64],
+        values: NDArray[np.float64],
+        step: NDArray[np.float64],
+        bounds: tuple[NDArray[np.float64], NDArray[np.float64]],
+    ) -> NDArray[np.float64]:
+        """Return values a part of a step on, put back between bounds, at which energy is less.
+
+        Args:
+            matrix: The second derivative of the energy.
+            slope: The first one, on this rank's own dofs; so are the others.
+            values: Where it is.
+            step: Newton's step from there, 0 at dofs that are held.
+            bounds: Least and largest values.
+        """
+        change, force = matrix.createVecs()
+        part = 1.0
+        for _ in range(HALVINGS):
+            new = np.clip(values + part * step, *bounds)
+            change.array_w[:] = new - values
+            matrix.mult(change, force)
+            falls = float(slope @ change.array_r)
+            rest = 0.5 * float(change.array_r @ force.array_r)
+            falls, rest = (over_ranks(self._comm, one) for one in (falls, rest))
+            if falls + rest <= ENOUGH * falls:
+                break
+            part *= 0.5
+        return np.asarray(new)
 
     def _bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the least and the largest values of this rank's own dofs."""
@@ -198,21 +229,20 @@ class FieldEquation(Term):
         self,
         matrix: PETSc.Mat,
         residual: PETSc.Vec,
-        active: NDArray[np.bool_],
-        change: NDArray[np.float64],
+        held: NDArray[np.bool_],
     ) -> NDArray[np.float64]:
-        """Return Newton's step with the changes of active dofs given, on this rank's own dofs."""
+        """Return Newton's step without dofs that are held, on this rank's own dofs."""
         x, b = matrix.createVecs()
-        x.array_w[:] = np.where(active, change, 0.0)
+        x.set(0.0)
         b.array_w[:] = -residual.array_r
         first = matrix.getOwnershipRange()[0]
-        rows = (first + np.flatnonzero(active)).astype(PETSc.IntType)
+        rows = (first + np.flatnonzero(held)).astype(PETSc.IntType)
         matrix.zeroRowsColumns(rows, 1.0, x, b)
         self._ksp.setOperators(matrix)
         self._ksp.solve(b, x)
         if self._ksp.getConvergedReason() < 0:
             raise self._indefinite()
-        return np.where(active, change, x.array_r)
+        return np.where(held, 0.0, x.array_r)
 
     def _indefinite(self) -> ConvergenceError:
         return ConvergenceError(

@@ -232,6 +232,84 @@ def test_a_plate_breaks():
     assert 0.5 < length < 0.5 * 1.5  # the ligament, and what the coarse mesh adds
 
 
+def bar(law, carried=False):
+    """A bar that is weak at 0.8, and its law of fracture with that toughness."""
+    body = mesh.create_rectangle(WORLD, [[0, 0], [2, 0.25]], [16, 2], QUADRILATERAL)
+    V = None
+    if carried:
+        grid = mesh.create_rectangle(WORLD, [[-1, -0.5], [3.5, 0.75]], [36, 10], QUADRILATERAL)
+        V = fem.functionspace(grid, ("Lagrange", 1, (2,)))
+    particles = mpm.Particles(body, V, quadrature_degree=2)
+    toughness = fem.Function(fem.functionspace(body, ("Discontinuous Lagrange", 0)))
+    toughness.interpolate(lambda x: np.where(np.abs(x[0] - 0.8) < 0.2, 0.01, 1.0))
+    return particles, law(toughness)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "carried", "dt"), [("midpoint", False, 0.01), ("euler", True, 0.02)]
+)
+def test_pieces_fly_on_and_keep_their_momentum(scheme, carried, dt):
+    """A bar that is torn as it flies: nothing but its speed of stretching ends in the crack."""
+    particles, law = bar(lambda toughness: Fracture(Hencky(YOUNG, 0.3), toughness, 0.25), carried)
+    made = mpm.Body(
+        particles,
+        law,
+        density=1.0,
+        velocity=lambda x: np.stack([0.4 * (x[0] - 0.8), np.full(x.shape[1], 0.1)]),
+    )
+    problem = mpm.DynamicProblem(made, scheme=scheme)
+    linear, turning = problem.momentum, problem.angular_momentum
+    damage = problem.damage[0].field.x.array
+    before, at_once = damage.copy(), 0
+    for step in problem.steps(0.6, dt):
+        assert (damage >= before).all()
+        before, at_once = damage.copy(), max(at_once, step.alternations)
+    assert WORLD.allreduce(damage.max(), MPI.MAX) > 0.99
+    assert at_once > 2
+    size = 0.5 * 0.4
+    np.testing.assert_allclose(problem.momentum, linear, rtol=0.0, atol=1e-10 * size)
+    np.testing.assert_allclose(problem.angular_momentum, turning, rtol=0.0, atol=1e-8 * size)
+    crack = problem.damage[0].surface_energy()
+    assert 0.25 * 0.01 < crack < 2.0 * 0.25 * 0.01  # (both ends of the band are in two cells)
+    spent = problem.history.energies[-1].dissipated
+    assert abs(spent / crack - 1.0) < 0.03 if scheme == "midpoint" else spent > crack
+    # Where the crack is, nothing goes from one piece to the other any more.
+    pieces = []
+    for _ in range(2):
+        velocity = problem.inertia.velocities[0]
+        left = ufl.conditional(ufl.lt(ufl.SpatialCoordinate(particles.mesh)[0], 0.8), 1.0, 0.0)
+        own = fem.assemble_scalar(fem.form(left * velocity[0] * particles.dx))
+        pieces.append(WORLD.allreduce(float(own)))
+        problem.step(dt)
+    assert abs(pieces[1] - pieces[0]) < 2e-3 * size
+
+
+def test_faces_that_close_bear_pressure():
+    """A bar that was torn is pressed together again, and is as stiff as a whole one then.
+
+    Nodes that are nearly broken come to all of it, without going to and fro between their bounds.
+    """
+
+    def split(toughness):
+        return Fracture(LinearElastic(YOUNG, 0.0), toughness, 0.25, split="spectral")
+
+    particles, law = bar(split)
+    bcs = [mpm.held(particles.W, i, **{"xy"[i]: 0.0}) for i in range(2)]
+    face = mesh.locate_entities_boundary(particles.mesh, 1, lambda x: np.isclose(x[0], 2.0))
+    dofs = fem.locate_dofs_topological(particles.W.sub(0), 1, face)
+    end = fem.Constant(particles.mesh, 0.0)
+    grip = fem.dirichletbc(end, dofs, particles.W.sub(0))
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, law), bcs=[*bcs, grip])
+    forces = []
+    for value in (*np.linspace(0.02, 0.3, 8), 0.1, -0.02):
+        end.value = value
+        problem.step()
+        forces.append(problem.reaction(grip)[0])
+    assert abs(forces[7]) < 1e-3 * max(forces)
+    assert abs(forces[8]) < 1e-3 * max(forces)
+    np.testing.assert_allclose(forces[9], -YOUNG * 0.25 * 0.01, rtol=1e-6)
+
+
 def test_a_checkpoint_goes_on_as_if_nothing_had_been(tmp_path):
     path = WORLD.bcast(tmp_path / "plate.mpm")
     problem, top = plate()
@@ -271,7 +349,8 @@ def test_what_does_not_go_together_is_refused():
     refused("f_bar", f_bar="domain")
     refused("mixed", options={"mixed": "stabilised pressure"})
     refused("axisymmetric", options={"axisymmetric": True})
-    refused("DynamicProblem", mpm.DynamicProblem, density=1.0)
+    refused("use 'euler'", mpm.DynamicProblem, {"scheme": "conserving"}, density=1.0)
+    refused("rayleigh", mpm.DynamicProblem, {"rayleigh": (0.0, 1e-3)}, density=1.0)
     refused("initial_stress", initial_stress=np.eye(3))
     problem = mpm.QuasiStaticProblem(mpm.Body(particles, law), bcs=[mpm.held(particles.W, y=0.0)])
     raises(
