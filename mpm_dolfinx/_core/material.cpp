@@ -979,6 +979,39 @@ struct Averaged
   }
 };
 
+// A law whose flow takes time: a share of the return of the step's end is left between that and the
+// trial state (Duvaut & Lions 1972); see mpm_dolfinx.materials.plastic. All of it where the share
+// is 1.
+template <typename Law>
+struct InTime
+{
+  Law law;
+  double bulk, shear, share;
+
+  void operator()(const std::array<double, 3>& strain, double tolerance, Response& r) const
+  {
+    const std::array<double, core::max_variables> before = r.variables;
+    law(strain, tolerance, r);
+    if (!(share < 1.0) || !r.plastic)
+      return;
+    Response trial;
+    answer_elastic(strain, bulk, shear, trial);
+    auto leave = [this](double from, double& to) { to = from + share * (to - from); };
+    for (std::size_t k = 0; k < core::max_variables; ++k)
+      leave(before[k], r.variables[k]);
+    for (int a = 0; a < 3; ++a)
+    {
+      leave(trial.stress[a], r.stress[a]);
+      leave(trial.elastic_strain[a], r.elastic_strain[a]);
+      for (int b = 0; b < 3; ++b)
+      {
+        leave(trial.normal[a][b], r.normal[a][b]);
+        leave(trial.shear[a][b], r.shear[a][b]);
+      }
+    }
+  }
+};
+
 // The volume strain at which a law answers a pressure, and what the tangent has of it; the
 // algorithm of mpm_dolfinx.materials.given_pressure, point by point.
 struct VolumeAtPressure
@@ -1241,12 +1274,13 @@ std::vector<std::int64_t> update_all(const core::Update& u)
     double values[core::max_parameters];
     for (std::size_t k = 0; k < parameters; ++k)
       values[k] = u.parameters[k](p);
+    const InTime<Law> law{Law(values), values[0], values[1], u.share(p)};
     Response r;
     for (std::size_t k = 0; k < variables; ++k)
       r.variables[k] = u.old_variables[k][p];
     const bool valid =
         update_point<dim>(u.gradient + p * size, history ? u.old_gradient + p * size : nullptr,
-                          history ? u.old_c + p * m : nullptr, Law(values), u.tolerance, r,
+                          history ? u.old_c + p * m : nullptr, law, u.tolerance, r,
                           u.P + p * size, u.A == nullptr ? nullptr : u.A + p * size * size,
                           u.stress + p * m, history ? u.c + p * m : nullptr, u.given, p);
     for (std::size_t k = 0; k < variables; ++k)

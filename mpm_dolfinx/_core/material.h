@@ -73,8 +73,10 @@ struct GivenPressure
   double *gap, *compliance, *slope, *by_pressure;
 };
 
+constexpr double whole = 1.0;
+
 // Input and output of an update of many points; see update_plastic in module.cpp. Without
-// old_gradient there is no history.
+// old_gradient there is no history; of a return there is only a share where flow takes time.
 struct Update
 {
   Law law;
@@ -82,6 +84,7 @@ struct Update
   const double *gradient, *old_gradient, *old_c;
   const double* old_variables[max_variables];
   Parameter parameters[max_parameters];
+  Parameter share{&whole, 0};
   double tolerance;
   double *P, *A, *stress, *c;
   double* variables[max_variables];

@@ -318,8 +318,8 @@ Law law_of(const std::string& name)
 // Update a law with a history, from arrays of which the shapes are looked at.
 auto update_with_history(Law law, const Reals& gradient, const Reals& old_gradient,
                          const Reals& old_c, const std::vector<Reals>& old_variables,
-                         const std::vector<Reals>& parameters, double tolerance, RealsOut& P,
-                         RealsOut& A, RealsOut& stress, RealsOut& c,
+                         const std::vector<Reals>& parameters, const Reals& share,
+                         double tolerance, RealsOut& P, RealsOut& A, RealsOut& stress, RealsOut& c,
                          std::vector<RealsOut>& variables, const GivenPressure* given = nullptr)
 {
   require(gradient.ndim() == 3 && old_gradient.size() == gradient.size()
@@ -343,6 +343,7 @@ auto update_with_history(Law law, const Reals& gradient, const Reals& old_gradie
     u.old_variables[k] = old_variables[k].data();
     u.variables[k] = variables[k].data();
   }
+  u.share = parameter_of(share, u.count);
   u.tolerance = tolerance;
   u.P = P.data();
   u.A = A.size() > 0 ? A.data() : nullptr;
@@ -657,13 +658,13 @@ NB_MODULE(_loops, m)
   m.def("update_plastic",
         [](const std::string& law, Reals gradient, Reals old_gradient, Reals old_c,
            const std::vector<Reals>& old_variables, const std::vector<Reals>& parameters,
-           double tolerance, RealsOut P, RealsOut A, RealsOut stress, RealsOut c,
+           Reals share, double tolerance, RealsOut P, RealsOut A, RealsOut stress, RealsOut c,
            std::vector<RealsOut> variables) {
     return update_with_history(law_of(law), gradient, old_gradient, old_c, old_variables,
-                               parameters, tolerance, P, A, stress, c, variables);
+                               parameters, share, tolerance, P, A, stress, c, variables);
   },
         "law"_a, "gradient"_a, "old_gradient"_a, "old_c"_a, "old_variables"_a, "parameters"_a,
-        "tolerance"_a, "P"_a.noconvert(), "A"_a.noconvert(), "stress"_a.noconvert(),
+        "share"_a, "tolerance"_a, "P"_a.noconvert(), "A"_a.noconvert(), "stress"_a.noconvert(),
         "c"_a.noconvert(), "variables"_a.noconvert(),
         "Update a law with a history; return the points whose domains are inverted.");
 
@@ -699,7 +700,7 @@ NB_MODULE(_loops, m)
   m.def("update_at_pressure",
         [](const std::string& law, Reals gradient, Reals old_gradient, Reals old_c,
            const std::vector<Reals>& old_variables, const std::vector<Reals>& parameters,
-           double tolerance, Reals pressure, Reals augmentation, RealsOut P, RealsOut A,
+           Reals share, double tolerance, Reals pressure, Reals augmentation, RealsOut P, RealsOut A,
            RealsOut stress, RealsOut c, std::vector<RealsOut> variables, RealsOut gap,
            RealsOut compliance, RealsOut slope, RealsOut by_pressure) {
     const std::size_t count = gradient.shape(0);
@@ -710,10 +711,10 @@ NB_MODULE(_loops, m)
                               gap.data(),        compliance.data(),
                               slope.data(),      by_pressure.data()};
     return update_with_history(law_of(law), gradient, old_gradient, old_c, old_variables,
-                               parameters, tolerance, P, A, stress, c, variables, &given);
+                               parameters, share, tolerance, P, A, stress, c, variables, &given);
   },
         "law"_a, "gradient"_a, "old_gradient"_a, "old_c"_a, "old_variables"_a, "parameters"_a,
-        "tolerance"_a, "pressure"_a, "augmentation"_a, "P"_a.noconvert(), "A"_a.noconvert(),
+        "share"_a, "tolerance"_a, "pressure"_a, "augmentation"_a, "P"_a.noconvert(), "A"_a.noconvert(),
         "stress"_a.noconvert(), "c"_a.noconvert(), "variables"_a.noconvert(), "gap"_a.noconvert(),
         "compliance"_a.noconvert(), "slope"_a.noconvert(), "by_pressure"_a.noconvert(),
         "Update a law with a history at given pressures; return the points where it fails.");

@@ -294,6 +294,11 @@ class Material(ABC):
         return self
 
     @property
+    def needs_time(self) -> bool:
+        """Whether it is for steps with a duration alone."""
+        return False
+
+    @property
     def softens(self) -> bool:
         """Whether its strength falls with its plastic strain, so that a body may have a length."""
         return False

@@ -37,6 +37,10 @@ class CompiledMaterial(StrainMaterial):
         """Return the parameters of the compiled law, in the order of ``material.h``."""
         raise NotImplementedError
 
+    def _share(self) -> Parameter:
+        """Return which share of a return is done in the time of a step."""
+        return 1.0
+
     @override
     def update(self, displacement_gradient: Array, state: State, tangent: bool = True) -> Update:
         loop = self._known_loop()
@@ -110,6 +114,7 @@ class CompiledMaterial(StrainMaterial):
             np.ascontiguousarray(state["elastic_b_minus_identity"]),
             [np.ascontiguousarray(state[name]) for name in names],
             parameters,
+            _values(self._share()),
             getattr(self, "yield_tolerance", 0.0),
             *given,
             P,

@@ -57,6 +57,7 @@ class DruckerPrager(FrictionalMaterial):
         cohesion_residual: ArrayLike | Field | None = None,
         friction_residual: ArrayLike | Field | None = None,
         decay: ArrayLike | Field | None = None,
+        relaxation_time: ArrayLike | Field | None = None,
         volume_correction: bool = False,
     ) -> None:
         """Set the parameters.
@@ -75,6 +76,7 @@ class DruckerPrager(FrictionalMaterial):
             friction_residual: Angle of friction after much plastic strain; ``None``: as before.
                 The angle of dilation falls with it where it is larger.
             decay: How fast strength falls: by 1/e in a plastic strain of 1/decay.
+            relaxation_time: Time in which stress beyond yield falls by 1/e; ``None``: at once.
             volume_correction: Whether volume that opens at the apex or the cap closes again
                 before there is pressure; without it, it is plastic and stays.
 
@@ -91,6 +93,7 @@ class DruckerPrager(FrictionalMaterial):
             cohesion_residual=cohesion_residual,
             friction_residual=friction_residual,
             decay=decay,
+            relaxation_time=relaxation_time,
             volume_correction=volume_correction,
         )
         if match not in get_args(Match):

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
 from .base import Field, Integration, Parameter, State, check_parameter
-from .elastic import IsotropicElastic
 from .mandel import to_tensor
+from .plastic import PlasticMaterial
 from .principal import axes_in_order, from_axes, shear_quotients, tangent_from_axes
 from .softening import SofteningMaterial, require_softening
 
@@ -42,7 +42,7 @@ class FrictionalMaterial(SofteningMaterial):
     kinematics: ClassVar[Literal["small", "logarithmic"]] = "logarithmic"
     limits: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType(
         {
-            **IsotropicElastic.limits,
+            **PlasticMaterial.limits,
             "cohesion": {"least": 0.0},
             "friction_angle": {"least": 0.0, "below": 90.0},
             "dilation_angle": {"least": 0.0, "below": 90.0},
@@ -66,6 +66,7 @@ class FrictionalMaterial(SofteningMaterial):
         cohesion_residual: ArrayLike | Field | None = None,
         friction_residual: ArrayLike | Field | None = None,
         decay: ArrayLike | Field | None = None,
+        relaxation_time: ArrayLike | Field | None = None,
         volume_correction: bool = False,
     ) -> None:
         """Set the parameters.
@@ -84,6 +85,7 @@ class FrictionalMaterial(SofteningMaterial):
             friction_residual: Angle of friction after much plastic strain; ``None``: as before.
                 The angle of dilation falls with it where it is larger.
             decay: How fast strength falls: by 1/e in a plastic strain of 1/decay.
+            relaxation_time: Time in which stress beyond yield falls by 1/e; ``None``: at once.
             volume_correction: Whether volume that opens at the apex (or at the corner of the
                 cut-off on the hydrostatic axis) is kept in mind, and closes again at the stress
                 of the apex, before there is pressure: for soils that part and come together
@@ -104,6 +106,7 @@ class FrictionalMaterial(SofteningMaterial):
             "cohesion_residual": cohesion_residual,
             "friction_residual": friction_residual,
             "decay": decay,
+            "relaxation_time": relaxation_time,
         }
         given |= {name: value for name, value in optional.items() if value is not None}
         checked = {name: check_parameter(name, v, **self.limits[name]) for name, v in given.items()}
@@ -310,6 +313,7 @@ class Tresca(MohrCoulomb):
         *,
         cohesion_residual: ArrayLike | Field | None = None,
         decay: ArrayLike | Field | None = None,
+        relaxation_time: ArrayLike | Field | None = None,
     ) -> None:
         """Set the parameters.
 
@@ -320,6 +324,7 @@ class Tresca(MohrCoulomb):
             tension_cutoff: Largest tension that is borne, in units of stress; ``None``: any.
             cohesion_residual: Cohesion after much plastic strain; ``None``: as before.
             decay: How fast it falls: by 1/e in a plastic strain of 1/decay.
+            relaxation_time: Time in which stress beyond yield falls by 1/e; ``None``: at once.
 
         Raises:
             MPMError: A value is out of range; see :class:`FrictionalMaterial`.
@@ -333,6 +338,7 @@ class Tresca(MohrCoulomb):
             tension_cutoff,
             cohesion_residual=cohesion_residual,
             decay=decay,
+            relaxation_time=relaxation_time,
         )
 
 

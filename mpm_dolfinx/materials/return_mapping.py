@@ -5,9 +5,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
-from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, Self, override
+from typing import Any, NamedTuple, Self, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +14,8 @@ from ..errors import ConvergenceError
 from ..tolerances import ROUND_OFF
 from .base import Integration, State
 from .derivatives import difference_by_stress, slope_by_plastic_strain, slope_by_stress
-from .elastic import IsotropicElastic
 from .mandel import norm
+from .plastic import PlasticMaterial
 
 __all__ = ["ReturnMapping"]
 
@@ -29,7 +27,7 @@ HALVINGS = 12
 """Times that the line search halves a Newton step."""
 
 
-class ReturnMapping(IsotropicElastic):
+class ReturnMapping(PlasticMaterial):
     """Elastoplasticity by backward Euler for any yield function.
 
     Isotropic linear elasticity in the elastic strain eps, yield function f and plastic
@@ -67,10 +65,6 @@ class ReturnMapping(IsotropicElastic):
     """
 
     symmetric = False
-    inelastic: ClassVar[bool] = True
-    internal_variables: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType(
-        {"plastic_strain": ()}
-    )
     max_iterations: int = 50
 
     @abstractmethod
@@ -139,7 +133,8 @@ class ReturnMapping(IsotropicElastic):
             moved = np.linalg.solve(system.jacobian(solution), right)[:, :m]
             D = D.copy()
             D[points] = law.elastic_tangent(len(points), m) @ moved
-        return Integration(stress, D, elastic_strain, {"plastic_strain": plastic_strain})
+        answer = Integration(stress, D, elastic_strain, {"plastic_strain": plastic_strain})
+        return self.over_time(answer, trial_strain, variables)
 
     def _yielding(
         self, stress: NDArray[np.float64], plastic_strain: NDArray[np.float64]

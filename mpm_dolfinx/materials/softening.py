@@ -7,8 +7,7 @@ from __future__ import annotations
 import copy
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from types import MappingProxyType
-from typing import Any, ClassVar, Self, override
+from typing import Any, Self, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 from ..errors import MPMError
 from ..tolerances import LOCAL_ITERATIONS
 from .base import Integration, Parameter, State, Update
-from .elastic import IsotropicElastic
 from .given_pressure import AtPressure
+from .plastic import PlasticMaterial
 
 __all__ = ["SofteningMaterial"]
 
@@ -30,7 +29,7 @@ STRIDE = 1e-5
 ROUND_OFF = 1e-15
 
 
-class SofteningMaterial(IsotropicElastic):
+class SofteningMaterial(PlasticMaterial):
     """Base of laws whose strength may fall with the accumulated plastic strain kappa.
 
     With ``decay`` among the parameters strength falls from that at first to a residual one as
@@ -42,11 +41,6 @@ class SofteningMaterial(IsotropicElastic):
     which each law's own return stands. Below zero strength goes on growing as
     2 - exp(decay (2 k - kappa)), up to twice what it falls by.
     """
-
-    inelastic: ClassVar[bool] = True
-    internal_variables: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType(
-        {"plastic_strain": ()}
-    )
 
     @property
     @override
@@ -114,12 +108,14 @@ class SofteningMaterial(IsotropicElastic):
         if self._softens_at_once():
             return self.softened(before).integrate(trial_strain, variables, tangent)
         if self.softens:
-            return _averaged(self, trial_strain, variables, tangent)
-        return self.give_back(trial_strain, variables, tangent)
+            answer = _averaged(self, trial_strain, variables, tangent)
+        else:
+            answer = self.give_back(trial_strain, variables, tangent)
+        return self.over_time(answer, trial_strain, variables)
 
     @abstractmethod
     def give_back(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
-        """Return the stress at the end of a step by a law that does not soften; see `integrate`."""
+        """Return the stress of a law that does not soften, without time; see `integrate`."""
 
 
 def require_softening(parameters: Mapping[str, Any], residuals: Mapping[str, str]) -> None:

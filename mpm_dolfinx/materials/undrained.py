@@ -93,6 +93,11 @@ class Undrained(Material):
 
     @property
     @override
+    def needs_time(self) -> bool:
+        return self.law.needs_time
+
+    @property
+    @override
     def softens(self) -> bool:
         return self.law.softens
 

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
 from .base import Field, Integration, Parameter, State, check_parameter
-from .elastic import IsotropicElastic
 from .mandel import deviator, deviatoric_projector, identity, norm, trace
+from .plastic import PlasticMaterial
 from .softening import SofteningMaterial, require_softening
 
 __all__ = ["SmallStrainVonMises", "VonMises"]
@@ -40,7 +40,7 @@ class VonMises(SofteningMaterial):
     linear_in_volume: ClassVar[bool] = True
     limits: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType(
         {
-            **IsotropicElastic.limits,
+            **PlasticMaterial.limits,
             "rho_y": {"above": 0.0},
             "yield_stress": {"above": 0.0},
             "hardening": {"least": 0.0},
@@ -61,6 +61,7 @@ class VonMises(SofteningMaterial):
         *,
         residual: ArrayLike | Field | None = None,
         decay: ArrayLike | Field | None = None,
+        relaxation_time: ArrayLike | Field | None = None,
     ) -> None:
         """Set the parameters.
 
@@ -73,6 +74,7 @@ class VonMises(SofteningMaterial):
             residual: Share of the stress at first yield that is left after much plastic strain;
                 ``None``: all of it.
             decay: How fast it falls: by 1/e in a plastic strain of 1/decay.
+            relaxation_time: Time in which stress beyond yield falls by 1/e; ``None``: at once.
 
         Raises:
             MPMError: A value is out of range, or not exactly one of ``rho_y`` and
@@ -87,7 +89,7 @@ class VonMises(SofteningMaterial):
             name: check_parameter(name, strength, **self.limits[name]),
             "hardening": check_parameter("hardening", hardening, **self.limits["hardening"]),
         }
-        further = {"residual": residual, "decay": decay}
+        further = {"residual": residual, "decay": decay, "relaxation_time": relaxation_time}
         self.parameters = {**self.parameters} | {
             key: check_parameter(key, value, **self.limits[key])
             for key, value in further.items()
@@ -134,8 +136,8 @@ class VonMises(SofteningMaterial):
 
     @override
     def plastic_work(self, state: State) -> NDArray[np.float64] | None:
-        """Work of the uniaxial stress along the plastic strain; not known of one that softens."""
-        if self.softens:
+        """Work of the uniaxial stress along the plastic strain; not known with softening or lag."""
+        if self.softens or self.needs_time:
             return None
         kappa = state["plastic_strain"]
         yields = np.sqrt(1.5) * self.rho_y + 0.5 * self.parameters["hardening"] * kappa

@@ -133,9 +133,9 @@ def test_impossible_deformations_are_named(law, bad):
 def test_unknown_laws_are_refused():
     H, empty = np.zeros((3, 2, 2)), np.empty(0)
     with pytest.raises(ValueError, match="no compiled law rubber"):
-        loops.update_plastic("rubber", H, H, H, [], [], 0.0, H, empty, empty, empty, [])
+        loops.update_plastic("rubber", H, H, H, [], [], empty, 0.0, H, empty, empty, empty, [])
     with pytest.raises(ValueError, match="parameters of the law"):
-        loops.update_plastic("von_mises", H, H, H, [], [], 0.0, H, empty, empty, empty, [])
+        loops.update_plastic("von_mises", H, H, H, [], [], empty, 0.0, H, empty, empty, empty, [])
 
 
 def test_shapes_that_do_not_fit_are_refused():

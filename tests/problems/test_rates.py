@@ -22,10 +22,11 @@ from scenes import (
 )
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.materials import MuIRheology, mandel
+from mpm_dolfinx.materials import MohrCoulomb, MuIRheology, Undrained, VonMises, mandel
 
 STATIC, LIMIT, GRAIN, DENSITY, NUMBER = 0.5, 0.76, 0.02, 3.0, 0.279
 LAW = MuIRheology(1e4, 0.3, STATIC, LIMIT, GRAIN, DENSITY, NUMBER)
+LAGGING = MohrCoulomb(1e4, 0.3, 0.1, 30.0, cohesion_residual=0.05, decay=2.0, relaxation_time=5e-3)
 
 
 @pytest.mark.parametrize("scheme", ["midpoint", "euler"])
@@ -86,17 +87,20 @@ def state_of(problem):
     return [in_order(particles, values) for values in (particles.centroid, particles.stress)]
 
 
-@pytest.mark.parametrize("f_bar", ["none", *slow("patch")])
-def test_a_flow_goes_on_after_a_restart_and_on_other_ranks(tmp_path, f_bar):
+@pytest.mark.parametrize(
+    "given", [(LAW, "none"), (LAGGING, "patch"), *slow((LAW, "patch"), (LAGGING, "none"))]
+)
+def test_a_flow_goes_on_after_a_restart_and_on_other_ranks(tmp_path, given):
+    law, f_bar = given
     path = WORLD.bcast(tmp_path) / "flow.ckpt"
-    whole = collapse(f_bar=f_bar)
+    whole = collapse(law=law, f_bar=f_bar)
     for number, _ in enumerate(whole.steps(time=0.2, dt=0.02), 1):
         if number == 6:
             whole.save(path)
-    restored = collapse(f_bar=f_bar)
+    restored = collapse(law=law, f_bar=f_bar)
     restored.restore(path)
     restored.solve(time=0.2, dt=0.02)
-    alone = collapse(MPI.COMM_SELF, f_bar=f_bar)
+    alone = collapse(MPI.COMM_SELF, law, f_bar=f_bar)
     alone.solve(time=0.2, dt=0.02)
     for mine, again, single in zip(*map(state_of, (whole, restored, alone)), strict=True):
         np.testing.assert_array_equal(again, mine)
@@ -118,8 +122,9 @@ def test_friction_by_rate_slows_the_flow_and_vanishes_with_the_grains():
     assert centres[3].mean() < centres[2].mean() < centres[1].mean()
 
 
-def test_a_stage_leaves_the_stress_of_what_flows():
-    problem = collapse()
+@pytest.mark.parametrize("law", [LAW, LAGGING])
+def test_a_stage_leaves_the_stress_of_what_flows(law):
+    problem = collapse(law=law)
     problem.solve(time=0.12, dt=0.02)
     before = problem.points[0].first_piola.copy()
     over = problem.points[0].last.yield_function()
@@ -161,3 +166,89 @@ def test_friction_stays_between_its_ends_with(options):
         if number == 3:
             problem.repartition(0.0)
     assert problem.history.stopped is None
+
+
+def moving(particles, bc, law):
+    return mpm.DynamicProblem(mpm.Body(particles, law, density=2.0), bcs=[bc], scheme="euler")
+
+
+def drained(particles, bc, law):
+    fluid = mpm.PoreFluid(1e9, drained=[(0.0, 1)])
+    tags = mpm.facet_tags(particles.mesh, {1: lambda x: x[0] < 9.0})
+    made = mpm.Body(particles, law, pore_fluid=fluid, facet_tags=tags)
+    return mpm.PorousProblem(made, bcs=[bc])
+
+
+@pytest.mark.parametrize(
+    ("problem_of", "law"), [(moving, "plain"), (moving, "undrained"), (drained, "plain")]
+)
+def test_stress_beyond_yield_relaxes_with_the_time_of_steps(problem_of, law):
+    """A block that is sheared at once and held, in steps of two durations."""
+    time, strain, modulus, strength = 0.1, 0.01, 1e3 / 2.6, 2.0
+    lagging = VonMises(1e3, 0.3, rho_y=np.sqrt(2.0) * strength, relaxation_time=time)
+    lagging = Undrained(lagging, 1e3) if law == "undrained" else lagging
+    V = vectors(box([-1.0, -1.0], [3.0, 2.0], [8, 6], QUADRILATERAL), 2)
+    body = box([0.1, 0.1], [1.1, 1.1], [3, 3], QUADRILATERAL)
+    particles = mpm.Particles(body, V, degree=2, quadrature_degree=4)
+    bc, u = everywhere(V)
+    problem = problem_of(particles, bc, lagging)
+    y = V.tabulate_dof_coordinates()[:, 1]
+
+    def shear(now):
+        u.x.array[::2] = strain * y * (now > 0.0)
+
+    expected = modulus * strain
+    ends = np.cumsum([0.02, 0.02, 0.02, 0.1, 0.1])
+    for end, step in zip(
+        ends, problem.steps(time=ends[-1], dt=1.0, update=shear, output_at=ends[:-1]), strict=True
+    ):
+        assert abs(step.time - end) < 1e-12
+        dt = 0.02 if end < 0.07 else 0.1
+        expected = strength + (expected - strength) / (1.0 + dt / time)
+        np.testing.assert_allclose(particles.stress[:, 0, 1], expected, rtol=1e-3)
+    assert problem.points[0].last.states[0]["plastic_strain"].min(initial=1.0) > 0.0
+
+
+def test_a_law_that_needs_time_is_refused_where_there_is_none():
+    body = box([0.1, 0.1], [1.1, 1.1], [3, 3], QUADRILATERAL)
+    lagging = VonMises(1e3, 0.3, rho_y=1.0, relaxation_time=1.0)
+    particles = mpm.Particles(body)
+    bcs = [mpm.held(particles.W, y=0.1)]
+    for law in (lagging, Undrained(lagging, 1e3)):
+        with pytest.raises(mpm.MPMError, match="relaxation_time needs steps with a duration"):
+            mpm.QuasiStaticProblem(mpm.Body(particles, law), bcs=bcs)
+    plain = VonMises(1e3, 0.3, rho_y=1.0)
+    problem = mpm.QuasiStaticProblem(mpm.Body(particles, plain), bcs=bcs)
+    with pytest.raises(mpm.MPMError, match="relaxation_time needs steps with a duration"):
+        problem.stage(bodies=problem.body().replace(material=lagging))
+    problem.solve(1)
+    motion = mpm.DynamicProblem(mpm.Body(particles, lagging, density=1.0), bcs=bcs, after=problem)
+    motion.solve(time=0.1, dt=0.1)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"f_bar": "patch"},
+        *slow(
+            {"mixed": "stabilised pressure"},
+            {"scheme": "conserving"},
+            {"scheme": "midpoint"},
+            {"rayleigh": (0.1, 1e-4)},
+            {"axisymmetric": True},
+            {"cell": HEXAHEDRON},
+            {"length": 0.3},
+        ),
+    ],
+    ids=str,
+)
+def test_a_lagging_column_runs_with(options):
+    """With each option, and after a rebase and a move of all particles to other ranks."""
+    problem = collapse(**{"law": LAGGING, "petsc_options": {}, **options})
+    for number, _ in enumerate(problem.steps(time=0.1, dt=0.02)):
+        if number == 2 and "length" not in options:
+            problem.rebase()
+        if number == 3:
+            problem.repartition(0.0)
+    assert problem.history.stopped is None
+    assert WORLD.allreduce(problem.particles.plastic_strain.max(initial=0.0), MPI.MAX) > 0.0
