@@ -261,7 +261,7 @@ def test_pieces_fly_on_and_keep_their_momentum(scheme, carried, dt):
     linear, turning = problem.momentum, problem.angular_momentum
     damage = problem.damage[0].field.x.array
     before, at_once = damage.copy(), 0
-    for step in problem.steps(0.6, dt):
+    for step in problem.steps(time=0.6, dt=dt):
         assert (damage >= before).all()
         before, at_once = damage.copy(), max(at_once, step.alternations)
     assert WORLD.allreduce(damage.max(), MPI.MAX) > 0.99
