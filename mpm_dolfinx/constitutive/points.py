@@ -470,6 +470,11 @@ class MaterialPoints:
         if self.softening is not None and last.average is not None and last.growth is not None:
             self.softening.expect(last.average + last.growth)
 
+    def miss(self) -> None:
+        """Expect no growth of the average in the next try of a step, which has failed with it."""
+        if self.last.growth is not None:
+            self.last = self.trial = replace(self.last, growth=np.zeros_like(self.last.growth))
+
     def alternate(self) -> int:
         """Average what softens; return the linear solves that it took (collective)."""
         return 0 if self.softening is None else self.softening.alternate(self.trial.states)
@@ -508,10 +513,8 @@ class MaterialPoints:
     def roll_back(self) -> None:
         """Forget the last update."""
         last = self.last
-        if self.softening is not None and (average := last.average) is not None:
-            if self.softening.expects:  # what was not found is not expected again
-                self.last = last = replace(last, growth=np.zeros(len(average)))
-            self.softening.begin(average)
+        if self.softening is not None and last.average is not None:
+            self.softening.begin(last.average)
         self.trial = last
         self.first_piola = last.stress.copy()
         if self.mean_stress is not None:

@@ -45,7 +45,6 @@ class SofteningAverage:
     Attributes:
         length: As given.
         values: That of the present update, at all points, shape ``(n nq,)``.
-        expects: Whether it was one that is expected at the end of a step.
 
     Raises:
         MPMError: No law softens, or domains do not share their nodes.
@@ -64,7 +63,7 @@ class SofteningAverage:
             )
         self._over = GradientAverage(strain, length, laws.by_domain(counts).any(axis=1))
         self.values = np.zeros(laws.num_points)
-        self._turns, self.expects = 0, False
+        self._turns = 0
 
     def of(self, states: list[State]) -> Array:
         """Return the average of the plastic strain of states, shape ``(n nq,)`` (collective)."""
@@ -76,11 +75,11 @@ class SofteningAverage:
 
     def begin(self, values: Array) -> None:
         """Let updates have the average of a converged step."""
-        self.values, self._turns, self.expects = values, 0, False
+        self.values, self._turns = values, 0
 
     def expect(self, values: Array) -> None:
         """Let updates begin with an average that is expected at the end of a step."""
-        self.values, self.expects = values, True
+        self.values = values
 
     def alternate(self, states: list[State]) -> int:
         """Average the plastic strain of the last update for the next one (collective).

@@ -153,12 +153,12 @@ class Sensitivity:
             yield
             return
         converged = self._stepper.converged
-        before = converged.supports
+        before = converged.supports, converged.force
         try:
-            converged.supports = self.problem.forces_of_supports()
+            converged.supports, converged.force = self.problem.forces_of_supports(), None
             yield
         finally:
-            converged.supports = before
+            converged.supports, converged.force = before
 
     # -- What follows the run --------------------------------------------------------------
 

@@ -388,6 +388,7 @@ class Standing(Kept):
             "supports": None
             if converged.supports is None
             else np.array(converged.supports).tolist(),
+            "force": converged.force,
             "run": None if run is None else run.numbers(),
             "experience": self.progress.experience,
         }
@@ -434,6 +435,7 @@ class Standing(Kept):
                 for V, columns in zip(self._spaces, taken.backgrounds, strict=True)
             ],
             None if supports is None else [np.array(force) for force in supports],
+            numbers.get("force"),
         )
         run = None
         if numbers["run"] is not None:

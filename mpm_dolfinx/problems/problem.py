@@ -601,8 +601,8 @@ class Problem(Hooked):
         In equilibrium the background sees no force: ``T^T R = 0``. R itself, on the bodies' own
         nodes, is what it could not balance; its energy, node by node, tells how far the bodies'
         own finite elements are from here. It is kept as ``error`` of the last of
-        ``history.steps``. Loads, conditions and obstacles count as they are set now, so ask before
-        they are changed for the next step.
+        ``history.steps``. Ask before loads, conditions and obstacles are changed for the next step;
+        after :meth:`restore` set them as they were.
 
         Not seen is what these elements cannot do themselves (shear or volumetric locking, a mesh
         too coarse for the load), nor the error of load steps, for which ``steps="auto"`` has a
@@ -612,8 +612,8 @@ class Problem(Hooked):
             Energy norm of the error over that of the deformation.
 
         Raises:
-            MPMError: A motion, or a flow of water, which is in no equilibrium of its own, or
-                particles that do not hang together.
+            MPMError: A motion, or a flow of water, which is in no equilibrium of its own, particles
+                that do not hang together, or forces that are not those of that step.
         """
         found = self._errors().total(self.bodies)
         steps = self.history.steps
@@ -643,7 +643,7 @@ class Problem(Hooked):
     def _errors(self) -> Errors:
         self._require_error()
         self._require_governing()
-        return estimated(self.bodies, self.body_terms, self.reduced)
+        return estimated(self.bodies, self.body_terms, self.reduced, self._stepper.converged.force)
 
     def _require_error(self) -> None:
         """Raise an error unless an error can be told."""
@@ -868,6 +868,14 @@ class Problem(Hooked):
     def forces_of_supports(self) -> list[NDArray[np.float64]]:
         """Return the forces of :attr:`supports` on the bodies, by what is set now (collective)."""
         return [support.reaction for support in self.supports]
+
+    def size_of_forces(self) -> float | None:
+        """Return the size of the forces on nodes in the last evaluation, if they tell an error."""
+        if not self._at_rest:
+            return None
+        for term in self.body_terms:
+            term.begin()  # (with a load factor that is found, loads are those before yet)
+        return self.reduced.terms.size_of_forces()
 
     def masses(self, number: int) -> NDArray[np.float64] | None:
         """Return the mass of each particle of a body that this rank owns, if it is known."""

@@ -156,7 +156,8 @@ class Staging:
                 return belongs(name, gone) or change.renews(body, name)
 
             found = merged(snapshot, state.capture(), numbers, backgrounds, renewed)
-            found.numbers.update({"past": [], "release remaining": 0.0, "supports": None})
+            nothing: dict[str, object] = {"past": [], "supports": None, "force": None}
+            found.numbers.update({**nothing, "release remaining": 0.0})
             return found
 
         def undo() -> None:

@@ -183,6 +183,8 @@ class Converged:
         proportional: Whether supports have moved in proportion to the load, else to totals.
         supports: Forces of the supports that the problem was given, in their order; ``None`` where
             there was no step with them.
+        force: Size of the forces of all on the bodies' nodes; ``None`` where there was no step, or
+            what was deleted after it has taken its own away.
     """
 
     load: float
@@ -192,6 +194,7 @@ class Converged:
     proportional: bool = True
     followed: Sequence[NDArray[np.float64] | None] = ()
     supports: list[NDArray[np.float64]] | None = None
+    force: float | None = None
 
     def reaction(self, number: int) -> NDArray[np.float64] | None:
         """Return the forces at supports on own dofs of V of a field, if any are known."""

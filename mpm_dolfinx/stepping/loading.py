@@ -96,6 +96,9 @@ class Owner(Protocol):
     def forces_of_supports(self) -> list[NDArray[np.float64]]:
         """Return the forces of the supports that it was given, by what is set now."""
 
+    def size_of_forces(self) -> float | None:
+        """Return the size of the forces on nodes in the last evaluation, if they tell an error."""
+
 
 class Mender(Protocol):
     """Changes of the bodies' meshes between steps. All calls are collective."""
@@ -487,6 +490,7 @@ class Stepper:
     def _take_back(self, size: float, end: float, reason: str) -> None:
         """Return to the last converged step, and take note of what is lost (collective)."""
         self.go_back()
+        self._miss()
         history, iterations = self.owner.history, self.newton.iterations
         history.failed_iterations += iterations
         history.taken_back.append(Attempt(end, size, iterations, reason))
@@ -543,6 +547,7 @@ class Stepper:
                         step = self._advance(Goal(load, self.prescribed(), time))
                     except TRIAL_ERRORS as error:
                         self.go_back()
+                        self._miss()
                         if not self._carry(relieve(self._looked_after, error)):
                             raise
             except BaseException as error:
@@ -573,6 +578,11 @@ class Stepper:
         self._set_load(self.converged.load, self.converged.proportional)
         self._reduced.terms.roll_back()
         self._follow_back(update)
+
+    def _miss(self) -> None:
+        """Let bodies expect nothing in the next try of a step, as this one has failed."""
+        for term in self.owner.body_terms:
+            term.miss()
 
     def _carry(self, carried: Carried) -> bool:
         """Carry free nodes before a step is tried again; return whether any are (collective)."""
@@ -677,7 +687,7 @@ class Stepper:
         """
         owner, reduced = self.owner, self._reduced
         owner.begin_step()
-        parameter = goal.parameter
+        parameter, losses = goal.parameter, len(owner.history.losses)
         size = 0.0 if goal.again else parameter - self.converged.parameter
         if control is not None and not goal.again:
             size = abs(parameter - control.present())
@@ -699,6 +709,7 @@ class Stepper:
             if not goal.again:
                 self._look_for_jump(owner, size, parameter)
             parameter = float(owner.bodies[0].load.value)
+        force = owner.size_of_forces()
         before = [body.converged_displacement for body in owner.bodies]
         move_bodies(owner.bodies, owner.history, owner.masses, parameter, goal.last)
         with owner.history.statistics.phase("commit"):
@@ -717,6 +728,8 @@ class Stepper:
                 load, parameter, prescribed, reactions, proportional, reduced.balance.followed()
             )
             self.converged.supports = owner.forces_of_supports()
+            if len(owner.history.losses) == losses:
+                self.converged.force = force
             reduced.end(goal.again)
             for take in taken:
                 take()
@@ -785,6 +798,7 @@ class Stepper:
             if control is not None:
                 self._set_load(self.converged.load, self.converged.proportional)
             reduced.terms.roll_back()
+            self._miss()
 
     def _look_for_jump(self, owner: Owner, size: float, displacement: float) -> None:
         """Warn where a body has moved much farther than its controlled displacement (collective).

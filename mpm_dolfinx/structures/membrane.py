@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Self, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from ..parallel.boundary import collective
 from ..parallel.given import as_positive, is_number
 from ..particles.particles import Particles
 from .laws import Sheet
-from .structure import Structure
+from .structure import State, Structure
 
 __all__ = ["Membrane"]
 
@@ -30,7 +30,7 @@ class Membrane(Structure):
 
     A lining on facets of a body is drawn by ``dolfinx.mesh.create_submesh`` of these. Give the
     membrane to a problem as ``terms=[membrane]``. In a stage it begins without stress where the
-    bodies are then.
+    bodies are then, or goes on as an equal one that is drawn alike.
 
     Args:
         bodies: The body that it lies in, or several: a node belongs to the first that has it.
@@ -70,6 +70,15 @@ class Membrane(Structure):
         super().__init__(bodies, shape, law, degree, True, held, axisymmetric)
         if self.layout.dim < self.nodes.shape[1] - 1:
             raise MPMError("A Membrane in space is a surface; a line there is a Truss.")
+
+    @override
+    def continued(self, other: Self) -> State:
+        if other.law != self.law:
+            raise MPMError(
+                "A Membrane cannot go on as one that is drawn like it with other stiffness, "
+                "poisson or compression; draw it in other cells, or take that one away before."
+            )
+        return super().continued(other)
 
     @property
     def force(self) -> NDArray[np.float64]:

@@ -57,7 +57,7 @@ class Nodal(NamedTuple):
     Attributes:
         forces: On the nodes of each cell, shape ``(m, k, gdim)``.
         tangent: Their derivatives, shape ``(m, k, gdim, k, gdim)``.
-        principal: Forces at the points, shape ``(m, q, c)``.
+        principal: Forces at the points, none where a cell is not there, shape ``(m, q, c)``.
         offset: See :class:`.Response`, shape ``(m, q)``.
         special: The same, shape ``(m, q)``.
     """
@@ -110,8 +110,10 @@ def stretched(rule: Rule, law: Law, nodes: Array, offset: Array, present: Array)
     a = np.einsum("mqkt,mkg->mqgt", rule.slopes, nodes[rule.cells])
     weights = rule.weights * present[:, None]
     if rule.slopes.shape[3] == 2:
-        return _surface(rule, law, a, offset, weights)
-    return _line(rule, law, nodes, a[..., 0], offset, weights)
+        found = _surface(rule, law, a, offset, weights)
+    else:
+        found = _line(rule, law, nodes, a[..., 0], offset, weights)
+    return found._replace(principal=found.principal * present[:, None, None])
 
 
 def _line(rule: Rule, law: Law, nodes: Array, a: Array, offset: Array, weights: Array) -> Nodal:

@@ -229,17 +229,32 @@ class Structure(Term):
         Args:
             other: The other, at its last converged step.
         """
-        state, bonds = other.state, self.state.bond.shape
-        return state if state.bond.shape == bonds else state._replace(bond=np.zeros(bonds))
+        if self._grip is None:
+            return other.state._replace(bond=np.zeros(0))
+        every = np.zeros(len(self.layout.nodes))
+        if other._grip is not None:
+            every[other._grip.nodes] = other.state.bond
+        return other.state._replace(bond=every[self._grip.nodes])
 
     @override
     def come_after(self, gone: Sequence[Term]) -> None:
         """Begin without stress where the bodies are, or as the one in whose place it comes.
 
-        That is one of the same kind that is drawn in the same way.
+        That is one of the same kind that is drawn in the same way; of several the one that is
+        called so, or has the same law.
+
+        Raises:
+            MPMError: It is not to be told which of several, or what it is cannot go on.
         """
-        before = [one for one in gone if isinstance(one, type(self))]
-        alike = [one for one in before if one.layout.is_same(self.layout)]
+        alike = [one for one in gone if isinstance(one, type(self))]
+        alike = [one for one in alike if one.layout.is_same(self.layout)]
+        called = [one for one in alike if one.name == self.name is not None]
+        alike = called or [one for one in alike if one.law == self.law] or alike
+        if any(not _is_same(one.state, alike[0].state) for one in alike):
+            raise MPMError(
+                f"Several of {type(self).__name__} were drawn like this one, and it is not to be "
+                "told in whose place it comes; give it the name of that one."
+            )
         self.take(self.continued(alike[0]) if alike else self._drawn())
 
     @override
@@ -362,6 +377,10 @@ class Structure(Term):
     @override
     def drives(self) -> bool:
         return bool(np.any(self.state.slip[self._alone] != self._path))
+
+
+def _is_same(one: State, other: State) -> bool:
+    return all(map(np.array_equal, one, other))
 
 
 def _require_around(drawn: Layout, what: str) -> None:

@@ -122,6 +122,11 @@ class BodyTerm(Term):
         if self._points is not None:
             self._points.expect()
 
+    def miss(self) -> None:
+        """Expect nothing in the next try of a step: from what was expected it has failed."""
+        if self._points is not None:
+            self._points.miss()
+
     @override
     def pace(self, dt: float, share: float) -> None:
         if self._static:

@@ -15,6 +15,7 @@ from dolfinx import fem
 from ..assembly.petsc import absolute
 from ..constitutive.points import MaterialPoints
 from ..constitutive.recovery import stress_errors
+from ..errors import MPMError
 from ..particles.particles import Particles
 from .body import BodyTerm
 from .conditions import fixed_dofs
@@ -22,6 +23,9 @@ from .estimate import nodal_errors, shares_of_domains
 from .reduced import ReducedSystem
 
 __all__ = ["Errors", "estimated"]
+
+#: Change of the forces, over those of all domains, by which they are others.
+OTHER = 1e-6
 
 
 class Errors(NamedTuple):
@@ -51,7 +55,10 @@ class Errors(NamedTuple):
 
 
 def estimated(
-    bodies: Sequence[Particles], terms: Sequence[BodyTerm], reduced: ReducedSystem
+    bodies: Sequence[Particles],
+    terms: Sequence[BodyTerm],
+    reduced: ReducedSystem,
+    size: float | None = None,
 ) -> Errors:
     """Return the errors of the last converged step (collective).
 
@@ -59,10 +66,23 @@ def estimated(
         bodies: The bodies.
         terms: What each is made of and loaded by.
         reduced: Their system.
+        size: Of the forces on their nodes in that step, by which these are known again; ``None``:
+            they are those.
+
+    Raises:
+        MPMError: Forces are others than in that step.
     """
     forces = reduced.terms.nodal_forces()
     if (failure := reduced.terms.update()) is not None:
         raise failure
+    now = reduced.terms.size_of_forces()
+    if size is not None and abs(now - size) > OTHER * reduced.terms.size_of_contributions():
+        reduced.terms.roll_back()
+        raise MPMError(
+            f"The forces on the bodies, {now:.6g} in all, are not those of the last converged step "
+            f"any more, {size:.6g}, of which error() tells: loads, conditions or obstacles have "
+            "been changed since; ask before, or set them as they were."
+        )
     nodal, own, energy = [], [], 0.0
     for body, term, force in zip(bodies, terms, forces, strict=False):
         field = next(field for field in reduced.fields if any(b is body for b in field.bodies))

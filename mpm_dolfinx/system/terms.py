@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import ConvergenceError, MPMError, agree, agreed, as_ours, gravest
 from ..parallel.interruption import Interrupted, note
+from ..parallel.magnitudes import joint_norm
 from ..parallel.totals import over_ranks
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
@@ -141,6 +142,15 @@ class Terms:
             return term.residuals()
 
         return self._on_nodes(force)
+
+    def size_of_forces(self) -> float:
+        """Return the size of :meth:`last_nodal_forces` of all bodies."""
+        return joint_norm(np.concatenate([*self.last_nodal_forces(), np.zeros(0)]), self._comm)
+
+    def size_of_contributions(self) -> float:
+        """Return the size of what the forces on nodes are sums of, in absolute values."""
+        parts = [part.norm() for term in self._terms for part in term.absolute_contributions()]
+        return joint_norm(parts)
 
     def last_nodal_forces(self) -> list[NDArray[np.float64]]:
         """Return the forces of all terms in the last evaluation, as :meth:`nodal_forces`."""

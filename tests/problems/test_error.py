@@ -393,3 +393,80 @@ def test_a_motion_has_none():
     body = mpm.Particles(box([0, 0], [1, 1], [4, 4], QUADRILATERAL), V)
     problem = mpm.DynamicProblem(mpm.Body(body, materials.Hencky(1e3, 0.3), density=1.0))
     raises(problem.error, mpm.MPMError, "in no equilibrium")
+
+
+def pressed_by(way):
+    """Return a block after a step, what loads it, and the function that sets that.
+
+    By a traction, an obstacle, a support that moves, or a load factor that is found.
+    """
+    V = vectors(box([-0.5, 0], [2, 2.25], [10, 9], QUADRILATERAL))
+    body = mpm.Particles(box([0.2, 0], [1.2, 1], [8, 8], QUADRILATERAL), V)
+    tags = facet_tags(body.mesh, at(1, 1.0), at(1, 0.0))
+    force, moved = (fem.Constant(body.mesh, (0.0, 0.0)) for _ in range(2))
+    own = mpm.Body(
+        body,
+        materials.VonMises(1e3, 0.3, rho_y=30.0),
+        facet_tags=tags,
+        tractions=[(force, 1)] if way in ("traction", "control") else [],
+    )
+    die = mpm.contact.Rigid(body, mpm.contact.disc((0.7, 1.4), 0.4), friction=0.3)
+    problem = mpm.QuasiStaticProblem(
+        own,
+        bcs=[fix(V, at(1, 0.0))],
+        supports=[mpm.boundary.fixed(body, tags, 1, value=moved)] if way == "support" else [],
+        terms=[die] if way == "obstacle" else [],
+    )
+
+    def put(t):
+        force.value[:] = (2.0 * t, -20.0 * t)
+        moved.value[:] = (0.0, -0.02 * t)
+        die.move((0.0, -0.03 * t))
+
+    if way == "control":
+        put(1.0)
+        control = mpm.DisplacementControl(body, -0.02, point=(0.7, 1.0), direction=(0.0, 1.0))
+        problem.solve(2, control=control)
+    return problem, put
+
+
+@pytest.mark.parametrize("way", ["traction", "obstacle", "support", "control"])
+def test_it_is_of_the_last_step_or_none(way, mpi_tmp_path):
+    """What is set for the next step, or by no path after a restart, is in no error of the last."""
+    problem, put = pressed_by(way)
+    if way != "control":
+        problem.solve(2, update=put)
+    found = problem.error()
+    assert 0.01 < found < 0.9
+    problem.save(mpi_tmp_path / "state")
+    put(1.5)
+    for ask in (problem.error, problem.error_of_particles):
+        raises(ask, mpm.MPMError, "not those of the last converged step any more")
+    assert problem.history.steps[-1].error == found
+    put(1.0)
+    assert problem.error() == pytest.approx(found, rel=1e-6)
+    again, put = pressed_by(way)
+    again.restore(mpi_tmp_path / "state")
+    put(0.0)
+    raises(again.error, mpm.MPMError, "not those of the last")
+    put(1.0)
+    assert again.error() == pytest.approx(found, rel=1e-6)
+    put(1.1)
+    again.step()
+    assert again.error() == again.history.steps[-1].error
+
+
+def test_it_goes_on_where_particles_leave_and_over_stages():
+    """What a step deletes has taken its forces away, and a stage holds back what it changes."""
+    V = vectors(box([0, 0], [1.05, 2], [4, 8], QUADRILATERAL))
+    body = mpm.Particles(box([0, 0], [1, 1], [8, 8], QUADRILATERAL), V, outside="delete")
+    own = mpm.Body(body, materials.Hencky(1e2, 0.3), density=1.0, body_force=(8.0, -20.0))
+    problem = mpm.QuasiStaticProblem(own, bcs=[fix(V, at(1, 0.0))])
+    for _ in problem.steps(4):
+        assert problem.error() > 0.0
+    assert problem.history.losses
+    before = problem.error()
+    problem.stage("dug", problem.body().replace(body_force=(0.0, -20.0)))
+    assert problem.error() == pytest.approx(before, rel=1e-6)
+    problem.solve(2)
+    assert problem.error() > 0.0

@@ -128,6 +128,11 @@ def cracking(terms):
     return of_law(terms, Fracture(Hencky(1e3, 0.3), 0.05, 0.4, model="AT2"), load=(2.0, -6.0))
 
 
+def softening(terms):
+    law = VonMises(1e3, 0.3, rho_y=5.5, hardening=100.0, residual=0.9, decay=20.0)
+    return of_law(terms, law, length=0.3)
+
+
 def with_water(terms):
     p = body(2)
     problem = mpm.PorousProblem(
@@ -203,6 +208,7 @@ KINDS = {
     "F-bar": lambda terms: of_materials(terms, f_bar="patch"),
     "free nodes": with_free_nodes,
     "fracture": cracking,
+    "softening": softening,
     "water table": lambda terms: of_law(
         terms, Hencky(1e3, 0.3), pore_pressure=mpm.WaterTable(0.7, 10.0)
     ),

@@ -378,3 +378,51 @@ def test_a_law_without_strength_is_refused():
         mpm.MPMError, match="has a strength; those of this problem are elastic: Hencky"
     ):
         mpm.strength_reduction(problem)
+
+
+def bank(cells, **options):
+    """Return a slope of 45 degrees, height 1, of undrained strength 1 on a firm base."""
+    body = box([0, 0], [2.5, 1], [5 * cells, 2 * cells], QUADRILATERAL)
+    x = body.geometry.x
+    x[:, 0] *= (1.5 + (1 - x[:, 1])) / 2.5
+    h = 1.0 / cells
+    V = vectors(
+        box([0, 0], [2.5 + 4 * h, 1 + 2 * h], [5 * cells // 2 + 4, cells + 2], QUADRILATERAL)
+    )
+    f_bar = options.pop("f_bar", "patch")
+    own = mpm.Body(
+        mpm.Particles(body, V, **options),
+        materials.Tresca(1e5, 0.49, cohesion=1.0),
+        density=3.0,
+        body_force=(0.0, -1.0),
+        f_bar=f_bar,
+    )
+    bcs = [mpm.held(V, y=0.0), mpm.held(V, 0, x=0.0)]
+    return mpm.QuasiStaticProblem(own, bcs=bcs)
+
+
+def known_of_bank():
+    """Return gamma H/c of the worst of slides along circles on the base: an upper bound."""
+    a, b = (m.ravel() for m in np.meshgrid(np.linspace(0.5, 1.0, 26), np.linspace(1.2, 2.2, 51)))
+    x = a[:, None] + b[:, None] * (np.arange(800) + 0.5 - 400) / 400  # (their radius is b)
+    surface = np.clip(1.0 - x, 0.0, 1.0)
+    down = np.sqrt(b[:, None] ** 2 - (x - a[:, None]) ** 2)
+    height = np.maximum(surface - (b[:, None] - down), 0.0)
+    width = b[:, None] / 400
+    moment = (height * (a[:, None] - x) * width).sum(axis=1)
+    arc = ((height > 0.0) * b[:, None] / down * width).sum(axis=1)
+    return (b * arc / moment)[moment > 0.01].min()
+
+
+@pytest.mark.parametrize("cells", [4, *slow(8)])
+def test_averages_of_carried_and_of_free_nodes_err_to_both_sides(cells):
+    """Patches of particles find too much, those of finite elements, which are soft, too little."""
+    found = []
+    for options in ({}, {"free": "auto"}):
+        problem = bank(cells, **options)
+        problem.solve(4)
+        found.append(3.0 * mpm.strength_reduction(problem).factor)
+    known = known_of_bank()
+    assert known == pytest.approx(6.05, abs=0.02)
+    assert known < found[0] < (1.0 + 0.55 / cells) * known
+    assert (1.0 - 0.8 / cells) * known < found[1] < known

@@ -660,3 +660,99 @@ def test_a_tie_tells_its_reaction():
     problem.solve(2)
     assert np.allclose(problem.reaction(tie), [0.0, -4.0], atol=1e-6)
     assert np.allclose(problem.reaction(problem.bcs[0]), [0.0, 4.0], atol=1e-6)
+
+
+# -- In place of others --------------------------------------------------------------------------
+
+
+def stretched_pit(*terms):
+    """Return a problem with terms that a heavier weight has stretched, and its body's points."""
+    problem = pit(carried=False)
+    problem.solve(2)
+    made = [one(problem.particles) for one in terms]
+    heavier = problem.body().replace(body_force=(0.0, -60.0))
+    problem.stage("loaded", heavier, terms=made)
+    problem.solve(4)
+    return problem, made
+
+
+POINTS = line((0.1, 0.45), (1.9, 0.9), 12)
+
+
+def test_two_that_are_drawn_alike_go_on_each_as_its_own():
+    laws = ({"stiffness": 500.0}, {"stiffness": 1500.0})
+
+    def made(laws):
+        return [lambda soil, one=one: mpm.Truss(soil, POINTS, **one) for one in laws]
+
+    problem, before = stretched_pit(*made(laws))
+    d, soil = problem.particles.displacement.x.array.copy(), problem.particles
+    others = [one(soil) for one in made(laws)[::-1]]
+    problem.stage("equal", terms=others)
+    problem.solve()
+    for one, other in zip(before, others[::-1], strict=True):
+        assert np.abs(other.force - one.force).max() < 1e-12
+    assert np.abs(soil.displacement.x.array - d).max() < 1e-12
+    # of two others nobody knows which is which, unless they are called so
+    changed = [mpm.Truss(soil, POINTS, stiffness) for stiffness in (600.0, 1600.0)]
+    with pytest.raises(mpm.MPMError, match="not to be told in whose place"):
+        problem.stage("unknown", terms=changed)
+    assert problem.terms == others
+    for name, one, other in zip("ab", others, changed, strict=True):
+        one.name = other.name = name
+    problem.stage("called", terms=changed)
+    problem.solve()
+    for one, other in zip(others, changed, strict=True):
+        assert np.abs(other.force - one.force).max() < 1e-12
+
+
+def test_a_bond_elsewhere_has_the_forces_of_its_own_nodes():
+    """Bonds at as many nodes, in another place: what both have goes on, the rest begins at zero."""
+
+    def nail(low, high):
+        bond = mpm.Bond(1e3, 5.0, where=mpm.region(x=(low, high)))
+        return lambda soil: mpm.Truss(soil, POINTS, 500.0, bond=bond)
+
+    problem, (before,) = stretched_pit(nail(0.0, 1.2))
+    other = nail(0.8, 2.0)(problem.particles)
+    assert other.state.bond.shape == before.state.bond.shape
+    problem.stage("elsewhere", terms=[other])
+    both = before.layout.nodes[:, 0] > 0.79
+    mine = before.layout.nodes[:, 0] < 1.21
+    kept = before.state.bond[both[mine]]
+    assert np.abs(kept).min() > 1e-3
+    assert np.array_equal(other.state.bond[: len(kept)], kept)
+    assert not other.state.bond[len(kept) :].any()
+
+
+def test_a_sheet_goes_on_as_an_equal_one_alone():
+    problem, (before,) = stretched_pit(lambda soil: mpm.Membrane(soil, POINTS, 1e3, 0.2))
+    soil = problem.particles
+    d = soil.displacement.x.array.copy()
+    other = mpm.Membrane(soil, POINTS, 1e3, 0.2)
+    problem.stage("equal", terms=[other])
+    problem.solve()
+    assert np.abs(other.force - before.force).max() < 1e-12
+    assert np.abs(soil.displacement.x.array - d).max() < 1e-12
+    for options in ({"stiffness": 4e3, "poisson": 0.2}, {"stiffness": 1e3}):
+        with pytest.raises(mpm.MPMError, match="cannot go on as one that is drawn like it"):
+            problem.stage("stiffer", terms=[mpm.Membrane(soil, POINTS, **options)])
+    problem.stage("without", terms=[])
+    problem.solve(2)
+    problem.stage("stiffer", terms=[stiffer := mpm.Membrane(soil, POINTS, 4e3)])
+    problem.solve()
+    assert np.abs(stiffer.force).max() < 1e-9
+
+
+@pytest.mark.parametrize("kind", [mpm.Truss, mpm.Membrane])
+def test_no_force_where_the_bodies_were_taken_away(kind):
+    points = line((0.1, 0.45), (1.9, 0.45), 12)
+    problem, (one,) = stretched_pit(lambda soil: kind(soil, points, 500.0))
+    assert np.abs(one.force.reshape(12, -1)[:, 0]).min() > 1e-3
+    problem.remove(mpm.region(x=(1.0, 2.0), y=(0.35, 1.0)))
+    problem.solve(2)
+    there = points[1:, 0] < 0.99
+    assert np.abs(one.force[there]).max() > 0.1
+    assert not one.force[points[:-1, 0] > 1.01].any()
+    for values in one.fields().values():
+        assert not values[points[:-1, 0] > 1.01].any()
