@@ -229,12 +229,15 @@ class Structure(Term):
         Args:
             other: The other, at its last converged step.
         """
-        if self._grip is None:
-            return other.state._replace(bond=np.zeros(0))
+        mine = slice(0) if self._grip is None else self._grip.nodes
+        return other.state._replace(bond=other.bond_at_nodes()[mine])
+
+    def bond_at_nodes(self) -> Array:
+        """Return the force of the bond per length, zero at nodes without one, shape ``(N,)``."""
         every = np.zeros(len(self.layout.nodes))
-        if other._grip is not None:
-            every[other._grip.nodes] = other.state.bond
-        return other.state._replace(bond=every[self._grip.nodes])
+        if self._grip is not None:
+            every[self._grip.nodes] = self.state.bond
+        return every
 
     @override
     def come_after(self, gone: Sequence[Term]) -> None:
