@@ -62,6 +62,7 @@ class MPMError(RuntimeError):
         particles: Global indices of the particles concerned, sorted (may be empty).
         load: Load factor of the last converged step, or ``None`` before a run.
         dofs: Global dofs of V with the largest residual, where Newton's method failed.
+        where: A place outside the background, where that is the trouble.
     """
 
     def __init__(
@@ -71,12 +72,17 @@ class MPMError(RuntimeError):
         self.particles: list[int] = sorted({int(p) for p in particles})
         self.load = load
         self.dofs: list[int] = []
+        self.where: tuple[float, ...] | None = None
         names = name_particles(self.particles)
         super().__init__(self.message.replace("{particles}", names))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Let ranks send errors to each other."""
-        return type(self), (self.message, self.particles, self.load), {"dofs": self.dofs}
+        return (
+            type(self),
+            (self.message, self.particles, self.load),
+            {"dofs": self.dofs, "where": self.where},
+        )
 
 
 class ParticleOutsideError(MPMError):
@@ -234,7 +240,7 @@ def _common[E: BaseException](place: MPI.Comm, error: E | None) -> E | None:
     if isinstance(first, MPMError):
         particles = {p for e in errors if type(e) is type(first) for p in e.particles}
         common = type(first)(first.message, particles, first.load)
-        common.dofs = first.dofs
+        common.dofs, common.where = first.dofs, first.where
         common.__cause__ = None if error is None else error.__cause__
     setattr(common, _AGREED, True)
     return cast(E, common)

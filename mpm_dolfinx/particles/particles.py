@@ -535,11 +535,13 @@ class Particles(MaterialDomains):
                 out = ~rows.basis.found[self.domain_nodes[lost[0]]]
                 where = corners[lost[0]][out][0]
                 where = np.where(np.abs(where) < 1e-12 * np.abs(where).max(), 0.0, where)
-                raise ParticleOutsideError(
-                    f"{what} outside the background mesh, e.g. at "
-                    f"{tuple(float(f'{c:.6g}') for c in where)}; {advice}",
+                place = tuple(float(f"{c:.6g}") for c in where)
+                error = ParticleOutsideError(
+                    f"{what} outside the background mesh, e.g. at {place}; {advice}",
                     self.global_index[lost],
                 )
+                error.where = place
+                raise error
 
     @collective()
     def field(

@@ -122,3 +122,38 @@ def test_pictures_and_series_know_deleted_particles(tmp_path):
     if WORLD.rank == 0:
         assert len(artist.get_paths()) == left
         plt.close()
+
+
+@pytest.mark.parametrize(
+    ("up", "place", "line"),
+    [
+        (False, "begin at y = -0.25", "mpm.held(V, y=(-0.25, 0))"),
+        (True, "end at y = 1.75", "mpm.held(V, y=(1.5, 1.75))"),
+    ],
+)
+def test_sand_that_falls_through_a_held_line_is_told_how_to_hold_it(up, place, line):
+    problem = sand(None, up)
+    with pytest.raises(mpm.ParticleOutsideError) as caught:
+        problem.solve(1.0, 0.01)
+    told = f"let the background {place} and hold the cells that are added, {line}."
+    assert str(caught.value).endswith(told)
+
+
+def sand(component, up):
+    """Return a column of sand on a held floor, or one that falls up to a ceiling."""
+    V = scenes.vectors(scenes.box([0.0, 0.0], [4.0, 1.5], [16, 6], QUADRILATERAL))
+    low = 0.5 if up else 0.0
+    particles = mpm.Particles(scenes.box([0.0, low], [1.0, low + 1.0], [8, 8], TRIANGLE), V)
+    law = mpm.materials.MohrCoulomb(1e6, 0.3, 0.0, 30.0)
+    force = (0.0, 10.0 if up else -10.0)
+    return mpm.DynamicProblem(
+        mpm.Body(particles, law, density=2000.0, body_force=force),
+        bcs=[mpm.held(V, 0, x=0.0), mpm.held(V, component, y=1.5 if up else 0.0)],
+    )
+
+
+def test_sand_that_slides_off_is_told_of_no_held_line():
+    problem = sand(1, up=False)
+    with pytest.raises(mpm.ParticleOutsideError) as caught:
+        problem.solve(1.5, 0.05)
+    assert caught.value.where[0] > 4.0 and "held" not in str(caught.value)
