@@ -134,7 +134,7 @@ def test_pictures_and_series_know_deleted_particles(tmp_path):
 def test_sand_that_falls_through_a_held_line_is_told_how_to_hold_it(up, place, line):
     problem = sand(None, up)
     with pytest.raises(mpm.ParticleOutsideError) as caught:
-        problem.solve(1.0, 0.01)
+        problem.solve(time=1.0, dt=0.01)
     told = f"let the background {place} and hold the cells that are added, {line}."
     assert str(caught.value).endswith(told)
 
@@ -155,5 +155,5 @@ def sand(component, up):
 def test_sand_that_slides_off_is_told_of_no_held_line():
     problem = sand(1, up=False)
     with pytest.raises(mpm.ParticleOutsideError) as caught:
-        problem.solve(1.5, 0.05)
+        problem.solve(time=1.5, dt=0.05)
     assert caught.value.where[0] > 4.0 and "held" not in str(caught.value)
