@@ -16,6 +16,7 @@ from dolfinx import mesh
 from ..constitutive.averaging import F_BARS
 from ..errors import MPMError
 from ..materials.fracture import Fracture
+from ..materials.undrained import Undrained
 from ..parallel.boundary import collective
 from ..parallel.given import is_number, require_same
 from ..particles.particles import Particles
@@ -163,6 +164,11 @@ class Body:
         if self.pore_fluid is not None and self.pore_pressure is not None:
             raise MPMError(
                 "A body has a pore_fluid=, whose pressure is found, or a pore_pressure=."
+            )
+        if self.pore_fluid is not None and any(isinstance(law, Undrained) for law in self.laws):
+            raise MPMError(
+                "A body has a pore_fluid=, or a law that is Undrained: both are the same water; "
+                "give the law of effective stress alone beside a pore_fluid."
             )
 
     @property

@@ -287,7 +287,7 @@ class Structure(Term):
     @override
     def begin(self) -> Sequence[PETSc.Vec]:
         require_same(self.comm, offset=self._path)
-        there = (self._hosts.present() | self._alone)[self.layout.cells].all(axis=1)
+        there = self._hosts.present()[self.layout.cells].all(axis=1)
         along = self._step.along
         if self._grip is not None:
             along = self._grip.directions(self.places())

@@ -28,6 +28,17 @@ def test_points_of_regions():
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_the_boundary_of_a_polygon_is_in_it_in_any_unit(scale):
+    corners = scale * np.array([(0.1, 0.0), (3.0, 0.7), (2.0, 2.3), (0.4, 1.9)])
+    t = np.linspace(0.0, 1.0, 7)[:, None]
+    sides = [a + t * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    on, middle = np.concatenate(sides), corners.mean(axis=0)
+    for points, found in ((on, True), (1.0001 * (on - middle) + middle, False)):
+        x = np.column_stack([points, np.zeros(len(points))]).T
+        assert (mpm.region(polygon=corners.tolist())(x) == found).all()
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_a_plane_is_found_in_any_unit(scale):
     domain = scenes.box([0.0, 0.0], [3.0 * scale, scale], [9, 3], TRIANGLE)
     domain.geometry.x[:] *= 1.0 + 1e-15

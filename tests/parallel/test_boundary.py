@@ -19,7 +19,7 @@ import mpm_dolfinx as mpm
 from mpm_dolfinx import boundary, contact, io, plot
 from mpm_dolfinx.io import Column, Kept, fill, of_cells
 from mpm_dolfinx.materials import Fracture, Hencky, NeoHooke, VonMises
-from mpm_dolfinx.parallel.boundary import collective, hooks_of, is_collective
+from mpm_dolfinx.parallel.boundary import Hooked, collective, hooks_of, is_collective
 from mpm_dolfinx.system.schemes import Euler
 
 PROBLEMS = (
@@ -87,8 +87,17 @@ def ask(body, thing, name):
     return getattr(thing, name)(*[None] * count)
 
 
-HOOKED = (mpm.Term, Kept, Euler, *PROBLEMS)
-HOOKS = [(base, name) for base in HOOKED for name in sorted(hooks_of(base))]
+HOOKED = [
+    *public(lambda c: inspect.isclass(c) and issubclass(c, Hooked) and not inspect.isabstract(c)),
+    Euler,  # (a scheme, which are abstract)
+]
+HOOKS = list(
+    {
+        inspect.getattr_static(base, name): (base, name)
+        for base in reversed(HOOKED)
+        for name in sorted(hooks_of(base))
+    }.values()
+)
 
 
 @pytest.mark.mpi

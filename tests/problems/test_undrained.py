@@ -224,6 +224,18 @@ def test_strength_is_divided_and_the_rest_is_not():
     assert stiff.parameters["water_bulk"] == 7.0 and stiff.law.parameters["cohesion"] == 20.0
 
 
+def test_a_law_that_takes_time_does_so_beside_water():
+    class Relaxing(Hencky):
+        def in_time(self, duration):
+            return Hencky(1e3 / (1.0 + duration), 0.3)
+
+    whole = Undrained(Relaxing(1e3, 0.3), 2e4)
+    now = whole.in_time(1.0)
+    assert now.law.parameters["young"] == 500.0 and now.parameters["water_bulk"] == 2e4
+    plain = Undrained(Hencky(1e3, 0.3), 2e4)
+    assert plain.in_time(1.0) is plain
+
+
 def test_what_makes_no_sense_is_said():
     law = Hencky(1e3, 0.3)
     raises(lambda: Undrained(Undrained(law, 1.0), 1.0), mpm.MPMError, "law of effective stress")
@@ -231,3 +243,6 @@ def test_what_makes_no_sense_is_said():
     mixed = mpm.Body(block(law).bodies[0], Undrained(law, 1.0))
     raises(lambda: mpm.QuasiStaticProblem(mixed, mixed="pressure"), mpm.MPMError, "strain space")
     raises(lambda: Undrained(law, 0.0), mpm.MPMError, "water_bulk is 0 but must be")
+    fluid = {"pore_fluid": mpm.PoreFluid(0.1)}
+    for wet in (Undrained(law, 1.0), {1: law, 2: Undrained(law, 1.0)}):
+        raises(lambda wet=wet: mpm.Body(mixed.particles, wet, **fluid), mpm.MPMError, "same water")

@@ -344,3 +344,12 @@ def test_what_cannot_be_is_refused():
         bcs=[mpm.held(own.W, where=lambda x: own.free[: x.shape[1]])],
     )
     raises(lambda: one.solve(1, adapt=0.1), mpm.MPMError, "condition on particles.W holds nodes")
+
+
+def test_nodes_that_are_carried_for_good_are_not_freed():
+    """Those that the background had to take, as domains around them were bad."""
+    problem, own = angle()
+    own.choose_free(own.free, np.ones(len(own.free), dtype=bool))
+    with pytest.warns(UserWarning, match="is not met"):
+        problem.solve(1, adapt=0.1)
+    assert freed(problem) == [0] and not own.free.any()

@@ -223,6 +223,47 @@ def test_a_nail_is_pulled_out_by_its_limit_times_its_length(n):
     assert max(problem.history.iterations) <= 5
 
 
+class Watched(mpm.Truss):
+    """A truss that notes whether it was smooth, and whether it was driven."""
+
+    def smooth(self):
+        found = super().smooth()
+        self.seen.append((found, self.drives()))
+        return found
+
+
+def test_a_casing_is_pulled_out_by_its_limit_around_the_axis():
+    """A tube of bars in a body of revolution: its bond acts on the whole circumference."""
+    limit, length, radius = 5.0, 2.0, 1.2
+    domain = box([0.5, 0], [2.5, 2], [8, 8], QUADRILATERAL)
+    soil = mpm.Particles(domain)
+    points = np.concatenate([[(radius, length + 0.5)], line((radius, length), (radius, 0.0), 8)])
+    casing = Watched(
+        soil,
+        points,
+        2e4,
+        bond=mpm.Bond(1e5, limit, where=mpm.region(y=(0, length))),
+        held=lambda x: x[1] > length + 0.1,
+        axisymmetric=True,
+    )
+    casing.seen = []
+    law, bcs = LinearElastic(2e4, 0.3), [mpm.held(soil.W, y=0.0), mpm.held(soil.W, x=2.5)]
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(soil, law), bcs=bcs, terms=[casing], axisymmetric=True
+    )
+    pulls, smooth = [], []
+    for _ in problem.steps("auto", update=lambda t: casing.move((0.0, 0.02 * t**2))):
+        pulls.append(problem.reaction(casing)[1])
+        smooth.append(casing.seen[-1])
+        casing.seen.clear()
+    whole = limit * length * 2.0 * np.pi * radius
+    assert np.isclose(pulls[-1], whole, rtol=1e-6)
+    assert pulls[0] < 0.3 * whole
+    assert smooth[0] == (True, True)  # elastic, and on a path of its own
+    assert smooth[-1] == (False, True)  # along the bond it slips
+    assert not casing.drives()
+
+
 def test_a_stretched_sheet_on_a_block_in_space_adds_its_plane_stress():
     # A uniform stretch along x of a block of Hencky's law without Poisson's effect.
     domain = box([0, 0, 0], [1, 1, 0.5], [2, 2, 1], HEXAHEDRON)
