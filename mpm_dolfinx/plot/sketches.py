@@ -198,7 +198,7 @@ def _conditions(problem: Any, bodies: Sequence[Particles]) -> list[_Marks]:
         active[np.concatenate(nodes)] = True
         groups = {
             "held": there & active,
-            "held, not reached": there & ~active & (moves.ndim == 0),
+            "held, not reached": there & ~active,
             "moved": (u != 0.0).any(axis=1) & active,
         }
         for kind, which in groups.items():
