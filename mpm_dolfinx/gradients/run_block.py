@@ -39,6 +39,7 @@ class RunBlock(Block):  # type: ignore[misc]
         self._parameters: list[fem.Function | fem.Constant] = []
         self._adjoint: Adjoint | None = None
         self._of: list[Array] = []
+        self._times: list[float] | None = None
         for given in controls:
             control, parameter = given if isinstance(given, tuple) else (given, given)
             follows = (fem.Constant, AdjFloat) if isinstance(given, tuple) else (fem.Function,) * 2
@@ -95,8 +96,20 @@ class RunBlock(Block):  # type: ignore[misc]
                 adjoint = Adjoint(problem, self._parameters)
                 self._run(problem)
                 self._of = self._chosen(adjoint.displacements)
+            self._compare_steps(problem)
             self._adjoint, self._values = adjoint, values
         return self._of
+
+    def _compare_steps(self, problem: QuasiStaticProblem) -> None:
+        """Warn where a run has made other steps than the first (collective)."""
+        times = [step.time for step in problem.history.steps]
+        if self._times not in (None, times):
+            problem.warn(
+                "A run on the tape has made other steps than the first time, as those are that "
+                "steps='auto' chooses and failures halve. Derivatives are of the steps of the last "
+                "run, and do not see what else they might be; give a number of steps, and enough."
+            )
+        self._times = self._times or times
 
     def _chosen(self, displacements: Sequence[Sequence[Array]]) -> list[Array]:
         """Return the displacements, of all bodies, of the steps that are asked for."""

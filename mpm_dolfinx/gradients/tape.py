@@ -48,7 +48,8 @@ def taped(
         controls: What the run depends on: Functions of dolfinx_adjoint, of which a law or a load is
             made (see the parameters of :class:`Adjoint`), and pairs of an ``AdjFloat`` and the
             Constant that has its value.
-        run: Runs the problem.
+        run: Runs the problem, in steps that are the same each time: not ``steps="auto"``, whose
+            sizes change with the controls, which no derivative sees (a warning tells it).
         steps: Numbers of the steps, from 0 or back from -1, whose displacements are returned.
 
     Returns:

@@ -2,11 +2,14 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Runs on pyadjoint's tape, by Taylor tests and against an Adjoint."""
 
+import warnings
+
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 from gradients.runs import EXACT
+from ranks import fails
 from scenes import QUADRILATERAL, WORLD, box, vectors
 
 import ufl
@@ -120,6 +123,19 @@ def test_a_stiffness_is_found_by_minimize():
     best = pyadjoint.minimize(reduced, tol=1e-3)
     assert float(reduced(best)) < 1e-2 * first
     assert np.linalg.norm(best.x.array - right) < 0.7 * np.linalg.norm(right - 5.0)
+
+
+def test_other_steps_than_the_first_time_are_told():
+    block = Block()
+    (d,) = mpm.taped(block.made, block.controls, lambda problem: problem.solve("auto"))
+    reduced = pyadjoint.ReducedFunctional(
+        dolfinx_adjoint.assemble_scalar(ufl.inner(d, d) * ufl.dx), pyadjoint.Control(block.weight)
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        reduced(pyadjoint.AdjFloat(1e3))
+        other = pyadjoint.AdjFloat(0.7e3)
+        fails(lambda: reduced(other), "has made other steps than the first time", UserWarning)
 
 
 def test_a_run_without_annotation_leaves_the_tape_alone(tape):
