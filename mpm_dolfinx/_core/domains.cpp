@@ -13,7 +13,9 @@
 namespace
 {
 using core::Domains;
+using core::Groups;
 using core::Rows;
+using core::Support;
 using core::Target;
 
 // Call f with the dimension as a constant.
@@ -26,39 +28,99 @@ void with_dimension(int dim, F&& f)
     f(std::integral_constant<int, 3>());
 }
 
-// The number of a node in a sorted support.
-inline std::size_t slot(const std::int32_t* begin, const std::int32_t* end, std::int32_t node)
+// Call f(group, domain) group by group.
+template <typename F>
+void for_each_domain(const Groups& groups, F&& f)
 {
-  return static_cast<std::size_t>(std::lower_bound(begin, end, node) - begin);
+  for (std::size_t g = 0; g < groups.count; ++g)
+    for (std::int64_t n = groups.first[g]; n < groups.first[g + 1]; ++n)
+      f(g, static_cast<std::size_t>(groups.order[n]));
 }
 
-// left[i][j][L] = factor sum_J gradient_J A_iJjL
-template <int dim>
-inline void contract(const double* A, const double* gradient, double factor, double* left)
+// Call f(domain) for the domains of a group.
+template <typename F>
+void for_each_domain_of(const Groups& groups, std::size_t g, F&& f)
 {
-  for (int i = 0; i < dim; ++i)
-    for (int jL = 0; jL < dim * dim; ++jL)
-    {
-      double sum = 0.0;
-      for (int J = 0; J < dim; ++J)
-        sum += gradient[J] * A[(i * dim + J) * dim * dim + jL];
-      left[i * dim * dim + jL] = factor * sum;
-    }
+  for (std::int64_t n = groups.first[g]; n < groups.first[g + 1]; ++n)
+    f(static_cast<std::size_t>(groups.order[n]));
 }
 
-// block[i][j] += sum_L left[i][j][L] gradient_L
-template <int dim>
-inline void add_block(const double* left, const double* gradient, double* block, int stride)
+// The number of nodes that a domain sees.
+inline std::size_t size_of(const Support& support, std::size_t p)
 {
-  for (int i = 0; i < dim; ++i)
-    for (int j = 0; j < dim; ++j)
-    {
-      double sum = 0.0;
+  return static_cast<std::size_t>(support.offsets[p + 1] - support.offsets[p]);
+}
+
+// The number of nodes that a group sees.
+inline std::size_t width_of(const Support& support, std::size_t g)
+{
+  return static_cast<std::size_t>(support.ends[g + 1] - support.ends[g]);
+}
+
+// Where a node stands among those that a domain of a group sees.
+inline std::size_t place_of(const Support& support, std::size_t g, std::size_t p, std::int32_t node)
+{
+  const std::int32_t* nodes = support.nodes + support.ends[g];
+  const std::uint16_t* begin = support.slots + support.offsets[p];
+  return static_cast<std::size_t>(
+      std::lower_bound(begin, support.slots + support.offsets[p + 1], node,
+                       [&](std::uint16_t slot, std::int32_t other) { return nodes[slot] < other; })
+      - begin);
+}
+
+// The lines of a block as the processor adds them up: of two, and of three with one to spare.
+template <int dim>
+struct Line
+{
+  static constexpr int length = dim == 2 ? 2 : 4;
+  typedef double type __attribute__((vector_size(8 * length), aligned(8), may_alias));
+};
+
+// A tangent A_iJjL at a point, times a factor, whose blocks gradient_J A_iJjL gradient_L are made
+// line by line, over j.
+template <int dim>
+class PointTangent
+{
+public:
+  using V = typename Line<dim>::type;
+
+  PointTangent(const double* A, double factor)
+  {
+    for (int J = 0; J < dim; ++J)
+      for (int i = 0; i < dim; ++i)
+        for (int L = 0; L < dim; ++L)
+        {
+          double line[Line<dim>::length] = {};
+          for (int j = 0; j < dim; ++j)
+            line[j] = factor * A[((i * dim + J) * dim + j) * dim + L];
+          lines_[J][i][L] = *reinterpret_cast<const V*>(line);
+        }
+  }
+
+  // Take the first gradient.
+  void contract(const double* gradient)
+  {
+    for (int i = 0; i < dim; ++i)
       for (int L = 0; L < dim; ++L)
-        sum += left[(i * dim + j) * dim + L] * gradient[L];
-      block[i * stride + j] += sum;
-    }
-}
+      {
+        left_[i][L] = gradient[0] * lines_[0][i][L];
+        for (int J = 1; J < dim; ++J)
+          left_[i][L] += gradient[J] * lines_[J][i][L];
+      }
+  }
+
+  // A line of the block with this gradient as the second.
+  V line(int i, const double* gradient) const
+  {
+    V sum = gradient[0] * left_[i][0];
+    for (int L = 1; L < dim; ++L)
+      sum += gradient[L] * left_[i][L];
+    return sum;
+  }
+
+private:
+  V lines_[dim][dim][dim], left_[dim][dim];
+};
 
 // The blocks of a tangent (3, 3, 3, 3) of a body of revolution: in the plane, and with the hoop.
 struct Revolution
@@ -102,11 +164,11 @@ struct Revolution
   }
 };
 
-// Add K (rows x columns of dofs, line by line) to a block: that of a node with the one at a position
-// in its row, of whose dofs those of a mask have numbers.
-template <int height, int width>
-inline void add_to(const Target& target, std::int32_t node, std::int32_t position,
-                   std::uint8_t mask, const double* K)
+// Add a block, whose lines follow each other at a stride, to that between two nodes: in the rows of
+// the first at a position, with a mask of the dofs of the second that have numbers.
+template <int height, int width, int stride>
+inline void add_block(const Target& target, std::int32_t node, std::int32_t position,
+                      std::uint8_t mask, const double* block)
 {
   const std::int32_t place = target.places[target.rows[node] + position];
   double* values = target.values[place & 3] + (place >> 2);
@@ -118,49 +180,99 @@ inline void add_to(const Target& target, std::int32_t node, std::int32_t positio
     double* out = values + starts[2 * i];
     if (mask == (1 << width) - 1)
       for (int j = 0; j < width; ++j)
-        out[j] += K[i * width + j];
+        out[j] += block[i * stride + j];
     else
       for (int j = 0; j < width; ++j)
         if (mask >> j & 1)
-          *out++ += K[i * width + j];
+          *out++ += block[i * stride + j];
   }
 }
 
-// Go through domains with their pairs.
-template <typename F>
-void for_each_domain(const Target& target, F&& f)
+// The tangents of the domains of one group: blocks between its nodes, with lines at a stride.
+template <int height, int width, int stride = width>
+class GroupBlocks
 {
-  for (std::size_t n = 0; n < target.count; ++n)
+public:
+  static constexpr int size = height * stride;
+
+  explicit GroupBlocks(const Target& target) : target_(target) {}
+
+  void begin(std::size_t group)
   {
-    const std::size_t p = target.order[n];
-    f(p, static_cast<std::size_t>(target.offsets[p + 1] - target.offsets[p]), target.pairs[p]);
+    group_ = group;
+    rows_ = width_of(target_.row, group);
+    columns_ = width_of(target_.column, group);
+    blocks_.assign(rows_ * columns_ * size, 0.0);
   }
-}
+
+  double* operator()(std::size_t row, std::size_t column)
+  {
+    return blocks_.data() + (row * columns_ + column) * size;
+  }
+
+  // Call f(node, node, position, block) for the blocks that domains have.
+  template <typename F>
+  void for_each(F&& f)
+  {
+    const std::int32_t *nodes = target_.row.nodes + target_.row.ends[group_],
+                       *others = target_.column.nodes + target_.column.ends[group_];
+    const std::int32_t none = target_.positions.none();
+    std::size_t pair = target_.pairs[group_];
+    const double* block = blocks_.data();
+    for (std::size_t a = 0; a < rows_; ++a)
+      for (std::size_t b = 0; b < columns_; ++b, ++pair, block += size)
+        if (const std::int32_t position = target_.positions[pair]; position != none)
+          f(nodes[a], others[b], position, block);
+  }
+
+  // Add the blocks where they go.
+  void end()
+  {
+    for_each([&](std::int32_t node, std::int32_t other, std::int32_t position, const double* block) {
+      add_block<height, width, stride>(target_, node, position, target_.masks[other], block);
+    });
+  }
+
+  // Make blocks below the diagonal of those above it.
+  void mirror()
+  {
+    for (std::size_t a = 0; a < rows_; ++a)
+      for (std::size_t b = 0; b < a; ++b)
+        for (int i = 0; i < height; ++i)
+          for (int j = 0; j < width; ++j)
+            (*this)(a, b)[i * stride + j] = (*this)(b, a)[j * stride + i];
+  }
+
+private:
+  const Target& target_;
+  std::size_t group_ = 0, rows_ = 0, columns_ = 0;
+  std::vector<double> blocks_;
+};
 
 // Room for the products of one domain.
 struct Work
 {
-  std::vector<double> blocks, weights;
+  std::vector<double> blocks, line, weights;
   std::vector<int> places, ends;
 };
 
-// Add T^T K T of one domain; K is (nodes dim, nodes dim). T is sparse: zeros are passed over.
-template <int dim>
-void add_element(const double* K, int nodes, const double* transfers, std::size_t p,
-                 const Target& target, Work& work)
+// Call f(a, line) with the rows of blocks of T^T K T of one domain, between the nodes that it sees; K
+// is (nodes dim, nodes dim). T is sparse: zeros are passed over.
+template <int dim, typename F>
+void for_each_row(const double* K, int nodes, const double* transfer, std::size_t size, Work& work,
+                  F&& f)
 {
   constexpr int block = dim * dim;
-  const std::size_t size = target.offsets[p + 1] - target.offsets[p];
-  const double* transfer = transfers + target.offsets[p] * nodes;
-  const std::int32_t* seen = target.nodes + target.offsets[p];
-  const std::int64_t pairs = target.pairs[p];
   const int width = nodes * dim, column = nodes * block;
-  work.blocks.resize((nodes + size) * column);
+  const std::size_t length = size * block;
+  work.blocks.resize((nodes + 1) * column + nodes * length);
+  work.line.resize(length);
   work.weights.resize(size * nodes + 1);
   work.places.resize(size * nodes + 1);
   work.ends.resize(size);
-  double* columns = work.blocks.data();     // K in blocks, column by column
-  double* right = columns + nodes * column; // K T, the same way
+  double* columns = work.blocks.data(); // K in blocks, column by column
+  double* out = columns + nodes * column;
+  double* right = out + column; // K T in blocks, row by row
   for (int c = 0; c < nodes; ++c)
     for (int i = 0; i < dim; ++i)
       for (int e = 0; e < nodes; ++e)
@@ -169,7 +281,6 @@ void add_element(const double* K, int nodes, const double* transfers, std::size_
   int end = 0;
   for (std::size_t b = 0; b < size; ++b)
   {
-    double* out = right + b * column;
     std::fill(out, out + column, 0.0);
     const int start = end;
     for (int e = 0; e < nodes; ++e)
@@ -182,16 +293,36 @@ void add_element(const double* K, int nodes, const double* transfers, std::size_
     for (int n = start; n < end; ++n)
       for (int k = 0; k < column; ++k)
         out[k] += work.weights[n] * columns[work.places[n] * column + k];
+    for (int c = 0; c < nodes; ++c)
+      for (int k = 0; k < block; ++k)
+        right[c * length + b * block + k] = out[c * block + k];
   }
+  double* line = work.line.data();
   for (std::size_t a = 0; a < size; ++a)
-    for (std::size_t b = 0; b < size; ++b)
+  {
+    std::fill(line, line + length, 0.0);
+    for (int n = a == 0 ? 0 : work.ends[a - 1]; n < work.ends[a]; ++n)
     {
-      double sum[block] = {};
-      for (int n = a == 0 ? 0 : work.ends[a - 1]; n < work.ends[a]; ++n)
-        for (int k = 0; k < block; ++k)
-          sum[k] += work.weights[n] * right[b * column + work.places[n] * block + k];
-      add_to<dim, dim>(target, seen[a], target.positions[pairs + a * size + b], target.masks[seen[b]], sum);
+      const double weight = work.weights[n];
+      const double* row = right + work.places[n] * length;
+      for (std::size_t k = 0; k < length; ++k)
+        line[k] += weight * row[k];
     }
+    f(a, line);
+  }
+}
+
+// Add a row of blocks of a domain where it goes.
+template <int dim>
+void add_row(const Target& target, std::size_t g, std::size_t p, std::size_t a, const double* line)
+{
+  const Support& support = target.row;
+  const std::int32_t* nodes = support.nodes + support.ends[g];
+  const std::uint16_t* slots = support.slots + support.offsets[p];
+  const std::size_t pair = target.pairs[g] + slots[a] * width_of(support, g);
+  for (std::size_t b = 0; b < size_of(support, p); ++b)
+    add_block<dim, dim, dim>(target, nodes[slots[a]], target.positions[pair + slots[b]],
+                             target.masks[nodes[slots[b]]], line + b * dim * dim);
 }
 
 // Set strains (nodes, dim) to w S : G at one point, with the hoop's part where there is one.
@@ -265,65 +396,166 @@ void core::internal_force(const Domains& domains, const double* P, double* force
   });
 }
 
-core::Supports core::supports(const Dofmap& dofmap, const Rows& rows)
+namespace
 {
-  Supports result;
-  result.offsets.reserve(dofmap.count + 1);
-  result.offsets.push_back(0);
-  std::vector<std::int32_t> support;
-  for (std::size_t p = 0; p < dofmap.count; ++p)
+// Call f(node) for the background nodes of a domain, as often as its own nodes have them.
+template <typename F>
+void for_each_node(const core::Dofmap& dofmap, const Rows& rows, std::size_t p, F&& f)
+{
+  for (int c = 0; c < dofmap.nodes; ++c)
   {
-    support.clear();
-    for (int c = 0; c < dofmap.nodes; ++c)
+    const std::int32_t row = dofmap.values[p * dofmap.nodes + c];
+    for (std::int64_t e = rows.offsets[row]; e < rows.offsets[row + 1]; ++e)
+      f(rows.nodes[e]);
+  }
+}
+
+// Where groups begin that see at most so many nodes, and no more pairs of nodes than their domains
+// do one by one; other domains are alone.
+std::vector<std::int64_t> make_groups(const core::Dofmap& dofmap, const Rows& rows,
+                                      const std::int32_t* order, std::size_t most)
+{
+  const auto count = static_cast<std::int64_t>(dofmap.count);
+  std::vector<std::int64_t> first(1, 0);
+  std::vector<std::int64_t> group(rows.num_nodes, -1), domain(rows.num_nodes, -1); // seen by last
+  std::int64_t number = 0;
+  std::size_t nodes = 0, pairs = 0;
+  const auto close = [&](std::int64_t end) {
+    if (nodes * nodes > pairs)
+      for (std::int64_t n = first.back() + 1; n < end; ++n)
+        first.push_back(n);
+    first.push_back(end);
+    nodes = pairs = 0;
+    ++number;
+  };
+  for (std::int64_t n = 0; n < count; ++n)
+  {
+    std::size_t size = 0, more = 0;
+    for_each_node(dofmap, rows, order[n], [&](std::int32_t node) {
+      size += domain[node] != n;
+      more += domain[node] != n && group[node] != number;
+      domain[node] = n;
+    });
+    if (nodes > 0 && nodes + more > most)
     {
-      const std::int32_t row = dofmap.values[p * dofmap.nodes + c];
-      support.insert(support.end(), rows.nodes + rows.offsets[row],
-                     rows.nodes + rows.offsets[row + 1]);
+      close(n);
+      more = size;
     }
-    std::sort(support.begin(), support.end());
-    const auto end = std::unique(support.begin(), support.end());
-    result.nodes.insert(result.nodes.end(), support.begin(), end);
-    result.offsets.push_back(static_cast<std::int64_t>(result.nodes.size()));
+    for_each_node(dofmap, rows, order[n], [&](std::int32_t node) { group[node] = number; });
+    nodes += more;
+    pairs += size * size;
+  }
+  if (count > 0)
+    close(count);
+  return first;
+}
+} // namespace
+
+core::Supports core::supports(const Dofmap& dofmap, const Rows& rows, const std::int32_t* order,
+                              std::vector<std::int64_t> first, std::size_t most)
+{
+  const auto count = static_cast<std::int32_t>(dofmap.count);
+  Supports result;
+  result.first = first.empty() ? make_groups(dofmap, rows, order, most) : std::move(first);
+  result.offsets.assign(dofmap.count + 1, 0);
+  result.ends.assign(1, 0);
+  const Groups groups{result.first.size() - 1, result.first.data(), order};
+  std::vector<std::int32_t> seen(rows.num_nodes, -1); // the group or domain that has seen a node last
+  for (std::size_t g = 0; g < groups.count; ++g)
+  {
+    for_each_domain_of(groups, g, [&](std::size_t p) {
+      for_each_node(dofmap, rows, p, [&](std::int32_t node) {
+        if (seen[node] != static_cast<std::int32_t>(g))
+          result.nodes.push_back(node);
+        seen[node] = static_cast<std::int32_t>(g);
+      });
+    });
+    std::sort(result.nodes.begin() + result.ends.back(), result.nodes.end());
+    result.ends.push_back(static_cast<std::int64_t>(result.nodes.size()));
+  }
+
+  // The slots of domains.
+  std::fill(seen.begin(), seen.end(), -1);
+  for (std::int32_t p = 0; p < count; ++p)
+  {
+    result.offsets[p + 1] = result.offsets[p];
+    for_each_node(dofmap, rows, p, [&](std::int32_t node) {
+      result.offsets[p + 1] += seen[node] != p;
+      seen[node] = p;
+    });
+  }
+  result.slots.resize(result.offsets.back());
+  std::fill(seen.begin(), seen.end(), -1);
+  std::vector<std::uint16_t> slot(rows.num_nodes);
+  for (std::size_t g = 0; g < groups.count; ++g)
+  {
+    for (std::int64_t e = result.ends[g]; e < result.ends[g + 1]; ++e)
+      slot[result.nodes[e]] = static_cast<std::uint16_t>(e - result.ends[g]);
+    for_each_domain_of(groups, g, [&](std::size_t p) {
+      std::uint16_t* const out = result.slots.data() + result.offsets[p];
+      std::uint16_t* last = out;
+      for_each_node(dofmap, rows, p, [&](std::int32_t node) {
+        if (seen[node] != static_cast<std::int32_t>(p))
+          *last++ = slot[node];
+        seen[node] = static_cast<std::int32_t>(p);
+      });
+      std::sort(out, last);
+    });
   }
   return result;
 }
 
-void core::local_transfers(const Dofmap& dofmap, const Rows& rows, const std::int64_t* offsets,
-                           const std::int32_t* nodes, double* transfers)
+void core::local_transfers(const Dofmap& dofmap, const Rows& rows, const Groups& groups,
+                           const Support& support, double* transfers)
 {
-  std::fill(transfers, transfers + offsets[dofmap.count] * dofmap.nodes, 0.0);
-  for (std::size_t p = 0; p < dofmap.count; ++p)
-  {
-    double* transfer = transfers + offsets[p] * dofmap.nodes;
+  std::fill(transfers, transfers + support.offsets[dofmap.count] * dofmap.nodes, 0.0);
+  for_each_domain(groups, [&](std::size_t g, std::size_t p) {
+    double* transfer = transfers + support.offsets[p] * dofmap.nodes;
     for (int c = 0; c < dofmap.nodes; ++c)
     {
       const std::int32_t row = dofmap.values[p * dofmap.nodes + c];
       for (std::int64_t e = rows.offsets[row]; e < rows.offsets[row + 1]; ++e)
-        transfer[slot(nodes + offsets[p], nodes + offsets[p + 1], rows.nodes[e]) * dofmap.nodes
-                 + c] = rows.values[e];
+        transfer[place_of(support, g, p, rows.nodes[e]) * dofmap.nodes + c] = rows.values[e];
     }
-  }
+  });
 }
 
-void core::support_gradients(const Domains& domains, const Rows& rows, const std::int64_t* offsets,
-                             const std::int32_t* nodes, double* gradients)
+void core::support_gradients(const Domains& domains, const Rows& rows, const Groups& groups,
+                             const Support& support, double* gradients)
 {
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
-    std::fill(gradients, gradients + offsets[domains.count] * dim, 0.0);
-    for (std::size_t p = 0; p < domains.count; ++p)
+    std::fill(gradients, gradients + support.offsets[domains.count] * dim, 0.0);
+    for_each_domain(groups, [&](std::size_t g, std::size_t p) {
       for (int c = 0; c < domains.nodes; ++c)
       {
         const std::int32_t row = domains.dofmap[p * domains.nodes + c];
         const double* gradient = domains.gradients + (p * domains.nodes + c) * dim;
         for (std::int64_t e = rows.offsets[row]; e < rows.offsets[row + 1]; ++e)
         {
-          const std::size_t a = slot(nodes + offsets[p], nodes + offsets[p + 1], rows.nodes[e]);
+          const std::size_t a = place_of(support, g, p, rows.nodes[e]);
           for (int J = 0; J < dim; ++J)
-            gradients[(offsets[p] + a) * dim + J] += rows.values[e] * gradient[J];
+            gradients[(support.offsets[p] + a) * dim + J] += rows.values[e] * gradient[J];
         }
       }
+    });
   });
+}
+
+std::vector<std::uint8_t> core::seen_pairs(const Groups& groups, const Support& rows,
+                                           const Support& columns)
+{
+  std::vector<std::int64_t> begin(1, 0);
+  for (std::size_t g = 0; g < groups.count; ++g)
+    begin.push_back(begin.back() + width_of(rows, g) * width_of(columns, g));
+  std::vector<std::uint8_t> result(begin.back(), 0);
+  for_each_domain(groups, [&](std::size_t g, std::size_t p) {
+    const std::size_t width = width_of(columns, g);
+    for (std::int64_t a = rows.offsets[p]; a < rows.offsets[p + 1]; ++a)
+      for (std::int64_t b = columns.offsets[p]; b < columns.offsets[p + 1]; ++b)
+        result[begin[g] + rows.slots[a] * width + columns.slots[b]] = 1;
+  });
+  return result;
 }
 
 HOT_LOOP void core::assemble_points(const Domains& domains, const double* support_gradients,
@@ -331,31 +563,33 @@ HOT_LOOP void core::assemble_points(const Domains& domains, const double* suppor
 {
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
-    constexpr int block = dim * dim;
-    for_each_domain(target, [&](std::size_t p, std::size_t size, std::int64_t pairs) {
-      const double* S = support_gradients + target.offsets[p] * dim;
-      const std::int32_t* seen = target.nodes + target.offsets[p];
-      double left[dim * block];
-      for (std::size_t a = 0; a < size; ++a)
-      {
-        const std::uint8_t mask = target.masks[seen[a]];
-        contract<dim>(A + p * block * block, S + a * dim, domains.weights[p], left);
-        for (std::size_t b = symmetric ? a : 0; b < size; ++b)
+    constexpr int stride = Line<dim>::length;
+    const Support& support = target.row;
+    GroupBlocks<dim, dim, stride> blocks(target);
+    for (std::size_t g = 0; g < target.groups.count; ++g)
+    {
+      blocks.begin(g);
+      for_each_domain_of(target.groups, g, [&](std::size_t p) {
+        PointTangent<dim> tangent(A + p * dim * dim * dim * dim, domains.weights[p]);
+        const std::size_t size = size_of(support, p);
+        const double* S = support_gradients + support.offsets[p] * dim;
+        const std::uint16_t* slots = support.slots + support.offsets[p];
+        for (std::size_t a = 0; a < size; ++a)
         {
-          double K[block] = {};
-          add_block<dim>(left, S + b * dim, K, dim);
-          add_to<dim, dim>(target, seen[a], target.positions[pairs + a * size + b], target.masks[seen[b]], K);
-          if (symmetric && b != a)
+          tangent.contract(S + a * dim);
+          for (std::size_t b = symmetric ? a : 0; b < size; ++b)
           {
-            double mirror[block];
+            double* out = blocks(slots[a], slots[b]);
             for (int i = 0; i < dim; ++i)
-              for (int j = 0; j < dim; ++j)
-                mirror[j * dim + i] = K[i * dim + j];
-            add_to<dim, dim>(target, seen[b], target.positions[pairs + b * size + a], mask, mirror);
+              *reinterpret_cast<typename Line<dim>::type*>(out + i * stride)
+                  += tangent.line(i, S + b * dim);
           }
         }
-      }
-    });
+      });
+      if (symmetric)
+        blocks.mirror();
+      blocks.end();
+    }
   });
 }
 
@@ -369,20 +603,26 @@ HOT_LOOP void core::assemble_domains(const Domains& domains, const double* trans
     const int width = domains.nodes * dim;
     std::vector<double> K(width * width);
     Work work;
-    for_each_domain(target, [&](std::size_t p, std::size_t, std::int64_t) {
+    GroupBlocks<dim, dim> blocks(target);
+    const auto set_tangent = [&](std::size_t p) {
       std::fill(K.begin(), K.end(), 0.0);
       for (int q = 0; q < domains.points; ++q)
       {
         const std::size_t point = p * domains.points + q;
         const double* gradients = domains.gradients + point * domains.nodes * dim;
-        const auto add = [&](const double* tangent) {
-          double left[dim * block];
+        const auto add = [&](const double* values) {
+          PointTangent<dim> tangent(values, domains.weights[point]);
           for (int c = 0; c < domains.nodes; ++c)
           {
-            contract<dim>(tangent, gradients + c * dim, domains.weights[point], left);
+            tangent.contract(gradients + c * dim);
             for (int e = 0; e < domains.nodes; ++e)
-              add_block<dim>(left, gradients + e * dim, K.data() + c * dim * width + e * dim,
-                             width);
+              for (int i = 0; i < dim; ++i)
+              {
+                const auto line = tangent.line(i, gradients + e * dim);
+                double* out = K.data() + (c * dim + i) * width + e * dim;
+                for (int j = 0; j < dim; ++j)
+                  out[j] += line[j];
+              }
           }
         };
         if (domains.hoop == nullptr)
@@ -403,8 +643,33 @@ HOT_LOOP void core::assemble_domains(const Domains& domains, const double* trans
           for (int s = 0; s < width; ++s)
             K[r * width + s] += left[r] * right[s];
       }
-      add_element<dim>(K.data(), domains.nodes, transfers, p, target, work);
-    });
+    };
+    for (std::size_t g = 0; g < target.groups.count; ++g)
+    {
+      const bool alone = target.groups.first[g + 1] == target.groups.first[g] + 1;
+      if (!alone)
+        blocks.begin(g);
+      for_each_domain_of(target.groups, g, [&](std::size_t p) {
+        const Support& support = target.row;
+        const std::uint16_t* slots = support.slots + support.offsets[p];
+        const std::size_t size = size_of(support, p);
+        set_tangent(p);
+        for_each_row<dim>(K.data(), domains.nodes, transfers + support.offsets[p] * domains.nodes,
+                          size, work, [&](std::size_t a, const double* line) {
+          if (alone)
+            add_row<dim>(target, g, p, a, line);
+          else
+            for (std::size_t b = 0; b < size; ++b)
+            {
+              double* out = blocks(slots[a], slots[b]);
+              for (int k = 0; k < block; ++k)
+                out[k] += line[b * block + k];
+            }
+        });
+      });
+      if (!alone)
+        blocks.end();
+    }
   });
 }
 
@@ -414,41 +679,50 @@ HOT_LOOP void core::assemble_masses(const Domains& domains, const double* transf
   const int nodes = domains.nodes;
   std::vector<double> weights, product(nodes);
   std::vector<int> places, ends;
-  for_each_domain(target, [&](std::size_t p, std::size_t size, std::int64_t pairs) {
-    const std::int32_t* seen = target.nodes + target.offsets[p];
-    const double* transfer = transfers + target.offsets[p] * nodes;
-    const double* mass = M + p * nodes * nodes;
-    weights.resize(size * nodes);
-    places.resize(size * nodes);
-    ends.assign(1, 0);
-    int end = 0;
-    for (std::size_t a = 0; a < size; ++a) // T is sparse: zeros are passed over
-    {
-      for (int c = 0; c < nodes; ++c)
-        if (transfer[a * nodes + c] != 0.0)
-        {
-          weights[end] = transfer[a * nodes + c];
-          places[end++] = c;
-        }
-      ends.push_back(end);
-    }
-    for (std::size_t a = 0; a < size; ++a)
-    {
-      std::fill(product.begin(), product.end(), 0.0);
-      for (int n = ends[a]; n < ends[a + 1]; ++n)
-        for (int c = 0; c < nodes; ++c)
-          product[c] += weights[n] * mass[places[n] * nodes + c];
-      for (std::size_t b = a; b < size; ++b)
+  const Support& support = target.row;
+  GroupBlocks<1, 1> blocks(target);
+  for (std::size_t g = 0; g < target.groups.count; ++g)
+  {
+    blocks.begin(g);
+    for_each_domain_of(target.groups, g, [&](std::size_t p) {
+      const std::size_t size = size_of(support, p);
+      const std::uint16_t* slots = support.slots + support.offsets[p];
+      const double* transfer = transfers + support.offsets[p] * nodes;
+      const double* mass = M + p * nodes * nodes;
+      weights.resize(size * nodes);
+      places.resize(size * nodes);
+      ends.assign(1, 0);
+      int end = 0;
+      for (std::size_t a = 0; a < size; ++a) // T is sparse: zeros are passed over
       {
-        double sum = 0.0;
-        for (int n = ends[b]; n < ends[b + 1]; ++n)
-          sum += weights[n] * product[places[n]];
-        values[target.rows[seen[a]] + target.positions[pairs + a * size + b]] += sum;
-        if (b != a)
-          values[target.rows[seen[b]] + target.positions[pairs + b * size + a]] += sum;
+        for (int c = 0; c < nodes; ++c)
+          if (transfer[a * nodes + c] != 0.0)
+          {
+            weights[end] = transfer[a * nodes + c];
+            places[end++] = c;
+          }
+        ends.push_back(end);
       }
-    }
-  });
+      for (std::size_t a = 0; a < size; ++a)
+      {
+        std::fill(product.begin(), product.end(), 0.0);
+        for (int n = ends[a]; n < ends[a + 1]; ++n)
+          for (int c = 0; c < nodes; ++c)
+            product[c] += weights[n] * mass[places[n] * nodes + c];
+        for (std::size_t b = a; b < size; ++b)
+        {
+          double sum = 0.0;
+          for (int n = ends[b]; n < ends[b + 1]; ++n)
+            sum += weights[n] * product[places[n]];
+          *blocks(slots[a], slots[b]) += sum;
+        }
+      }
+    });
+    blocks.mirror();
+    blocks.for_each([&](std::int32_t node, std::int32_t, std::int32_t position, const double* sum) {
+      values[target.rows[node] + position] += *sum;
+    });
+  }
 }
 
 void core::add_diagonals(std::size_t num_nodes, int dim, const std::int32_t* nodes,
@@ -462,15 +736,14 @@ void core::add_diagonals(std::size_t num_nodes, int dim, const std::int32_t* nod
         double K[size * size] = {};
         for (int i = 0; i < size; ++i)
           K[i * size + i] = factor * numbers[e];
-        add_to<size, size>(target, static_cast<std::int32_t>(node),
-                           e - target.rows[node],
-                           target.masks[nodes[e]], K);
+        add_block<size, size, size>(target, static_cast<std::int32_t>(node), e - target.rows[node],
+                                    target.masks[nodes[e]], K);
       }
   });
 }
 
 HOT_LOOP void core::assemble_slopes(const Domains& domains, const double* slope,
-                                    const Transfers& displacement, const Transfers& pressure,
+                                    const double* displacement, const double* pressure,
                                     const std::optional<Target>& of_pressure,
                                     const std::optional<Target>& of_displacement)
 {
@@ -480,14 +753,21 @@ HOT_LOOP void core::assemble_slopes(const Domains& domains, const double* slope,
     std::vector<double> strains(nodes * dim), reduced, line; // strains of nodes of W; of V
     std::vector<double> weights;                             // T without its zeros
     std::vector<int> places, ends;
-    const Target& some = of_pressure ? *of_pressure : *of_displacement;
-    for (std::size_t n = 0; n < some.count; ++n)
-    {
-      const std::size_t p = some.order[n];
-      const std::size_t size = displacement.offsets[p + 1] - displacement.offsets[p];
-      const std::size_t rows = pressure.offsets[p + 1] - pressure.offsets[p];
-      const double* T = displacement.values + displacement.offsets[p] * nodes;
-      const double* T_p = pressure.values + pressure.offsets[p] * points;
+    const Groups& groups = (of_pressure ? *of_pressure : *of_displacement).groups;
+    const Support& seen = of_pressure ? of_pressure->column : of_displacement->row;
+    const Support& values = of_pressure ? of_pressure->row : of_displacement->column;
+    std::optional<GroupBlocks<1, dim>> for_pressure;
+    std::optional<GroupBlocks<dim, 1>> for_displacement;
+    if (of_pressure)
+      for_pressure.emplace(*of_pressure);
+    if (of_displacement)
+      for_displacement.emplace(*of_displacement);
+    const auto add_domain = [&](std::size_t p) {
+      const std::size_t size = size_of(seen, p), rows = size_of(values, p);
+      const std::uint16_t *slots = seen.slots + seen.offsets[p],
+                          *its = values.slots + values.offsets[p];
+      const double* T = displacement + seen.offsets[p] * nodes;
+      const double* T_p = pressure + values.offsets[p] * points;
       const std::size_t width = size * dim;
       weights.resize(size * nodes);
       places.resize(size * nodes);
@@ -523,44 +803,53 @@ HOT_LOOP void core::assemble_slopes(const Domains& domains, const double* slope,
           if (const double t = T_p[a * points + q]; t != 0.0)
             for (std::size_t k = 0; k < width; ++k)
               line[k] += t * reduced[q * width + k];
-        if (of_pressure)
-        {
-          const Target& to = *of_pressure;
-          const std::int32_t* seen = to.column_nodes + to.column_offsets[p];
-          for (std::size_t b = 0; b < size; ++b)
-            add_to<1, dim>(to, to.nodes[to.offsets[p] + a],
-                           to.positions[to.pairs[p] + a * size + b], to.masks[seen[b]],
-                           line.data() + b * dim);
-        }
-        if (of_displacement)
-        {
-          const Target& to = *of_displacement;
-          const std::int32_t* seen = to.nodes + to.offsets[p];
-          const std::uint8_t mask = to.masks[to.column_nodes[to.column_offsets[p] + a]];
-          for (std::size_t b = 0; b < size; ++b)
-            add_to<dim, 1>(to, seen[b], to.positions[to.pairs[p] + b * rows + a], mask,
-                           line.data() + b * dim);
-        }
+        for (std::size_t b = 0; b < size; ++b)
+          for (int i = 0; i < dim; ++i)
+          {
+            if (for_pressure)
+              (*for_pressure)(its[a], slots[b])[i] += line[b * dim + i];
+            if (for_displacement)
+              (*for_displacement)(slots[b], its[a])[i] += line[b * dim + i];
+          }
       }
+    };
+    for (std::size_t g = 0; g < groups.count; ++g)
+    {
+      if (for_pressure)
+        for_pressure->begin(g);
+      if (for_displacement)
+        for_displacement->begin(g);
+      for_each_domain_of(groups, g, add_domain);
+      if (for_pressure)
+        for_pressure->end();
+      if (for_displacement)
+        for_displacement->end();
     }
   });
 }
 
-void core::assemble_diagonal(int points, const double* factors, const Transfers& pressure,
+void core::assemble_diagonal(int points, const double* factors, const double* pressure,
                              const Target& target)
 {
-  for_each_domain(target, [&](std::size_t p, std::size_t size, std::int64_t pairs) {
-    const std::int32_t* seen = target.nodes + target.offsets[p];
-    const double* T = pressure.values + pressure.offsets[p] * points;
-    for (std::size_t a = 0; a < size; ++a)
-      for (std::size_t b = 0; b < size; ++b)
-      {
-        double sum = 0.0;
-        for (int q = 0; q < points; ++q)
-          sum += factors[p * points + q] * T[a * points + q] * T[b * points + q];
-        add_to<1, 1>(target, seen[a], target.positions[pairs + a * size + b], target.masks[seen[b]], &sum);
-      }
-  });
+  const Support& support = target.row;
+  GroupBlocks<1, 1> blocks(target);
+  for (std::size_t g = 0; g < target.groups.count; ++g)
+  {
+    blocks.begin(g);
+    for_each_domain_of(target.groups, g, [&](std::size_t p) {
+      const std::uint16_t* slots = support.slots + support.offsets[p];
+      const double* T = pressure + support.offsets[p] * points;
+      for (std::size_t a = 0; a < size_of(support, p); ++a)
+        for (std::size_t b = 0; b < size_of(support, p); ++b)
+        {
+          double sum = 0.0;
+          for (int q = 0; q < points; ++q)
+            sum += factors[p * points + q] * T[a * points + q] * T[b * points + q];
+          *blocks(slots[a], slots[b]) += sum;
+        }
+    });
+    blocks.end();
+  }
 }
 
 void core::slope_sizes(const Domains& domains, const double* slope, const double* u, double* sizes)
@@ -610,10 +899,18 @@ HOT_LOOP void core::assemble_form(const Form& form, const Domains& domains, cons
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
     Work work;
+    const Support& support = target.row;
+    std::vector<std::int32_t> group(domains.count);
+    for_each_domain(target.groups, [&](std::size_t g, std::size_t p) {
+      group[p] = static_cast<std::int32_t>(g);
+    });
     for_each_tensor(form, domains.nodes * dim, [&](std::int32_t cell, std::vector<double>& K) {
       for (double& entry : K)
         entry *= factor;
-      add_element<dim>(K.data(), domains.nodes, transfers, cell, target, work);
+      for_each_row<dim>(K.data(), domains.nodes, transfers + support.offsets[cell] * domains.nodes,
+                        size_of(support, cell), work, [&](std::size_t a, const double* line) {
+        add_row<dim>(target, group[cell], cell, a, line);
+      });
     });
   });
 }

@@ -38,6 +38,7 @@ struct Rows
   const std::int64_t* offsets;
   const std::int32_t* nodes;
   const double* values;
+  std::size_t num_nodes; // of the background
 };
 
 // The nodes of W of each domain: (count, nodes).
@@ -48,23 +49,52 @@ struct Dofmap
   const std::int32_t* values;
 };
 
-// The background nodes of each domain, sorted, in compressed rows.
+// Domains in groups: those that are visited one after the other and see few nodes together. Their
+// tangents add up in a small dense matrix first.
+struct Groups
+{
+  std::size_t count;
+  const std::int64_t* first; // where they begin in the order, (count + 1)
+  const std::int32_t* order; // in which domains are visited
+};
+
+// The nodes that groups see, sorted, in compressed rows, and which of them each domain sees.
+struct Support
+{
+  const std::int64_t* offsets; // of the slots of domains, (number of domains + 1)
+  const std::uint16_t* slots;  // among the nodes of the group, sorted
+  const std::int64_t* ends;    // of the nodes of groups, (number of groups + 1)
+  const std::int32_t* nodes;
+};
+
 struct Supports
 {
-  std::vector<std::int64_t> offsets;
+  std::vector<std::int64_t> first, offsets, ends;
+  std::vector<std::uint16_t> slots;
   std::vector<std::int32_t> nodes;
 };
-Supports supports(const Dofmap& dofmap, const Rows& rows);
+
+// The supports of domains that are visited in an order, in groups that see no more than `most` nodes
+// and fewer pairs of these than their domains one by one; or in those that begin at `first`, if there
+// are any.
+Supports supports(const Dofmap& dofmap, const Rows& rows, const std::int32_t* order,
+                  std::vector<std::int64_t> first, std::size_t most);
 
 // T of each domain: (support size, nodes) one domain after the other.
-void local_transfers(const Dofmap& dofmap, const Rows& rows, const std::int64_t* offsets,
-                     const std::int32_t* nodes, double* transfers);
+void local_transfers(const Dofmap& dofmap, const Rows& rows, const Groups& groups,
+                     const Support& support, double* transfers);
 
 // The gradients of the background basis that a domain's single point sees: (support size, dim).
-void support_gradients(const Domains& domains, const Rows& rows, const std::int64_t* offsets,
-                       const std::int32_t* nodes, double* gradients);
+void support_gradients(const Domains& domains, const Rows& rows, const Groups& groups,
+                       const Support& support, double* gradients);
 
-// The place of each pair of nodes that a domain sees in the row of the first, in one byte or in two.
+// Whether a domain of a group sees both nodes, for each pair of a node of its rows and one of its
+// columns.
+std::vector<std::uint8_t> seen_pairs(const Groups& groups, const Support& rows,
+                                     const Support& columns);
+
+// The place of each pair of nodes that a group sees in the row of the first, in one byte or in two;
+// pairs that no domain sees have none.
 class Positions
 {
 public:
@@ -74,6 +104,7 @@ public:
     return wide_ ? static_cast<const std::uint16_t*>(values_)[pair]
                  : static_cast<const std::uint8_t*>(values_)[pair];
   }
+  std::int32_t none() const { return wide_ ? UINT16_MAX : UINT8_MAX; }
 
 private:
   const void* values_;
@@ -84,13 +115,9 @@ private:
 // of one field's columns (sparsity.h).
 struct Target
 {
-  std::size_t count;           // of domains
-  const std::int32_t* order;   // in which they are visited
-  const std::int64_t* pairs;   // where those of a domain begin
-  const std::int64_t* offsets; // of the supports
-  const std::int32_t* nodes;   // of the rows
-  const std::int64_t* column_offsets;
-  const std::int32_t* column_nodes;
+  Groups groups;
+  Support row, column;
+  const std::int64_t* pairs; // where those of a group begin
   Positions positions;
   const std::int32_t* rows;   // of blocks
   const std::int32_t* places; // of these
@@ -117,22 +144,16 @@ void assemble_masses(const Domains& domains, const double* transfers, const doub
 void add_diagonals(std::size_t num_nodes, int dim, const std::int32_t* nodes, const double* numbers,
                    double factor, const Target& target);
 
-// T of a field on each domain, and its supports: (support size, nodes) one after the other.
-struct Transfers
-{
-  const std::int64_t* offsets;
-  const double* values;
-};
-
 // Add w T_p^T (S : G) T for a slope S at the points (count, points, strain, strain), what a pressure
 // at the points does with the displacement, to blocks with rows of the pressure, and its transpose to
-// blocks with rows of the displacement; either may be none.
-void assemble_slopes(const Domains& domains, const double* slope, const Transfers& displacement,
-                     const Transfers& pressure, const std::optional<Target>& of_pressure,
+// blocks with rows of the displacement; either may be none. T of both are (support size, nodes), and
+// (support size, points), one domain after the other.
+void assemble_slopes(const Domains& domains, const double* slope, const double* displacement,
+                     const double* pressure, const std::optional<Target>& of_pressure,
                      const std::optional<Target>& of_displacement);
 
 // Add T_p^T diag(factors) T_p with factors at the points, (count, points).
-void assemble_diagonal(int points, const double* factors, const Transfers& pressure,
+void assemble_diagonal(int points, const double* factors, const double* pressure,
                        const Target& target);
 
 // Set sizes at the points to w |S : G| |u|, term by term, with u at the nodes.

@@ -3,6 +3,7 @@
 //
 // The compiled loops as Python functions: arrays and addresses of kernels, nothing else.
 
+#include <algorithm>
 #include <complex>
 #include <optional>
 #include <string>
@@ -90,31 +91,49 @@ bool add_entries(const std::tuple<Array<const Index>, Array<const Index>, Reals>
   });
 }
 
-// Supports of rows and columns with the order of domains; pairs and positions; rows, places, starts
-// and masks of a pattern; values inside, outside, of rows of other ranks.
+// The groups of domains: their order, and where groups begin in it.
+using GroupArrays = std::tuple<Indices, Offsets>;
+
+Groups groups_of(const GroupArrays& groups)
+{
+  const auto& [order, first] = groups;
+  require(first.size() > 0 && first.data()[first.size() - 1] == static_cast<std::int64_t>(order.size()),
+          "groups of all domains");
+  return {first.size() - 1, first.data(), order.data()};
+}
+
+// Offsets and slots of domains, ends and nodes of groups.
+using Shorts = Array<const std::uint16_t>;
+using SupportArrays = std::tuple<Offsets, Shorts, Offsets, Indices>;
+
+Support support_of(const GroupArrays& groups, const SupportArrays& support)
+{
+  const auto& [offsets, slots, ends, nodes] = support;
+  require(offsets.size() == std::get<0>(groups).size() + 1, "offsets of supports (n + 1)");
+  require(ends.size() == std::get<1>(groups).size(), "ends of the nodes of all groups");
+  return {offsets.data(), slots.data(), ends.data(), nodes.data()};
+}
+
+// Groups with the supports of rows and columns; pairs and positions; rows, places, starts and masks
+// of a pattern; values inside, outside, of rows of other ranks.
 using Bytes = Array<const std::uint8_t>;
-using Where = std::tuple<Indices, Offsets, Indices, Offsets, Indices, Offsets, Bytes, Indices,
-                         Indices, Offsets, Bytes, RealsOut, RealsOut, RealsOut>;
+using Where = std::tuple<GroupArrays, SupportArrays, SupportArrays, Offsets, Bytes, Indices, Indices,
+                         Offsets, Bytes, RealsOut, RealsOut, RealsOut>;
 
 Target target_of(const Where& where)
 {
-  const auto& [order, offsets, nodes, column_offsets, column_nodes, pairs, positions, rows, places,
-               starts, masks, inside, outside, sent]
+  const auto& [groups, row, column, pairs, positions, rows, places, starts, masks, inside, outside,
+               sent]
       = where;
-  const std::size_t count = order.size();
-  require(offsets.size() == count + 1 && column_offsets.size() == count + 1,
-          "offsets of supports (n + 1)");
-  require(pairs.size() == count + 1, "pairs of all domains (n + 1)");
-  const auto num_pairs = static_cast<std::size_t>(pairs.data()[count]);
+  const Groups all = groups_of(groups);
+  require(pairs.size() == all.count + 1, "pairs of all groups");
+  const auto num_pairs = static_cast<std::size_t>(pairs.data()[all.count]);
   require(positions.size() == num_pairs || positions.size() == 2 * num_pairs,
           "positions of all pairs");
-  return {count,
-          order.data(),
+  return {all,
+          support_of(groups, row),
+          support_of(groups, column),
           pairs.data(),
-          offsets.data(),
-          nodes.data(),
-          column_offsets.data(),
-          column_nodes.data(),
           Positions(positions.data(), positions.size() > num_pairs),
           rows.data(),
           places.data(),
@@ -281,7 +300,9 @@ Rows rows_of(const Offsets& offsets, const Indices& nodes, const Reals& values)
   require(nodes.size() == values.size() && offsets.size() > 0
               && static_cast<std::size_t>(offsets.data()[offsets.size() - 1]) == nodes.size(),
           "offsets, nodes and values of rows");
-  return {offsets.data(), nodes.data(), values.data()};
+  const std::int32_t *begin = nodes.data(), *end = begin + nodes.size();
+  const std::size_t count = begin == end ? 0 : 1 + *std::max_element(begin, end);
+  return {offsets.data(), begin, values.data(), count};
 }
 
 Parameter parameter_of(const Reals& values, std::size_t count)
@@ -408,35 +429,55 @@ NB_MODULE(_loops, m)
   }, "P"_a, "dofmap"_a, "gradients"_a, "weights"_a, "hoop"_a, "force"_a.noconvert(),
         "Add the integral of P : grad v to the force at the nodes.");
 
-  m.def("supports", [](Indices dofmap, Offsets offsets, Indices nodes, Reals values) {
-    Supports result = supports(dofmap_of(dofmap), rows_of(offsets, nodes, values));
-    return std::make_pair(to_numpy(std::move(result.offsets)), to_numpy(std::move(result.nodes)));
-  }, "dofmap"_a, "offsets"_a, "nodes"_a, "values"_a,
-        "Return the background nodes of each domain, sorted, in compressed rows.");
+  m.def("supports",
+        [](Indices dofmap, Offsets offsets, Indices nodes, Reals values, Indices order,
+           Offsets first, std::size_t most) {
+    const Dofmap domains = dofmap_of(dofmap);
+    require(order.size() == domains.count, "an order of all domains");
+    Supports result
+        = supports(domains, rows_of(offsets, nodes, values), order.data(),
+                   std::vector<std::int64_t>(first.data(), first.data() + first.size()), most);
+    return std::make_pair(to_numpy(std::move(result.first)),
+                          std::make_tuple(to_numpy(std::move(result.offsets)),
+                                          to_numpy(std::move(result.slots)),
+                                          to_numpy(std::move(result.ends)),
+                                          to_numpy(std::move(result.nodes))));
+  },
+        "dofmap"_a, "offsets"_a, "nodes"_a, "values"_a, "order"_a, "first"_a, "most"_a,
+        "Return where groups of domains begin that see at most so many nodes together (or one domain), "
+        "if they are not given; and offsets and slots of domains, ends and nodes of groups.");
 
   m.def("local_transfers",
-        [](Indices dofmap, Offsets offsets, Indices nodes, Reals values, Offsets support_offsets,
-           Indices support_nodes, RealsOut transfers) {
+        [](Indices dofmap, Offsets offsets, Indices nodes, Reals values, const GroupArrays& groups,
+           const SupportArrays& support, RealsOut transfers) {
     const Dofmap domains = dofmap_of(dofmap);
-    require(transfers.size() == support_nodes.size() * domains.nodes, "transfers");
-    local_transfers(domains, rows_of(offsets, nodes, values), support_offsets.data(),
-                    support_nodes.data(), transfers.data());
+    require(transfers.size() == std::get<1>(support).size() * domains.nodes, "transfers");
+    local_transfers(domains, rows_of(offsets, nodes, values), groups_of(groups),
+                    support_of(groups, support), transfers.data());
   },
-        "dofmap"_a, "offsets"_a, "nodes"_a, "values"_a, "support_offsets"_a, "support_nodes"_a,
+        "dofmap"_a, "offsets"_a, "nodes"_a, "values"_a, "groups"_a, "support"_a,
         "transfers"_a.noconvert(), "Set the values of T of each domain's nodes.");
 
   m.def("support_gradients",
         [](Indices dofmap, Reals gradients, Offsets offsets, Indices nodes, Reals values,
-           Offsets support_offsets, Indices support_nodes, RealsOut result) {
+           const GroupArrays& groups, const SupportArrays& support, RealsOut result) {
     const Domains domains = domains_of(dofmap, gradients, nullptr);
-    require(domains.points == 1 && result.size() == support_nodes.size() * domains.dim,
+    require(domains.points == 1 && result.size() == std::get<1>(support).size() * domains.dim,
             "gradients of domains with one point");
-    support_gradients(domains, rows_of(offsets, nodes, values), support_offsets.data(),
-                      support_nodes.data(), result.data());
+    support_gradients(domains, rows_of(offsets, nodes, values), groups_of(groups),
+                      support_of(groups, support), result.data());
   },
-        "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a, "support_offsets"_a,
-        "support_nodes"_a, "result"_a.noconvert(),
+        "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a, "groups"_a, "support"_a,
+        "result"_a.noconvert(),
         "Set the gradients of the background basis at each domain's single point.");
+
+  m.def("seen_pairs",
+        [](const GroupArrays& groups, const SupportArrays& rows, const SupportArrays& columns) {
+    return to_numpy(
+        seen_pairs(groups_of(groups), support_of(groups, rows), support_of(groups, columns)));
+  },
+        "groups"_a, "rows"_a, "columns"_a,
+        "Return whether a domain of a group sees both nodes, for each pair of them.");
 
   m.def("locate",
         [](const std::vector<std::pair<Reals, double>>& lines, Offsets table, Offsets first,
@@ -474,20 +515,22 @@ NB_MODULE(_loops, m)
 
   m.def("pattern",
         [](Offsets row_offsets, Indices row_nodes, std::size_t num_rows, Offsets column_offsets,
-           Indices column_nodes, std::size_t num_columns) {
+           Indices column_nodes, std::size_t num_columns, Bytes has) {
     require(row_offsets.size() > 0 && row_offsets.size() == column_offsets.size(),
-            "offsets of supports (n + 1)");
+            "nodes of as many groups");
     Pattern result = pattern({row_offsets.data(), row_nodes.data(), num_rows},
                              {column_offsets.data(), column_nodes.data(), num_columns},
-                             row_offsets.size() - 1);
+                             row_offsets.size() - 1,
+                             std::vector<std::uint8_t>(has.data(), has.data() + has.size()));
     return std::make_tuple(to_numpy(std::move(result.offsets)), to_numpy(std::move(result.nodes)),
                            to_numpy(std::move(result.pairs)),
                            to_numpy(std::move(result.positions)), result.bytes);
   },
         "row_offsets"_a, "row_nodes"_a, "num_rows"_a, "column_offsets"_a, "column_nodes"_a,
-        "num_columns"_a,
-        "Return the sparsity of a sum over domains; where the pairs of nodes of two fields that each "
-        "domain sees begin, and the place of each in the row of its first node, with the bytes that it takes.");
+        "num_columns"_a, "has"_a,
+        "Return the sparsity of a sum over groups of domains; where the pairs of nodes of two fields "
+        "that each group sees begin, and the place of each that has a block in the row of its first "
+        "node, with the bytes that it takes.");
 
   m.def("foreign_rows",
         [](const FieldRows& rows, const std::vector<FieldColumns>& parts, std::pair<int, int> own) {
@@ -567,7 +610,7 @@ NB_MODULE(_loops, m)
 
   m.def("add_diagonals",
         [](int dim, Indices nodes, Reals numbers, double factor, const Where& where) {
-    const Indices& rows = std::get<7>(where);
+    const Indices& rows = std::get<5>(where);
     require(nodes.size() == numbers.size() && rows.size() > 0, "numbers of all blocks");
     add_diagonals(rows.size() - 1, dim, nodes.data(), numbers.data(), factor, target_of(where));
   },
@@ -575,33 +618,30 @@ NB_MODULE(_loops, m)
         "Add a number for each block to its diagonal.");
 
   m.def("assemble_slopes",
-        [](Indices dofmap, Reals gradients, Reals weights, Reals hoop, Reals slope, Offsets offsets,
-           Reals transfers, Offsets pressure_offsets, Reals pressure_transfers,
-           const std::optional<Where>& of_pressure, const std::optional<Where>& of_displacement) {
+        [](Indices dofmap, Reals gradients, Reals weights, Reals hoop, Reals slope,
+           Reals displacement, Reals pressure, const std::optional<Where>& of_pressure, const std::optional<Where>& of_displacement) {
     Domains domains = domains_of(dofmap, gradients, &weights);
     revolve(domains, hoop);
     const int strain = domains.strain();
     require(slope.size() == num_points(domains) * strain * strain, "slopes (n, nq, dim, dim)");
-    require(offsets.size() == domains.count + 1 && pressure_offsets.size() == offsets.size(),
-            "offsets of supports (n + 1)");
     require(of_pressure || of_displacement, "somewhere to go");
-    assemble_slopes(domains, slope.data(), {offsets.data(), transfers.data()},
-                    {pressure_offsets.data(), pressure_transfers.data()},
+    assemble_slopes(domains, slope.data(), displacement.data(), pressure.data(),
                     of_pressure ? std::optional(target_of(*of_pressure)) : std::nullopt,
                     of_displacement ? std::optional(target_of(*of_displacement)) : std::nullopt);
   },
-        "dofmap"_a, "gradients"_a, "weights"_a, "hoop"_a, "slope"_a, "offsets"_a, "transfers"_a,
-        "pressure_offsets"_a, "pressure_transfers"_a, "of_pressure"_a.none(),
+        "dofmap"_a, "gradients"_a, "weights"_a, "hoop"_a, "slope"_a,
+        "displacement"_a, "pressure"_a, "of_pressure"_a.none(),
         "of_displacement"_a.none(),
         "Add the blocks between a pressure at the points and the displacement.");
 
   m.def("assemble_diagonal",
-        [](Reals factors, Offsets offsets, Reals transfers, const Where& where) {
-    require(factors.ndim() == 2 && offsets.size() == factors.shape(0) + 1, "factors (n, nq)");
-    assemble_diagonal(static_cast<int>(factors.shape(1)), factors.data(),
-                      {offsets.data(), transfers.data()}, target_of(where));
+        [](Reals factors, Reals transfers, const Where& where) {
+    require(factors.ndim() == 2 && factors.shape(0) == std::get<0>(std::get<0>(where)).size(),
+            "factors (n, nq)");
+    assemble_diagonal(static_cast<int>(factors.shape(1)), factors.data(), transfers.data(),
+                      target_of(where));
   },
-        "factors"_a, "offsets"_a, "transfers"_a, "where"_a,
+        "factors"_a, "transfers"_a, "where"_a,
         "Add the block of a pressure with factors at the points.");
 
   m.def("slope_sizes",

@@ -9,26 +9,43 @@
 #include <tuple>
 #include <type_traits>
 
-core::Pattern core::pattern(const Seen& rows, const Seen& columns, std::size_t count)
+core::Pattern core::pattern(const Seen& rows, const Seen& columns, std::size_t count,
+                            std::vector<std::uint8_t> has)
 {
-  // Which domains see a node.
+  // Where groups see a node of a row: the pairs with their first column.
+  struct Visit
+  {
+    std::int64_t pair;
+    const std::int32_t *begin, *end; // columns
+  };
   std::vector<std::int64_t> first(rows.num_nodes + 1, 0);
   for (std::int64_t e = 0; e < rows.offsets[count]; ++e)
     ++first[rows.nodes[e] + 1];
   std::partial_sum(first.begin(), first.end(), first.begin());
-  std::vector<std::int32_t> visits(rows.offsets[count]);
+  std::vector<Visit> visits(rows.offsets[count]);
   std::vector<std::int64_t> next(first.begin(), first.end() - 1);
   Pattern result;
-  result.pairs.reserve(count + 1);
-  result.pairs.push_back(0);
-  for (std::size_t p = 0; p < count; ++p)
+  result.pairs.assign(1, 0);
+  for (std::size_t g = 0; g < count; ++g)
   {
-    const std::int64_t size = rows.offsets[p + 1] - rows.offsets[p];
-    for (std::int64_t e = rows.offsets[p]; e < rows.offsets[p + 1]; ++e)
-      visits[next[rows.nodes[e]]++] = static_cast<std::int32_t>(p);
-    result.pairs.push_back(result.pairs.back()
-                           + size * (columns.offsets[p + 1] - columns.offsets[p]));
+    const std::int32_t *begin = columns.nodes + columns.offsets[g],
+                       *end = columns.nodes + columns.offsets[g + 1];
+    std::int64_t pair = result.pairs.back();
+    for (std::int64_t e = rows.offsets[g]; e < rows.offsets[g + 1]; ++e, pair += end - begin)
+      visits[next[rows.nodes[e]]++] = {pair, begin, end};
+    result.pairs.push_back(pair);
   }
+  if (has.empty())
+    has.assign(result.pairs.back(), 1);
+  if (has.size() != static_cast<std::size_t>(result.pairs.back()))
+    throw std::invalid_argument("whether all pairs have a block");
+  // Call f(column, pair) for the blocks of a row, those of several groups again.
+  const auto for_each_pair = [&](std::size_t row, auto&& f) {
+    for (std::int64_t v = first[row]; v < first[row + 1]; ++v)
+      for (const std::int32_t* column = visits[v].begin; column != visits[v].end; ++column)
+        if (const std::int64_t pair = visits[v].pair + (column - visits[v].begin); has[pair])
+          f(*column, pair);
+  };
 
   // Once for the rows, and once for the positions, of which it is known then how many bytes they take.
   result.offsets.assign(1, 0);
@@ -37,42 +54,31 @@ core::Pattern core::pattern(const Seen& rows, const Seen& columns, std::size_t c
   for (std::size_t row = 0; row < rows.num_nodes; ++row)
   {
     const std::size_t start = result.nodes.size();
-    for (std::int64_t v = first[row]; v < first[row + 1]; ++v)
-      for (std::int64_t e = columns.offsets[visits[v]]; e < columns.offsets[visits[v] + 1]; ++e)
-        if (place[columns.nodes[e]] < 0)
-        {
-          place[columns.nodes[e]] = 0;
-          result.nodes.push_back(columns.nodes[e]);
-        }
+    for_each_pair(row, [&](std::int32_t column, std::int64_t) {
+      if (place[column] < 0)
+      {
+        place[column] = 0;
+        result.nodes.push_back(column);
+      }
+    });
     std::sort(result.nodes.begin() + start, result.nodes.end());
     for (std::size_t e = start; e < result.nodes.size(); ++e)
       place[result.nodes[e]] = -1;
     longest = std::max(longest, result.nodes.size() - start);
     result.offsets.push_back(static_cast<std::int32_t>(result.nodes.size()));
   }
-  if (longest > UINT16_MAX + 1)
+  if (longest > UINT16_MAX)
     throw std::overflow_error("a node of the background meets too many others");
-  result.bytes = longest <= UINT8_MAX + 1 ? 1 : 2;
-  result.positions.resize(result.bytes * result.pairs.back());
+  result.bytes = longest <= UINT8_MAX ? 1 : 2;
+  result.positions.assign(result.bytes * has.size(), UINT8_MAX);
   const auto set = [&](auto* positions) {
     for (std::size_t row = 0; row < rows.num_nodes; ++row)
     {
       for (std::int32_t e = result.offsets[row]; e < result.offsets[row + 1]; ++e)
         place[result.nodes[e]] = e - result.offsets[row];
-      std::int64_t before = -1, slot = 0; // a domain may see a node twice
-      for (std::int64_t v = first[row]; v < first[row + 1]; ++v)
-      {
-        const std::int32_t p = visits[v];
-        slot = p == before ? slot + 1 : rows.offsets[p];
-        before = p;
-        while (rows.nodes[slot] != static_cast<std::int32_t>(row))
-          ++slot;
-        const std::int64_t size = columns.offsets[p + 1] - columns.offsets[p];
-        auto* out = positions + result.pairs[p] + (slot - rows.offsets[p]) * size;
-        for (std::int64_t b = 0; b < size; ++b)
-          out[b] = static_cast<std::remove_reference_t<decltype(*out)>>(
-              place[columns.nodes[columns.offsets[p] + b]]);
-      }
+      for_each_pair(row, [&](std::int32_t column, std::int64_t pair) {
+        positions[pair] = static_cast<std::remove_reference_t<decltype(*positions)>>(place[column]);
+      });
     }
   };
   if (result.bytes == 1)

@@ -13,7 +13,7 @@
 
 namespace core
 {
-// The nodes of one field that each domain sees, sorted, in compressed rows.
+// The nodes of one field that each group of domains sees, in compressed rows.
 struct Seen
 {
   const std::int64_t* offsets;
@@ -21,9 +21,9 @@ struct Seen
   std::size_t num_nodes;
 };
 
-// Sparsity of the sum over domains in compressed rows of blocks, which are sorted; where the pairs
-// of the nodes that each domain sees begin, and the place of each pair in the row of its first node,
-// in one byte if that is enough and in two otherwise.
+// Sparsity of the sum over groups in compressed rows of blocks, which are sorted; where the pairs
+// of the nodes that each group sees begin, and the place of each pair in the row of its first node,
+// in one byte if that is enough and in two otherwise. Pairs without a block have the largest number.
 struct Pattern
 {
   std::vector<std::int32_t> offsets, nodes;
@@ -31,7 +31,9 @@ struct Pattern
   std::vector<std::uint8_t> positions;
   std::size_t bytes; // of each of these
 };
-Pattern pattern(const Seen& rows, const Seen& columns, std::size_t count);
+// `has` tells which pairs have a block; where it is empty all have.
+Pattern pattern(const Seen& rows, const Seen& columns, std::size_t count,
+                std::vector<std::uint8_t> has);
 
 // A block between two nodes at the unknowns: the first number of its rows and how many there are,
 // and the same of its columns. Those of a node follow each other.

@@ -78,7 +78,7 @@ class PressureBlocks:
 
     def add(self, blocks: CoupledBlocks) -> None:
         """Add the blocks (see :class:`~mpm_dolfinx.assembly.fused.Coupling`)."""
-        found, places = self._material.volume_strain, (*blocks.displacement, *blocks.field)
+        found, places = self._material.volume_strain, (blocks.displacement, blocks.field)
         beside = None if not self._material.symmetric else blocks.of_displacement
         loops.assemble_slopes(*self._domains, found.slope, *places, blocks.of_field, beside)
         if not self._material.symmetric:
@@ -86,7 +86,7 @@ class PressureBlocks:
             loops.assemble_slopes(*self._domains, slope, *places, None, blocks.of_displacement)
         weights = self._material.weights
         factors = -weights * found.compliance.reshape(weights.shape)
-        loops.assemble_diagonal(factors, *blocks.field, blocks.alone)
+        loops.assemble_diagonal(factors, blocks.field, blocks.alone)
 
     def sizes(
         self, moved: NDArray[np.float64], pressed: NDArray[np.float64]

@@ -210,7 +210,8 @@ def _pattern(
         widths = np.concatenate([np.full(len(nodes), nodes.shape[1]) for _, nodes in side])
         ends = np.concatenate([[0], np.cumsum(widths)]).astype(np.int64)
         seen += [ends, np.concatenate([nodes.ravel() for _, nodes in side]), count]
-    ends, nodes, _, positions, size = loops.pattern(*seen)
+    every = np.zeros(0, dtype=np.uint8)  # all pairs of a group have a block
+    ends, nodes, _, positions, size = loops.pattern(*seen, every)
     places = positions.view(np.uint8 if size == 1 else np.uint16)
     splits = np.split(places, np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1])
     parts = [

@@ -16,6 +16,7 @@ from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx._core import loops
+from mpm_dolfinx.assembly import fused
 
 QUADRILATERAL, TRIANGLE = mesh.CellType.quadrilateral, mesh.CellType.triangle
 HEXAHEDRON, TETRAHEDRON = mesh.CellType.hexahedron, mesh.CellType.tetrahedron
@@ -164,12 +165,47 @@ def test_the_tangent_is_one_matrix_where_a_penalty_ties_cells():
         assert whole.norm() < 1e-13 * K.norm()
 
 
+@pytest.mark.parametrize("degree", [1, 2])
+def test_groups_of_domains_do_not_matter(degree, monkeypatch):
+
+    def tangent(most):
+        monkeypatch.setattr(fused, "GROUP", most)
+        particles = mpm.Particles(bent(QUADRILATERAL), space(2, degree), degree=degree)
+        problem = quasi_static(particles)
+        return evaluated(lambda: problem, False)[1]
+
+    reference = tangent(1)
+    scale = reference.norm()
+    for most in (12, 48, 1000):
+        K = tangent(most)
+        assert K.getInfo()["nz_used"] == reference.getInfo()["nz_used"]
+        K.axpy(-1.0, reference)
+        assert K.norm() < 1e-14 * scale
+
+
+def test_groups_see_fewer_pairs_than_their_domains():
+    dofmap = np.array([[0, 1], [1, 2], [2, 3], [3, 4]], dtype=np.int32)
+    near = np.array([0, 0, 1, 1, 9], dtype=np.int32)  # the node of each row of T
+    ends, weights = np.arange(6, dtype=np.int64), np.ones(5)
+    order, free = np.arange(4, dtype=np.int32), np.zeros(0, dtype=np.int64)
+    first, (offsets, slots, starts, nodes) = loops.supports(
+        dofmap, ends, near, weights, order, free, 3
+    )
+    # Nodes {0}, {0, 1}, {1}, {1, 9}: ten pairs one by one, nine of the three nodes together.
+    assert first.tolist() == [0, 4] and nodes.tolist() == [0, 1, 9] and starts.tolist() == [0, 3]
+    assert offsets.tolist() == [0, 1, 3, 4, 6] and slots.tolist() == [0, 0, 1, 1, 1, 2]
+    apart = loops.supports(dofmap, ends, np.arange(5, dtype=np.int32), weights, order, free, 9)
+    assert apart[0].tolist() == [0, 1, 2, 3, 4]  # 16 pairs one by one, 25 together
+
+
 @pytest.mark.parametrize(("count", "size"), [(40, 1), (300, 2)])
 def test_positions_take_as_many_bytes_as_rows_are_long(count, size):
     nodes = np.arange(0, 2 * count, 2, dtype=np.int32)
     offsets = np.array([0, count, 2 * count], dtype=np.int64)
     seen = offsets, np.concatenate([nodes, nodes + 1]), 2 * count
-    ends, columns, pairs, positions, found = loops.pattern(*seen, *seen)
+    ends, columns, pairs, positions, found = loops.pattern(
+        *seen, *seen, np.zeros(0, dtype=np.uint8)
+    )
     assert found == size and pairs.tolist() == [0, count**2, 2 * count**2]
     places = positions.view(f"u{size}").reshape(2, count, count)
     for domain in range(2):
