@@ -30,7 +30,7 @@ from ..io.series import Output
 from ..io.snapshot import Kept, spaces_of
 from ..parallel.boundary import Hooked, by_itself, collective
 from ..parallel.garbage import Cleaner
-from ..parallel.given import is_number, require_same
+from ..parallel.given import PACKAGE, is_number, require_same
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
 from ..solvers.newton import NewtonSolver
@@ -100,6 +100,16 @@ class Problem(Hooked):
         fields: As given.
         body_terms: What each body is made of and loaded by.
     """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Refuse what a user derives from what all problems have alone."""
+        super().__init_subclass__(**options)
+        if Problem in cls.__bases__ and cls.__module__.partition(".")[0] != PACKAGE:
+            raise MPMError(
+                f"{cls.__name__} is of mpm.Problem, which is what all problems have and can be "
+                "none; derive it from mpm.ParticleProblem, mpm.QuasiStaticProblem or one of those "
+                "through time."
+            )
 
     def __init__(
         self,

@@ -313,7 +313,7 @@ def _equilibrium(problem: QuasiStaticProblem, start: list[Array], limit: float) 
     Returns:
         How far the body has moved, or why no equilibrium was found.
     """
-    comm = problem.bodies[0].V.mesh.comm
+    comm, stages = problem.bodies[0].V.mesh.comm, len(problem.history.stages)
     found: float | MPMError
     with held() as hold:
         before = problem.capture()
@@ -328,6 +328,11 @@ def _equilibrium(problem: QuasiStaticProblem, start: list[Array], limit: float) 
         except BaseException:
             problem.return_to(before)
             raise
+        if len(problem.history.stages) != stages:
+            raise MPMError(
+                "A stage was begun within strength_reduction(), by a method of the problem's own; "
+                "a factor is of one stage alone."
+            )
         if not isinstance(found, MPMError) and found > limit:
             problem.return_to(before)
     if interrupted(comm, hold.left):

@@ -143,6 +143,10 @@ class Structure(Term):
             self._grip = None if bond is None else Grip(bond, self.layout, axisymmetric, self.comm)
             if self._grip is not None and self._alone[self._grip.nodes].any():
                 raise MPMError("Nodes that are held have no bond; leave them out by where=.")
+        where = None if self._grip is None else self._grip.nodes
+        require_same(
+            self.comm, **{"held=, where it holds,": self._alone, "where= of a Bond": where}
+        )
         self._hosts: Hosts = find_hosts(self.bodies, self.layout.nodes, self._alone, what)
         self._path = np.zeros(gdim)
         self.state = self._drawn()

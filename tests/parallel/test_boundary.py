@@ -91,6 +91,7 @@ HOOKED = [
     *public(lambda c: inspect.isclass(c) and issubclass(c, Hooked) and not inspect.isabstract(c)),
     Euler,  # (a scheme, which are abstract)
 ]
+HOOKED.remove(mpm.Problem)  # (of which users derive nothing: what it has its heirs have)
 HOOKS = list(
     {
         inspect.getattr_static(base, name): (base, name)

@@ -171,3 +171,29 @@ def test_an_heir_goes_on_on_other_meshes_and_from_files(mpi_tmp_path):
     np.testing.assert_allclose(now, total, atol=1e-14)
     assert not cut.particles.displacement.x.array.any()
     assert len(anchors(cut)) == 38
+
+
+def test_what_is_derived_from_what_all_problems_have_is_refused():
+    with pytest.raises(mpm.MPMError, match="derive it from mpm"):
+        type("Own", (mpm.Problem,), {})
+
+
+def test_a_stage_within_a_reduction_of_strength_is_refused():
+    class Own(mpm.QuasiStaticProblem):
+        acts = False
+
+        def end_step(self):
+            if self.acts:
+                self.acts = False
+                self.stage("within", self.body().replace(body_force=(0.0, -5.0)))
+
+    V = scenes.vectors(scenes.box([0, 0], [2.25, 1.25], [9, 5], QUADRILATERAL))
+    soil = mpm.Particles(scenes.box([0, 0], [2, 1], [16, 8], QUADRILATERAL), V)
+    law = mpm.materials.Tresca(1e4, 0.3, cohesion=10.0)
+    body = mpm.Body(soil, law, density=1.0, body_force=(0.0, -20.0), f_bar="patch")
+    problem = Own(body, bcs=[mpm.held(V, 0, x=0.0), mpm.held(V, y=0.0)])
+    problem.solve(2)
+    problem.acts = True
+    with pytest.raises(mpm.MPMError, match="stage was begun within strength_reduction"):
+        mpm.strength_reduction(problem)
+    assert problem.points[0].weakening == 1.0

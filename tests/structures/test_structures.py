@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from ranks import differing, fails
 from scenes import HEXAHEDRON, QUADRILATERAL, WORLD, at, box, facet_tags, vectors
 from stock import newton
 
@@ -651,6 +652,14 @@ def test_structures_in_space_are_drawn():
     for field in ("axial_force", "membrane_force", "displacement"):
         figure = mpm.plot.scene(problem, field)
         assert (figure is None) == (WORLD.rank > 0)
+
+
+@pytest.mark.mpi
+def test_places_that_differ_between_ranks_are_named():
+    soil, places = pit().particles, [mpm.region(x=(0, 1.2)), mpm.region(x=(0.7, 2))]
+    bond = mpm.Bond(1e3, where=differing(*places))
+    fails(lambda: mpm.Truss(soil, POINTS, 1.0, held=differing(*places)), "^held=.* differs between")
+    fails(lambda: mpm.Truss(soil, POINTS, 1.0, bond=bond), "^where= of a Bond differs between")
 
 
 def test_what_makes_no_sense_is_refused():
