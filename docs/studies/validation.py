@@ -94,6 +94,7 @@ HERTZ = "hertz --cells 3", "--cells 6"
 COLUMN = "column_roller --elements 16", "--elements 64"
 STRIP = "strength --recommended --case"
 WEDGE = "penetration --obstacle wedge --depth 0.5"
+SHEARED = "notch --case shear --model AT2 --length 0.06 --body free --slit 0.125"
 BLOCK = "spinning_block --turn 4 --angle 0.08", "--angle 0.04"
 
 ELASTIC = {
@@ -236,6 +237,14 @@ MOTION = {
     "Block that spins, change of energy": Error("energy_change", *BLOCK),
     "Its angular momentum": Error("angular_momentum_change", *BLOCK),
 }
+CRACKS = {
+    "Notched square, sheared, force; PhaseFieldX on DOLFINx": Value(
+        "peak", 0.4947, f"{SHEARED} --cells 4 --steps 48 --reach 0.0096", "--cells 6", 4
+    ),
+    "L-shaped panel, carried, force; stock DOLFINx": Value(
+        "peak", 15.998, "notch --case l-panel --steps 25 --reach 0.5 --cells 1", "--cells 2", 2
+    ),
+}
 
 
 def table(rows: Mapping[str, Value | Error]) -> Table:
@@ -255,5 +264,6 @@ def tables() -> dict[str, Table]:
         "soils": SOILS,
         "water": WATER,
         "motion": MOTION,
+        "cracks": CRACKS,
     }
     return {f"validation/{name}": table(rows) for name, rows in groups.items()}

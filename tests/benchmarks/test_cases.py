@@ -7,6 +7,7 @@ import runpy
 import sys
 from pathlib import Path
 
+import numpy as np
 import programs
 import pytest
 from marks import all_but
@@ -516,6 +517,21 @@ def test_numbers(case, capfd):
         assert 1.2 < numbers["y_mean"] < 2.5
     if case == "roller-small-strain":
         assert numbers["error_syy"] > 0.95 / 32
+
+
+def test_a_crack_in_shear_is_that_of_stock_dolfinx(capfd):
+    """Force and energies of each step, to beyond the peak, and where the crack is."""
+    small = "--case shear --model AT2 --length 0.16 --body free --steps 9 --reach 0.0108 --json"
+    found = []
+    for solver in ("staggered", "stock"):
+        status, out = run("notch", [*small.split(), "--solver", solver], capfd)
+        assert status == 0
+        found.append(json.loads(out))
+    curves = [np.array(one["curve"])[1:] for one in found]
+    np.testing.assert_allclose(*curves, rtol=3e-3)
+    np.testing.assert_allclose(curves[0][:-1], curves[1][:-1], rtol=5e-4)
+    assert curves[0][-1, 1] < 0.9 * curves[0][:, 1].max()
+    np.testing.assert_allclose(*[np.array(one["crack"]) for one in found], atol=0.02 * 0.16)
 
 
 def test_plain_solver_reports_its_end(capfd):

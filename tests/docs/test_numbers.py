@@ -92,10 +92,10 @@ for table in validation.tables().values():
     assert hashes() == before
     edit(study, "incline --tilt 30 --steps 20", "incline --tilt 30 --steps 25")
     one = hashes()
-    assert changed(before, one) == [1, 0, 0, 0, 0]
+    assert changed(before, one) == [1, 0, 0, 0, 0, 0]
     with (tmp_path / case).open("a", encoding="utf-8") as file:
         file.write("\nCELLS = 1\n")
     two = hashes()
-    assert changed(one, two) == [0, 0, 2, 0, 0]
+    assert changed(one, two) == [0, 0, 2, 0, 0, 0]
     edit(study, "if abs(share) >= 5e-5", "if abs(share) >= 6e-5")
     assert changed(two, hashes()) == [len(rows) for rows in two]
