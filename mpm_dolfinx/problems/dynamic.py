@@ -41,6 +41,9 @@ from .stages import join
 
 __all__ = ["DynamicParticleProblem", "DynamicProblem"]
 
+#: Share of the energies of a motion that stress may give it beyond what is stored.
+GAIN = 0.1
+
 
 class DynamicProblem(MovingProblem, QuasiStaticProblem):
     """Motion of bodies with materials: the balance of momentum, implicit in time.
@@ -230,6 +233,24 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         own = [(s.strain_energy(), s.stress_work) for s in self._step_stresses]
         energy, work = self._comm.allreduce(np.sum(own, axis=0))
         return float(energy), float(work)
+
+    _most_dissipated, _told_of_gain = 0.0, False
+
+    @override
+    def end_step(self) -> None:
+        """Say so, once, where stress has done much more work than the materials had stored."""
+        super().end_step()
+        now, scheme = self._energies[-1], self.inertia.scheme
+        self._most_dissipated = most = max(self._most_dissipated, now.dissipated)
+        gain = most - now.dissipated
+        if self._told_of_gain or scheme.share == 1.0:
+            return
+        if gain > GAIN * (now.kinetic + now.strain + most):
+            self._told_of_gain = True
+            self.warn(
+                f"By the time {now.time:.3g} stress has done {gain:.2g} more work on the bodies "
+                f"than they had stored, as scheme={scheme.name!r} lets it; take scheme='euler'."
+            )
 
     @override
     def _mass_form(self, number: int, product: Any) -> ufl.Form:
