@@ -4,7 +4,20 @@
 
 from __future__ import annotations
 
-__all__ = ["BLOCK", "EQUAL", "LOCAL_ITERATIONS", "NEGLIGIBLE", "ROUND_OFF", "SMALL"]
+import numpy as np
+
+__all__ = [
+    "BLOCK",
+    "DIFFERENCE",
+    "EQUAL",
+    "HALF_DIGITS",
+    "LAST_PLACES",
+    "LOCAL_ITERATIONS",
+    "NEGLIGIBLE",
+    "ROUND_OFF",
+    "SMALL",
+    "SOLVED",
+]
 
 #: Share of what something is compared with that counts as nothing. Errors of sums and quotients of
 #: computed numbers are below it, and what users tell apart is above.
@@ -16,6 +29,14 @@ SMALL = 1e-6
 EQUAL = 1e-12
 #: What is left, relative to its parts, of a sum that vanishes: some hundred times the last place.
 ROUND_OFF = 1e-13
+#: Relative error of a number that was rounded a few times.
+LAST_PLACES = 4.0 * np.finfo(float).eps
+#: Half of the digits: the square of a smaller share vanishes beside one.
+HALF_DIGITS = float(np.sqrt(np.finfo(float).eps))
+#: Relative step of differences of second order: errors by it and by round-off are equal.
+DIFFERENCE = float(np.cbrt(np.finfo(float).eps))
+#: Relative residual of linear equations that are solved as well as by a factor, by iterations.
+SOLVED = 1e-10
 #: Most iterations for one number at a point, or one vector: more than any takes.
 LOCAL_ITERATIONS = 100
 #: Most points or domains that are looked at together, so that what is known of them stays in the

@@ -17,14 +17,12 @@ from dolfinx import fem, mesh
 
 from .. import _compat
 from .._core import loops
-from ..tolerances import BLOCK, EQUAL
+from ..tolerances import BLOCK, EQUAL, LAST_PLACES
 
-__all__ = ["COORDINATES", "TOLERANCE", "CellTable", "Cells", "cell_volumes"]
+__all__ = ["TOLERANCE", "CellTable", "Cells", "cell_volumes"]
 
 #: Reference distance within which a point outside a cell counts as on its boundary.
 TOLERANCE = 1e-10
-#: Error of coordinates, relative to them: some units in the last place.
-COORDINATES = 4.0 * np.finfo(float).eps
 
 
 class CellTable(NamedTuple):
@@ -89,11 +87,11 @@ class Cells:
         ).basix_element
         self.middle = basix.geometry(self._name).mean(axis=0)
         # Of coordinates: no small part of a cell that is tiny or far from the origin.
-        self.roundoff = 8.0 * np.finfo(float).eps * np.abs(self.vertices).max(initial=0.0)
+        self.roundoff = 2.0 * LAST_PLACES * np.abs(self.vertices).max(initial=0.0)
         self.affine = self._is_affine()
         every = np.arange(count)
         slopes = np.linalg.inv(self.jacobians(every, np.tile(self.middle, (count, 1))))
-        error = COORDINATES * np.abs(self.vertices).max(axis=(1, 2), initial=0.0)
+        error = LAST_PLACES * np.abs(self.vertices).max(axis=(1, 2), initial=0.0)
         #: Reference distance that is round-off of coordinates, which is much far from the origin.
         self.slack = error * np.abs(slopes).sum(axis=2).max(axis=1, initial=0.0)
         if self.affine:
@@ -234,7 +232,7 @@ class Cells:
             self._centres,
             self.middle,
             self.slack,
-            (COORDINATES, EQUAL),
+            (LAST_PLACES, EQUAL),
             points,
             cell,
             reference,
@@ -287,7 +285,7 @@ class RegularGrid:
         lines, places = [], []
         for x in np.moveaxis(vertices, 2, 0):
             line = np.unique(x)
-            error = 2.0 * COORDINATES * np.abs(line).max()
+            error = 2.0 * LAST_PLACES * np.abs(line).max()
             line = line[np.diff(line, prepend=-np.inf) > max(1e-9 * (line[-1] - line[0]), error)]
             middles = 0.5 * (x.min(axis=1) + x.max(axis=1))
             place = np.searchsorted(line, middles) - 1

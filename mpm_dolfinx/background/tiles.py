@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..parallel.exchange import swap
-from .cells import COORDINATES, TOLERANCE, CellTable
+from ..tolerances import LAST_PLACES
+from .cells import TOLERANCE, CellTable
 
 __all__ = ["Tiles"]
 
@@ -43,7 +44,7 @@ class Tiles:
         edge = (size.prod() * TILE / count) ** (1.0 / gdim)
         self._shape = np.maximum(size / edge, 1.0).astype(np.int64)
         self._edges = size / self._shape
-        error = 2.0 * COORDINATES * (np.abs(self._low) + size).max()
+        error = 2.0 * LAST_PLACES * (np.abs(self._low) + size).max()
         pad = max(1e2 * TOLERANCE * size.max(), error)
         self._ranks = self._place(boxes + np.array([[-pad], [pad]]))
         self._ranges = self._place(low - pad), self._place(high + pad)

@@ -23,12 +23,11 @@ from numpy.typing import NDArray
 
 from .._core import loops
 from ..errors import ConvergenceError
+from ..tolerances import SMALL
 from .averaging import LowRankTerm, VolumeAveraging
 
 __all__ = ["Ends", "Gradients", "abandon", "by_end", "mean", "mean_of_groups"]
 
-#: Change of strain below which Gonzalez' correction, a quotient of small numbers, is faded out.
-SMALL = 1e-6
 #: How many numbers of each domain are summed over its group in an evaluation.
 SUMS = 4
 

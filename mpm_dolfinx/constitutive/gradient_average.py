@@ -25,9 +25,6 @@ __all__ = ["GradientAverage"]
 
 type Array = NDArray[np.float64]
 
-#: Most iterations of the method of conjugate gradients.
-MOST_ITERATIONS = 10000
-
 
 class GradientAverage:
     """An average over a length, of some of a body's domains (collective).
@@ -59,7 +56,7 @@ class GradientAverage:
         numbers = index_map.local_to_global(body.domain_nodes.ravel())
         self._numbers = numbers.reshape(body.domain_nodes.shape).astype(PETSc.IntType)
         self._present: NDArray[np.bool_] | None = None
-        self._ksp = conjugate_gradients(self._comm, MOST_ITERATIONS)
+        self._ksp = conjugate_gradients(self._comm)
 
     def _vector(self) -> PETSc.Vec:
         vector = PETSc.Vec().createGhost(self._ghosts, self._sizes, comm=self._comm)

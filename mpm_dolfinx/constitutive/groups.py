@@ -23,14 +23,12 @@ from ..background.basis import BackgroundBasis
 from ..background.cells import cell_volumes
 from ..background.grids import cell_lines, coarser
 from ..particles.particles import Particles
+from ..tolerances import HALF_DIGITS
 
 __all__ = ["Groups", "background_cells", "patches", "singles"]
 
 #: Share of a background cell below which a patch joins a neighbour.
 LEAST_FILL = 0.4
-#: Shares of cells are counted in it, so that which of several are the least is no matter of
-#: round-off.
-FILL_UNIT = 2.0**-26
 #: Singular values, relative to the largest, that a fitted plane needs to have a slope.
 SLENDER = 0.1
 
@@ -367,7 +365,8 @@ def patches(particles: Particles, material: NDArray[np.int64]) -> Groups:
             np.stack([whole.key, whole.material]), axis=1, return_index=True, return_inverse=True
         )
         label = first[label.ravel()]
-    fill = np.round(whole.volume / whole.cell_volume / FILL_UNIT) * FILL_UNIT
+    # (rounded, so that which of several are the least is no matter of round-off)
+    fill = np.round(whole.volume / whole.cell_volume / HALF_DIGITS) * HALF_DIGITS
     return _numbered(particles, whole, _joined(label, fill, links))
 
 

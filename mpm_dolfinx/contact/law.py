@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from .._core import is_as_inherited, loops
 from ..errors import MPMError, as_ours
 from ..reals import as_reals
-from ..tolerances import EQUAL, LOCAL_ITERATIONS
+from ..tolerances import DIFFERENCE, EQUAL, LOCAL_ITERATIONS, ROUND_OFF, SMALL
 
 __all__ = [
     "Coulomb",
@@ -41,11 +41,6 @@ __all__ = [
     "traction",
     "unworn",
 ]
-
-#: Step of differences of a user's law over the size of what is varied: the third root of eps.
-STEP = 6e-6
-#: Least length over which a user's law is varied, over the round-off of positions.
-LENGTH = 1e8
 
 
 type Array = NDArray[np.float64]
@@ -502,7 +497,7 @@ def _rubbing(law: Friction, points: Points, at: Separation) -> tuple[Rubbing, Ar
     trial = _acting(at, known(law, points, at.touch, at.behind, never))
     size, way = (np.linalg.norm(part, axis=1) for part in (trial.shear, _along(at)))
     stiffness = size / np.where(way > 0.0, way, 1.0)
-    length = max(float(way.max(initial=0.0)), LENGTH * at.touch)
+    length = max(float(way.max(initial=0.0)), SMALL / ROUND_OFF * at.touch)
     # (points may touch at a gap of round-off)
     pressure = np.maximum(trial.pressure, 0.0)
     slip, low, high = np.zeros_like(way), np.zeros_like(way), way
@@ -527,7 +522,7 @@ def _slope(law: Friction, rubs: Rubbing, name: str, size: float) -> Array:
 
     It is of second order in a step forwards: there are no pressures nor slips below zero.
     """
-    values, step = getattr(rubs, name), STEP * size
+    values, step = getattr(rubs, name), DIFFERENCE * size
     beside = (rubs._replace(**{name: values + i * step}) for i in range(3))
     first, second, third = (_bound(law, at) for at in beside)
     return np.asarray((4.0 * second - 3.0 * first - third) / (2.0 * step))

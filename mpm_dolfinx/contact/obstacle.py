@@ -15,6 +15,7 @@ from ..errors import MPMError, agree
 from ..io.snapshot import Taken
 from ..meshes.remesh import Column
 from ..reals import as_reals
+from ..tolerances import NEGLIGIBLE
 from .contact import Contact, Outcome, stiffness
 from .law import Friction, unworn
 from .memory import Grip, Memory
@@ -26,10 +27,7 @@ from .rotation import Pose
 from .shapes import Shape
 from .surface import PointMatrix, Surface
 
-__all__ = ["SAME", "Obstacle"]
-
-#: Difference of normals, and of gaps over the body's coordinates, of obstacles in the same place.
-SAME = 1e-10
+__all__ = ["Obstacle"]
 
 
 class Obstacle(Contact):
@@ -333,13 +331,13 @@ class Obstacle(Contact):
             return surface.of_column(before.surface.column(values).values)
 
         n = memory.normal @ memory.pose.Q.T
-        there = np.abs(seen(before.gap) - memory.gap) <= SAME * surface.layout.extent
+        there = np.abs(seen(before.gap) - memory.gap) <= NEGLIGIBLE * surface.layout.extent
         whole = surface.column(there & there.all(axis=1)[:, None]).values
         known = before.surface.columns().items()
         surface.restore({name: np.where(whole, c.values, 0.0) for name, c in known})
         self._take_stiffness()
         same = seen(before.touched) & there
-        same &= np.abs(seen(before.normal) - n).max(axis=2) <= SAME
+        same &= np.abs(seen(before.normal) - n).max(axis=2) <= NEGLIGIBLE
         anchor = framed(self.shape, memory.pose, seen(before.anchor))
         acts, mine, rubbed = before.outcome, memory.outcome, memory.friction
         if before.friction.shape[2] == rubbed.shape[2]:

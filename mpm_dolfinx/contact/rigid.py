@@ -20,12 +20,13 @@ from ..parallel.boundary import collective
 from ..parallel.given import as_positive, require_same
 from ..particles.particles import Particles
 from ..system.term import PointMaterial
+from ..tolerances import NEGLIGIBLE
 from .behind import At
 from .contact import OVERLAP
 from .law import Friction, as_friction
 from .memory import Memory
 from .nitsche import Spread, require_stress
-from .obstacle import SAME, Obstacle
+from .obstacle import Obstacle
 from .obstacle_tractions import Acting, ObstacleTractions
 from .placed import framed
 from .reach import is_near
@@ -335,7 +336,7 @@ class Rigid(Obstacle):
                 )
             turn = self._turn(before.pose, trial.pose)
             rubs = not self.friction.smooth and bool(trial.touched.any())
-            if rubs and turn > MOST_TURN * (1.0 + SAME):
+            if rubs and turn > MOST_TURN * (1.0 + NEGLIGIBLE):
                 failure = ConvergenceError(
                     f"An obstacle turns by {turn:.3g} rad in one step, and friction follows a "
                     "quarter of a turn at most; turn it in smaller steps, by a path (update=), and "

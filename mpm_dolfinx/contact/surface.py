@@ -23,6 +23,7 @@ from ..errors import MPMError
 from ..meshes.remesh import Column
 from ..parallel.given import require_truth, require_whole
 from ..particles.particles import Particles
+from ..tolerances import ROUND_OFF
 
 __all__ = [
     "Blocks",
@@ -40,9 +41,6 @@ __all__ = [
 
 #: Cells that narrow to a point over each of their facets.
 SIMPLICES = (basix.CellType.triangle, basix.CellType.tetrahedron)
-
-#: Position, relative to the coordinates of a body, at which a point touches: their round-off.
-TOUCH = 1e-14
 
 
 class Facets:
@@ -276,7 +274,7 @@ class Surface:
     @property
     def touch(self) -> float:
         """Gap at which points touch."""
-        return TOUCH * self.layout.extent
+        return ROUND_OFF * self.layout.extent
 
     @property
     def reference_points(self) -> list[NDArray[np.float64]]:

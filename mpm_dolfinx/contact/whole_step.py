@@ -22,10 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["corrected", "corrected_slope", "deformation", "mean_pressure", "pressure_slope"]
+from ..tolerances import HALF_DIGITS
 
-#: Change of position, over a body's coordinates, below which a gradient is not corrected.
-STILL = 1e-8
+__all__ = ["corrected", "corrected_slope", "deformation", "mean_pressure", "pressure_slope"]
 
 
 def mean_pressure(
@@ -85,7 +84,7 @@ def corrected(
     """
     axes = tuple(range(1, gradient.ndim))
     size = (along * along).sum(axis=axes)
-    moved = size.real > (STILL * extent) ** 2
+    moved = size.real > (HALF_DIGITS * extent) ** 2
     lacks = difference - (gradient * change).sum(axis=axes)
     factor = np.where(moved, lacks / np.where(moved, size, 1.0), 0.0)
     return gradient + factor.reshape(-1, *(1 for _ in axes)) * along, factor

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
-from ..tolerances import NEGLIGIBLE
+from ..tolerances import LOCAL_ITERATIONS, NEGLIGIBLE
 from .base import (
     Field,
     Integration,
@@ -28,10 +28,8 @@ __all__ = ["ModifiedCamClay"]
 
 Array = NDArray[np.float64]
 
+#: Newton steps before the bounded search.
 STEPS = 40
-"""Newton steps before the bounded search."""
-HALVINGS = 80
-"""Bisections of the bounded search."""
 
 
 class ModifiedCamClay(CompiledMaterial):
@@ -318,13 +316,13 @@ class _Law(NamedTuple):
     def search(self, volume: Array, shape: Array) -> tuple[Array, Array]:
         """Return the unknowns by bisection of y, with x by bisection for each."""
         largest = np.ones_like(volume)
-        for _ in range(HALVINGS):
+        for _ in range(LOCAL_ITERATIONS):
             x = self.volume_at(volume, shape, largest)
             largest = np.where(
                 self.residual(volume, shape, x, largest)[1] > 0.0, 4.0 * largest, largest
             )
         least = np.zeros_like(volume)
-        for _ in range(HALVINGS):
+        for _ in range(LOCAL_ITERATIONS):
             middle = 0.5 * (least + largest)
             x = self.volume_at(volume, shape, middle)
             beyond = self.residual(volume, shape, x, middle)[1] > 0.0
@@ -334,7 +332,7 @@ class _Law(NamedTuple):
     def volume_at(self, volume: Array, shape: Array, y: Array) -> Array:
         """Return x for a given y."""
         low, high = self.range(volume)
-        for _ in range(HALVINGS):
+        for _ in range(LOCAL_ITERATIONS):
             middle = 0.5 * (low + high)
             above = self.residual(volume, shape, middle, y)[0] > 0.0
             low, high = np.where(above, low, middle), np.where(above, middle, high)

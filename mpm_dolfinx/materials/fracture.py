@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
 from ..reals import is_one_of
+from ..tolerances import HALF_DIGITS, SMALL
 from .base import (
     Field,
     Integration,
@@ -34,9 +35,7 @@ type Array = NDArray[np.float64]
 MODELS = ("AT1", "AT2")
 SPLITS = ("volumetric", "spectral", "none")
 #: Share of its stiffness that a broken point keeps.
-RESIDUAL = 1e-6
-#: Principal strains that count as equal, relative to the largest.
-EQUAL = 1e-8
+RESIDUAL = SMALL
 OWN = ("toughness", "length")
 
 
@@ -187,7 +186,7 @@ class Fracture(StrainMaterial):
             return stress, None, driving, rest
         normal = np.broadcast_to(lame * of_volume, (3, 3, len(strain))).copy()
         quotients = np.zeros_like(normal)
-        near = EQUAL * np.abs(values).max(axis=0)
+        near = HALF_DIGITS * np.abs(values).max(axis=0)
         for a in range(3):
             normal[a, a] += 2.0 * shear * share[a]
             for b in range(a):

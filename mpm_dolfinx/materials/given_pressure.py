@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConvergenceError
-from ..tolerances import LOCAL_ITERATIONS
+from ..tolerances import LOCAL_ITERATIONS, SMALL
 from .kinematics import KINEMATICS
 from .mandel import trace
 
@@ -39,7 +39,7 @@ type Array = NDArray[np.float64]
 
 #: Share of the shear modulus that alpha is: no more than lets a pressure beyond an apex have an
 #: answer, as limit loads rise with it (by 3 % with 1e-2, where G is 4e5 times the cohesion).
-ALPHA = 1e-6
+ALPHA = SMALL
 #: How well the pressure is met, relative to the stresses at hand; or well enough for one more step.
 TOLERANCE, NEARLY = 1e-13, 1e-8
 #: Largest compression in the first iteration, twice as much in each that follows: stiffness grows

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConvergenceError
-from ..tolerances import ROUND_OFF
+from ..tolerances import LAST_PLACES, ROUND_OFF
 from .base import Integration, State
 from .derivatives import difference_by_stress, slope_by_plastic_strain, slope_by_stress
 from .mandel import norm
@@ -19,8 +19,6 @@ from .plastic import PlasticMaterial
 
 __all__ = ["ReturnMapping"]
 
-TOLERANCE = 1e-15
-"""Norm of the residual, relative to the trial strain, at which a point is done."""
 FLOOR = 1e-10
 """Relative residual from which round-off may be what stops the decrease."""
 HALVINGS = 12
@@ -287,7 +285,7 @@ def _solve(system: _System, max_iterations: int) -> tuple[NDArray[np.float64], N
             new_size[rising] = norm(new_residual[rising]) / goal[active[rising]]
         falls = new_size < old_size
         unknowns[active[falls]], residual[active[falls]] = new[falls], new_residual[falls]
-        done = (new_size <= TOLERANCE) | (at_floor & ~(new_size < 0.5 * old_size))
+        done = (new_size <= LAST_PLACES) | (at_floor & ~(new_size < 0.5 * old_size))
         converged[active[done]] = True
         active = active[falls & ~done]
         if len(active) == 0:

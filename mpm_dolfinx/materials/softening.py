@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
-from ..tolerances import LOCAL_ITERATIONS
+from ..tolerances import LAST_PLACES, LOCAL_ITERATIONS
 from .base import Integration, Parameter, State, Update
 from .given_pressure import AtPressure
 from .plastic import PlasticMaterial
@@ -26,7 +26,6 @@ type Array = NDArray[np.float64]
 MIXTURE = 2.0
 #: Step of the derivatives by the strain that softens, over that in which strength falls by 1/e.
 STRIDE = 1e-5
-ROUND_OFF = 1e-15
 
 
 class SofteningMaterial(PlasticMaterial):
@@ -192,7 +191,7 @@ def _root(excess: Callable[[NDArray[np.int64], Array], Array], low: Array, high:
         high: By how much beyond that they are there, as they fall; looked further where not.
     """
     low, high = low.copy(), high.copy()
-    size = ROUND_OFF * high
+    size = LAST_PLACES * high
     rows = np.arange(len(low))
     f_low, f_high = high - low, excess(rows, high)
     for _ in range(LOCAL_ITERATIONS):

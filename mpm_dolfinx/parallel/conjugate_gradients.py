@@ -11,16 +11,18 @@ from ..tolerances import ROUND_OFF
 
 __all__ = ["conjugate_gradients"]
 
+#: More iterations than any system of this kind takes.
+MOST_ITERATIONS = 10000
 
-def conjugate_gradients(comm: MPI.Comm, most: int) -> PETSc.KSP:
+
+def conjugate_gradients(comm: MPI.Comm) -> PETSc.KSP:
     """Return conjugate gradients with a diagonal preconditioner (collective).
 
     Args:
         comm: The ranks.
-        most: Most iterations.
     """
     ksp = PETSc.KSP().create(comm)
     ksp.setType("cg")
     ksp.getPC().setType("jacobi")
-    ksp.setTolerances(rtol=ROUND_OFF, max_it=most)
+    ksp.setTolerances(rtol=ROUND_OFF, max_it=MOST_ITERATIONS)
     return ksp

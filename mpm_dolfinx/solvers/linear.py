@@ -16,8 +16,8 @@ import numpy as np
 from ..errors import MPMError
 from ..history import Statistics
 from ..parallel.totals import over_ranks
-from ..tolerances import ROUND_OFF
-from .multigrid import SHIFT, Multigrid
+from ..tolerances import HALF_DIGITS, ROUND_OFF, SOLVED
+from .multigrid import Multigrid
 from .problem import Levels
 from .refinement import KRYLOV, Refinement
 from .refusals import options_refused, require_factor
@@ -32,8 +32,6 @@ COARSEST = 600
 #: Order of PETSc's own Cholesky, and the pivot, relative to its row, that counts as none: those of
 #: the shift are as small as round-off.
 ORDER, NO_PIVOT = "nd", 0.0
-#: Relative residual to which a factor with blocks of low rank is iterated with.
-COMPRESSED = 1e-10
 #: How many times as many iterations as cost as much as a factor a solve by multigrid may have.
 MOST_BEARABLE = 2.0
 #: Steps in a row in which a factorisation may take over before no step begins with multigrid.
@@ -207,7 +205,7 @@ class ShiftedFactor:
         if self._compresses(size):
             self._ksp.setType("fgmres")
             self._ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
-            self._ksp.setTolerances(rtol=COMPRESSED, atol=0.0, max_it=ITERATIONS)
+            self._ksp.setTolerances(rtol=SOLVED, atol=0.0, max_it=ITERATIONS)
             self._ksp.setGMRESRestart(KRYLOV)
         elif self._ksp.getType() != self._direct[0]:
             self._ksp.setType(self._direct[0])
@@ -360,7 +358,7 @@ class ShiftedFactor:
                     self._multigrid = Multigrid(pc, interpolations, symmetric)
                     pc.setFromOptions()
             assert self._multigrid is not None
-            relative = damping if damped else SHIFT if self._shifts else ROUND_OFF
+            relative = damping if damped else HALF_DIGITS if self._shifts else ROUND_OFF
             if damped or self._shifts or not self._multigrid.levels or _has_zeros(K):
                 matrix = self._shifted_copy(K, relative * levels.diagonal(K))
             if self._symmetric:
@@ -405,7 +403,7 @@ class ShiftedFactor:
                     self._curved = missed
         if norms and norms[-1] > 0.0:
             rtol = max(rtol, min(FINAL * tolerance / norms[-1], ROUGHEST))
-        rtol = max(rtol, COMPRESSED)
+        rtol = max(rtol, SOLVED)
         assert self.K is not None
         bearable = -math.log10(min(rtol, ROUGHEST)) * self._bearable(self.K.getSize()[0])
         most = min(MOST_BEARABLE * bearable, self._longest)

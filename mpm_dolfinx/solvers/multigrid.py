@@ -10,12 +10,11 @@ from petsc4py import PETSc
 
 import numpy as np
 
-__all__ = ["SHIFT", "Multigrid"]
+from ..tolerances import HALF_DIGITS
+
+__all__ = ["Multigrid"]
 
 
-#: Shift of the coarse levels' diagonals, relative to them: boxes may have more dofs than the body
-#: can tell apart.
-SHIFT = 1e-8
 #: Power iterations that look for the largest correction of a sweep, what it may fall short of it,
 #: and what it may be, relative to the right one: below 2.
 POWERS, MARGIN, OVERSHOOT = 12, 1.15, 1.8
@@ -119,6 +118,7 @@ def _shift_diagonal(matrix: PETSc.Mat) -> None:
     largest = diagonal.max()[1]
     values = diagonal.array_w
     zero = values == 0.0
-    values *= SHIFT
+    # (boxes may have more dofs than the body can tell apart)
+    values *= HALF_DIGITS
     values[zero] = largest if largest > 0.0 else 1.0
     matrix.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)

@@ -20,7 +20,7 @@ from ..log import NEWTON, tell
 from ..parallel.garbage import weakly
 from ..parallel.magnitudes import norm, sign_of_product
 from ..parallel.totals import over_ranks
-from ..tolerances import ROUND_OFF
+from ..tolerances import HALF_DIGITS, ROUND_OFF, SOLVED
 from .attempt import Attempt, Predictions
 from .line_search import LineSearch, stalled
 from .linear import Indefinite, ShiftedFactor
@@ -31,8 +31,6 @@ __all__ = ["NewtonSolver"]
 
 #: Share of the residual that the proximal term may go on to hold back where it is released.
 HELD = 0.1
-#: Residual, relative to the forces, that may stay where next to nothing moves.
-FROZEN = 1e-8
 #: Share of the forces that the proximal term may bear in the first step.
 LOOSE = 1e-3
 #: Newton increment, relative to the step's, from which on a refined one needs no line search, and
@@ -40,8 +38,6 @@ LOOSE = 1e-3
 SETTLED = 1e-9
 #: What the norm of ``F - K y`` falls to, relative to F, where a step is refined.
 REFINED = 1e-6
-#: What it falls to where the solution itself is linearised.
-LINEARISED = 1e-10
 #: Iterations after which it is noted which particles yield, should a solve fail.
 LATE = 5
 #: Relative diagonal shifts tried in turn until a tangent is positive definite.
@@ -181,7 +177,7 @@ class NewtonSolver:
 
         def solve(b: PETSc.Vec, x: PETSc.Vec) -> None:
             self._factor.solve(b, x)
-            self._factor.refine(b, x, LINEARISED)
+            self._factor.refine(b, x, SOLVED)
 
         return solve
 
@@ -579,7 +575,9 @@ class NewtonSolver:
         if rest <= 0.5 and self._now.goes_on < 5:
             self._now.goes_on += 1
             return "go on"
-        if left > FROZEN * forces and left > FROZEN * self._problem.balance.internal_scale():
+        # (less may stay where next to nothing moves)
+        scale_inside = self._problem.balance.internal_scale
+        if left > HALF_DIGITS * forces and left > HALF_DIGITS * scale_inside():
             share = left / forces if forces > 0.0 else np.inf
             loose = mechanism(self._problem.resistance, self._factor, step)
             self._now.failure = (

@@ -17,7 +17,7 @@ from ..parallel.given import is_number
 from ..particles.free import chosen_nodes
 from ..particles.particles import Particles
 from ..system.errors import Errors
-from ..tolerances import SMALL
+from ..tolerances import LOCAL_ITERATIONS, SMALL
 from .freeing import bad_nodes
 
 __all__ = ["Adaptivity"]
@@ -28,8 +28,6 @@ BESIDE = 0.4
 #: Share of what is too much of the background's error that is freed at a time (Doerfler 1996), and
 #: to what part of the allowed one, so that the nodes seldom change.
 MARKED, SPARE = 0.8, 0.5
-#: Halvings in which the least error of a node to be freed is found.
-HALVINGS = 60
 
 
 class Adaptivity:
@@ -142,7 +140,7 @@ def _nodes_beside(body: Particles, others: Sequence[Particles]) -> NDArray[np.bo
 def _threshold(values: NDArray[np.float64], wanted: float, comm: MPI.Comm) -> float:
     """Return the largest number that values with a sum of so much are at or above (collective)."""
     low, high = 0.0, comm.allreduce(float(values.max(initial=0.0)), MPI.MAX)
-    for _ in range(HALVINGS):
+    for _ in range(LOCAL_ITERATIONS):
         middle = 0.5 * (low + high)
         if comm.allreduce(float(values[values >= middle].sum())) >= wanted:
             low = middle

@@ -17,7 +17,7 @@ from dolfinx import fem, la
 
 from ..assembly.rules import depends_on, split_by_rule
 from ..background.basis import BackgroundBasis
-from ..background.cells import COORDINATES, TOLERANCE
+from ..background.cells import TOLERANCE
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
@@ -26,12 +26,9 @@ from ..particles.geometry import RING
 from ..particles.particles import Particles
 from ..reals import as_reals
 from ..system.reduced import ReducedSystem
-from ..tolerances import NEGLIGIBLE
+from ..tolerances import EQUAL, LAST_PLACES, NEGLIGIBLE
 
 __all__ = ["ControlledSystem", "DisplacementControl"]
-
-#: Share of the motion under load that is the controlled displacement, below which it is none.
-UNMOVED = 1e-12
 
 
 class DisplacementControl:
@@ -167,7 +164,7 @@ class DisplacementControl:
         start, sides = x[nodes[:, 0]], x[nodes[:, 1:]] - x[nodes[:, :1]]
         along = np.linalg.solve(sides.transpose(0, 2, 1), (self._point - start)[:, :, None])
         weights = np.column_stack([1.0 - along.sum(axis=1), along[:, :, 0]])
-        error = COORDINATES * np.abs(self._point).max() * np.abs(np.linalg.inv(sides)).sum((1, 2))
+        error = LAST_PLACES * np.abs(self._point).max() * np.abs(np.linalg.inv(sides)).sum((1, 2))
         inside = weights.min(axis=1) + error
         best = np.argsort(-inside)[:1]
         numbers = particles.W.dofmap.index_map.local_to_global(nodes[best].ravel())
@@ -251,7 +248,7 @@ class ControlledSystem:
                 "from those of the last step; move them before, by problem.step() or a path."
             )
         self._gap = goal - control.present()
-        if self._row.norm() <= UNMOVED * self._size:
+        if self._row.norm() <= EQUAL * self._size:
             raise MPMError(
                 "No unknown of the background moves the controlled displacement; control that of "
                 "a point that is not held."
@@ -318,7 +315,7 @@ class ControlledSystem:
         w = self._slope.duplicate()
         solve(self._slope, w)
         moved = self._row.dot(w)
-        if abs(moved) <= UNMOVED * self._size * self._reduced.resistance.motion(w):
+        if abs(moved) <= EQUAL * self._size * self._reduced.resistance.motion(w):
             raise MPMError(
                 "The load does not move the controlled displacement; control another one."
             )

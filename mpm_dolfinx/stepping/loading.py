@@ -37,6 +37,7 @@ from ..system.conditions import dirichlet_values
 from ..system.errors import estimated
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
+from ..tolerances import SMALL
 from .adaptivity import Adaptivity
 from .automatic import ErrorControl, error_of_step
 from .control import Control, Converged, Progress, Run, StepControl
@@ -47,8 +48,6 @@ from .leaving import may_stop, move_bodies
 
 __all__ = ["Mender", "Owner", "Recorder", "Stepper"]
 
-#: Residual of the displacements, relative to the forces, at which a step that alternates ends.
-ALTERNATED = 1e-6
 #: What an alternation may leave of the residual that it begins with.
 INEXACT = 0.1
 #: How much farther a body may move for the same controlled displacement than in the step before.
@@ -834,7 +833,7 @@ class Stepper:
             self.owner.history.statistics.count("alternations")
             left = newton.unbalanced()
             tell(self._comm, NEWTON, "  alternation %d: residual %.2e", number, left)
-            if left <= ALTERNATED:
+            if left <= SMALL:
                 newton.residuals.append(left)
                 return number
             newton.go_on(INEXACT)

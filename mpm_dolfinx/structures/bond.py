@@ -17,13 +17,10 @@ import basix
 from ..errors import MPMError
 from ..parallel.given import as_positive
 from ..system.own import OwnUnknowns
+from ..tolerances import SMALL
 from .layout import Layout, chosen
 
 __all__ = ["Bond", "Grip", "Skin"]
-
-#: Stiffness of a bond that gives way, over its own: no change of force, but a tangent that can be
-#: solved where a whole bar slips.
-GIVEN_WAY = 1e-6
 
 
 @dataclass(frozen=True)
@@ -130,7 +127,8 @@ class Grip:
         trial = before + bond.stiffness * slip
         bears = np.clip(trial, -bond.limit, bond.limit)
         slips = bears != trial
-        tangent = self._sizes * np.where(slips, GIVEN_WAY, 1.0) * bond.stiffness
+        # (where a whole bar slips, no change of force, but a tangent that can be solved with)
+        tangent = self._sizes * np.where(slips, SMALL, 1.0) * bond.stiffness
         return Skin(bears, self._sizes * bears, tangent, slips)
 
 

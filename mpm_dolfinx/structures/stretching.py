@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 
 import basix
 
+from ..tolerances import HALF_DIGITS
 from .laws import Law
 from .layout import Layout
 
 __all__ = ["Nodal", "Rule", "rule_of", "stretched"]
 
 type Array = NDArray[np.float64]
-
-#: Stretch below which a cell has no direction any more.
-LEAST = 1e-8
 
 
 class Rule(NamedTuple):
@@ -120,7 +118,7 @@ def _line(rule: Rule, law: Law, nodes: Array, a: Array, offset: Array, weights: 
     """Return the forces of a line, or of the sheet of which it is the section."""
     (m, q, gdim), k = a.shape, rule.cells.shape[1]
     stretches = np.ones((m, q, rule.components))
-    stretches[..., 0] = np.maximum(np.linalg.norm(a, axis=2), LEAST)
+    stretches[..., 0] = np.maximum(np.linalg.norm(a, axis=2), HALF_DIGITS)
     along = a / stretches[..., :1]
     # what a motion of the nodes stretches: B_c is the derivative of a stretch
     B = np.zeros((rule.components, m, q, k, gdim))
@@ -144,7 +142,7 @@ def _surface(rule: Rule, law: Law, a: Array, offset: Array, weights: Array) -> N
     """Return the forces of a surface."""
     m, q, gdim, _ = a.shape
     squares, axes = np.linalg.eigh(np.einsum("mqgs,mqgt->mqst", a, a))
-    stretches = np.maximum(np.sqrt(np.maximum(squares, 0.0)), LEAST)
+    stretches = np.maximum(np.sqrt(np.maximum(squares, 0.0)), HALF_DIGITS)
     found = law.respond(stretches.reshape(m * q, 2), offset.ravel())
     n, H = found.forces.reshape(m, q, 2), found.tangent.reshape(m, q, 2, 2)
     # second Piola forces S_i = n_i / l_i and their derivatives by Green's strain, on these axes

@@ -26,6 +26,7 @@ from ..parallel.given import is_number
 from ..parallel.totals import over_ranks
 from ..particles.field import ParticleField
 from ..particles.particles import Particles
+from ..tolerances import SOLVED
 from .term import PointMaterial, Term
 
 __all__ = ["FieldEquation"]
@@ -33,10 +34,8 @@ __all__ = ["FieldEquation"]
 type Bound = float | fem.Function | str | None
 """A number, a Function on the field's W, ``"previous"``, or none."""
 
-#: Step of Jacobi's method, relative to the largest value, below which an equation is solved.
-SOLVED = 1e-10
-#: Solves after which a solution is given up, and the most iterations of one.
-MOST, MOST_ITERATIONS = 200, 10000
+#: Solves after which a solution is given up.
+MOST = 200
 #: Times that a step is halved, and which share of the fall of energy that its slope promises it
 #: must have.
 HALVINGS, ENOUGH = 20, 1e-4
@@ -104,7 +103,7 @@ class FieldEquation(Term):
         self._own = field.W.dofmap.index_map.size_local * field.W.dofmap.index_map_bs
         self._comm: MPI.Comm = body.mesh.comm
         self._number = self._body_number = 0
-        self._ksp = conjugate_gradients(self._comm, MOST_ITERATIONS)
+        self._ksp = conjugate_gradients(self._comm)
 
     def _require_bound(self, bound: Any) -> None:
         known = bound is None or bound == "previous" or (is_number(bound) and np.isfinite(bound))

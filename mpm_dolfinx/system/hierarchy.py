@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..background.grids import box_weights, coarser
+from ..tolerances import NEGLIGIBLE
 
 __all__ = ["FieldDofs", "interpolations"]
 
@@ -27,8 +28,6 @@ __all__ = ["FieldDofs", "interpolations"]
 GATHERED = 3000
 #: Share of the dofs above which a coarser level is not worth its while.
 FEWER = 0.7
-#: Values below this are none.
-DROP = 1e-10
 
 
 class FieldDofs(NamedTuple):
@@ -80,7 +79,7 @@ class _Entries(NamedTuple):
         for field in fields:
             dofs, values = field.weights()
             rows = np.broadcast_to(field.numbers[:, None], dofs.shape)
-            kept = values > DROP
+            kept = values > NEGLIGIBLE
             parts.append((rows[kept], first + dofs[kept], values[kept]))
             first += field.size
         return cls(*(np.concatenate(part) for part in zip(*parts, strict=True)))

@@ -13,16 +13,14 @@ from petsc4py import PETSc
 import numpy as np
 
 from ..errors import ConvergenceError
-from ..tolerances import ROUND_OFF
+from ..tolerances import ROUND_OFF, SOLVED
 
 __all__ = ["Projection"]
 
-#: What the residual of a projection falls to, and the most iterations and refinements of it.
-PROJECTED, MOST_ITERATIONS, REFINEMENTS = 1e-13, 100, 6
+#: Most iterations and refinements of a projection, to ``ROUND_OFF``.
+MOST_ITERATIONS, REFINEMENTS = 100, 6
 #: What iterations go on to beyond it, so that momentum does not wander in thousands of steps.
 BEYOND = 0.01
-#: The same for one that has come to the end of what round-off lets it do.
-AT_ROUND_OFF = 1e-10
 #: How often what the shift holds back is let go.
 RELEASES = 3
 #: What is added to it in turn where the factor is at round-off.
@@ -75,7 +73,7 @@ class Projection:
         self._solve_scaled(scaled, y, size)
         rest = self._rest(scaled, y)
         for _ in range(RELEASES):
-            if rest.norm() <= 2.0 * BEYOND * PROJECTED * size:
+            if rest.norm() <= 2.0 * BEYOND * ROUND_OFF * size:
                 break
             part = y.duplicate()
             self._solve_scaled(rest, part, size)
@@ -106,7 +104,7 @@ class Projection:
             if self._incomplete is None:
                 self._incomplete = _incomplete(self._shifted)
             ksp = self._incomplete
-            ksp.setTolerances(rtol=0.0, atol=BEYOND * PROJECTED * size, max_it=MOST_ITERATIONS)
+            ksp.setTolerances(rtol=0.0, atol=BEYOND * ROUND_OFF * size, max_it=MOST_ITERATIONS)
             ksp.solve(right, y)
             if ksp.getConvergedReason() > 0:
                 return
@@ -124,9 +122,9 @@ class Projection:
                 y.axpy(1.0, part)
                 self._shifted.mult(y, rest)
                 rest.aypx(-1.0, right)
-                if rest.norm() <= PROJECTED * size:
+                if rest.norm() <= ROUND_OFF * size:
                     return
-            if rest.norm() <= AT_ROUND_OFF * size:
+            if rest.norm() <= SOLVED * size:
                 return
             self._factor = None
         raise ConvergenceError("The projection of the velocities on the range of T failed")

@@ -107,7 +107,7 @@ class ValueField(Field):
         free = PETSc.IS().createGeneral((first + self.dofs).astype(PETSc.IntType), comm=self._comm)
         block, part = normal.createSubMatrix(free, free), right.getSubVector(free)
         change = part.duplicate()
-        ksp = conjugate_gradients(self._comm, 1000)
+        ksp = conjugate_gradients(self._comm)
         ksp.setOperators(block)
         ksp.solve(part, change)
         if np.isfinite(norm(change)):

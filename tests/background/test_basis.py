@@ -11,7 +11,7 @@ from scenes import ALL, HEXAHEDRON, PLANE, QUADRILATERAL, TETRAHEDRON, TRIANGLE,
 
 from mpm_dolfinx.background import cells
 from mpm_dolfinx.background.basis import BackgroundBasis
-from mpm_dolfinx.tolerances import EQUAL
+from mpm_dolfinx.tolerances import EQUAL, LAST_PLACES
 
 MESHES = {
     **{f"structured {c.name}": (lambda c=c: scenes.unit(4, c)) for c in ALL},
@@ -254,7 +254,7 @@ def test_search_in_a_grid_finds_what_that_by_boxes_does(cell, change, away, monk
     vertices, nodes, number, *_ = (np.concatenate(p) for p in gathered(cells.CellTable.owned(V)))
     low, high = vertices.min(axis=1), vertices.max(axis=1)
     size = np.maximum(np.abs(low), np.abs(high))
-    reach = np.maximum(EQUAL * (high - low), cells.COORDINATES * size)
+    reach = np.maximum(EQUAL * (high - low), LAST_PLACES * size)
     for point, found in zip(points[there], basis.nodes[there], strict=True):
         beyond = np.maximum(low - point, point - high)
         inside = np.flatnonzero((beyond <= reach).all(axis=1))
