@@ -66,7 +66,7 @@ from .summary import in_one_line, on_a_screen
 __all__ = ["Law", "Problem"]
 
 #: What goes with automatic steps, and is of no meaning to others.
-AUTOMATIC = {"tolerance": 1e-2, "output_at": (), "first_step": 0.05, "length": None}
+AUTOMATIC = {"tolerance": 1e-2, "output_at": (), "length": None}
 
 
 type Law = tuple[str, dict[str, Any]]
@@ -409,7 +409,6 @@ class Problem(Hooked):
         control: DisplacementControl | None = None,
         tolerance: float = 1e-2,
         output_at: Sequence[float] = (),
-        first_step: float = 0.05,
         length: float | None = None,
         adapt: float | None = None,
     ) -> History:
@@ -432,7 +431,6 @@ class Problem(Hooked):
                 relative to the motion of the run, as root mean squares over the nodes.
             output_at: With ``"auto"``: shares t of the run in (0, 1] at which a step is to end, to
                 the last bit; ``step.output`` says so.
-            first_step: With ``"auto"``: size of the first step, at most 0.05 of the run.
             length: With ``"auto"``: a motion to be expected, by which the error is measured instead
                 of the motion so far.
             adapt: What :meth:`error` may be. Where it is more at the end of a step, nodes of bodies
@@ -455,7 +453,6 @@ class Problem(Hooked):
             control=control,
             tolerance=tolerance,
             output_at=output_at,
-            first_step=first_step,
             length=length,
             adapt=adapt,
         )
@@ -476,7 +473,6 @@ class Problem(Hooked):
         control: DisplacementControl | None = None,
         tolerance: float = 1e-2,
         output_at: Sequence[float] = (),
-        first_step: float = 0.05,
         length: float | None = None,
         adapt: float | None = None,
     ) -> Iterator[Step]:
@@ -491,7 +487,6 @@ class Problem(Hooked):
             control: As in :meth:`solve`.
             tolerance: As in :meth:`solve`.
             output_at: As in :meth:`solve`.
-            first_step: As in :meth:`solve`.
             length: As in :meth:`solve`.
             adapt: As in :meth:`solve`.
 
@@ -505,15 +500,13 @@ class Problem(Hooked):
         automatic = {
             "tolerance": tolerance,
             "output_at": output_at,
-            "first_step": first_step,
             "length": length,
         }
         if isinstance(steps, str) and steps == "auto":
-            chosen: Any = ErrorControl(tolerance, output_at, first_step, length)
+            chosen: Any = ErrorControl(tolerance, output_at, length)
         elif automatic != AUTOMATIC:
             raise MPMError(
-                "tolerance=, output_at=, first_step= and length= are for steps='auto', not for "
-                f"steps={steps!r}."
+                f"tolerance=, output_at= and length= are for steps='auto', not for steps={steps!r}."
             )
         else:
             chosen = steps

@@ -22,7 +22,7 @@ from .control import LIMIT_HALVINGS, LIMIT_WIDTH, MOST_HALVINGS, Control, StepCo
 
 __all__ = ["ErrorControl", "StepError", "control_of", "error_of_step"]
 
-#: The largest first step: one that walks from the elastic range into flow leaves an error that
+#: The first step: a larger one that walks from the elastic range into flow leaves an error that
 #: nothing repairs.
 FIRST = 0.05
 #: Share of the first step down to which it is taken back where something touches in it.
@@ -110,7 +110,6 @@ class ErrorControl:
     Args:
         tolerance: Error allowed in the end, relative to the motion.
         output_at: Shares of the run at which a step is to end.
-        first_step: The first step.
         length: Compare with it, and not with the motion so far.
 
     Attributes:
@@ -124,10 +123,9 @@ class ErrorControl:
         self,
         tolerance: float = 1e-2,
         output_at: Sequence[float] = (),
-        first_step: float = FIRST,
         length: float | None = None,
     ) -> None:
-        given = {"tolerance": (tolerance, 1.0), "first_step": (first_step, FIRST)}
+        given = {"tolerance": (tolerance, 1.0)}
         if length is not None:
             given["length"] = (length, math.inf)
         for name, (value, most) in given.items():
@@ -146,11 +144,11 @@ class ErrorControl:
                 f"{output_at!r}."
             )
         self.steps: Any = "auto"
-        self._tolerance, self._first = float(tolerance), float(first_step)
+        self._tolerance = float(tolerance)
         self._length = None if length is None else float(length)
         self._levels = [*levels, 1.0]
         self._now = 0.0
-        self._size = self._first
+        self._size = FIRST
         self._before: float | None = None
         self._ratio = 0.0
         self._holds = self._touches = False
@@ -159,14 +157,14 @@ class ErrorControl:
     @property
     def asked(self) -> list[Any]:
         """Options that a run from a checkpoint must share with the one before."""
-        return [self.steps, self._tolerance, self._first, self._length, self._levels]
+        return [self.steps, self._tolerance, self._length, self._levels]
 
     def __str__(self) -> str:
         """Return how the steps are chosen, for a sentence."""
         levels = ", ".join(f"{t:g}" for t in self._levels[:-1])
         return (
-            f"steps chosen by tolerance={self._tolerance:g}, first_step={self._first:g}, "
-            f"length={self._length}, output_at=[{levels}]"
+            f"steps chosen by tolerance={self._tolerance:g}, length={self._length}, "
+            f"output_at=[{levels}]"
         )
 
     @property
@@ -190,7 +188,7 @@ class ErrorControl:
 
     @property
     def _least(self) -> float:
-        return self._first / float(2**MOST_HALVINGS)
+        return FIRST / float(2**MOST_HALVINGS)
 
     @property
     def _smallest(self) -> bool:
@@ -232,7 +230,7 @@ class ErrorControl:
         first step is made small.
         """
         tried = self.target - self._now
-        small = not self._touches or tried <= EARLIEST * self._first
+        small = not self._touches or tried <= EARLIEST * FIRST
         if self._ratio <= REJECTED or (self._before is None and small):
             return False
         if self._smallest:
@@ -251,8 +249,7 @@ class ErrorControl:
             f"tolerance={self._tolerance:g}{length} cannot be kept: {MANY} steps of the smallest "
             f"size, {self._least:.3g} of the load, had errors above the allowed one (the last "
             f"{self._ratio:.3g} times), and the run goes on with them for up to "
-            f"{math.ceil((1.0 - self._now) / self._least)} steps; give larger ones, or a smaller "
-            "first_step."
+            f"{math.ceil((1.0 - self._now) / self._least)} steps; give larger ones."
         )
 
     def accept(self, iterations: int) -> None:
@@ -275,7 +272,7 @@ class ErrorControl:
 
     def begin_anew(self) -> None:
         """Try a step as at the beginning, after what made smaller ones fail has changed."""
-        self._size, self._before, self._holds = self._first, None, False
+        self._size, self._before, self._holds = FIRST, None, False
 
     def cut_back(self, gave_up: bool = False) -> bool:
         """Halve the step; return False where it is at its smallest, or a limit is found.
@@ -284,7 +281,7 @@ class ErrorControl:
             gave_up: As in :meth:`StepControl.cut_back`.
         """
         tried = self.target - self._now
-        limit = tried <= self._first / 2**LIMIT_HALVINGS and tried <= LIMIT_WIDTH * self._now
+        limit = tried <= FIRST / 2**LIMIT_HALVINGS and tried <= LIMIT_WIDTH * self._now
         if self._smallest or (gave_up and limit):
             return False
         self._size, self._holds = max(0.5 * tried, self._least), True

@@ -381,7 +381,6 @@ def test_a_length_instead_of_the_motion():
         ({"steps": 3, "tolerance": 0.1}, r"are for steps='auto', not for steps=3"),
         ({"tolerance": 0.0}, r"tolerance must be a positive number up to 1, not 0.0"),
         ({"tolerance": "small"}, r"tolerance must be a positive number"),
-        ({"first_step": 0.2}, r"first_step must be a positive number up to 0.05, not 0.2"),
         ({"length": -1.0}, r"length must be a positive number, not -1.0"),
         ({"output_at": [0.0, 0.5]}, r"output_at must be a list of shares of the run"),
         ({"output_at": 0.5}, r"output_at must be a list of shares of the run"),
