@@ -30,10 +30,8 @@ SHARP = 0.3
 SECANTS = 4
 #: Growth of the norm up to which a step goes on over a fold.
 FOLD = 10.0
-#: Steps that may follow one which is taken on trust until the residual is below that before it.
-TRUST = 7
-#: Iterations within which the smallest residual must fall, in a solve that hurries too, and to what
-#: share of itself.
+#: Iterations within which the smallest residual must fall to a share of itself; fewer in a solve
+#: that hurries, and for a step taken on trust to have paid.
 PATIENCE = 15
 LITTLE_PATIENCE = 7
 HEADWAY = 0.7
@@ -208,7 +206,7 @@ class LineSearch:
 
     def _overdue(self, F: PETSc.Vec) -> bool:
         """Whether a step taken on trust should have paid by now."""
-        if self._trusted is None or self._since < TRUST:
+        if self._trusted is None or self._since < LITTLE_PATIENCE:
             return False
         return norm(F) > self._trusted.norm
 
