@@ -729,6 +729,8 @@ def stretched_pit(*terms):
 
 
 POINTS = line((0.1, 0.45), (1.9, 0.9), 12)
+#: Forces by stretches of 1500, which are known to round-off of one.
+KNOWN = 1e-14 * 1500.0
 
 
 def test_two_that_are_drawn_alike_go_on_each_as_its_own():
@@ -743,7 +745,7 @@ def test_two_that_are_drawn_alike_go_on_each_as_its_own():
     problem.stage("equal", terms=others)
     problem.solve()
     for one, other in zip(before, others[::-1], strict=True):
-        assert np.abs(other.force - one.force).max() < 1e-12
+        assert np.abs(other.force - one.force).max() < KNOWN
     assert np.abs(soil.displacement.x.array - d).max() < 1e-12
     # of two others nobody knows which is which, unless they are called so
     changed = [mpm.Truss(soil, POINTS, stiffness) for stiffness in (600.0, 1600.0)]
@@ -755,7 +757,7 @@ def test_two_that_are_drawn_alike_go_on_each_as_its_own():
     problem.stage("called", terms=changed)
     problem.solve()
     for one, other in zip(others, changed, strict=True):
-        assert np.abs(other.force - one.force).max() < 1e-12
+        assert np.abs(other.force - one.force).max() < KNOWN
 
 
 def test_a_bond_elsewhere_has_the_forces_of_its_own_nodes():
@@ -784,7 +786,7 @@ def test_a_sheet_goes_on_as_an_equal_one_alone():
     other = mpm.Membrane(soil, POINTS, 1e3, 0.2)
     problem.stage("equal", terms=[other])
     problem.solve()
-    assert np.abs(other.force - before.force).max() < 1e-12
+    assert np.abs(other.force - before.force).max() < KNOWN
     assert np.abs(soil.displacement.x.array - d).max() < 1e-12
     for options in ({"stiffness": 4e3, "poisson": 0.2}, {"stiffness": 1e3}):
         with pytest.raises(mpm.MPMError, match="cannot go on as one that is drawn like it"):
