@@ -24,6 +24,7 @@ def digest(text: str, length: int = 8) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:length]
 
 
+@cache
 def plain(path: Path) -> str:
     """Return the code of a script, without its comments and docstrings, in one layout."""
     return ast.unparse(_tree(path))

@@ -174,8 +174,9 @@ Ways<T, dim, bends> ways_of(const core::Meeting& m, std::size_t p)
   return ways;
 }
 
+// (One function of all kinds would take compilers twice as long.)
 template <int dim, int bends>
-void act_in(const core::Meeting& m, const core::Met& result)
+HOT_LOOP void act_in(const core::Meeting& m, const core::Met& result)
 {
   for (std::size_t p = 0; p < m.points; ++p)
   {
@@ -316,18 +317,15 @@ void add_at(const core::Sums& sums, std::size_t p, int nodes, int count, const d
   }
 }
 
-template <int dim, int bends>
-void add_tangents_in(const core::Meeting& m, const core::Sums& sums)
+template <int dim, int bends, bool rubs>
+HOT_LOOP void add_tangents_in(const core::Meeting& m, const core::Sums& sums)
 {
   constexpr int vectors = dim + bends;
   std::vector<double> D((1 + m.nodes) * dim * m.count * dim);
   std::vector<double> work(m.nodes * vectors + vectors * dim * m.count * dim);
   for (std::size_t p = 0; p < m.points; ++p)
   {
-    if (m.known.smooth)
-      differentiate_at<dim, bends, false>(m, p, D.data(), work);
-    else
-      differentiate_at<dim, bends, true>(m, p, D.data(), work);
+    differentiate_at<dim, bends, rubs>(m, p, D.data(), work);
     add_at<dim>(sums, p, m.nodes, m.count, D.data());
   }
 }
@@ -356,17 +354,21 @@ void with_kind(int dim, int nodes, F&& f)
 }
 } // namespace
 
-HOT_LOOP void core::act(const Meeting& meeting, int dim, const Met& result)
+void core::act(const Meeting& meeting, int dim, const Met& result)
 {
   with_kind(dim, meeting.nodes, [&](auto kind) {
     act_in<decltype(kind)::dim, decltype(kind)::bends>(meeting, result);
   });
 }
 
-HOT_LOOP void core::add_tangents(const Meeting& meeting, int dim, const Sums& sums)
+void core::add_tangents(const Meeting& meeting, int dim, const Sums& sums)
 {
   with_kind(dim, meeting.nodes, [&](auto kind) {
-    add_tangents_in<decltype(kind)::dim, decltype(kind)::bends>(meeting, sums);
+    constexpr int dimension = decltype(kind)::dim, bends = decltype(kind)::bends;
+    if (meeting.known.smooth)
+      add_tangents_in<dimension, bends, false>(meeting, sums);
+    else
+      add_tangents_in<dimension, bends, true>(meeting, sums);
   });
 }
 
