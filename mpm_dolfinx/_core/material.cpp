@@ -1261,8 +1261,9 @@ bool update_point(const double* gradient, const double* old_gradient, const doub
   return true;
 }
 
+// (One function of all laws would take compilers many times as long.)
 template <int dim, typename Law>
-std::vector<std::int64_t> update_all(const core::Update& u)
+HOT_LOOP std::vector<std::int64_t> update_all(const core::Update& u)
 {
   constexpr int size = dim * dim, m = dim == 2 ? 4 : 6;
   std::vector<std::int64_t> invalid;
@@ -1298,7 +1299,7 @@ std::vector<std::int64_t> update_all(const core::Update& u, int dim)
 }
 } // namespace
 
-HOT_LOOP std::vector<std::int64_t> core::update_logarithmic(const Update& update, int dim)
+std::vector<std::int64_t> core::update_logarithmic(const Update& update, int dim)
 {
   switch (update.law)
   {
