@@ -22,6 +22,7 @@ from .meshes.grid import grid, grid_lines  # noqa: E402
 from .meshes.regions import cell_tags, facet_tags, held, region  # noqa: E402
 from .particles.field import ParticleField  # noqa: E402
 from .particles.particles import Particles  # noqa: E402
+from .particles.probe import probe  # noqa: E402
 from .problems.body import Body, PoreFluid  # noqa: E402
 from .problems.dynamic import DynamicParticleProblem, DynamicProblem  # noqa: E402
 from .problems.initial_stress import geostatic  # noqa: E402
@@ -95,6 +96,7 @@ __all__ = [
     "held",
     "materials",
     "plot",
+    "probe",
     "region",
     "strength_reduction",
     "taped",

@@ -1,0 +1,124 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Results at material points, wherever the body has taken them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dolfinx import geometry
+
+from .. import _compat
+from ..errors import MPMError, agree
+from ..parallel.boundary import collective
+from ..parallel.given import require_same
+from ..parallel.totals import over_ranks
+from ..reals import as_reals
+from ..tolerances import NEGLIGIBLE
+from .particles import Particles
+
+__all__ = ["probe"]
+
+
+@collective()
+def probe(particles: Particles, points: Any, field: str = "displacement") -> NDArray[np.float64]:
+    """Return a result at points of a body, the same on all ranks (collective).
+
+    Points are where they were in the undeformed body, and move with it: asked after each step, a
+    probe tells the history of a point.
+
+    Args:
+        particles: The body.
+        points: Undeformed coordinates, shape ``(m, gdim)`` or ``(gdim,)``.
+        field: ``"displacement"``, or ``"position"``, both interpolated within the domain of a
+            point; or a name in ``particles.fields()``, as ``"stress"``, ``"plastic_strain"``,
+            ``"pore_pressure"``: the value of the particle whose domain has the point, that of the
+            first of them between several.
+
+    Returns:
+        Values, shape ``(m, ...)``; of a single point without the first index.
+
+    Raises:
+        MPMError: Points outside the body, a name that there is not, or a body that was rebased,
+            whose mesh does not show the undeformed body.
+    """
+    comm, gdim = particles.mesh.comm, particles.mesh.geometry.dim
+    with agree(comm):
+        try:
+            given = as_reals(points)
+        except (TypeError, ValueError):
+            given = np.zeros(0)
+        if given.shape[-1:] != (gdim,) or given.ndim > 2 or not np.isfinite(given).all():
+            raise MPMError(f"points must be numbers of shape (m, {gdim}), or one point ({gdim},).")
+        if particles.undeformed.origin is not None:
+            raise MPMError(
+                "The body was rebased, so that its mesh does not show where points were in the "
+                "undeformed body; probe() before that, or look at particles.centroid."
+            )
+    require_same(comm, points=given, field=field)
+    at = np.atleast_2d(given)
+    cells = _cells(particles, at)
+    with agree(comm):
+        values = _values(particles, field, at, cells)
+    found = over_ranks(comm, values)
+    return np.asarray(found[0] if given.ndim == 1 else found)
+
+
+def _cells(particles: Particles, points: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Return this rank's particle at each point, -1 where it is another rank's (collective)."""
+    mesh, comm = particles.mesh, particles.mesh.comm
+    at = np.zeros((len(points), 3))
+    at[:, : points.shape[1]] = points
+    own = np.arange(particles.num_local, dtype=np.int32)
+    x = mesh.geometry.x
+    ends = (x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf))
+    low, high = np.swapaxes(comm.allgather(ends), 0, 1)
+    slack = NEGLIGIBLE * float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
+    none = np.iinfo(np.int64).max
+    names = np.full(len(at), none)
+    cells = np.full(len(at), -1, dtype=np.int32)
+    if len(own):
+        tree = _compat.cell_tree(mesh, own, slack)
+        offsets, near = _compat.candidate_cells(tree, at)
+        of = np.repeat(np.arange(len(at)), np.diff(offsets))
+        squares = geometry.squared_distance(mesh, mesh.topology.dim, near, at[of])
+        for point, cell in zip(of[squares <= slack**2], near[squares <= slack**2], strict=True):
+            if particles.global_index[cell] < names[point]:
+                names[point], cells[point] = particles.global_index[cell], cell
+    first = np.min(comm.allgather(names), axis=0)
+    with agree(comm):
+        if (first == none).any():
+            where = tuple(float(f"{c:.6g}") for c in points[first == none][0])
+            raise MPMError(
+                f"The point {where} is not in the undeformed body; give coordinates there, not "
+                "those of the background or of a later time."
+            )
+    return np.where(names == first, cells, -1).astype(np.int32)
+
+
+def _values(
+    particles: Particles, field: str, points: NDArray[np.float64], cells: NDArray[np.int32]
+) -> NDArray[np.float64]:
+    """Return this rank's values at points, zeros at those of others."""
+    mine = cells >= 0
+    if field in ("displacement", "position"):
+        at = np.zeros((len(points), 3))
+        at[:, : points.shape[1]] = points
+        values = np.zeros(points.shape)
+        if mine.any():
+            values[mine] = particles.displacement.eval(at[mine], cells[mine]).reshape(
+                mine.sum(), -1
+            )
+        if field == "position":
+            values[mine] += points[mine]
+        return values
+    fields = particles.fields()
+    if field not in fields:
+        names = ", ".join(["displacement", "position", *fields])
+        raise MPMError(f"There is no field {field!r} of these particles; they have {names}.")
+    values = np.zeros((len(points), *fields[field].shape[1:]))
+    values[mine] = fields[field][cells[mine]]
+    return values

@@ -1,0 +1,83 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Results at points of a body, beside what was prescribed and what the particles have."""
+
+import numpy as np
+import pytest
+import scenes
+
+from dolfinx import mesh
+
+import mpm_dolfinx as mpm
+
+CELLS = {2: mesh.CellType.quadrilateral, 3: mesh.CellType.hexahedron}
+
+
+def bar(dim=2, degree=1, cell=None):
+    """A bar of length 2 that is drawn by 10 % along x, without anything across."""
+    cell = cell or CELLS[dim]
+    kind = CELLS[dim]
+    V = scenes.vectors(
+        scenes.box([0.0] * dim, [3.0] + [1.0] * (dim - 1), [6, 2, 2][:dim], kind), degree
+    )
+    body = scenes.box([0.0] * dim, [2.0] + [1.0] * (dim - 1), [8, 4, 4][:dim], cell)
+    particles = mpm.Particles(body, V, degree=degree)
+    ends = [mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=(2.0, 3.0), value=0.2)]
+    sides = [mpm.held(V, i, x=(0.0, 3.0)) for i in range(1, dim)]
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(particles, mpm.materials.Hencky(1e3, 0.0)), bcs=[*ends, *sides]
+    )
+    return particles, problem
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("degree", [1, 2])
+def test_a_bar_that_is_drawn(dim, degree):
+    particles, problem = bar(dim, degree)
+    points = np.array([[0.3, 0.7, 0.2], [1.0, 0.5, 0.5], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])[:, :dim]
+    for step in problem.steps(1):
+        u = mpm.probe(particles, points)
+        assert np.allclose(u[:, 0], 0.1 * step.load * points[:, 0], atol=1e-10)
+        assert np.allclose(u[:, 1:], 0.0, atol=1e-12)
+        assert np.allclose(mpm.probe(particles, points, "position"), points + u, atol=1e-14)
+        stress = mpm.probe(particles, points, "stress")
+        exact = 1e3 * np.log(1 + 0.1 * step.load) / (1 + 0.1 * step.load)  # Cauchy: tau / J
+        assert stress.shape == (4, 3, 3) and np.allclose(stress[:, 0, 0], exact, rtol=1e-8)
+        one = mpm.probe(particles, points[0])
+        assert one.shape == (dim,) and np.allclose(one, u[0], rtol=1e-14, atol=1e-16)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_points_of_uneven_cells(dim):
+    particles, _ = bar(dim)
+    x = particles.mesh.geometry.x
+    x[:, 0] += 0.03 * np.sin(np.pi * x[:, 0]) * np.cos(3.0 * x[:, 1])
+    turn = np.arange(9.0).reshape(3, 3)[:dim, :dim]
+    particles.displacement.interpolate(lambda X: turn @ X[:dim])
+    points = np.random.default_rng(0).uniform(0.05, 0.95, (40, dim))
+    assert np.allclose(mpm.probe(particles, points), points @ turn.T, rtol=1e-11)
+
+
+def test_a_field_is_that_of_the_particle_there():
+    particles, problem = bar(cell=mesh.CellType.triangle)
+    problem.solve(steps=1)
+    own = mesh.compute_midpoints(particles.mesh, 2, np.arange(particles.num_local, dtype=np.int32))[
+        :, :2
+    ]
+    every = np.concatenate(particles.mesh.comm.allgather(own))
+    expected = np.concatenate(
+        particles.mesh.comm.allgather(particles.volume / particles.initial_volume)
+    )
+    assert np.allclose(mpm.probe(particles, every, "volume_ratio"), expected, rtol=1e-14)
+
+
+def test_what_cannot_be_asked():
+    particles, problem = bar()
+    problem.solve(steps=1)
+    with pytest.raises(mpm.MPMError, match=r"point \(2.1, 0.5\) is not in the undeformed body"):
+        mpm.probe(particles, [(1.0, 0.5), (2.1, 0.5)])
+    with pytest.raises(mpm.MPMError, match=r"no field 'pressur'.*they have displacement, position"):
+        mpm.probe(particles, (1.0, 0.5), "pressur")
+    for points in [(1.0,), "here", [[[0.0, 0.0]]], (np.nan, 0.0)]:
+        with pytest.raises(mpm.MPMError, match=r"shape \(m, 2\)"):
+            mpm.probe(particles, points)
