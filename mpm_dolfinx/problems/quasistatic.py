@@ -179,7 +179,7 @@ class QuasiStaticProblem(Problem):
                 raise MPMError(f"Fracture does not go with {what}.")
 
     def _not_for_cracks(self) -> dict[str, bool]:
-        """Return names of further options that cracks do not go with, and whether they are there."""
+        """Return further options that cracks do not go with, and whether they are there."""
         return {}
 
     #: What bodies may have besides, which is for some problems alone.
