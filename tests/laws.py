@@ -11,6 +11,21 @@ from mpm_dolfinx._core import is_as_inherited
 from mpm_dolfinx.materials import Hencky, VonMises
 
 
+def assert_as_in_python(law, path):
+    """Compare a compiled law with the same in NumPy along a path, ``(steps, n, dim, dim)``."""
+    reference, state = in_python(law), law.initial_state(*path[0].shape[:2])
+    for H in path:
+        H[0] = 0.0
+        mine, theirs = law.update(H, state), reference.update(H, state)
+        assert mine.state.keys() == theirs.state.keys()
+        for key, values in theirs.state.items():
+            bound = 1e-11 * np.abs(values).max()
+            np.testing.assert_allclose(mine.state[key], values, rtol=0.0, atol=bound)
+        bound = 2e-9 * np.abs(theirs.tangent).max()
+        np.testing.assert_allclose(mine.tangent, theirs.tangent, rtol=0.0, atol=bound)
+        state = theirs.state
+
+
 def in_python(law):
     """Return the same law without its compiled update, as laws are that override something."""
     found = copy.copy(law)

@@ -51,6 +51,8 @@ def collective[**P, R](*own: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        signature = inspect.signature(function)
+
         @functools.wraps(function)
         def call(*args: P.args, **given: P.kwargs) -> R:
             if _within and _within[-1] is not None:
@@ -58,7 +60,7 @@ def collective[**P, R](*own: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
             comm = _ranks_of([*args, *given.values()], 3) or called_last() or MPI.COMM_SELF
             with _entered(comm), explained(function, args, given):
                 if comm.size > 1:
-                    require_same(comm, **_named(function, own, args, given))
+                    require_same(comm, **_named(signature, own, args, given))
                 require_truths(function, args, given)
                 result = function(*args, **given)
             return cast(R, _together(result, comm)) if isinstance(result, Generator) else result
@@ -97,15 +99,16 @@ def _together[T](values: Generator[T], comm: MPI.Comm) -> Iterator[T]:
 
 
 def _named(
-    function: Callable[..., Any], own: tuple[str, ...], args: Any, given: Any
+    signature: inspect.Signature, own: tuple[str, ...], args: Any, given: Any
 ) -> dict[str, Any]:
-    """Return the values that a call was given, by names of parameters, but for those of a rank."""
-    signature = inspect.signature(function)
+    """Return the values that a call was given, by names of parameters, but for those of a rank.
+
+    There are none where arguments do not fit: the call has Python's own sentence about that.
+    """
     try:
         bound = signature.bind(*args, **given)
     except TypeError:
-        function(*args, **given)  # Python's own sentence, as on one rank
-        raise
+        return {}
     bound.apply_defaults()
     named: dict[str, Any] = {}
     for name, value in bound.arguments.items():

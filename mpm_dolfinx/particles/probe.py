@@ -14,7 +14,6 @@ from dolfinx import geometry
 from .. import _compat
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
-from ..parallel.given import require_same
 from ..parallel.totals import over_ranks
 from ..reals import as_reals
 from ..tolerances import NEGLIGIBLE
@@ -58,8 +57,8 @@ def probe(particles: Particles, points: Any, field: str = "displacement") -> NDA
                 "The body was rebased, so that its mesh does not show where points were in the "
                 "undeformed body; probe() before that, or look at particles.centroid."
             )
-    require_same(comm, points=given, field=field)
-    at = np.atleast_2d(given)
+    at = np.zeros((given.size // gdim, 3))
+    at[:, :gdim] = given
     cells = _cells(particles, at)
     with agree(comm):
         values = _values(particles, field, at, cells)
@@ -68,30 +67,28 @@ def probe(particles: Particles, points: Any, field: str = "displacement") -> NDA
 
 
 def _cells(particles: Particles, points: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Return this rank's particle at each point, -1 where it is another rank's (collective)."""
+    """Return this rank's particle at points in space, -1 where it is another's (collective)."""
     mesh, comm = particles.mesh, particles.mesh.comm
-    at = np.zeros((len(points), 3))
-    at[:, : points.shape[1]] = points
     own = np.arange(particles.num_local, dtype=np.int32)
     x = mesh.geometry.x
     ends = (x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf))
     low, high = np.swapaxes(comm.allgather(ends), 0, 1)
     slack = NEGLIGIBLE * float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
     none = np.iinfo(np.int64).max
-    names = np.full(len(at), none)
-    cells = np.full(len(at), -1, dtype=np.int32)
+    names = np.full(len(points), none)
+    cells = np.full(len(points), -1, dtype=np.int32)
     if len(own):
         tree = _compat.cell_tree(mesh, own, slack)
-        offsets, near = _compat.candidate_cells(tree, at)
-        of = np.repeat(np.arange(len(at)), np.diff(offsets))
-        squares = geometry.squared_distance(mesh, mesh.topology.dim, near, at[of])
+        offsets, near = _compat.candidate_cells(tree, points)
+        of = np.repeat(np.arange(len(points)), np.diff(offsets))
+        squares = geometry.squared_distance(mesh, mesh.topology.dim, near, points[of])
         for point, cell in zip(of[squares <= slack**2], near[squares <= slack**2], strict=True):
             if particles.global_index[cell] < names[point]:
                 names[point], cells[point] = particles.global_index[cell], cell
     first = np.min(comm.allgather(names), axis=0)
     with agree(comm):
         if (first == none).any():
-            where = tuple(float(f"{c:.6g}") for c in points[first == none][0])
+            where = tuple(float(f"{c:.6g}") for c in points[first == none][0][: mesh.geometry.dim])
             raise MPMError(
                 f"The point {where} is not in the undeformed body; give coordinates there, not "
                 "those of the background or of a later time."
@@ -102,18 +99,16 @@ def _cells(particles: Particles, points: NDArray[np.float64]) -> NDArray[np.int3
 def _values(
     particles: Particles, field: str, points: NDArray[np.float64], cells: NDArray[np.int32]
 ) -> NDArray[np.float64]:
-    """Return this rank's values at points, zeros at those of others."""
+    """Return this rank's values at points in space, zeros at those of others."""
     mine = cells >= 0
     if field in ("displacement", "position"):
-        at = np.zeros((len(points), 3))
-        at[:, : points.shape[1]] = points
-        values = np.zeros(points.shape)
+        gdim = particles.mesh.geometry.dim
+        values = np.zeros((len(points), gdim))
         if mine.any():
-            values[mine] = particles.displacement.eval(at[mine], cells[mine]).reshape(
-                mine.sum(), -1
-            )
+            moved = particles.displacement.eval(points[mine], cells[mine])
+            values[mine] = moved.reshape(-1, gdim)
         if field == "position":
-            values[mine] += points[mine]
+            values[mine] += points[mine, :gdim]
         return values
     fields = particles.fields()
     if field not in fields:
