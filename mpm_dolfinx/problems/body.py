@@ -182,6 +182,11 @@ class Body:
         """Whether a law of it is a :class:`mpm_dolfinx.materials.Fracture`."""
         return any(isinstance(law, Fracture) for law in self.laws)
 
+    @property
+    def takes_time(self) -> bool:
+        """Whether a law of it has a ``relaxation_time``."""
+        return any(getattr(law, "needs_time", False) for law in self.laws)
+
     def replace(self, **changes: Any) -> Body:
         """Return the same body with some things changed, such as ``tractions=[...]`` for a stage.
 

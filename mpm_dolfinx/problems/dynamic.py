@@ -392,7 +392,7 @@ def _static_among(
     if all(static):
         raise MPMError(
             "With quasi_static= at least one body must move; where none does, make a "
-            "QuasiStaticProblem."
+            "QuasiStaticProblem, or a PorousProblem if laws take time."
         )
     if any(still and body.velocity is not None for still, body in zip(static, bodies, strict=True)):
         raise MPMError("A body of quasi_static= has no velocity; omit it.")

@@ -82,8 +82,8 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
 
     Args:
         bodies: One :class:`Body`, or a list, of degree 2 or 3 on a background of degree 2 or 3
-            where they have a ``pore_fluid``; one at least has. Bodies without, such as a footing,
-            are dry.
+            where they have a ``pore_fluid``. Bodies without, such as a footing, are dry; all may
+            be, if a law has a ``relaxation_time``: that is equilibrium through time.
         bcs: As in :class:`QuasiStaticProblem`, and on the space of the pore pressure.
         pressure_space: Background space of the pore pressure, for Dirichlet conditions on it in
             ``bcs``; ``None``: continuous, of one degree less than V on its mesh.
@@ -117,8 +117,10 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         for name in ("mixed", "background", "fields"):
             if name in options:
                 raise MPMError(f"A PorousProblem has no {name}=; omit it.")
-        if all(body.pore_fluid is None for body in given):
-            raise MPMError("A PorousProblem needs a body with a pore_fluid= at least.")
+        if not any(body.pore_fluid is not None or body.takes_time for body in given):
+            raise MPMError(
+                "A PorousProblem needs a body with a pore_fluid=, or a law with a relaxation_time=."
+            )
         self._spaces_of_water = _spaces(given, pressure_space)
         self._filled: list[_Filled] = []
         super().__init__(bodies, bcs, **options)

@@ -190,12 +190,11 @@ class QuasiStaticProblem(Problem):
 
     def _require_given(self, bodies: Sequence[Body]) -> None:
         """Raise an error where bodies have what is for other problems alone."""
-        laws = [law for body in bodies for law in body.laws]
-        if not self._has_time and any(getattr(law, "needs_time", False) for law in laws):
+        if not self._has_time and any(body.takes_time for body in bodies):
             raise MPMError(
                 "A law with a relaxation_time needs steps with a duration, which a "
-                f"{type(self).__name__} does not have; make a DynamicProblem or a PorousProblem, "
-                "or omit it: that is the law of loads that last."
+                f"{type(self).__name__} does not have; make a PorousProblem, of dry bodies too, or "
+                "a DynamicProblem; or omit it: that is the law of loads that last."
             )
         for name, kind in (("velocity", "DynamicProblem"), ("pore_fluid", "PorousProblem")):
             if name not in self._further and any(getattr(b, name) is not None for b in bodies):

@@ -172,6 +172,10 @@ def moving(particles, bc, law):
     return mpm.DynamicProblem(mpm.Body(particles, law, density=2.0), bcs=[bc], scheme="euler")
 
 
+def dry(particles, bc, law):
+    return mpm.PorousProblem(mpm.Body(particles, law), bcs=[bc])
+
+
 def drained(particles, bc, law):
     fluid = mpm.PoreFluid(1e9, drained=[(0.0, 1)])
     tags = mpm.facet_tags(particles.mesh, {1: lambda x: x[0] < 9.0})
@@ -180,7 +184,8 @@ def drained(particles, bc, law):
 
 
 @pytest.mark.parametrize(
-    ("problem_of", "law"), [(moving, "plain"), (moving, "undrained"), (drained, "plain")]
+    ("problem_of", "law"),
+    [(moving, "plain"), (moving, "undrained"), (dry, "plain"), (drained, "plain")],
 )
 def test_stress_beyond_yield_relaxes_with_the_time_of_steps(problem_of, law):
     """A block that is sheared at once and held, in steps of two durations."""
