@@ -71,6 +71,16 @@ def rollers(V: fem.FunctionSpace, *planes: tuple[int, float]) -> list[fem.Dirich
     return bcs
 
 
+def particles_of(
+    body: mesh.Mesh, V: fem.FunctionSpace, method: str, degree: int, rule: int | None = None
+) -> mpm.Particles:
+    """Return particles of a method; for ``"fem"`` finite elements."""
+    options: dict[str, Any] = {"degree": degree, "quadrature_degree": rule}
+    if method == "fem":
+        return mpm.Particles(body, **options)
+    return mpm.Particles(body, V, method=method, **options)
+
+
 def _column(
     elements: float,
     height: float,
@@ -85,10 +95,10 @@ def _column(
     upper = [height / n, height]
     V = fem.functionspace(kit.box(upper, [1, n], kit.DOMAINS["quad"]), ("Lagrange", degree, (2,)))
     body = kit.box(upper, [2, 2 * n], kit.DOMAINS[domain])
-    particles = mpm.Particles(body, V, method=method, degree=degree)
+    particles = particles_of(body, V, method, degree)
     problem = mpm.QuasiStaticProblem(
         mpm.Body(particles, law, body_force=(0.0, -weight)),
-        bcs=rollers(V, (0, 0.0), (0, upper[0]), (1, 0.0)),
+        bcs=rollers(particles.V, (0, 0.0), (0, upper[0]), (1, 0.0)),
         solver=mpm.Solver(petsc_options_prefix="column_"),
     )
     return particles, problem
@@ -160,7 +170,7 @@ def compaction_in_space(
         kit.box(upper, [n, n, 4 * n], kit.DOMAINS["hex"]), ("Lagrange", degree, (3,))
     )
     body = kit.box(upper, [2 * n, 2 * n, 8 * n], kit.DOMAINS[domain])
-    particles = mpm.Particles(body, V, method=method, degree=degree)
+    particles = particles_of(body, V, method, degree)
     sides = [(axis, place) for axis in (0, 1) for place in (0.0, width)]
     problem = mpm.QuasiStaticProblem(
         mpm.Body(
@@ -168,7 +178,7 @@ def compaction_in_space(
             mpm.materials.Hencky(COMPACTION_IN_SPACE["young"], COMPACTION_IN_SPACE["poisson"]),
             body_force=(0.0, 0.0, -COMPACTION_IN_SPACE["weight"]),
         ),
-        bcs=rollers(V, *sides, (2, 0.0)),
+        bcs=rollers(particles.V, *sides, (2, 0.0)),
         solver=mpm.Solver(petsc_options_prefix="column_"),
     )
     return Scene(problem, steps, lambda: position_error(particles.displacement))
@@ -235,10 +245,10 @@ def column_free(
     V = fem.functionspace(background, ("Lagrange", degree, (2,)))
     body = kit.box([4.0, 8.0], [round(8.0 / size), round(16.0 / size)], kit.DOMAINS[domain])
     rule = 2 if f_bar == "domain" else None
-    particles = mpm.Particles(body, V, method=method, degree=degree, quadrature_degree=rule)
+    particles = particles_of(body, V, method, degree, rule)
     problem = mpm.QuasiStaticProblem(
         mpm.Body(particles, free_law(), body_force=(0.0, -weight), f_bar=f_bar),
-        bcs=rollers(V, (0, 0.0), (1, 0.0)),
+        bcs=rollers(particles.V, (0, 0.0), (1, 0.0)),
         solver=mpm.Solver(petsc_options_prefix="collapse_"),
     )
 
@@ -265,7 +275,7 @@ def cantilever(
     background = kit.box([11.0, 10.0], cells, kit.DOMAINS["quad"])
     V = fem.functionspace(background, ("Lagrange", degree, (2,)))
     body = beam(size, domain)
-    particles = mpm.Particles(body, V, method=method, degree=degree)
+    particles = particles_of(body, V, method, degree)
     problem = mpm.QuasiStaticProblem(
         mpm.Body(
             particles,
@@ -273,7 +283,7 @@ def cantilever(
             tractions=[((0.0, -100e3), 1)],
             facet_tags=beam_end(body),
         ),
-        bcs=rollers(V, (0, 0.0)) + clamp(V),
+        bcs=rollers(particles.V, (0, 0.0)) + clamp(particles.V),
         solver=mpm.Solver(petsc_options_prefix="cantilever_"),
     )
     return Scene(problem, steps, lambda: tip_error(particles.displacement))
@@ -336,11 +346,12 @@ def block(
     V = fem.functionspace(background, ("Lagrange", degree, (3,)))
     body = kit.box([1.0] * 3, [2 * n] * 3, kit.DOMAINS[domain])
     rule = 2 if degree == 1 else None
-    particles = mpm.Particles(body, V, method=method, degree=degree, quadrature_degree=rule)
+    particles = particles_of(body, V, method, degree, rule)
+    V = particles.V
     top = np.sort(mesh.locate_entities_boundary(body, 2, lambda x: np.isclose(x[2], 1.0)))
     plane = fem.Constant(body, 1.0)
     above = ufl.SpatialCoordinate(body)[2] + particles.displacement[2] - plane
-    base = mesh.locate_entities_boundary(background, 2, lambda x: np.isclose(x[2], 0.0))
+    base = mesh.locate_entities_boundary(V.mesh, 2, lambda x: np.isclose(x[2], 0.0))
     plate = [
         fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 2, base), V.sub(i))
         for i in range(3)
@@ -435,7 +446,7 @@ def hertz(
     over = np.append(y, 0.4 * HERTZ["half"] / size)
     wide = np.append(x, 2.0 * x[-1] - x[-2])
     V = fem.functionspace(graded(wide, over, 1), ("Lagrange", degree, (2,)))
-    particles = mpm.Particles(graded(x, y, 2), V, method=method, degree=degree)
+    particles = particles_of(graded(x, y, 2), V, method, degree)
     radius, depth = HERTZ["radius"], HERTZ["depth"]
     die = mpm.contact.Rigid(
         particles,
@@ -443,6 +454,7 @@ def hertz(
         facet_tags=hertz_top(particles.mesh),
         tag=1,
     )
+    V = particles.V
     base = mesh.locate_entities_boundary(V.mesh, 1, lambda x: np.isclose(x[1], y[0]))
     floor = fem.dirichletbc(np.zeros(2), fem.locate_dofs_topological(V, 1, base), V)
     problem = mpm.QuasiStaticProblem(
@@ -554,9 +566,7 @@ def vortex(
     square = [[-half / size] * 2, [half / size] * 2]
     background = mesh.create_rectangle(kit.comm, square, [2 * half] * 2, kit.DOMAINS["quad"])
     V = fem.functionspace(background, ("Lagrange", degree, (2,)))
-    particles = mpm.Particles(
-        motion.mesh, V, method=method, degree=degree, quadrature_degree=2 * degree + 1
-    )
+    particles = particles_of(motion.mesh, V, method, degree, 2 * degree + 1)
     w = ufl.TestFunction(particles.W)
     residual = ufl.inner(motion.stress(particles.displacement), ufl.grad(w)) * particles.dx
     problem = mpm.DynamicParticleProblem(

@@ -57,8 +57,10 @@ KINDS = {
     "auto": Kind("quad", "cpdi2", 1, "automatic steps", "#D55E00", "s"),
     "equal-tri": Kind("tri", "cpdi2", 1, "equal steps, triangles", "#56B4E9", "^"),
     "auto-tri": Kind("tri", "cpdi2", 1, "automatic steps, triangles", "#E69F00", ">"),
-    "fem1": Kind("", "fem", 1, "finite elements, degree 1", "0.0", "o"),
-    "fem2": Kind("", "fem", 2, "finite elements, degree 2", "0.0", "s"),
+    "free1": Kind("body", "fem", 1, "finite element body, degree 1", "#117733", "o"),
+    "free2": Kind("body", "fem", 2, "finite element body, degree 2", "#117733", "s"),
+    "fem1": Kind("", "stock", 1, "stock DOLFINx, degree 1", "0.0", "o"),
+    "fem2": Kind("", "stock", 2, "stock DOLFINx, degree 2", "0.0", "s"),
 }
 
 # Coarse to fine: background cells over the height (A, B), over the width (D), over 1 m (P, V), in
@@ -72,6 +74,8 @@ SIZES: dict[str, dict[str, list[float]]] = {
         "quad2": [4, 8, 16, 32, 64, 128],
         "tri2": [8, 16, 32, 64],
         "quad3": [4, 8, 16, 32],
+        "free1": [8, 32, 128, 512],
+        "free2": [2, 4, 8, 16, 32],
     },
     "B": {
         "quad1": [16, 64, 256, 1024],
@@ -81,6 +85,8 @@ SIZES: dict[str, dict[str, list[float]]] = {
         "quad2": [8, 16, 32, 64, 128],
         "tri2": [8, 16, 32],
         "quad3": [4, 8, 16, 32],
+        "free1": [8, 32, 128, 512],
+        "free2": [4, 8, 16, 32],
     },
     "C": {
         "quad1": [1.0, 0.5, 0.25],
@@ -89,12 +95,16 @@ SIZES: dict[str, dict[str, list[float]]] = {
         "gimp": [1.0, 0.5],
         "quad2": [2.0, 1.0, 0.5],
         "tri2": [2.0, 1.0],
+        "free1": [2.0, 1.0, 0.5, 0.25],
+        "free2": [2.0, 1.0, 0.5],
         "fem1": [2.0, 1.0, 0.5, 0.25],
         "fem2": [2.0, 1.0, 0.5],
     },
     "D": {
         "hex1": [1, 2, 4, 8],
         "hex2": [1, 2, 4],
+        "free1": [1, 2, 4, 8],
+        "free2": [1, 2],
         "fem1": [1, 2, 4, 8],
         "fem2": [1, 2],
     },
@@ -106,6 +116,8 @@ SIZES: dict[str, dict[str, list[float]]] = {
         "quad2": [1.0, 0.5, 0.25],
         "tri2": [1.0, 0.5, 0.25],
         "quad3": [1.0, 0.5],
+        "free1": [0.5, 0.25, 0.125, 0.0625],
+        "free2": [1.0, 0.5, 0.25],
         "fem1": [0.5, 0.25, 0.125, 0.0625],
         "fem2": [1.0, 0.5, 0.25],
     },
@@ -118,6 +130,8 @@ SIZES: dict[str, dict[str, list[float]]] = {
     "H": {
         "quad1": [4, 8, 16, 32],
         "quad2": [2, 4, 8],
+        "free1": [4, 8, 16, 32],
+        "free2": [2, 4, 8, 16],
         "fem1": [4, 8, 16, 32],
         "fem2": [2, 4, 8, 16],
     },
@@ -125,12 +139,16 @@ SIZES: dict[str, dict[str, list[float]]] = {
         "hex1": [2, 4, 8],
         "hexf": [2, 4, 8],
         "hex2": [1, 2, 4],
+        "free1": [2, 4, 8],
+        "free2": [1, 2, 3],
         "fem1": [2, 4, 8],
         "fem2": [1, 2, 3],
     },
     "V": {
         "quad1": [8, 16, 32],
         "quad2": [4, 8],
+        "free1": [8, 16, 32],
+        "free2": [4, 8, 16],
         "fem1": [8, 16, 32],
         "fem2": [4, 8, 16],
     },
@@ -139,12 +157,12 @@ SMOKE: dict[str, dict[str, list[float]]] = {
     "A": {"quad1": [4, 8], "quad2": [4]},
     "B": {"quad1": [4]},
     "C": {"quad1": [2.0]},
-    "D": {"hex1": [1], "fem1": [1]},
+    "D": {"hex1": [1], "free1": [1], "fem1": [1]},
     "E": {"quad1": [1.0]},
     "F": {"equal": [4], "auto": [0.1]},
-    "H": {"quad1": [2], "fem1": [2]},
+    "H": {"quad1": [2], "free1": [2], "fem1": [2]},
     "P": {"hex1": [1], "fem1": [1]},
-    "V": {"quad1": [4], "fem1": [4]},
+    "V": {"quad1": [4], "free2": [2], "fem1": [4]},
 }
 #: The runs that those of C and of both kinds of F are compared with.
 REFERENCES: dict[tuple[str, str], tuple[str, float, float]] = {
@@ -188,9 +206,11 @@ def point(case: str, kind: str, size: float, steps: int | None) -> None:
     if KINDS[kind].f_bar != "none":
         options["f_bar"] = KINDS[kind].f_bar
     scene: Any
-    if method == "fem":
+    if method == "stock":
         scene = finite_elements.CASES[case](size, degree, **options)
     else:
+        if domain == "body":
+            domain = "hex" if case in ("D", "P") else "quad"
         scene = scenes.CASES[case](size, domain, method, degree, **options)
     start = time.process_time()
     failure = None

@@ -518,8 +518,9 @@ class Particles(MaterialDomains):
     def _transfer_by(self, rows: CornerBasis) -> Transfer:
         """Return the transfer by rows, without the weight of deleted domains' own nodes."""
         if self.deletion is not None:
-            values = rows.basis.values
+            values = rows.basis.values.copy()
             values[self.deletion.dead[: len(values)]] = 0.0
+            rows = rows._replace(basis=rows.basis._replace(values=values))
             if rows.corners is not None:
                 rows.corners[self.deleted] = self.converged_domains[self.deleted]
             if self.free_nodes is not None:
@@ -789,6 +790,7 @@ class Particles(MaterialDomains):
         if self.deletion is not None:
             self.deletion.restore(np.zeros_like(self.deletion.mask), arrays["kept"])
             self.deletion.restore(arrays["deleted"], arrays["kept"])
+            self._transfer = None
         if self.undeformed.mass_share is not None:
             reference = (arrays[f"reference {name}"] for name in Reference._fields)
             self.undeformed.refer(Reference(*reference))
@@ -805,7 +807,8 @@ class Particles(MaterialDomains):
     def restore(self, converged: NDArray[np.float64]) -> None:
         """Set the converged displacement, shape ``(N, gdim)`` at the local nodes of W."""
         self._converged = converged
-        self._transfer = None
+        if not self.is_free:  # T of finite elements stays as it is
+            self._transfer = None
 
     def begin_from(self, displacement: NDArray[np.float64]) -> None:
         """Let a step begin from a displacement on the local dofs of W; T stays as it is."""

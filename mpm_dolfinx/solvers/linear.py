@@ -78,7 +78,8 @@ class ShiftedFactor:
     Attributes:
         K: The tangent that was factorised last.
         P: What was factorised; K itself without a shift, and with multigrid.
-        D: The shift of the step, or ``None`` before its first factorisation and without a shift.
+        D: The shift of the step, or ``None`` before its first factorisation and where there is
+            none: by ``shift=0``, or as masses hold all unknowns.
         shift: As given.
         num_negative: Number of unknowns, of all ranks, with a negative shift.
         iterates: Whether multigrid solves in the step that has begun.
@@ -276,7 +277,7 @@ class ShiftedFactor:
         if self.iterates and self._dear:
             self._choose(False)
             self._iterate_with_factor(K.getSize()[0])
-        if self.shift > 0.0 and self.D is None:
+        if self.shift > 0.0 and self.D is None and not levels.held:
             self.D = self.shift * levels.diagonal(K)
             negative = int(np.count_nonzero(self.D.array_r < 0.0))
             self.num_negative = over_ranks(K.comm.tompi4py(), negative)
@@ -295,7 +296,7 @@ class ShiftedFactor:
         diagonal = damping * levels.diagonal(K) if damping > self.shift else self.D
         if diagonal is None:
             self.P = K
-        elif new:
+        elif new or self.P is K:
             self.P = K.copy()
         else:
             K.copy(self.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)

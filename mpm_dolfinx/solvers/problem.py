@@ -30,6 +30,10 @@ class Levels(Fields, Protocol):
     def coarsening(self) -> Coarsening:
         """How well multigrid's boxes follow the tangent."""
 
+    @property
+    def held(self) -> bool:
+        """Whether the tangent resists each unknown by itself, so that it needs no shift."""
+
     def rigid_motions(self) -> PETSc.NullSpace:
         """Return the rigid motions in the unknowns."""
 

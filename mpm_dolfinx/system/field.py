@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from itertools import combinations
@@ -20,6 +21,7 @@ from dolfinx import fem
 from .. import _compat
 from ..assembly.background_forms import BackgroundForms
 from ..assembly.fused import Restriction, no_ties
+from ..background.basis import PointBasis
 from ..background.grids import cell_lines, coarser, grid_lines
 from ..meshes.boxes import BOX_CELLS
 from ..parallel.magnitudes import joint_norm, norm
@@ -69,7 +71,7 @@ class Motion:
         """Take over the present transfer."""
         self._work = self.T.createVecLeft()
         self._rows = self._own_rows()
-        self._free_T: PETSc.Mat | None = None
+        self._free_T: tuple[PETSc.Mat, PETSc.Mat] | None = None
 
     def _own_rows(self) -> slice | NDArray[np.intp]:
         """Return which of this rank's own dofs of W are moved by V, or as free ones."""
@@ -80,10 +82,10 @@ class Motion:
         return slice(None)
 
     def free_T(self, prolongation: PETSc.Mat) -> PETSc.Mat:
-        """Return T times what gives u from the unknowns, made once a step (collective)."""
-        if self._free_T is None:
-            self._free_T = self.T.matMult(prolongation)
-        return self._free_T
+        """Return T times what gives u from the unknowns, made once for each of it (collective)."""
+        if self._free_T is None or self._free_T[0] is not prolongation:
+            self._free_T = prolongation, self.T.matMult(prolongation)
+        return self._free_T[1]
 
     def move(self, u: PETSc.Vec) -> None:
         """Set ``d = d_n + T u`` in the rows that are u's."""
@@ -190,6 +192,9 @@ class Field:
         self._looked_up: list[fem.DirichletBC] | None = None
         self._lines: list[NDArray[np.float64]] | None = None
         self._background = background
+        self.dofs = np.zeros(0, dtype=np.int32)
+        self._found: FreeDofs | None = None
+        self._bases: list[PointBasis] = []  # by which nodes were found
         self._ghosts = ghosts
         self._joints = joints
         self._comm: MPI.Comm = V.mesh.comm
@@ -223,31 +228,51 @@ class Field:
     # -- Unknowns -------------------------------------------------------------------------
 
     def find(self) -> FreeDofs:
-        """Find the unknowns: dofs with weight or a background term, and without a condition."""
-        self.look()
-        ghosts = self._ghosts
+        """Find the unknowns: dofs with weight or a background term, and without a condition.
+
+        They are the same object as long as nothing moves relative to what carries it.
+        """
+        moved, ghosts = self.look(), self._ghosts
         active = self.touched.has_weight if ghosts is None else ghosts.tie(self.touched)
         free = self.touched.on_dofs(active)
         if self._background is not None:
             free[self._background.support()] = True
-        self.dofs = np.flatnonzero(free & ~self._fixed).astype(np.int32)
-        self.free = FreeDofs(self.V, self.dofs, self.touched)
+        dofs = np.flatnonzero(free & ~self._fixed).astype(np.int32)
+        same = not moved and ghosts is None and np.array_equal(dofs, self.dofs)
+        if self._found is None or not over_ranks(self._comm, same, MPI.LAND):
+            self._take(dofs)
+        self.u.set(0.0)
+        self.force.set(0.0)
+        self.free = self._found
+        assert self.free is not None
+        return self.free
+
+    def _take(self, dofs: NDArray[np.int32]) -> None:
+        """Take other dofs for the unknowns (collective)."""
+        self.dofs = dofs
+        self._found = FreeDofs(self.V, dofs, self.touched)
         T = self.bodies[0].T
         self.u, self.force = T.createVecRight(), T.createVecRight()
         for motion in self.motions:
             motion.begin()
-        self._penalty: tuple[PETSc.Mat, PETSc.Mat] | None = None
-        self._product: PETSc.Mat | None = None
-        return self.free
 
-    def look(self) -> None:
-        """Find the nodes of V that bodies touch, and the dofs with a condition."""
+    def look(self) -> bool:
+        """Find the nodes of V that bodies touch, and the dofs with a condition.
+
+        Returns:
+            Whether the nodes may be others than before.
+        """
+        bases = [body.node_basis for body in self.bodies]
+        same = len(bases) == len(self._bases) and all(map(operator.is_, bases, self._bases))
+        moved = self._joints is not None or not over_ranks(self._comm, same, MPI.LAND)
         if self._joints is not None:
             self.touched = self._joints.touched()
-        else:
+        elif moved:
             owned = [body.W.dofmap.index_map.size_local for body in self.bodies]
-            self.touched = TouchedNodes(self.V, [body.node_basis for body in self.bodies], owned)
+            self.touched = TouchedNodes(self.V, bases, owned)
+        self._bases = bases
         self._fixed = self.held_now()
+        return moved
 
     def held_now(self) -> NDArray[np.bool_]:
         """Return which of this rank's own dofs of V conditions hold where the bodies are now."""
@@ -279,6 +304,8 @@ class Field:
         """
         self.part, self._numbers, self._sizes = part, numbers, sizes
         self._prolongation: PETSc.Mat | None = None
+        self._penalty: tuple[PETSc.Mat, PETSc.Mat] | None = None
+        self._product: PETSc.Mat | None = None
 
     def restriction(self, rows: Sequence[TransferRows]) -> tuple[Restriction, tuple[int, int]]:
         """Return where a tangent goes that is reduced by rows of T, and its size."""

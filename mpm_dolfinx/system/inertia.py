@@ -22,6 +22,7 @@ Dirichlet values move.
 
 from __future__ import annotations
 
+import operator
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -118,16 +119,22 @@ class _Reduced(NamedTuple):
     """The mass in all unknowns.
 
     Attributes:
+        nodal: That of the bodies' nodes.
         transfers: T of each body, by which it is reduced.
         mass: That of bodies whose mass the compiled loops do not have, or ``None``.
         scaled: Room for a multiple of it.
         projection: Solves with the mass of all.
     """
 
+    nodal: NodalMass
     transfers: list[PETSc.Mat]
     mass: PETSc.Mat | None
     scaled: PETSc.Mat | None
     projection: Projection
+
+    def is_of(self, mass: NodalMass, transfers: list[PETSc.Mat]) -> bool:
+        """Return whether it is a mass reduced by some transfers."""
+        return self.nodal is mass and all(map(operator.is_, transfers, self.transfers))
 
 
 class Projected(NamedTuple):
@@ -198,6 +205,10 @@ class Inertia(Term):
     def is_static(self, body: Particles) -> bool:
         """Return whether a body has no inertia."""
         return self._state.is_static(body)
+
+    @override
+    def has_mass(self, body: Particles) -> bool:
+        return any(body is one for one in self.bodies) and not self._state.is_static(body)
 
     @property
     def _rest(self) -> _Rest:
@@ -297,7 +308,7 @@ class Inertia(Term):
             size.axpy((1.0 - share) / share, before)
         self._beginning = _Beginning(mass, rates, fields, float(factors[0]), staying, sizes)
         if not self._is_held:
-            self._reduced = self._projected = None
+            self._projected = None
         return staying
 
     @property
@@ -329,7 +340,10 @@ class Inertia(Term):
         taken = bool(step.rates.velocity[1])
         if not taken and right.norm() == 0.0:
             return None
-        y = reduced.projection.solve(right) if right.getSize() > 0 else right
+        y = right
+        if right.getSize() > 0:
+            known = self._rest.reduced.unknowns.at_nodes(self.bodies, v)
+            y = reduced.projection.solve(right, known)
         moved = [v.duplicate() for v in v] if driven is None else driven
         for T, part in zip(reduced.transfers, moved, strict=True):
             T.multAdd(y, part, part) if driven else T.mult(y, part)
@@ -416,8 +430,9 @@ class Inertia(Term):
         """Return the mass reduced by T of all bodies, anew where they are others."""
         Ts = [transfer(body) for body in self.bodies]
         known = self._reduced
-        if known is None or any(T is not its for T, its in zip(Ts, known.transfers, strict=True)):
-            self._reduced = known = _reduced(self._step.mass, Ts, self._rest.reduced.tangent.masses)
+        mass = self._step.mass
+        if known is None or not known.is_of(mass, Ts):
+            self._reduced = known = _reduced(mass, Ts, self._rest.reduced.tangent.masses)
         return known
 
     @override
@@ -576,7 +591,7 @@ def _reduced(mass: NodalMass, transfers: list[PETSc.Mat], by_loops: ReducedMasse
     ]
     left = _sum(others) if others else None
     projection = Projection(_sum([one for one in (known, left) if one is not None]))
-    return _Reduced(transfers, left, None if left is None else left.copy(), projection)
+    return _Reduced(mass, transfers, left, None if left is None else left.copy(), projection)
 
 
 def _sum(parts: Sequence[PETSc.Mat]) -> PETSc.Mat:

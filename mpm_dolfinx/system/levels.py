@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..parallel.totals import over_ranks
+from ..particles.particles import Particles
 from ..solvers.strategies import Coarsening
+from .field import Field
 from .hierarchy import interpolations
 from .terms import Terms
 from .unknowns import Unknowns
@@ -38,6 +40,21 @@ class Levels:
     def constrained(self) -> bool:
         """Whether there are unknowns besides displacements."""
         return bool(self._unknowns.values)
+
+    @property
+    def held(self) -> bool:
+        """Whether each unknown is the motion of a free node with mass."""
+        blocks = self._unknowns.blocks
+        return all(
+            isinstance(block, Field)
+            and all(
+                isinstance(body, Particles)
+                and block.V is body.W
+                and any(term.has_mass(body) for term in self._terms)
+                for body in block.bodies
+            )
+            for block in blocks
+        )
 
     @property
     def coarsening(self) -> Coarsening:

@@ -10,6 +10,7 @@ rows of T in its column, as far as no rank gets more than its share.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from itertools import combinations, pairwise
 from typing import Any, Protocol
@@ -155,6 +156,10 @@ class Numbering:
         self.numbers: list[NDArray[np.int64]] = [
             starts[free.owners, number] + free.places for number, free in enumerate(fields)
         ]
+
+    def is_of(self, fields: Sequence[Unknowns]) -> bool:
+        """Return whether these are the numbers of some free dofs."""
+        return all(map(operator.is_, fields, self._fields))
 
     def vector(self) -> PETSc.Vec:
         """Return a vector of all unknowns, zero (collective)."""

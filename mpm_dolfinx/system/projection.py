@@ -56,11 +56,12 @@ class Projection:
         vector.set(0.0)
         return vector
 
-    def solve(self, right: PETSc.Vec) -> PETSc.Vec:
+    def solve(self, right: PETSc.Vec, guess: PETSc.Vec | None = None) -> PETSc.Vec:
         """Return the unknowns of a projection (collective).
 
         Args:
             right: ``T^T M v``.
+            guess: Unknowns to begin with.
 
         Raises:
             ConvergenceError: That failed.
@@ -70,9 +71,10 @@ class Projection:
         size = scaled.norm()
         if size == 0.0:
             return y
-        self._solve_scaled(scaled, y, size)
+        if guess is not None:
+            y.pointwiseDivide(guess, self._unit)
         rest = self._rest(scaled, y)
-        for _ in range(RELEASES):
+        for _ in range(1 + RELEASES):
             if rest.norm() <= 2.0 * BEYOND * ROUND_OFF * size:
                 break
             part = y.duplicate()

@@ -151,7 +151,7 @@ class ReducedSystem:
     def _find_unknowns(self) -> None:
         unknowns, statistics = self.unknowns, self._statistics
         numbering = unknowns.find()
-        self.tangent.renew()
+        self.tangent.renew(numbering)
         counts: dict[str, int] = {}
         for field in self.fields:
             for name, count in field.counts.items():

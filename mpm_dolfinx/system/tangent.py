@@ -20,6 +20,7 @@ from ..parallel.magnitudes import norm
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from .field import Field
+from .numbering import Numbering
 from .own import OwnUnknowns
 from .term import Term
 from .terms import Terms
@@ -67,6 +68,7 @@ class Tangent:
     def __init__(self, unknowns: Unknowns, terms: Terms, statistics: Statistics) -> None:
         self._unknowns, self._terms, self._statistics = unknowns, terms, statistics
         self.mass_factor = 0.0
+        self._numbering: Numbering | None = None
         self._coupled = [self._is_fused(term.coupling) for term in terms]
         pairs = [self._fused_on(one.host) for one in unknowns.subspaces]
         self.loops = (
@@ -111,8 +113,11 @@ class Tangent:
         bodies: list[Particles | CarriedField] = [body for body, _ in self._fused_on(field)]
         return bodies + [body for body in carried if self._unknowns.place(body)[0] is field]
 
-    def renew(self) -> None:
-        """Take over the present unknowns."""
+    def renew(self, numbering: Numbering) -> None:
+        """Take over the present unknowns; matrices last as long as these are numbered alike."""
+        if self._numbering is numbering:
+            return
+        self._numbering = numbering
         self._made = _Made()
         if self.loops is not None:
             subspaces = self._unknowns.subspaces

@@ -228,6 +228,10 @@ class Term(Hooked):
                 body without inertia.
         """
 
+    def has_mass(self, body: Particles) -> bool:
+        """Return whether its forces are those of inertia at all nodes of a body."""
+        return False
+
     def end_forces(self) -> Sequence[PETSc.Vec]:
         """Return the residuals at the last converged step, but for what is of a whole step.
 

@@ -63,6 +63,7 @@ class Unknowns:
         self.places = [ways[0] for ways in self._ways]
         self.subspaces = Subspace.all_of(fields)
         self.numbering: Numbering | None = None
+        self._last: Numbering | None = None
         self._transfers: dict[int, PETSc.Mat] = {}
         self._found_by: list[Any] = []
 
@@ -132,14 +133,21 @@ class Unknowns:
     # -- Numbers ----------------------------------------------------------------------------------
 
     def find(self) -> Numbering:
-        """Find and number the unknowns with the present transfers."""
+        """Find and number the unknowns with the present transfers.
+
+        Returns:
+            The numbers; the same object where all unknowns are those of before.
+        """
         free = [block.find() for block in self.blocks]
-        numbering = self.numbering = Numbering(self.comm, free)
+        self._found_by = self._by
+        if self._last is not None and self._last.is_of(free):
+            self.numbering = self._last
+            return self._last
+        numbering = self.numbering = self._last = Numbering(self.comm, free)
         parts = zip(self.blocks, numbering.parts, numbering.numbers, strict=True)
         for block, part, numbers in parts:
             block.number(part, numbers, numbering.sizes)
         self._transfers = {}
-        self._found_by = self._by
         return numbering
 
     @property
@@ -222,6 +230,23 @@ class Unknowns:
             for field, motion in self.ways(body):
                 target = to[self.fields.index(field)]
                 motion.T.multTransposeAdd(vector, target, target)
+
+    def at_nodes(self, bodies: Sequence[Body], vectors: Sequence[PETSc.Vec]) -> PETSc.Vec:
+        """Return unknowns that have the values of vectors on bodies where they are these' nodes.
+
+        Args:
+            bodies: Some bodies.
+            vectors: On W of each.
+
+        Returns:
+            Zero at all other unknowns.
+        """
+        found = self.vector()
+        for body, vector in zip(bodies, vectors, strict=True):
+            for field, _ in self.ways(body):
+                if field.V is body.W:
+                    field.collect(vector, found)
+        return found
 
     def restricted(self, forces: Sequence[PETSc.Vec]) -> PETSc.Vec:
         """Return vectors on all dofs of each V at the unknowns."""

@@ -60,6 +60,7 @@ class ValueField(Field):
     @override
     def find(self) -> FreeDofs:
         """Look for the values that the step starts from."""
+        self._found = None  # (the unit of values may be another one)
         found = super().find()
         self.start = self.force.duplicate()
         self.start.set(0.0)

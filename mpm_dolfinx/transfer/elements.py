@@ -35,13 +35,13 @@ class FiniteElements(Method):
         super().__init__(V, domain_update)
         layout = V.dofmap.index_map
         local = np.arange(layout.size_local + layout.num_ghosts, dtype=np.int32)
-        self._nodes: NDArray[np.int64] = layout.local_to_global(local)
+        nodes: NDArray[np.int64] = layout.local_to_global(local)[:, None]
+        ones = np.ones(nodes.shape)
+        self._rows = CornerBasis(None, PointBasis(nodes, ones, np.ones(len(nodes), dtype=bool)))
 
     @override
     def rows(self, state: DomainState, background: BackgroundBasis) -> CornerBasis:
-        nodes = self._nodes[:, None]
-        ones = np.ones(nodes.shape)
-        return CornerBasis(None, PointBasis(nodes.copy(), ones, np.ones(len(nodes), dtype=bool)))
+        return self._rows
 
     @override
     def domains(self, state: DomainState) -> NDArray[np.float64]:

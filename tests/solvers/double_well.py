@@ -28,6 +28,7 @@ class DoubleWell:
         return self
 
     levels = resistance = terms = balance = itself
+    held = False
 
     def residual(self, x, F):
         self.x = x.array_r + self.start

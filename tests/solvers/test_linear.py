@@ -98,6 +98,7 @@ class Alone:
     """What a factor asks about unknowns that are displacements alone."""
 
     constrained = False
+    held = False
     coarsening = strategies.Coarsening.GOOD
 
     def diagonal(self, K):
@@ -133,6 +134,25 @@ def test_negative_pivots_are_the_negative_eigenvalues(few, negative, monkeypatch
     x = b.duplicate()
     factor.solve(b, x)
     np.testing.assert_allclose(x.array_r, np.linalg.solve(dense, b.array_r), rtol=1e-9)
+
+
+def test_a_tangent_without_a_shift_is_damped_in_a_copy():
+    n, own = 8, MPI.COMM_SELF
+    csr = np.arange(n + 1, dtype=np.int32), np.arange(n, dtype=np.int32)
+    K = PETSc.Mat().createAIJ((n, n), csr=(*csr, np.full(n, 2.0)), comm=own)
+    levels = Alone()
+    levels.held = True
+    snes = PETSc.SNES().create(own)
+    factor = linear.ShiftedFactor(snes, "damped_", {}, True, 1e-13, 2, mpm.Statistics())
+    factor.begin(n, levels)
+    b = K.createVecLeft()
+    b.set(1.0)
+    x = b.duplicate()
+    for damping, value in ((0.0, 0.5), (0.25, 0.4), (0.0, 0.5), (0.5, 1.0 / 3.0)):
+        factor.set(K, levels, damping)
+        snes.getKSP().solve(b, x)
+        np.testing.assert_allclose(x.array_r, value)
+        np.testing.assert_array_equal(K.getDiagonal().array_r, 2.0)
 
 
 @pytest.mark.skip_in_parallel

@@ -69,3 +69,29 @@ def test_unknowns_follow_the_body():
     else:
         assert before > 0.4
         assert 0.0 < statistics["off_rank_rows"] < before
+
+
+def test_unknowns_of_finite_elements_last_until_others_are_held():
+    """Nothing moves relative to what carries it: numbers, T and matrices stay as they are."""
+    body = mpm.Particles(scenes.box([0.0, 0.0], [2.0, 1.0], [8, 4], QUADRILATERAL), degree=2)
+    end, side = mpm.held(body.W, x=0.0), mpm.held(body.W, 1, x=2.0)
+    given = mpm.Body(body, Hencky(1e3, 0.3), density=1.0, body_force=(0.0, -2.0))
+    problem = mpm.QuasiStaticProblem(given, bcs=[end, side])
+    seen = []
+    for bcs in ([end, side], [end], [end, side]):
+        problem.stage(f"stage {len(seen)}", bcs=bcs)
+        for _ in problem.steps(3):
+            seen.append((problem.reduced.unknowns.find(), body.T, problem.A.getSize()[0]))
+    numbers, transfers, sizes = zip(*seen, strict=True)
+    for kept in (numbers, transfers):
+        for first in (0, 3, 6):
+            assert all(one is kept[first] for one in kept[first : first + 3])
+        assert kept[3] is not kept[2] and kept[6] is not kept[5]
+    assert sizes[2] == sizes[8] < sizes[5]
+    again = mpm.Particles(scenes.box([0.0, 0.0], [2.0, 1.0], [8, 4], QUADRILATERAL), degree=2)
+    ends = [mpm.held(again.W, x=0.0), mpm.held(again.W, 1, x=2.0)]
+    given = mpm.Body(again, Hencky(1e3, 0.3), density=1.0, body_force=(0.0, -2.0))
+    whole = mpm.QuasiStaticProblem(given, bcs=ends)
+    whole.solve(1)
+    left = problem.reaction(end)[1] + problem.reaction(side)[1]
+    assert np.isclose(left, whole.reaction(ends[0])[1] + whole.reaction(ends[1])[1], rtol=1e-6)
