@@ -21,7 +21,7 @@ TOGETHER = re.compile(
 #: Physics, texts that are read, arrays that each rank has for itself.
 ALONE = re.compile(
     r"tests/(benchmarks|demos|docs|materials|physics)/|"
-    r"/test_(house|public_api|law|shapes|whole_step|jacobian_bound)\.py"
+    r"/test_(house|public_api|law|shapes|jacobian_bound)\.py"
 )
 
 

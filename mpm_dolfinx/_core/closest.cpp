@@ -10,6 +10,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -18,33 +19,112 @@ namespace
 using core::dot;
 using core::solved;
 
-// A facet of degree 1 at a place: the point there, its slopes, and its one mixed second derivative.
+constexpr int most_degree = 7;
+
+// Call f(number, a, b) for the powers of monomials.
+template <int dim, typename F>
+void for_monomials(const core::Shape& shape, F&& f)
+{
+  int number = 0;
+  for (int a = 0; a <= shape.degree; ++a)
+    for (int b = 0; b <= (dim == 2 ? 0 : shape.simplex ? shape.degree - a : shape.degree); ++b)
+      f(number++, a, b);
+}
+
+// The factors of monomials, (count, dim), of facets by their nodes.
+template <int dim>
+void expand(const core::Shape& shape, const double* corners, double* factors)
+{
+  for (int m = 0; m < shape.count; ++m)
+    for (int i = 0; i < dim; ++i)
+    {
+      double sum = 0.0;
+      for (int k = 0; k < shape.nodes; ++k)
+        sum += shape.coefficients[m * shape.nodes + k] * corners[k * dim + i];
+      factors[m * dim + i] = sum;
+    }
+}
+
+// The powers of a coordinate, and their first and second derivatives.
+struct Powers
+{
+  std::array<double, most_degree + 1> of, first, second;
+
+  Powers(double s, int degree)
+  {
+    of[0] = 1.0;
+    first[0] = second[0] = 0.0;
+    for (int k = 1; k <= degree; ++k)
+    {
+      of[k] = of[k - 1] * s;
+      first[k] = k * of[k - 1];
+      second[k] = k * first[k - 1];
+    }
+  }
+};
+
+// A facet at a place: the point there, its slopes, and where asked for its second derivatives.
 template <int dim>
 struct Place
 {
-  std::array<double, dim> x{}, bend{};
-  std::array<std::array<double, dim>, dim - 1> A{};
+  static constexpr int sides = dim - 1;
+  using Vector = std::array<double, dim>;
+  Vector x{};
+  std::array<Vector, sides> A{};
+  std::array<std::array<Vector, sides>, sides> B{};
 
-  Place(const double* corners, int nodes, const std::array<double, dim - 1>& s)
+  Place(const core::Shape& shape, const double* factors, const std::array<double, sides>& s,
+        bool bends = false)
+  {
+    if (shape.degree == 1)
+    {
+      of_degree_1(shape, factors, s);
+      return;
+    }
+    const Powers one(s[0], shape.degree), two(s[sides - 1], dim == 2 ? 0 : shape.degree);
+    for_monomials<dim>(shape, [&](int m, int a, int b) {
+      const double* by = factors + m * dim;
+      const auto add = [&](Vector& to, double factor) {
+        for (int i = 0; i < dim; ++i)
+          to[i] += factor * by[i];
+      };
+      add(x, one.of[a] * two.of[b]);
+      add(A[0], one.first[a] * two.of[b]);
+      if constexpr (dim == 3)
+        add(A[1], one.of[a] * two.first[b]);
+      if (!bends)
+        return;
+      add(B[0][0], one.second[a] * two.of[b]);
+      if constexpr (dim == 3)
+      {
+        add(B[0][1], one.first[a] * two.first[b]);
+        add(B[1][1], one.of[a] * two.second[b]);
+      }
+    });
+    if constexpr (dim == 3)
+      B[1][0] = B[0][1];
+  }
+
+  // The same, faster.
+  void of_degree_1(const core::Shape& shape, const double* factors,
+                   const std::array<double, sides>& s)
   {
     for (int i = 0; i < dim; ++i)
     {
-      const auto X = [&](int node) { return corners[node * dim + i]; };
+      A[0][i] = factors[sides * dim + i];
       if constexpr (dim == 3)
-        if (nodes == 4)
-        {
-          bend[i] = X(0) - X(1) - X(2) + X(3);
-          A[0][i] = X(1) - X(0) + bend[i] * s[1];
-          A[1][i] = X(2) - X(0) + bend[i] * s[0];
-          x[i] = X(0) + (X(1) - X(0)) * s[0] + A[1][i] * s[1];
-          continue;
-        }
-      x[i] = X(0);
-      for (int e = 0; e < dim - 1; ++e)
       {
-        A[e][i] = X(1 + e) - X(0);
-        x[i] += A[e][i] * s[e];
+        A[1][i] = factors[dim + i];
+        if (!shape.simplex)
+        {
+          B[0][1][i] = B[1][0][i] = factors[3 * dim + i];
+          A[0][i] += B[0][1][i] * s[1];
+          A[1][i] += B[0][1][i] * s[0];
+        }
       }
+      x[i] = factors[i] + factors[sides * dim + i] * s[0];
+      if constexpr (dim == 3)
+        x[i] += A[1][i] * s[1];
     }
   }
 
@@ -82,37 +162,48 @@ std::array<double, dim> difference(const double* a, const std::array<double, dim
   return result;
 }
 
-// Project a point on a facet, by Newton's method from its middle; false where the facet has no area.
 template <int dim>
-bool project(const core::Search& search, const double* x, const double* corners,
-             std::array<double, dim - 1>& s)
+std::array<double, dim - 1> middle_of(const core::Shape& shape)
+{
+  std::array<double, dim - 1> s;
+  s.fill(dim == 3 && shape.simplex ? 1.0 / 3.0 : 0.5);
+  return s;
+}
+
+// Project a point on a facet, by Newton's method from a place; false where the facet has no area.
+template <int dim>
+bool project_on(const core::Shape& shape, const double* x, const double* factors,
+                std::array<double, dim - 1>& s)
 {
   constexpr int sides = dim - 1;
-  s.fill(search.nodes == 3 ? 1.0 / 3.0 : 0.5);
-  const bool flat = search.nodes == dim;
-  for (int step = 0; step < search.most; ++step)
+  using Matrix = std::array<std::array<double, sides>, sides>;
+  const bool flat = shape.nodes == dim;
+  const auto determinant = [](const Matrix& G) {
+    if constexpr (sides == 1)
+      return G[0][0];
+    else
+      return G[0][0] * G[1][1] - G[0][1] * G[1][0];
+  };
+  for (int step = 0; step < shape.most; ++step)
   {
-    const Place<dim> at(corners, search.nodes, s);
+    const Place<dim> at(shape, factors, s, !flat);
     const auto r = difference<dim>(x, at.x);
-    std::array<std::array<double, sides>, sides> G;
+    Matrix G, bent;
     std::array<double, sides> along;
     for (int e = 0; e < sides; ++e)
     {
       along[e] = dot(at.A[e], r);
       for (int f = 0; f < sides; ++f)
+      {
         G[e][f] = dot(at.A[e], at.A[f]);
+        bent[e][f] = G[e][f] - dot(at.B[e][f], r);
+      }
     }
-    if constexpr (sides == 2)
-    {
-      // where a curved facet bends towards the point too much, its plane has to do
-      const double det = G[0][0] * G[1][1] - G[0][1] * G[0][1], bend = dot(at.bend, r);
-      const double bent = G[0][1] - bend;
-      if (G[0][0] * G[1][1] - bent * bent > 0.1 * det)
-        G[0][1] = G[1][0] = bent;
-      else if (!(det > 0.0))
-        return false;
-    }
-    else if (!(G[0][0] > 0.0))
+    // where a curved facet bends towards the point too much, its plane has to do
+    const double det = determinant(G);
+    if (determinant(bent) > 0.1 * det)
+      G = bent;
+    if (!(determinant(G) > 0.0))
       return false;
     const auto change = solved(G, along);
     double size = 0.0;
@@ -122,10 +213,27 @@ bool project(const core::Search& search, const double* x, const double* corners,
       size = std::max(size, std::abs(moved));
       s[e] = std::min(std::max(s[e] + moved, -3.0), 4.0);
     }
-    if (flat || !(size > search.close))
+    if (flat || !(size > shape.close))
       break;
   }
   return true;
+}
+
+template <int dim>
+bool project_in(std::size_t points, const core::Shape& shape, const double* x,
+                const double* corners, double* place)
+{
+  std::vector<double> factors(shape.count * dim);
+  std::array<double, dim - 1> s;
+  bool good = true;
+  for (std::size_t p = 0; p < points; ++p)
+  {
+    expand<dim>(shape, corners + p * shape.nodes * dim, factors.data());
+    std::copy_n(place + p * (dim - 1), dim - 1, s.begin());
+    good = project_on<dim>(shape, x + p * dim, factors.data(), s) && good;
+    std::copy_n(s.begin(), dim - 1, place + p * (dim - 1));
+  }
+  return good;
 }
 
 // Boxes of facets in the tiles of a grid.
@@ -137,20 +245,23 @@ public:
 
   explicit Tiles(const core::Search& search)
       : low_(search.facets), high_(search.facets), normal_(search.facets),
-        at_corners_(search.facets)
+        at_corners_(search.facets), step_(search.shape.count * dim),
+        factors_(search.facets * search.shape.count * dim)
   {
+    const core::Shape& shape = search.shape;
+    const bool curved = shape.degree > 1;
     base_.fill(INFINITY);
     top_.fill(-INFINITY);
     std::vector<std::int64_t> there;
     for (std::size_t facet = 0; facet < search.facets; ++facet)
     {
-      const double* corners = search.corners + facet * search.nodes * dim;
+      const double* corners = search.corners + facet * shape.nodes * dim;
       Vector &low = low_[facet], &high = high_[facet];
       bool finite = search.present[facet] != 0;
       for (int i = 0; i < dim; ++i)
       {
         low[i] = high[i] = corners[i];
-        for (int k = 0; k < search.nodes; ++k)
+        for (int k = 0; k < shape.nodes; ++k)
         {
           const double at = corners[k * dim + i];
           finite = finite && std::isfinite(at);
@@ -161,17 +272,27 @@ public:
       if (!finite)
         continue;
       there.push_back(static_cast<std::int64_t>(facet));
-      std::array<double, dim - 1> middle;
-      middle.fill(search.nodes == 3 ? 1.0 / 3.0 : 0.5);
-      normal_[facet] = Place<dim>(corners, search.nodes, middle).normal(search.outward[facet]);
-      at_corners_[facet].fill(normal_[facet]);
+      if (curved) // which goes beyond its nodes
+        for (int i = 0; i < dim; ++i)
+        {
+          const double more = 0.5 * (high[i] - low[i]);
+          low[i] -= more;
+          high[i] += more;
+        }
+      double* factors = factors_.data() + facet * step_;
+      expand<dim>(shape, corners, factors);
+      const Place<dim> middle(shape, factors, middle_of<dim>(shape));
+      normal_[facet] = middle.normal(search.outward[facet]);
+      // (a curved one may face anything)
+      at_corners_[facet].fill(curved ? Vector{NAN} : normal_[facet]);
       if constexpr (dim == 3)
-        if (search.nodes == 4)
+        if (shape.nodes == 4)
         {
           double least = INFINITY;
           for (int k = 0; k < 4; ++k)
           {
-            const Place<dim> at(corners, 4, {static_cast<double>(k % 2), static_cast<double>(k / 2)});
+            const Place<dim> at(shape, factors,
+                                {static_cast<double>(k % 2), static_cast<double>(k / 2)});
             at_corners_[facet][k] = at.area(search.outward[facet]);
             least = std::min(least, dot(at_corners_[facet][k], normal_[facet]));
           }
@@ -295,6 +416,9 @@ public:
     return true;
   }
 
+  // The factors of monomials of a facet.
+  const double* factors(std::int64_t facet) const { return factors_.data() + facet * step_; }
+
   // The normal in the middle of a facet.
   const Vector& normal(std::int64_t facet) const { return normal_[facet]; }
 
@@ -338,6 +462,8 @@ private:
 
   std::vector<Vector> low_, high_, normal_;
   std::vector<std::array<Vector, dim == 2 ? 1 : 4>> at_corners_; // see turned_away
+  std::size_t step_;
+  std::vector<double> factors_;
   Vector base_, top_;
   double width_ = 0.0;
   std::array<std::int64_t, dim> count_{};
@@ -347,13 +473,13 @@ private:
 
 // A place on a facet, within its edges.
 template <std::size_t sides>
-std::array<double, sides> clamped(const std::array<double, sides>& s, int nodes)
+std::array<double, sides> clamped(const std::array<double, sides>& s, bool simplex)
 {
   std::array<double, sides> inner;
   double sum = 0.0;
   for (std::size_t e = 0; e < sides; ++e)
     sum += inner[e] = std::min(std::max(s[e], 0.0), 1.0);
-  if (nodes == 3 && sum > 1.0)
+  if (sides == 2 && simplex && sum > 1.0)
     for (double& part : inner)
       part /= sum;
   return inner;
@@ -363,6 +489,7 @@ template <int dim>
 bool find_closest_in(const core::Search& search, const core::Found& found)
 {
   constexpr int sides = dim - 1;
+  const core::Shape& shape = search.shape;
   const Tiles<dim> tiles(search);
   std::vector<std::pair<double, std::int64_t>> some;
   bool good = true;
@@ -390,8 +517,8 @@ bool find_closest_in(const core::Search& search, const core::Found& found)
       some.emplace_back(away, facet);
       if (turned < search.sure)
       {
-        const double* corners = search.corners + facet * search.nodes * dim;
-        for (int k = 0; k < search.nodes; ++k)
+        const double* corners = search.corners + facet * shape.nodes * dim;
+        for (int k = 0; k < shape.nodes; ++k)
         {
           double sum = 0.0;
           for (int i = 0; i < dim; ++i)
@@ -410,11 +537,11 @@ bool find_closest_in(const core::Search& search, const core::Found& found)
       if (facet == found.facet[p] || facet == before)
         continue;
       before = facet;
-      const double* corners = search.corners + facet * search.nodes * dim;
-      std::array<double, sides> s;
-      good = project<dim>(search, x, corners, s) && good;
-      const auto inner = clamped(s, search.nodes);
-      const Place<dim> border(corners, search.nodes, inner);
+      const double* factors = tiles.factors(facet);
+      auto s = middle_of<dim>(shape);
+      good = project_on<dim>(shape, x, factors, s) && good;
+      const auto inner = clamped(s, shape.simplex);
+      const Place<dim> border(shape, factors, inner);
       const auto r = difference<dim>(x, border.x);
       const double far = std::sqrt(dot(r, r));
       if (!(far <= search.reach)
@@ -426,7 +553,7 @@ bool find_closest_in(const core::Search& search, const core::Found& found)
         continue;
       least = rank;
       nearest = far;
-      const Place<dim> foot(corners, search.nodes, s);
+      const Place<dim> foot(shape, factors, s);
       const double gap = dot(difference<dim>(x, foot.x), foot.normal(search.outward[facet]));
       // A point beside the end of an open surface, or beside an edge, touches nothing, behind the
       // plane of the facet nor at a gap; nor does one beside the edge of a thin body that faces its
@@ -483,6 +610,57 @@ bool find_closest_in(const core::Search& search, const core::Found& found)
   return good;
 }
 } // namespace
+
+HOT_LOOP void core::tabulate(std::size_t points, int dim, const Shape& shape, const double* place,
+                            const Tables& tables)
+{
+  const int sides = dim - 1, nodes = shape.nodes;
+  const auto work = [&](auto constant) {
+    constexpr int space = decltype(constant)::value;
+    std::fill_n(tables.shape, points * nodes, 0.0);
+    std::fill_n(tables.slope, points * sides * nodes, 0.0);
+    std::fill_n(tables.bend, points * sides * sides * nodes, 0.0);
+    for (std::size_t p = 0; p < points; ++p)
+    {
+      const double* s = place + p * sides;
+      const Powers one(s[0], shape.degree), two(s[sides - 1], space == 2 ? 0 : shape.degree);
+      double* N = tables.shape + p * nodes;
+      double* dN = tables.slope + p * sides * nodes;
+      double* ddN = tables.bend + p * sides * sides * nodes;
+      for_monomials<space>(shape, [&](int m, int a, int b) {
+        const double* by = shape.coefficients + m * nodes;
+        const auto add = [&](double* to, double factor) {
+          for (int k = 0; k < nodes; ++k)
+            to[k] += factor * by[k];
+        };
+        add(N, one.of[a] * two.of[b]);
+        add(dN, one.first[a] * two.of[b]);
+        if constexpr (space == 3)
+          add(dN + nodes, one.of[a] * two.first[b]);
+        if (shape.nodes == space)
+          return;
+        add(ddN, one.second[a] * two.of[b]);
+        if constexpr (space == 3)
+        {
+          add(ddN + nodes, one.first[a] * two.first[b]);
+          add(ddN + 2 * nodes, one.first[a] * two.first[b]);
+          add(ddN + 3 * nodes, one.of[a] * two.second[b]);
+        }
+      });
+    }
+  };
+  if (dim == 2)
+    work(std::integral_constant<int, 2>{});
+  else
+    work(std::integral_constant<int, 3>{});
+}
+
+HOT_LOOP bool core::project(std::size_t points, int dim, const Shape& shape, const double* x,
+                           const double* corners, double* place)
+{
+  return dim == 2 ? project_in<2>(points, shape, x, corners, place)
+                  : project_in<3>(points, shape, x, corners, place);
+}
 
 HOT_LOOP bool core::find_closest(const Search& search, int dim, const Found& found)
 {

@@ -30,27 +30,29 @@ constexpr int bend_of(int e, int f)
   return bends == 1 && e != f ? 0 : -1;
 }
 
-// What all depends on: r, slopes A, bends B, and the way from the anchor.
+// What a projection depends on: r, slopes A and bends B.
 template <typename T, int dim, int bends>
 struct Ways
 {
   static constexpr int sides = dim - 1;
   using Vector = std::array<T, dim>;
-  Vector r, delta;
+  Vector r;
   std::array<Vector, sides> A;
   std::array<Vector, bends> B;
 };
 
+// A point projected on its facet: how far the foot has moved, the slopes and the normal there.
 template <typename T, int dim>
-struct Foot : Traction<T, dim>
+struct Foot
 {
-  std::array<T, dim - 1> moved, lag; // to the foot, and the shear along the slopes there
+  std::array<T, dim - 1> moved;
+  std::array<std::array<T, dim>, dim - 1> A;
   std::array<T, dim> n;
   T gap;
 };
 
 template <typename T, int dim, int bends>
-Foot<T, dim> foot_of(const Ways<T, dim, bends>& ways, const core::Meeting& m, std::size_t p)
+Foot<T, dim> foot_of(const Ways<T, dim, bends>& ways, double outward)
 {
   constexpr int sides = dim - 1;
   Foot<T, dim> foot{};
@@ -75,7 +77,7 @@ Foot<T, dim> foot_of(const Ways<T, dim, bends>& ways, const core::Meeting& m, st
   }
   foot.moved = solved(G, along);
   std::array<T, dim> r = ways.r;
-  std::array<std::array<T, dim>, sides> A = ways.A;
+  foot.A = ways.A;
   for (int i = 0; i < dim; ++i)
     for (int e = 0; e < sides; ++e)
     {
@@ -83,116 +85,347 @@ Foot<T, dim> foot_of(const Ways<T, dim, bends>& ways, const core::Meeting& m, st
       if constexpr (bends > 0)
         for (int f = 0; f < sides; ++f)
           if (const int b = bend_of<dim, bends>(e, f); b >= 0)
-            A[e][i] = A[e][i] + ways.B[b][i] * foot.moved[f];
+            foot.A[e][i] = foot.A[e][i] + ways.B[b][i] * foot.moved[f];
     }
+  const auto& A = foot.A;
   std::array<T, dim> n;
   if constexpr (dim == 2)
     n = {A[0][1], T(-1.0) * A[0][0]};
   else
     for (int i = 0; i < 3; ++i)
       n[i] = A[0][(i + 1) % 3] * A[1][(i + 2) % 3] - A[0][(i + 2) % 3] * A[1][(i + 1) % 3];
-  const T unit = m.outward[p] * inverse(root(dot(n, n)));
+  const T unit = outward * inverse(root(dot(n, n)));
   for (int i = 0; i < dim; ++i)
     foot.n[i] = n[i] * unit;
   foot.gap = dot(r, foot.n);
-  static_cast<Traction<T, dim>&>(foot)
-      = traction_of(m.known, p, pressing(m.known, p, foot.gap, foot.n), foot.gap, foot.n, ways.delta);
-  if (m.known.smooth || !foot.inside)
-    return foot;
+  return foot;
+}
+
+// The shear along the slopes at the foot.
+template <typename T, int dim>
+std::array<T, dim - 1> lag_of(const Foot<T, dim>& foot, const std::array<T, dim>& shear)
+{
+  constexpr int sides = dim - 1;
   std::array<std::array<T, sides>, sides> metric;
   std::array<T, sides> rubs;
   for (int e = 0; e < sides; ++e)
   {
-    rubs[e] = dot(A[e], foot.shear);
+    rubs[e] = dot(foot.A[e], shear);
     for (int f = 0; f < sides; ++f)
-      metric[e][f] = dot(A[e], A[f]);
+      metric[e][f] = dot(foot.A[e], foot.A[f]);
   }
-  foot.lag = solved(metric, rubs);
-  return foot;
+  return solved(metric, rubs);
 }
 
-// What acts on a node of the facet: by pressure, and by friction, whose arm turns with the facet.
+// Shape functions of a facet's nodes where a point is projected, and their derivatives.
 template <int dim>
-void on_node(const Foot<double, dim>& foot, const core::Meeting& m, std::size_t p, int node,
-             double* push, double* rub)
+struct Shapes
 {
-  constexpr int sides = dim - 1;
-  const double* slope = m.slope + p * sides * m.nodes;
-  const double* bend = m.bend + p * sides * sides * m.nodes;
-  double N = m.shape[p * m.nodes + node], turn = 0.0;
-  for (int e = 0; e < sides; ++e)
-  {
-    N += slope[e * m.nodes + node] * foot.moved[e];
-    double by = slope[e * m.nodes + node];
-    for (int f = 0; f < sides; ++f)
-      by += bend[(e * sides + f) * m.nodes + node] * foot.moved[f];
-    turn += by * foot.lag[e];
-  }
-  const double arm = foot.gap * turn, pressed = N * foot.pressure;
-  for (int i = 0; i < dim; ++i)
-  {
-    push[i] = -pressed * foot.n[i];
-    rub[i] = arm * foot.n[i] - N * foot.shear[i];
-  }
-}
+  static constexpr int sides = dim - 1;
+  const double *shape, *slope, *bend;
+  int nodes;
 
+  Shapes(const core::Table& table, std::size_t p, int count)
+      : shape(table.shape + p * count), slope(table.slope + p * sides * count),
+        bend(table.bend + p * sides * sides * count), nodes(count)
+  {
+  }
+
+  // That of a node where the foot has moved to.
+  template <typename T>
+  T at(int node, const std::array<T, sides>& moved) const
+  {
+    T N(shape[node]);
+    for (int e = 0; e < sides; ++e)
+      N = N + slope[e * nodes + node] * moved[e];
+    return N;
+  }
+
+  // The sum of its derivatives there, times some factors.
+  template <typename T>
+  T along(int node, const std::array<T, sides>& moved, const std::array<T, sides>& factors) const
+  {
+    T sum(0.0);
+    for (int e = 0; e < sides; ++e)
+    {
+      T by(slope[e * nodes + node]);
+      for (int f = 0; f < sides; ++f)
+        by = by + bend[(e * sides + f) * nodes + node] * moved[f];
+      sum = sum + by * factors[e];
+    }
+    return sum;
+  }
+};
+
+// What a point's projection depends on, by places of the point and of the nodes of its facet.
 template <typename T, int dim, int bends>
-Ways<T, dim, bends> ways_of(const core::Meeting& m, std::size_t p)
+Ways<T, dim, bends> ways_of(const Shapes<dim>& shapes, const std::array<T, dim>* x)
 {
   constexpr int sides = dim - 1;
   Ways<T, dim, bends> ways{};
-  const double* x = m.x + p * m.count * dim;
-  const double* slope = m.slope + p * sides * m.nodes;
-  const double* bend = m.bend + p * sides * sides * m.nodes;
   for (int i = 0; i < dim; ++i)
   {
-    double r = x[i], delta = x[i];
-    std::array<double, sides> A{};
-    std::array<double, bends> B{};
-    for (int k = 0; k < m.nodes; ++k)
+    T r = x[0][i];
+    std::array<T, sides> A{};
+    std::array<T, bends> B{};
+    for (int k = 0; k < shapes.nodes; ++k)
     {
-      const double X = x[(1 + k) * dim + i];
-      r -= m.shape[p * m.nodes + k] * X;
+      const T& X = x[1 + k][i];
+      r = r - shapes.shape[k] * X;
       for (int e = 0; e < sides; ++e)
       {
-        A[e] += slope[e * m.nodes + k] * X;
+        A[e] = A[e] + shapes.slope[e * shapes.nodes + k] * X;
         if constexpr (bends > 0)
           for (int f = e; f < sides; ++f)
             if (const int b = bend_of<dim, bends>(e, f); b >= 0)
-              B[b] += bend[(e * sides + f) * m.nodes + k] * X;
+              B[b] = B[b] + shapes.bend[(e * sides + f) * shapes.nodes + k] * X;
       }
-      if (!m.known.smooth)
-        delta -= m.anchored[p * m.nodes + k] * x[(1 + m.nodes + k) * dim + i];
     }
-    ways.r[i] = T(r);
-    ways.delta[i] = m.known.smooth ? T(0.0) : T(delta);
+    ways.r[i] = r;
     for (int e = 0; e < sides; ++e)
-      ways.A[e][i] = T(A[e]);
+      ways.A[e][i] = A[e];
     for (int b = 0; b < bends; ++b)
-      ways.B[b][i] = T(B[b]);
+      ways.B[b][i] = B[b];
   }
   return ways;
+}
+
+// The way of a point from its anchor, by places of its stencil.
+template <typename T, int dim>
+std::array<T, dim> delta_of(const core::Meeting& m, std::size_t p, const std::array<T, dim>* x)
+{
+  std::array<T, dim> delta{};
+  if (m.known.smooth)
+    return delta;
+  delta = x[0];
+  for (int k = 0; k < m.nodes; ++k)
+    for (int i = 0; i < dim; ++i)
+      delta[i] = delta[i] - m.anchored[p * m.nodes + k] * x[1 + m.nodes + k][i];
+  return delta;
+}
+
+// The places of a point's stencil. (An array of doubles is one of vectors of these.)
+template <int dim>
+const std::array<double, dim>* places_of(const double* x, std::size_t p, int count)
+{
+  static_assert(sizeof(std::array<double, dim>) == dim * sizeof(double));
+  return reinterpret_cast<const std::array<double, dim>*>(x) + p * count;
+}
+
+// Changes of some places less their rigid motion about where these are in the middle of a step.
+template <typename T>
+void take_rigid_motion(const std::vector<std::array<T, 2>>& arm, std::vector<std::array<T, 2>>& v)
+{
+  T moment(0.0), inertia(0.0);
+  for (std::size_t k = 0; k < v.size(); ++k)
+  {
+    moment = moment + arm[k][0] * v[k][1] - arm[k][1] * v[k][0];
+    inertia = inertia + dot(arm[k], arm[k]);
+  }
+  const T turn = moment * inverse(inertia);
+  for (std::size_t k = 0; k < v.size(); ++k)
+    v[k] = {v[k][0] + turn * arm[k][1], v[k][1] - turn * arm[k][0]};
+}
+
+template <typename T>
+std::array<T, 3> cross(const std::array<T, 3>& a, const std::array<T, 3>& b)
+{
+  return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
+}
+
+template <typename T>
+void take_rigid_motion(const std::vector<std::array<T, 3>>& arm, std::vector<std::array<T, 3>>& v)
+{
+  std::array<T, 3> moment{}, turn{};
+  std::array<std::array<T, 3>, 3> J{};
+  for (std::size_t k = 0; k < v.size(); ++k)
+  {
+    const auto part = cross(arm[k], v[k]);
+    const T square = dot(arm[k], arm[k]);
+    for (int i = 0; i < 3; ++i)
+    {
+      moment[i] = moment[i] + part[i];
+      J[i][i] = J[i][i] + square;
+      for (int j = 0; j < 3; ++j)
+        J[i][j] = J[i][j] - arm[k][i] * arm[k][j];
+    }
+  }
+  const T factor = inverse(dot(J[0], cross(J[1], J[2])));
+  for (int i = 0; i < 3; ++i)
+  {
+    const auto row = cross(J[(i + 1) % 3], J[(i + 2) % 3]);
+    turn[i] = factor * dot(row, moment);
+  }
+  for (std::size_t k = 0; k < v.size(); ++k)
+  {
+    const auto part = cross(turn, arm[k]);
+    for (int i = 0; i < 3; ++i)
+      v[k][i] = v[k][i] - part[i];
+  }
+}
+
+template <typename T, int dim>
+void centre(std::vector<std::array<T, dim>>& x)
+{
+  for (int i = 0; i < dim; ++i)
+  {
+    T mean(0.0);
+    for (const auto& at : x)
+      mean = mean + at[i];
+    mean = (1.0 / static_cast<double>(x.size())) * mean;
+    for (auto& at : x)
+      at[i] = at[i] - mean;
+  }
+}
+
+// What acts at a point, and on it and the nodes of its facet.
+template <typename T, int dim>
+struct Acting
+{
+  using Vectors = std::vector<std::array<T, dim>>;
+  Traction<T, dim> acts;
+  Vectors pushes, rubs, middle, change, along;
+
+  explicit Acting(int nodes) : pushes(1 + nodes), rubs(1 + nodes) {}
+
+  // By friction, whose arm turns with the facet.
+  void rub(const Foot<T, dim>& foot, const Shapes<dim>& shapes)
+  {
+    std::array<T, dim - 1> lag{};
+    if (acts.inside)
+      lag = lag_of<T, dim>(foot, acts.shear);
+    rubs[0] = acts.shear;
+    for (int k = 0; k < shapes.nodes; ++k)
+    {
+      const T N = shapes.at(k, foot.moved), arm = foot.gap * shapes.along(k, foot.moved, lag);
+      for (int i = 0; i < dim; ++i)
+        rubs[1 + k][i] = arm * foot.n[i] - N * acts.shear[i];
+    }
+  }
+
+  // Set the gradient of the gap.
+  void point(const Foot<T, dim>& foot, const Shapes<dim>& shapes)
+  {
+    pushes[0] = foot.n;
+    for (int k = 0; k < shapes.nodes; ++k)
+    {
+      const T N = shapes.at(k, foot.moved);
+      for (int i = 0; i < dim; ++i)
+        pushes[1 + k][i] = T(-1.0) * N * foot.n[i];
+    }
+  }
+
+  // Go from the gradient to what the pressure does.
+  void push()
+  {
+    for (auto& by : pushes)
+      for (T& part : by)
+        part = acts.pressure * part;
+  }
+};
+
+// Set what acts at a point by places of its stencil.
+template <int bends, int dim, typename T>
+void act_at(const core::Meeting& m, std::size_t p, const std::array<T, dim>* x,
+            Acting<T, dim>& found)
+{
+  const Shapes<dim> shapes(m.table, p, m.nodes);
+  const auto foot = foot_of(ways_of<T, dim, bends>(shapes, x), m.outward[p]);
+  const auto delta = delta_of<T, dim>(m, p, x);
+  if (!m.start)
+  {
+    auto press = pressing(m.known, p, foot.gap, foot.n);
+    put_on_top(press);
+    found.acts = traction_of(m.known, p, press, foot.gap, foot.n, delta);
+    found.point(foot, shapes);
+    found.rub(foot, shapes);
+    found.push();
+    return;
+  }
+  // By the energy at both ends, with the gradient of the middle.
+  const auto* start = places_of<dim>(m.start, p, 1 + m.nodes);
+  auto &middle = found.middle, &change = found.change, &along = found.along;
+  middle.resize(1 + m.nodes);
+  change.resize(1 + m.nodes);
+  for (int k = 0; k <= m.nodes; ++k)
+    for (int i = 0; i < dim; ++i)
+    {
+      middle[k][i] = 0.5 * (T(start[k][i]) + x[k][i]);
+      change[k][i] = x[k][i] - T(start[k][i]);
+    }
+  const Shapes<dim> there(m.middle, p, m.nodes);
+  const auto half = foot_of(ways_of<T, dim, bends>(there, middle.data()), m.outward[p]);
+  const auto press = mean_pressing(m.known, p, m.before[p] - m.offset[p],
+                                   T(foot.gap - T(m.offset[p])));
+  found.acts = traction_of(m.known, p, press, foot.gap, half.n, delta);
+  found.point(half, there);
+  found.rub(half, there);
+  // (what corrects the gradient has no sum nor moment in the middle)
+  along = change;
+  centre<T, dim>(along);
+  centre<T, dim>(middle);
+  take_rigid_motion(middle, along);
+  correct(found.pushes.data(), change.data(), along.data(), along.size(),
+          T(foot.gap - T(m.before[p])), m.known.still);
+  found.push();
 }
 
 // (One function of all kinds would take compilers twice as long.)
 template <int dim, int bends>
 HOT_LOOP void act_in(const core::Meeting& m, const core::Met& result)
 {
+  Acting<double, dim> found(m.nodes);
+  const std::size_t width = (1 + m.nodes) * dim;
   for (std::size_t p = 0; p < m.points; ++p)
   {
-    const auto foot = foot_of(ways_of<double, dim, bends>(m, p), m, p);
-    double* push = result.pushes + p * (1 + m.nodes) * dim;
-    double* rub = result.rubs + p * (1 + m.nodes) * dim;
-    for (int i = 0; i < dim; ++i)
+    act_at<bends, dim>(m, p, places_of<dim>(m.x, p, m.count), found);
+    std::copy_n(found.pushes[0].data(), width, result.pushes + p * width);
+    std::copy_n(found.rubs[0].data(), width, result.rubs + p * width);
+    result.pressure[p] = found.acts.pressure;
+    result.inside[p] = found.acts.inside;
+    result.slips[p] = found.acts.slips;
+  }
+}
+
+template <int dim, int bends>
+HOT_LOOP void differentiate_by_pressure_in(const core::Meeting& m, double* slopes)
+{
+  using T = Dual<1>;
+  Acting<T, dim> found(m.nodes);
+  std::vector<std::array<T, dim>> x(m.count);
+  for (std::size_t p = 0; p < m.points; ++p)
+  {
+    const auto* places = places_of<dim>(m.x, p, m.count);
+    for (int k = 0; k < m.count; ++k)
+      std::copy_n(places[k].begin(), dim, x[k].begin());
+    act_at<bends, dim>(m, p, x.data(), found);
+    for (int k = 0; k <= m.nodes; ++k)
+      for (int i = 0; i < dim; ++i)
+        *slopes++ = (found.pushes[k][i] + found.rubs[k][i]).by[0];
+  }
+}
+
+template <int dim, int bends>
+void see_in(const core::Meeting& m, double* gap, double* n, double* delta)
+{
+  for (std::size_t p = 0; p < m.points; ++p)
+  {
+    const auto* x = places_of<dim>(m.x, p, m.count);
+    auto foot = foot_of(ways_of<double, dim, bends>({m.table, p, m.nodes}, x), m.outward[p]);
+    gap[p] = foot.gap;
+    if (m.start)
     {
-      push[i] = foot.pressure * foot.n[i];
-      rub[i] = result.shear[p * dim + i] = foot.shear[i];
+      std::vector<std::array<double, dim>> middle(x, x + 1 + m.nodes);
+      const auto* start = places_of<dim>(m.start, p, 1 + m.nodes);
+      for (int k = 0; k <= m.nodes; ++k)
+        for (int i = 0; i < dim; ++i)
+          middle[k][i] = 0.5 * (start[k][i] + x[k][i]);
+      const Shapes<dim> there(m.middle, p, m.nodes);
+      foot = foot_of(ways_of<double, dim, bends>(there, middle.data()), m.outward[p]);
     }
-    result.pressure[p] = foot.pressure;
-    result.inside[p] = foot.inside;
-    result.slips[p] = foot.slips;
-    for (int k = 1; k <= m.nodes; ++k)
-      on_node<dim>(foot, m, p, k - 1, push + k * dim, rub + k * dim);
+    const auto way = delta_of<double, dim>(m, p, x);
+    std::copy_n(foot.n.data(), dim, n + p * dim);
+    std::copy_n(way.data(), dim, delta + p * dim);
   }
 }
 
@@ -203,51 +436,68 @@ void differentiate_at(const core::Meeting& m, std::size_t p, double* D, std::vec
 {
   constexpr int sides = dim - 1, vectors = 1 + sides + bends, lanes = dim * (vectors + rubs);
   using T = Dual<lanes>;
-  auto ways = ways_of<T, dim, bends>(m, p);
+  const auto* x = places_of<dim>(m.x, p, m.count);
+  const auto given = ways_of<double, dim, bends>({m.table, p, m.nodes}, x);
+  const auto way = delta_of<double, dim>(m, p, x);
+  Ways<T, dim, bends> ways;
+  std::array<T, dim> delta;
   for (int i = 0; i < dim; ++i)
   {
+    ways.r[i] = T(given.r[i]);
     ways.r[i].by[i] = 1.0;
     for (int e = 0; e < sides; ++e)
+    {
+      ways.A[e][i] = T(given.A[e][i]);
       ways.A[e][i].by[(1 + e) * dim + i] = 1.0;
+    }
     for (int b = 0; b < bends; ++b)
+    {
+      ways.B[b][i] = T(given.B[b][i]);
       ways.B[b][i].by[(1 + sides + b) * dim + i] = 1.0;
+    }
+    delta[i] = T(way[i]);
     if constexpr (rubs)
-      ways.delta[i].by[vectors * dim + i] = 1.0;
+      delta[i].by[vectors * dim + i] = 1.0;
   }
-  const auto foot = foot_of(ways, m, p);
+  const auto foot = foot_of(ways, m.outward[p]);
+  const auto acts = traction_of(m.known, p, pressing(m.known, p, foot.gap, foot.n), foot.gap,
+                                foot.n, delta);
+  std::array<T, sides> lag{};
+  if (rubs && acts.inside)
+    lag = lag_of<T, dim>(foot, acts.shear);
   // What acts on a node is a sum of vectors: that on the point, and by each slope and bend.
   constexpr int parts = rubs ? vectors : 1 + sides;
   std::array<std::array<T, dim>, parts> made;
   for (int i = 0; i < dim; ++i)
   {
-    const T force = foot.pressure * foot.n[i] + foot.shear[i];
+    const T force = acts.pressure * foot.n[i] + acts.shear[i];
     made[0][i] = force;
     if constexpr (rubs)
     {
       const T arm = foot.gap * foot.n[i];
       for (int e = 0; e < sides; ++e)
-        made[1 + e][i] = foot.moved[e] * force - foot.lag[e] * arm;
+        made[1 + e][i] = foot.moved[e] * force - lag[e] * arm;
       for (int b = 0; b < bends; ++b)
         made[1 + sides + b][i] = T(0.0);
       for (int e = 0; e < sides; ++e)
         for (int f = 0; f < sides; ++f)
           if (const int b = bend_of<dim, bends>(e, f); b >= 0)
-            made[1 + sides + b][i] = made[1 + sides + b][i] + foot.lag[e] * foot.moved[f] * arm;
+            made[1 + sides + b][i] = made[1 + sides + b][i] + lag[e] * foot.moved[f] * arm;
     }
     else
       for (int e = 0; e < sides; ++e)
         made[1 + e][i] = foot.moved[e] * force;
   }
   // How the vectors go with each node.
-  const double* slope = m.slope + p * sides * m.nodes;
-  const double* bend = m.bend + p * sides * sides * m.nodes;
+  const double* slope = m.table.slope + p * sides * m.nodes;
+  const double* bend = m.table.bend + p * sides * sides * m.nodes;
   const int width = m.count * dim;
   double* factors = work.data();
   double* half = factors + m.nodes * vectors;
   for (int k = 0; k < m.nodes; ++k)
   {
     double* mine = factors + k * vectors;
-    mine[0] = -m.shape[p * m.nodes + k];
+    mine[0] = -m.table.shape[p * m.nodes + k];
     for (int e = 0; e < sides; ++e)
     {
       mine[1 + e] = slope[e * m.nodes + k];
@@ -292,6 +542,39 @@ void differentiate_at(const core::Meeting& m, std::size_t p, double* D, std::vec
   }
 }
 
+// Set the same of a step of a motion, node by node.
+template <int dim, int bends>
+void differentiate_step_at(const core::Meeting& m, std::size_t p, double* D)
+{
+  using T = Dual<dim>;
+  Acting<T, dim> found(m.nodes);
+  std::vector<std::array<T, dim>> x(m.count);
+  const auto* places = places_of<dim>(m.x, p, m.count);
+  for (int k = 0; k < m.count; ++k)
+    std::copy_n(places[k].begin(), dim, x[k].begin());
+  const int width = m.count * dim, rows = (1 + m.nodes) * dim;
+  for (int row = 0; row < rows; ++row)
+    std::fill_n(D + row * width, dim, 0.0);
+  for (int node = 1; node < m.count; ++node)
+  {
+    for (int j = 0; j < dim; ++j)
+      x[node][j].by[j] = 1.0;
+    act_at<bends, dim>(m, p, x.data(), found);
+    for (int j = 0; j < dim; ++j)
+      x[node][j].by[j] = 0.0;
+    for (int row = 0; row < rows; ++row)
+    {
+      const T force = found.pushes[row / dim][row % dim] + found.rubs[row / dim][row % dim];
+      for (int j = 0; j < dim; ++j)
+      {
+        D[row * width + node * dim + j] = force.by[j];
+        // (nothing acts where all are shifted)
+        D[row * width + j] -= force.by[j];
+      }
+    }
+  }
+}
+
 // Add the derivative at a point to blocks between nodes.
 template <int dim>
 void add_at(const core::Sums& sums, std::size_t p, int nodes, int count, const double* D)
@@ -325,7 +608,10 @@ HOT_LOOP void add_tangents_in(const core::Meeting& m, const core::Sums& sums)
   std::vector<double> work(m.nodes * vectors + vectors * dim * m.count * dim);
   for (std::size_t p = 0; p < m.points; ++p)
   {
-    differentiate_at<dim, bends, rubs>(m, p, D.data(), work);
+    if (m.start)
+      differentiate_step_at<dim, bends>(m, p, D.data());
+    else
+      differentiate_at<dim, bends, rubs>(m, p, D.data(), work);
     add_at<dim>(sums, p, m.nodes, m.count, D.data());
   }
 }
@@ -361,6 +647,20 @@ void core::act(const Meeting& meeting, int dim, const Met& result)
   });
 }
 
+void core::differentiate_by_pressure(const Meeting& meeting, int dim, double* slopes)
+{
+  with_kind(dim, meeting.nodes, [&](auto kind) {
+    differentiate_by_pressure_in<decltype(kind)::dim, decltype(kind)::bends>(meeting, slopes);
+  });
+}
+
+void core::see(const Meeting& meeting, int dim, double* gap, double* n, double* delta)
+{
+  with_kind(dim, meeting.nodes, [&](auto kind) {
+    see_in<decltype(kind)::dim, decltype(kind)::bends>(meeting, gap, n, delta);
+  });
+}
+
 void core::add_tangents(const Meeting& meeting, int dim, const Sums& sums)
 {
   with_kind(dim, meeting.nodes, [&](auto kind) {
@@ -370,15 +670,4 @@ void core::add_tangents(const Meeting& meeting, int dim, const Sums& sums)
     else
       add_tangents_in<dimension, bends, true>(meeting, sums);
   });
-}
-
-HOT_LOOP void core::add_derivatives(std::size_t points, int dim, int nodes, int count,
-                                    const double* derivatives, const Sums& sums)
-{
-  const std::size_t size = static_cast<std::size_t>((1 + nodes) * dim * count * dim);
-  for (std::size_t p = 0; p < points; ++p)
-    if (dim == 2)
-      add_at<2>(sums, p, nodes, count, derivatives + p * size);
-    else
-      add_at<3>(sums, p, nodes, count, derivatives + p * size);
 }

@@ -4,7 +4,6 @@
 // The compiled loops as Python functions: arrays and addresses of kernels, nothing else.
 
 #include <algorithm>
-#include <complex>
 #include <optional>
 #include <string>
 #include <tuple>
@@ -148,7 +147,7 @@ Touching touching_of(std::size_t n, std::size_t dim, const std::vector<Reals>& p
                      bool smooth)
 {
   require(dim == 2 || dim == 3, "two or three dimensions");
-  require(points.size() == 6 && law.size() == 4, "points and law");
+  require(points.size() == 6 && law.size() == 5, "points and law");
   for (std::size_t i = 0; i < 4; ++i)
     require(points[i].size() == n, "values (n,)");
   const Reals &behind = points[4], &bounds = points[5];
@@ -166,44 +165,29 @@ Touching touching_of(std::size_t n, std::size_t dim, const std::vector<Reals>& p
           law[1],
           law[2],
           law[3],
+          law[4],
           smooth};
 }
 
-// Points of which gaps, normals, ways from anchors and, or not, pressures are given.
-template <typename T, typename V>
-Separation<T> separation_of(const std::vector<Array<const V>>& given)
+// Points of which gaps, normals and ways from anchors are given, and, or not, how a step began.
+Separation separation_of(const std::vector<Reals>& given)
 {
-  static_assert(sizeof(T) == sizeof(V));
-  require(given.size() == 4 && given[1].ndim() == 2, "gaps, normals, ways and pressures");
+  require(given.size() == 6 && given[1].ndim() == 2, "gaps, normals, ways, and a step");
   const std::size_t n = given[0].size();
   require(given[1].shape(0) == n && given[2].size() == given[1].size(), "vectors (n, dim)");
-  require(given[3].size() == 0 || given[3].size() == n, "pressures (n,) or none");
-  const auto data
-      = [&](std::size_t i) { return reinterpret_cast<const T*>(given[i].data()); };
-  return {n, data(0), data(1), data(2), given[3].size() == 0 ? nullptr : data(3)};
-}
-
-// Numbers T of the loops are V in NumPy: those with one derivative are complex there.
-template <typename T, typename V>
-void act_on(const std::vector<Array<const V>>& given, const std::vector<Reals>& points,
-            Array<const std::uint8_t> touched, const std::vector<double>& law, bool smooth,
-            Array<V> pressure, Array<V> shear, Array<std::uint8_t> inside,
-            Array<std::uint8_t> slips)
-{
-  const auto seen = separation_of<T, V>(given);
-  const std::size_t n = seen.points, dim = given[1].shape(1);
-  require(pressure.size() == n && shear.size() == n * dim && inside.size() == n
-              && slips.size() == n,
-          "pressures (n,), shears (n, dim), values (n,)");
-  act(touching_of(n, dim, points, touched, law, smooth), seen, static_cast<int>(dim),
-      reinterpret_cast<T*>(pressure.data()), reinterpret_cast<T*>(shear.data()), inside.data(),
-      slips.data());
+  const bool moves = given[5].size() > 0;
+  require(!moves || (given[3].size() == n && given[4].size() == n
+                     && given[5].size() == given[1].size()),
+          "gaps and changes of a step, or none");
+  const auto data = [&](std::size_t i) { return moves ? given[i].data() : nullptr; };
+  return {n, given[0].data(), given[1].data(), given[2].data(), data(3), data(4), data(5)};
 }
 
 // Points that meet facets: places, tables of the facets, and what is known of the points.
 Meeting meeting_of(const Reals& x, const std::vector<Reals>& tables,
-                   const std::vector<Reals>& points, const Array<const std::uint8_t>& touched,
-                   const std::vector<double>& law, bool smooth)
+                   const std::vector<Reals>& start, const std::vector<Reals>& points,
+                   const Array<const std::uint8_t>& touched, const std::vector<double>& law,
+                   bool smooth)
 {
   require(x.ndim() == 3 && (x.shape(2) == 2 || x.shape(2) == 3), "places (n, count, 2 or 3)");
   require(tables.size() == 5, "tables");
@@ -215,16 +199,50 @@ Meeting meeting_of(const Reals& x, const std::vector<Reals>& tables,
           "shape functions with first and second derivatives, and those of anchors");
   require(tables[4].size() == n, "signs of normals (n,)");
   require(x.shape(1) == 1 + (smooth ? nodes : 2 * nodes), "places of a point, nodes and anchors");
+  const bool moves = !start.empty();
+  require(!moves
+              || (start.size() == 6 && start[0].size() == n * (1 + nodes) * x.shape(2)
+                  && start[1].size() == tables[0].size() && start[2].size() == tables[1].size()
+                  && start[3].size() == tables[2].size() && start[4].size() == n
+                  && start[5].size() == n),
+          "places, shape functions and gaps where a step begins");
+  const auto data = [&](std::size_t i) { return moves ? start[i].data() : nullptr; };
   return {n,
           static_cast<int>(x.shape(1)),
           static_cast<int>(nodes),
           x.data(),
-          tables[0].data(),
-          tables[1].data(),
-          tables[2].data(),
+          {tables[0].data(), tables[1].data(), tables[2].data()},
           tables[3].data(),
           tables[4].data(),
-          touching_of(n, x.shape(2), points, touched, law, smooth)};
+          touching_of(n, x.shape(2), points, touched, law, smooth),
+          data(0),
+          {data(1), data(2), data(3)},
+          data(4),
+          data(5)};
+}
+
+// Facets by their nodes and shape functions: degree, and whether they are triangles or lines.
+Shape shape_of(std::size_t dim, const Reals& coefficients, const std::tuple<int, bool>& kind,
+               double close, int most)
+{
+  const auto [degree, simplex] = kind;
+  require(dim == 2 || dim == 3, "two or three dimensions");
+  require(degree > 0 && degree <= 7, "degrees from 1 to 7");
+  const int row = degree + 1, count = dim == 2 ? row : simplex ? row * (row + 1) / 2 : row * row;
+  const auto size = static_cast<std::size_t>(count);
+  require(coefficients.ndim() == 2 && coefficients.shape(0) == size
+              && coefficients.shape(1) == size,
+          "coefficients (monomials, nodes)");
+  return {degree, count, count, simplex, coefficients.data(), close, most};
+}
+
+Shape shape_of(const Reals& corners, const Reals& coefficients, const std::tuple<int, bool>& kind,
+               double close, int most)
+{
+  require(corners.ndim() == 3, "nodes (facets, nodes, dim)");
+  const Shape shape = shape_of(corners.shape(2), coefficients, kind, close, most);
+  require(corners.shape(1) == static_cast<std::size_t>(shape.nodes), "nodes of a facet");
+  return shape;
 }
 
 // Where derivatives at points add up.
@@ -815,27 +833,50 @@ NB_MODULE(_loops, m)
         "gradient"_a, "old_gradient"_a, "stiffness"_a, "small"_a, "factor"_a,
         "stress"_a.noconvert(), "tangent"_a.noconvert(), "Set stress and tangent of damping.");
 
-  m.def("traction", &act_on<double, double>, "given"_a, "points"_a, "touched"_a, "law"_a,
-        "smooth"_a, "pressure"_a.noconvert(), "shear"_a.noconvert(), "inside"_a.noconvert(),
+  m.def("traction",
+        [](const std::vector<Reals>& given, const std::vector<Reals>& points,
+           Array<const std::uint8_t> touched, const std::vector<double>& law, bool smooth,
+           RealsOut pressure, RealsOut normal, RealsOut shear, Array<std::uint8_t> inside,
+           Array<std::uint8_t> slips) {
+    const auto seen = separation_of(given);
+    const std::size_t n = seen.points, dim = given[1].shape(1);
+    require(pressure.size() == n && normal.size() == n * dim && shear.size() == n * dim
+                && inside.size() == n && slips.size() == n,
+            "pressures (n,), vectors (n, dim), values (n,)");
+    act(touching_of(n, dim, points, touched, law, smooth), seen, static_cast<int>(dim),
+        pressure.data(), normal.data(), shear.data(), inside.data(), slips.data());
+  },
+        "given"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a, "pressure"_a.noconvert(),
+        "normal"_a.noconvert(), "shear"_a.noconvert(), "inside"_a.noconvert(),
         "slips"_a.noconvert(), "Set tractions of contact at points.");
 
-  m.def("traction", &act_on<Dual<1>, std::complex<double>>, "given"_a, "points"_a, "touched"_a,
-        "law"_a, "smooth"_a, "pressure"_a.noconvert(), "shear"_a.noconvert(),
-        "inside"_a.noconvert(), "slips"_a.noconvert(),
-        "Set tractions with derivatives as small imaginary parts.");
+  m.def("traction_by_pressure",
+        [](const std::vector<Reals>& given, const std::vector<Reals>& points,
+           Array<const std::uint8_t> touched, const std::vector<double>& law, bool smooth,
+           RealsOut slopes) {
+    const auto seen = separation_of(given);
+    const std::size_t dim = given[1].shape(1);
+    require(slopes.size() == seen.points * dim, "slopes (n, dim)");
+    differentiate_by_pressure(touching_of(seen.points, dim, points, touched, law, smooth), seen,
+                              static_cast<int>(dim), slopes.data());
+  },
+        "given"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a, "slopes"_a.noconvert(),
+        "Set derivatives of tractions by pressures on top.");
 
   m.def("traction_slopes",
         [](const std::vector<Reals>& given, const std::vector<Reals>& points,
            Array<const std::uint8_t> touched, const std::vector<double>& law, bool smooth,
-           RealsOut slopes) {
-    const auto seen = separation_of<double, double>(given);
-    const std::size_t dim = given[1].shape(1);
-    require(slopes.size() == seen.points * (1 + dim) * (2 + 2 * dim), "slopes (n, 1 + d, 2 + 2 d)");
-    differentiate(touching_of(seen.points, dim, points, touched, law, smooth), seen,
-                  static_cast<int>(dim), slopes.data());
+           Reals of_gap, Reals of_normal, RealsOut slopes) {
+    const auto seen = separation_of(given);
+    const std::size_t n = seen.points, dim = given[1].shape(1);
+    require(of_gap.size() == n * dim && of_normal.size() == n * dim * dim
+                && slopes.size() == n * dim * dim,
+            "derivatives of gaps (n, dim), of normals and tractions (n, dim, dim)");
+    differentiate(touching_of(n, dim, points, touched, law, smooth), seen, static_cast<int>(dim),
+                  of_gap.data(), of_normal.data(), slopes.data());
   },
-        "given"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a, "slopes"_a.noconvert(),
-        "Set derivatives of tractions by pressures on top, gaps, normals and ways.");
+        "given"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a, "of_gap"_a, "of_normal"_a,
+        "slopes"_a.noconvert(), "Set derivatives of tractions by positions.");
 
   m.def("coulomb",
         [](Reals pressure, Reals stretch, double friction, double cohesion, double limit) {
@@ -849,80 +890,115 @@ NB_MODULE(_loops, m)
         "Return the largest shears by Coulomb's law.");
 
   m.def("act",
-        [](Reals x, const std::vector<Reals>& tables, const std::vector<Reals>& points,
-           Array<const std::uint8_t> touched, const std::vector<double>& law, bool smooth,
-           RealsOut pushes, RealsOut rubs, RealsOut pressure, RealsOut shear,
-           Array<std::uint8_t> inside, Array<std::uint8_t> slips) {
-    const Meeting meeting = meeting_of(x, tables, points, touched, law, smooth);
+        [](Reals x, const std::vector<Reals>& tables, const std::vector<Reals>& start,
+           const std::vector<Reals>& points, Array<const std::uint8_t> touched,
+           const std::vector<double>& law, bool smooth,
+           RealsOut pushes, RealsOut rubs, RealsOut pressure, Array<std::uint8_t> inside,
+           Array<std::uint8_t> slips) {
+    const Meeting meeting = meeting_of(x, tables, start, points, touched, law, smooth);
     const std::size_t n = meeting.points, dim = x.shape(2);
     require(pushes.size() == n * (1 + meeting.nodes) * dim && rubs.size() == pushes.size()
-                && pressure.size() == n && shear.size() == n * dim && inside.size() == n
-                && slips.size() == n,
+                && pressure.size() == n && inside.size() == n && slips.size() == n,
             "forces (n, 1 + nodes, dim), values (n,)");
     act(meeting, static_cast<int>(dim),
-        {pushes.data(), rubs.data(), pressure.data(), shear.data(), inside.data(), slips.data()});
+        {pushes.data(), rubs.data(), pressure.data(), inside.data(), slips.data()});
   },
-        "x"_a, "tables"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a, "pushes"_a.noconvert(),
-        "rubs"_a.noconvert(), "pressure"_a.noconvert(), "shear"_a.noconvert(),
-        "inside"_a.noconvert(), "slips"_a.noconvert(),
-        "Set what acts between points and facets.");
+        "x"_a, "tables"_a, "start"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a, "pushes"_a.noconvert(),
+        "rubs"_a.noconvert(), "pressure"_a.noconvert(), "inside"_a.noconvert(),
+        "slips"_a.noconvert(), "Set what acts between points and facets.");
+
+  m.def("act_by_pressure",
+        [](Reals x, const std::vector<Reals>& tables, const std::vector<Reals>& start,
+           const std::vector<Reals>& points, Array<const std::uint8_t> touched,
+           const std::vector<double>& law, bool smooth, RealsOut slopes) {
+    const Meeting meeting = meeting_of(x, tables, start, points, touched, law, smooth);
+    const std::size_t dim = x.shape(2);
+    require(slopes.size() == meeting.points * (1 + meeting.nodes) * dim, "forces (n, 1 + nodes, dim)");
+    differentiate_by_pressure(meeting, static_cast<int>(dim), slopes.data());
+  },
+        "x"_a, "tables"_a, "start"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a,
+        "slopes"_a.noconvert(), "Set derivatives of forces on points and nodes by pressures on top.");
+
+  m.def("see",
+        [](Reals x, const std::vector<Reals>& tables, const std::vector<Reals>& start,
+           const std::vector<Reals>& points, Array<const std::uint8_t> touched,
+           const std::vector<double>& law, bool smooth, RealsOut gap, RealsOut normal,
+           RealsOut way) {
+    const Meeting meeting = meeting_of(x, tables, start, points, touched, law, smooth);
+    const std::size_t n = meeting.points, dim = x.shape(2);
+    require(gap.size() == n && normal.size() == n * dim && way.size() == n * dim,
+            "gaps (n,), vectors (n, dim)");
+    see(meeting, static_cast<int>(dim), gap.data(), normal.data(), way.data());
+  },
+        "x"_a, "tables"_a, "start"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a,
+        "gap"_a.noconvert(), "normal"_a.noconvert(), "way"_a.noconvert(),
+        "Set gaps, normals and ways from anchors of points at their facets.");
 
   m.def("add_tangents",
-        [](Reals x, const std::vector<Reals>& tables, const std::vector<Reals>& points,
-           Array<const std::uint8_t> touched, const std::vector<double>& law, bool smooth,
+        [](Reals x, const std::vector<Reals>& tables, const std::vector<Reals>& start,
+           const std::vector<Reals>& points, Array<const std::uint8_t> touched,
+           const std::vector<double>& law, bool smooth,
            Reals weights, Reals shapes, Offsets group, Indices positions, RealsOut values) {
-    const Meeting meeting = meeting_of(x, tables, points, touched, law, smooth);
+    const Meeting meeting = meeting_of(x, tables, start, points, touched, law, smooth);
     const auto dim = static_cast<int>(x.shape(2));
     add_tangents(meeting, dim,
                  sums_of(meeting.points, dim, meeting.nodes, meeting.count, weights, shapes, group,
                          positions, values));
   },
-        "x"_a, "tables"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a, "weights"_a, "shapes"_a,
+        "x"_a, "tables"_a, "start"_a, "points"_a, "touched"_a, "law"_a, "smooth"_a, "weights"_a, "shapes"_a,
         "group"_a, "positions"_a, "values"_a.noconvert(),
         "Add the derivatives of what acts between points and facets to blocks between nodes.");
 
-  m.def("add_derivatives",
-        [](Reals derivatives, Reals weights, Reals shapes, Offsets group, Indices positions,
-           RealsOut values) {
-    require(derivatives.ndim() == 5, "derivatives (n, 1 + nodes, dim, count, dim)");
-    const auto dim = static_cast<int>(derivatives.shape(2));
-    require((dim == 2 || dim == 3) && derivatives.shape(4) == derivatives.shape(2),
-            "two or three dimensions");
-    const std::size_t n = derivatives.shape(0);
-    const auto nodes = static_cast<int>(derivatives.shape(1)) - 1;
-    const auto count = static_cast<int>(derivatives.shape(3));
-    add_derivatives(
-        n, dim, nodes, count, derivatives.data(),
-        sums_of(n, dim, nodes, count, weights, shapes, group, positions, values));
+  m.def("tabulate",
+        [](Reals place, Reals coefficients, const std::tuple<int, bool>& kind, double close, int most,
+           RealsOut shape, RealsOut slope, RealsOut bend) {
+    require(place.ndim() == 2, "places (n, sides)");
+    const std::size_t n = place.shape(0), sides = place.shape(1);
+    const Shape facet = shape_of(sides + 1, coefficients, kind, close, most);
+    const std::size_t size = n * static_cast<std::size_t>(facet.nodes);
+    require(shape.size() == size && slope.size() == size * sides
+                && bend.size() == size * sides * sides,
+            "shape functions and derivatives (n, ..., nodes)");
+    tabulate(n, static_cast<int>(sides) + 1, facet, place.data(),
+             {shape.data(), slope.data(), bend.data()});
   },
-        "derivatives"_a, "weights"_a, "shapes"_a, "group"_a, "positions"_a,
-        "values"_a.noconvert(), "Add derivatives at points to blocks between nodes.");
+        "place"_a, "coefficients"_a, "kind"_a, "close"_a, "most"_a, "shape"_a.noconvert(),
+        "slope"_a.noconvert(), "bend"_a.noconvert(),
+        "Set shape functions of facets with first and second derivatives.");
+
+  m.def("project",
+        [](Reals x, Reals corners, Reals coefficients, const std::tuple<int, bool>& kind,
+           double close, int most, RealsOut place) {
+    const Shape shape = shape_of(corners, coefficients, kind, close, most);
+    const std::size_t n = corners.shape(0), dim = corners.shape(2);
+    require(x.size() == n * dim && place.size() == n * (dim - 1), "points and places (n,)");
+    return project(n, static_cast<int>(dim), shape, x.data(), corners.data(), place.data());
+  },
+        "x"_a, "corners"_a, "coefficients"_a, "kind"_a, "close"_a, "most"_a, "place"_a.noconvert(),
+        "Project points on facets, from some places; return whether all have an area.");
 
   m.def("find_closest",
-        [](Reals x, Reals normal, Reals corners, Reals outward, Array<const std::uint8_t> present,
-           const std::vector<double>& bounds, int most, OffsetsOut found, RealsOut place,
-           RealsOut gap, Array<std::uint8_t> near, RealsOut beside) {
-    require(corners.ndim() == 3 && (corners.shape(2) == 2 || corners.shape(2) == 3),
-            "corners (facets, nodes, 2 or 3)");
-    const std::size_t dim = corners.shape(2), nodes = corners.shape(1), n = found.size();
-    const std::size_t facets = corners.shape(0);
-    require(nodes == dim || (dim == 3 && nodes == 4), "lines, triangles or quadrilaterals");
+        [](Reals x, Reals normal, Reals corners, Reals coefficients,
+           const std::tuple<int, bool>& kind, double close, int most, Reals outward,
+           Array<const std::uint8_t> present, const std::vector<double>& bounds, OffsetsOut found,
+           RealsOut place, RealsOut gap, Array<std::uint8_t> near, RealsOut beside) {
+    const Shape shape = shape_of(corners, coefficients, kind, close, most);
+    const std::size_t dim = corners.shape(2), n = found.size(), facets = corners.shape(0);
     require(x.size() == n * dim && (normal.size() == 0 || normal.size() == n * dim)
                 && outward.size() == facets && present.size() == facets,
             "points and normals (n, dim), signs of facets");
     require(place.size() == n * (dim - 1) && gap.size() == n && near.size() == n
                 && beside.size() == n,
             "results (n,)");
-    require(bounds.size() == 5, "reach, three cosines, and the last step");
-    return find_closest({n, facets, static_cast<int>(nodes), x.data(),
-                         normal.size() == 0 ? nullptr : normal.data(), corners.data(),
-                         outward.data(), present.data(), bounds[0], bounds[1], bounds[2], bounds[3],
-                         bounds[4], most},
+    require(bounds.size() == 4, "reach and three cosines");
+    return find_closest({n, facets, shape, x.data(), normal.size() == 0 ? nullptr : normal.data(),
+                         corners.data(), outward.data(), present.data(), bounds[0], bounds[1],
+                         bounds[2], bounds[3]},
                         static_cast<int>(dim),
                         {found.data(), place.data(), gap.data(), near.data(), beside.data()});
   },
-        "x"_a, "normal"_a, "corners"_a, "outward"_a, "present"_a, "bounds"_a, "most"_a,
-        "found"_a.noconvert(), "place"_a.noconvert(), "gap"_a.noconvert(), "near"_a.noconvert(),
-        "beside"_a.noconvert(),
+        "x"_a, "normal"_a, "corners"_a, "coefficients"_a, "kind"_a, "close"_a, "most"_a,
+        "outward"_a, "present"_a, "bounds"_a, "found"_a.noconvert(), "place"_a.noconvert(),
+        "gap"_a.noconvert(), "near"_a.noconvert(), "beside"_a.noconvert(),
         "Find the closest facets of points; return whether all that were tried have an area.");
 }

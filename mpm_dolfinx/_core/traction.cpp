@@ -6,91 +6,134 @@
 #include "traction.h"
 #include "hot_loop.h"
 
-#include <algorithm>
-
 namespace
 {
 using namespace core;
 
+// What a point sees, as numbers with derivatives or without.
 template <typename T, int dim>
-std::array<T, dim> row(const T* values, std::size_t p)
+struct Seen
 {
-  std::array<T, dim> found;
-  std::copy_n(values + p * dim, dim, found.begin());
-  return found;
+  using Vector = std::array<T, dim>;
+  T gap;
+  Vector n, delta, change;
+
+  Seen(const Separation& all, std::size_t p) : gap(all.gap[p])
+  {
+    for (int i = 0; i < dim; ++i)
+    {
+      n[i] = T(all.n[p * dim + i]);
+      delta[i] = T(all.delta[p * dim + i]);
+      change[i] = T(all.change ? all.change[p * dim + i] : 0.0);
+    }
+  }
+};
+
+// Return what acts on a point, and set its traction by pressure.
+template <typename T, int dim>
+Traction<T, dim> acting(const Touching& known, const Separation& all, std::size_t p,
+                        const Seen<T, dim>& seen, std::array<T, dim>& normal)
+{
+  normal = seen.n;
+  Press<T> press;
+  if (all.before)
+  {
+    const T gap = seen.gap - T(all.offset[p]), difference = seen.gap - T(all.before[p]);
+    press = mean_pressing(known, p, all.before[p] - all.offset[p], gap);
+    correct(&normal, &seen.change, &seen.change, 1, difference, known.still);
+  }
+  else
+  {
+    press = pressing(known, p, seen.gap, seen.n);
+    put_on_top(press);
+  }
+  for (T& part : normal)
+    part = press.value * part;
+  return traction_of(known, p, press, seen.gap, seen.n, seen.delta);
 }
 
-template <typename T, int dim>
-void act_in(const Touching& known, const Separation<T>& seen, T* pressure, T* shear,
-            std::uint8_t* inside, std::uint8_t* slips)
+template <int dim>
+void act_in(const Touching& known, const Separation& all, double* pressure, double* normal,
+            double* shear, std::uint8_t* inside, std::uint8_t* slips)
 {
-  for (std::size_t p = 0; p < seen.points; ++p)
+  std::array<double, dim> by;
+  for (std::size_t p = 0; p < all.points; ++p)
   {
-    const auto n = row<T, dim>(seen.n, p);
-    const T gap = seen.gap[p];
-    const Press<T> press
-        = seen.pressure ? Press<T>{seen.pressure[p], true} : pressing(known, p, gap, n);
-    const auto acts = traction_of(known, p, press, gap, n, row<T, dim>(seen.delta, p));
+    const auto acts = acting<double, dim>(known, all, p, Seen<double, dim>(all, p), by);
     pressure[p] = acts.pressure;
-    std::copy_n(acts.shear.begin(), dim, shear + p * dim);
+    for (int i = 0; i < dim; ++i)
+    {
+      normal[p * dim + i] = by[i];
+      shear[p * dim + i] = acts.shear[i];
+    }
     inside[p] = acts.inside;
     slips[p] = acts.slips;
   }
 }
 
 template <int dim>
-void differentiate_in(const Touching& known, const Separation<double>& seen, double* slopes)
+void differentiate_by_pressure_in(const Touching& known, const Separation& all, double* slopes)
 {
-  constexpr int lanes = 2 + 2 * dim;
-  using T = Dual<lanes>;
-  for (std::size_t p = 0; p < seen.points; ++p)
+  using T = Dual<1>;
+  std::array<T, dim> normal;
+  for (std::size_t p = 0; p < all.points; ++p)
   {
-    T gap(seen.gap[p]);
-    std::array<T, dim> n, delta;
-    gap.by[1] = 1.0;
+    const auto acts = acting<T, dim>(known, all, p, Seen<T, dim>(all, p), normal);
+    for (int i = 0; i < dim; ++i)
+      slopes[p * dim + i] = (normal[i] + acts.shear[i]).by[0];
+  }
+}
+
+template <int dim>
+void differentiate_in(const Touching& known, const Separation& all, const double* of_gap,
+                      const double* of_normal, double* slopes)
+{
+  using T = Dual<dim>;
+  std::array<T, dim> normal;
+  for (std::size_t p = 0; p < all.points; ++p)
+  {
+    Seen<T, dim> seen(all, p);
+    for (int j = 0; j < dim; ++j)
+    {
+      seen.gap.by[j] = of_gap[p * dim + j];
+      seen.delta[j].by[j] = seen.change[j].by[j] = 1.0;
+      for (int i = 0; i < dim; ++i)
+        seen.n[i].by[j] = of_normal[(p * dim + i) * dim + j];
+    }
+    const auto acts = acting<T, dim>(known, all, p, seen, normal);
     for (int i = 0; i < dim; ++i)
     {
-      n[i] = T(seen.n[p * dim + i]);
-      n[i].by[2 + i] = 1.0;
-      delta[i] = T(seen.delta[p * dim + i]);
-      delta[i].by[2 + dim + i] = 1.0;
+      const T force = normal[i] + acts.shear[i];
+      for (int j = 0; j < dim; ++j)
+        slopes[(p * dim + i) * dim + j] = force.by[j];
     }
-    Press<T> press
-        = seen.pressure ? Press<T>{T(seen.pressure[p]), true} : pressing(known, p, gap, n);
-    press.value.by[0] = press.acts ? 1.0 : 0.0;
-    const auto acts = traction_of(known, p, press, gap, n, delta);
-    double* found = slopes + p * (1 + dim) * lanes;
-    std::copy_n(acts.pressure.by.begin(), lanes, found);
-    for (int i = 0; i < dim; ++i)
-      std::copy_n(acts.shear[i].by.begin(), lanes, found + (1 + i) * lanes);
   }
 }
 } // namespace
 
-HOT_LOOP void core::act(const Touching& known, const Separation<double>& seen, int dim, double* pressure,
-                        double* shear, std::uint8_t* inside, std::uint8_t* slips)
+HOT_LOOP void core::act(const Touching& known, const Separation& seen, int dim, double* pressure,
+                        double* normal, double* shear, std::uint8_t* inside, std::uint8_t* slips)
 {
   if (dim == 2)
-    act_in<double, 2>(known, seen, pressure, shear, inside, slips);
+    act_in<2>(known, seen, pressure, normal, shear, inside, slips);
   else
-    act_in<double, 3>(known, seen, pressure, shear, inside, slips);
+    act_in<3>(known, seen, pressure, normal, shear, inside, slips);
 }
 
-HOT_LOOP void core::act(const Touching& known, const Separation<Dual<1>>& seen, int dim,
-                        Dual<1>* pressure, Dual<1>* shear, std::uint8_t* inside,
-                        std::uint8_t* slips)
+HOT_LOOP void core::differentiate_by_pressure(const Touching& known, const Separation& seen, int dim,
+                                              double* slopes)
 {
   if (dim == 2)
-    act_in<Dual<1>, 2>(known, seen, pressure, shear, inside, slips);
+    differentiate_by_pressure_in<2>(known, seen, slopes);
   else
-    act_in<Dual<1>, 3>(known, seen, pressure, shear, inside, slips);
+    differentiate_by_pressure_in<3>(known, seen, slopes);
 }
 
-HOT_LOOP void core::differentiate(const Touching& known, const Separation<double>& seen, int dim,
-                                  double* slopes)
+HOT_LOOP void core::differentiate(const Touching& known, const Separation& seen, int dim,
+                                  const double* of_gap, const double* of_normal, double* slopes)
 {
   if (dim == 2)
-    differentiate_in<2>(known, seen, slopes);
+    differentiate_in<2>(known, seen, of_gap, of_normal, slopes);
   else
-    differentiate_in<3>(known, seen, slopes);
+    differentiate_in<3>(known, seen, of_gap, of_normal, slopes);
 }

@@ -25,7 +25,8 @@ struct Touching
   // and tangential stiffness, (points, 5); or null: they are by Coulomb's law.
   const double* bounds;
   double friction, cohesion, limit, touch;
-  bool smooth; // whether there is no friction
+  double still; // changes of positions in a step that are none
+  bool smooth;  // whether there is no friction
 };
 
 // A pressure, and whether it acts, or is about to.
@@ -58,6 +59,45 @@ Press<T> pressing(const Touching& known, std::size_t p, const T& gap, const std:
     acts = value_of(pressure) >= -k * known.touch;
   }
   return {acts ? pressure : T(0.0), acts};
+}
+
+// Derivatives by one number are by a pressure that comes on top where one acts.
+template <typename T>
+void put_on_top(Press<T>&)
+{
+}
+
+inline void put_on_top(Press<Dual<1>>& press) { press.value.by[0] = press.acts ? 1.0 : 0.0; }
+
+// The mean pressure of a step between two gaps: the loss of the energy k/2 <-gap>^2 over the change.
+template <typename T>
+Press<T> mean_pressing(const Touching& known, std::size_t p, double before, const T& gap)
+{
+  const bool was = before <= known.touch, is = value_of(gap) <= known.touch;
+  const T first(was ? before : 0.0), last = is ? gap : T(0.0), change = gap - T(before);
+  const bool once = was != is && std::abs(value_of(change)) > known.touch;
+  const T share = once ? T((last - first) * inverse(change)) : T(1.0);
+  return {-0.5 * known.stiffness[p] * ((first + last) * share), true};
+}
+
+// Correct gradients at some places, along given vectors, so that their product with the changes of
+// these is a given difference.
+template <typename T, std::size_t dim>
+void correct(std::array<T, dim>* gradient, const std::array<T, dim>* change,
+             const std::array<T, dim>* along, std::size_t count, const T& difference, double still)
+{
+  T size(0.0), lacks = difference;
+  for (std::size_t k = 0; k < count; ++k)
+  {
+    size = size + dot(along[k], along[k]);
+    lacks = lacks - dot(gradient[k], change[k]);
+  }
+  if (!(value_of(size) > still * still))
+    return;
+  const T factor = lacks * inverse(size);
+  for (std::size_t k = 0; k < count; ++k)
+    for (std::size_t i = 0; i < dim; ++i)
+      gradient[k][i] = gradient[k][i] + factor * along[k][i];
 }
 
 // The largest shear by Coulomb's law.
@@ -115,22 +155,27 @@ Traction<T, dim> traction_of(const Touching& known, std::size_t p, const Press<T
   return acts;
 }
 
-// Points of which gaps (points,), normals and ways from anchors (points, dim) are known, and
-// pressures (points,), or null: they are those of gaps and tractions behind.
-template <typename T>
+// Points of which gaps (points,), normals and ways from anchors (points, dim) are known. In a step of
+// a motion normals are those of its middle, and gaps at its beginning, those at which points begin to
+// be pressed (points,), and changes (points, dim) are known too; otherwise these are null.
 struct Separation
 {
   std::size_t points;
-  const T *gap, *n, *delta, *pressure;
+  const double *gap, *n, *delta;
+  const double *before, *offset, *change;
 };
 
-// Set pressures (points,), shears (points, dim), and which points touch and slip.
-void act(const Touching& known, const Separation<double>& seen, int dim, double* pressure, double* shear,
-         std::uint8_t* inside, std::uint8_t* slips);
-void act(const Touching& known, const Separation<Dual<1>>& seen, int dim, Dual<1>* pressure,
-         Dual<1>* shear, std::uint8_t* inside, std::uint8_t* slips);
+// Set pressures (points,), tractions by these and by friction (points, dim), and which points touch
+// and slip.
+void act(const Touching& known, const Separation& seen, int dim, double* pressure, double* normal,
+         double* shear, std::uint8_t* inside, std::uint8_t* slips);
 
-// Set the derivatives of pressures and shears by a pressure that comes on top, gaps, normals and
-// ways from anchors, (points, 1 + dim, 2 + 2 dim).
-void differentiate(const Touching& known, const Separation<double>& seen, int dim, double* slopes);
+// Set the derivatives of tractions by a pressure on top, (points, dim).
+void differentiate_by_pressure(const Touching& known, const Separation& seen, int dim,
+                               double* slopes);
+
+// Set the derivatives of tractions by positions (points, dim, dim), from those of gaps (points, dim)
+// and of normals (points, dim, dim).
+void differentiate(const Touching& known, const Separation& seen, int dim, const double* of_gap,
+                   const double* of_normal, double* slopes);
 } // namespace core

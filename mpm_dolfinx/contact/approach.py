@@ -15,7 +15,6 @@ import basix
 from .facets import Closest, separated
 from .neighbourhood import Neighbourhood
 from .pass_memory import Memory
-from .stencil import Foot, projected
 
 __all__ = ["LINGER", "Approach", "OverStep"]
 
@@ -100,10 +99,8 @@ class Approach:
         facet, place = found.facet.copy(), found.place.copy()
         gap, near = found.gap.copy(), found.near.copy()
         facet[keep] = before.facet[keep]
-        at = facet[keep]
-        r, n = separated(around.tabulate(s), x[keep], nodes[at], around.outward[at])
+        gap[keep], _ = self._gaps(s, x[keep], nodes[facet[keep]], facet[keep])
         place[keep], near[keep] = s, True
-        gap[keep] = (r * n).sum(axis=1)
         return Closest(facet, place, gap, near, found.beside)
 
     def over_step(self, found: Closest, within: NDArray[np.bool_]) -> OverStep:
@@ -123,9 +120,8 @@ class Approach:
         if len(lost):
             facet, place, gap = found.facet.copy(), found.place.copy(), found.gap.copy()
             place[lost] = self._place(x[lost], nodes[at])
-            table = near.tabulate(place[lost])
-            foot = projected(table, x[lost], nodes[at], near.outward[at])
-            facet[lost], gap[lost] = at, foot.gap
+            gap[lost], _ = self._gaps(place[lost], x[lost], nodes[at], at)
+            facet[lost] = at
             found = found._replace(facet=facet, place=place, gap=gap)
         before, begins = self._before_step(found)
         sideways = within & ~last.within & (before < -touch)
@@ -149,25 +145,37 @@ class Approach:
         new = np.flatnonzero((found.facet >= 0) & (found.facet != last))
         if len(new) == 0:
             return gap, offset
-        foot = self._foot_before(new, found.facet[new], found.place[new])
+        now, n = self._gaps_before(new, found.facet[new], found.place[new])
         pressed = memory.within[new] & (last[new] >= 0)
-        was = self._foot_before(new, np.where(pressed, last[new], found.facet[new]), None)
-        bent = (foot.n * was.n).sum(axis=1) < CORNER
+        _, was = self._gaps_before(new, np.where(pressed, last[new], found.facet[new]), None)
+        bent = (n * was).sum(axis=1) < CORNER
         other = ~pressed | bent
         depth = (gap - offset)[new]
-        gap[new[other]] = foot.gap[other]
+        gap[new[other]] = now[other]
         turned = pressed & bent
-        offset[new[turned]] = np.minimum(foot.gap - depth, 0.0)[turned]
+        offset[new[turned]] = np.minimum(now - depth, 0.0)[turned]
         return gap, offset
 
-    def _foot_before(
+    def _gaps_before(
         self, which: NDArray[np.int64], facet: NDArray[np.int64], place: NDArray[np.float64] | None
-    ) -> Foot:
-        """Return projections of some points on facets at the beginning of the step."""
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return gaps and normals of some points at facets at the beginning of the step."""
         near = self.around.near
         x, X = self.last.points[which], self.around.before[facet]
         s = self._place(x, X) if place is None else near.project(x, X, place)
-        return projected(near.tabulate(s), x, X, near.outward[facet])
+        return self._gaps(s, x, X, facet)
+
+    def _gaps(
+        self,
+        place: NDArray[np.float64],
+        x: NDArray[np.float64],
+        X: NDArray[np.float64],
+        facet: NDArray[np.int64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return gaps and normals of points x at places on facets with the nodes X."""
+        near = self.around.near
+        r, n = separated(near.tabulate(place), x, X, near.outward[facet])
+        return (r * n).sum(axis=1), n
 
     def returned(
         self,
@@ -232,8 +240,8 @@ class Approach:
         X = self.nodes[at[was]]
         s = self._place(x[was], X)
         inner = near.clamped(s)
-        r, n = separated(near.tabulate(inner), x[was], X, near.outward[at[was]])
-        deep = (r * n).sum(axis=1) < -0.75 * reach
+        gap, _ = self._gaps(inner, x[was], X, at[was])
+        deep = gap < -0.75 * reach
         beside = np.linalg.norm(s - inner, axis=1) > 0.5
         return bool(np.any(deep & ~beside))
 

@@ -168,14 +168,12 @@ class BodyContact(Rigid):
         """
         assert self._trial is not None
         trial = self._trial
-        if trial.step is None:
+        if trial.step is None or trial.step.push is None:
             return np.zeros(2)
         memory, w = self._known(trial), self._tractions.weights(trial)[:, :, None]
         f = w * trial.outcome.traction
         change = trial.outcome.positions - memory.outcome.positions
-        Q = self._tractions.rotation(trial, memory)
-        step = trial.step
-        normal = (step.pressure[:, None] * step.gradient) @ Q.T
+        normal = trial.step.push @ self._tractions.rotation(trial, memory).T
         shear = trial.outcome.traction - normal.reshape(f.shape)
         slid = change - motion(0.5 * change + memory.outcome.positions)
         taken = -float((w * shear * slid).sum())

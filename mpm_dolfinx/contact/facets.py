@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Facets of one body near points of another: copies of them on the points' ranks, and the closest.
 
-Facets are known by a number that is the same on any ranks. They are looked for in boxes of a grid,
-so that the cost grows with the number of points and facets, not with its square.
+Facets are known by a number that is the same on any ranks. Compiled loops look for them in boxes of
+a grid, so that the cost grows with the number of points and facets, not with its square.
 """
 
 from __future__ import annotations
 
-from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mpi4py import MPI
 
@@ -22,7 +21,7 @@ from .._core import loops
 from ..parallel.exchange import swap
 from .surface import Surface, global_dofs, normals
 
-__all__ = ["Closest", "NearFacets", "Table", "separated", "solved"]
+__all__ = ["Closest", "NearFacets", "Table", "separated"]
 
 #: Cosine of the angle of two normals below which surfaces face each other; and in the middle of a
 #: facet, below which they may do so somewhere, and below which they do so for sure.
@@ -51,6 +50,12 @@ class Closest(NamedTuple):
     gap: NDArray[np.float64]
     near: NDArray[np.bool_]
     beside: NDArray[np.float64]
+
+    @classmethod
+    def none(cls, n: int, e: int) -> Closest:
+        """Return the closest facets of n points to which none is near."""
+        facet, gap, place = np.full(n, -1, dtype=np.int64), np.full(n, np.inf), np.zeros((n, e))
+        return cls(facet, place, gap, np.zeros(n, dtype=bool), np.zeros(n))
 
 
 class NearFacets:
@@ -81,7 +86,13 @@ class NearFacets:
         self._surface = surface
         self._comm: MPI.Comm = surface.particles.mesh.comm
         self.gdim, self.element = surface.gdim, surface.element
-        self._flat = self.element.degree == 1 and self.element.dim == self.gdim
+        degree, e = self.element.degree, self.gdim - 1
+        simplex = self.element.cell_type != basix.CellType.quadrilateral
+        grid = np.indices((degree + 1,) * e).reshape(e, -1).T
+        # shape functions by monomials
+        powers = grid[grid.sum(axis=1) <= degree] if simplex else grid
+        values = np.prod(self.element.points[:, None, :] ** powers, axis=2)
+        self._shape = np.linalg.inv(values), (degree, simplex), CLOSE, PROJECTIONS
         empty = np.full((1, self.gdim), np.inf)
         low = np.append(points, empty, axis=0).min(axis=0) - around
         high = np.append(points, -empty, axis=0).max(axis=0) + around
@@ -126,50 +137,16 @@ class NearFacets:
         numbers[facet >= 0] = self.number[facet[facet >= 0]]
         return numbers
 
-    def tabulate(
-        self, place: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def tabulate(self, place: NDArray[np.float64]) -> Table:
         """Return shape functions with first and second derivatives at reference points ``(n, e)``.
 
         Returns:
             Shapes ``(n, k)``, ``(n, e, k)`` and ``(n, e, e, k)``.
         """
-        n, e = place.shape
-        k = self.element.dim
-        if n == 0:
-            return np.zeros((0, k)), np.zeros((0, e, k)), np.zeros((0, e, e, k))
-        if self.element.degree == 1:
-            return self._of_degree_1(place)
-        table = self.element.tabulate(2, place)[:, :, :, 0]
-        first = [1 + i for i in range(e)]
-        if e == 1:
-            second = [[2]]
-        else:
-            second = [
-                [basix.index(2, 0), basix.index(1, 1)],
-                [basix.index(1, 1), basix.index(0, 2)],
-            ]
-        return table[0], table[first].swapaxes(0, 1), np.moveaxis(table[np.array(second)], 2, 0)
-
-    def _of_degree_1(
-        self, place: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return :meth:`tabulate` of lines, triangles and quadrilaterals of degree 1."""
-        n, e = place.shape
-        k = self.element.dim
-        N, dN, ddN = np.empty((n, k)), np.empty((n, e, k)), np.zeros((n, e, e, k))
-        if k < 4:
-            N[:, 0], N[:, 1:] = 1.0 - place.sum(axis=1), place
-            dN[:] = np.vstack([-np.ones(e), np.eye(e)]).T
-            return N, dN, ddN
-        ends = np.stack([1.0 - place, place], axis=1)
-        slopes = np.array([-1.0, 1.0])
-        for node in range(4):
-            i, j = node % 2, node // 2
-            N[:, node] = ends[:, i, 0] * ends[:, j, 1]
-            dN[:, 0, node] = slopes[i] * ends[:, j, 1]
-            dN[:, 1, node] = slopes[j] * ends[:, i, 0]
-            ddN[:, 0, 1, node] = ddN[:, 1, 0, node] = slopes[i] * slopes[j]
+        (n, e), k = place.shape, self.element.dim
+        shapes = ((n, k), (n, e, k), (n, e, e, k))
+        N, dN, ddN = (np.empty(shape) for shape in shapes)
+        loops.tabulate(np.ascontiguousarray(place), *self._shape, N, dN, ddN)
         return N, dN, ddN
 
     def project(
@@ -181,34 +158,15 @@ class NearFacets:
             points: Shape ``(n, gdim)``.
             nodes: Nodes of the facet of each, shape ``(n, k, gdim)``.
             place: Where to begin, shape ``(n, e)``.
+
+        Raises:
+            numpy.linalg.LinAlgError: A facet has no area.
         """
-        if self._flat:  # lines and planes, on which no steps are needed
-            N, dN, _ = self.tabulate(place)
-            r = points - np.einsum("nk,nki->ni", N, nodes)
-            A = np.einsum("nek,nki->nei", dN, nodes)
-            step = solved(A @ A.swapaxes(1, 2), np.einsum("nei,ni->ne", A, r))
-            return np.asarray(np.clip(place + step, -3.0, 4.0))
-        place = place.copy()
-        left = np.arange(len(points))
-        x, X = points, nodes
-        for _ in range(PROJECTIONS):
-            N, dN, ddN = self.tabulate(place[left])
-            r = x - np.einsum("nk,nki->ni", N, X)
-            A = dN @ X
-            G = A @ A.swapaxes(1, 2)
-            # where a curved facet bends towards the point too much, its plane has to do
-            bent = G - np.einsum("nefk,nk->nef", ddN, np.einsum("nki,ni->nk", X, r))
-            good = _determinant(bent) > 0.1 * _determinant(G)
-            G = np.where(good[:, None, None], bent, G)
-            if not (_determinant(G) > 0.0).all():
-                raise np.linalg.LinAlgError("A facet has no area.")
-            step = np.clip(solved(G, np.einsum("nei,ni->ne", A, r)), -1.0, 1.0)
-            place[left] = np.clip(place[left] + step, -3.0, 4.0)
-            going = np.abs(step).max(axis=1, initial=0.0) > CLOSE
-            left, x, X = left[going], x[going], X[going]
-            if len(left) == 0:
-                break
-        return place
+        found = np.array(place)
+        nodes = np.ascontiguousarray(nodes)
+        if not loops.project(np.ascontiguousarray(points), nodes, *self._shape, found):
+            raise np.linalg.LinAlgError("A facet has no area.")
+        return found
 
     def clamped(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return places within the reference facet."""
@@ -216,10 +174,6 @@ class NearFacets:
         if self.element.cell_type == basix.CellType.triangle:
             inner = inner / np.maximum(inner.sum(axis=1), 1.0)[:, None]
         return inner
-
-    def _start(self, count: int) -> NDArray[np.float64]:
-        middle = basix.geometry(self.element.cell_type).mean(axis=0)
-        return np.tile(middle, (count, 1))
 
     def closest(
         self,
@@ -240,17 +194,15 @@ class NearFacets:
         Raises:
             numpy.linalg.LinAlgError: A facet has no area.
         """
-        if self.element.degree > 1:
-            return self.closest_curved(points, outward, nodes, reach)
-        found = self._nothing_near(len(points))
+        found = Closest.none(len(points), self.gdim - 1)
         good = loops.find_closest(
             np.ascontiguousarray(points),
             np.zeros((0, 1)) if outward is None else np.ascontiguousarray(outward),
             np.ascontiguousarray(nodes),
+            *self._shape,
             np.ascontiguousarray(self.outward),
             self.present.view(np.uint8),
-            [reach, FACING, SURELY_FACING, MAY_FACE, CLOSE],
-            PROJECTIONS,
+            [reach, FACING, SURELY_FACING, MAY_FACE],
             found.facet,
             found.place,
             found.gap,
@@ -260,194 +212,6 @@ class NearFacets:
         if not good:
             raise np.linalg.LinAlgError("A facet has no area.")
         return found
-
-    def _nothing_near(self, count: int) -> Closest:
-        """Return the answer for points to which no facet is near."""
-        return Closest(
-            np.full(count, -1, dtype=np.int64),
-            np.zeros((count, self.gdim - 1)),
-            np.full(count, np.inf),
-            np.zeros(count, dtype=bool),
-            np.zeros(count),
-        )
-
-    def closest_curved(
-        self,
-        points: NDArray[np.float64],
-        outward: NDArray[np.float64] | None,
-        nodes: NDArray[np.float64],
-        reach: float,
-    ) -> Closest:
-        """Return the closest facet of each point, whatever the degree of the facets.
-
-        Args:
-            points: As for :meth:`closest`, as are the others.
-            outward: See there.
-            nodes: See there.
-            reach: See there.
-        """
-        facet, place, gap, near, beside = found = self._nothing_near(len(points))
-        which, facets = self._candidates(points, nodes, reach)
-        which, facets, faces = self._facing(points, outward, nodes, which, facets, reach)
-        which, facets = self._nearest(points, nodes, which, facets, faces)
-        if len(which) == 0:
-            return found
-        x, X = points[which], nodes[facets]
-        s = self.project(x, X, self._start(len(which)))
-        inner = self.clamped(s)
-        r, n_of = separated(self.tabulate(inner), x, X, self.outward[facets])
-        far = np.linalg.norm(r, axis=1)
-        ok = far <= reach
-        if outward is not None:
-            ok &= (outward[which] * n_of).sum(axis=1) < FACING
-        which, facets, s, inner, far = which[ok], facets[ok], s[ok], inner[ok], far[ok]
-        # the nearest, and among equals that with the lowest number
-        order = np.lexsort((facets, np.round(far / reach, 12), which))
-        first = order[np.diff(which[order], prepend=-1) != 0]
-        who = which[first]
-        facet[who], place[who] = facets[first], s[first]
-        table, X = self.tabulate(s[first]), nodes[facets[first]]
-        r, n_of = separated(table, points[who], X, self.outward[facets[first]])
-        gap[who] = g = (r * n_of).sum(axis=1)
-        # A point beside the end of an open surface, or beside an edge, touches nothing, behind the
-        # plane of the facet nor at a gap; nor does one beside the edge of a thin body that faces
-        # its far side.
-        size = np.linalg.norm(np.einsum("nek,nki->nei", table[1], X), axis=2).max(axis=1)
-        over = np.abs(s[first] - inner[first]).max(axis=1) * size
-        off = over > np.maximum(1e-9 * size, 0.2 * np.minimum(np.abs(g), 0.1 * size))
-        off &= (far[first] > 2.0 * np.abs(g) + 1e-12 * size) | (g < -0.5 * size)
-        near[who] = ~off
-        beside[who] = over / size
-        return found
-
-    def _nearest(
-        self,
-        points: NDArray[np.float64],
-        nodes: NDArray[np.float64],
-        which: NDArray[np.int64],
-        facets: NDArray[np.int64],
-        faces: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the pairs in which a facet may be the closest.
-
-        No facet is nearer than its box, nor farther than the place on it where its plane in the
-        middle has the point.
-
-        Args:
-            points: Shape ``(n, gdim)``.
-            nodes: Nodes of the facets.
-            which: Points of some pairs.
-            facets: Their facets.
-            faces: Whether the facet of each faces its point for sure.
-        """
-        if len(which) == 0:
-            return which, facets
-        N, dN, _ = self.tabulate(self._start(1))
-        middle, A = N[0] @ nodes, dN[0] @ nodes
-        G = A @ A.swapaxes(1, 2)
-        x, X = points[which], nodes[facets]
-        along = np.einsum("nei,ni->ne", A[facets], x - middle[facets])
-        good = _determinant(G)[facets] > 0.0
-        place = self._start(len(which))
-        place[good] += solved(G[facets][good], along[good])
-        at, _, _ = self.tabulate(self.clamped(place))
-        far = np.linalg.norm(x - np.einsum("nk,nki->ni", at, X), axis=1)
-        most = np.full(len(points), np.inf)
-        np.minimum.at(most, which[faces], far[faces])
-        low, high = nodes.min(axis=1), nodes.max(axis=1)
-        if self.element.degree > 1:  # which goes beyond its nodes
-            more = 0.5 * (high - low)
-            low, high = low - more, high + more
-        out = np.maximum(np.maximum(low[facets] - x, x - high[facets]), 0.0)
-        # (within round-off, as where surfaces touch all of these are nothing)
-        slack = 1e-9 * (high - low).max(axis=1, initial=0.0)[facets]
-        good = np.linalg.norm(out, axis=1) <= most[which] * (1.0 + 1e-9) + slack
-        return which[good], facets[good]
-
-    def _facing(
-        self,
-        points: NDArray[np.float64],
-        outward: NDArray[np.float64] | None,
-        nodes: NDArray[np.float64],
-        which: NDArray[np.int64],
-        facets: NDArray[np.int64],
-        reach: float,
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-        """Return the pairs of points and facets that may be near, by the planes of the facets.
-
-        And which of the facets face their points for sure.
-        """
-        faces = np.ones(len(which), dtype=bool)
-        if len(which) == 0:
-            return which, facets, faces
-        _, dN, _ = self.tabulate(self._start(1))
-        n = self.outward[:, None] * normals(np.einsum("ek,fki->fie", dN[0], nodes))
-        n = n / np.maximum(np.linalg.norm(n, axis=1), 1e-300)[:, None]
-        middle = nodes.mean(axis=1)
-        curved = self.element.degree > 1 or self.element.dim == 4
-        away = ((points[which] - middle[facets]) * n[facets]).sum(axis=1)
-        size = np.linalg.norm(nodes - middle[:, None], axis=2).max(axis=1, initial=0.0)
-        good = np.abs(away) <= reach + (0.5 * size[facets] if curved else 0.0)
-        good &= np.linalg.norm(points[which] - middle[facets], axis=1) <= reach + size[facets]
-        if outward is not None:
-            facing = (outward[which] * n[facets]).sum(axis=1)
-            good &= facing < MAY_FACE
-            faces = facing < SURELY_FACING
-        return which[good], facets[good], faces[good]
-
-    def _candidates(
-        self, points: NDArray[np.float64], nodes: NDArray[np.float64], reach: float
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return pairs of points and facets whose boxes, made larger by the reach, hold them."""
-        none = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-        if len(points) == 0 or len(nodes) == 0:
-            return none
-        low, high = nodes.min(axis=1) - reach, nodes.max(axis=1) + reach
-        there = self.present & np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
-        if not there.any():
-            return none
-        edge = max(float(np.median((high - low)[there])), 1e-300)
-        base = low[there].min(axis=0)
-        top = high[there].max(axis=0)
-        inside = ((points >= base) & (points <= top)).all(axis=1)
-        who = np.flatnonzero(inside)
-        if len(who) == 0:
-            return none
-        count = np.minimum((top - base) / edge + 1.0, 2.0**20).astype(np.int64)
-        edges = (top - base) / count
-        edges[edges == 0.0] = 1.0
-
-        def tile(x: NDArray[np.float64]) -> NDArray[np.int64]:
-            return np.asarray(np.clip((x - base) / edges, 0, count - 1).astype(np.int64))
-
-        facets = np.flatnonzero(there)
-        first, last = tile(low[facets]), tile(high[facets])
-        most = (last - first).max(axis=0) + 1
-        tiles, owners = [], []
-        for shift in product(*(range(m) for m in most)):
-            at = first + shift
-            good = (at <= last).all(axis=1)
-            tiles.append(np.ravel_multi_index(tuple(at[good].T), tuple(count)))
-            owners.append(facets[good])
-        all_tiles, all_owners = np.concatenate(tiles), np.concatenate(owners)
-        order = np.argsort(all_tiles, kind="stable")
-        all_tiles, all_owners = all_tiles[order], all_owners[order]
-        mine = np.ravel_multi_index(tuple(tile(points[who]).T), tuple(count))
-        begin = np.searchsorted(all_tiles, mine)
-        size = np.searchsorted(all_tiles, mine, side="right") - begin
-        which = np.repeat(who, size)
-        offset = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
-        facet = all_owners[np.repeat(begin, size) + offset]
-        x = points[which]
-        good = ((x >= low[facet]) & (x <= high[facet])).all(axis=1)
-        return which[good], facet[good]
-
-
-def _determinant(G: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return determinants of matrices ``(n, e, e)`` of one or two rows."""
-    if G.shape[1] == 1:
-        return G[:, 0, 0]
-    return np.asarray(G[:, 0, 0] * G[:, 1, 1] - G[:, 0, 1] * G[:, 1, 0])
 
 
 def separated(
@@ -464,13 +228,3 @@ def separated(
     N, dN, _ = table
     n = outward[:, None] * normals(np.einsum("nek,nki->nie", dN, X))
     return x - np.einsum("nk,nki->ni", N, X), n / np.linalg.norm(n, axis=1)[:, None]
-
-
-def solved(G: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-    """Return the solutions of positive systems ``(n, e, e)``, e = 1 or 2, for ``b``, ``(n, e)``."""
-    if G.shape[1] == 1:
-        return np.asarray(b / G[:, 0])
-    det = G[:, 0, 0] * G[:, 1, 1] - G[:, 0, 1] * G[:, 1, 0]
-    x = G[:, 1, 1] * b[:, 0] - G[:, 0, 1] * b[:, 1]
-    y = G[:, 0, 0] * b[:, 1] - G[:, 1, 0] * b[:, 0]
-    return np.asarray(np.stack([x, y], axis=1) / det[:, None])

@@ -8,6 +8,19 @@ with ``P = I - n n``, as long as its size stays within ``min(mu p + c, limit)``;
 and has that size (the return mapping of Wriggers 2006, Computational Contact Mechanics, section
 5.2.3, with the anchor instead of a traction that would have to be turned and transported). Compiled
 loops do so for the points of obstacles and of pairs alike; a law of a user's own gives the bound.
+
+In a step of a motion contact neither adds energy nor takes any. A gap g stores the energy
+``W(g) = k/2 <-g>^2`` per area. Over a step in which positions z go from z_0 to z_1 and the gap from
+g_0 to g_1 there acts
+
+    p G,   p = -(W(g_1) - W(g_0)) / (g_1 - g_0),
+    G = grad g(z_m) + (g_1 - g_0 - grad g(z_m) . dz) v / (v . v),   dz = z_1 - z_0,
+
+z_m being the middle and v the change dz less its rigid part at z_m. Then ``p G . dz`` is the loss
+of energy, whatever facets the gaps are measured from; and as the gradient and v have neither sum
+nor moment about any point at z_m, momentum and angular momentum stay what they are (the discrete
+gradient that knows symmetries of Gonzalez 1996, J. Nonlinear Sci. 6, section 4). Friction acts
+with its traction at the step's end, within the cone of the step's pressure: it never gives energy.
 """
 
 from __future__ import annotations
@@ -22,18 +35,19 @@ from numpy.typing import NDArray
 from .._core import is_as_inherited, loops
 from ..errors import MPMError, as_ours
 from ..reals import as_reals
-from ..tolerances import DIFFERENCE, EQUAL, LOCAL_ITERATIONS, ROUND_OFF, SMALL
+from ..tolerances import DIFFERENCE, EQUAL, HALF_DIGITS, LOCAL_ITERATIONS, ROUND_OFF, SMALL
 
 __all__ = [
+    "Begun",
     "Coulomb",
     "Friction",
     "Points",
     "Rubbing",
     "Separation",
-    "Slopes",
     "Traction",
     "as_friction",
     "bounds",
+    "by_pressure",
     "known",
     "remembered",
     "secant_along",
@@ -304,39 +318,47 @@ class Points(NamedTuple):
         return Points(*(values[which] for values in self))
 
 
+class Begun(NamedTuple):
+    """How a step of a motion began, at some points.
+
+    Attributes:
+        gap: Gap at its beginning, shape ``(n,)``.
+        offset: Gap at which points begin to be pressed, shape ``(n,)``.
+        change: Change of positions with respect to what they touch, shape ``(n, gdim)``.
+    """
+
+    gap: Array
+    offset: Array
+    change: Array
+
+
 class Separation(NamedTuple):
     """Where points are with respect to what they touch.
 
     Attributes:
         gap: Shape ``(n,)``.
-        normal: Normals, towards the points, shape ``(n, gdim)``.
+        normal: Normals, towards the points, in a step of a motion those of its middle, shape
+            ``(n, gdim)``.
         delta: From anchors to points, shape ``(n, gdim)``.
         touch: Gap at which points touch: round-off of positions.
         behind: Tractions of the body at its facets that press but for what gaps are left (Nitsche's
             method), shape ``(n, gdim)``; ``None``: gaps alone do.
-        pressure: That of a whole step, shape ``(n,)``; ``None``: it is by the above.
+        begun: How a step of a motion began, of whose whole forces are; ``None``: of its end.
     """
 
-    gap: NDArray[Any]
-    normal: NDArray[Any]
-    delta: NDArray[Any]
+    gap: Array
+    normal: Array
+    delta: Array
     touch: float
-    behind: NDArray[np.float64] | None = None
-    pressure: NDArray[Any] | None = None
+    behind: Array | None = None
+    begun: Begun | None = None
 
     def of(self, which: Any) -> Separation:
         """Return some of them."""
-        parts = (None if part is None else part[which] for part in (self.behind, self.pressure))
+        behind = None if self.behind is None else self.behind[which]
+        begun = None if self.begun is None else Begun(*(part[which] for part in self.begun))
         return Separation(
-            self.gap[which], self.normal[which], self.delta[which], self.touch, *parts
-        )
-
-    @property
-    def real(self) -> Separation:
-        """All without imaginary parts."""
-        p = None if self.pressure is None else self.pressure.real
-        return Separation(
-            self.gap.real, self.normal.real, self.delta.real, self.touch, self.behind, p
+            self.gap[which], self.normal[which], self.delta[which], self.touch, behind, begun
         )
 
 
@@ -345,53 +367,22 @@ class Traction(NamedTuple):
 
     Attributes:
         pressure: Shape ``(n,)``.
+        normal: Traction by it, shape ``(n, gdim)``: along the normal, or over a step the gradient
+            of the gap.
         shear: Traction along the surface, shape ``(n, gdim)``.
         inside: Which are in contact.
         slips: Which of these slip.
     """
 
-    pressure: NDArray[Any]
-    shear: NDArray[Any]
+    pressure: Array
+    normal: Array
+    shear: Array
     inside: NDArray[np.bool_]
     slips: NDArray[np.bool_]
 
 
-class Slopes(NamedTuple):
-    """Derivatives of pressure and of shear at points, the latter by way of the former as well.
-
-    Attributes:
-        pressure: By a pressure that comes on top where one acts, gap, normal and way from the
-            anchor, shape ``(n, 2 + 2 gdim)``.
-        shear: By the same, shape ``(n, gdim, 2 + 2 gdim)``.
-    """
-
-    pressure: Array
-    shear: Array
-
-    def by_pressure(self, n: Array) -> Array:
-        """Return the derivative of ``p n + t`` by a pressure on top, shape ``(n, gdim)``."""
-        return np.asarray(self.pressure[:, :1] * n + self.shear[:, :, 0])
-
-    def by_position(self, n: Array, H: Array, dp: Array | None = None) -> tuple[Array, Array]:
-        """Return the derivatives of pressure and shear by positions.
-
-        Args:
-            n: Derivatives of gaps, shape ``(n, gdim)``.
-            H: Those of normals, shape ``(n, gdim, gdim)``.
-            dp: Those of pressures on top, shape ``(n, gdim)``; ``None``: nothing comes on top.
-
-        Returns:
-            Shapes ``(n, gdim)`` and ``(n, gdim, gdim)``.
-        """
-        dim = n.shape[1]
-        eye = np.broadcast_to(np.eye(dim), H.shape)
-        dp = np.zeros_like(n) if dp is None else dp
-        chain = np.concatenate([dp[:, None], n[:, None], H, eye], axis=1)
-        return (self.pressure[:, None] @ chain)[:, 0], self.shear @ chain
-
-
 def traction(law: Friction, points: Points, at: Separation) -> Traction:
-    """Return the tractions at points, where positions may have small imaginary parts.
+    """Return the tractions at points.
 
     Args:
         law: The friction.
@@ -401,13 +392,30 @@ def traction(law: Friction, points: Points, at: Separation) -> Traction:
     return _acting(at, known(law, points, at.touch, at.behind, bounds(law, points, at)))
 
 
-def slopes(law: Friction, points: Points, at: Separation) -> Slopes:
-    """Return the derivatives of what acts on points: see :func:`traction`."""
-    count, dim = at.normal.shape
-    found = np.zeros((count, 1 + dim, 2 + 2 * dim))
+def slopes(law: Friction, points: Points, at: Separation, n: Array, bends: Array) -> Array:
+    """Return the derivatives of tractions by positions, shape ``(n, gdim, gdim)``.
+
+    Args:
+        law: The friction.
+        points: The points.
+        at: Where they are.
+        n: Derivatives of gaps, shape ``(n, gdim)``.
+        bends: Those of normals, shape ``(n, gdim, gdim)``.
+    """
+    found = np.zeros(bends.shape)
     acting = known(law, points, at.touch, at.behind, bounds(law, points, at))
-    loops.traction_slopes(_given(at, np.float64), *acting, found)
-    return Slopes(found[:, 0], found[:, 1:])
+    loops.traction_slopes(
+        _given(at), *acting, np.ascontiguousarray(n), np.ascontiguousarray(bends), found
+    )
+    return found
+
+
+def by_pressure(law: Friction, points: Points, at: Separation) -> Array:
+    """Return the derivatives of tractions by pressures on top where some act, ``(n, gdim)``."""
+    found = np.zeros(at.normal.shape)
+    acting = known(law, points, at.touch, at.behind, bounds(law, points, at))
+    loops.traction_by_pressure(_given(at), *acting, found)
+    return found
 
 
 def known(
@@ -428,23 +436,21 @@ def known(
     numbers = [0.0] * 3
     if isinstance(law, Coulomb):
         numbers = [law.friction, law.cohesion, law.limit]
-    return [np.ascontiguousarray(part) for part in parts], touched, [*numbers, touch], law.smooth
+    numbers += [touch, HALF_DIGITS / ROUND_OFF * touch]  # (changes that are none)
+    return [np.ascontiguousarray(part) for part in parts], touched, numbers, law.smooth
 
 
-def _given(at: Separation, kind: Any) -> list[NDArray[Any]]:
-    """Return the arguments of the compiled loops for places, as numbers of some kind."""
-    pressure = np.zeros(0) if at.pressure is None else at.pressure
-    parts = (at.gap, at.normal, at.delta, pressure)
-    return [np.ascontiguousarray(part, dtype=kind) for part in parts]
+def _given(at: Separation) -> list[Array]:
+    """Return the arguments of the compiled loops for places."""
+    begun = [np.zeros(0)] * 3 if at.begun is None else at.begun
+    return [np.ascontiguousarray(part) for part in (at.gap, at.normal, at.delta, *begun)]
 
 
 def _acting(at: Separation, known: tuple[Any, ...]) -> Traction:
     """Return the tractions at points, by the arguments of the compiled loops."""
-    kind: Any = np.complex128 if np.iscomplexobj(at.delta) else np.float64
-    (n, dim) = at.normal.shape
-    acts = Traction(np.zeros(n, kind), np.zeros((n, dim), kind), *np.zeros((2, n), dtype=bool))
-    masks = acts.inside.view(np.uint8), acts.slips.view(np.uint8)
-    loops.traction(_given(at, kind), *known, acts.pressure, acts.shear, *masks)
+    n, dim = at.normal.shape
+    acts = Traction(np.zeros(n), *np.zeros((2, n, dim)), *np.zeros((2, n), dtype=bool))
+    loops.traction(_given(at), *known, *acts[:3], *(mask.view(np.uint8) for mask in acts[3:]))
     return acts
 
 
@@ -460,7 +466,7 @@ def bounds(law: Friction, points: Points, at: Separation) -> Array:
     """
     if law.smooth or law.compiled:
         return np.zeros(0)
-    rubs, stiffness, length = _rubbing(law, points, at.real)
+    rubs, stiffness, length = _rubbing(law, points, at)
     size = float(rubs.pressure.max(initial=0.0)) or 1.0
     by_slip = _slope(law, rubs, "slip", length)
     bound, slips = _bound(law, rubs), rubs.slip > 0.0

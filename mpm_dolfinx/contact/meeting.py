@@ -107,8 +107,7 @@ class Meeting:
         sums = Sums(
             -factor * around.weights[which], shapes[which % len(shapes)], group, positions, values
         )
-        sides = around.sides
-        add_tangents(self.law, self.stencil, sides.touch, sides.target.layout.extent, sums)
+        add_tangents(self.law, self.stencil, around.sides.touch, sums)
 
     def by_stress(self, factor: float) -> tuple[At, Sequence[Spread]]:
         """Return points with normals, and how forces on both bodies grow with the stress behind.
@@ -162,9 +161,7 @@ class Meeting:
         anchors[at >= 0] = np.einsum("nk,nki->ni", N, nodes[at[at >= 0]])
         rubbed = last.friction.copy()
         if self.law.memory:
-            rubbed[which] = remembered(
-                self.law, self.stencil, sides.touch, sides.target.layout.extent
-            )
+            rubbed[which] = remembered(self.law, self.stencil, sides.touch)
         own = last._replace(
             touched=inside,
             facet=numbers,

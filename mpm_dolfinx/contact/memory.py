@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .contact import Outcome
+from .law import Begun
 from .rotation import Pose
 from .surface import Surface
 
@@ -43,22 +44,16 @@ class Step(NamedTuple):
     """A step of a motion, at some points, in the frame of the shape.
 
     Attributes:
-        change: Of positions, shape ``(n, gdim)``.
-        middle: Positions in the middle.
+        middle: Positions in the middle, shape ``(n, gdim)``.
         normal: Normals there.
-        gradient: That by which the change of the gap is the one of positions.
-        factor: What of the change is in it.
-        before: Gap at the beginning, shape ``(n,)``.
-        pressure: Mean pressure.
+        begun: How it began.
+        push: Traction by pressure; ``None``: not known yet.
     """
 
-    change: NDArray[np.float64]
     middle: NDArray[np.float64]
     normal: NDArray[np.float64]
-    gradient: NDArray[np.float64]
-    factor: NDArray[np.float64]
-    before: NDArray[np.float64]
-    pressure: NDArray[np.float64]
+    begun: Begun
+    push: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)

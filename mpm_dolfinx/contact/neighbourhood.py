@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .facets import Closest, NearFacets
-from .pass_memory import nothing_near, spread
+from .pass_memory import spread
 from .surface import Surface
 
 __all__ = ["Neighbourhood", "Sides"]
@@ -107,6 +107,6 @@ class Neighbourhood:
         facet = self.near.find(before.near.numbers(paired.facet))
         paired = paired._replace(facet=facet, near=paired.near & (facet >= 0))
         source = self.sides.source
-        whole = nothing_near(len(source.layout.cells) * source.nq, source.gdim - 1)
+        whole = Closest.none(len(source.layout.cells) * source.nq, source.gdim - 1)
         parts = zip(paired, whole, strict=True)
         return Closest(*(spread(part, before.which, base)[self.which] for part, base in parts))

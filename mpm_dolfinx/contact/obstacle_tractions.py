@@ -3,7 +3,7 @@
 """Tractions of an obstacle at the points of a body's facets, and their derivatives.
 
 They are those of :mod:`.law` in the frame of the shape, where it is at the end of a step; or, in
-motion by the middle of a step, those of :mod:`.whole_step` turned by the mean of the rotations.
+motion by the middle of a step, turned by the mean of the rotations.
 """
 
 from __future__ import annotations
@@ -14,7 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .contact import Outcome
-from .law import Friction, Points, Separation, remembered, secant_along, slopes, traction
+from .law import (
+    Begun,
+    Friction,
+    Points,
+    Separation,
+    by_pressure,
+    remembered,
+    secant_along,
+    slopes,
+    traction,
+)
 from .memory import Memory, Step
 from .nitsche import Nitsche
 from .placed import distance_within, framed
@@ -22,7 +32,6 @@ from .rotation import Pose
 from .shapes import Shape
 from .slip_changes import SlipChanges
 from .surface import Surface
-from .whole_step import corrected, corrected_slope, mean_pressure, pressure_slope
 
 __all__ = ["Acting", "ObstacleTractions"]
 
@@ -154,19 +163,17 @@ class ObstacleTractions:
             reach = touch + np.linalg.norm(pressing, axis=1) / points.stiffness
         phi, n = self._distance(y, memory, reach)
         at = Separation(phi, n, y - points.anchor, touch, pressing)
-        pushes, step, Q = n, None, pose.Q
+        step, Q = None, pose.Q
         if self.of_step:
-            step = self._step(points, memory, y, phi)
-            pushes, Q = step.gradient, memory.pose.mean(pose)
-            at = at._replace(normal=step.normal, pressure=step.pressure)
+            step, Q = self._step(memory, y, phi), memory.pose.mean(pose)
+            at = at._replace(normal=step.normal, begun=step.begun)
         acts = traction(self._friction, points, at)
         shape = (m, nq)
-        normal, shear = (
-            (part @ Q.T).reshape(x.shape) for part in (acts.pressure[:, None] * pushes, acts.shear)
-        )
+        normal, shear = ((part @ Q.T).reshape(x.shape) for part in (acts.normal, acts.shear))
         force = normal + shear
         works = (0.0, 0.0)
         if step is not None:
+            step = step._replace(push=acts.normal)
             moves = self.weights(memory)[:, :, None] * (x - memory.outcome.positions)
             works = -float((normal * moves).sum()), -float((shear * moves).sum())
         outcome = Outcome(
@@ -215,25 +222,16 @@ class ObstacleTractions:
         phi[near], n[near] = distance_within(self._shape, y[near])
         return phi, n
 
-    def _step(
-        self,
-        points: Points,
-        memory: Memory,
-        y: NDArray[np.float64],
-        gap: NDArray[np.float64],
-    ) -> Step:
+    def _step(self, memory: Memory, y: NDArray[np.float64], gap: NDArray[np.float64]) -> Step:
         """Return the step to positions and gaps at all points."""
         before = memory.gap.ravel()
-        x = memory.outcome.positions
-        change = y - framed(self._shape, memory.pose, x).reshape(y.shape)
+        change = y - framed(self._shape, memory.pose, memory.outcome.positions).reshape(y.shape)
         middle = y - 0.5 * change
-        surface = self._surface
+        touch = self._surface.touch
         n = memory.normal.reshape(y.shape).copy()
-        acts = (before <= surface.touch) | (gap <= surface.touch)
+        acts = (before <= touch) | (gap <= touch)
         n[acts] = self._shape.distance(middle[acts])[1]
-        gradient, factor = corrected(n, change, change, gap - before, surface.layout.extent)
-        pressure = mean_pressure(points.stiffness, before, gap, surface.touch)
-        return Step(change, middle, n, gradient, factor, before, pressure)
+        return Step(middle, n, Begun(before, np.zeros_like(before), change))
 
     # -- Derivatives of what acts ---------------------------------------------------------------
 
@@ -276,20 +274,12 @@ class ObstacleTractions:
     ) -> NDArray[np.float64]:
         """Return :meth:`derivative` in the frame of the shape."""
         points, at, y = self._seen(trial, memory, flat)
-        found = slopes(self._friction, points, at)
         n = trial.normal.reshape(-1, y.shape[1])[flat]
         if trial.step is None:
             H = self._shape.curvature(y)
-            dp, dt = found.by_position(n, H)
-            pressure = trial.outcome.pressure.ravel()[flat]
-            return np.asarray(n[:, :, None] * dp[:, None, :] + pressure[:, None, None] * H + dt)
-        step = Step(*(part[flat] for part in trial.step))
-        H = 0.5 * self._shape.curvature(step.middle)
-        slope = pressure_slope(points.stiffness, step.before, at.gap, at.touch)
-        turn = corrected_slope(step.normal, H, step.change, step.factor, n)
-        dp, dt = found.by_position(n, H, slope[:, None] * n)
-        D = step.gradient[:, :, None] * dp[:, None, :]
-        return np.asarray(D + step.pressure[:, None, None] * turn + dt)
+        else:
+            H = 0.5 * self._shape.curvature(trial.step.middle[flat])
+        return slopes(self._friction, points, at, n, H)
 
     def secants(
         self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
@@ -324,8 +314,7 @@ class ObstacleTractions:
         Of the latter by its part along the normal, shape ``(n, gdim)``.
         """
         points, at, _ = self._seen(trial, memory, flat)
-        force = slopes(self._friction, points, at).by_pressure(at.normal)
-        return np.asarray(force @ trial.pose.Q.T)
+        return np.asarray(by_pressure(self._friction, points, at) @ trial.pose.Q.T)
 
     def _seen(
         self, trial: Memory, memory: Memory, flat: NDArray[np.int64]
@@ -337,9 +326,9 @@ class ObstacleTractions:
         if trial.behind is not None:
             behind = trial.behind.reshape(-1, gdim)[flat] @ pose.Q
         n = trial.normal.reshape(-1, gdim)[flat] if step is None else step.normal[flat]
-        pressure = None if step is None else step.pressure[flat]
+        begun = None if step is None else Begun(*(part[flat] for part in step.begun))
         at = Separation(
-            trial.gap.ravel()[flat], n, y - points.anchor, self._surface.touch, behind, pressure
+            trial.gap.ravel()[flat], n, y - points.anchor, self._surface.touch, behind, begun
         )
         return points, at, y
 

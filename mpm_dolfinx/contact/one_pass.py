@@ -221,7 +221,7 @@ class Pass:
         shape = (len(around.facets), source.nq)
         force = np.zeros_like(x)
         pressure, slips = np.zeros(len(x)), np.zeros(len(x), dtype=bool)
-        pushes, rubs, acts = acting(self._law, stencil, sides.touch, sides.target.layout.extent)
+        pushes, rubs, acts = acting(self._law, stencil, sides.touch)
         both = pushes + rubs
         force[which], pressure[which], slips[which] = both[:, 0], acts.pressure, acts.slips
         if behind is not None:

@@ -13,7 +13,7 @@ from .contact import Outcome
 from .facets import Closest
 from .law import Friction, unworn
 
-__all__ = ["Memory", "State", "no_memory", "nothing_near", "spread"]
+__all__ = ["Memory", "State", "no_memory", "spread"]
 
 
 class Memory(NamedTuple):
@@ -71,14 +71,8 @@ class State(NamedTuple):
 def no_memory(law: Friction, x: NDArray[np.float64]) -> Memory:
     """Return the memory of points at x ``(n, gdim)`` that nothing has touched or was near."""
     n, gdim = x.shape
-    facet, place, gap, near, beside = nothing_near(n, gdim - 1)
+    facet, place, gap, near, beside = Closest.none(n, gdim - 1)
     return Memory(near, facet, place, facet, gap, near, beside, x, x, unworn(law, (n,)))
-
-
-def nothing_near(n: int, e: int) -> Closest:
-    """Return the closest points of n points to which no facet is near."""
-    facet, gap, place = np.full(n, -1, dtype=np.int64), np.full(n, np.inf), np.zeros((n, e))
-    return Closest(facet, place, gap, np.zeros(n, dtype=bool), np.zeros(n))
 
 
 def spread(part: NDArray[Any], which: NDArray[np.int64], base: NDArray[Any]) -> NDArray[Any]:

@@ -9,7 +9,7 @@ What contact keeps rests on one identity: in the frame of the body a point's coo
 ``z = Q^T (x - X)`` change by ``Q_m^T (dx - dX - theta x r_m)``, where ``Q_m`` is the mean of the
 rotations and ``r_m`` that of the arms. So tractions ``Q_m t`` do the work ``t . dz`` on both
 together, which is the loss of the energy of penetration where t is its discrete gradient
-(:mod:`.whole_step`), and moments about any point balance, as the arms are those of the middle.
+(:mod:`.law`), and moments about any point balance, as the arms are those of the middle.
 
 Its displacement and rotation in a step are unknowns of Newton's method, by their balance in
 :mod:`.rigid_balance`.

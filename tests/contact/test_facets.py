@@ -1,11 +1,13 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The facets of a body that are closest to points: compiled, by NumPy, and by brute force."""
+"""The facets of a body that are closest to points: against a search among all, and basix."""
 
 import numpy as np
 import pytest
 import scenes
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD, box
+
+import basix
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.contact import facets
@@ -35,19 +37,69 @@ def near_a_body(kind, degree=1):
     return known, known.positions(nodes), x, inner
 
 
+def among_all(known, nodes, x, inner):
+    """Return the closest facets, and what is told of them, by a projection on every facet."""
+    count, size = len(x), len(nodes)
+    which, facet = np.repeat(np.arange(count), size), np.tile(np.arange(size), count)
+    middle = np.full((len(which), x.shape[1] - 1), 1 / 3 if nodes.shape[1] in (3, 6) else 0.5)
+    if x.shape[1] == 2:
+        middle[:] = 0.5
+    s = known.project(x[which], nodes[facet], middle)
+    border = known.clamped(s)
+    r, n = facets.separated(known.tabulate(border), x[which], nodes[facet], known.outward[facet])
+    far = np.linalg.norm(r, axis=1)
+    ok = far <= REACH
+    if inner is not None:
+        ok &= (inner[which] * n).sum(axis=1) < facets.FACING
+    far = np.where(ok, np.round(far / REACH, 12), np.inf).reshape(count, size)
+    best = far.argmin(axis=1)
+    who = np.arange(count) * size + best
+    table, X = known.tabulate(s[who]), nodes[best]
+    r, n = facets.separated(table, x, X, known.outward[best])
+    gap, length = (r * n).sum(axis=1), np.linalg.norm(table[1] @ X, axis=2).max(axis=1)
+    over = np.abs(s - border)[who].max(axis=1) * length
+    depth = np.abs(gap)
+    off = over > np.maximum(1e-9 * length, 0.2 * np.minimum(depth, 0.1 * length))
+    off &= (REACH * far.min(axis=1) > 2.0 * depth + 1e-12 * length) | (gap < -0.5 * length)
+    return np.isfinite(far.min(axis=1)), best, s[who], gap, ~off, over / length
+
+
 @pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("faced", [False, True])
 @pytest.mark.parametrize("kind", [TRIANGLE, QUADRILATERAL, TETRAHEDRON, HEXAHEDRON])
-def test_compiled_search_finds_what_that_by_numpy_finds(kind, faced):
-    known, nodes, x, inner = near_a_body(kind)
-    found, other = (
-        search(x, inner if faced else None, nodes, REACH)
-        for search in (known.closest, known.closest_curved)
-    )
-    assert np.array_equal(found.facet, other.facet) and (found.facet >= 0).sum() > 50
-    assert np.array_equal(found.near, other.near)
-    for name in ("place", "gap", "beside"):
-        np.testing.assert_allclose(getattr(found, name), getattr(other, name), atol=1e-11)
+def test_the_closest_facet_is_that_of_a_search_among_all(kind, faced, degree):
+    known, nodes, x, inner = near_a_body(kind, degree)
+    found = known.closest(x, inner if faced else None, nodes, REACH)
+    there, best, *told = among_all(known, nodes, x, inner if faced else None)
+    assert np.array_equal(found.facet, np.where(there, best, -1)) and there.sum() > 50
+    for name, value in zip(("place", "gap", "near", "beside"), told, strict=True):
+        np.testing.assert_allclose(getattr(found, name)[there], value[there], atol=1e-11)
+
+
+@pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("kind", [TRIANGLE, QUADRILATERAL, TETRAHEDRON, HEXAHEDRON])
+def test_shape_functions_are_those_of_basix_and_projections_are_upright(kind, degree):
+    known, nodes, x, _ = near_a_body(kind, degree)
+    e, some = x.shape[1] - 1, np.random.default_rng(2)
+    place = some.uniform(-0.2, 1.2, (50, e))
+    table = known.element.tabulate(2, place)[:, :, :, 0]
+    N, dN, ddN = known.tabulate(place)
+    np.testing.assert_allclose(N, table[0], atol=1e-13)
+    for i in range(e):
+        powers = np.eye(e, dtype=int)[i]
+        np.testing.assert_allclose(dN[:, i], table[basix.index(*powers)], atol=1e-12)
+        for j in range(e):
+            powers = np.eye(e, dtype=int)[i] + np.eye(e, dtype=int)[j]
+            np.testing.assert_allclose(ddN[:, i, j], table[basix.index(*powers)], atol=1e-11)
+    facet = some.integers(0, len(nodes), len(x))
+    on = known.tabulate(some.uniform(0.1, 0.4, (len(x), e)))[0]
+    x = np.einsum("nk,nki->ni", on, nodes[facet]) + 0.02 * some.normal(size=x.shape)
+    s = known.project(x, nodes[facet], np.full((len(x), e), 0.3))
+    N, dN, _ = known.tabulate(s)
+    r = x - np.einsum("nk,nki->ni", N, nodes[facet])
+    assert np.abs(np.einsum("nek,nki,ni->ne", dN, nodes[facet], r)).max() < 1e-10
 
 
 @pytest.mark.skip_in_parallel

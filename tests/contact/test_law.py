@@ -39,23 +39,27 @@ def scene(dim, seed=4, count=400):
     return body, points, y
 
 
-def seen(body, points, y, behind=None):
+def seen(body, points, y, behind=None, start=None):
+    """Return where points are, which have started elsewhere in a step of a motion."""
     phi, n = body.distance(y)
-    return laws.Separation(phi, n, y - points.anchor, TOUCH, behind)
+    begun = None
+    if start is not None:
+        before = body.distance(start)[0]
+        _, n = body.distance(0.5 * (start + y))
+        begun = laws.Begun(before, np.minimum(0.5 * before, 0.0), y - start)
+    return laws.Separation(phi, n, y - points.anchor, TOUCH, behind, begun)
 
 
-def acting(law, body, points, y, behind=None, by=laws.traction):
-    at = seen(body, points, y, behind)
-    acts = laws.Traction(*by(law, points, at))
-    return acts, acts.pressure[:, None] * at.normal + acts.shear
+def acting(law, body, points, y, behind=None, start=None, by=laws.traction):
+    acts = laws.Traction(*by(law, points, seen(body, points, y, behind, start)))
+    return acts, acts.normal + acts.shear
 
 
-def derivative(law, body, points, y, behind=None):
-    """Return the derivative of ``p n + t`` by positions."""
-    at, H = seen(body, points, y, behind), body.curvature(y)
-    dp, dt = laws.slopes(law, points, at).by_position(at.normal, H)
-    p = laws.traction(law, points, at).pressure
-    return at.normal[:, :, None] * dp[:, None, :] + p[:, None, None] * H + dt
+def derivative(law, body, points, y, behind=None, start=None):
+    at = seen(body, points, y, behind, start)
+    _, n = body.distance(y)
+    H = body.curvature(y) if start is None else 0.5 * body.curvature(0.5 * (start + y))
+    return laws.slopes(law, points, at, n, H)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -68,18 +72,19 @@ def derivative(law, body, points, y, behind=None):
         contact.Coulomb(0.5, cohesion=0.1, limit=0.7),
     ],
 )
-def test_tractions_and_tangents_are_those_of_numpy_and_the_complex_step(law, dim):
+@pytest.mark.parametrize("moves", [False, True])
+def test_tractions_and_tangents_are_those_of_numpy_and_the_complex_step(moves, law, dim):
     body, points, y = scene(dim)
-    D = derivative(law, body, points, y)
-    acts, T = acting(law, body, points, y)
-    known, exact = acting(law, body, points, y, by=rubbing.traction)
+    start = y + 0.05 * np.random.default_rng(9).normal(size=y.shape) if moves else None
+    D = derivative(law, body, points, y, None, start)
+    acts, T = acting(law, body, points, y, None, start)
+    known, exact = acting(law, body, points, y, None, start, rubbing.traction)
     assert law.smooth or 0.1 < acts.slips.mean() < 0.99
     assert (acts.slips == known.slips).all() and (acts.inside == known.inside).all()
     np.testing.assert_allclose(T, exact, atol=1e-14 * np.abs(exact).max())
     for i, e in enumerate(np.eye(dim)):
-        for by in (rubbing.traction, laws.traction):
-            exact = acting(law, body, points, y + 1e-30j * e, by=by)[1].imag / 1e-30
-            assert np.abs(D[:, :, i] - exact).max() < 1e-12 * np.abs(D).max()
+        tried = acting(law, body, points, y + 1e-30j * e, None, start, rubbing.traction)
+        assert np.abs(D[:, :, i] - tried[1].imag / 1e-30).max() < 1e-12 * np.abs(D).max()
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -95,29 +100,31 @@ def test_nitsches_tangent_is_that_of_the_complex_step(friction, dim):
     assert (acts.inside & (phi > TOUCH)).any() and (acts.inside & (phi < 0)).any()
     assert (~acts.inside).any() and (acts.pressure[phi < 0] == 0.0).any()
     D = derivative(law, body, points, y, behind)
-    by_stress = laws.slopes(law, points, seen(body, points, y, behind)).by_pressure(n)
+    by_stress = laws.by_pressure(law, points, seen(body, points, y, behind))
     for i, e in enumerate(np.eye(dim)):
-        exact = acting(law, body, points, y + 1e-30j * e, behind, rubbing.traction)[1].imag / 1e-30
-        assert np.abs(D[:, :, i] - exact).max() < 1e-12 * np.abs(D).max()
-        exact = acting(law, body, points, y, behind + 1e-30j * e, rubbing.traction)[1].imag / 1e-30
-        assert np.abs(by_stress * n[:, i : i + 1] - exact).max() < 1e-12 * np.abs(by_stress).max()
+        moved, pushed = (
+            acting(law, body, points, *at, by=rubbing.traction)[1].imag / 1e-30
+            for at in ((y + 1e-30j * e, behind), (y, behind + 1e-30j * e))
+        )
+        assert np.abs(D[:, :, i] - moved).max() < 1e-12 * np.abs(D).max()
+        assert np.abs(by_stress * n[:, i : i + 1] - pushed).max() < 1e-12 * np.abs(by_stress).max()
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_pressure_that_is_given_counts_as_it_is(dim):
-    law = contact.Coulomb(0.5, cohesion=0.1, limit=0.7)
+def test_the_pressure_of_a_step_does_the_work_of_the_penetration(dim):
     body, points, y = scene(dim)
-    at = seen(body, points, y)._replace(pressure=np.random.default_rng(7).uniform(0, 2, len(y)))
-    found, known = laws.traction(law, points, at), rubbing.traction(law, points, at)
-    for mine, other in zip(found, known, strict=True):
-        np.testing.assert_allclose(mine, other, atol=1e-14)
-    D = laws.slopes(law, points, at)
-    tried = at._replace(**{name: getattr(at, name) + 0j for name in ("gap", "normal", "delta")})
-    tried = tried._replace(pressure=at.pressure + 1e-30j)
-    for by in (rubbing.traction, laws.traction):
-        exact = by(law, points, tried)[1].imag / 1e-30
-        np.testing.assert_allclose(D.shear[:, :, 0], exact, atol=1e-13)
-    assert (D.pressure[:, 0] == 1.0).all() and not D.pressure[:, 1:].any()
+    start = y + 0.05 * np.random.default_rng(9).normal(size=y.shape)
+    y = y + 0.05 * np.random.default_rng(5).normal(size=y.shape)
+    acts, _ = acting(contact.Coulomb(), body, points, y, None, start)
+    at = seen(body, points, y, None, start)
+    k, offset = points.stiffness, at.begun.offset
+    before, after = (0.5 * k * np.minimum(g - offset, 0.0) ** 2 for g in (at.begun.gap, at.gap))
+    work = (acts.normal * at.begun.change).sum(axis=1)
+    np.testing.assert_allclose(work, before - after, atol=1e-14 * before.max())
+    assert (acts.pressure >= 0.0).all() and 50 < (acts.pressure > 0.0).sum() < len(y)
+    still = acting(contact.Coulomb(), body, points, y, None, y)[0]
+    rest = -k * np.minimum(0.5 * at.gap, 0.0)
+    np.testing.assert_allclose(still.pressure, rest, atol=1e-14 * rest.max())
 
 
 def test_shear_stays_within_coulombs_cone():
