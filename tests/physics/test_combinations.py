@@ -596,7 +596,7 @@ class Moving(Scene):
             1.0,
             velocity=start,
             scheme=self.scheme,
-            rayleigh=(0.5, 1e-3),
+            rayleigh=(0.5, 0.0 if isinstance(law, Fracture) else 1e-3),
             quasi_static=still,
             **options,
         )
