@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem
 
-__all__ = ["as_reals", "as_wholes", "holds_ufl", "is_one_of"]
+__all__ = ["as_finite", "as_reals", "as_wholes", "holds_ufl", "is_one_of"]
 
 
 def as_reals(value: Any) -> NDArray[np.float64]:
@@ -34,6 +34,23 @@ def as_reals(value: Any) -> NDArray[np.float64]:
         return np.array(array, dtype=np.float64)
     except OverflowError as error:
         raise ValueError("too large a number") from error
+
+
+def as_finite(value: Any, *shape: int | None) -> NDArray[np.float64] | None:
+    """Return finite numbers as a new array, or ``None``: they are something else.
+
+    Args:
+        value: Anything.
+        *shape: Sizes of the array along its axes; ``None``: any.
+    """
+    try:
+        array = as_reals(value)
+    except (TypeError, ValueError):
+        return None
+    if len(shape) != array.ndim or not np.isfinite(array).all():
+        return None
+    fits = all(size in (None, own) for size, own in zip(shape, array.shape, strict=True))
+    return array if fits else None
 
 
 def as_wholes(value: Any) -> NDArray[np.int64]:

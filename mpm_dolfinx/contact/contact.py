@@ -19,7 +19,7 @@ from ..io.identity import same
 from ..io.snapshot import Kept, Taken
 from ..meshes.remesh import Column
 from ..particles.particles import Particles
-from ..reals import as_reals, is_one_of
+from ..reals import as_finite, is_one_of
 from ..system.term import PointMaterial, Term
 from .law import Friction
 from .surface import Surface
@@ -297,11 +297,8 @@ class Contact(Term):
     ) -> NDArray[np.float64]:
         """Return the moment of forces at points of this rank, summed over ranks (collective)."""
         gdim = self.bodies[0].mesh.geometry.dim
-        try:
-            centre = as_reals(about)
-        except (TypeError, ValueError):
-            centre = np.zeros(0)
-        if centre.shape != (gdim,) or not np.isfinite(centre).all():
+        centre = as_finite(about, gdim)
+        if centre is None:
             raise MPMError(f"A moment is about {gdim} coordinates, not {about!r}.")
         parts = [cross(x - centre, f).sum(axis=0) for x, f in zip(points, forces, strict=True)]
         return np.asarray(self._comm.allreduce(np.atleast_1d(np.sum(parts, axis=0))))

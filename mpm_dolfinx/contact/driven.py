@@ -13,9 +13,9 @@ from ..io.snapshot import Kept, Taken
 from ..particles.particles import Particles
 from ..system.own import OwnUnknowns
 from ..system.term import Term
-from .rigid_motion import RigidMotion, as_rotation
+from .rigid_motion import RigidMotion
 from .rotation import Pose
-from .shapes import as_point
+from .shapes import as_point, as_rotation
 
 __all__ = ["Driven", "KeptMotion"]
 
@@ -45,7 +45,8 @@ class Driven(Term):
             MPMError: No finite numbers of these shapes.
         """
         gdim = len(self._motion.start)
-        self._motion.push = as_point(force, "force", gdim), as_rotation(moment, "moment", gdim)
+        turning = as_rotation(moment, "moment of a RigidBody", gdim)
+        self._motion.push = as_point(force, "force", gdim), turning
 
     def move(self, offset: Any, angle: Any = 0.0) -> None:
         """Say where it is to be at the end of the next step, in what is ``fixed`` of it.
@@ -59,7 +60,8 @@ class Driven(Term):
             MPMError: No finite numbers of these shapes.
         """
         gdim = len(self._motion.start)
-        self._motion.aim = Pose(as_point(offset, "offset", gdim), as_rotation(angle, "angle", gdim))
+        turn = as_rotation(angle, "angle of a RigidBody", gdim)
+        self._motion.aim = Pose(as_point(offset, "offset", gdim), turn)
 
     # -- What it tells, at the last converged step ----------------------------------------------
 

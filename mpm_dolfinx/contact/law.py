@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from .._core import is_as_inherited, loops
 from ..errors import MPMError, as_ours
-from ..reals import as_reals
+from ..reals import as_finite
 from ..tolerances import DIFFERENCE, EQUAL, HALF_DIGITS, LOCAL_ITERATIONS, ROUND_OFF, SMALL
 
 __all__ = [
@@ -240,11 +240,7 @@ def as_friction(value: Any) -> Friction:
     """
     if not isinstance(value, Friction):
         return Coulomb(friction=value)
-    try:
-        begins = as_reals(value.memory)
-    except (TypeError, ValueError):
-        begins = np.array(np.nan)
-    if begins.ndim != 1 or not np.isfinite(begins).all():
+    if as_finite(value.memory, None) is None:
         raise MPMError(
             f"{value.told[0]}.memory must be a list of finite numbers, not {value.memory!r}."
         )

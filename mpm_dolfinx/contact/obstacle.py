@@ -24,7 +24,7 @@ from .obstacle_tractions import ObstacleTractions
 from .placed import Placed, framed, placed, unframed
 from .reach import Reach
 from .rotation import Pose
-from .shapes import Shape
+from .shapes import Shape, as_point, as_rotation
 from .surface import PointMatrix, Surface
 
 __all__ = ["Obstacle"]
@@ -78,22 +78,9 @@ class Obstacle(Contact):
         Raises:
             MPMError: No finite numbers of these shapes.
         """
-        gdim = len(self._pose.offset)
-        count = len(self._pose.angle)
-        try:
-            to = as_reals(offset)
-            turn = np.atleast_1d(as_reals(angle))
-        except (TypeError, ValueError):
-            to = turn = np.zeros(0)
-        if count == 3 and turn.shape == (1,) and turn[0] == 0.0:
-            turn = np.zeros(3)
-        good = to.shape == (gdim,) and turn.shape == (count,)
-        if not good or not (np.isfinite(to).all() and np.isfinite(turn).all()):
-            raise MPMError(
-                f"An obstacle moves by an offset of {gdim} numbers and an angle of {count}, not "
-                f"{offset!r} and {angle!r}."
-            )
-        self._pose = self._aim = Pose(to, turn)
+        gdim = self.shape.dim
+        to = as_point(offset, "offset of an obstacle", gdim)
+        self._pose = self._aim = Pose(to, as_rotation(angle, "angle of an obstacle", gdim))
 
     @property
     def offset(self) -> NDArray[np.float64]:

@@ -37,9 +37,9 @@ from .driven import Driven, KeptMotion
 from .law import Friction
 from .placed import Placed
 from .rigid_balance import RigidBalance
-from .rigid_motion import RigidMotion, State, as_inertia, as_rotation, held_of
+from .rigid_motion import RigidMotion, State, as_inertia, held_of
 from .rotation import Turn, crossing
-from .shapes import Shape, as_point
+from .shapes import Shape, as_point, as_rotation
 
 __all__ = ["RigidBody"]
 
@@ -124,7 +124,7 @@ class RigidBody(Driven):
             np.zeros(gdim),
             Turn.none(gdim),
             np.zeros(gdim) if velocity is None else as_point(velocity, "velocity", gdim),
-            np.zeros(nr) if spin is None else as_rotation(spin, "spin", gdim),
+            np.zeros(nr) if spin is None else as_rotation(spin, "spin of a RigidBody", gdim),
             np.zeros(gdim),
             np.zeros(nr),
         )

@@ -22,10 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
-from ..reals import as_reals
+from ..reals import as_finite
 from .rotation import Pose, Turn, cayley_variation, crossing
+from .shapes import one_line
 
-__all__ = ["RigidMotion", "State", "as_inertia", "as_rotation", "held_of", "names_of"]
+__all__ = ["RigidMotion", "State", "as_inertia", "held_of", "names_of"]
 
 NAMES = ("x", "y", "z")
 TURNS = "rotation"
@@ -274,54 +275,20 @@ def held_of(fixed: Any, gdim: int, axisymmetric: bool) -> NDArray[np.bool_]:
     return np.array(held + [TURNS in given] * (1 if gdim == 2 else 3))
 
 
-def as_rotation(value: Any, name: str, gdim: int) -> NDArray[np.float64]:
-    """Return a number ``(1,)``, or a vector in space; a zero is none of either.
-
-    Raises:
-        MPMError: It is something else.
-    """
-    count = 1 if gdim == 2 else 3
-    try:
-        found = np.atleast_1d(as_reals(value))
-    except (TypeError, ValueError):
-        found = np.zeros(0)
-    if count == 3 and found.shape == (1,) and found[0] == 0.0:
-        found = np.zeros(3)
-    if found.shape != (count,) or not np.isfinite(found).all():
-        raise MPMError(f"{name} of a RigidBody must be {_finite(count)}, not {_shown(value)}.")
-    return found
-
-
-def _finite(count: int) -> str:
-    """Return how many numbers are asked for, in words."""
-    return "a finite number" if count == 1 else f"{count} finite numbers"
-
-
-def _shown(value: Any) -> str:
-    """Return a value in words, on one line."""
-    return " ".join(repr(value).split())
-
-
 def as_inertia(value: Any, gdim: int) -> NDArray[np.float64]:
     """Return a moment of inertia ``(1, 1)``, or a tensor ``(3, 3)``.
 
     Raises:
         MPMError: It is none: not symmetric, or not positive.
     """
-    try:
-        found = as_reals(value)
-    except (TypeError, ValueError):
-        found = np.zeros(0)
     count = 1 if gdim == 2 else 3
-    if found.shape == ():
-        found = found * np.eye(count)
-    good = found.shape == (count, count) and bool(np.isfinite(found).all())
-    good = good and not isinstance(value, bool)
-    if not good or np.abs(found - found.T).max() > 1e-12 * np.abs(found).max():
+    number = as_finite(value)
+    found = as_finite(value, count, count) if number is None else number * np.eye(count)
+    if found is None or np.abs(found - found.T).max() > 1e-12 * np.abs(found).max():
         raise MPMError(
             f"inertia of a RigidBody must be a number{'' if gdim == 2 else ' or (3, 3) numbers'}, "
-            f"not {_shown(value)}."
+            f"not {one_line(value)}."
         )
     if not np.linalg.eigvalsh(found).min() > 0.0:
-        raise MPMError(f"inertia of a RigidBody must be positive, not {_shown(value)}.")
+        raise MPMError(f"inertia of a RigidBody must be positive, not {one_line(value)}.")
     return found

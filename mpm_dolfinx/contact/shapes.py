@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 
 from ..errors import ConvergenceError, MPMError, as_ours
 from ..parallel.given import as_positive, is_number
-from ..reals import as_reals
+from ..reals import as_finite, as_reals
 
 __all__ = [
     "Shape",
     "as_direction",
     "as_point",
     "as_radius",
+    "as_rotation",
     "box",
     "cavity",
     "cylinder",
     "disc",
+    "one_line",
     "plane",
     "polygon",
     "signed_distance",
@@ -397,11 +399,8 @@ def polygon(corners: Any, radius: float = 0.0) -> Shape:
     Raises:
         MPMError: No polygon, or one that is too small for the radius.
     """
-    try:
-        given = as_reals(corners)
-    except (TypeError, ValueError):
-        given = np.zeros(0)
-    if given.ndim != 2 or given.shape[1] != 2 or len(given) < 3 or not np.isfinite(given).all():
+    given = as_finite(corners, None, 2)
+    if given is None or len(given) < 3:
         raise MPMError(f"A polygon needs three corners (x, y) or more, not {corners!r}.")
     ahead = np.roll(given, -1, axis=0)
     area = float((given[:, 0] * ahead[:, 1] - given[:, 1] * ahead[:, 0]).sum()) / 2.0
@@ -467,12 +466,9 @@ def as_point(value: Any, name: str, dim: int | None = None) -> NDArray[np.float6
     Raises:
         MPMError: They are none.
     """
-    try:
-        vector = as_reals(value)
-    except (TypeError, ValueError):
-        vector = np.zeros(0)
+    vector = as_finite(value, None)
     dims = (2, 3) if dim is None else (dim,)
-    if vector.ndim != 1 or len(vector) not in dims or not np.isfinite(vector).all():
+    if vector is None or len(vector) not in dims:
         raise MPMError(
             f"{name} must be {' or '.join(map(str, dims))} finite numbers, not {value!r}."
         )
@@ -501,3 +497,24 @@ def as_radius(value: Any) -> float:
     if not is_number(value) or not 0.0 <= value < np.inf:
         raise MPMError(f"radius must be a number from 0 on, not {value!r}.")
     return float(value)
+
+
+def as_rotation(value: Any, what: str, gdim: int) -> NDArray[np.float64]:
+    """Return a number ``(1,)``, or a vector in space; a zero is none of either.
+
+    Raises:
+        MPMError: It is something else.
+    """
+    count = 1 if gdim == 2 else 3
+    number, found = as_finite(value), as_finite(value, count)
+    if number is not None and (count == 1 or number == 0.0):
+        found = np.full(count, number)
+    if found is None:
+        numbers = "a finite number" if count == 1 else "3 finite numbers"
+        raise MPMError(f"{what} must be {numbers}, not {one_line(value)}.")
+    return found
+
+
+def one_line(value: Any) -> str:
+    """Return a value in words, on one line."""
+    return " ".join(repr(value).split())

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..errors import MPMError, agree, as_ours
 from ..parallel.given import as_positive
 from ..plot.outlines import surface_algorithm
-from ..reals import as_reals
+from ..reals import as_finite
 from ..tolerances import NEGLIGIBLE, ROUND_OFF
 from .nearest import FacetTree
 from .orientation import edges_of, facet_normals, oriented
@@ -248,24 +248,14 @@ def terrain(x: Any, y: Any, heights: Any, *, radius: float = 0.0, pivot: Any = N
     Raises:
         MPMError: No grid of heights, or a radius that is too large.
     """
-    try:
-        first, second, z = (as_reals(v) for v in (x, y, heights))
-    except (TypeError, ValueError):
-        first = second = z = np.zeros(0)
-    good = first.ndim == second.ndim == 1 and min(len(first), len(second)) > 1
-    good = good and z.shape == (len(first), len(second))
-    if (
-        not good
-        or not np.isfinite(z).all()
-        or not all(np.all(np.diff(v) > 0) for v in (first, second))
-    ):
+    lines = [line for v in (x, y) if (line := as_finite(v, None)) is not None and len(line) > 1]
+    z = as_finite(heights, *map(len, lines))
+    if z is None or len(lines) < 2 or not all((np.diff(line) > 0).all() for line in lines):
         raise MPMError(
             "A terrain needs two arrays of places that grow, (n,) and (m,), and finite heights "
             f"(n, m), not {np.shape(x)}, {np.shape(y)} and {np.shape(heights)}."
         )
-    points = np.column_stack(
-        [*(v.ravel() for v in np.meshgrid(first, second, indexing="ij")), z.ravel()]
-    )
+    points = np.column_stack([*(v.ravel() for v in np.meshgrid(*lines, indexing="ij")), z.ravel()])
     number = np.arange(z.size).reshape(z.shape)
     a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
     cells = [np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))]
@@ -342,12 +332,13 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 def _as_arrays(
     points: Any, facets: Any, dim: int, what: str
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    try:
-        x, corners = as_reals(points), np.array(facets)
-    except (TypeError, ValueError):
-        x, corners = np.zeros(0), np.zeros(0)
-    if x.ndim != 2 or x.shape[1] != dim or not np.isfinite(x).all():
+    x = as_finite(points, None, dim)
+    if x is None:
         raise MPMError(f"{what} needs finite points of the shape (n, {dim}), not {_told(points)}.")
+    try:
+        corners = np.array(facets)
+    except (TypeError, ValueError):
+        corners = np.zeros(0)
     if corners.ndim != 2 or corners.shape[1] != dim or not len(corners):
         names = "two points or more" if dim == 2 else "triangles of the shape (m, 3)"
         raise MPMError(f"{what} needs {names}, not {_told(points if dim == 2 else facets)}.")

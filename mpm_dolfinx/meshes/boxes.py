@@ -17,7 +17,7 @@ from dolfinx import mesh
 from .. import _compat
 from ..errors import MPMError, agree
 from ..parallel.exchange import swap
-from ..reals import as_reals
+from ..reals import as_finite, as_reals
 from ..tolerances import SMALL
 
 __all__ = ["BOX_CELLS", "mesh_of_boxes"]
@@ -38,11 +38,8 @@ def mesh_of_boxes(comm: MPI.Comm, points: Any, lengths: Any, gdim: int) -> mesh.
         MPMError: Shapes that do not fit, or lengths that are not positive.
     """
     with agree(comm):
-        try:
-            centres = as_reals(points)
-        except (TypeError, ValueError):
-            centres = np.array(np.nan)
-        if centres.ndim != 2 or centres.shape[1] != gdim or not np.isfinite(centres).all():
+        centres = as_finite(points, None, gdim)
+        if centres is None:
             raise MPMError(f"points must be finite and of shape (n, {gdim}).")
         try:
             sides = np.broadcast_to(as_reals(lengths), centres.shape)

@@ -20,7 +20,7 @@ from ..errors import MPMError, agree
 from ..parallel.boundary import collective
 from ..parallel.given import is_number
 from ..particles.particles import Particles
-from ..reals import as_reals
+from ..reals import as_finite
 from .fields import LABELS, Field, Lines, bodies_of, lines_of, values_of
 from .outlines import (
     edges,
@@ -191,11 +191,8 @@ def corners(box: Any, gdim: int) -> NDArray[np.float64] | None:
     """
     if box is None:
         return None
-    try:
-        given = as_reals(box)
-    except (TypeError, ValueError):
-        given = np.zeros(0)
-    if given.shape != (2, gdim) or not np.isfinite(given).all() or (given[0] >= given[1]).any():
+    given = as_finite(box, 2, gdim)
+    if given is None or (given[0] >= given[1]).any():
         raise MPMError(
             f"box must be the lower and the upper corner of what is shown, {gdim} coordinates "
             f"each, not {box!r}."

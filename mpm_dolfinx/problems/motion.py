@@ -25,7 +25,7 @@ from ..errors import MPMError, agree, as_ours
 from ..history import Energy
 from ..parallel.compilation import compiled_expression, compiled_form
 from ..particles.particles import Particles
-from ..reals import as_reals
+from ..reals import as_finite, as_reals
 from ..system.inertia import Inertia
 from ..system.term import PointMaterial, Term
 from .arguments import as_bodies
@@ -260,12 +260,13 @@ def rayleigh_of(values: Any) -> tuple[float, float]:
     Raises:
         MPMError: They are not two numbers, or negative.
     """
-    try:
-        alpha, beta = as_reals(values).tolist()
-    except (TypeError, ValueError):
-        raise MPMError(f"rayleigh must be (alpha, beta), two numbers, not {values!r}.") from None
-    if not (0.0 <= alpha < math.inf and 0.0 <= beta < math.inf):
-        raise MPMError(f"rayleigh must have finite numbers that are not negative, not {values!r}.")
+    found = as_finite(values, 2)
+    if found is None or found.min() < 0.0:
+        raise MPMError(
+            f"rayleigh must be (alpha, beta), two numbers that are finite and not negative, not "
+            f"{values!r}."
+        )
+    alpha, beta = found.tolist()
     return alpha, beta
 
 

@@ -20,7 +20,15 @@ from ..log import NEWTON, tell
 from ..parallel.garbage import weakly
 from ..parallel.magnitudes import norm, sign_of_product
 from ..parallel.totals import over_ranks
-from ..tolerances import HALF_DIGITS, ROUND_OFF, SOLVED
+from ..tolerances import (
+    EQUAL,
+    HALF_DIGITS,
+    LAST_PLACES,
+    NEGLIGIBLE,
+    ROUND_OFF,
+    SMALL,
+    SOLVED,
+)
 from .attempt import Attempt, Predictions
 from .line_search import LineSearch, stalled
 from .linear import Indefinite, ShiftedFactor
@@ -33,11 +41,6 @@ __all__ = ["NewtonSolver"]
 HELD = 0.1
 #: Share of the forces that the proximal term may bear in the first step.
 LOOSE = 1e-3
-#: Newton increment, relative to the step's, from which on a refined one needs no line search, and
-#: is at the floor of round-off where it does not fall to a quarter of that before.
-SETTLED = 1e-9
-#: What the norm of ``F - K y`` falls to, relative to F, where a step is refined.
-REFINED = 1e-6
 #: Iterations after which it is noted which particles yield, should a solve fail.
 LATE = 5
 #: Relative diagonal shifts tried in turn until a tangent is positive definite.
@@ -503,19 +506,18 @@ class NewtonSolver:
     def _is_round_off(self, step: float, whole: float) -> bool:
         """Whether a step's motion is round-off of the whole motion or, after a stall, of places."""
         return step <= ROUND_OFF * whole or bool(
-            self._now.stalled
-            and step <= 4 * np.finfo(float).eps * self._problem.resistance.extent()
+            self._now.stalled and step <= LAST_PLACES * self._problem.resistance.extent()
         )
 
     def _is_at_floor(self, step: float, whole: float) -> bool:
         """Whether a refined step's motion is small, and no longer falls from one to the next."""
-        return self._now.refines and not self._now.shrinks and step <= SETTLED * whole
+        return self._now.refines and not self._now.shrinks and step <= NEGLIGIBLE * whole
 
     def _is_settled(self, y: PETSc.Vec, x: PETSc.Vec) -> bool:
         """Whether a refined step is too small for the residual to judge it."""
         return self._now.refines and self._problem.resistance.motion(
             y
-        ) <= SETTLED * self._problem.resistance.motion(x)
+        ) <= NEGLIGIBLE * self._problem.resistance.motion(x)
 
     def _release(self, x: PETSc.Vec, tolerance: float) -> float:
         """Let go what the proximal term holds back, except where next to nothing moves.
@@ -595,7 +597,7 @@ class NewtonSolver:
     @property
     def _refined(self) -> float:
         """How far a step is refined: a residual of round-off hides what the soft parts lack."""
-        return REFINED**2 if self._now.stalled else REFINED
+        return EQUAL if self._now.stalled else SMALL
 
     def _refine(self) -> None:
         """Solve for the tangent itself from now on, and let go what the proximal term holds."""

@@ -24,7 +24,7 @@ from ..parallel.compilation import compiled_form
 from ..parallel.given import is_number
 from ..particles.geometry import RING
 from ..particles.particles import Particles
-from ..reals import as_reals
+from ..reals import as_finite
 from ..system.reduced import ReducedSystem
 from ..tolerances import EQUAL, LAST_PLACES, NEGLIGIBLE
 
@@ -361,10 +361,7 @@ def _norm(vectors: Sequence[PETSc.Vec]) -> float:
 
 def _vector(value: Any, particles: Particles, name: str) -> NDArray[np.float64]:
     gdim = particles.mesh.geometry.dim
-    try:
-        array = as_reals(value)
-    except (TypeError, ValueError):
-        array = np.zeros(0)
-    if array.shape != (gdim,) or not np.isfinite(array).all():
+    array = as_finite(value, gdim)
+    if array is None:
         raise MPMError(f"{name} must be {gdim} finite numbers, not {value!r}.")
     return array

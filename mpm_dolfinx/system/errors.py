@@ -17,15 +17,13 @@ from ..constitutive.points import MaterialPoints
 from ..constitutive.recovery import stress_errors
 from ..errors import MPMError
 from ..particles.particles import Particles
+from ..tolerances import SMALL
 from .body import BodyTerm
 from .conditions import fixed_dofs
 from .estimate import nodal_errors, shares_of_domains
 from .reduced import ReducedSystem
 
 __all__ = ["Errors", "estimated"]
-
-#: Change of the forces, over those of all domains, by which they are others.
-OTHER = 1e-6
 
 
 class Errors(NamedTuple):
@@ -76,7 +74,7 @@ def estimated(
     if (failure := reduced.terms.update()) is not None:
         raise failure
     now = reduced.terms.size_of_forces()
-    if size is not None and abs(now - size) > OTHER * reduced.terms.size_of_contributions():
+    if size is not None and abs(now - size) > SMALL * reduced.terms.size_of_contributions():
         reduced.terms.roll_back()
         raise MPMError(
             f"The forces on the bodies, {now:.6g} in all, are not those of the last converged step "
