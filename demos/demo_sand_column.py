@@ -48,12 +48,12 @@ density, gravity = 2000.0, (0.0, -10.0)  # kg/m3, m/s2
 grain, grain_density = 0.01 * r0, density / 0.6  # m, kg/m3
 end, dt, run_out = 1.45, 0.01, 1.2 * a  # s, s, -
 
-# The floor is a row of cells held as a whole: sand that falls onto it in a step stays there.
+# The floor is the background's lower end, held as a whole: sand that falls onto it stays there.
 
-corners, quadrilateral = [[0.0, -h], [28 * h, 11 * h]], mesh.CellType.quadrilateral
-background = mesh.create_rectangle(comm, corners, [28, 12], quadrilateral)
+corners, quadrilateral = [[0.0, 0.0], [28 * h, 11 * h]], mesh.CellType.quadrilateral
+background = mesh.create_rectangle(comm, corners, [28, 11], quadrilateral)
 V = fem.functionspace(background, ("Lagrange", 1, (2,)))
-bcs = [mpm.held(V, y=(-h, 0.0)), mpm.held(V, 0, x=0.0)]
+bcs = [mpm.held(V, y=0.0), mpm.held(V, 0, x=0.0)]
 both = mesh.DiagonalType.left_right
 body = mesh.create_rectangle(comm, [[0.0, 0.0], [r0, a * r0]], [16, 16], diagonal=both)
 particles = mpm.Particles(body, V)

@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import Any, NamedTuple
+
+from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,39 +14,17 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from .. import _compat
+from ..parallel.totals import over_ranks
 from ..tolerances import BLOCK, ROUND_OFF
 from .cells import TOLERANCE, Cells, CellTable
+from .points import PointBasis
 from .tiles import Tiles
+from .walls import Walls
 
 __all__ = ["BackgroundBasis", "PointBasis"]
 
 #: Distance in cells at which the cells beside a point are looked for.
 BESIDE = 0.25
-
-
-class PointBasis(NamedTuple):
-    """Background basis functions at points.
-
-    Attributes:
-        nodes: Global node (block) numbers of V, shape ``(n, k)``.
-        values: Their values at the points, zero where below 1e-13, shape ``(n, k)``.
-        found: Whether a background cell holds the point, shape ``(n,)``.
-        gradients: Their gradients, shape ``(n, k, gdim)``, where asked for.
-        cell: The cell, a local number on the rank that owns it, shape ``(n,)``; ``None`` where
-            values are of several cells.
-        rank: That rank, shape ``(n,)``.
-    """
-
-    nodes: NDArray[np.int64]
-    values: NDArray[np.float64]
-    found: NDArray[np.bool_]
-    gradients: NDArray[np.float64] | None = None
-    cell: NDArray[np.integer[Any]] | None = None
-    rank: NDArray[np.integer[Any]] | None = None
-
-    def part(self, count: int) -> PointBasis:
-        """Return the basis at the first points."""
-        return PointBasis._make(None if a is None else a[:count] for a in self)
 
 
 class BackgroundBasis:
@@ -59,18 +38,36 @@ class BackgroundBasis:
     """
 
     def __init__(self, V: fem.FunctionSpace) -> None:
-        self._mesh = V.mesh
+        self._V, self._mesh = V, V.mesh
+        self._at_rest: NDArray[np.bool_] | None = None
+        self._walls: Walls | None = None
         self._basis = V.ufl_element().basix_element
         own = CellTable.owned(V)
         self._tiles = Tiles(V.mesh.comm, own) if V.mesh.comm.size > 1 else None
         self._cells = Cells(V.mesh, own if self._tiles is None else self._tiles.cells)
+
+    def hold(self, at_rest: NDArray[np.bool_]) -> bool:
+        """Let the boundary hold what passes it where its nodes are at rest (collective).
+
+        See :class:`.Walls`.
+
+        Args:
+            at_rest: Components of nodes of V that this rank owns, shape ``(n, gdim)``.
+
+        Returns:
+            Whether some were at rest that are no longer.
+        """
+        before, self._at_rest = self._at_rest, at_rest
+        let_go = before is not None and bool(np.any(before & ~at_rest))
+        return over_ranks(self._mesh.comm, let_go, MPI.LOR)
 
     def at(self, points: NDArray[np.float64], gradients: bool = False) -> PointBasis:
         """Evaluate the basis at points (collective).
 
         A point on a facet belongs to that of its cells that comes first in the mesh's input,
         on any number of ranks. A point at most 1e-10 of a cell outside the mesh, or the round-off
-        of its coordinates, counts as on it.
+        of its coordinates, counts as on it. Beyond a boundary that :meth:`hold` was told of, the
+        basis is continued.
 
         Args:
             points: This rank's points, shape ``(n, gdim)``; they may lie in cells of any rank.
@@ -79,6 +76,18 @@ class BackgroundBasis:
         Returns:
             Nodes, values and whether a cell was found.
         """
+        basis = self._within(points, gradients)
+        if self._at_rest is None:
+            return basis
+        lost = np.flatnonzero(~basis.found & np.isfinite(points).all(axis=1))
+        if over_ranks(self._mesh.comm, len(lost)) > 0:
+            if self._walls is None:
+                self._walls = Walls(self._V)
+            self._walls.extend(basis, points, lost, self._at_rest)
+        return basis
+
+    def _within(self, points: NDArray[np.float64], gradients: bool) -> PointBasis:
+        """Evaluate the basis at points in cells (collective)."""
         cells = self._around(points)
         n, k = len(points), cells.nodes.shape[1]
         if n == 0 or len(cells.index) == 0:

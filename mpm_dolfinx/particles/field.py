@@ -247,6 +247,10 @@ class CarriedField:
         self.increment = fem.Function(self.V, name=f"increment of {field.name}")
         self.converged_displacement: NDArray[Any] = field.previous.x.array.copy()
         self._basis = BackgroundBasis(self.V)
+        if self.V.mesh is field.particles.V.mesh:
+            # (where its boundary holds the body, it holds what the body has)
+            count = self.V.dofmap.index_map.size_local
+            self._basis.hold(np.ones((count, self.V.mesh.geometry.dim), dtype=bool))
         self._at: Transfer | None = None
         self._rows: PointBasis | None = None
         self._T: PETSc.Mat | None = None

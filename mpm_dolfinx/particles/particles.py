@@ -88,7 +88,8 @@ class Particles(MaterialDomains):
             per domain for degree 1, and for finite elements the least without hourglass modes.
         outside: What happens when a step takes a corner of a domain out of the background:
             ``"error"`` ends the run with an error, ``"stop"`` without one (both before that
-            step), ``"delete"`` goes on without the domain and adds up what is lost.
+            step), ``"delete"`` goes on without the domain and adds up what is lost. What has passed
+            a boundary whose nodes are held, by less than a cell, stays there and has not left.
         domain_update: For ``"gimp"``: ``"stretch"`` (half-lengths follow the diagonal of the
             right stretch) or ``"fixed"`` (the box only translates).
         partition: ``"given"`` leaves the cells of ``body`` on their ranks; ``"background"``

@@ -17,12 +17,11 @@ from ..history import Statistics
 from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
 from ..stabilisation.joints import HARDLY
-from ..system.conditions import dirichlet_values
 from ..system.field import Field
 from ..system.free_field import FreeField
 from ..system.reduced import ReducedSystem
 from ..system.value_field import ValueField
-from ..tolerances import EQUAL, NEGLIGIBLE
+from ..tolerances import NEGLIGIBLE
 
 __all__ = ["count_folded", "crossed", "placed"]
 
@@ -97,54 +96,9 @@ def placed(
             advice = "; move the background or the bodies a little, or use stabilisation='ghost'"
         else:
             text += _flipping(reduced, flips)
-    if error.where is not None:
-        advice = "".join(_passed(field, np.array(error.where)) for field in reduced.fields)
     told = type(error)(f"{text}, in the step after load {load:.6g}{advice}.", particles, load)
     told.dofs, told.where = dofs, error.where
     return told
-
-
-def _passed(field: Field, where: NDArray[np.float64]) -> str:
-    """Say what to do where a body has passed nodes that are held at rest (collective).
-
-    Args:
-        field: Of a background.
-        where: A place outside it, shape ``(gdim,)``.
-    """
-    if isinstance(field, ValueField | FreeField):
-        return ""
-    V, comm = field.V, field.V.mesh.comm
-    bs, owned = V.dofmap.index_map_bs, V.dofmap.index_map.size_local
-    x = V.tabulate_dof_coordinates()[:owned, : len(where)]
-    values = dirichlet_values(field.conditions, V)[: bs * owned]
-    at_rest = (field.held_now() & (values == 0.0)).reshape(-1, bs)
-    ends = comm.allgather((x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)))
-    low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
-    beyond = np.flatnonzero((where < low) | (where > high))
-    if len(beyond) != 1:
-        return ""
-    axis = int(beyond[0])
-    side = float(low[axis] if where[axis] < low[axis] else high[axis])
-    depth = np.abs(x[:, axis] - side)
-    on = depth <= EQUAL * (high[axis] - low[axis])
-    mine: list[tuple[float, list[bool]]] = [(np.inf, [False] * bs)]
-    if on.any():
-        away = np.where(on, np.linalg.norm(x - where, axis=1), np.inf)
-        mine = [(float(away.min()), at_rest[away.argmin()].tolist())]
-    held = min(one for rank in comm.allgather(mine) for one in rank)[1]
-    if not held[axis]:
-        return ""
-    cell = over_ranks(comm, float(depth[~on].min(initial=np.inf)), MPI.MIN)
-    cell *= V.ufl_element().basix_element.degree
-    name, component = "xyz"[axis], "" if all(held) else f"{axis}, "
-    out = side - cell if side == low[axis] else side + cell
-    first, last = (f"{round(float(c), 12) + 0.0:.6g}" for c in sorted((out, side)))
-    verb, new = ("begin", first) if out < side else ("end", last)
-    return (
-        "; what is fast passes held nodes in one step: let the background "
-        f"{verb} at {name} = {new} and hold the cells that are added, "
-        f"mpm.held(V, {component}{name}=({first}, {last}))"
-    )
 
 
 class _Astray(NamedTuple):

@@ -224,6 +224,12 @@ class Field:
         self._totals = np.zeros(self._owned) if before is None else before[: self._owned]
         self._imposed = False
         self.prescribes = over_ranks(self._comm, bool(np.any(change)), MPI.LOR)
+        at_rest = (self._held() & (self._change == 0.0)).reshape(-1, self._bs)
+        for body in self.bodies:
+            if not isinstance(body, Particles) or body.is_free:
+                continue
+            if body.background_basis.hold(at_rest):
+                body.forget_transfer()
 
     # -- Unknowns -------------------------------------------------------------------------
 

@@ -265,3 +265,34 @@ def test_search_in_a_grid_finds_what_that_by_boxes_does(cell, change, away, monk
 def gathered(table):
     """Return the columns of tables of cells on all ranks, each as a list (collective)."""
     return zip(*scenes.WORLD.allgather(tuple(table)), strict=True)
+
+
+@pytest.mark.parametrize("name", [name for name in MESHES if "sheared" not in name])
+def test_a_boundary_that_is_held_goes_on_beyond_it(name):
+    # At a point below a face that is held stands the basis of the nearest place of the face, whose
+    # gradient has no part across it; elsewhere there is nothing.
+    domain = MESHES[name]()
+    V = scenes.vectors(domain)
+    dim = domain.geometry.dim
+    evaluator = BackgroundBasis(V)
+    x = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local, :dim]
+    at_rest = np.zeros((len(x), dim), dtype=bool)
+    at_rest[:, dim - 1] = np.abs(x[:, dim - 1]) < 1e-9
+    assert not evaluator.hold(at_rest)  # nothing was
+    random = np.random.default_rng(7)
+    on = np.full((30, dim), 0.0)
+    on[:, : dim - 1] = 0.3 + 0.4 * random.random((30, dim - 1))
+    below, far, above = on.copy(), on.copy(), on.copy()
+    below[:, -1], far[:, -1], above[:, -1] = -0.01, -1.5, 1.2
+    there, found = (evaluator.at(points, gradients=True) for points in (on, below))
+    assert there.found.all() and found.found.all()
+    np.testing.assert_allclose(to_dense(found, V), to_dense(there, V), atol=1e-12)
+    assert np.abs(found.gradients[..., -1]).max() < 1e-12
+    step = np.zeros(dim)
+    step[0] = 1e-6
+    change = to_dense(evaluator.at(below + step), V) - to_dense(evaluator.at(below - step), V)
+    slopes = to_dense(found._replace(values=found.gradients[..., 0]), V)
+    smooth = np.abs(slopes) > 0  # (facets meet at kinks)
+    np.testing.assert_allclose((change / 2e-6)[smooth], slopes[smooth], atol=1e-5)
+    assert not evaluator.at(far).found.any() and not evaluator.at(above).found.any()
+    assert evaluator.hold(np.zeros_like(at_rest)) and not evaluator.at(below).found.any()
