@@ -286,9 +286,8 @@ class MaterialPoints:
             unchanged = np.repeat(same, self._particles.num_points)
         gap = None
         if self.mean_stress is not None and before.mean_stress is not None:
-            pressure, seen = before.mean_stress.values, before.volume_strain
-            self.mean_stress.begin_with(pressure)
-            gap = seen.volume - seen.compliance * pressure
+            self.mean_stress.begin_with(before.mean_stress.values)
+            gap = before.mean_stress.gap
         gradient = gradient.reshape(-1, self.dim, self.dim)
         stress = before.last.cauchy_stress(gradient).reshape(-1, 3, 3)
         carried = Carried(stress, gradient, gap)

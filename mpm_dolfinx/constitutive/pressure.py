@@ -112,6 +112,11 @@ class MeanStress:
         """The pressure at the points, shape ``(n,)``."""
         return np.asarray(self._pressure.x.array[: len(self._soft)])
 
+    @property
+    def gap(self) -> NDArray[np.float64]:
+        """Volume strain less the one of the pressure, as seen last, shape ``(n,)``."""
+        return np.asarray(self.strain.volume - self.strain.compliance * self.values)
+
     def begin_with(self, values: NDArray[np.float64]) -> None:
         """Let a body that has not moved have a pressure, shape ``(n,)`` (collective)."""
         whole = np.zeros(len(self._pressure.x.array))
