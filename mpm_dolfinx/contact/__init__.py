@@ -17,11 +17,10 @@ from .shapes import (
     cylinder,
     disc,
     plane,
-    polygon,
     signed_distance,
     sphere,
 )
-from .triangulation import polyline, read_surface, terrain, triangulated
+from .triangulation import polygon, polyline, read_surface, terrain, triangulated
 
 __all__ = [
     "Coulomb",

@@ -26,7 +26,6 @@ __all__ = [
     "disc",
     "one_line",
     "plane",
-    "polygon",
     "signed_distance",
     "sphere",
 ]
@@ -190,63 +189,6 @@ class _Box(Shape):
         return np.where(edge[:, None, None], across / length[:, None, None], 0.0)
 
 
-class _Polygon(Shape):
-    """A polygon with rounded corners: an inner polygon and all that is near to it."""
-
-    def __init__(self, corners: NDArray[np.float64], radius: float) -> None:
-        super().__init__(2, corners.mean(axis=0))
-        self._corners, self._radius = corners, radius
-        self._edges = np.roll(corners, -1, axis=0) - corners
-        self._squares = (self._edges**2).sum(axis=1)
-        lengths = np.sqrt(self._squares)[:, None]
-        self._normals = np.column_stack([self._edges[:, 1], -self._edges[:, 0]]) / lengths
-
-    @property
-    def bounds(self) -> NDArray[np.float64]:
-        low, high = self._corners.min(axis=0), self._corners.max(axis=0)
-        return np.array([low - self._radius, high + self._radius])
-
-    def _nearest(
-        self, y: NDArray[Any]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-        """Return the nearest edge of each point, its nearest corner, and which of both is near."""
-        x = y.real
-        arm = x[:, None] - self._corners
-        along = np.clip((arm * self._edges).sum(axis=2) / self._squares, 0.0, 1.0)
-        foot = arm - along[:, :, None] * self._edges
-        edge = (foot**2).sum(axis=2).argmin(axis=1)
-        place = along[np.arange(len(y)), edge]
-        corner = (edge + (place >= 1.0)) % len(self._corners)
-        return edge, corner, (place > 0.0) & (place < 1.0)
-
-    def _inside(self, x: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether points are in the inner polygon, by the even-odd rule."""
-        a, b = self._corners, self._corners + self._edges
-        across = (a[:, 1] > x[:, None, 1]) != (b[:, 1] > x[:, None, 1])
-        rise = np.where(self._edges[:, 1] == 0.0, 1.0, self._edges[:, 1])
-        at = a[:, 0] + (x[:, None, 1] - a[:, 1]) / rise * self._edges[:, 0]
-        return np.asarray(np.count_nonzero(across & (x[:, None, 0] < at), axis=1) % 2 == 1)
-
-    def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        edge, corner, on_edge = self._nearest(y)
-        normals = self._normals[edge]
-        flat = ((y - self._corners[edge]) * normals).sum(axis=1)
-        arm = y - self._corners[corner]
-        length = np.sqrt((arm * arm).sum(axis=1) + TINY)
-        sign = np.where(self._inside(y.real), -1.0, 1.0)
-        n = np.where(on_edge[:, None], normals, (sign / length)[:, None] * arm)
-        return np.where(on_edge, flat, sign * length) - self._radius, n
-
-    def curvature(self, y: NDArray[Any]) -> NDArray[Any]:
-        _, corner, on_edge = self._nearest(y)
-        arm = y - self._corners[corner]
-        length = np.sqrt((arm * arm).sum(axis=1) + TINY)
-        n = arm / length[:, None]
-        sign = np.where(self._inside(y.real), -1.0, 1.0)
-        across = (np.eye(2) - n[:, :, None] * n[:, None, :]) * (sign / length)[:, None, None]
-        return np.where(on_edge[:, None, None], 0.0, across)
-
-
 class _Cavity(Shape):
     def __init__(self, shape: Shape) -> None:
         super().__init__(shape.dim, shape.pivot)
@@ -387,43 +329,6 @@ def box(lower: Any, upper: Any, radius: float = 0.0) -> Shape:
     if 2.0 * r >= (high - low).min():
         raise MPMError(f"The radius {r:g} of a box must be below half of its smallest side.")
     return _Box(low, high, r)
-
-
-def polygon(corners: Any, radius: float = 0.0) -> Shape:
-    """Return a polygon in the plane, with corners rounded within its outline.
-
-    Args:
-        corners: One after the other, in either sense, shape ``(n, 2)``; edges must not cross.
-        radius: Of the outward corners; see :func:`box`.
-
-    Raises:
-        MPMError: No polygon, or one that is too small for the radius.
-    """
-    given = as_finite(corners, None, 2)
-    if given is None or len(given) < 3:
-        raise MPMError(f"A polygon needs three corners (x, y) or more, not {corners!r}.")
-    ahead = np.roll(given, -1, axis=0)
-    area = float((given[:, 0] * ahead[:, 1] - given[:, 1] * ahead[:, 0]).sum()) / 2.0
-    extent = float(np.ptp(given, axis=0).max())
-    edges = ahead - given
-    lengths = np.linalg.norm(edges, axis=1)
-    if abs(area) <= 1e-12 * extent**2 or lengths.min() <= 1e-12 * extent:
-        raise MPMError("The corners of a polygon must enclose an area and differ from each other.")
-    if area < 0.0:
-        return polygon(given[::-1], radius)
-    r = as_radius(radius)
-    if r == 0.0:
-        return _Polygon(given, 0.0)
-    inward = np.column_stack([-edges[:, 1], edges[:, 0]]) / lengths[:, None]
-    before = np.roll(inward, 1, axis=0)
-    share = 1.0 + (before * inward).sum(axis=1)
-    if share.min() <= 1e-9:
-        raise MPMError("A corner of a polygon turns back on itself and cannot be rounded.")
-    inner = given + r * (before + inward) / share[:, None]
-    left = ((np.roll(inner, -1, axis=0) - inner) * edges).sum(axis=1) / lengths
-    if left.min() <= 1e-9 * extent:
-        raise MPMError(f"The radius {r:g} is too large for the edges of this polygon.")
-    return _Polygon(inner, r)
 
 
 def cavity(shape: Shape) -> Shape:

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Rigid shapes by segments in the plane and by triangles in space: polylines, terrain, files.
+"""Rigid shapes by segments in the plane and by triangles in space: polygons, terrain, files.
 
 The distance is that of the nearest place, which lies within a facet, on an edge or at a corner.
 Its sign is that of the normal of a facet, of the sum of both at an edge, and of the sum of all at a
@@ -28,7 +28,7 @@ from .nearest import FacetTree
 from .orientation import edges_of, facet_normals, oriented
 from .shapes import Shape, as_point, as_radius
 
-__all__ = ["polyline", "read_surface", "terrain", "triangulated"]
+__all__ = ["polygon", "polyline", "read_surface", "terrain", "triangulated"]
 
 #: Least product of the normals of a facet before and after its corners were moved inwards.
 KEPT = 0.5
@@ -55,30 +55,36 @@ class _Place(NamedTuple):
     off: NDArray[np.bool_]
 
 
+class _Solid(NamedTuple):
+    """What facets enclose.
+
+    Attributes:
+        points: Corners, shape ``(n, dim)``.
+        facets: Corners of each facet, oriented outwards, shape ``(m, dim)``.
+        radius: How far they lie within the surface, whose edges are rounded.
+        outline: Corners of the surface itself.
+    """
+
+    points: NDArray[np.float64]
+    facets: NDArray[np.int64]
+    radius: float
+    outline: NDArray[np.float64]
+
+
 class _Faceted(Shape):
     """Solid behind segments or triangles, which are oriented outwards, with rounded edges.
 
     Args:
-        points: Corners, shape ``(n, dim)``.
-        facets: Corners of each facet, shape ``(m, dim)``.
-        radius: Of its edges: how far the facets given lie within the surface.
+        solid: The facets.
         pivot: The point about which it turns.
-        outline: Corners of the surface before they were moved inwards by the radius.
     """
 
     costly = True
 
-    def __init__(
-        self,
-        points: NDArray[np.float64],
-        facets: NDArray[np.int64],
-        radius: float,
-        pivot: NDArray[np.float64],
-        outline: NDArray[np.float64],
-    ) -> None:
+    def __init__(self, solid: _Solid, pivot: NDArray[np.float64]) -> None:
+        points, facets, self._radius, self._outline = solid
         super().__init__(points.shape[1], pivot)
         self.points, self.facets = points, facets
-        self._radius, self._outline = radius, outline
         self._on = ROUND_OFF * float(np.abs(points).max(initial=0.0))
         corners = points[facets]
         self._normals = facet_normals(corners)
@@ -208,6 +214,27 @@ def triangulated(
     """
     x, facets = _as_arrays(points, triangles, 3, "triangulated")
     return _surface(x, facets, outside, radius, pivot)
+
+
+def polygon(corners: Any, radius: float = 0.0) -> Shape:
+    """Return a polygon in the plane, with corners rounded within its outline.
+
+    It turns about the mean of its corners, less the radius.
+
+    Args:
+        corners: One after the other, in either sense, shape ``(n, 2)``; edges must not cross.
+        radius: Of the outward corners; see :func:`box`.
+
+    Raises:
+        MPMError: No polygon, or one that is too small for the radius.
+    """
+    given = as_finite(corners, None, 2)
+    if given is None or len(given) < 3:
+        raise MPMError(f"A polygon needs three corners (x, y) or more, not {corners!r}.")
+    count = np.arange(len(given))
+    edges = np.column_stack([count, np.roll(count, -1)])
+    solid = _solid(given, edges, None, as_radius(radius), "The polygon")
+    return _Faceted(solid, solid.points.mean(axis=0))
 
 
 def polyline(points: Any, *, outside: Any = None, radius: float = 0.0, pivot: Any = None) -> Shape:
@@ -364,16 +391,25 @@ def _surface(
     what = "The surface" if name is None else f"The surface of {name}"
     if len(x) and not np.isfinite(x).all():
         raise MPMError(f"{what} has points that are not finite.")
-    dim = x.shape[1]
-    r = as_radius(radius)
+    solid = _solid(x, facets, outside, as_radius(radius), what)
+    ends = np.array([solid.outline.min(axis=0), solid.outline.max(axis=0)])
+    centre = ends.mean(axis=0) if pivot is None else as_point(pivot, "pivot", x.shape[1])
+    return _Faceted(solid, centre)
+
+
+def _solid(
+    x: NDArray[np.float64], facets: NDArray[np.int64], outside: Any, radius: float, what: str
+) -> _Solid:
+    """Return facets with their corners moved inwards by a radius.
+
+    Raises:
+        MPMError: They make no surface, or one that is too small for the radius.
+    """
     x, facets = _merged(x, facets)
     if len(facets) == 0:
         raise MPMError(f"{what} has no extent: all of its corners are at one place.")
-    extent = np.array([x.min(axis=0), x.max(axis=0)])
     facets = oriented(x, facets, outside, what)
-    centre = extent.mean(axis=0) if pivot is None else as_point(pivot, "pivot", dim)
-    inner = _inner(x, facets, r, what) if r > 0.0 else x
-    return _Faceted(inner, facets, r, centre, x)
+    return _Solid(_inner(x, facets, radius, what) if radius > 0.0 else x, facets, radius, x)
 
 
 def _merged(

@@ -146,14 +146,25 @@ def test_triangles_of_a_box_are_a_box(radius):
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.05])
-def test_a_closed_line_is_a_polygon(radius):
+def test_a_polygon_and_a_closed_line_have_the_distance_of_segments(radius):
     corners = np.array([(0, 0), (2, 0), (2, 2), (1, 2), (1, 1), (0, 1), (0, 0)], dtype=float)
-    other = contact.polygon(corners[:-1], radius)
+    inwards = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1), (1, -1), (1, -1), (1, 1)])
+    a = corners + radius * inwards
     y = np.random.default_rng(1).uniform(-0.5, 2.5, (800, 2))
-    for one in (corners, corners[::-1]):
-        line = contact.polyline(one, radius=radius)
-        for mine, exact in zip(line.distance(y), other.distance(y), strict=True):
-            assert np.abs(mine - exact).max() < 1e-12
+    x, way, arm = y[:, None], a[1:] - a[:-1], y[:, None] - a[:-1]
+    along = np.clip((arm * way).sum(axis=2) / (way**2).sum(axis=1), 0.0, 1.0)
+    far = np.linalg.norm(arm - along[:, :, None] * way, axis=2).min(axis=1)
+    across = (a[:-1, 1] > x[:, :, 1]) != (a[1:, 1] > x[:, :, 1])  # edges here are upright or level
+    inside = (across & (x[:, :, 0] < a[:-1, 0])).sum(axis=1) % 2 == 1
+    exact = np.where(inside, -far, far) - radius
+    shapes = [contact.polyline(one, radius=radius) for one in (corners, corners[::-1])]
+    shapes += [contact.polygon(one, radius) for one in (corners[:-1], corners[-2::-1])]
+    for shape in shapes:
+        phi, n = shape.distance(y)
+        assert np.abs(phi - exact).max() < 1e-12
+        on = np.abs(shape.distance(y - phi[:, None] * n)[0])[np.abs(phi) < 0.2]
+        assert np.median(on) < 1e-12
+    assert np.abs(shapes[-1].pivot - a[:-1].mean(axis=0)).max() < 1e-14
 
 
 def test_triangles_of_a_ball_come_near_to_a_sphere_with_their_number():
@@ -293,10 +304,12 @@ def dragged(shape, comm=WORLD, friction=0.4):
     return problem, die
 
 
-def test_a_polyline_presses_as_the_polygon_that_it_is():
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_polygon_presses_as_the_box_that_it_is(closed):
     corners = [(0.4, 1.0), (1.0, 1.0), (1.0, 1.6), (0.4, 1.6)]
-    problem, die = dragged(contact.polyline([*corners, corners[0]], radius=0.1))
-    other, same = dragged(contact.polygon(corners, 0.1))
+    square = contact.polyline([*corners, corners[0]], radius=0.1)
+    problem, die = dragged(square if closed else contact.polygon(corners, 0.1))
+    other, same = dragged(contact.box(corners[0], corners[2], 0.1))
     assert np.abs(die.reaction - same.reaction).max() < 1e-9 * np.abs(same.reaction).max()
     same_run(outcome(problem), outcome(other), 1e-9)
     # gaps of points that were too far away to be looked for in each iteration, too
