@@ -115,6 +115,6 @@ assert abs(ratio / 1.4 - 1.0) < 0.05
 
 # ## Exercises
 #
-# 1. Without friction the ball slides. When does it hit the wall?
+# 1. Without friction between it and the ground the ball slides. When does it hit the wall?
 # 2. Take `scheme="euler"`. How much energy does the scheme take (`lost`) besides?
 # 3. Make a movie: `mpm.plot.movie(problem, problem.steps(time=1.4, dt=0.02), "wall.gif", "mises")`.

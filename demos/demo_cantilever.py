@@ -109,4 +109,4 @@ assert error < 1e-2 and history.total_iterations <= 240
 # ## Exercises
 #
 # 1. Use degree 2 for `V` and `degree=2` for the particles, with cells twice as large.
-# 2. Let the load turn with the tip: `pressures=` in place of `tractions=`.
+# 2. Spread the load over the upper face, dead, and by `pressures=`. Which bends the beam further?

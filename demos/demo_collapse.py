@@ -114,4 +114,4 @@ assert abs(u_top / -2.70 - 1.0) < 0.01 and abs(u_toe / 5.79 - 1.0) < 0.01
 
 # ## Exercises
 #
-# Give each cell 6 by 6 particles: the body becomes stiffer. Then use `f_bar="patch"`.
+# Give each cell 6 by 6 particles, and then use `f_bar="patch"`. How far does the toe come?

@@ -134,7 +134,7 @@ assert yield_violation < 1e-8
 
 # ## Exercises
 #
-# 1. Use quadrilaterals, then `on_distortion="split"`, then `quadrature_degree=2` with
-#    `f_bar="domain"`. Which domains fold?
-# 2. Turn the cures off, `shift=0.0` or `line_search=False`. Where does the run stop?
-# 3. Four times the weight needs a background four times as wide. How far does the toe get?
+# 1. Use quadrilaterals as large as cells. Where does the run stop? Then give the particles
+#    `on_distortion="split"`, or `quadrature_degree=2` and the body `f_bar="domain"`.
+# 2. Four times the weight needs a background four times as wide. How far does the toe get?
+# 3. There turn the cures off, by `solver=mpm.Solver(shift=0.0)`, `line_search=False`, and both.

@@ -147,6 +147,6 @@ assert violation < 1e-8 and problem.history.total_iterations <= 135
 
 # ## Exercises
 #
-# 1. Halve the cells: by how much do the errors fall, and why not by four near the front?
+# 1. Halve the cells: by how much do the errors fall? Where are they largest, and why?
 # 2. Print `step.residuals` of the first and of the last step. Newton's method is quadratic in both.
 # 3. Draw `mpm.plot.history(problem, "run.png")`. In which step does the column begin to yield?

@@ -163,5 +163,5 @@ assert abs(plateau) < 0.005 and drop < 0.003
 # ## Exercises
 #
 # 1. Leave `f_bar` out. How far does the pressure rise?
-# 2. Make the strip rough, `mpm.boundary.fixed`: the limit is the same.
-# 3. Put the line of the background at the strip's edge, `beyond = 0`. Why does the pressure fall?
+# 2. Make the strip rough, `mpm.boundary.fixed`. Prandtl's limit is the same; is the computed one?
+# 3. Put the line of the background at the strip's edge, `beyond = 0`. Why does the pressure rise?

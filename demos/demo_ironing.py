@@ -141,4 +141,4 @@ assert problem.history.cutbacks == 0 and np.mean(solves) < 4.0
 #
 # 1. Take `passes=1`, and then exchange the two bodies. Which one should have the points?
 # 2. Take `penalty=1000`. How do scatter and the number of linear solves change, and why?
-# 3. Give both bodies the same background. At which gap do they meet, and do they slide?
+# 3. Give both bodies the same V and leave the pair out. What bears the die now, and does it slide?
