@@ -76,7 +76,7 @@ class BackgroundBasis:
         Returns:
             Nodes, values and whether a cell was found.
         """
-        basis = self._within(points, gradients)
+        basis = self.within(points, gradients)
         if self._at_rest is None:
             return basis
         lost = np.flatnonzero(~basis.found & np.isfinite(points).all(axis=1))
@@ -86,8 +86,8 @@ class BackgroundBasis:
             self._walls.extend(basis, points, lost, self._at_rest)
         return basis
 
-    def _within(self, points: NDArray[np.float64], gradients: bool) -> PointBasis:
-        """Evaluate the basis at points in cells (collective)."""
+    def within(self, points: NDArray[np.float64], gradients: bool = False) -> PointBasis:
+        """Evaluate the basis as :meth:`at` does, at points in cells alone (collective)."""
         cells = self._around(points)
         n, k = len(points), cells.nodes.shape[1]
         if n == 0 or len(cells.index) == 0:

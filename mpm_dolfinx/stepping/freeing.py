@@ -60,7 +60,7 @@ def carried_after(bodies: Sequence[Particles]) -> Carried:
         ahead = 2.0 * after - before
         nodes = np.flatnonzero(free)
         points = np.concatenate([x[nodes] for x in (before, after, ahead)])
-        was, stays, remains = body.background_basis.at(points).found.reshape(3, -1)
+        was, stays, remains = body.background_basis.within(points).found.reshape(3, -1)
         left = _any(body, was & ~stays)
         too_late = too_late or left
         here = before if left else after
@@ -123,7 +123,7 @@ def _without(
     """
     if not _any(body, seeds):
         return None
-    rows = body.background_basis.at(positions)
+    rows = body.background_basis.within(positions)
     T = transfer_matrix(rows._replace(values=np.abs(rows.values)), body.W, body.V)
     one, together = T.createVecLeft(), T.createVecRight()
     bs = body.W.dofmap.index_map_bs
