@@ -224,7 +224,8 @@ class Field:
         self._totals = np.zeros(self._owned) if before is None else before[: self._owned]
         self._imposed = False
         self.prescribes = over_ranks(self._comm, bool(np.any(change)), MPI.LOR)
-        at_rest = (self._held() & (self._change == 0.0)).reshape(-1, self._bs)
+        moved = (self._change != 0.0) | (self._totals != 0.0)
+        at_rest = (self._held() & ~moved).reshape(-1, self._bs)
         for body in self.bodies:
             if not isinstance(body, Particles) or body.is_free:
                 continue
