@@ -121,7 +121,7 @@ assert np.abs(change).max() < 1e-3
 
 # ## Exercises
 #
-# 1. Read the settlement at small loads alone, up to 40 kPa. What becomes of the deviation of $c$?
+# 1. Read the settlement at small loads alone, up to 40 kPa. What becomes of $c$ and of $J^T J$?
 # 2. Take Poisson's ratio as a third parameter. Look at the deviations, and at the eigenvectors of
 #    $J^T J$: which combination does the curve not tell?
 # 3. Without `stabilisation="ghost"` plot the derivative by $E$ over $E$ within 10 %.

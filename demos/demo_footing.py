@@ -164,4 +164,4 @@ assert abs(plateau) < 0.005 and drop < 0.003
 #
 # 1. Leave `f_bar` out. How far does the pressure rise?
 # 2. Make the strip rough, `mpm.boundary.fixed`. Prandtl's limit is the same; is the computed one?
-# 3. Put the line of the background at the strip's edge, `beyond = 0`. Why does the pressure rise?
+# 3. Put lines of the background at the edge, `beyond = 0`, or the ground, `over = 0`: what changes?

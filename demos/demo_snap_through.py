@@ -145,6 +145,6 @@ assert error < 5e-3 and problem.history.cutbacks == 0
 
 # ## Exercises
 #
-# 1. Leave `control=` out: where does the run by load stop, and what does the error say?
-# 2. Make the arch higher. From which height on does the path turn back, so that the crown's way
-#    no longer grows on all of it? Control another point then.
+# 1. Leave `control=` out, and print `path[-1]` in the loop. What does the arch do at the limit?
+# 2. Make the arch higher, up to 4 m, and its background. Does the crown's way still grow on all of
+#    the path?

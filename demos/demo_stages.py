@@ -102,6 +102,6 @@ assert abs(rows[2][2] / rows[0][2] - 1.0) < 1e-8 and rows[2][1] > rows[0][1]
 #
 # 1. The width of the loaded facets is the difference of the reactions over 100 kPa. Is it still
 #    `STRIP` where the strip begins at 1.02 m, within a facet?
-# 2. How large may the load be? Let it grow to 300 kPa and see where `solve` stops.
+# 2. How large may the load be? Let it grow to 300 kPa and see where the settlement runs away.
 # 3. Dig: take the strip's load away first, then let the density of the upper layer go to half of
 #    its value on a path. (`density` is a Function; what is `problem.reaction(base_y)` then?)

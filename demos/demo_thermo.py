@@ -150,6 +150,6 @@ assert abs(cooled / kelvin - 1.0) < 0.01
 
 # ## Exercises
 #
-# 1. Shift the background by a third of a cell. What changes?
+# 1. Shift the background down by a third of a cell. What changes?
 # 2. Make the lower layer twice as stiff. What is Timoshenko's factor then?
 # 3. Let the strip lose heat to the air: add `dt * beta * theta * q * ufl.ds(body)` to its residual.

@@ -3,9 +3,10 @@
 """MkDocs hook: one page per demo, made from its script (jupytext, light) without running it.
 
 What the script printed and drew is in ``images/demos``, kept by ``scripts/run_demos.py``; it comes
-before the exercises. Beside each page are the script and a notebook made of it. The gallery has the
-demos by the level that stands below their licence, as ``# Level: 1.2: Clay under its weight``: the
-second of the first level, and what stands below its title there.
+before the exercises, and a link to their answers after them. Beside each page are the script and a
+notebook made of it. The gallery has the demos by the level that stands below their licence, as
+``# Level: 1.2: Clay under its weight``: the second of the first level, and what stands below its
+title there.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ HEADER = re.compile(r"\A(?:#!.*\n)?(?:# (?:Copyright|SPDX-|Level:).*\n)+(?:#?\n)
 LEVEL = re.compile(r"^# Level: ([123])\.(\d+): (.+)$", re.MULTILINE)
 LEVELS = ("First steps", "Standard problems", "Further on")
 EXERCISES = "\n## Exercises\n"
+ANSWERS = "answers.md"
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -69,6 +71,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         parts.append('<div class="gallery">\n' + "\n".join(cards) + "\n</div>")
         nav.append({heading: [{title: f"demos/demo_{name}.md"} for _, title, name, _ in entries]})
     files.append(File.generated(config, "demos/index.md", content="\n\n".join(parts) + "\n"))
+    nav.append({"Answers to the exercises": ANSWERS})
     config.nav.append({"Demos": nav})
     return files
 
@@ -116,8 +119,10 @@ def page(script: str, source: str, sketch: str, shown: str) -> tuple[str, str]:
     if title is None:
         raise PluginError(f"{script} must start with a title: a comment '# # Title'.")
     before, exercises, after = body.partition(EXERCISES)
-    body = before + shown + exercises + after
     stem = script.removesuffix(".py")
+    if exercises:
+        after += f"\n[Answers](../{ANSWERS}#{stem.removeprefix('demo_')})\n"
+    body = before + shown + exercises + after
     note = f"*The script: [{script}]({script}); as a notebook: [{stem}.ipynb]({stem}.ipynb).*"
     text, code, rest = body[title.end() :].partition("\n```python")
     return title[1].strip(), f"{title[0]}\n{note}\n{text}\n{sketch}{code}{rest}\n"

@@ -37,6 +37,19 @@ def test_text_is_a_lecture_note(name):
 
 @pytest.mark.skip_in_parallel
 @pytest.mark.parametrize("name", NAMES)
+def test_each_exercise_has_its_answer(name):
+    asked = (DEMOS / f"{name}.py").read_text("utf-8").partition("\n# ## Exercises\n")[2]
+    answers = (DEMOS.parent / "docs" / "answers.md").read_text("utf-8")
+    title = rf"^### .+ \{{ #{name.removeprefix('demo_')} \}}\n+"
+    found = re.search(title + r"(.+?)(?=^##|\Z)", answers, re.MULTILINE | re.DOTALL)
+    assert found is not None
+    assert re.findall(r"^(\d)\. ", found[1], re.MULTILINE) == re.findall(
+        r"^# (\d)\. ", asked, re.MULTILINE
+    )
+
+
+@pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("name", NAMES)
 def test_code_fits_into_the_80_columns_of_a_page(name):
     """Pages have code formatted anew; what the formatter cannot break is too long."""
     ruff = shutil.which("ruff", path=str(Path(sys.executable).parent)) or shutil.which("ruff")
