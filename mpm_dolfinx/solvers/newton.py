@@ -510,8 +510,12 @@ class NewtonSolver:
         )
 
     def _is_at_floor(self, step: float, whole: float) -> bool:
-        """Whether a refined step's motion is small, and no longer falls from one to the next."""
-        return self._now.refines and not self._now.shrinks and step <= NEGLIGIBLE * whole
+        """Whether a step's motion is small, and no longer falls from one to the next.
+
+        A step that is not refined yet must leave the residual as large as it was, too.
+        """
+        may_end = self._now.refines or self._now.stalled
+        return may_end and not self._now.shrinks and step <= NEGLIGIBLE * whole
 
     def _is_settled(self, y: PETSc.Vec, x: PETSc.Vec) -> bool:
         """Whether a refined step is too small for the residual to judge it."""

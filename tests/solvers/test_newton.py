@@ -113,6 +113,30 @@ def test_round_off_counts_as_converged():
     assert max(step.residuals[-1] for step in history.steps) < 1e-12
 
 
+def test_a_residual_that_round_off_keeps_large_ends_a_solve():
+    # Elements of degree 2 across cells: steps rest at 2e-13 of the motion, the residual at 2e-12.
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.5], [12, 15], QUADRILATERAL), 2)
+    body = scenes.box([0.0, 0.0], [1.0, 2.0], [6, 12], QUADRILATERAL)
+    particles = mpm.Particles(body, V, degree=2, quadrature_degree=4)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(
+            particles,
+            Hencky(2e4, 0.3),
+            body_force=(0.0, -1e3),
+            tractions=[((300.0, 0.0), 1)],
+            facet_tags=mpm.facet_tags(body, {1: mpm.region(y=2.0)}),
+        ),
+        bcs=[
+            *(mpm.held(V, 0, value=0.02, **{side: 0.0}) for side in "xy"),
+            mpm.held(V, 1, y=0.0),
+        ],
+        solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
+    )
+    history = problem.solve(10)
+    assert history.failed_iterations == 0
+    assert max(step.residuals[-1] for step in history.steps) < 1e-11
+
+
 @pytest.mark.skip_in_parallel
 def test_a_solve_that_goes_on_and_makes_no_headway_tells_its_own_residuals():
     class NoRoot(DoubleWell):
