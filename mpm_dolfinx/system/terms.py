@@ -144,8 +144,16 @@ class Terms:
         return self._on_nodes(force)
 
     def size_of_forces(self) -> float:
-        """Return the size of :meth:`last_nodal_forces` of all bodies."""
-        return joint_norm(np.concatenate([*self.last_nodal_forces(), np.zeros(0)]), self._comm)
+        """Return the size of the forces of the last evaluation, but for contact between bodies.
+
+        Where its points would change facets again and again they stay with some to the end of the
+        step; the next evaluation finds others, which share its forces in another way.
+        """
+
+        def force(term: Term) -> Sequence[PETSc.Vec]:
+            return () if term.one_sided and len(term.bodies) > 1 else term.residuals()
+
+        return joint_norm(np.concatenate([*self._on_nodes(force), np.zeros(0)]), self._comm)
 
     def size_of_contributions(self) -> float:
         """Return the size of what the forces on nodes are sums of, in absolute values."""

@@ -33,6 +33,7 @@ from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import materials
+from mpm_dolfinx.contact import one_pass
 
 LOAD = 1e-6
 
@@ -496,3 +497,26 @@ def test_it_goes_on_where_particles_leave_and_over_stages():
     assert problem.error() == pytest.approx(before, rel=1e-6)
     problem.solve(2)
     assert problem.error() > 0.0
+
+
+def test_contact_that_changes_facets_after_a_step(monkeypatch):
+    """Points kept to facets of a step's beginning, which they leave, share their forces anew."""
+    monkeypatch.setattr(one_pass, "FREEZE", 0)
+    ground = mpm.Particles(box([0.0, -0.5], [2.0, 0.0], [8, 2], QUADRILATERAL))
+    block = mpm.Particles(box([0.3, 0.0], [0.9, 0.4], [3, 2], QUADRILATERAL))
+    moved = fem.Constant(block.mesh, (0.0, 0.0))
+    top = mpm.facet_tags(block.mesh, {1: mpm.region(y=0.4)})
+    problem = mpm.QuasiStaticProblem(
+        [mpm.Body(body, materials.Hencky(1e3, 0.3)) for body in (ground, block)],
+        bcs=[mpm.held(ground.W, y=-0.5)],
+        supports=[mpm.boundary.fixed(block, top, 1, value=moved)],
+        terms=[mpm.contact.Pair(block, ground, friction=0.3)],
+    )
+
+    def push(t):
+        moved.value[:] = (0.4 * t, -0.02)
+
+    for _ in problem.steps(4, update=push):
+        assert 0.0 < problem.error() < 1.0
+    moved.value[:] = (0.5, -0.02)
+    raises(problem.error, mpm.MPMError, "not those of the last converged step any more")
