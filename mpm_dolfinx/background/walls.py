@@ -20,7 +20,7 @@ __all__ = ["Walls"]
 
 
 class _Found(NamedTuple):
-    """What one rank knows of points beyond the boundary.
+    """Points beyond the boundary, as one rank knows them.
 
     Attributes:
         away: Their distances, infinite where the boundary does not hold them, shape ``(n,)``.

@@ -5,8 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, override
+from typing import Any, NamedTuple, override
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -24,7 +23,7 @@ from ..system.term import PointMaterial, Term
 from .law import Friction
 from .surface import Surface
 
-__all__ = ["OVERLAP", "Contact", "Outcome", "stiffness"]
+__all__ = ["Contact", "Outcome", "require_apart", "stiffness"]
 
 #: What the pressure is made of.
 LAWS = ("penalty", "nitsche")
@@ -32,8 +31,7 @@ LAWS = ("penalty", "nitsche")
 OVERLAP = 0.1
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """Tractions at the points of a surface.
 
     Attributes:
@@ -51,6 +49,34 @@ class Outcome:
     traction: NDArray[np.float64]
     inside: NDArray[np.bool_]
     slips: NDArray[np.bool_]
+
+    def of(self, which: NDArray[np.int64]) -> Outcome:
+        """Return that of some facets."""
+        parts: list[Any] = [part[which] for part in self]
+        return Outcome(*parts)
+
+
+def require_apart(surface: Surface, outcome: Outcome, what: str) -> None:
+    """Raise an error where points that do not touch yet are deep in an obstacle (collective).
+
+    Args:
+        surface: The points.
+        outcome: Where they are.
+        what: A sentence that says so, with places for particles, ``depth`` and ``where``.
+
+    Raises:
+        MPMError: Some are in it by more than a share of the domains behind.
+    """
+    deep = (-outcome.gap > OVERLAP * surface.thickness[:, None]) & (surface.weights > 0.0)
+    deep &= ~outcome.inside
+    with agree(surface.particles.mesh.comm):
+        if deep.any():
+            depth = np.where(deep, -outcome.gap, 0.0)
+            place = np.unravel_index(np.argmax(depth), depth.shape)
+            where = tuple(float(f"{x:.6g}") for x in outcome.positions[place])
+            sentence = what.format(particles="{particles}", depth=depth[place], where=where)
+            index = surface.particles.global_index[surface.layout.cells[deep.any(axis=1)]]
+            raise MPMError(sentence, index)
 
 
 class Contact(Term):

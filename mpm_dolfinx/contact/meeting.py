@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 from petsc4py import PETSc
 
@@ -177,12 +177,8 @@ class Meeting:
         x = sides.source.positions()
         rest = no_memory(self.law, x.reshape(-1, x.shape[2]))._replace(friction=friction)
         base = untouched(sides.source, x)
-        outcome = Outcome(
-            *(
-                spread(getattr(trial, field.name), around.facets, getattr(base, field.name))
-                for field in fields(Outcome)
-            )
-        )
+        parts = (spread(one, around.facets, whole) for one, whole in zip(trial, base, strict=True))
+        outcome = Outcome(*parts)
         return State(rest.with_some(around.which, own), outcome)
 
 

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -94,14 +94,13 @@ class Memory:
 
     def of(self, which: NDArray[np.int64]) -> Memory:
         """Return the memory of some facets."""
-        outcome = Outcome(*(getattr(self.outcome, field.name)[which] for field in fields(Outcome)))
         return Memory(
             self.pose,
             self.touched[which],
             self.anchor[which],
             self.gap[which],
             self.normal[which],
-            outcome,
+            self.outcome.of(which),
             self.friction[which],
             facets=which,
         )

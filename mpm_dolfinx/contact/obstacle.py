@@ -197,7 +197,7 @@ class Obstacle(Contact):
         phi, n = self.shape.distance(framed(self.shape, memory.pose, x).reshape(-1, x.shape[2]))
         gap, normal = memory.gap.copy(), memory.normal.copy()
         gap[chosen], normal[chosen] = phi.reshape(x.shape[:2]), n.reshape(x.shape)
-        outcome = replace(memory.outcome, gap=gap)
+        outcome = memory.outcome._replace(gap=gap)
         return replace(memory, gap=gap, normal=normal, outcome=outcome, exact=which is None)
 
     @property
@@ -282,10 +282,10 @@ class Obstacle(Contact):
         outcome = found.outcome
         if self._tells_more:
             told = {name: surface.of_column(columns[name]) for name in ("pressure", "traction")}
-            outcome = replace(outcome, **told)
+            outcome = outcome._replace(**told)
         else:
             outcome = self._evaluated_at_converged().outcome
-        outcome = replace(outcome, inside=touched, slips=surface.of_column(columns["slips"]))
+        outcome = outcome._replace(inside=touched, slips=surface.of_column(columns["slips"]))
         self._memory = self._trial = replace(self._memory, outcome=outcome)
 
     def grip(self) -> Grip:
@@ -329,8 +329,7 @@ class Obstacle(Contact):
         acts, mine, rubbed = before.outcome, memory.outcome, memory.friction
         if before.friction.shape[2] == rubbed.shape[2]:
             rubbed = np.where(same[:, :, None], seen(before.friction), rubbed)
-        outcome = replace(
-            mine,
+        outcome = mine._replace(
             pressure=np.where(same, seen(acts.pressure), mine.pressure),
             traction=np.where(same[:, :, None], seen(acts.traction), mine.traction),
             inside=same | mine.inside,

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from mpi4py import MPI
 
 import numpy as np
@@ -14,7 +12,7 @@ from numpy.typing import NDArray
 import basix
 
 from .approach import Approach, OverStep
-from .contact import OVERLAP, Outcome
+from .contact import Outcome
 from .facets import Closest
 from .law import Friction, Points
 from .meeting import Meeting, untouched
@@ -128,7 +126,7 @@ class Pass:
         )
         base = untouched(self.source, at)
         gap = np.where(found.near, found.gap, np.inf).reshape(-1, self.source.nq)
-        outcome = replace(base, gap=spread(gap, around.facets, base.gap))
+        outcome = base._replace(gap=spread(gap, around.facets, base.gap))
         return State(whole.with_some(around.which, known), outcome), approach
 
     def restore(
@@ -160,16 +158,6 @@ class Pass:
             friction=rubbed,
         )
         self.state = self.state._replace(memory=memory)
-
-    def overlap(self) -> tuple[NDArray[np.int64], float] | None:
-        """Return particles that are deep in the other body at the beginning, and how deep."""
-        outcome, source = self.state.outcome, self.source
-        bound = OVERLAP * source.thickness[:, None]
-        deep = (-outcome.gap > bound) & (source.weights > 0.0) & ~outcome.inside
-        if not deep.any():
-            return None
-        cells = source.layout.cells[deep.any(axis=1)]
-        return source.particles.global_index[cells], float(-outcome.gap[deep].min())
 
     # -- A step ---------------------------------------------------------------------------------
 

@@ -11,7 +11,6 @@ and moments of both bodies balance, also where friction acts at a gap.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple, override
 
 from mpi4py import MPI
@@ -23,14 +22,14 @@ from numpy.typing import NDArray
 from dolfinx import mesh
 
 from ..assembly.petsc import MatrixSum
-from ..errors import ConvergenceError, MPMError, agree, agreed
+from ..errors import ConvergenceError, MPMError, agreed
 from ..io.snapshot import Taken
 from ..meshes.remesh import Column
 from ..parallel.boundary import collective
 from ..parallel.given import as_positive
 from ..particles.particles import Particles
 from ..system.term import PointMaterial
-from .contact import Contact, Outcome, stiffness
+from .contact import Contact, Outcome, require_apart, stiffness
 from .law import Friction, as_friction
 from .meeting import Meeting
 from .nitsche import Nitsche, require_stress
@@ -44,6 +43,11 @@ __all__ = ["Pair"]
 ALIKE, LEAST = 1.5, 0.2
 #: Degree of the rule on a facet, by the dimension of space: the other body's facets have kinks.
 DEGREES = {2: 9, 3: 5}
+#: What is said of bodies that overlap from the beginning.
+OVERLAPS = (
+    "The bodies of a Pair overlap at the beginning: {particles} are up to {depth:.3g} deep in the "
+    "other body; move the bodies apart."
+)
 #: Columns of what points remember, and of what acted, by its names there.
 MEMORY = ("touches", "anchor", "offset", "friction")
 OUTCOME = {"inside": "touches", "slips": "slips", "pressure": "pressure", "traction": "traction"}
@@ -165,7 +169,8 @@ class Pair(Contact):
         if self._joins:
             gone = [contact for contact in self._gone if isinstance(contact, Pair)]
             self._stand_in([one for one in gone if set(one.bodies) == set(self.bodies)])
-            _require_apart(self._comm, self._passes)
+            for each in self._passes:
+                require_apart(each.source, each.state.outcome, OVERLAPS)
             self._has_joined()
 
     def _stand_in(self, gone: Sequence[Pair]) -> None:
@@ -185,7 +190,7 @@ class Pair(Contact):
             return
         self._take_over(every)
         for each, surface, mine in zip(self._passes, self._surfaces, every, strict=False):
-            told = replace(each.state.outcome, **_told(surface, mine))
+            told = each.state.outcome._replace(**_told(surface, mine))
             each.state = each.state._replace(outcome=told)
 
     def _take_over(self, every: Sequence[dict[str, NDArray[Any]]]) -> None:
@@ -374,8 +379,8 @@ class Pair(Contact):
         if not self._passes:
             raise MPMError("A contact belongs to no problem yet; give it as terms=[contact].")
         told, share = self._passes[0].state.outcome, self._passes[0].share
-        return self._surfaces[0], replace(
-            told, pressure=told.pressure / share, traction=told.traction / share
+        return self._surfaces[0], told._replace(
+            pressure=told.pressure / share, traction=told.traction / share
         )
 
     def _forces(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
@@ -435,7 +440,7 @@ class Pair(Contact):
         self._take_over(every)
         self.update()
         for each, surface, columns in zip(self._passes, self._surfaces, every, strict=False):
-            told = replace(each.after().outcome, **_told(surface, columns))
+            told = each.after().outcome._replace(**_told(surface, columns))
             each.state = each.state._replace(outcome=told)
 
     @override
@@ -478,16 +483,3 @@ def _shares(surfaces: Sequence[Surface], count: int) -> list[float]:
         return [0.5, 0.5]
     first = float(np.clip(squares[1] / sum(squares), LEAST, 1.0 - LEAST))
     return [first, 1.0 - first]
-
-
-def _require_apart(comm: MPI.Comm, passes: Sequence[Pass]) -> None:
-    """Raise an error where bodies overlap at the beginning (collective)."""
-    for each in passes:
-        deep = each.overlap()
-        with agree(comm):
-            if deep is not None:
-                raise MPMError(
-                    f"The bodies of a Pair overlap at the beginning: {{particles}} are up to "
-                    f"{deep[1]:.3g} deep in the other body; move the bodies apart.",
-                    deep[0],
-                )

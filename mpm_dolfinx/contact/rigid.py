@@ -22,7 +22,7 @@ from ..particles.particles import Particles
 from ..system.term import PointMaterial
 from ..tolerances import NEGLIGIBLE
 from .behind import At
-from .contact import OVERLAP
+from .contact import require_apart
 from .law import Friction, as_friction
 from .memory import Memory
 from .nitsche import Spread, require_stress
@@ -40,6 +40,11 @@ __all__ = ["Rigid"]
 #: Most that an obstacle turns in a step at whose end points rub against it: friction is along the
 #: chord of their way in its frame.
 MOST_TURN = 0.5 * np.pi
+#: What is said of a body that is in the obstacle from the beginning.
+WITHIN = (
+    "The body begins within the obstacle of a Rigid: {particles} are up to {depth:.3g} deep in it, "
+    "at {where}; move one of them away."
+)
 
 
 class Slopes(NamedTuple):
@@ -156,7 +161,7 @@ class Rigid(Obstacle):
                 if isinstance(contact, Rigid) and contact.bodies == self.bodies:
                     self._stand_in(contact.grip())
             assert self._memory is not None
-            self._require_apart(self._memory)
+            require_apart(self._surface, self._memory.outcome, WITHIN)
             self._has_joined()
 
     @override
@@ -176,23 +181,6 @@ class Rigid(Obstacle):
             distances = self.shape.distance(framed(self.shape, self._pose, places))[0]
         told = distances.astype(np.float32).tolist()
         require_same(self._comm, shape=[type(self.shape).__name__, *told])
-
-    def _require_apart(self, memory: Memory) -> None:
-        """Raise an error where the body is in the obstacle from the beginning (collective)."""
-        surface = self._surface
-        depth = -memory.gap / surface.thickness[:, None]
-        deep = (depth > OVERLAP) & (surface.weights > 0.0) & ~memory.touched
-        with agree(self._comm):
-            if deep.any():
-                place = np.unravel_index(np.argmax(np.where(deep, depth, 0.0)), depth.shape)
-                where = tuple(float(f"{x:.6g}") for x in memory.outcome.positions[place])
-                index = self.bodies[0].global_index[surface.layout.cells[deep.any(axis=1)]]
-                raise MPMError(
-                    f"The body begins within the obstacle of a Rigid: {{particles}} are up to "
-                    f"{-float(memory.gap[place]):.3g} deep in it, at {where}; move one of them "
-                    "away.",
-                    index,
-                )
 
     @override
     def begin(self) -> Sequence[PETSc.Vec]:

@@ -308,8 +308,7 @@ class Surface:
 
     def mesh_normals(self) -> NDArray[np.float64]:
         """Return outward unit normals in the present mesh, shape ``(m, nq, gdim)``."""
-        n = self.layout.outward[:, None, None] * normals(self.layout.edges)
-        return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
+        return self._outward(self.layout.edges)
 
     def undeformed_normals(self) -> NDArray[np.float64]:
         """Return outward unit normals of the undeformed body, as those in the present mesh."""
@@ -317,7 +316,11 @@ class Surface:
         if origin is None:
             return self.mesh_normals()
         x = origin.x.array.reshape(-1, self.gdim)[self.layout.nodes]
-        n = self.layout.outward[:, None, None] * normals(np.einsum("jqk,mki->mqij", self.slopes, x))
+        return self._outward(np.einsum("jqk,mki->mqij", self.slopes, x))
+
+    def _outward(self, edges: NDArray[np.float64], which: Any = slice(None)) -> NDArray[np.float64]:
+        """Return outward unit normals of facets by the derivatives of their positions."""
+        n = self.layout.outward[which, None, None] * normals(edges)
         return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
 
     def positions(
@@ -349,9 +352,7 @@ class Surface:
         """Return outward unit normals at the points, as the body is displaced, as positions."""
         chosen: Any = slice(None) if which is None else which
         x = self.own_nodes(converged)[self.layout.own[chosen]]
-        edges = np.moveaxis(self.slopes[:, None] @ x, 0, -1)
-        n = self.layout.outward[chosen, None, None] * normals(edges)
-        return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
+        return self._outward(np.moveaxis(self.slopes[:, None] @ x, 0, -1), chosen)
 
     def force(
         self,

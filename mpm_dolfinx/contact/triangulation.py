@@ -56,7 +56,7 @@ class _Place(NamedTuple):
 
 
 class _Solid(NamedTuple):
-    """What facets enclose.
+    """A solid by its facets.
 
     Attributes:
         points: Corners, shape ``(n, dim)``.
