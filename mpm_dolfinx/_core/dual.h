@@ -11,7 +11,7 @@
 
 namespace core
 {
-// A number with its derivatives by some others.
+// A number with its derivatives by some others; it is compared by its value.
 template <int count>
 struct Dual
 {
@@ -20,43 +20,54 @@ struct Dual
 
   Dual() = default;
   Dual(double number) : value(number) {}
+
+  friend Dual operator+(Dual a, const Dual& b) { return a += b; }
+  friend Dual operator-(Dual a, const Dual& b) { return a -= b; }
+  friend Dual operator*(const Dual& a, const Dual& b)
+  {
+    Dual result(a.value * b.value);
+    for (int i = 0; i < count; ++i)
+      result.by[i] = a.value * b.by[i] + b.value * a.by[i];
+    return result;
+  }
+  friend Dual operator*(double a, Dual b)
+  {
+    b.value *= a;
+    for (int i = 0; i < count; ++i)
+      b.by[i] *= a;
+    return b;
+  }
+  friend Dual operator*(const Dual& a, double b) { return b * a; }
+  friend Dual operator/(const Dual& a, double b) { return 1.0 / b * a; }
+  friend Dual operator/(const Dual& a, const Dual& b)
+  {
+    Dual result(a.value / b.value);
+    for (int i = 0; i < count; ++i)
+      result.by[i] = (a.by[i] - result.value * b.by[i]) / b.value;
+    return result;
+  }
+  friend Dual operator-(const Dual& a) { return -1.0 * a; }
+  friend bool operator<(const Dual& a, const Dual& b) { return a.value < b.value; }
+  friend bool operator>(const Dual& a, const Dual& b) { return a.value > b.value; }
+  friend bool operator<=(const Dual& a, const Dual& b) { return a.value <= b.value; }
+  friend bool operator>=(const Dual& a, const Dual& b) { return a.value >= b.value; }
+
+  Dual& operator+=(const Dual& b)
+  {
+    value += b.value;
+    for (int i = 0; i < count; ++i)
+      by[i] += b.by[i];
+    return *this;
+  }
+  Dual& operator-=(const Dual& b)
+  {
+    value -= b.value;
+    for (int i = 0; i < count; ++i)
+      by[i] -= b.by[i];
+    return *this;
+  }
+  Dual& operator*=(const Dual& b) { return *this = *this * b; }
 };
-
-template <int count>
-Dual<count> operator+(Dual<count> a, const Dual<count>& b)
-{
-  a.value += b.value;
-  for (int i = 0; i < count; ++i)
-    a.by[i] += b.by[i];
-  return a;
-}
-
-template <int count>
-Dual<count> operator-(Dual<count> a, const Dual<count>& b)
-{
-  a.value -= b.value;
-  for (int i = 0; i < count; ++i)
-    a.by[i] -= b.by[i];
-  return a;
-}
-
-template <int count>
-Dual<count> operator*(const Dual<count>& a, const Dual<count>& b)
-{
-  Dual<count> result(a.value * b.value);
-  for (int i = 0; i < count; ++i)
-    result.by[i] = a.value * b.by[i] + b.value * a.by[i];
-  return result;
-}
-
-template <int count>
-Dual<count> operator*(double a, Dual<count> b)
-{
-  b.value *= a;
-  for (int i = 0; i < count; ++i)
-    b.by[i] *= a;
-  return b;
-}
 
 // f(a), of a known derivative.
 template <int count>
@@ -89,6 +100,39 @@ Dual<count> root(const Dual<count>& a)
 {
   const double size = std::sqrt(a.value);
   return chain(a, size, 0.5 / size);
+}
+
+template <int count>
+Dual<count> abs(const Dual<count>& a)
+{
+  return a.value < 0.0 ? -a : a;
+}
+
+template <int count>
+Dual<count> exp(const Dual<count>& a)
+{
+  const double value = std::exp(a.value);
+  return chain(a, value, value);
+}
+
+template <int count>
+Dual<count> expm1(const Dual<count>& a)
+{
+  const double value = std::expm1(a.value);
+  return chain(a, value, value + 1.0);
+}
+
+template <int count>
+Dual<count> log(const Dual<count>& a)
+{
+  return chain(a, std::log(a.value), 1.0 / a.value);
+}
+
+// Of sizes, which do not fall below zero: where they are zero, their derivative is that too.
+template <int count>
+Dual<count> sqrt(const Dual<count>& a)
+{
+  return a.value > 0.0 ? root(a) : Dual<count>(0.0);
 }
 
 template <typename T, std::size_t dim>

@@ -94,4 +94,32 @@ struct Update
 // Update all points; return those whose det F or trial b is not positive and finite, or, with a
 // given pressure, that have no volume strain for it.
 std::vector<std::int64_t> update_logarithmic(const Update& update, int dim);
+
+// The same, of laws that soften by an average.
+std::vector<std::int64_t> update_averaged(const Update& update, int dim);
+
+// What a law has derivatives by: its parameters, and the share of a return.
+constexpr std::size_t num_numbers(Law law) { return num_parameters(law) + 1; }
+
+// A step of many points that has been made, and derivatives of something by all that goes into it
+// and comes out of it. Without old_gradient there is no history. The
+// numbers of points, num_numbers of each, lie together, and so do their variables.
+struct Change
+{
+  Law law;
+  std::size_t count;
+  const double *gradient, *old_gradient, *old_c;
+  const double* old_variables[max_variables];
+  Parameter parameters[max_parameters];
+  Parameter share;
+  double tolerance;
+  double *of_gradient, *of_old_gradient, *of_old_c, *of_old_variables, *of_numbers;
+  double *of_P, *of_stress, *of_c, *of_variables;
+};
+
+// Set the derivatives by what goes in from those by what comes out.
+void pull_logarithmic(const Change& change, int dim);
+
+// Whether there are derivatives of a law: laws that soften by an average end have none.
+constexpr bool has_derivatives(Law law) { return law < Law::von_mises_averaged; }
 } // namespace core

@@ -392,6 +392,58 @@ auto update_with_history(Law law, const Reals& gradient, const Reals& old_gradie
   return to_numpy(update_logarithmic(u, static_cast<int>(gradient.shape(2))));
 }
 
+// A step of a law and derivatives by what goes into it (gradient, old gradient, old c, old variables,
+// parameters with the share) and by what comes out of it (P, stress, c, variables), from arrays of
+// which the sizes are looked at. Arrays are empty where there is no history.
+Change change_of(const std::string& name, const std::vector<Reals>& before,
+                 const std::vector<Reals>& variables, const std::vector<Reals>& parameters,
+                 const Reals& share, double tolerance, const std::vector<RealsOut>& in,
+                 const std::vector<RealsOut>& out)
+{
+  Change u{};
+  u.law = law_of(name);
+  require(has_derivatives(u.law) && before.size() == 3 && in.size() == 5 && out.size() == 4,
+          "a law with derivatives, and all that it takes and gives");
+  const Reals& gradient = before[0];
+  require(gradient.ndim() == 3 && (gradient.shape(2) == 2 || gradient.shape(2) == 3),
+          "displacement gradients (n, dim, dim)");
+  const std::size_t count = u.count = gradient.shape(0);
+  const std::size_t own = num_variables(u.law), m = gradient.shape(2) == 2 ? 4 : 6;
+  const bool history = before[1].size() > 0;
+  const std::size_t old = history ? count * m : 0, seen = history ? gradient.size() : 0;
+  require(variables.size() == own && parameters.size() == num_parameters(u.law),
+          "the variables and the parameters of the law");
+  require(before[1].size() == seen && before[2].size() == old
+              && (history || own == 0) && in[0].size() == gradient.size() && in[1].size() == seen
+              && in[2].size() == old && in[3].size() == count * own
+              && in[4].size() == count * num_numbers(u.law) && out[0].size() == gradient.size()
+              && out[1].size() == count * m && out[2].size() == old
+              && out[3].size() == count * own,
+          "numbers for all points");
+  u.gradient = gradient.data();
+  u.old_gradient = history ? before[1].data() : nullptr;
+  u.old_c = history ? before[2].data() : nullptr;
+  for (std::size_t k = 0; k < own; ++k)
+  {
+    require(variables[k].size() == count, "internal variables (n,)");
+    u.old_variables[k] = variables[k].data();
+  }
+  for (std::size_t k = 0; k < parameters.size(); ++k)
+    u.parameters[k] = parameter_of(parameters[k], count);
+  u.share = parameter_of(share, count);
+  u.tolerance = tolerance;
+  u.of_gradient = in[0].data();
+  u.of_old_gradient = in[1].data();
+  u.of_old_c = in[2].data();
+  u.of_old_variables = in[3].data();
+  u.of_numbers = in[4].data();
+  u.of_P = out[0].data();
+  u.of_stress = out[1].data();
+  u.of_c = out[2].data();
+  u.of_variables = out[3].data();
+  return u;
+}
+
 // The rows of T by the background's basis at points, with offsets of PETSc's kind of integer.
 template <typename Index>
 auto rows_of_transfer(Offsets nodes, Reals values, int bs, Array<Index> offsets)
@@ -725,6 +777,18 @@ NB_MODULE(_loops, m)
         "share"_a, "tolerance"_a, "P"_a.noconvert(), "A"_a.noconvert(), "stress"_a.noconvert(),
         "c"_a.noconvert(), "variables"_a.noconvert(),
         "Update a law with a history; return the points whose domains are inverted.");
+
+  m.def("pull",
+        [](const std::string& law, const std::vector<Reals>& before,
+           const std::vector<Reals>& variables, const std::vector<Reals>& parameters,
+           const Reals& share, double tolerance, const std::vector<RealsOut>& in,
+           const std::vector<RealsOut>& out) {
+    pull_logarithmic(change_of(law, before, variables, parameters, share, tolerance, in, out),
+                     static_cast<int>(before[0].shape(2)));
+  },
+        "law"_a, "before"_a, "variables"_a, "parameters"_a, "share"_a, "tolerance"_a, "out"_a,
+        "weights"_a,
+        "Set derivatives by what a step of a law takes from those by what it gives.");
 
   m.def("replace_mean_stress",
         [](Reals gradient, Reals P, Reals A, Reals stress, Reals pressure, Reals bulk,

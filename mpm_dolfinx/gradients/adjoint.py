@@ -30,7 +30,8 @@ from ..problems.quasistatic import QuasiStaticProblem
 from ..problems.through_time import TimeProblem
 from ..reals import as_reals
 from ..stepping.loading import Stepper
-from .backward import Backward, Laws, Record, Weights, no_weights, slope_of
+from .backward import Backward, Record, Weights, no_weights
+from .laws import Laws
 from .nearby import varying
 from .parameters import CHANGE, Parameter, as_parameter, largest
 from .sensitivity import require_followed
@@ -384,24 +385,16 @@ class Adjoint:
         seen, resists = law.seen(motion)
         work = points.weights.ravel()[:, None, None] * seen
         states = weights.states[place]
+        pulled = law.pull(states, work)
         for one, first in zip(self._many, self._first, strict=True):
-            parameter = one.parameter
-            if not parameter.of_law:
+            if not one.parameter.of_law:
                 continue
-
-            def at(amount: float, parameter: Parameter = parameter) -> Array:
-                parameter.shift(amount)
-                parameter.govern(points, amount)
-                return law.change(states, work, law.answers())
-
-            one.add_of_points(body, slope_of(at, parameter.change))
-            parameter.shift(0.0)
-            parameter.govern(points, 0.0)
+            one.add_of_points(body, law.by_parameter(one.parameter, states, work, pulled))
             modulus = first.modulus[place]
             if modulus is not None:
                 one.add_of_cells(body, -modulus * (points.weights * resists).sum(axis=1))
         if any(law.have_history()):
-            weights.states[place] = law.by_states(states, work)
+            weights.states[place] = law.by_states(states, work, pulled)
         else:
             weights.states[place] = [{k: 0.0 * v for k, v in own.items()} for own in states]
 

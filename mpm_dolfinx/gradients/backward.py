@@ -11,16 +11,17 @@ their weights, g the gradient there that laws see by a motion, and dashes for pa
     m_n = H_h^T m - P_h^T W g q,    dJ/dp += m . H_p - P_p . W g q - q . f_p,
 
 where y and z are functions on the background, with their gradients at the body's nodes, r and f the
-forces there, all and those of loads. Derivatives of laws are central differences, those of the
-forces by displacements the tangents that Newton's method has.
+forces there, all and those of loads. Derivatives of laws are those of
+:class:`~mpm_dolfinx.gradients.laws.Laws`, those of the forces by displacements the tangents that
+Newton's method has.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from petsc4py import PETSc
 
@@ -29,7 +30,6 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
-from ..constitutive.points import MaterialPoints
 from ..errors import MPMError
 from ..materials.base import State
 from ..parallel.magnitudes import norm
@@ -37,19 +37,16 @@ from ..particles.particles import Particles
 from ..problems.quasistatic import QuasiStaticProblem
 from ..solvers.newton import NewtonSolver
 from ..transfer.matrix import transfer_matrix
+from .laws import Laws
 from .nearby import add_product, varying
-from .parameters import CHANGE
 
-__all__ = ["Backward", "Laws", "Record", "Weights", "no_weights", "slope_of"]
+__all__ = ["Backward", "Record", "Weights", "no_weights"]
 
 type Array = NDArray[np.float64]
 
-#: Second difference from which values bend, relative to the first and to the largest of these; by
-#: what differences are smaller then.
-BENDS, NOTICED, FINER = 1e-3, 1e-6, 1e-3
 #: What a residual may be when a step is gone through again, relative to the forces; what a linear
-#: solve leaves, and how often it is corrected; what tangents may differ by from differences.
-AGAIN, SOLVED, CORRECTIONS, TANGENT = 1e-6, 1e-13, 5, 1e-6
+#: solve leaves, and how often it is corrected.
+AGAIN, SOLVED, CORRECTIONS = 1e-6, 1e-13, 5
 
 
 class Record(NamedTuple):
@@ -82,183 +79,6 @@ class Weights:
 
     motion: list[fem.Function]
     states: list[list[State]]
-
-
-class Laws:
-    """Derivatives of the materials at the points of a body, in one step.
-
-    Args:
-        points: The points, after the update of the step.
-    """
-
-    def __init__(self, points: MaterialPoints) -> None:
-        self._points = points
-        self._gradient = points.trial.gradient.copy()
-        self._states = points.last.states
-        self._after = points.trial.states
-        self._own = self.answers()
-        particles = points.strain.particles
-        self._shape = (particles.num_local, particles.num_points)
-
-    def by_gradient(self, weights: list[State]) -> tuple[Array, Array | None]:
-        """Return ``H_F^T m`` at the points, shape ``(n nq, dim, dim)``, and ``P_F^T``.
-
-        A point between two branches of a law has the slope of differences, as in a
-        :class:`Sensitivity`, where the tangent that it tells is another one.
-
-        Args:
-            weights: m.
-
-        Returns:
-            The second is ``None`` where the law's own tangent is as good.
-        """
-        found = np.zeros(self._gradient.shape)
-        if not any(np.any(values) for own in weights for values in own.values()) and not any(
-            self.have_history()
-        ):
-            return found, None
-        tangent = self._points.laws.tangents(self._gradient, self._states)
-        slopes = np.empty(tangent.shape)
-        for i, J in np.ndindex(found.shape[1:]):
-            way = np.zeros(found.shape[1:])
-            way[i, J] = 1.0
-
-            def at(amount: float, way: Array = way) -> Array:
-                P, states = self._points.laws.answers(self._gradient + amount * way, self._states)
-                kept = self._weighed(weights, states, self._own[1])
-                return np.column_stack([kept, (P - self._own[0]).reshape(len(P), -1)])
-
-            both = slope_of(at, CHANGE)
-            found[:, i, J] = both[:, 0]
-            slopes[..., i, J] = both[:, 1:].reshape(found.shape)
-        axes = tuple(range(1, tangent.ndim))
-        size = np.abs(tangent).max(axis=axes, initial=0.0)
-        apart = np.abs(slopes - tangent).max(axis=axes, initial=0.0) > TANGENT * size
-        comm = self._points.strain.particles.mesh.comm
-        if self._points.symmetric and not comm.allreduce(bool(apart.any())):
-            return found, None
-        tangent[apart] = slopes[apart]
-        return found, np.ascontiguousarray(tangent.transpose(0, 3, 4, 1, 2))
-
-    def have_history(self) -> list[bool]:
-        """Return whether the answer of each material depends on what it keeps."""
-        return [bool(memory) for memory in self._points.last.memories()]
-
-    def by_states(self, weights: list[State], work: Array) -> list[State]:
-        """Return ``H_h^T m - P_h^T W g q``, as states are.
-
-        Args:
-            weights: m.
-            work: ``W g q``, shape ``(n nq, dim, dim)``.
-        """
-        found = [{name: np.zeros_like(values) for name, values in own.items()} for own in weights]
-        for law, own in enumerate(found):
-            for name, values in own.items():
-                size = max(
-                    float(np.abs(side[law][name]).max(initial=0.0))
-                    for side in (self._states, self._after)
-                )
-                amount = CHANGE * (size or 1.0)
-                if not self._matters(law, name, amount):
-                    continue
-                for place in np.ndindex(values.shape[1:]):
-
-                    def at(
-                        change: float,
-                        law: int = law,
-                        name: str = name,
-                        place: tuple[int, ...] = place,
-                    ) -> Array:
-                        states = self._with(law, name, place, change)
-                        answer = self._points.laws.answers(self._gradient, states)
-                        return self.change(weights, work, answer)
-
-                    slope = slope_of(at, amount)
-                    values[:, *place] = slope[self._points.laws.governed[law].points]
-        return found
-
-    def _matters(self, law: int, name: str, amount: float) -> bool:
-        """Return whether anything depends on a part of the state, on this rank."""
-        whole = self._points.laws.answers(self._gradient, self._with(law, name, (), amount))
-        own = self._own
-        same = np.array_equal(whole[0], own[0])
-        return not same or any(
-            not np.array_equal(values, its[key])
-            for one, its in zip(whole[1], own[1], strict=True)
-            for key, values in one.items()
-        )
-
-    def _with(self, law: int, name: str, place: tuple[int, ...], amount: float) -> list[State]:
-        """Return the states with one number of each point changed, or all of them."""
-        states = list(self._states)
-        values = states[law][name].copy()
-        every: Any = (slice(None), *place)
-        values[every] += amount
-        states[law] = states[law] | {name: values}
-        return states
-
-    def change(self, weights: list[State], work: Array, answer: tuple[Array, list[State]]) -> Array:
-        """Return the change of ``m . H - P : W g q`` to an answer beside the state."""
-        found = self._weighed(weights, answer[1], self._own[1])
-        return np.asarray(found - np.einsum("niJ,niJ->n", answer[0] - self._own[0], work))
-
-    def answers(self) -> tuple[Array, list[State]]:
-        """Return the answers of the laws, with the numbers that they have now."""
-        return self._points.laws.answers(self._gradient, self._states)
-
-    def _weighed(self, weights: list[State], after: list[State], before: list[State]) -> Array:
-        """Return the products of weights and differences of states, at all points."""
-        found = np.zeros(len(self._gradient))
-        laws = self._points.laws.governed
-        for part, own, one, other in zip(laws, weights, after, before, strict=True):
-            points = part.points
-            for name, values in own.items():
-                product = (one[name] - other[name]) * values
-                found[points] += product.reshape(len(points), -1).sum(axis=1)
-        return found
-
-    # -- F-bar -----------------------------------------------------------------------------
-
-    def seen(self, motion: fem.Function) -> tuple[Array, Array]:
-        """Return a motion as laws see it (collective).
-
-        Args:
-            motion: On W.
-
-        Returns:
-            ``g q`` at the points, and the derivative of the energy of deviations over its modulus,
-            which is zero without F-bar.
-        """
-        points, d = self._points, self._points.strain.particles.displacement.x
-        own, averaging = d.array.copy(), self._points.averaging
-        d.array[:] = motion.x.array
-        direction = points.strain.gradient().copy()
-        d.array[:] = own
-        shape = self._gradient.shape
-        if averaging is None:
-            return direction.reshape(shape), np.zeros(self._shape)
-        gradient, sides, energies = points.strain.gradient().copy(), [], []
-        amount = CHANGE / max(float(np.abs(direction).max(initial=0.0)), 1e-300)
-        comm = points.strain.particles.mesh.comm
-        amount = min(comm.allgather(amount))
-        modulus = averaging.modulus[:, None]
-        for sign in (1.0, -1.0):
-            sides.append(averaging.average(gradient + sign * amount * direction).copy())
-            energies.append(averaging.energy() / modulus)
-        averaging.average(gradient)
-        rate = (sides[0] - sides[1]) / (2.0 * amount)
-        return rate.reshape(shape), (energies[0] - energies[1]) / (2.0 * amount)
-
-    def effective(self, stress: Array) -> Array:
-        """Return ``g^T`` of a stress that works on what laws see (collective)."""
-        averaging = self._points.averaging
-        if averaging is None:
-            return stress
-        shape = (*self._shape, *stress.shape[1:])
-        none = np.zeros((*shape, *stress.shape[1:]))
-        whole = averaging.effective(stress.reshape(shape), none)[0]
-        own = averaging.effective(np.zeros(shape), none)[0]
-        return (whole - own).reshape(stress.shape)
 
 
 class Gone(NamedTuple):
@@ -417,24 +237,6 @@ class Backward:
             (force,) = term.stiffness_force([_vector(function)])
             found.append(force.array_r.copy())
         return found
-
-
-def slope_of(at: Callable[[float], Array], amount: float) -> Array:
-    """Return the derivative of values at points, which may be near another branch of a law.
-
-    Args:
-        at: Returns the change of values by an amount, shape ``(n, ...)``, not collective.
-        amount: For the difference; points that bend within it have a smaller one.
-    """
-    plus, minus = at(amount), at(-amount)
-    slope = (plus - minus) / (2.0 * amount)
-    first, second = np.abs(plus - minus), np.abs(plus + minus)
-    bends = (second > BENDS * first) & (second > NOTICED * first.max(axis=0, initial=0.0))
-    if bends.any():
-        finer = FINER * amount
-        fine = (at(finer) - at(-finer)) / (2.0 * finer)
-        slope[bends] = fine[bends]
-    return np.asarray(slope)
 
 
 def _gradients(body: Particles) -> list[PETSc.Mat]:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, override
+from typing import ClassVar, NamedTuple, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,23 @@ from .given_pressure import ALPHA, AtPressure
 from .kinematics import require_valid
 from .mandel import num_components
 
-__all__ = ["CompiledMaterial"]
+__all__ = ["CompiledMaterial", "Taken"]
 
 type Array = NDArray[np.float64]
+
+
+class Taken(NamedTuple):
+    """Derivatives of something by what an update takes.
+
+    Attributes:
+        gradient: For the displacement gradient, shape ``(n, dim, dim)``.
+        state: For the state at the beginning of the step.
+        numbers: For :meth:`CompiledMaterial.numbers`, shape ``(n, k)``.
+    """
+
+    gradient: Array
+    state: State
+    numbers: Array
 
 
 class CompiledMaterial(StrainMaterial):
@@ -85,6 +99,69 @@ class CompiledMaterial(StrainMaterial):
         valid[invalid] = False
         require_valid(valid)
         return AtPressure(P, A, by_pressure, gap, slope, compliance, new)
+
+    # -- Derivatives -------------------------------------------------------------------------
+
+    @property
+    def is_differentiable(self) -> bool:
+        """Whether there is :meth:`pull` of its updates."""
+        return self._known_loop() == self._loop != ""
+
+    def numbers(self) -> Array:
+        """Return the numbers of the compiled law, shape ``(k, n)``, or ``(k, 1)`` if all alike.
+
+        The last is the share of a return that there is time for.
+        """
+        return np.stack(np.broadcast_arrays(*map(_values, (*self._constants(), self._share()))))
+
+    def pull(
+        self, displacement_gradient: Array, state: State, first_piola: Array, weights: State
+    ) -> Taken:
+        """Return the derivatives by all that an update takes of something, exactly.
+
+        Args:
+            displacement_gradient: As in :meth:`update`.
+            state: As there.
+            first_piola: Derivatives of it by the stress, shape ``(n, dim, dim)``.
+            weights: Those by the new state.
+        """
+        taken = [np.empty_like(own) for own in self._in_order(first_piola, weights, state)]
+        taken.append(np.empty((len(first_piola), len(self.numbers()))))
+        seen = self._in_order(first_piola, weights, state)
+        given = [seen[0], np.array(weights["stress"]), seen[2], seen[3]]
+        loops.pull(*self._step(displacement_gradient, state), taken, given)
+        by = {"stress": np.zeros_like(given[1])}
+        if "displacement_gradient" in state:
+            by |= {"displacement_gradient": taken[1], "elastic_b_minus_identity": taken[2]}
+            taken[0] += weights["displacement_gradient"]
+        return Taken(taken[0], by | self._by_name(taken[3]), taken[4])
+
+    def _step(
+        self, H: Array, state: State
+    ) -> tuple[str, list[Array], list[Array], list[Array], Array, float]:
+        """Return what compiled derivatives take for the step that was made."""
+        before = [np.ascontiguousarray(H), np.empty(0), np.empty(0)]
+        if "displacement_gradient" in state:
+            names = "displacement_gradient", "elastic_b_minus_identity"
+            before[1:] = (np.ascontiguousarray(state[name]) for name in names)
+        variables = [np.ascontiguousarray(state[name]) for name in self.internal_variables]
+        parameters = [_values(parameter) for parameter in self._constants()]
+        tolerance = getattr(self, "yield_tolerance", 0.0)
+        return self._loop, before, variables, parameters, _values(self._share()), tolerance
+
+    def _in_order(self, gradient: Array, values: State, state: State) -> list[Array]:
+        """Return numbers for the gradient, the old one, the elastic b and the variables."""
+        history = [np.empty(0), np.empty(0)]
+        if "displacement_gradient" in state:
+            names = "displacement_gradient", "elastic_b_minus_identity"
+            history = [np.array(values[name], order="C") for name in names]
+        own = [values[name] for name in self.internal_variables]
+        variables = np.column_stack(own) if own else np.empty((len(gradient), 0))
+        return [np.array(gradient, order="C"), *history, np.array(variables, order="C")]
+
+    def _by_name(self, variables: Array) -> State:
+        """Return columns of numbers for the internal variables by name."""
+        return {name: variables[:, k] for k, name in enumerate(self.internal_variables)}
 
     def _with_history(
         self,
