@@ -139,7 +139,7 @@ class CompiledMaterial(StrainMaterial):
     def _step(
         self, H: Array, state: State
     ) -> tuple[str, list[Array], list[Array], list[Array], Array, float]:
-        """Return what compiled derivatives take for the step that was made."""
+        """Return the step that was made as compiled derivatives take it."""
         before = [np.ascontiguousarray(H), np.empty(0), np.empty(0)]
         if "displacement_gradient" in state:
             names = "displacement_gradient", "elastic_b_minus_identity"
