@@ -124,6 +124,7 @@ def test_pictures_and_series_know_deleted_particles(tmp_path):
         plt.close()
 
 
+@pytest.mark.skip_in_parallel  # (round-off of ranks decides the way of sand on a row)
 @pytest.mark.parametrize(("up", "kind"), [(False, QUADRILATERAL), (True, TRIANGLE)])
 def test_a_floor_is_as_a_row_of_cells_that_is_held(up, kind):
     # What falls in a step into cells that are held stays there; so it does where there are none.
@@ -140,8 +141,8 @@ def test_a_floor_is_as_a_row_of_cells_that_is_held(up, kind):
     np.testing.assert_allclose(weights, 1.0, rtol=1e-12)
 
 
-def test_what_is_below_its_floor_stays_there_over_a_restart(tmp_path):
-    path = tmp_path / "sand.ckpt"
+def test_what_is_below_its_floor_stays_there_over_a_restart(mpi_tmp_path):
+    path = mpi_tmp_path / "sand.ckpt"
     problem, again = (sand(None, up=False) for _ in range(2))
     problem.solve(time=0.68, dt=0.04)
     problem.save(path)
