@@ -30,6 +30,7 @@ from ..errors import MPMError, agree, warn
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
 from ..parallel.given import as_positive
+from ..particles.deletion import Deletion
 from ..particles.particles import Particles
 
 __all__ = ["Dashpot", "Support", "dashpot", "fixed", "roller"]
@@ -95,8 +96,8 @@ class Support:
         self._whole_step = False
         self._scale = fem.Constant(body, 1.0)
         self._share = 1.0
-        self._sum: tuple[fem.Constant, fem.Form] | None = None
-        self._power: fem.Form | None = None
+        self._sum: tuple[fem.Constant, fem.Form, Deletion | None] | None = None
+        self._power: tuple[fem.Form, Deletion | None] | None = None
         self._works: tuple[fem.Function, fem.Form] | None = None
 
     def facets(self) -> NDArray[np.int32]:
@@ -287,24 +288,26 @@ class Support:
 
     def _step_power(self, motion: Any) -> float:
         """Return this rank's work done by a motion, UFL, against the traction of the whole step."""
-        if self._power is None:
+        deletion = self.particles.deletion
+        if self._power is None or self._power[1] is not deletion:
             form = -self._turn * ufl.inner(self._of_step(), motion) * self._ds
-            if self.particles.deletion is not None:
-                form = self.particles.deletion.present_only(form)
-            self._power = compiled_form(form)
-        return float(np.real(fem.assemble_scalar(self._power)))
+            if deletion is not None:
+                form = deletion.present_only(form)
+            self._power = compiled_form(form), deletion
+        return float(np.real(fem.assemble_scalar(self._power[0])))
 
     @property
     def reaction(self) -> NDArray[np.float64]:
         """Force of the support on the body now, shape ``(gdim,)``, on all ranks (collective)."""
         gdim = self.particles.mesh.geometry.dim
-        if self._sum is None:
+        deletion = self.particles.deletion
+        if self._sum is None or self._sum[2] is not deletion:
             along = fem.Constant(self.particles.mesh, np.zeros(gdim))
             form = self._turn * ufl.inner(self._traction, along) * self._ds
-            if self.particles.deletion is not None:
-                form = self.particles.deletion.present_only(form)
-            self._sum = along, compiled_form(form)
-        along, total = self._sum
+            if deletion is not None:
+                form = deletion.present_only(form)
+            self._sum = along, compiled_form(form), deletion
+        along, total, _ = self._sum
         mine = np.zeros(gdim)
         for i, direction in enumerate(np.eye(gdim)):
             along.value[:] = direction

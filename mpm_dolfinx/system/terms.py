@@ -139,6 +139,8 @@ class Terms:
         def force(term: Term) -> Sequence[PETSc.Vec]:
             term.roll_back()
             term.begin()
+            if term.own is not None:
+                term.own.values[:] = 0.0
             return term.residuals()
 
         return self._on_nodes(force)
