@@ -340,7 +340,8 @@ class Scene:
         """Begin a stage with a law, and equals of all conditions, loads, supports and contacts."""
         problem, first = self.problem, self.problem.bodies[0]
         spaces = list({id(body.V): body.V for body in problem.bodies}.values())
-        self.bases = [self.base(V, 1.0 * i, self.bases[i].g) for i, V in enumerate(spaces)]
+        known = enumerate(zip(spaces, self.bases, strict=False))  # (what is tied has none)
+        self.bases = [self.base(V, 1.0 * i, base.g) for i, (V, base) in known]
         given = {"facet_tags": self.tags()}
         if self.supports:
             self.supports = [mpm.boundary.fixed(first, self.side, 1, self.grip)]
