@@ -31,6 +31,9 @@ from .volume_ratio import average_in
 
 __all__ = ["BodyForms", "PointStress", "integrals_of", "no_values"]
 
+#: Parts of a body's domains whose forces are held apart at a time.
+PIECES = 16
+
 no_values: NDArray[np.float64] = np.zeros(0)
 
 
@@ -412,25 +415,31 @@ class BodyForms:
         """
         gdim = self._element.block_size
         n, k = domain_nodes.shape
-        own: NDArray[np.float64] = np.zeros((n, k, gdim))
+        external: NDArray[np.float64] = np.broadcast_to(0.0, (n, k, gdim))
         if self._parts:
             forms, vector = self._elementwise
             assemble_into(vector, forms)
-            own += vector.array_r[: n * k * gdim].reshape(n, k, gdim)
-        if self.internal is not None:
-            weights = self.internal.weights
-            P = self.internal.first_piola.reshape(
-                *weights.shape, *self.internal.first_piola.shape[1:]
-            )
-            own += nodal_forces(
-                P, weights, self._particles.quadrature.gradients, self.internal.hoop
-            )
-        own = np.abs(own)
+            external = vector.array_r[: n * k * gdim].reshape(n, k, gdim)
         total = self.r.duplicate()
         with total.localForm() as local:
             local.set(0.0)
-            nodes, count = domain_nodes.ravel(), local.getLocalSize() // gdim
-            for i in range(gdim):
-                local.array_w[i::gdim] = np.bincount(nodes, own[:, :, i].ravel(), count)
+            count = local.getLocalSize() // gdim
+            ends = np.linspace(0, n, PIECES + 1).astype(int)
+            for part in map(slice, ends[:-1], ends[1:]):
+                own = np.abs(external[part] + self._internal_forces(part))
+                nodes = domain_nodes[part].ravel()
+                for i in range(gdim):
+                    local.array_w[i::gdim] += np.bincount(nodes, own[:, :, i].ravel(), count)
         total.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
         return total
+
+    def _internal_forces(self, part: slice) -> NDArray[np.float64] | float:
+        """Return the forces of the stress in some domains on their nodes, ``(n, k, gdim)``."""
+        if self.internal is None:
+            return 0.0
+        weights, hoop = self.internal.weights[part], self.internal.hoop
+        P = self.internal.first_piola.reshape(
+            *self.internal.weights.shape, *self.internal.first_piola.shape[1:]
+        )
+        gradients = self._particles.quadrature.gradients[part]
+        return nodal_forces(P[part], weights, gradients, None if hoop is None else hoop[part])

@@ -453,7 +453,8 @@ class Field:
         """
         assert self.free is not None
         fit = fit and all(body.shares_nodes for body in self.bodies)
-        u = map_to_background([motion.T for motion in self.motions], increments, fit)
+        positive = self.V.ufl_element().degree == 1
+        u = map_to_background([motion.T for motion in self.motions], increments, fit, positive)
         x.array_w[self.part] = self.free.collect(u[self.dofs]) / self.factor
 
     def reactions(self) -> float:

@@ -6,13 +6,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..parallel.totals import over_ranks
+from ..assembly.petsc import absolute
 
 __all__ = ["Predictor", "extrapolated", "map_to_background"]
 
@@ -107,7 +106,10 @@ def extrapolated(past: Sequence[tuple[float, Increments]], size: float) -> Incre
 
 
 def map_to_background(
-    transfers: Sequence[PETSc.Mat], increments: Increments, fit: bool = True
+    transfers: Sequence[PETSc.Mat],
+    increments: Increments,
+    fit: bool = True,
+    positive: bool = False,
 ) -> NDArray[np.float64]:
     """Map increments of the bodies' nodes to the background, so that it gives them back.
 
@@ -122,6 +124,7 @@ def map_to_background(
         increments: w of each body, on this rank's own dofs of W.
         fit: Whether to lower the gap. Where bodies touch something with a few nodes, an increment
             that is met to the last node carries them through it, and the smooth one does not.
+        positive: Whether no entry of T is negative, but for round-off.
 
     Returns:
         u on this rank's own dofs of V, zero without weight.
@@ -129,12 +132,7 @@ def map_to_background(
     total = transfers[0].createVecRight()
     weight = total.duplicate()
     for T, increment in zip(transfers, increments, strict=True):
-        indptr, columns, values = T.getValuesCSR()
-        size = T
-        if over_ranks(T.comm.tompi4py(), bool(values.min(initial=0.0) < 0.0), MPI.LOR):
-            size = T.copy()
-            size.setValuesCSR(indptr, columns, np.abs(values))
-            size.assemble()
+        size = T if positive else absolute(T)
         rows = size.createVecLeft()
         rows.array_w[:] = increment
         size.multTransposeAdd(rows, total, total)
