@@ -29,7 +29,7 @@ from ..particles.particles import Particles
 from ..problems.quasistatic import QuasiStaticProblem
 from ..problems.through_time import TimeProblem
 from ..reals import as_reals
-from ..stepping.loading import Stepper
+from ..stepping.trial import Trial
 from .backward import Backward, Record, Weights, no_weights
 from .laws import Laws
 from .nearby import varying
@@ -175,7 +175,7 @@ class Adjoint:
         self._first = [self._at_first(one) for one in self._many]
         self._shear = self._shear_modes()
         self._records: list[Record] = []
-        self._stepper: Stepper | None = None
+        self._trial: Trial | None = None
         self._reduced = problem.reduced
         self._values = [one.function.x.array.copy() if one.function else None for one in self._many]
         problem.record(self)
@@ -190,17 +190,17 @@ class Adjoint:
     def begins(self) -> None:
         """Do nothing: this is for motions."""
 
-    def solved(self, stepper: Stepper) -> Callable[[], None]:
+    def solved(self, trial: Trial) -> Callable[[], None]:
         """Note a step that is solved; see :meth:`Problem.record`."""
         problem = self.problem
         self._require_present()
-        if stepper.run is not None and stepper.run.goal is not None:
+        if trial.run is not None and trial.run.goal is not None:
             raise MPMError("An Adjoint does not follow displacement control; apply a load.")
         before = [body.converged_displacement.copy() for body in problem.bodies]
         record = Record(
             self._records[-1].after if self._records else before,
             [np.array(body.displacement.x.array) for body in problem.bodies],
-            [field.u.array_r.copy() for field in stepper.reduced.fields],
+            [field.u.array_r.copy() for field in trial.reduced.fields],
             [
                 [{name: v.copy() for name, v in own.items()} for own in points.last.memories()]
                 for points in problem.points
@@ -209,7 +209,7 @@ class Adjoint:
         )
 
         def take() -> None:
-            self._stepper = stepper
+            self._trial = trial
             self._records.append(record)
 
         return take
@@ -322,11 +322,11 @@ class Adjoint:
             An array for each parameter: one number, or one for each local dof of a Function.
         """
         self._require_present()
-        if self._stepper is None:
+        if self._trial is None:
             raise MPMError("There is no step yet that an Adjoint could go through.")
         look = self._look_of(functional)
         problem, data = self.problem, self._data()
-        back = Backward(problem, self._stepper.newton)
+        back = Backward(problem, self._trial.newton)
         own = [array.copy() for array in data]
         states = [points.last.states for points in problem.points]
         for one in self._many:
@@ -346,7 +346,7 @@ class Adjoint:
                 body.restore(last.copy().reshape(-1, body.mesh.geometry.dim))
                 points.go_from(its)
             self._reduced.unknowns.forget()
-            self._stepper.go_back()
+            self._trial.go_back()
         found = [one.result() for one in self._many]
         with agree(problem.bodies[0].mesh.comm):
             if not all(np.isfinite(slope).all() for slope in found):

@@ -36,7 +36,7 @@ from ..parallel.magnitudes import norm
 from ..particles.field import CarriedField
 from ..problems.motion import MovingProblem
 from ..problems.problem import Problem
-from ..stepping.loading import Stepper
+from ..stepping.trial import Trial
 from ..system.value_field import ValueField
 from ..transfer.matrix import transfer_matrix
 from .nearby import Nearby, Rates, add_product, followed, varying
@@ -87,15 +87,15 @@ class StepDerivative:
 
     Args:
         problem: The problem.
-        stepper: What has solved the step.
+        trial: What has solved the step.
         nearby: The state at its end, which is held.
     """
 
-    def __init__(self, problem: Problem, stepper: Stepper, nearby: Nearby) -> None:
-        self._problem, self._stepper, self._nearby = problem, stepper, nearby
-        self._reduced = stepper.reduced
+    def __init__(self, problem: Problem, trial: Trial, nearby: Nearby) -> None:
+        self._problem, self._trial, self._nearby = problem, trial, nearby
+        self._reduced = trial.reduced
         self._fields = self._reduced.fields
-        self._solve = stepper.newton.linearise()
+        self._solve = trial.newton.linearise()
         self._size = self._reduced.scale()
         self._y = [field.u.copy() for field in self._fields]
         self._z = [y.copy() for y in self._y]
@@ -208,7 +208,7 @@ class StepDerivative:
 
     def _prescribed(self, parameter: Parameter, rates: Rates) -> list[Array]:
         """Return the derivative of the Dirichlet totals at the step's end."""
-        run = self._stepper.run
+        run = self._trial.run
         base = [] if run is None else run.base
 
         if not parameter.outside and not any(np.any(rate) for rate in rates.base):
@@ -219,7 +219,7 @@ class StepDerivative:
             parameter.shift(amount)
             if run is not None:
                 run.base = [b + amount * rate for b, rate in zip(base, rates.base, strict=True)]
-            return self._stepper.prescribed()
+            return self._trial.prescribed()
 
         try:
             pairs = zip(totals(1.0), totals(-1.0), strict=True)

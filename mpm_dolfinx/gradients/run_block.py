@@ -14,7 +14,7 @@ from pyadjoint import AdjFloat, Block, OverloadedType, create_overloaded_object
 
 from dolfinx import fem
 
-from ..errors import MPMError
+from ..errors import MPMError, warn
 from ..problems.quasistatic import QuasiStaticProblem
 from .adjoint import Adjoint
 
@@ -104,10 +104,11 @@ class RunBlock(Block):  # type: ignore[misc]
         """Warn where a run has made other steps than the first (collective)."""
         times = [step.time for step in problem.history.steps]
         if self._times not in (None, times):
-            problem.warn(
+            warn(
+                problem.bodies[0].mesh.comm,
                 "A run on the tape has made other steps than the first time, as those are that "
                 "steps='auto' chooses and failures halve. Derivatives are of the steps of the last "
-                "run, and do not see what else they might be; give a number of steps, and enough."
+                "run, and do not see what else they might be; give a number of steps, and enough.",
             )
         self._times = self._times or times
 

@@ -21,7 +21,7 @@ from ..problems.problem import Problem
 from ..problems.quasistatic import QuasiStaticProblem
 from ..reals import as_reals
 from ..stepping.control import Run
-from ..stepping.loading import Stepper
+from ..stepping.trial import Trial
 from .forward import StepDerivative
 from .nearby import Nearby, Rates, followed, varying
 from .parameters import as_parameter
@@ -91,7 +91,7 @@ class Sensitivity:
             raise MPMError("Name a parameter to differentiate by.")
         require_same(problem.bodies[0].mesh.comm, names=[one.name for one in self._parameters])
         self._reduced = problem.reduced
-        self._stepper: Stepper | None = None
+        self._trial: Trial | None = None
         self._run: Run | None = None
         self._rates, self._nearby = self._beginning()
         self._note()
@@ -144,39 +144,40 @@ class Sensitivity:
 
     def _reactions(self) -> list[Array]:
         """Return the reactions of the last step, to be set."""
-        return [] if self._stepper is None else self._stepper.converged.reactions or []
+        return [] if self._trial is None else self._trial.converged.reactions or []
 
     @contextmanager
     def _supported(self) -> Iterator[None]:
         """Let the forces of supports be those of the state now, in the block (collective)."""
-        if self._stepper is None:
+        if self._trial is None:
             yield
             return
-        converged = self._stepper.converged
+        converged = self._trial.converged
         before = converged.supports, converged.force
         try:
-            converged.supports, converged.force = self.problem.forces_of_supports(), None
+            converged.supports = [support.reaction for support in self.problem.supports]
+            converged.force = None
             yield
         finally:
             converged.supports, converged.force = before
 
     # -- What follows the run --------------------------------------------------------------
 
-    def solved(self, stepper: Stepper) -> Callable[[], None]:
+    def solved(self, trial: Trial) -> Callable[[], None]:
         """Find the derivatives of a step that is solved; see :meth:`Problem.record`.
 
         Raises:
             MPMError: There are none.
         """
-        self._require_followed(stepper)
-        reduced, newton = stepper.reduced, stepper.newton
+        self._require_followed(trial)
+        reduced, newton = trial.reduced, trial.newton
         rates = self._rates
-        if stepper.run is not None and stepper.run is not self._run:
+        if trial.run is not None and trial.run is not self._run:
             for one in rates:
                 one.base = one.prescribed
         problem = self.problem
         with self._nearby.held():
-            step = StepDerivative(problem, stepper, self._nearby)
+            step = StepDerivative(problem, trial, self._nearby)
             pairs = zip(self._parameters, rates, strict=True)
             found = [step.by(parameter, one) for parameter, one in pairs]
         assert newton.x is not None and newton.F is not None
@@ -184,7 +185,7 @@ class Sensitivity:
             raise MPMError(failure.message)
 
         def take() -> None:
-            self._stepper, self._run, self._rates = stepper, stepper.run, found
+            self._trial, self._run, self._rates = trial, trial.run, found
             self._note()
 
         return take
@@ -276,10 +277,10 @@ class Sensitivity:
             for parameter in self._parameters:
                 parameter.require_unchanged()
 
-    def _require_followed(self, stepper: Stepper) -> None:
+    def _require_followed(self, trial: Trial) -> None:
         """Raise an error where a step has what has no part in the derivative."""
         self._require_present()
-        if stepper.run is not None and stepper.run.goal is not None:
+        if trial.run is not None and trial.run.goal is not None:
             raise MPMError(
                 "A Sensitivity does not follow displacement control, whose load factor depends on "
                 "the parameters too; apply a load."

@@ -247,9 +247,10 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
             return
         if gain > GAIN * (now.kinetic + now.strain + most):
             self._told_of_gain = True
-            self.warn(
+            warn(
+                self._comm,
                 f"By the time {now.time:.3g} stress has done {gain:.2g} more work on the bodies "
-                f"than they had stored, as scheme={scheme.name!r} lets it; take scheme='euler'."
+                f"than they had stored, as scheme={scheme.name!r} lets it; take scheme='euler'.",
             )
 
     @override

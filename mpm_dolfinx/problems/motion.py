@@ -56,7 +56,7 @@ class MovingProblem(TimeProblem):
     def _build(self) -> None:
         self.inertia.join(self.bodies)
         super()._build()
-        self._stepper.newton.lets_go = self._stepper.newton.gives_up_early = True
+        self._trial.newton.lets_go = self._trial.newton.gives_up_early = True
         others = [*self.body_terms, *(term for term in self.terms if term is not self.inertia)]
         self.inertia.follow(self, others)
 
@@ -196,7 +196,7 @@ class MovingProblem(TimeProblem):
     @override
     def _begin_run(self, now: float) -> None:
         self.inertia.begin_run(now)
-        for recorder in self._stepper.recorders:
+        for recorder in self._trial.recorders:
             recorder.begins()
 
     @override

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -22,7 +22,7 @@ from dolfinx import fem
 from .. import _compat
 from ..boundary.supports import Support
 from ..constitutive.points import MaterialPoints
-from ..errors import MPMError, agree, warn
+from ..errors import MPMError, agree
 from ..history import History, Step
 from ..io import checkpoint
 from ..io.files import as_path
@@ -37,10 +37,11 @@ from ..solvers.newton import NewtonSolver
 from ..solvers.strategies import chosen
 from ..stepping.adaptivity import Adaptivity
 from ..stepping.automatic import ErrorControl
-from ..stepping.diagnosis import crossed
 from ..stepping.displacement_control import DisplacementControl
-from ..stepping.loading import Mender, Recorder, Stepper
+from ..stepping.loading import Mender, Stepper
 from ..stepping.progress import with_bar
+from ..stepping.solving import System
+from ..stepping.trial import Recorder, Trial
 from ..structures.structure import Structure
 from ..system.body import BodyTerm
 from ..system.conditions import force_at
@@ -131,7 +132,8 @@ class Problem(Hooked):
         self._background, self._how = background, solver
         self._output = Output()
         self._held = Release()
-        self._stepper = Stepper(self, self._held, mender)
+        self._trial = Trial(self)
+        self._stepper = Stepper(self._trial, self._held, mender)
         self._state = ProblemState(self, self._stepper, self._held, self._output, self._history_at)
         self._staging = Staging(self, self._state, self._stepper, self._held)
         self.body_terms: list[BodyTerm] = []
@@ -210,7 +212,7 @@ class Problem(Hooked):
             self.bodies[0].V.mesh.geometry.dim,
             chosen(how.linear, degree),
         )
-        self._stepper.follow(reduced, newton, clean_up)
+        self._trial.follow(System(self.bodies, self.body_terms, reduced, newton, clean_up))
         for body in self.bodies:
             known = [*self.fields, *parts.alternating]
             body.attach_unknowns([one for one in known if one.particles is body])
@@ -227,7 +229,7 @@ class Problem(Hooked):
     #: Whether steps may start from an extrapolation of those before.
     _predicts = True
     #: Whether a step ends in equilibrium.
-    _at_rest = True
+    at_rest: ClassVar[bool] = True
     #: Residuals of the fields.
     _of_fields: Sequence[ufl.Form] = ()
 
@@ -262,7 +264,7 @@ class Problem(Hooked):
         """
         if sys.is_finalizing():
             return
-        if hasattr(self, "_stepper"):
+        if hasattr(self, "_trial"):
             self._release()
         vars(self).clear()
 
@@ -291,7 +293,7 @@ class Problem(Hooked):
                 field.forget_transfer()
         self.body_terms = []
         self._field_terms = []
-        self._stepper.release()
+        self._trial.release()
 
     def renew(
         self,
@@ -353,27 +355,27 @@ class Problem(Hooked):
     @property
     def reduced(self) -> ReducedSystem:
         """Residual and tangent in the free dofs of V."""
-        return self._stepper.reduced
+        return self._trial.reduced
 
     @property
     def solver(self) -> PETSc.SNES:
         """The nonlinear solver."""
-        return self._stepper.newton.snes
+        return self._trial.newton.snes
 
     @property
     def A(self) -> PETSc.Mat | None:
         """The reduced tangent of the last Newton iteration."""
-        return self._stepper.newton.K
+        return self._trial.newton.K
 
     @property
     def b(self) -> PETSc.Vec | None:
         """The reduced residual that was evaluated last."""
-        return self._stepper.newton.F
+        return self._trial.newton.F
 
     @property
     def x(self) -> PETSc.Vec | None:
         """The free dofs of the last step's increment."""
-        return self._stepper.newton.x
+        return self._trial.newton.x
 
     # -- Which problem governs the bodies -----------------------------------------------------
 
@@ -511,7 +513,9 @@ class Problem(Hooked):
         else:
             chosen = steps
         adaptivity = None if adapt is None else self._adaptivity(adapt)
-        return self._stepper.steps(chosen, update, repartition, control, adaptivity=adaptivity)
+        return self._stepper.steps(
+            self, chosen, update, repartition, control, adaptivity=adaptivity
+        )
 
     def _adaptivity(self, tolerance: float) -> Adaptivity:
         """Return the rule by which nodes are freed, or raise an error where they cannot be."""
@@ -582,7 +586,7 @@ class Problem(Hooked):
                 raise MPMError(f"reaction() needs one of the {what} of this problem.")
         require_same(self._comm, bc=f"number {place} of the {what}")
         if isinstance(bc, Support):
-            own, known = self.supports, self._stepper.converged.supports or ()
+            own, known = self.supports, self._trial.converged.supports or ()
             number = next((i for i, one in enumerate(own) if one is bc), len(own))
             return known[number].copy() if number < len(known) == len(own) else bc.reaction
         if isinstance(bc, Term):
@@ -595,7 +599,7 @@ class Problem(Hooked):
             for number, field in enumerate(self.reduced.fields)
             if any(bc is known for known in field.conditions)
         )
-        return force_at(bc, self._stepper.converged.reaction(number), field.V)
+        return force_at(bc, self._trial.converged.reaction(number), field.V)
 
     @collective()
     def error(self) -> float:
@@ -646,11 +650,11 @@ class Problem(Hooked):
     def _errors(self) -> Errors:
         self._require_error()
         self._require_governing()
-        return estimated(self.bodies, self.body_terms, self.reduced, self._stepper.converged.force)
+        return estimated(self.bodies, self.body_terms, self.reduced, self._trial.converged.force)
 
     def _require_error(self) -> None:
         """Raise an error unless an error can be told."""
-        if not self._at_rest:
+        if not self.at_rest:
             raise MPMError(
                 f"A {type(self).__name__} is in no equilibrium of which an error could be told; "
                 "error() is for problems at rest."
@@ -697,10 +701,6 @@ class Problem(Hooked):
     def keep_identity(self) -> None:
         """Note what this problem is known by, before its body meshes change (collective)."""
         self._state.before_remeshing()
-
-    def warn(self, sentence: str) -> None:
-        """Warn the user, on one rank (collective)."""
-        warn(self._comm, sentence, stacklevel=4)
 
     @collective()
     def repartition(self, threshold: float = 0.1) -> bool:
@@ -758,7 +758,7 @@ class Problem(Hooked):
         Args:
             recorder: Called when a step is solved; it is not kept alive.
         """
-        self._stepper.record(recorder)
+        self._trial.record(recorder)
 
     def constants(self) -> list[fem.Constant]:
         """Return the Constants of all forms, without loads of bodies."""
@@ -868,18 +868,6 @@ class Problem(Hooked):
         """The supports that hold, but for those that a residual in UFL has."""
         return ()
 
-    def forces_of_supports(self) -> list[NDArray[np.float64]]:
-        """Return the forces of :attr:`supports` on the bodies, by what is set now (collective)."""
-        return [support.reaction for support in self.supports]
-
-    def size_of_forces(self) -> float | None:
-        """Return the size of the forces on nodes in the last evaluation, if they tell an error."""
-        if not self._at_rest:
-            return None
-        for term in self.body_terms:
-            term.begin()  # (with a load factor that is found, loads are those before yet)
-        return self.reduced.terms.size_of_forces()
-
     def masses(self, number: int) -> NDArray[np.float64] | None:
         """Return the mass of each particle of a body that this rank owns, if it is known."""
         return None
@@ -898,22 +886,11 @@ class Problem(Hooked):
         load = [float(body.load.value) for body in self.bodies]
         require_same(self._comm, load=load, bcs=self.bcs, constants=self._constants)
 
-    def improper(self) -> MPMError | None:
-        """Return why the domains as they are now cannot be those of a converged step (collective).
-
-        They may not cross themselves, nor reach across the axis of a body of revolution.
-        """
-        return crossed(self.bodies)
-
     def commit(self) -> None:
         """Make the last evaluation the converged one."""
 
     def end_step(self) -> None:
         """Do what is to be done between two steps."""
-
-    def mend(self, error: MPMError) -> bool:
-        """Change what made the smallest step fail; return whether to go on (collective)."""
-        return False
 
     def roll_back(self) -> None:
         """Return to the last converged evaluation."""

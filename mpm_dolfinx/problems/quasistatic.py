@@ -23,7 +23,7 @@ from ..constitutive.groups import background_cells
 from ..constitutive.points import MaterialPoints
 from ..constitutive.step_stress import StepStress
 from ..constitutive.strain import Strain, strain_of
-from ..errors import DomainDistortionError, MPMError, agree, agreed, warn
+from ..errors import MPMError, agree, warn
 from ..io.checkpoint import Snapshot
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
@@ -586,13 +586,6 @@ class QuasiStaticProblem(Problem):
             density.require()
         for stress in self._built.points:
             stress.follow_parameters()
-
-    @override
-    def improper(self) -> MPMError | None:
-        found: MPMError | None = None
-        for stress in self._built.points:
-            found = found or DomainDistortionError.of(*stress.strain.beyond())
-        return super().improper() or agreed(self._comm, found)
 
     @override
     def masses(self, number: int) -> NDArray[np.float64]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from .. import _compat
-from ..errors import MPMError, agree
+from ..errors import MPMError, agree, warn
 from ..history import History
 from ..io.checkpoint import Snapshot, Table
 from ..meshes.remesh import Column, Cuts, Remesh, diagonals
@@ -56,9 +56,6 @@ class Remeshable(Protocol):
     bcs: list[fem.DirichletBC]
     history: History
     setup: Setup
-
-    def warn(self, sentence: str) -> None:
-        """Warn the user, on one rank."""
 
     def keep_identity(self) -> None:
         """Remember what the problem is, as it was made at first (collective)."""
@@ -151,9 +148,10 @@ class Remeshing:
         first = problem.history.statistics["split_domains"] == 0
         count = self.split(chosen)
         if first and count:
-            problem.warn(
+            warn(
+                problem.bodies[0].mesh.comm,
                 f"{count} quadrilaterals fold and are split into triangles, and others may be "
-                "later; with quadrature_degree=2 and f_bar='domain' they would not."
+                "later; with quadrature_degree=2 and f_bar='domain' they would not.",
             )
         return count > 0
 

@@ -192,7 +192,7 @@ class Staging:
             self._state.spaces,
             self._gathered(forces),
             self._release.left(),
-            self._stepper.converged.reactions,
+            self._stepper.trial.converged.reactions,
             [field.held_now() for field in reduced.fields],
         )
 

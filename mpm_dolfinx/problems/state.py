@@ -186,7 +186,7 @@ class ProblemState:
             MPMError: Functions that cannot be kept, or that are missing.
         """
         problem = self._problem
-        standing = kept.Standing(self._stepper.progress(), self.spaces, problem.history)
+        standing = kept.Standing(self._stepper.trial.progress(), self.spaces, problem.history)
         carried = [
             [one for one in problem.carried if one.mesh is body.mesh] for body in problem.bodies
         ]
@@ -273,7 +273,7 @@ class ProblemState:
         """
         things, standing = self._all(functions)
         adopt(things, self._problem.bodies, snapshot, source, self.spaces)
-        self._stepper.take(standing.progress)
+        self._stepper.trial.take(standing.progress)
         return standing.progress.run
 
     def save(self, path: Path, functions: Sequence[fem.Function]) -> None:

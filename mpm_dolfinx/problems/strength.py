@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..constitutive.moduli import undeformed_tangent
-from ..errors import TRIAL_ERRORS, MPMError, ParticleOutsideError
+from ..errors import TRIAL_ERRORS, MPMError, ParticleOutsideError, warn
 from ..materials.base import StrainMaterial
 from ..parallel.boundary import collective
 from ..parallel.interruption import held, interrupted, settle
@@ -227,10 +227,11 @@ def _warn_if_far(problem: QuasiStaticProblem, result: StrengthReduction) -> None
     """Warn where Newton's method failed for a body that has hardly moved (collective)."""
     limit = result.limit if result.limit < np.inf else _elastic_displacement(problem)
     if result.displacements[-1] < 0.25 * limit:  # it does not look as if it slid
-        problem.warn(
+        warn(
+            problem.bodies[0].mesh.comm,
             f"The factor of safety of {result.factor:g} may be too low: at {result.above:g} "
             f"Newton's method failed, for a body that has moved by {result.displacements[-1]:.3g} "
-            f"(limit {limit:.3g}). {result.failure!s}"
+            f"(limit {limit:.3g}). {result.failure!s}",
         )
 
 

@@ -28,7 +28,7 @@ class TimeProblem(Problem):
 
     _has_time = True
     _predicts = False
-    _at_rest = False
+    at_rest = False
 
     def _aim(self, t: float) -> None:
         """Take a time for the end of the step to try."""
@@ -169,7 +169,7 @@ class TimeProblem(Problem):
             if resumes and interrupted is not None:
                 count, began = interrupted.control.steps, interrupted.began
                 resumes = False
-            yield from self._stepper.steps(count, path, repartition, None, (began, end))
+            yield from self._stepper.steps(self, count, path, repartition, None, (began, end))
             if self.history.time != end:
                 return
             now = end

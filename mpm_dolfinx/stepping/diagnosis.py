@@ -12,6 +12,7 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
+from ..constitutive.points import MaterialPoints
 from ..errors import TRIAL_ERRORS, ConvergenceError, DomainDistortionError, MPMError, agreed
 from ..history import Statistics
 from ..parallel.totals import over_ranks
@@ -23,7 +24,7 @@ from ..system.reduced import ReducedSystem
 from ..system.value_field import ValueField
 from ..tolerances import NEGLIGIBLE
 
-__all__ = ["count_folded", "crossed", "placed"]
+__all__ = ["count_folded", "improper", "placed"]
 
 #: Share of the bodies' largest motion from which on it is that of a node of the background which is
 #: held by next to nothing.
@@ -32,8 +33,15 @@ ASTRAY = 0.5
 FLIPS = 2
 
 
-def crossed(bodies: Sequence[Particles]) -> MPMError | None:
-    """Return an error where domains cross themselves (collective)."""
+def improper(bodies: Sequence[Particles], materials: Sequence[MaterialPoints]) -> MPMError | None:
+    """Return why the domains as they are now cannot be those of a converged step (collective).
+
+    They may not cross themselves, nor reach across the axis of a body of revolution.
+
+    Args:
+        bodies: The bodies.
+        materials: The materials at their points, if there are any.
+    """
     found: MPMError | None = None
     for body in bodies:
         how = "cross themselves"
@@ -42,6 +50,8 @@ def crossed(bodies: Sequence[Particles]) -> MPMError | None:
                 ", as one quadrature point lets them; Particles(..., quadrature_degree=2) does not"
             )
         found = found or DomainDistortionError.of(how, body.crossed())
+    for points in materials:
+        found = found or DomainDistortionError.of(*points.strain.beyond())
     return agreed(bodies[0].mesh.comm, found)
 
 

@@ -15,7 +15,7 @@ from ..particles.free import chosen_nodes
 from ..particles.particles import Particles
 from ..transfer.matrix import transfer_matrix
 
-__all__ = ["Carried", "bad_nodes", "carried_after", "relieve"]
+__all__ = ["Carried", "TriedNodes", "bad_nodes", "carried_after", "relieve"]
 
 #: Mean ratio of the deformation (1 undeformed, 0 flat) below which a domain is distorted: that of a
 #: simple shear by 2.4 in the plane, where finite elements begin to stiffen.
@@ -33,11 +33,75 @@ class Carried(NamedTuple):
     free: Sequence[tuple[Particles, NDArray[np.bool_]]]
     too_late: bool
 
-    def apply(self) -> None:
-        """Carry them, for good."""
+    def apply(self) -> bool:
+        """Carry them, for good; return whether there are any."""
         for body, free in self.free:
             assert body.free_nodes is not None
             body.choose_free(free, body.free_nodes.spent | (body.free & ~free))
+        return bool(self.free)
+
+
+class TriedNodes:
+    """Free nodes with which steps are tried, and those of the last converged step.
+
+    Args:
+        bodies: The bodies of a problem.
+    """
+
+    def __init__(self, bodies: Sequence[Particles]) -> None:
+        self._bodies = [body for body in bodies if body.free_nodes is not None]
+        self._before: list[tuple[NDArray[np.bool_], NDArray[np.bool_]]] | None = None
+
+    def looked_after(self, adapts: bool) -> list[Particles]:
+        """Return bodies with nodes that are free as long as the domains around them are good.
+
+        Args:
+            adapts: Whether nodes are freed where the background errs.
+        """
+        return [body for body in self._bodies if adapts or body.frees_by_itself]
+
+    def keep(self) -> None:
+        """Note which nodes are free, unless that is done since the last converged step."""
+        if self._before is None:
+            self._before = [
+                (body.free_nodes.chosen, body.free_nodes.spent)
+                for body in self._bodies
+                if body.free_nodes is not None
+            ]
+
+    def put_back(self) -> None:
+        """Let the nodes be free that were so at the last converged step."""
+        for body, nodes in zip(self._bodies, self._before or (), strict=False):
+            body.choose_free(*nodes)
+        self._before = None
+
+    def settle(self) -> None:
+        """Take the nodes that are free for those of a converged step."""
+        self._before = None
+
+    def carry(self, carried: Carried) -> bool:
+        """Carry nodes before a step is tried again; return whether there are any."""
+        if carried.free:
+            self.keep()
+        return carried.apply()
+
+    def free(self, chosen: Sequence[tuple[Particles, NDArray[np.bool_]]]) -> int:
+        """Free more nodes; return how many (collective).
+
+        Args:
+            chosen: Bodies, and which of this rank's nodes are to be free.
+        """
+        self.keep()
+        before = self._count()
+        for body, free in chosen:
+            assert body.free_nodes is not None
+            body.choose_free(free, body.free_nodes.spent)
+        return self._count() - before
+
+    def _count(self) -> int:
+        """Return the number of free nodes (collective)."""
+        own = [int(body.free[: body.W.dofmap.index_map.size_local].sum()) for body in self._bodies]
+        return int(self._bodies[0].mesh.comm.allreduce(sum(own)))
 
 
 def carried_after(bodies: Sequence[Particles]) -> Carried:

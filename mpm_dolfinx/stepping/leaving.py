@@ -14,7 +14,7 @@ from ..history import History, Loss
 from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
 
-__all__ = ["may_stop", "move_bodies"]
+__all__ = ["Masses", "left_outside", "may_stop", "move_bodies"]
 
 type Masses = Callable[[int], NDArray[np.float64] | None]
 """Masses of the owned particles of a body, by its number; ``None`` where they are not known."""
@@ -24,6 +24,18 @@ def may_stop(bodies: Sequence[Particles]) -> bool:
     """Return whether a run that leaves the background ends without an error."""
     policies = {body.outside for body in bodies}
     return "stop" in policies and "error" not in policies
+
+
+def left_outside(bodies: Sequence[Particles], history: History) -> str | None:
+    """Return a warning where the last, converged step took particles off (collective)."""
+    try:
+        with history.statistics.phase("locate"):
+            for body in bodies:
+                body.locate()
+    except ParticleOutsideError as error:
+        told = str(error)
+        return f"The run is complete, but {told[0].lower()}{told[1:]}"
+    return None
 
 
 def move_bodies(

@@ -75,8 +75,8 @@ def evaluated(make, symmetric):
         body.load.value = 1.0
     system.begin([change], 1.0)
     first, local = system.unknowns.sizes[1], system.unknowns.sizes[0]
-    problem._stepper.newton._start(system.unknowns.sizes)
-    x, F = problem._stepper.newton.x, problem._stepper.newton.F
+    problem._trial.newton._start(system.unknowns.sizes)
+    x, F = problem._trial.newton.x, problem._trial.newton.F
     assert system.residual(x, F) is None
     system.tangent()
     system.impose()
