@@ -361,6 +361,11 @@ RUNS = {
         "--parameters 2 --steps 4",
         {"difference": 1e-6, "trend": 0.02, "cutbacks": 0},
     ),
+    "gradient-degree-2": (
+        "gradient",
+        "--kind elastic --degree 2 --cells 4 --parameters 2 --steps 4",
+        {"difference": 1e-6, "trend": 1e-3, "cutbacks": 0},
+    ),
     "notch": (
         "notch",
         "--body free --steps 20",
