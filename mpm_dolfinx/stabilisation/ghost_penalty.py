@@ -39,8 +39,8 @@ class GhostPenalty:
 
     Args:
         bodies: The bodies (collective).
-        least: Number of background nodes with weight over that of the bodies' nodes, below which
-            there is no penalty.
+        least: Number of background nodes with weight over that of the bodies' carried nodes, below
+            which there is no penalty.
 
     Attributes:
         acts: Whether there is a penalty where the bodies are now.
@@ -50,7 +50,7 @@ class GhostPenalty:
     def __init__(self, bodies: Sequence[Particles], least: float = 0.0) -> None:
         self._bodies = list(bodies)
         self._V = bodies[0].V
-        self._least = least * sum(_num_nodes(body) for body in bodies)
+        self._least = least
         self.acts = False
         self.counts: dict[str, int] = {}
         self._known: dict[bytes, NDArray[np.float64]] = {}
@@ -76,7 +76,8 @@ class GhostPenalty:
             that are tied together.
         """
         active = touched.has_weight
-        self.acts = over_ranks(self._V.mesh.comm, len(touched.active)) >= self._least
+        carried = sum(_num_carried(body) for body in self._bodies)
+        self.acts = over_ranks(self._V.mesh.comm, len(touched.active)) >= self._least * carried
         if self.acts:
             self._choose()
             active = active | self._marked
@@ -158,8 +159,10 @@ class GhostPenalty:
         return np.asarray(0.5 * (values + values.swapaxes(1, 2)))
 
 
-def _num_nodes(body: Particles) -> int:
-    """Return the number of nodes of a body, each counted once where domains may part."""
-    nodes: int = body.W.dofmap.index_map.size_global
+def _num_carried(body: Particles) -> int:
+    """Return how many nodes are carried, each counted once where domains may part (collective)."""
+    layout = body.W.dofmap.index_map
+    nodes: int = layout.size_global
     corners: int = body.mesh.topology.index_map(0).size_global
-    return min(nodes, corners) if body.W.ufl_element().degree == 1 else nodes
+    whole = min(nodes, corners) if body.W.ufl_element().degree == 1 else nodes
+    return whole - over_ranks(body.mesh.comm, int(body.free[: layout.size_local].sum()))
