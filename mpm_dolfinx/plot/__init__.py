@@ -11,13 +11,14 @@ Both packages are optional (``pip install 'mpm-dolfinx[plot]'``) and imported on
 when a picture is asked for. All functions are collective.
 """
 
+from .looks import Look
 from .movies import movie
 from .outlines import background, domains, grid
 from .runs import history
 from .scenes import scene
 from .sketches import sketch
 
-__all__ = ["background", "domains", "grid", "history", "movie", "scene", "sketch"]
+__all__ = ["Look", "background", "domains", "grid", "history", "movie", "scene", "sketch"]
 
 
 def __dir__() -> list[str]:

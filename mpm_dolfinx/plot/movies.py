@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
 from ..parallel.given import as_positive, require_whole
-from .fields import LABELS, Field, bodies_of
+from .fields import Field, bodies_of
+from .looks import Look, look_of
 from .outlines import imported
-from .scenes import Look, Shot, corners, draw, ends_of, framed, new_figure, take
+from .scenes import Shot, draw, framed, new_figure, take
 
 __all__ = ["movie"]
 
@@ -35,12 +36,7 @@ def movie(
     every: int = 1,
     fps: float = 10.0,
     dpi: float = 90.0,
-    background: bool = True,
-    label: str | None = None,
-    cmap: Any = "viridis",
-    limits: tuple[float | None, float | None] | None = None,
-    camera: Any = None,
-    box: Any = None,
+    **look: Any,
 ) -> None:
     """Run a problem and make a movie of it: ``movie(problem, problem.steps(40), "run.gif")``.
 
@@ -58,16 +54,11 @@ def movie(
         every: A frame after so many steps, and after the last.
         fps: Frames in a second.
         dpi: Pixels in an inch; a frame in the plane is eight inches wide.
-        background: As in :func:`scene`.
-        label: As in :func:`scene`.
-        cmap: As in :func:`scene`.
-        limits: First and last value of the colours; by default the extremes of the whole run.
-        camera: As in :func:`scene`.
-        box: As in :func:`scene`.
+        **look: As in :func:`scene`; the title stands before the time.
 
     Raises:
-        MPMError: Another kind of file, ``box`` is none, there is no such field, or matplotlib is
-            missing; or what the run raises.
+        MPMError: Another kind of file, there is no such field or look, or matplotlib is missing;
+            or what the run raises.
     """
     bodies = bodies_of(problem)
     comm: MPI.Comm = bodies[0].mesh.comm
@@ -77,16 +68,13 @@ def movie(
         require_whole("every", every, least=1)
         as_positive(fps, "fps")
         as_positive(dpi, "dpi")
-        shown, between = corners(box, bodies[0].mesh.geometry.dim), ends_of(limits)
+        own = look_of(look, field, bodies[0].mesh.geometry.dim)
     figures = imported("matplotlib.figure", comm)
     imported("PIL.Image", comm)
-    name = field if isinstance(field, str) else ""
-    look = Look(LABELS.get(name, name.replace("_", " ")) if label is None else label)
-    look = replace(look, cmap=cmap, limits=between, camera=camera, box=shown)
 
     def shot() -> tuple[float, Shot | None]:
         now = field() if callable(field) else field
-        return problem.history.time, take(problem, bodies, now, 1.0, background)
+        return problem.history.time, take(problem, bodies, now, own)
 
     frames = [shot()]
     number, taken = 0, 0
@@ -102,7 +90,7 @@ def movie(
         with agree(comm):
             if comm.rank == 0:
                 kept = [(time, frame) for time, frame in frames if frame is not None]
-                _write(figures, kept, look, Path(path), fps, dpi)
+                _write(figures, kept, own, Path(path), fps, dpi)
 
 
 def _write(
@@ -147,7 +135,8 @@ def _frames(
     pictures = []
     for number, (time, shot) in enumerate(frames):
         ax.clear()
-        draw(shot, replace(look, title=f"time {time:.3f}"), ax, bar=number == 0)
+        title = f"{look.title}, time" if look.title else "time"
+        draw(shot, replace(look, title=f"{title} {time:.3f}"), ax, bar=number == 0)
         canvas.draw()
         if number == 0:
             figure.set_layout_engine("none")  # what stands where stays

@@ -43,12 +43,8 @@ def domains(
     values: ArrayLike | None = None,
     ax: Any = None,
     *,
-    cmap: Any = "viridis",
     vmin: float | None = None,
     vmax: float | None = None,
-    facecolor: Any = "0.8",
-    edgecolor: Any = "0.25",
-    linewidth: float = 0.3,
     warp: float = 1.0,
     **options: Any,
 ) -> Any:
@@ -63,14 +59,11 @@ def domains(
             colour; ``None`` is one colour for all. Deleted particles are not drawn.
         ax: Axes to draw on, matplotlib's current ones by default; only that of rank 0 counts.
             Its aspect is made equal.
-        cmap: Colour map of the values.
         vmin: Value of the first colour, the smallest by default.
         vmax: Value of the last colour, the largest by default.
-        facecolor: Colour of domains without values.
-        edgecolor: Colour of the domains' edges.
-        linewidth: Width of the edges in points.
         warp: Factor on the displacement; 0 draws the undeformed body.
-        **options: Passed on to ``matplotlib.collections.PolyCollection``.
+        **options: Passed on to ``matplotlib.collections.PolyCollection``, such as ``cmap=``,
+            ``facecolor=`` of domains without values, ``edgecolor=`` and ``linewidth=``.
 
     Returns:
         The ``PolyCollection`` on rank 0 (ready for ``fig.colorbar``), ``None`` elsewhere.
@@ -83,9 +76,10 @@ def domains(
     _require_plane(particles.mesh)
     with agree(comm):
         shown = None if values is None else owned_values(particles, values)
+        options = {"edgecolor": "0.25", "linewidth": 0.3, **options}
         ends = {"vmin": vmin, "vmax": vmax}
         given = {name: value for name, value in ends.items() if value is not None}
-        require_finite(warp=warp, linewidth=linewidth, **given)
+        require_finite(warp=warp, linewidth=options["linewidth"], **given)
     collections = imported("matplotlib.collections", comm)
     present = ~particles.deleted
     index = comm.gather(particles.global_index[present])
@@ -95,12 +89,10 @@ def domains(
         return None
     order = np.argsort(np.concatenate(index))
     if shown is not None:
-        options = {"array": np.concatenate(colours)[order], "cmap": cmap, **options}
+        options = {"array": np.concatenate(colours)[order], "cmap": "viridis", **options}
     else:
-        options = {"facecolors": facecolor, **options}
-    artist = collections.PolyCollection(
-        np.concatenate(polygons)[order], edgecolors=edgecolor, linewidths=linewidth, **options
-    )
+        options = {"facecolor": "0.8", **options}
+    artist = collections.PolyCollection(np.concatenate(polygons)[order], **options)
     if shown is not None:
         artist.set_clim(vmin, vmax)
     return _added(artist, ax)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -18,21 +18,19 @@ from numpy.typing import NDArray
 
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
-from ..parallel.given import is_number
 from ..particles.particles import Particles
-from ..reals import as_finite
-from .fields import LABELS, Field, Lines, bodies_of, lines_of, values_of
+from .fields import Field, Lines, bodies_of, lines_of, values_of
+from .looks import Look, look_of
 from .outlines import (
     edges,
     grid,
     imported,
     outlines,
     require_axes,
-    require_finite,
     surface_algorithm,
 )
 
-__all__ = ["Look", "Shot", "corners", "draw", "ends_of", "framed", "new_figure", "scene", "take"]
+__all__ = ["Shot", "draw", "framed", "new_figure", "scene", "take"]
 
 #: Room around the bodies, relative to their extent, and pixels of the longer side in space.
 MARGIN, PIXELS = 0.04, 1500
@@ -47,24 +45,6 @@ STRUCTURE, WIDE, WIDE_IN_SPACE, CLEAR = "0.1", 2.0, 6.0, 0.2
 #: Grey of bodies without a field.
 NO_FIELD = "0.8"
 NEAR, SAMPLES = {2: 0.3, 3: 0.2}, {2: 300, 3: 60}
-
-
-@dataclass(frozen=True)
-class Look:
-    """How a scene is drawn; see :func:`scene` for each.
-
-    Attributes:
-        limits: First and last value of the colours.
-        box: Corners of what is shown, shape ``(2, gdim)``; ``None``: the bodies, and some room.
-    """
-
-    label: str
-    cmap: Any = "viridis"
-    limits: tuple[float | None, float | None] | None = None
-    lines: bool | None = None
-    camera: Any = None
-    title: str | None = None
-    box: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -107,15 +87,7 @@ def scene(
     path: str | Path | None = None,
     *,
     ax: Any = None,
-    warp: float = 1.0,
-    background: bool = True,
-    label: str | None = None,
-    cmap: Any = "viridis",
-    limits: tuple[float | None, float | None] | None = None,
-    lines: bool | None = None,
-    camera: Any = None,
-    title: str | None = None,
-    box: Any = None,
+    **look: Any,
 ) -> Any:
     """Draw all bodies of a problem as they are now, coloured by a field (collective).
 
@@ -140,81 +112,30 @@ def scene(
             list. ``None``: no colours.
         path: Where to save it, e.g. ``"scene.png"``.
         ax: Axes of matplotlib to draw on; only those of rank 0 count. A figure is made without.
-        warp: Factor on the displacement.
-        background: Whether the background is drawn: its cells in the plane; in space its box, if
-            that is not much larger than the bodies, or lies in ``box``.
-        label: What the colour bar says; the field's name without.
-        cmap: Colour map.
-        limits: First and last value of the colours; ``None`` in a place is the smallest or
-            largest value.
-        lines: Whether edges of domains are drawn; by default where there are not too many.
-        camera: In space, from which side it is seen: anything that pyvista takes as
-            ``camera_position``, such as ``"xz"`` or a vector towards the eye.
-        title: A line above it.
-        box: What is shown instead of all bodies: the lower and the upper corner of a box, shape
-            ``(2, gdim)``.
+        **look: How it looks, by attributes of :class:`Look`: ``label=``, ``cmap=``, ``limits=``,
+            ``lines=``, ``camera=``, ``title=``, ``box=``, ``background=``, ``warp=``.
 
     Returns:
         The figure of matplotlib on rank 0, ``None`` elsewhere.
 
     Raises:
-        MPMError: There is no such field, ``box`` is none, or a package for pictures is missing.
+        MPMError: There is no such field or look, or a package for pictures is missing.
     """
     bodies = bodies_of(problem)
     comm: MPI.Comm = bodies[0].mesh.comm
     with agree(comm):
-        shown = corners(box, bodies[0].mesh.geometry.dim)
-        between = ends_of(limits)
-        require_finite(warp=warp)
+        own = look_of(look, field, bodies[0].mesh.geometry.dim)
     figures = imported("matplotlib.figure", comm)
-    name = field if isinstance(field, str) else ""
-    look = Look(LABELS.get(name, name.replace("_", " ")) if label is None else label)
-    look = replace(look, cmap=cmap, limits=between, lines=lines, camera=camera, title=title)
-    look = replace(look, box=shown)
-    shot = take(problem, bodies, field, warp, background)
+    shot = take(problem, bodies, field, own)
     with agree(comm):
         if shot is None:
             return None
         require_axes(ax)
-        figure = ax.figure if ax is not None else new_figure(figures, shot, look)
-        draw(shot, look, figure.add_subplot() if ax is None else ax)
+        figure = ax.figure if ax is not None else new_figure(figures, shot, own)
+        draw(shot, own, figure.add_subplot() if ax is None else ax)
         if path is not None:
             figure.savefig(path, dpi=160, bbox_inches="tight")
         return figure
-
-
-def corners(box: Any, gdim: int) -> NDArray[np.float64] | None:
-    """Return the corners of a box that a user gives, shape ``(2, gdim)``.
-
-    Raises:
-        MPMError: It is none.
-    """
-    if box is None:
-        return None
-    given = as_finite(box, 2, gdim)
-    if given is None or (given[0] >= given[1]).any():
-        raise MPMError(
-            f"box must be the lower and the upper corner of what is shown, {gdim} coordinates "
-            f"each, not {box!r}."
-        )
-    return given
-
-
-def ends_of(limits: Any) -> tuple[float | None, float | None] | None:
-    """Return the first and the last value of colours that a user gives.
-
-    Raises:
-        MPMError: They are none.
-    """
-    if limits is None:
-        return None
-    given = list(limits) if isinstance(limits, list | tuple | np.ndarray) else []
-    if len(given) != 2 or not all(v is None or (is_number(v) and abs(v) < np.inf) for v in given):
-        raise MPMError(
-            "limits must be the first and the last value of the colours, each a number or None, "
-            f"not {limits!r}."
-        )
-    return given[0], given[1]
 
 
 def framed(
@@ -236,9 +157,7 @@ def framed(
     return np.array([extent[0] - room, extent[1] + room])
 
 
-def take(
-    problem: Any, bodies: Sequence[Particles], field: Field, warp: float, background: bool
-) -> Shot | None:
+def take(problem: Any, bodies: Sequence[Particles], field: Field, look: Look) -> Shot | None:
     """Return the bodies at this moment on rank 0 (collective)."""
     comm: MPI.Comm = bodies[0].mesh.comm
     gdim = bodies[0].mesh.geometry.dim
@@ -252,7 +171,7 @@ def take(
         index = comm.gather(body.global_index)
         mine = comm.gather(None if values is None else values[number])
         there = comm.gather(kept)
-        polygons = comm.gather(outlines(body, warp)) if planar else None
+        polygons = comm.gather(outlines(body, look.warp)) if planar else None
         whole = None if planar else grid(body)
         if index is None or mine is None or there is None:
             continue
@@ -264,19 +183,21 @@ def take(
             shape = np.concatenate(polygons)[order]
             points = shape.reshape(-1, 2)
         else:
-            shape = _kept(whole, np.concatenate(there)[np.argsort(np.concatenate(index))], warp)
+            shape = _kept(
+                whole, np.concatenate(there)[np.argsort(np.concatenate(index))], look.warp
+            )
             points = shape.points
         shapes.append(shape)
         if len(points):
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
     backgrounds = {id(body.V.mesh): body.V.mesh for body in bodies if not body.is_free}
-    background = background and len(backgrounds) > 0
+    background = look.background and len(backgrounds) > 0
     boxes = [_box(one, comm) for one in backgrounds.values()]
     cells = [edges(one) for one in backgrounds.values()] if planar and background else []
     marks = (
         _marks(problem, comm) if isinstance(field, str) and field == "contact_pressure" else None
     )
-    structures = lines_of(problem, field, warp)
+    structures = lines_of(problem, field, look.warp)
     if comm.rank > 0:
         return None
     terms = getattr(problem, "terms", ())

@@ -22,8 +22,9 @@ from ..errors import MPMError, agree
 from ..parallel.boundary import collective
 from ..particles.particles import Particles
 from .fields import bodies_of
+from .looks import Look, corners
 from .outlines import imported, require_axes
-from .scenes import OBSTACLE, STRUCTURE, Look, Shot, corners, draw, framed, new_figure, take
+from .scenes import OBSTACLE, STRUCTURE, Shot, draw, framed, new_figure, take
 
 __all__ = ["sketch"]
 
@@ -118,7 +119,7 @@ def sketch(problem: Any, path: str | Path | None = None, *, ax: Any = None, box:
     if setup is not None:
         marks += [one.gathered(comm) for one in _on_facets(setup)]
     marks = [one for one in marks if comm.allreduce(len(one.parts)) > 0]
-    shot = take(problem, bodies, values if len(values) > 1 else values[0], 1.0, True)
+    shot = take(problem, bodies, values if len(values) > 1 else values[0], Look())
     with agree(comm):
         if shot is None:
             return None

@@ -107,8 +107,9 @@ def test_what_is_not_there_is_refused_in_one_sentence(solved):
         ({"warp": 1j}, "warp must be a finite number, not 1j"),
         ({"limits": (0.0, 1.0, 2.0)}, "limits must be the first and the last value"),
         ({"limits": (np.nan, 1.0)}, "limits must be .* a number or None"),
-        ({"background": None}, r"background of scene\(\) must be True or False, not None"),
-        ({"lines": "few"}, r"lines of scene\(\) must be True, False or None"),
+        ({"background": None}, r"background of Look\(\) must be True or False, not None"),
+        ({"colour": "red"}, "A picture has no colour=; it has label, cmap, "),
+        ({"lines": "few"}, r"lines of Look\(\) must be True, False or None"),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
