@@ -154,5 +154,5 @@ assert rows[-1][1] - rows[-2][1] > 3 * rows[0][1] and 1.1 < found.factor < 1.4
 # ## Exercises
 #
 # 1. Build on to 5 m, with `DEPTH + 8.0`. At which height does it begin to sink? What does (1) say?
-# 2. Let the clay soften: `cohesion_residual=8e3, decay=20.0`. What is left of the safety?
+# 2. Let the clay soften: `.with_softening(20.0, cohesion=8e3)`. What is left of the safety?
 # 3. Place a berm, a lift of 1 m beside the foot, before the fourth lift.

@@ -73,7 +73,8 @@ def press(particles):
     strength = fem.Function(fem.functionspace(body, ("Discontinuous Lagrange", 0)))
     strength.interpolate(lambda x: 1.0 - 0.1 * np.exp(-40.0 * (x[0] ** 2 + (x[1] - 0.5) ** 2)))
     strength.x.array[:] *= np.sqrt(3.0)
-    clay = mpm.materials.VonMises(1e3, 0.3, yield_stress=strength, residual=0.3, decay=15.0)
+    clay = mpm.materials.VonMises(1e3, 0.3, yield_stress=strength)
+    clay = clay.with_softening(15.0, residual=0.3)
     tags = mpm.facet_tags(body, {1: mpm.region(y=0), 2: mpm.region(y=2)})
     foot = mpm.facet_tags(body, {1: mpm.region(x=(0.5, 1), y=0)})
     plates = [

@@ -88,20 +88,14 @@ def weakened(X: np.ndarray) -> np.ndarray:
 yields.interpolate(weakened)
 if args.law == "von-mises":
     yields.x.array[:] *= np.sqrt(3.0)
-    law: mpm.materials.Material = mpm.materials.VonMises(
-        young, poisson, yield_stress=yields, residual=residual, decay=decay
-    )
+    metal = mpm.materials.VonMises(young, poisson, yield_stress=yields)
+    law: mpm.materials.Material = metal.with_softening(decay, residual=residual)
 elif args.law == "tresca":
-    law = mpm.materials.Tresca(
-        young, poisson, yields, cohesion_residual=residual * 0.97, decay=decay
-    )
+    clay = mpm.materials.Tresca(young, poisson, yields)
+    law = clay.with_softening(decay, cohesion=residual * 0.97)
 else:
-    law = mpm.materials.DruckerPrager(
-        *(young, poisson, yields, 10.0),
-        match="plane_strain",
-        cohesion_residual=residual * 0.97,
-        decay=decay,
-    )
+    soil = mpm.materials.DruckerPrager(young, poisson, yields, 10.0, match="plane_strain")
+    law = soil.with_softening(decay, cohesion=residual * 0.97)
 
 # The plates.
 

@@ -76,12 +76,14 @@ struct GivenPressure
 constexpr double whole = 1.0;
 
 // Input and output of an update of many points; see update_plastic in module.cpp. Without
-// old_gradient there is no history; of a return there is only a share where flow takes time.
+// old_gradient there is no history; of a return there is only a share where flow takes time. With
+// trial strains, Mandel vectors of the law's own strain, it is one of stress and strain: A has the
+// derivatives of the stress by them, and c the elastic strains.
 struct Update
 {
   Law law;
   std::size_t count;
-  const double *gradient, *old_gradient, *old_c;
+  const double *gradient, *old_gradient, *old_c, *trial;
   const double* old_variables[max_variables];
   Parameter parameters[max_parameters];
   Parameter share{&whole, 0};

@@ -114,6 +114,15 @@ void first_piola(const std::array<double, 3>& values, const Matrix<dim>& axes,
     }
 }
 
+// Set the Mandel vector of a tensor with given axes; in the plane the third value is that of z.
+template <int dim>
+void vector_of(const std::array<double, 3>& values, const Matrix<dim>& axes, double* vector)
+{
+  pack<dim>(from_principal<dim>(values, axes), vector);
+  if constexpr (dim == 2)
+    vector[2] = values[2];
+}
+
 // P = tau F^-T and dP/dF, put together from the dyads Q_a (F^-1 Q)_b.
 //
 // With l = dF F^-1, d eps_ab = g_ab (b_b l_ab + b_a l_ba) in the principal frame, g_ab the
@@ -185,9 +194,7 @@ bool update_point(const double* gradient, const double* old_gradient, const doub
     first_piola<dim>(volume.by_pressure, axes, inverse_F, given->by_pressure + point * size);
   }
   first_piola<dim>(r.stress, axes, inverse_F, P);
-  pack<dim>(from_principal<dim>(r.stress, axes), stress);
-  if constexpr (dim == 2)
-    stress[2] = r.stress[2];
+  vector_of<dim>(r.stress, axes, stress);
   if (A != nullptr)
     tangent<dim>(r, principal, axes, inverse_F, A);
   if (c != nullptr)
@@ -199,12 +206,54 @@ bool update_point(const double* gradient, const double* old_gradient, const doub
       std::array<double, 3> returned{};
       for (int a = 0; a < 3; ++a)
         returned[a] = std::expm1(2.0 * r.elastic_strain[a]);
-      pack<dim>(from_principal<dim>(returned, axes), c);
-      if constexpr (dim == 2)
-        c[2] = returned[2];
+      vector_of<dim>(returned, axes, c);
     }
   }
   return true;
+}
+
+// The answer of a law in its own strain: stress, its derivative, and elastic strain.
+template <int dim, typename Law>
+void integrate_point(const double* trial, const Law& law, double tolerance, Response<>& r,
+                     double* D, double* stress, double* elastic)
+{
+  constexpr int m = num_components<dim>;
+  Matrix<dim> axes;
+  const std::array<double, dim> principal = eigen<dim>(unpack<dim>(trial), axes);
+  std::array<double, 3> strain{0.0, 0.0, trial[2]};
+  std::copy(principal.begin(), principal.end(), strain.begin());
+  law(strain, tolerance, r);
+  vector_of<dim>(r.stress, axes, stress);
+  std::copy(trial, trial + m, elastic);
+  if (r.plastic)
+    vector_of<dim>(r.elastic_strain, axes, elastic);
+  if (D == nullptr)
+    return;
+  std::fill(D, D + m * m, 0.0);
+  double dyads[3][3][m] = {};
+  for (int a = 0; a < dim; ++a)
+    for (int b = 0; b < dim; ++b)
+    {
+      Matrix<dim> dyad;
+      for (int i = 0; i < dim; ++i)
+        for (int j = 0; j < dim; ++j)
+          dyad[i][j] = axes[i][a] * axes[j][b];
+      pack<dim>(dyad, dyads[a][b]);
+    }
+  if constexpr (dim == 2)
+    dyads[2][2][2] = 1.0;
+  auto add = [&](double factor, const double* left, const double* right) {
+    for (int i = 0; i < m; ++i)
+      for (int j = 0; j < m; ++j)
+        D[i * m + j] += factor * left[i] * right[j];
+  };
+  for (int a = 0; a < 3; ++a)
+    for (int b = 0; b < 3; ++b)
+    {
+      add(r.normal[a][b], dyads[a][a], dyads[b][b]);
+      if (a < b && b < dim)
+        add(2.0 * r.shear[a][b], dyads[a][b], dyads[a][b]);
+    }
 }
 
 // (One function of all laws would take compilers many times as long.)
@@ -225,8 +274,13 @@ HOT_LOOP std::vector<std::int64_t> update_all(const core::Update& u)
     Response<> r;
     for (std::size_t k = 0; k < variables; ++k)
       r.variables[k] = u.old_variables[k][p];
+    if (u.trial != nullptr)
+      integrate_point<dim>(u.trial + p * m, law, u.tolerance, r,
+                           u.A == nullptr ? nullptr : u.A + p * m * m, u.stress + p * m,
+                           u.c + p * m);
     const bool valid =
-        update_point<dim>(u.gradient + p * size, history ? u.old_gradient + p * size : nullptr,
+        u.trial != nullptr
+        || update_point<dim>(u.gradient + p * size, history ? u.old_gradient + p * size : nullptr,
                           history ? u.old_c + p * m : nullptr, law, u.tolerance, r,
                           u.P + p * size, u.A == nullptr ? nullptr : u.A + p * size * size,
                           u.stress + p * m, history ? u.c + p * m : nullptr, u.given, p);

@@ -354,6 +354,28 @@ Law law_of(const std::string& name)
   throw std::invalid_argument("there is no compiled law " + name);
 }
 
+// The step of a law at a number of points, but for what they are strained by.
+Update update_of(Law law, std::size_t count, const std::vector<Reals>& old_variables,
+                 const std::vector<Reals>& parameters, std::vector<RealsOut>& variables)
+{
+  Update u{};
+  u.law = law;
+  u.count = count;
+  require(parameters.size() == num_parameters(law), "the parameters of the law");
+  require(old_variables.size() == num_variables(law) && variables.size() == num_variables(law),
+          "the internal variables of the law");
+  for (std::size_t k = 0; k < parameters.size(); ++k)
+    u.parameters[k] = parameter_of(parameters[k], count);
+  for (std::size_t k = 0; k < variables.size(); ++k)
+  {
+    require(old_variables[k].size() == count && variables[k].size() == count,
+            "internal variables (n,)");
+    u.old_variables[k] = old_variables[k].data();
+    u.variables[k] = variables[k].data();
+  }
+  return u;
+}
+
 // Update a law with a history, from arrays of which the shapes are looked at.
 auto update_with_history(Law law, const Reals& gradient, const Reals& old_gradient,
                          const Reals& old_c, const std::vector<Reals>& old_variables,
@@ -364,26 +386,12 @@ auto update_with_history(Law law, const Reals& gradient, const Reals& old_gradie
   require(gradient.ndim() == 3 && old_gradient.size() == gradient.size()
               && old_c.shape(0) == gradient.shape(0),
           "displacement gradients (n, dim, dim) and states (n, ...)");
-  Update u{};
-  u.law = law;
-  u.count = gradient.shape(0);
-  require(parameters.size() == num_parameters(law), "the parameters of the law");
-  require(old_variables.size() == num_variables(law) && variables.size() == num_variables(law),
-          "the internal variables of the law");
+  Update u = update_of(law, gradient.shape(0), old_variables, parameters, variables);
+  u.share = parameter_of(share, u.count);
+  u.tolerance = tolerance;
   u.gradient = gradient.data();
   u.old_gradient = old_gradient.data();
   u.old_c = old_c.data();
-  for (std::size_t k = 0; k < parameters.size(); ++k)
-    u.parameters[k] = parameter_of(parameters[k], u.count);
-  for (std::size_t k = 0; k < variables.size(); ++k)
-  {
-    require(old_variables[k].size() == u.count && variables[k].size() == u.count,
-            "internal variables (n,)");
-    u.old_variables[k] = old_variables[k].data();
-    u.variables[k] = variables[k].data();
-  }
-  u.share = parameter_of(share, u.count);
-  u.tolerance = tolerance;
   u.P = P.data();
   u.A = A.size() > 0 ? A.data() : nullptr;
   u.stress = stress.data();
@@ -749,14 +757,9 @@ NB_MODULE(_loops, m)
         [](const std::string& law, Reals gradient, const std::vector<Reals>& parameters, RealsOut P,
            RealsOut A, RealsOut stress) {
     require(gradient.ndim() == 3, "displacement gradients (n, dim, dim)");
-    Update u{};
-    u.law = law_of(law);
-    require(num_variables(u.law) == 0 && parameters.size() == num_parameters(u.law),
-            "an elastic law and its parameters");
-    u.count = gradient.shape(0);
+    std::vector<RealsOut> none;
+    Update u = update_of(law_of(law), gradient.shape(0), {}, parameters, none);
     u.gradient = gradient.data();
-    for (std::size_t k = 0; k < parameters.size(); ++k)
-      u.parameters[k] = parameter_of(parameters[k], u.count);
     u.P = P.data();
     u.A = A.size() > 0 ? A.data() : nullptr;
     u.stress = stress.data();
@@ -777,6 +780,27 @@ NB_MODULE(_loops, m)
         "share"_a, "tolerance"_a, "P"_a.noconvert(), "A"_a.noconvert(), "stress"_a.noconvert(),
         "c"_a.noconvert(), "variables"_a.noconvert(),
         "Update a law with a history; return the points whose domains are inverted.");
+
+  m.def("integrate",
+        [](const std::string& law, Reals trial, const std::vector<Reals>& old_variables,
+           const std::vector<Reals>& parameters, Reals share, double tolerance, RealsOut stress,
+           RealsOut tangent, RealsOut elastic, std::vector<RealsOut> variables) {
+    require(trial.ndim() == 2 && (trial.shape(1) == 4 || trial.shape(1) == 6)
+                && stress.size() == trial.size() && elastic.size() == trial.size()
+                && (tangent.size() == 0 || tangent.size() == trial.size() * trial.shape(1)),
+            "strains and stresses (n, m), tangents (n, m, m)");
+    Update u = update_of(law_of(law), trial.shape(0), old_variables, parameters, variables);
+    u.share = parameter_of(share, u.count);
+    u.tolerance = tolerance;
+    u.trial = trial.data();
+    u.A = tangent.size() > 0 ? tangent.data() : nullptr;
+    u.stress = stress.data();
+    u.c = elastic.data();
+    update_logarithmic(u, trial.shape(1) == 4 ? 2 : 3);
+  },
+        "law"_a, "trial"_a, "old_variables"_a, "parameters"_a, "share"_a, "tolerance"_a,
+        "stress"_a.noconvert(), "tangent"_a.noconvert(), "elastic"_a.noconvert(),
+        "variables"_a.noconvert(), "Set the answers of a law to strains of its own.");
 
   m.def("pull",
         [](const std::string& law, const std::vector<Reals>& before,

@@ -3,8 +3,7 @@
 //
 // Laws of plasticity in principal logarithmic strains, for numbers and for numbers with derivatives.
 //
-// The same algorithms as mpm_dolfinx.materials (neo_hooke, von_mises, mohr_coulomb, drucker_prager,
-// mu_i, cam_clay), which are their oracles.
+// tests/returns.py has the same algorithms for all points together, which are their oracles.
 
 #pragma once
 
@@ -81,7 +80,7 @@ struct Hencky
   }
 };
 
-// tau = G (b - 1) + lambda ln J; see mpm_dolfinx.materials.neo_hooke.
+// tau = G (b - 1) + lambda ln J; see NeoHooke of mpm_dolfinx.materials.
 template <typename T = double>
 struct NeoHooke
 {

@@ -58,7 +58,7 @@ class SofteningAverage:
         if not any(part.material.softens for part in laws.governed):
             names = ", ".join(type(law).__name__ for law in laws.given)
             raise MPMError(
-                "length= is for laws that soften with their plastic strain (decay=), which "
+                "length= is for laws that soften with their plastic strain (with_softening), which "
                 f"{names} does not; omit it, or give the law a residual strength and decay."
             )
         self._over = GradientAverage(strain, length, laws.by_domain(counts).any(axis=1))

@@ -6,23 +6,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, NamedTuple, Self, override
+from typing import Any, ClassVar, Literal, override
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
-from ..tolerances import LOCAL_ITERATIONS, NEGLIGIBLE
 from .base import (
     Field,
-    Integration,
     Parameter,
     State,
     check_parameter,
     per_row,
 )
 from .compiled import CompiledMaterial
-from .mandel import deviator, deviatoric_projector, identity, norm, trace
+from .mandel import deviator, norm, trace
 
 __all__ = ["ModifiedCamClay"]
 
@@ -176,185 +174,6 @@ class ModifiedCamClay(CompiledMaterial):
         q = np.sqrt(1.5) * norm(deviator(stress)) / self.parameters["critical_ratio"]
         return np.asarray((q / p_c) ** 2 + p / p_c * (p / p_c - 1.0))
 
-    @override
-    def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
-        n, m = trial_strain.shape
-        p_c = variables["preconsolidation"]
-        law = _Law.of(self.parameters, p_c)
-        dev = deviator(trial_strain)
-        size = norm(dev)
-        volume, shape = -trace(trial_strain), np.sqrt(2.0 / 3.0) * size
-        x, y = volume.copy(), np.zeros(n)
-        residual = law.residual(volume, shape, x, y)[1]
-        points = np.flatnonzero(residual > self.yield_tolerance)
-        if len(points):
-            x[points], y[points] = law.at(points).solve(volume[points], shape[points])
-        ratio = 1.0 / (1.0 + law.softness * y)
-        pressure = law.pressure(x)
-        stress = (2.0 * law.shear * p_c * ratio)[:, None] * dev
-        stress[:, :3] -= (pressure * p_c)[:, None]
-        elastic = trial_strain.copy()
-        elastic[points] = ratio[points, None] * dev[points]
-        elastic[points, :3] -= (x[points] / 3.0)[:, None]
-        new = {name: values.copy() for name, values in variables.items()}
-        new["plastic_strain"] += np.sqrt(2.0 / 3.0) * norm(trial_strain - elastic)
-        new["preconsolidation"][points] *= law.at(points).growth(volume[points], x[points])
-        if not tangent:
-            return Integration(stress, None, elastic, new)
-
-        plastic = np.zeros(n, dtype=bool)
-        plastic[points] = True
-        p_v, p_s, q_v, q_s = law.slopes(volume, shape, x, y, plastic) * p_c
-        direction = np.divide(dev, size[:, None], out=np.zeros_like(dev), where=size[:, None] > 0.0)
-        one, secant = identity(m), 2.0 * law.shear * p_c * ratio
-        D = np.einsum("n,ij->nij", secant, deviatoric_projector(m))
-        D += np.einsum("n,ni,nj->nij", 2.0 / 3.0 * q_s - secant, direction, direction)
-        D += np.einsum("n,i,j->nij", p_v, one, one)
-        D -= np.einsum("n,i,nj->nij", np.sqrt(2.0 / 3.0) * p_s, one, direction)
-        D -= np.einsum("n,ni,j->nij", np.sqrt(2.0 / 3.0) * q_v, direction, one)
-        return Integration(stress, D, elastic, new)
-
     def _constants(self) -> tuple[Parameter, ...]:
         names = ("compression", "swelling", "critical_ratio", "shear_modulus", "reference_pressure")
         return tuple(self.parameters[name] for name in names)
-
-
-class _Law(NamedTuple):
-    """Constants of a number of points, shape ``(n,)`` each; stresses over the old p_c.
-
-    The unknowns are the elastic strain of volume x and the multiplier y (times the old p_c).
-    """
-
-    plastic: Array
-    swelling: Array
-    ratio: Array
-    shear: Array
-    reference: Array
-
-    @classmethod
-    def of(cls, parameters: Mapping[str, Parameter], p_c: Array) -> Self:
-        """Return the constants of points with preconsolidation p_c."""
-        plastic = parameters["compression"] - parameters["swelling"]
-        names = ("swelling", "critical_ratio")
-        values = (plastic, *(parameters[name] for name in names))
-        stresses = (parameters["shear_modulus"] / p_c, parameters["reference_pressure"] / p_c)
-        return cls(*(np.broadcast_to(value, len(p_c)) for value in (*values, *stresses)))
-
-    def at(self, points: NDArray[np.integer[Any]]) -> Self:
-        """Return the constants of some of the points."""
-        return type(self)(*(value[points] for value in self))
-
-    @property
-    def softness(self) -> Array:
-        """The strain of shape is 1/(1 + softness y) of its trial value."""
-        return 6.0 * self.shear / self.ratio**2
-
-    def pressure(self, x: Array) -> Array:
-        """Return p."""
-        return np.asarray(self.reference * np.exp(x / self.swelling))
-
-    def growth(self, volume: Array, x: Array) -> Array:
-        """Return p_c."""
-        return np.asarray(np.exp((volume - x) / self.plastic))
-
-    def residual(self, volume: Array, shape: Array, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return the residuals of the flow rule and of the yield function."""
-        p, p_c = self.pressure(x), self.growth(volume, x)
-        q = 3.0 * self.shear * shape / (1.0 + self.softness * y) / self.ratio
-        return x - volume + y * (2.0 * p - p_c), q**2 + p * (p - p_c)
-
-    def jacobian(self, volume: Array, shape: Array, x: Array, y: Array) -> tuple[Array, ...]:
-        """Return the derivatives of the residuals: flow by x, by y, yield by x, by y."""
-        p, p_c = self.pressure(x), self.growth(volume, x)
-        q = 3.0 * self.shear * shape / (1.0 + self.softness * y) / self.ratio
-        slope, hardening = p / self.swelling, p_c / self.plastic
-        return (
-            1.0 + y * (2.0 * slope + hardening),
-            2.0 * p - p_c,
-            (2.0 * p - p_c) * slope + p * hardening,
-            -2.0 * q**2 * self.softness / (1.0 + self.softness * y),
-        )
-
-    def step(self, volume: Array, shape: Array, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return Newton's step."""
-        flow, f = self.residual(volume, shape, x, y)
-        a, b, c, d = self.jacobian(volume, shape, x, y)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            det = a * d - b * c
-            return -(d * flow - b * f) / det, -(a * f - c * flow) / det
-
-    def range(self, volume: Array) -> tuple[Array, Array]:
-        """Return the bounds of x: the trial value and that of the critical state."""
-        rates = 1.0 / self.swelling + 1.0 / self.plastic
-        critical = (volume / self.plastic - np.log(2.0 * self.reference)) / rates
-        return np.minimum(volume, critical), np.maximum(volume, critical)
-
-    def solve(self, volume: Array, shape: Array) -> tuple[Array, Array]:
-        """Return the unknowns of points that yield."""
-        low, high = self.range(volume)
-        x, y = volume.copy(), np.zeros_like(volume)
-        active = np.arange(len(x))
-        for _ in range(STEPS):
-            law, there = self.at(active), (volume[active], shape[active], x[active], y[active])
-            dx, dy = law.step(*there)
-            x[active] = np.clip(x[active] + dx, low[active], high[active])
-            y[active] = np.maximum(y[active] + dy, 0.0)
-            flow, f = law.residual(volume[active], shape[active], x[active], y[active])
-            size = law.pressure(x[active]) + law.growth(volume[active], x[active])
-            done = (np.abs(flow) <= NEGLIGIBLE * self.swelling[active]) & (
-                np.abs(f) <= NEGLIGIBLE * size**2
-            )
-            active = active[~(done & (y[active] > 0.0))]
-            if len(active) == 0:
-                break
-        if len(active):
-            x[active], y[active] = self.at(active).search(volume[active], shape[active])
-        dx, dy = self.step(volume, shape, x, y)
-        finite = np.isfinite(dx) & np.isfinite(dy)
-        return np.where(finite, x + dx, x), np.where(finite, y + dy, y)
-
-    def search(self, volume: Array, shape: Array) -> tuple[Array, Array]:
-        """Return the unknowns by bisection of y, with x by bisection for each."""
-        largest = np.ones_like(volume)
-        for _ in range(LOCAL_ITERATIONS):
-            x = self.volume_at(volume, shape, largest)
-            largest = np.where(
-                self.residual(volume, shape, x, largest)[1] > 0.0, 4.0 * largest, largest
-            )
-        least = np.zeros_like(volume)
-        for _ in range(LOCAL_ITERATIONS):
-            middle = 0.5 * (least + largest)
-            x = self.volume_at(volume, shape, middle)
-            beyond = self.residual(volume, shape, x, middle)[1] > 0.0
-            least, largest = np.where(beyond, middle, least), np.where(beyond, largest, middle)
-        return self.volume_at(volume, shape, largest), largest
-
-    def volume_at(self, volume: Array, shape: Array, y: Array) -> Array:
-        """Return x for a given y."""
-        low, high = self.range(volume)
-        for _ in range(LOCAL_ITERATIONS):
-            middle = 0.5 * (low + high)
-            above = self.residual(volume, shape, middle, y)[0] > 0.0
-            low, high = np.where(above, low, middle), np.where(above, middle, high)
-        return 0.5 * (low + high)
-
-    def slopes(
-        self, volume: Array, shape: Array, x: Array, y: Array, plastic: NDArray[np.bool_]
-    ) -> Array:
-        """Return the derivatives of p and q by the trial strains of volume and shape, (4, n)."""
-        p, p_c = self.pressure(x), self.growth(volume, x)
-        left = 1.0 + self.softness * y
-        q, hardening = 3.0 * self.shear * shape / left, p_c / self.plastic
-        a, b, c, d = self.jacobian(volume, shape, x, y)
-        det = np.where(plastic, a * d - b * c, 1.0)
-        # What the residuals change by with the trial strains, with the sign turned.
-        flow_v, f_v = 1.0 + y * hardening, p * hardening
-        f_s = -2.0 * q / self.ratio**2 * 3.0 * self.shear / left
-        x_v, y_v = (d * flow_v - b * f_v) / det, (a * f_v - c * flow_v) / det
-        x_s, y_s = -b * f_s / det, a * f_s / det
-        slope, fall = p / self.swelling, -q * self.softness / left
-        result = np.stack(
-            (slope * x_v, slope * x_s, fall * y_v, 3.0 * self.shear / left + fall * y_s)
-        )
-        zero = np.zeros_like(p)
-        return np.where(plastic, result, np.stack((slope, zero, zero, 3.0 * self.shear)))

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._core import is_as_inherited, loops
-from ..errors import ConvergenceError
-from .base import Parameter, State, StrainMaterial, Update
+from ..errors import ConvergenceError, MPMError
+from .base import Integration, Parameter, State, StrainMaterial, Update
 from .given_pressure import ALPHA, AtPressure
 from .kinematics import require_valid
 from .mandel import num_components
@@ -35,17 +35,25 @@ class Taken(NamedTuple):
     numbers: Array
 
 
-class CompiledMaterial(StrainMaterial):
-    """A law that may have a compiled update: its class names it in ``_loop``.
+#: What a compiled return has of a law by heart.
+BY_HEART = frozenset({"yield_function", "strength", "elastic_stress", "elastic_tangent"})
 
-    A law derived from it that overrides anything of it is updated in Python.
+
+class CompiledMaterial(StrainMaterial):
+    """A law with a compiled return, which its class names in ``_loop``.
+
+    Where a law derived from it overrides nothing, the whole update is compiled too.
     """
 
     _loop: ClassVar[str] = ""
 
-    def _known_loop(self) -> str:
-        """Return the name of the compiled update that may be used, or nothing."""
-        return self._loop if is_as_inherited(self, "_loop") else ""
+    def _has_compiled_update(self) -> bool:
+        """Return whether updates are compiled as a whole."""
+        return self._loop != "" and is_as_inherited(self, "_loop")
+
+    def _return(self) -> str:
+        """Return the name of the compiled return."""
+        return self._loop
 
     def _constants(self) -> tuple[Parameter, ...]:
         """Return the parameters of the compiled law, in the order of ``material.h``."""
@@ -56,19 +64,59 @@ class CompiledMaterial(StrainMaterial):
         return 1.0
 
     @override
+    def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
+        owner = self._owner()
+        n, m = trial_strain.shape
+        stress, elastic = np.empty((n, m)), np.empty((n, m))
+        D, new = np.empty((n if tangent else 0, m, m)), {}
+        for name in owner.internal_variables:
+            new[name] = np.empty(n)
+        loops.integrate(
+            self._return(),
+            np.ascontiguousarray(trial_strain),
+            [np.ascontiguousarray(variables[name]) for name in new],
+            [_values(parameter) for parameter in self._constants()],
+            _values(self._share()),
+            getattr(self, "yield_tolerance", 0.0),
+            stress,
+            D,
+            elastic,
+            list(new.values()),
+        )
+        return Integration(stress, D if tangent else None, elastic, new)
+
+    def _owner(self) -> type[CompiledMaterial]:
+        """Return the class that names the return.
+
+        Raises:
+            MPMError: A law derived from it overrides what the return does not ask.
+        """
+        changed: set[str] = set()
+        for its in type(self).__mro__:
+            if "_loop" in vars(its) and issubclass(its, CompiledMaterial):
+                break
+            changed |= vars(its).keys()
+        if BY_HEART & changed and "integrate" not in changed:
+            raise MPMError(
+                f"{type(self).__name__} overrides {', '.join(sorted(BY_HEART & changed))} of "
+                f"{its.__name__}, whose return does not ask it; override integrate, or write a "
+                "ReturnMapping."
+            )
+        return its
+
+    @override
     def update(self, displacement_gradient: Array, state: State, tangent: bool = True) -> Update:
-        loop = self._known_loop()
-        if not loop:
+        if not self._has_compiled_update():
             return super().update(displacement_gradient, state, tangent)
         H = np.ascontiguousarray(displacement_gradient)
         n, dim, _ = H.shape
         P, A = np.empty_like(H), np.empty((n if tangent else 0, dim, dim, dim, dim))
         parameters = [_values(parameter) for parameter in self._constants()]
         if "displacement_gradient" in state:
-            new, invalid = self._with_history(loop, parameters, H, state, P, A)
+            new, invalid = self._with_history(parameters, H, state, P, A)
         else:
             new = {"stress": np.empty((n, num_components(dim)))}
-            invalid = loops.update_elastic(loop, H, parameters, P, A, new["stress"])
+            invalid = loops.update_elastic(self._return(), H, parameters, P, A, new["stress"])
         valid = np.ones(n, dtype=bool)
         valid[invalid] = False
         require_valid(valid)
@@ -78,8 +126,7 @@ class CompiledMaterial(StrainMaterial):
     def at_pressure(
         self, displacement_gradient: Array, state: State, pressure: Array, shear: Array
     ) -> AtPressure:
-        loop = self._known_loop()
-        if not loop or "displacement_gradient" not in state:
+        if not self._has_compiled_update() or "displacement_gradient" not in state:
             return super().at_pressure(displacement_gradient, state, pressure, shear)
         H = np.ascontiguousarray(displacement_gradient)
         n, dim, _ = H.shape
@@ -89,7 +136,7 @@ class CompiledMaterial(StrainMaterial):
         given = np.ascontiguousarray(pressure), ALPHA * shear
         seen = gap, compliance, slope, by_pressure
         parameters = [_values(parameter) for parameter in self._constants()]
-        new, invalid = self._with_history(loop, parameters, H, state, P, A, given, seen)
+        new, invalid = self._with_history(parameters, H, state, P, A, given, seen)
         lost = invalid[np.isnan(gap[invalid])]
         if len(lost):
             raise ConvergenceError(
@@ -105,7 +152,7 @@ class CompiledMaterial(StrainMaterial):
     @property
     def is_differentiable(self) -> bool:
         """Whether there is :meth:`pull` of its updates."""
-        return self._known_loop() == self._loop != ""
+        return self._has_compiled_update() and self._return() == self._loop
 
     def numbers(self) -> Array:
         """Return the numbers of the compiled law, shape ``(k, n)``, or ``(k, 1)`` if all alike.
@@ -165,7 +212,6 @@ class CompiledMaterial(StrainMaterial):
 
     def _with_history(
         self,
-        loop: str,
         parameters: list[Array],
         H: Array,
         state: State,
@@ -185,7 +231,7 @@ class CompiledMaterial(StrainMaterial):
         variables = [np.empty(n) for _ in names]
         run = loops.update_at_pressure if given else loops.update_plastic
         invalid = run(
-            loop,
+            self._return(),
             H,
             np.ascontiguousarray(state["displacement_gradient"]),
             np.ascontiguousarray(state["elastic_b_minus_identity"]),

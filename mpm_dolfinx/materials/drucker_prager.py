@@ -4,17 +4,17 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, NamedTuple, get_args, override
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
-from .base import Field, Integration, Parameter, State
-from .mandel import deviator, deviatoric_projector, identity, norm, trace
+from .base import Field, Parameter
+from .mandel import deviator, norm, trace
 from .mohr_coulomb import FrictionalMaterial
 
-__all__ = ["DruckerPrager", "Returned", "returned_tangent"]
+__all__ = ["DruckerPrager"]
 
 Array = NDArray[np.float64]
 Match = Literal["outer", "inner", "plane_strain"]
@@ -54,10 +54,6 @@ class DruckerPrager(FrictionalMaterial):
         tension_cutoff: ArrayLike | Field | None = None,
         match: Match = "outer",
         *,
-        cohesion_residual: ArrayLike | Field | None = None,
-        friction_residual: ArrayLike | Field | None = None,
-        decay: ArrayLike | Field | None = None,
-        relaxation_time: ArrayLike | Field | None = None,
         volume_correction: bool = False,
     ) -> None:
         """Set the parameters.
@@ -72,11 +68,6 @@ class DruckerPrager(FrictionalMaterial):
                 tangent symmetric.
             tension_cutoff: Largest mean stress that is borne; ``None``: as far as the cone goes.
             match: ``"outer"``, ``"inner"`` or ``"plane_strain"``.
-            cohesion_residual: Cohesion after much plastic strain; ``None``: as before.
-            friction_residual: Angle of friction after much plastic strain; ``None``: as before.
-                The angle of dilation falls with it where it is larger.
-            decay: How fast strength falls: by 1/e in a plastic strain of 1/decay.
-            relaxation_time: Time in which stress beyond yield falls by 1/e; ``None``: at once.
             volume_correction: Whether volume that opens at the apex or the cap closes again
                 before there is pressure; without it, it is plastic and stays.
 
@@ -90,10 +81,6 @@ class DruckerPrager(FrictionalMaterial):
             friction_angle,
             dilation_angle,
             tension_cutoff,
-            cohesion_residual=cohesion_residual,
-            friction_residual=friction_residual,
-            decay=decay,
-            relaxation_time=relaxation_time,
             volume_correction=volume_correction,
         )
         if match not in get_args(Match):
@@ -136,114 +123,3 @@ class DruckerPrager(FrictionalMaterial):
         mean = trace(stress) / 3.0
         cone = np.sqrt(0.5) * norm(deviator(stress)) + eta * mean - strength
         return np.asarray(np.maximum(cone, mean - self._tension()))
-
-    @override
-    def give_back(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
-        n, m = trial_strain.shape
-        stress = self.elastic_stress(trial_strain)
-        D = self.elastic_tangent(n, m) if tangent else None
-        constants = _Constants(*(np.broadcast_to(c, n) for c in self._constants()))
-        bulk, shear, eta, _, strength, top, _ = constants
-        mean = bulk * trace(trial_strain)
-        root = np.sqrt(2.0) * shear * norm(deviator(trial_strain))
-        room = self.yield_tolerance * (root + np.abs(mean) + strength)
-        beyond = (root + eta * mean - strength > room) | (mean - top > room)
-        points = np.flatnonzero(beyond)
-        if len(points) == 0:
-            return Integration(stress, D, trial_strain, variables)
-        elastic, kappa = trial_strain.copy(), variables["plastic_strain"].copy()
-        stress[points], elastic[points], D_plastic = _give_back(
-            _Constants(*(values[points] for values in constants)), trial_strain[points], tangent
-        )
-        kappa[points] += np.sqrt(2.0 / 3.0) * norm(trial_strain[points] - elastic[points])
-        if D is not None:
-            D = D.copy()
-            D[points] = D_plastic
-        return Integration(stress, D, elastic, {"plastic_strain": kappa})
-
-
-class _Constants(NamedTuple):
-    """Constants of a number of points, shape ``(n,)`` each."""
-
-    bulk: Array
-    shear: Array
-    eta: Array
-    flow: Array
-    strength: Array
-    top: Array
-    corrects: Array
-
-
-def _give_back(
-    constants: _Constants, strain: Array, tangent: bool
-) -> tuple[Array, Array, Array | None]:
-    """Return stress, elastic strain and tangent of trial strains ``(n, m)`` that yield."""
-    n = len(strain)
-    bulk, shear, eta, flow, strength, top, corrects = constants
-    mean, dev = bulk * trace(strain), deviator(strain)
-    size = norm(dev)
-    root = np.sqrt(2.0) * shear * size
-    # The cone, and where its mean stress is too large, the cap.
-    stiffness = shear + bulk * eta * flow
-    multiplier = np.maximum(root + eta * mean - strength, 0.0) / stiffness
-    returned = mean - bulk * flow * multiplier
-    cap = returned > top
-    with np.errstate(invalid="ignore"):
-        limit = np.where(cap, np.maximum(strength - eta * top, 0.0), np.inf)
-    p = np.where(cap, top, returned)
-    held = cap & (root < limit)
-    q = np.where(cap, np.minimum(root, limit), root - shear * multiplier)
-    ratio = np.divide(q, root, out=np.ones(n), where=root > 0.0)
-    ratio = np.where(cap & ~held & (root == 0.0), 0.0, ratio)
-    elastic = ratio[:, None] * dev
-    volume = np.where(cap & (corrects != 0.0), trace(strain), p / bulk)
-    elastic[:, :3] += (volume / 3.0)[:, None]
-    stress = (2.0 * shear * ratio)[:, None] * dev
-    stress[:, :3] += p[:, None]
-    if not tangent:
-        return stress, elastic, None
-    answer = Returned(
-        p,
-        q,
-        p_trace=np.where(cap, 0.0, bulk * (1.0 - bulk * eta * flow / stiffness)),
-        p_size=np.where(cap, 0.0, -np.sqrt(2.0) * shear * bulk * flow / stiffness),
-        q_trace=np.where(cap, 0.0, -shear * bulk * eta / stiffness),
-        q_size=np.sqrt(2.0) * shear * np.where(cap, held, 1.0 - shear / stiffness),
-    )
-    return stress, elastic, returned_tangent(answer, strain, shear, ratio)
-
-
-class Returned(NamedTuple):
-    """Result of a return in p and q, the root of J2, with derivatives, shape ``(n,)`` each.
-
-    Derivatives are those by the trace and by the size of the deviator of the trial strain.
-    """
-
-    p: Array
-    q: Array
-    p_trace: Array
-    p_size: Array
-    q_trace: Array
-    q_size: Array
-
-
-def returned_tangent(law: Returned, strain: Array, shear: Array, ratio: Array) -> Array:
-    """Return the tangent of a law of two invariants, shape ``(n, m, m)``.
-
-    Args:
-        law: What it returns to.
-        strain: Trial strains, shape ``(n, m)``.
-        shear: Shear modulus, shape ``(n,)``.
-        ratio: q over that of the trial state, shape ``(n,)``.
-    """
-    m = strain.shape[1]
-    one, dev = identity(m), deviator(strain)
-    size = norm(dev)[:, None]
-    direction = np.divide(dev, size, out=np.zeros_like(dev), where=size > 0.0)
-    along = np.sqrt(2.0) * law.q_size - 2.0 * shear * ratio
-    D = np.einsum("n,ij->nij", 2.0 * shear * ratio, deviatoric_projector(m))
-    D += np.einsum("n,ni,nj->nij", along, direction, direction)
-    D += np.einsum("n,i,j->nij", law.p_trace, one, one)
-    D += np.einsum("n,i,nj->nij", law.p_size, one, direction)
-    D += np.einsum("n,ni,j->nij", np.sqrt(2.0) * law.q_trace, direction, one)
-    return np.asarray(D)

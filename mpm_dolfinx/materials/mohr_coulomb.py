@@ -7,17 +7,16 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, NamedTuple, Self, override
+from typing import Any, ClassVar, Literal, Self, override
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
-from .base import Field, Integration, Parameter, State, check_parameter
+from .base import Field, Parameter, State, check_parameter
 from .mandel import to_tensor
 from .plastic import PlasticMaterial
-from .principal import axes_in_order, from_axes, shear_quotients, tangent_from_axes
-from .softening import SofteningMaterial, require_softening
+from .softening import SofteningMaterial
 
 __all__ = ["FrictionalMaterial", "MohrCoulomb", "Tresca"]
 
@@ -63,10 +62,6 @@ class FrictionalMaterial(SofteningMaterial):
         dilation_angle: ArrayLike | Field = 0.0,
         tension_cutoff: ArrayLike | Field | None = None,
         *,
-        cohesion_residual: ArrayLike | Field | None = None,
-        friction_residual: ArrayLike | Field | None = None,
-        decay: ArrayLike | Field | None = None,
-        relaxation_time: ArrayLike | Field | None = None,
         volume_correction: bool = False,
     ) -> None:
         """Set the parameters.
@@ -81,19 +76,13 @@ class FrictionalMaterial(SofteningMaterial):
                 tangent symmetric.
             tension_cutoff: Largest tension that is borne, in units of stress; ``None``: as far as
                 cohesion and friction go.
-            cohesion_residual: Cohesion after much plastic strain; ``None``: as before.
-            friction_residual: Angle of friction after much plastic strain; ``None``: as before.
-                The angle of dilation falls with it where it is larger.
-            decay: How fast strength falls: by 1/e in a plastic strain of 1/decay.
-            relaxation_time: Time in which stress beyond yield falls by 1/e; ``None``: at once.
             volume_correction: Whether volume that opens at the apex (or at the corner of the
                 cut-off on the hydrostatic axis) is kept in mind, and closes again at the stress
                 of the apex, before there is pressure: for soils that part and come together
                 again. Without it, it is plastic and stays.
 
         Raises:
-            MPMError: A value is out of range; a residual strength without decay, decay without a
-                residual strength, or one that is larger than the strength at first.
+            MPMError: A value is out of range.
         """
         super().__init__(young, poisson)
         given: dict[str, Any] = {
@@ -101,22 +90,42 @@ class FrictionalMaterial(SofteningMaterial):
             "friction_angle": friction_angle,
             "dilation_angle": dilation_angle,
         }
-        optional = {
-            "tension_cutoff": tension_cutoff,
-            "cohesion_residual": cohesion_residual,
-            "friction_residual": friction_residual,
-            "decay": decay,
-            "relaxation_time": relaxation_time,
-        }
-        given |= {name: value for name, value in optional.items() if value is not None}
+        if tension_cutoff is not None:
+            given["tension_cutoff"] = tension_cutoff
         checked = {name: check_parameter(name, v, **self.limits[name]) for name, v in given.items()}
         self.parameters = {**self.parameters, **checked}
         friction, dilation = (checked[angle] for angle in _ANGLES)
         numbers = isinstance(friction, float) and isinstance(dilation, float)
         self.symmetric = friction == dilation if numbers else friction_angle is dilation_angle
         _require_less_dilation(checked["friction_angle"], checked["dilation_angle"])
-        _require_softening(checked)
         self.volume_correction = bool(volume_correction)
+
+    def with_softening(
+        self,
+        decay: ArrayLike | Field,
+        *,
+        cohesion: ArrayLike | Field | None = None,
+        friction_angle: ArrayLike | Field | None = None,
+    ) -> Self:
+        """Return this law with a strength that falls as plastic strain accumulates.
+
+        Args:
+            decay: How fast: by 1/e in a plastic strain of 1/decay.
+            cohesion: Cohesion after much plastic strain, the parameter ``"cohesion_residual"``;
+                ``None``: as before.
+            friction_angle: Angle of friction after much plastic strain, the parameter
+                ``"friction_residual"``; ``None``: as before. The angle of dilation falls with it
+                where it is larger.
+
+        Raises:
+            MPMError: A value is out of range, neither strength falls, or one rises.
+        """
+        strengths = {"cohesion_residual": cohesion, "friction_residual": friction_angle}
+        given: dict[str, Any] = {"decay": decay}
+        given |= {name: value for name, value in strengths.items() if value is not None}
+        other = self.with_parameters(**given)
+        _require_softening(other.parameters)
+        return other
 
     @override
     def with_share(self, left: Array) -> Self:
@@ -207,7 +216,12 @@ _RESIDUALS = {"cohesion": "cohesion_residual", "friction_angle": "friction_resid
 
 def _require_softening(parameters: Mapping[str, Parameter]) -> None:
     """Raise an error where what is said of softening is not whole, or is hardening."""
-    require_softening(parameters, _RESIDUALS)
+    given = [name for name in _RESIDUALS.values() if name in parameters]
+    if ("decay" in parameters) != bool(given):
+        raise MPMError(
+            f"Softening needs decay and a residual strength, {' or '.join(_RESIDUALS.values())}; "
+            f"given: {', '.join(given) or 'decay'}."
+        )
     for name, residual in _RESIDUALS.items():
         first, last = parameters[name], parameters.get(residual, 0.0)
         if not all(isinstance(value, float | np.ndarray) for value in (first, last)):
@@ -273,28 +287,6 @@ class MohrCoulomb(FrictionalMaterial):
         corrects = float(self.volume_correction)
         return self.bulk, self.shear, friction, dilation, strength, self._tension(), corrects
 
-    @override
-    def give_back(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
-        n, m = trial_strain.shape
-        stress = self.elastic_stress(trial_strain)
-        D = self.elastic_tangent(n, m) if tangent else None
-        strain, axes = axes_in_order(trial_strain)
-        law = _Law.of(self._constants(), n)
-        points = np.flatnonzero(law.yields(strain, self.yield_tolerance))
-        if len(points) == 0:
-            return Integration(stress, D, trial_strain, variables)
-        law, strain, axes = law.at(points), strain[:, points], axes[:, :, points]
-        answer = law.give_back(strain, self.yield_tolerance)
-        elastic, kappa = trial_strain.copy(), variables["plastic_strain"].copy()
-        stress[points] = from_axes(answer.stress, axes, m)
-        elastic[points] = from_axes(answer.elastic, axes, m)
-        kappa[points] += np.sqrt(2.0 / 3.0 * np.sum((strain - answer.elastic) ** 2, axis=0))
-        if D is not None:
-            D = D.copy()
-            quotients = shear_quotients(strain, answer.elastic, answer.normal, law.shear)
-            D[points] = tangent_from_axes(answer.normal, quotients, axes, m)
-        return Integration(stress, D, elastic, {"plastic_strain": kappa})
-
 
 class Tresca(MohrCoulomb):
     """:class:`MohrCoulomb` without friction and dilation: (s1 - s3)/2 = c."""
@@ -310,10 +302,6 @@ class Tresca(MohrCoulomb):
         poisson: ArrayLike | Field,
         cohesion: ArrayLike | Field,
         tension_cutoff: ArrayLike | Field | None = None,
-        *,
-        cohesion_residual: ArrayLike | Field | None = None,
-        decay: ArrayLike | Field | None = None,
-        relaxation_time: ArrayLike | Field | None = None,
     ) -> None:
         """Set the parameters.
 
@@ -322,208 +310,8 @@ class Tresca(MohrCoulomb):
             poisson: Poisson's ratio.
             cohesion: Shear strength, half the uniaxial one, in units of stress.
             tension_cutoff: Largest tension that is borne, in units of stress; ``None``: any.
-            cohesion_residual: Cohesion after much plastic strain; ``None``: as before.
-            decay: How fast it falls: by 1/e in a plastic strain of 1/decay.
-            relaxation_time: Time in which stress beyond yield falls by 1/e; ``None``: at once.
 
         Raises:
             MPMError: A value is out of range; see :class:`FrictionalMaterial`.
         """
-        super().__init__(
-            young,
-            poisson,
-            cohesion,
-            0.0,
-            0.0,
-            tension_cutoff,
-            cohesion_residual=cohesion_residual,
-            decay=decay,
-            relaxation_time=relaxation_time,
-        )
-
-
-class _Answer(NamedTuple):
-    """Principal values at the end of a step: ``(3, n)``, the derivatives ``(3, 3, n)``."""
-
-    stress: Array
-    elastic: Array
-    normal: Array
-
-    def put(self, where: NDArray[np.bool_], other: _Answer) -> None:
-        """Take over another answer at some points."""
-        for mine, theirs in zip(self, other, strict=True):
-            mine[..., where] = theirs[..., where]
-
-
-AVERAGES = {
-    "plane": np.eye(3),
-    "compression": np.array([[0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.0, 0.0, 1.0]]),
-    "extension": np.array([[1.0, 0.0, 0.0], [0.0, 0.5, 0.5], [0.0, 0.5, 0.5]]),
-}
-"""Principal values on a plane and on the two edges, where two of them are equal."""
-
-
-class _Law(NamedTuple):
-    """Constants of a number of points, shape ``(n,)`` each.
-
-    The yield function is (1 + sin phi) s1 - (1 - sin phi) s3 - strength here.
-    """
-
-    bulk: Array
-    shear: Array
-    friction: Array
-    dilation: Array
-    strength: Array
-    tension: Array
-    corrects: Array
-
-    @classmethod
-    def of(cls, constants: tuple[Parameter, ...], n: int) -> Self:
-        """Return the constants at n points."""
-        return cls(*(np.broadcast_to(value, n) for value in constants))
-
-    def at(self, points: NDArray[np.integer[Any]] | NDArray[np.bool_]) -> Self:
-        """Return the constants of some of the points."""
-        return type(self)(*(value[points] for value in self))
-
-    def stiffness(self) -> Array:
-        """Return the elastic stiffness of principal values, shape ``(3, 3, n)``."""
-        lame = self.bulk - 2.0 / 3.0 * self.shear
-        return np.asarray(lame + 2.0 * self.shear * np.eye(3)[:, :, None])
-
-    def _stress(self, elastic: Array) -> Array:
-        lame = self.bulk - 2.0 / 3.0 * self.shear
-        return np.asarray(lame * elastic.sum(axis=0) + 2.0 * self.shear * elastic)
-
-    def _excess(self, stress: Array) -> tuple[Array, Array]:
-        """Return the yield function, and what it is small against."""
-        tension, pressure = (1.0 + self.friction) * stress[0], (1.0 - self.friction) * stress[2]
-        size = np.abs(tension) + np.abs(pressure) + self.strength
-        return tension - pressure - self.strength, size
-
-    def yields(self, strain: Array, tolerance: float) -> NDArray[np.bool_]:
-        """Return whether the stress of strains ``(3, n)`` is beyond yield."""
-        stress = self._stress(strain)
-        f, size = self._excess(stress)
-        return np.asarray((f > tolerance * size) | (stress[0] - self.tension > tolerance * size))
-
-    def give_back(self, strain: Array, tolerance: float) -> _Answer:
-        """Return trial strains ``(3, n)``, of which all yield, to the yield surface."""
-        stress = self._stress(strain)
-        answer = _Answer(stress, strain.copy(), self.stiffness())
-        with np.errstate(divide="ignore", invalid="ignore"):
-            apex = self.strength / (2.0 * self.friction)
-        f, size = self._excess(stress)
-        shears = f > tolerance * size
-        if shears.any():
-            law = self.at(shears)
-            part = law.to_pyramid(strain[:, shears], apex[shears])
-            for mine, theirs in zip(answer, part, strict=True):
-                mine[..., shears] = theirs
-        # The cut-off lies beyond the apex where it is larger.
-        cut = (answer.stress[0] - self.tension > tolerance * size) & ~(self.tension >= apex)
-        if cut.any():
-            part = self.at(cut).to_cutoff(strain[:, cut])
-            for mine, theirs in zip(answer, part, strict=True):
-                mine[..., cut] = theirs
-        return answer
-
-    def to_pyramid(self, strain: Array, apex: Array) -> _Answer:
-        """Return strains to Mohr-Coulomb's pyramid without cut-off."""
-        answer = self._along("plane", strain)
-        e = answer.elastic
-        low, high = e[0] < e[1], e[1] < e[2]
-        compression = self._along("compression", strain)
-        extension = self._along("extension", strain)
-        first = low & (compression.elastic[0] >= compression.elastic[2])
-        second = high & ~first & (extension.elastic[0] >= extension.elastic[2])
-        neither = (low | high) & ~first & ~second
-        answer.put(first, compression)
-        answer.put(second, extension)
-        if neither.any():
-            law, corner = self.at(neither), np.broadcast_to(apex[neither], (3, neither.sum()))
-            part = law.at_stress(strain[:, neither], (0, 1, 2), corner)
-            part = law.with_volume(strain[:, neither], part)
-            for mine, theirs in zip(answer, part, strict=True):
-                mine[..., neither] = theirs
-        return answer
-
-    def _along(self, where: str, strain: Array) -> _Answer:
-        """Return strains to the plane or an edge, as if these went on for ever."""
-        average = AVERAGES[where]
-        yield_, flow = (
-            average @ np.stack((1.0 + sine, np.zeros_like(sine), sine - 1.0))
-            for sine in (self.friction, self.dilation)
-        )
-        averaged = average @ strain
-        f = np.sum(yield_ * self._stress(averaged), axis=0) - self.strength
-        push, pull = self._stress(flow), self._stress(yield_)
-        curvature = np.sum(yield_ * push, axis=0)
-        elastic = averaged - f / curvature * flow
-        lame = self.bulk - 2.0 / 3.0 * self.shear
-        normal = lame + 2.0 * self.shear * average[:, :, None]
-        normal = normal - push[:, None] * pull[None] / curvature
-        return _Answer(self._stress(elastic), elastic, normal)
-
-    def at_stress(self, strain: Array, which: tuple[int, ...], values: Array) -> _Answer:
-        """Return the answer with some stresses given and no plastic strain along the other axes.
-
-        Args:
-            strain: Trial strains, shape ``(3, n)``.
-            which: Numbers of the stresses that are given.
-            values: Their values, shape ``(3, n)``; the others are not looked at.
-        """
-        given = np.isin(np.arange(3), which)[:, None]
-        lame, shear = self.bulk - 2.0 / 3.0 * self.shear, 2.0 * self.shear
-        slope = 1.0 / (1.0 + len(which) * lame / shear)
-        trace = slope * np.where(given, values / shear, strain).sum(axis=0)
-        elastic = np.where(given, (values - lame * trace) / shear, strain)
-        stress = np.where(given, values, lame * trace + shear * strain)
-        free = (~given & ~given.T)[:, :, None]
-        normal = free * (lame * slope + shear * np.eye(3)[:, :, None])
-        return _Answer(stress, elastic, normal)
-
-    def with_volume(self, strain: Array, answer: _Answer) -> _Answer:
-        """Return the answer at a point of the hydrostatic axis, with the volume correction.
-
-        What opens there stays in the elastic strain, to close again before there is pressure.
-        """
-        third = np.broadcast_to(strain.sum(axis=0) / 3.0, strain.shape)
-        return answer._replace(elastic=np.where(self.corrects != 0.0, third, answer.elastic))
-
-    def to_cutoff(self, strain: Array) -> _Answer:
-        """Return strains to the cut-off, its edges and corners: what fits best, or fits."""
-        t = self.tension
-        with np.errstate(divide="ignore"):
-            least = ((1.0 + self.friction) * t - self.strength) / (1.0 - self.friction)
-            ratio = (1.0 + self.dilation) / (1.0 - self.dilation)
-        unit = 2.0 * self.shear
-        candidates = (
-            ((0,), (t, t, t)),
-            ((0, 1), (t, t, t)),
-            ((0, 1, 2), (t, t, t)),
-            ((0, 2), (t, t, least)),
-            ((0, 1, 2), (t, t, least)),
-            ((0, 1, 2), (t, least, least)),
-        )
-        best = np.full(strain.shape[1], np.inf)
-        answer = _Answer(np.empty_like(strain), np.empty_like(strain), np.empty((3, *strain.shape)))
-        for number, (which, values) in enumerate(candidates):
-            candidate = self.at_stress(strain, which, np.stack(values))
-            s, p = candidate.stress, strain - candidate.elastic
-            # By how much the answer is not one, as a strain.
-            misfits = {
-                0: (-p[0], (s[1] - t) / unit, (least - s[2]) / unit),
-                1: (-p[0], -p[1], (s[2] - t) / unit, (least - s[2]) / unit),
-                2: (-p[0], -p[1], -p[2]),
-                3: (p[2], -ratio * p[2] - p[0], (s[1] - t) / unit, (least - s[1]) / unit),
-                4: (p[2], -p[0], -p[1], -ratio * p[2] - p[0] - p[1]),
-                5: (p[1], p[2], -ratio * (p[1] + p[2]) - p[0]),
-            }[number]
-            if number == 2:
-                candidate = self.with_volume(strain, candidate)
-            misfit = np.max(misfits, axis=0)
-            better = misfit < best
-            best = np.where(better, misfit, best)
-            answer.put(better, candidate)
-        return answer
+        super().__init__(young, poisson, cohesion, 0.0, 0.0, tension_cutoff)

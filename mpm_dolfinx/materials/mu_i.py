@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
 from .base import Field, Integration, Parameter, State, check_parameter
-from .drucker_prager import Returned, returned_tangent
+from .compiled import CompiledMaterial
 from .elastic import IsotropicElastic
 from .mandel import deviator, norm, trace
 
@@ -147,67 +147,7 @@ class MuIRheology(IsotropicElastic):
 
     @override
     def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
-        n, m = trial_strain.shape
-        stress = self.elastic_stress(trial_strain)
-        D = self.elastic_tangent(n, m) if tangent else None
-        constants = [np.broadcast_to(c, n) for c in self._constants()]
-        bulk, shear, friction = constants[:3]
-        pressure = -bulk * trace(trial_strain)
-        root = np.sqrt(2.0) * shear * norm(deviator(trial_strain))
-        room = self.yield_tolerance * (root + np.abs(pressure))
-        points = np.flatnonzero((root - friction * pressure > room) | (-pressure > room))
-        if len(points) == 0:
-            return Integration(stress, D, trial_strain, variables)
-        constants = [values[points] for values in constants]
-        strain, shear = trial_strain[points], shear[points]
-        answer = _give_back(constants, pressure[points], root[points])
-        ratio = np.divide(
-            answer.q, root[points], out=np.zeros(len(points)), where=root[points] > 0.0
-        )
-        part = ratio[:, None] * deviator(strain)
-        stress[points] = 2.0 * shear[:, None] * part
-        stress[points, :3] += answer.p[:, None]
-        elastic, kappa = trial_strain.copy(), variables["plastic_strain"].copy()
-        part[:, :3] += trace(strain)[:, None] / 3.0
-        elastic[points] = part
-        kappa[points] += np.sqrt(2.0 / 3.0) * norm(strain - part)
-        if D is not None:
-            D = D.copy()
-            D[points] = returned_tangent(answer, strain, shear, ratio)
-        return Integration(stress, D, elastic, {"plastic_strain": kappa})
-
-
-def _give_back(constants: list[Array], pressure: Array, root: Array) -> Returned:
-    """Return the stresses that yielding trial states return to.
-
-    The plastic shear of a step is the positive root of G k x^2 + b x = f w, with w = dt sqrt(P),
-    k = d sqrt(rho_s)/I_0, f the excess over mu_s P, and b = G w + k ((mu_2 - mu_s) P - f).
-
-    Args:
-        constants: As :meth:`MuIRheology._constants` gives them, shape ``(n,)`` each.
-        pressure: P of the trial state.
-        root: Its root of J2.
-    """
-    bulk, shear, friction, span, lag, time = constants
-    apart = ~(pressure > 0.0)
-    P = np.where(apart, 1.0, pressure)
-    f = np.where(apart, 1.0, root - friction * P)
-    wait = time * np.sqrt(P)
-    b = shear * wait + lag * (span * P - f)
-    slope = np.sqrt(b**2 + 4.0 * shear * lag * f * wait)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slip = np.where(b > 0.0, 2.0 * f * wait / (b + slope), 0.5 * (slope - b) / (shear * lag))
-    q = np.clip(root - shear * slip, friction * P, (friction + span) * P)
-    by_root = 1.0 - shear * (lag * slip + wait) / slope
-    by_pressure = slip * lag * (friction + span) + wait * (1.5 * friction - 0.5 * q / P)
-    return Returned(
-        p=np.where(apart, 0.0, -P),
-        q=np.where(apart, 0.0, q),
-        p_trace=np.where(apart, 0.0, bulk),
-        p_size=np.zeros_like(P),
-        q_trace=np.where(apart, 0.0, -bulk * shear * by_pressure / slope),
-        q_size=np.where(apart, 0.0, np.sqrt(2.0) * shear * by_root),
-    )
+        return CompiledMaterial.integrate(self, trial_strain, variables, tangent)
 
 
 def _require_rising(parameters: Mapping[str, Any]) -> None:

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..tolerances import LOCAL_ITERATIONS
-from .base import Field, Integration, Parameter, State, check_parameter, per_row
+from .base import Field, Parameter, State, check_parameter, per_row
 from .compiled import CompiledMaterial
-from .mandel import identity, to_tensor, to_vector, trace
+from .mandel import to_tensor, to_vector, trace
 
 __all__ = ["NeoHooke"]
 
@@ -64,18 +64,6 @@ class NeoHooke(CompiledMaterial):
     @override
     def _constants(self) -> tuple[Parameter, ...]:
         return self.lame, self.shear
-
-    @override
-    def integrate(self, trial_strain: Array, variables: State, tangent: bool) -> Integration:
-        m = trial_strain.shape[1]
-        strains, axes = np.linalg.eigh(to_tensor(trial_strain))
-        stress = per_row(self.shear) * _spectral(np.expm1(2.0 * strains), axes, m)
-        stress[:, :3] += (self.lame * trace(trial_strain))[:, None]
-        D = None
-        if tangent:
-            shear, lame = (np.reshape(p, (-1, 1, 1)) for p in (self.shear, self.lame))
-            D = 2.0 * shear * _slopes(strains, axes, m) + lame * np.outer(identity(m), identity(m))
-        return Integration(stress, D, trial_strain, variables)
 
     @override
     def elastic_strain(self, stress: Array) -> Array:
@@ -129,24 +117,3 @@ def _spectral(values: Array, axes: Array, m: int) -> Array:
     """Mandel vectors, shape ``(n, m)``, of principal values ``(n, 3)`` and axes ``(n, 3, 3)``."""
     tensor = np.einsum("nia,na,nja->nij", axes, values, axes)
     return to_vector(tensor, 2 if m == 4 else 3)
-
-
-def _slopes(strains: Array, axes: Array, m: int) -> Array:
-    """Half the derivative of exp(2 eps) by eps, shape ``(n, m, m)``.
-
-    Args:
-        strains: Principal values of eps, shape ``(n, 3)``.
-        axes: Their directions as columns, shape ``(n, 3, 3)``.
-        m: Number of components.
-    """
-    result = np.zeros((len(strains), m, m))
-    for a in range(3):
-        for b in range(a, 3):
-            pair = np.einsum("ni,nj->nij", axes[:, :, a], axes[:, :, b])
-            scale = 0.5 if a == b else np.sqrt(0.5)
-            vector = to_vector(scale * (pair + pair.swapaxes(1, 2)), 2 if m == 4 else 3)
-            gap = strains[:, a] - strains[:, b]
-            ratio = np.where(gap == 0.0, 1.0, np.sinh(gap) / np.where(gap == 0.0, 1.0, gap))
-            factor = np.exp(strains[:, a] + strains[:, b]) * ratio
-            result += factor[:, None, None] * np.einsum("ni,nj->nij", vector, vector)
-    return result

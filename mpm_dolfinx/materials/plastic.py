@@ -8,12 +8,12 @@ import copy
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import ClassVar, Self, override
+from typing import Any, ClassVar, Self, override
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from .base import Integration, Parameter, State
+from .base import Field, Parameter, State
 from .elastic import IsotropicElastic
 
 __all__ = ["PlasticMaterial"]
@@ -22,9 +22,10 @@ type Array = NDArray[np.float64]
 
 
 class PlasticMaterial(IsotropicElastic):
-    """Base of plastic laws: viscoplastic ones where the parameters have a ``relaxation_time`` T.
+    """Base of plastic laws: viscoplastic ones with :meth:`with_relaxation`.
 
-    Stress beyond yield falls back in time (Duvaut & Lions 1972; Simo & Hughes 1998, section 3.7)::
+    With the parameter ``"relaxation_time"`` T stress beyond yield falls back in time (Duvaut &
+    Lions 1972; Simo & Hughes 1998, section 3.7)::
 
         d eps_p/dt = C^-1 (stress - stress_0)/T,    d kappa/dt = (kappa_0 - kappa)/T
 
@@ -47,6 +48,18 @@ class PlasticMaterial(IsotropicElastic):
     )
     duration = math.inf
 
+    def with_relaxation(self, time: ArrayLike | Field) -> Self:
+        """Return this law as a viscoplastic one.
+
+        Args:
+            time: In which stress beyond yield falls by 1/e, the parameter ``"relaxation_time"``.
+
+        Raises:
+            MPMError: Not a positive time.
+        """
+        given: dict[str, Any] = {"relaxation_time": time}
+        return self.with_parameters(**given)
+
     @property
     @override
     def needs_time(self) -> bool:
@@ -65,32 +78,6 @@ class PlasticMaterial(IsotropicElastic):
         if not self.needs_time or math.isinf(self.duration):
             return 1.0
         return self.duration / (self.duration + self.parameters["relaxation_time"])
-
-    def over_time(self, answer: Integration, trial_strain: Array, variables: State) -> Integration:
-        """Return the answer of the law over a step from that without time.
-
-        Args:
-            answer: Of the law without time.
-            trial_strain: As in :meth:`integrate`.
-            variables: As there.
-        """
-        share = self._share()
-        if isinstance(share, float) and share == 1.0:
-            return answer
-
-        def left(before: Array, after: Array) -> Array:
-            part = np.reshape(share, (-1,) + (1,) * (after.ndim - 1))
-            return np.asarray(before + part * (after - before))
-
-        D = answer.tangent
-        if D is not None:
-            D = left(self.elastic_tangent(*trial_strain.shape), D)
-        return Integration(
-            left(self.elastic_stress(trial_strain), answer.stress),
-            D,
-            left(trial_strain, answer.elastic_strain),
-            {name: left(variables[name], values) for name, values in answer.variables.items()},
-        )
 
     @override
     def stressed_state(

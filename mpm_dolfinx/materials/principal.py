@@ -13,10 +13,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..tolerances import EQUAL
 from .tensors import eigen, pack, unpack
 
-__all__ = ["axes_in_order", "from_axes", "shear_quotients", "tangent_from_axes"]
+__all__ = ["axes_in_order", "from_axes", "tangent_from_axes"]
 
 Array = NDArray[np.float64]
 
@@ -47,37 +46,12 @@ def from_axes(values: Array, axes: Array, m: int) -> Array:
     return pack(np.einsum("ian,jan->ijn", values * axes, axes))[:m].T
 
 
-def shear_quotients(strain: Array, elastic: Array, normal: Array, shear: Array) -> Array:
-    """Return the quotients of differences of stress and strain, shape ``(3, 3, n)``.
-
-    Of laws with linear elasticity, where differences of stress are 2 G times those of the elastic
-    strain. They are between 0 and 2 G, as the return keeps the order of the principal values;
-    where two strains are equal, the quotient is its limit.
-
-    Args:
-        strain: Trial strains, shape ``(3, n)``.
-        elastic: Elastic strains, shape ``(3, n)``.
-        normal: Derivatives of the stresses by the trial strains, shape ``(3, 3, n)``.
-        shear: Shear modulus G, shape ``(n,)``.
-    """
-    result = np.zeros_like(normal)
-    near = EQUAL * np.abs(strain).max(axis=0)
-    for a, b in ((0, 1), (1, 2), (0, 2)):
-        difference = strain[a] - strain[b]
-        equal = np.abs(difference) <= near
-        limit = 0.5 * (normal[a, a] - normal[a, b] - normal[b, a] + normal[b, b])
-        ratio = (elastic[a] - elastic[b]) / np.where(equal, 1.0, difference)
-        quotient = np.clip(np.where(equal, limit, 2.0 * shear * ratio), 0.0, 2.0 * shear)
-        result[a, b] = result[b, a] = quotient
-    return result
-
-
 def tangent_from_axes(normal: Array, quotients: Array, axes: Array, m: int) -> Array:
     """Return the tangent of principal values as matrices of Mandel vectors, shape ``(n, m, m)``.
 
     Args:
         normal: Derivatives of the principal stresses by the principal strains, ``(3, 3, n)``.
-        quotients: See :func:`shear_quotients`.
+        quotients: Those of differences of stress and strain, shape ``(3, 3, n)``.
         axes: Shape ``(3, 3, n)``.
         m: Length of a Mandel vector.
     """

@@ -132,7 +132,29 @@ class ReturnMapping(PlasticMaterial):
             D = D.copy()
             D[points] = law.elastic_tangent(len(points), m) @ moved
         answer = Integration(stress, D, elastic_strain, {"plastic_strain": plastic_strain})
-        return self.over_time(answer, trial_strain, variables)
+        return self._over_time(answer, trial_strain, variables)
+
+    def _over_time(
+        self, answer: Integration, trial_strain: NDArray[np.float64], variables: State
+    ) -> Integration:
+        """Return the answer of the law over a step from that without time."""
+        share = self._share()
+        if isinstance(share, float) and share == 1.0:
+            return answer
+
+        def left(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+            part = np.reshape(share, (-1,) + (1,) * (after.ndim - 1))
+            return np.asarray(before + part * (after - before))
+
+        D = answer.tangent
+        if D is not None:
+            D = left(self.elastic_tangent(*trial_strain.shape), D)
+        return Integration(
+            left(self.elastic_stress(trial_strain), answer.stress),
+            D,
+            left(trial_strain, answer.elastic_strain),
+            {name: left(variables[name], values) for name, values in answer.variables.items()},
+        )
 
     def _yielding(
         self, stress: NDArray[np.float64], plastic_strain: NDArray[np.float64]

@@ -119,7 +119,7 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
                 raise MPMError(f"A PorousProblem has no {name}=; omit it.")
         if not any(body.pore_fluid is not None or body.takes_time for body in given):
             raise MPMError(
-                "A PorousProblem needs a body with a pore_fluid=, or a law with a relaxation_time=."
+                "A PorousProblem needs a body with a pore_fluid=, or a law by with_relaxation()."
             )
         self._spaces_of_water = _spaces(given, pressure_space)
         self._filled: list[_Filled] = []

@@ -76,7 +76,7 @@ def test_domains_without_common_nodes_are_refused():
     V = fem.functionspace(grid, ("Lagrange", 1, (2,)))
     body = mesh.create_rectangle(comm, [[1, 1], [2, 2]], [2, 2], mesh.CellType.quadrilateral)
     particles = mpm.Particles(body, V, method="mpm")
-    law = mpm.materials.Tresca(1e3, 0.3, 1.0, cohesion_residual=0.5, decay=10.0)
+    law = mpm.materials.Tresca(1e3, 0.3, 1.0).with_softening(10.0, cohesion=0.5)
     with pytest.raises(mpm.MPMError, match="length= averages over neighbours"):
         mpm.QuasiStaticProblem(mpm.Body(particles, law, length=0.1))
 

@@ -146,8 +146,8 @@ SOILS = {
         young, poisson, yield_stress=300.0, hardening=1e3
     ),
     "lagging": lambda young, poisson: materials.VonMises(
-        young, poisson, yield_stress=100.0, hardening=1e3, relaxation_time=0.2
-    ),
+        young, poisson, yield_stress=100.0, hardening=1e3
+    ).with_relaxation(0.2),
 }
 
 

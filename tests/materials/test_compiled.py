@@ -2,18 +2,21 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """The compiled updates against NumPy's."""
 
+import contextlib
 import copy
 import functools
 import inspect
+import types
 
 import numpy as np
 import pytest
+import scenes
 from laws import in_python
 from marks import slow
 from materials.test_von_mises import random_path
 
 import mpm_dolfinx.materials
-from mpm_dolfinx import DomainDistortionError
+from mpm_dolfinx import DomainDistortionError, MPMError
 from mpm_dolfinx._core import loops
 from mpm_dolfinx.materials import (
     DruckerPrager,
@@ -25,7 +28,10 @@ from mpm_dolfinx.materials import (
     Tresca,
     VonMises,
 )
+from mpm_dolfinx.materials.compiled import BY_HEART, CompiledMaterial
+from mpm_dolfinx.materials.softening import SofteningMaterial
 
+RETURNS = (CompiledMaterial.integrate, SofteningMaterial.integrate, MuIRheology.integrate)
 COUNT = 50
 SPREAD = np.linspace(1.0, 2.0, COUNT)
 LAWS = {
@@ -47,17 +53,11 @@ LAWS = {
     "cam clay by point": ModifiedCamClay(0.2, 0.04, SPREAD, 300.0, 20.0 * SPREAD, 10.0 * SPREAD),
     "mohr-coulomb, corrected and softening by point": MohrCoulomb(
         *(1e3, 0.3, 2.0 * SPREAD, 20.0 * SPREAD, 5.0 * SPREAD, 0.5 * SPREAD),
-        cohesion_residual=SPREAD,
-        friction_residual=2.0,
-        decay=10.0 * SPREAD,
         volume_correction=True,
-    ),
+    ).with_softening(10.0 * SPREAD, cohesion=SPREAD, friction_angle=2.0),
     "drucker-prager, corrected and softening": DruckerPrager(
-        *(1e3, 0.3, 2.0, 30.0, 10.0),
-        cohesion_residual=0.5,
-        decay=20.0,
-        volume_correction=True,
-    ),
+        *(1e3, 0.3, 2.0, 30.0, 10.0), volume_correction=True
+    ).with_softening(20.0, cohesion=0.5),
     "mu(i)": MuIRheology(1e3, 0.3, 0.4, 0.7, 0.02, 3.0).in_time(0.01),
     "mu(i) by point, without rates": MuIRheology(1e3, 0.3, 0.4, 0.7 * SPREAD, 0.02, 3.0),
     "mu(i) by point": MuIRheology(
@@ -158,8 +158,9 @@ def test_a_gradient_that_may_be_written_to_is_copied():
 
 
 def test_an_heir_that_overrides_anything_has_no_compiled_update(monkeypatch):
-    # Any use of loops that are none is an error.
-    monkeypatch.setattr(mpm_dolfinx.materials.compiled, "loops", object())
+    # Any use of other loops than those of the return is an error.
+    alone = types.SimpleNamespace(integrate=loops.integrate)
+    monkeypatch.setattr(mpm_dolfinx.materials.compiled, "loops", alone)
     H = 1e-3 * np.random.default_rng(1).normal(size=(COUNT, 2, 2))
     every = {type(law): law for law in LAWS.values()}
     known = {law for law in vars(mpm_dolfinx.materials).values() if "_loop" in vars_of(law)}
@@ -172,10 +173,23 @@ def test_an_heir_that_overrides_anything_has_no_compiled_update(monkeypatch):
         for name in dir(law):
             if not name.startswith("__") and name not in ("_abc_impl", "_loop"):
                 heir = type("Heir", (law,), {name: inspect.getattr_static(law, name)})
-                as_a(heir, made).update(H, state)
+                known_by_heart = name in BY_HEART and law.integrate in RETURNS
+                told = pytest.raises(MPMError, match=f"overrides {name} of {law.__name__}")
+                with told if known_by_heart else contextlib.nullcontext():
+                    as_a(heir, made).update(H, state)
     own = as_a(VonMises, LAWS["perfect"])
     own.integrate = functools.partial(VonMises.integrate, own)
     own.update(H, own.initial_state(COUNT, 2))
+
+
+def test_an_heir_with_a_strength_of_its_own_is_refused_in_a_problem():
+    class Stronger(VonMises):
+        def strength(self, plastic_strain):
+            return 2.0 * super().strength(plastic_strain)
+
+    problem = scenes.block(Stronger(1e3, 0.3, rho_y=2.0), force=(0.0, -2.0))
+    with pytest.raises(MPMError, match="whose return does not ask it; override integrate"):
+        problem.solve(steps=1)
 
 
 def vars_of(one):

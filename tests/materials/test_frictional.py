@@ -45,11 +45,11 @@ LAWS = {
     "cone, corrected": DruckerPrager(*ELASTIC, COHESION, 30.0, volume_correction=True),
 }
 SOFTENING = {
-    "pyramid": MohrCoulomb(
-        *ELASTIC, COHESION, 30.0, 10.0, cohesion_residual=2.0, friction_residual=20.0, decay=50.0
+    "pyramid": MohrCoulomb(*ELASTIC, COHESION, 30.0, 10.0).with_softening(
+        50.0, cohesion=2.0, friction_angle=20.0
     ),
-    "tresca": Tresca(*ELASTIC, COHESION, cohesion_residual=2.0, decay=50.0),
-    "cone": DruckerPrager(*ELASTIC, COHESION, 30.0, friction_residual=5.0, decay=20.0),
+    "tresca": Tresca(*ELASTIC, COHESION).with_softening(50.0, cohesion=2.0),
+    "cone": DruckerPrager(*ELASTIC, COHESION, 30.0).with_softening(20.0, friction_angle=5.0),
 }
 PYRAMIDS = [name for name, law in LAWS.items() if isinstance(law, MohrCoulomb)]
 
@@ -438,7 +438,7 @@ def test_softening_of_a_body_follows_functions_and_is_weakened():
     V = vectors(box([0.0, 0.0], [1.5, 1.5], [3, 3], QUADRILATERAL))
     body = box([0.0, 0.0], [1.0, 1.0], [4, 4], QUADRILATERAL)
     residual = fem.Constant(body, 2.0)
-    law = Tresca(*ELASTIC, COHESION, cohesion_residual=residual, decay=100.0)
+    law = Tresca(*ELASTIC, COHESION).with_softening(100.0, cohesion=residual)
     every, moved = everywhere(V)
     particles = mpm.Particles(body, V)
     problem = mpm.QuasiStaticProblem(mpm.Body(particles, law), bcs=[every])
@@ -447,7 +447,7 @@ def test_softening_of_a_body_follows_functions_and_is_weakened():
         moved.interpolate(lambda x: (0.02 * t * x[0], -0.02 * t * x[1]))
 
     problem.solve(10, update=squeeze)
-    element = Tresca(*ELASTIC, COHESION, cohesion_residual=2.0, decay=100.0)
+    element = Tresca(*ELASTIC, COHESION).with_softening(100.0, cohesion=2.0)
     state = element.initial_state(1, 2)
     for step in range(1, 11):  # each moves where the last one has led to
         H = np.diag([1.002**step - 1.0, 0.998**step - 1.0])[None]
@@ -468,14 +468,19 @@ def test_softening_of_a_body_follows_functions_and_is_weakened():
     "options, message",
     [
         ({"decay": 1.0}, "Softening needs decay and a residual strength"),
-        ({"friction_residual": 20.0}, "given: friction_residual"),
-        ({"cohesion_residual": 2.0, "decay": 1.0}, "cohesion_residual is larger than cohesion"),
-        ({"friction_residual": 20.0, "decay": -1.0}, "decay is -1"),
+        ({"cohesion": 2.0, "decay": 1.0}, "cohesion_residual is larger than cohesion"),
+        ({"friction_angle": 20.0, "decay": -1.0}, "decay is -1"),
     ],
 )
 def test_bad_softening(options, message):
     with pytest.raises(MPMError, match=message):
-        MohrCoulomb(*ELASTIC, 1.0, 30.0, **options)
+        MohrCoulomb(*ELASTIC, 1.0, 30.0).with_softening(**options)
+
+
+def test_a_residual_strength_alone_is_told_where_a_law_is_used():
+    law = MohrCoulomb(*ELASTIC, 1.0, 30.0).with_parameters(friction_residual=20.0)
+    with pytest.raises(MPMError, match="given: friction_residual"):
+        law.initial_state(1, 2)
 
 
 @pytest.mark.parametrize("axisymmetric", [False, True])

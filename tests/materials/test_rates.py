@@ -11,8 +11,8 @@ from mpm_dolfinx.materials import MohrCoulomb, VonMises
 from mpm_dolfinx.materials.compiled import Taken
 
 LAWS = {name: law for name, law in LAWS.items() if "softening" not in name} | {
-    "lagging metal": VonMises(1e3, 0.3, 3.0, hardening=50.0, relaxation_time=0.2).in_time(0.1),
-    "lagging soil": MohrCoulomb(1e3, 0.3, 1.0, 30.0, 10.0, relaxation_time=0.2).in_time(0.1),
+    "lagging metal": VonMises(1e3, 0.3, 3.0, hardening=50.0).with_relaxation(0.2).in_time(0.1),
+    "lagging soil": MohrCoulomb(1e3, 0.3, 1.0, 30.0, 10.0).with_relaxation(0.2).in_time(0.1),
 }
 #: Differences that see the next branch of a law are told by a smaller one.
 CHANGES = 1e-6, 1e-8

@@ -20,18 +20,28 @@ from mpm_dolfinx.materials import (
 
 COUNT = 30
 AVERAGE = np.linspace(0.0, 0.1, COUNT)
-FALL = {"cohesion_residual": 0.5, "decay": 20.0}
+FALL = {"decay": 20.0, "cohesion": 0.5}
 LAWS = {
-    "von mises": VonMises(1e3, 0.3, rho_y=2.0, residual=0.3, decay=20.0),
-    "hardening too": VonMises(1e3, 0.3, yield_stress=2.0, hardening=20.0, residual=0.3, decay=20.0),
-    "small strain": SmallStrainVonMises(1e3, 0.3, yield_stress=2.0, residual=0.3, decay=20.0),
-    "tresca": Tresca(1e3, 0.3, 2.0, 1.0, **FALL),
-    "mohr-coulomb": MohrCoulomb(1e3, 0.3, 2.0, 30.0, 10.0, friction_residual=15.0, **FALL),
-    "corrected": MohrCoulomb(*(1e3, 0.3, 2.0, 30.0, 10.0, 0.5), volume_correction=True, **FALL),
-    "sand": MohrCoulomb(1e3, 0.3, 0.0, 30.0, 30.0, friction_residual=15.0, decay=20.0),
-    "cone": DruckerPrager(1e3, 0.3, 2.0, 30.0, 10.0, friction_residual=15.0, **FALL),
-    "inner cone": DruckerPrager(1e3, 0.3, 2.0, 30.0, 10.0, match="inner", **FALL),
-    "plane strain": DruckerPrager(1e3, 0.3, 2.0, 30.0, 10.0, 0.5, match="plane_strain", **FALL),
+    "von mises": VonMises(1e3, 0.3, rho_y=2.0).with_softening(20.0, residual=0.3),
+    "hardening too": VonMises(1e3, 0.3, yield_stress=2.0, hardening=20.0).with_softening(
+        20.0, residual=0.3
+    ),
+    "small strain": SmallStrainVonMises(1e3, 0.3, yield_stress=2.0).with_softening(
+        20.0, residual=0.3
+    ),
+    "tresca": Tresca(1e3, 0.3, 2.0, 1.0).with_softening(**FALL),
+    "mohr-coulomb": MohrCoulomb(1e3, 0.3, 2.0, 30.0, 10.0).with_softening(
+        friction_angle=15.0, **FALL
+    ),
+    "corrected": MohrCoulomb(
+        *(1e3, 0.3, 2.0, 30.0, 10.0, 0.5), volume_correction=True
+    ).with_softening(**FALL),
+    "sand": MohrCoulomb(1e3, 0.3, 0.0, 30.0, 30.0).with_softening(20.0, friction_angle=15.0),
+    "cone": DruckerPrager(1e3, 0.3, 2.0, 30.0, 10.0).with_softening(friction_angle=15.0, **FALL),
+    "inner cone": DruckerPrager(1e3, 0.3, 2.0, 30.0, 10.0, match="inner").with_softening(**FALL),
+    "plane strain": DruckerPrager(
+        *(1e3, 0.3, 2.0, 30.0, 10.0, 0.5), match="plane_strain"
+    ).with_softening(**FALL),
 }
 
 
@@ -76,7 +86,8 @@ def sheared(law, shears):
 
 
 def test_von_mises_softens_to_a_share_of_its_strength():
-    law = SmallStrainVonMises(1e3, 0.3, yield_stress=np.sqrt(3.0), residual=0.25, decay=30.0)
+    law = SmallStrainVonMises(1e3, 0.3, yield_stress=np.sqrt(3.0))
+    law = law.with_softening(30.0, residual=0.25)
     stresses, kappa = sheared(law, np.linspace(0.0, 0.4, 4001))
     assert abs(stresses.max() - 1.0) < 1e-12
     assert abs(stresses[-1] - (0.25 + 0.75 * np.exp(-30.0 * kappa))) < 1e-4
@@ -86,7 +97,8 @@ def test_von_mises_softens_to_a_share_of_its_strength():
 
 def test_a_point_by_itself_hardens_against_its_average():
     """The strength at 2 k - kappa, with the odd continuation below zero."""
-    law = SmallStrainVonMises(1e3, 0.3, yield_stress=np.sqrt(3.0), residual=0.25, decay=30.0)
+    law = SmallStrainVonMises(1e3, 0.3, yield_stress=np.sqrt(3.0))
+    law = law.with_softening(30.0, residual=0.25)
     for average in (0.0, 0.01, 0.2):
         stresses, kappa = sheared(law.softening_by(np.array([average])), [0.01, 0.1])
         driving = 30.0 * (2.0 * average - kappa)
@@ -97,15 +109,13 @@ def test_a_point_by_itself_hardens_against_its_average():
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"residual": 0.5}, "Softening needs decay and a residual strength"),
-        ({"decay": 5.0}, "Softening needs decay and a residual strength"),
         ({"residual": 1.5, "decay": 5.0}, "residual is 1.5"),
         ({"residual": 0.5, "decay": -5.0}, "decay is -5"),
     ],
 )
 def test_softening_that_makes_no_sense_is_refused(given, words):
     with pytest.raises(MPMError, match=words):
-        VonMises(1e3, 0.3, yield_stress=1.0, **given)
+        VonMises(1e3, 0.3, yield_stress=1.0).with_softening(**given)
 
 
 def test_laws_that_do_not_soften_stay_as_they_are():

@@ -49,7 +49,7 @@ BALANCED, IN_TURN = 1e-7, 3e-6
 
 def softening():
     """Return a law whose hardening keeps it from failing where it softens."""
-    return VonMises(YOUNG, POISSON, rho_y=3.0, hardening=300.0, residual=0.7, decay=20.0)
+    return VonMises(YOUNG, POISSON, rho_y=3.0, hardening=300.0).with_softening(20.0, residual=0.7)
 
 
 #: What each feature asks for. Two that ask one option for different values exclude each other.

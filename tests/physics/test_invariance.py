@@ -497,7 +497,8 @@ def softening(frame):
     scene = Scene(frame, particles={"quadrature_degree": 2})
     scene.body(scene.background())
     s = frame.stress
-    law = materials.VonMises(YOUNG * s, 0.3, 8 * s, hardening=100 * s, residual=0.7, decay=10.0)
+    law = materials.VonMises(YOUNG * s, 0.3, 8 * s, hardening=100 * s)
+    law = law.with_softening(10.0, residual=0.7)
     problem = scene.problem(law=law, length=0.5 * frame.length)
     problem.solve(3)
     assert problem.history.steps[-1].alternations > 2

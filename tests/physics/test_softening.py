@@ -39,12 +39,11 @@ def width_of_closed_form():
 def law_of(name, strength):
     """Return a law whose strength in shear is a Function."""
     if name == "tresca":
-        return mpm.materials.Tresca(
-            YOUNG, POISSON, strength, cohesion_residual=RESIDUAL * 0.9, decay=DECAY
-        )
+        law = mpm.materials.Tresca(YOUNG, POISSON, strength)
+        return law.with_softening(DECAY, cohesion=RESIDUAL * 0.9)
     strength.x.array[:] *= np.sqrt(3.0)
     law = mpm.materials.VonMises if name == "von mises" else mpm.materials.SmallStrainVonMises
-    return law(YOUNG, POISSON, yield_stress=strength, residual=RESIDUAL, decay=DECAY)
+    return law(YOUNG, POISSON, yield_stress=strength).with_softening(DECAY, residual=RESIDUAL)
 
 
 def bar(cells, law="von mises", degree=1, free=False, length=LENGTH, mixed=None, f_bar="none"):

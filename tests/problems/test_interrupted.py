@@ -129,7 +129,7 @@ def cracking(terms):
 
 
 def softening(terms):
-    law = VonMises(1e3, 0.3, rho_y=5.5, hardening=100.0, residual=0.9, decay=20.0)
+    law = VonMises(1e3, 0.3, rho_y=5.5, hardening=100.0).with_softening(20.0, residual=0.9)
     return of_law(terms, law, length=0.3)
 
 

@@ -508,7 +508,7 @@ SOILS = {
     "tresca": Tresca(300.0, 0.3, 1.0),
     "mohr-coulomb": MohrCoulomb(300.0, 0.3, 1.0, 20.0, 5.0),
     "associated": MohrCoulomb(300.0, 0.3, 1.0, 20.0, 20.0),
-    "softening": MohrCoulomb(300.0, 0.3, 1.0, 20.0, cohesion_residual=0.5, decay=10.0),
+    "softening": MohrCoulomb(300.0, 0.3, 1.0, 20.0).with_softening(10.0, cohesion=0.5),
     "drucker-prager": DruckerPrager(300.0, 0.3, 1.0, 20.0),
 }
 

@@ -26,7 +26,7 @@ from mpm_dolfinx.materials import MohrCoulomb, MuIRheology, Undrained, VonMises,
 
 STATIC, LIMIT, GRAIN, DENSITY, NUMBER = 0.5, 0.76, 0.02, 3.0, 0.279
 LAW = MuIRheology(1e4, 0.3, STATIC, LIMIT, GRAIN, DENSITY, NUMBER)
-LAGGING = MohrCoulomb(1e4, 0.3, 0.1, 30.0, cohesion_residual=0.05, decay=2.0, relaxation_time=5e-3)
+LAGGING = MohrCoulomb(1e4, 0.3, 0.1, 30.0).with_softening(2.0, cohesion=0.05).with_relaxation(5e-3)
 
 
 @pytest.mark.parametrize("scheme", ["midpoint", "euler"])
@@ -190,7 +190,7 @@ def drained(particles, bc, law):
 def test_stress_beyond_yield_relaxes_with_the_time_of_steps(problem_of, law):
     """A block that is sheared at once and held, in steps of two durations."""
     time, strain, modulus, strength = 0.1, 0.01, 1e3 / 2.6, 2.0
-    lagging = VonMises(1e3, 0.3, rho_y=np.sqrt(2.0) * strength, relaxation_time=time)
+    lagging = VonMises(1e3, 0.3, rho_y=np.sqrt(2.0) * strength).with_relaxation(time)
     lagging = Undrained(lagging, 1e3) if law == "undrained" else lagging
     V = vectors(box([-1.0, -1.0], [3.0, 2.0], [8, 6], QUADRILATERAL), 2)
     body = box([0.1, 0.1], [1.1, 1.1], [3, 3], QUADRILATERAL)
@@ -216,7 +216,7 @@ def test_stress_beyond_yield_relaxes_with_the_time_of_steps(problem_of, law):
 
 def test_a_law_that_needs_time_is_refused_where_there_is_none():
     body = box([0.1, 0.1], [1.1, 1.1], [3, 3], QUADRILATERAL)
-    lagging = VonMises(1e3, 0.3, rho_y=1.0, relaxation_time=1.0)
+    lagging = VonMises(1e3, 0.3, rho_y=1.0).with_relaxation(1.0)
     particles = mpm.Particles(body)
     bcs = [mpm.held(particles.W, y=0.1)]
     for law in (lagging, Undrained(lagging, 1e3)):
