@@ -34,7 +34,6 @@ from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.algorithms.strip_terminal_data import strip_terminal_data
 
 __all__ = [
-    "NOT_FINITE",
     "NUMBERS_CELLS",
     "CompiledIntegral",
     "NonlinearProblem",
@@ -63,16 +62,10 @@ __all__ = [
     "set_entry_places",
     "tabulated",
     "tags_from_nodes",
-    "use_basic_line_search",
     "vtk_cell",
 ]
 
 _VERSION = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])
-_REASONS: Any = PETSc.SNES.ConvergedReason
-#: Why SNES ends where a norm is not finite (another name before PETSc 3.24).
-NOT_FINITE: Any = getattr(_REASONS, "DIVERGED_FUNCTION_NANORINF", None) or getattr(
-    _REASONS, "DIVERGED_FNORM_NAN", None
-)
 #: Whether a mesh that is put together can be told the input index of its cells.
 NUMBERS_CELLS = _VERSION >= (0, 10)
 
@@ -361,19 +354,6 @@ def set_entries(matrix: PETSc.Mat, values: NDArray[np.float64]) -> None:
     matrix.zeroEntries()
     matrix.setValuesRCV(rows, columns, values[:, None], addv=PETSc.InsertMode.ADD_VALUES)
     matrix.assemble()
-
-
-def use_basic_line_search(snes: PETSc.SNES) -> None:
-    """Let a solver take full steps (petsc4py has no line search objects in PETSc 3.22)."""
-    if hasattr(snes, "getLineSearch"):
-        snes.getLineSearch().setType("basic")
-        return
-    options = PETSc.Options()
-    option = f"{snes.getOptionsPrefix() or ''}snes_linesearch_type"
-    if not options.hasName(option):
-        options[option] = "basic"
-        snes.setFromOptions()
-        options.delValue(option)
 
 
 class _NonlinearProblem:

@@ -9,16 +9,14 @@ own on each rank, in the middle of other collective calls too.
 
 from __future__ import annotations
 
-import weakref
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinx import mesh
 
-__all__ = ["Cleaner", "weakly"]
+__all__ = ["Cleaner"]
 
 
 class Cleaner:
@@ -53,19 +51,3 @@ class Cleaner:
         """Leave what the problem has to the next one (not collective)."""
         if self.comm.size > 1:
             self._ended[self._number] = self
-
-
-def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a call of a method that does not keep its object alive.
-
-    PETSc keeps its callbacks out of sight of Python's garbage collection, so a solver that held
-    itself through them would never be freed.
-    """
-    reference = weakref.WeakMethod(method)
-
-    def call(*args: Any) -> Any:
-        bound = reference()
-        assert bound is not None
-        return bound(*args)
-
-    return call

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from petsc4py import PETSc
-
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import MPMError
+from .judge import Judge
+from .line_search import LineSearch
 from .problem import ReducedProblem
+from .residual import Residual
+from .steps import Steps
 
 __all__ = ["Attempt", "Predictions"]
 
@@ -21,58 +22,28 @@ __all__ = ["Attempt", "Predictions"]
 KEPT = 2.0
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Attempt:
     """An attempt at a solution.
 
     Attributes:
         problem: As given to :meth:`NewtonSolver.solve`.
         shorten: As there.
-        predicts: Whether it may begin at a prediction.
         hurries: Whether it is given up soon where it makes no headway.
-        enough: Norm of a residual that is small enough, however large the forces are.
-        centre: Where the proximal term holds; ``None``: nowhere.
-        failure: Why the last evaluation, or all, has failed.
-        first: Norm of the first residual, with linearised forces of Dirichlet values.
-        norm: That of the last; ``norms`` are all.
-        norms: See above.
-        internal: Size of internal forces, once it is known.
-        tolerance: Norm of a residual that is small enough.
-        motion: Sizes of the last step and of the whole motion.
-        shrinks: Whether the last step was much smaller than that before.
-        stalled: Whether residuals no longer fall.
-        refines: Whether steps are those of the tangent itself, without the shift.
-        goes_on: How often a residual that was left has been gone on with.
-        ended: Whether it has ended by its own tests.
-        known: Whether the residual is that of the vector that PETSc asks for next.
-        fresh: Whether the tangent is.
-        negative: Number of negative eigenvalues that are permitted.
-        origin: Where the last step began.
-        yielding: Which particles yielded in late iterations.
+        residual: The residual.
+        steps: Finds Newton steps.
+        judge: Says when it is at an end.
+        search: Shortens the steps, if that is asked for.
+        yielding: Which particles yielded in each iteration, by body.
     """
 
     problem: ReducedProblem
     shorten: bool
-    predicts: bool
-    hurries: bool = False
-    enough: float = 0.0
-    centre: PETSc.Vec | None = None
-    failure: MPMError | None = None
-    first: float = 0.0
-    norm: float = np.inf
-    norms: list[float] = field(default_factory=list)
-    internal: float = np.inf
-    tolerance: float = 0.0
-    motion: tuple[float, float] = (0.0, 0.0)
-    shrinks: bool = True
-    stalled: bool = False
-    refines: bool = False
-    goes_on: int = 0
-    ended: bool = False
-    known: bool = False
-    fresh: bool = False
-    negative: int = 0
-    origin: PETSc.Vec | None = None
+    hurries: bool
+    residual: Residual
+    steps: Steps
+    judge: Judge
+    search: LineSearch | None
     yielding: list[list[NDArray[np.bool_]]] = field(default_factory=list)
 
 

@@ -15,7 +15,7 @@ from ..errors import MPMError
 from ..history import Statistics
 from ..parallel.magnitudes import norm, unit_sized
 
-__all__ = ["LineSearch", "stalled"]
+__all__ = ["LineSearch", "Rules", "stalled"]
 
 #: Most halvings of a Newton step, and the drop in work that needs none.
 HALVINGS = 8
@@ -70,8 +70,16 @@ class _Step(NamedTuple):
         return self._replace(work=0.5 * self.work)
 
 
-class _Rules(NamedTuple):
-    """Rules of a search in one solve; see :meth:`LineSearch.begin`."""
+class Rules(NamedTuple):
+    """Rules of the search in one solve.
+
+    Attributes:
+        potential: Whether the residual is the gradient of a potential.
+        works: Whether its work on a step tells if that is stable.
+        hurries: Whether a solve that is hard is better given up: see :func:`stalled`.
+        by_norm: Whether steps are judged by the residual's norm alone: without a potential, its
+            work on them may mean nothing.
+    """
 
     potential: bool
     works: bool
@@ -105,7 +113,7 @@ class LineSearch:
     accepted go to and fro over them.
 
     Args:
-        symmetric: Whether tangents are symmetric.
+        rules: The rules of the solve.
         evaluate: Evaluates the residual at unknowns into ``F``; returns a failure or ``None``.
         uphill: Says whether the step for a residual is not that of a positive definite tangent.
         redirect: Replaces it by a damped one that is, or reverses it; returns whether it is
@@ -116,36 +124,21 @@ class LineSearch:
 
     def __init__(
         self,
-        symmetric: bool,
+        rules: Rules,
         evaluate: Callable[[PETSc.Vec], MPMError | None],
         uphill: Callable[[PETSc.Vec, PETSc.Vec], bool],
         redirect: Callable[[PETSc.Vec, PETSc.Vec], bool],
         smooth: Callable[[], bool],
         statistics: Statistics,
     ) -> None:
-        self._symmetric = symmetric
+        self._rules = rules
         self._evaluate = evaluate
         self._uphill = uphill
         self._redirect = redirect
         self._smooth = smooth
         self._statistics = statistics
-        self._rules = _Rules(False, False, False, False)
         self._trusted: _Step | None = None
         self._since, self._may_trust = 0, True
-
-    def begin(self, works: bool, hurries: bool, by_norm: bool) -> None:
-        """Begin a solve.
-
-        Args:
-            works: Whether the residual's work on a step tells if that is stable; where tangents
-                are symmetric too, it is the gradient of a potential.
-            hurries: Whether a solve that is hard is better given up: see :func:`stalled`.
-            by_norm: Whether steps are judged by the residual's norm alone where there is no
-                potential, so that its work on them means nothing.
-        """
-        potential = self._symmetric and works
-        self._rules = _Rules(potential, works, hurries, by_norm and not potential)
-        self._trusted, self._since, self._may_trust = None, 0, True
 
     def __call__(self, x: PETSc.Vec, y: PETSc.Vec, F: PETSc.Vec, trial: PETSc.Vec) -> bool:
         """Choose the step to ``x - y`` (collective).

@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 import numpy as np
 
-from ..errors import MPMError
+from ..errors import ConvergenceError, MPMError
 from ..history import Statistics
 from ..parallel.totals import over_ranks
 from ..tolerances import HALF_DIGITS, ROUND_OFF, SOLVED
@@ -25,7 +25,7 @@ from .saddle import SaddleMultigrid
 from .strategies import STRATEGIES, mumps_options
 from .workspace import FACTORS, give_workspace, lacks_workspace
 
-__all__ = ["Indefinite", "ShiftedFactor"]
+__all__ = ["ShiftedFactor"]
 
 #: Most unknowns of the coarsest level of multigrid, which is factorised.
 COARSEST = 600
@@ -53,10 +53,6 @@ SINGULAR = (
     PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC,
     PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED,
 )
-
-
-class Indefinite(Exception):
-    """A tangent is not positive definite, for which a smaller step is the best cure."""
 
 
 class ShiftedFactor:
@@ -108,7 +104,6 @@ class ShiftedFactor:
         self._multigrid: Multigrid | SaddleMultigrid | None = None
         self._constrained = False
         self._levels: Levels | None = None
-        self._told: tuple[Any, Any] = None, None
         self._linear_solver = linear_solver
         self._negative = False
         self._indefinite = 0
@@ -130,6 +125,11 @@ class ShiftedFactor:
         said = any(key.startswith(("ksp_", "pc_", "mat_")) for key in given)
         with options_refused(), self._own_options() as database:
             snes.setFromOptions()
+            if snes.getType() != "newtonls" or database.hasName(f"{prefix}snes_linesearch_type"):
+                raise MPMError(
+                    "snes_type and snes_linesearch_type of petsc_options= have no meaning here, as "
+                    "Newton's method and its line search are this package's own; leave them out."
+                )
             own = database.hasName(f"{prefix}pc_factor_mat_solver_type")
             self._own_rtol = database.hasName(f"{prefix}ksp_rtol")
             self._own_type = any(database.hasName(prefix + key) for key in ("pc_type", "ksp_type"))
@@ -259,19 +259,16 @@ class ShiftedFactor:
         pc.setFactorSolverType(package)
 
     def forget(self) -> None:
-        """Take the next tangent for a new one, since SNES knows none any more."""
+        """Take the next tangent for a new one."""
         self.K = None
 
-    def set(self, K: PETSc.Mat, levels: Levels, damping: float = 0.0) -> bool:
+    def set(self, K: PETSc.Mat, levels: Levels, damping: float = 0.0) -> None:
         """Factorise K with the step's shift, or with a larger one (collective).
 
         Args:
             K: The tangent.
             levels: What multigrid must know of the unknowns.
             damping: Relative shift, if larger.
-
-        Returns:
-            Whether K and P are other objects than at the last call.
         """
         self._levels = levels
         if self.iterates and self._dear:
@@ -287,8 +284,6 @@ class ShiftedFactor:
         else:
             self._factorise(K, levels, damping)
         self._statistics.count("factorisations")
-        before, self._told = self._told, (K, self.P)
-        return before[0] is not K or before[1] is not self.P
 
     def _factorise(self, K: PETSc.Mat, levels: Levels, damping: float = 0.0) -> None:
         """Make a factor of K with a shift (collective)."""
@@ -417,8 +412,8 @@ class ShiftedFactor:
         if self.iterates:
             self._failures = 0
 
-    def finish(self, b: PETSc.Vec, x: PETSc.Vec, shorten: bool = False) -> bool:
-        """Look at what SNES has solved; return whether it is a solution (collective).
+    def step(self, b: PETSc.Vec, x: PETSc.Vec, shorten: bool = False) -> str | None:
+        """Solve for a Newton step, or say why that failed (collective).
 
         Where the method of conjugate gradients has found the tangent indefinite, that of
         generalised minimal residuals solves. Where multigrid comes to nothing a factor takes over
@@ -427,14 +422,15 @@ class ShiftedFactor:
 
         Args:
             b: The right-hand side.
-            x: The solution; replaced by a better one.
+            x: Set to the solution.
             shorten: Whether a step that fails is tried again with less load.
 
         Raises:
-            Indefinite: The tangent is, and a smaller step may do better.
+            ConvergenceError: The tangent is indefinite, and a smaller step of the load does better.
         """
+        self._ksp.solve(b, x)
         if not self.iterates:
-            return True
+            return _failure(self._ksp)
         self._statistics["krylov_iterations"] += self._ksp.getIterationNumber()
         K, levels = self.K, self._levels
         assert K is not None and levels is not None
@@ -446,15 +442,15 @@ class ShiftedFactor:
         reason = self._ksp.getConvergedReason()
         if reason >= 0 or self._does(b):
             self._assess(self._ksp, b)
-            return True
+            return None
         if reason in INDEFINITE:
             self._negative = True
             if self._solve_indefinite(b, x, self._ksp.getTolerances()[0]):
                 self._assess(self._flexible, b)
-                return True
+                return None
             self.give_up(shorten)
         if K.getSize()[0] > self._strategy.taken_over:
-            return False
+            return "as multigrid does not solve for a step; use linear='direct'"
         self._failures += 1
         self._dear = self._linear_solver == "auto"
         self._choose(False)
@@ -462,7 +458,7 @@ class ShiftedFactor:
         self._factorise(K, levels)
         self._statistics.count("multigrid_failures")
         self._ksp.solve(b, x)
-        return True
+        return _failure(self._ksp)
 
     def give_up(self, shorten: bool) -> None:
         """Give a step up whose tangent is indefinite, a few times, where multigrid solves.
@@ -471,11 +467,11 @@ class ShiftedFactor:
             shorten: Whether a step that fails is tried again with less load.
 
         Raises:
-            Indefinite: The step is given up.
+            ConvergenceError: The step is given up.
         """
         if self.iterates and shorten and self._indefinite < PATIENCE:
             self._indefinite += 1
-            raise Indefinite
+            raise ConvergenceError("The tangent is not positive definite")
 
     def _assess(self, ksp: PETSc.KSP, b: PETSc.Vec) -> None:
         """Note what a solve has left, and whether a factor would have cost less (collective)."""
@@ -558,6 +554,14 @@ class ShiftedFactor:
         if package == PETSc.Mat.SolverType.PETSC and not pc.getFailedReason():
             return int(pc.getFactorMatrix().getInertia()[0])
         return int(pc.getFactorMatrix().getMumpsInfog(12)) if package == "mumps" else 0
+
+
+def _failure(ksp: PETSc.KSP) -> str | None:
+    """Return why a solve has failed, ``None`` where it has not."""
+    reason = ksp.getConvergedReason()
+    if reason == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
+        return "as the factorisation of the tangent failed"
+    return "as a linear solve failed" if reason < 0 else None
 
 
 def _has_zeros(K: PETSc.Mat) -> bool:

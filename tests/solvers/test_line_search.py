@@ -14,7 +14,7 @@ from solvers.double_well import DoubleWell, newton
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.history import Statistics
-from mpm_dolfinx.solvers.line_search import LineSearch, stalled
+from mpm_dolfinx.solvers.line_search import LineSearch, Rules, stalled
 
 
 def test_a_step_uphill_is_redirected():
@@ -86,9 +86,13 @@ def test_work_that_tells_nothing_judges_a_step_by_its_size(works):
 
     statistics = Statistics()
     search = LineSearch(
-        False, evaluate, lambda *_: False, lambda *_: False, lambda: False, statistics
+        Rules(False, works, False, False),
+        evaluate,
+        lambda *_: False,
+        lambda *_: False,
+        lambda: False,
+        statistics,
     )
-    search.begin(works, False, False)
     x, y, F, trial = vector(0, 0), vector(-1, 0), vector(1, 0), vector(0, 0)
     assert search(x, y, F, trial) == works
     assert (statistics["halvings"] > 0) == works

@@ -76,10 +76,18 @@ def test_what_is_held_softly_is_held():
     np.testing.assert_allclose(problem.reaction(problem.bcs[0]), [0.0, 6e-8], rtol=1e-6, atol=1e-12)
 
 
-def test_a_snes_with_a_test_of_its_own():
-    options = {"snes_type": "ksponly"}
-    problem = scenes.block(petsc_options=options)
-    raises(lambda: problem.solve(steps=1), mpm.MPMError, r"SNES 'ksponly' ended by a test of its")
+@pytest.mark.parametrize("option", [{"snes_type": "ksponly"}, {"snes_linesearch_type": "bt"}])
+def test_a_newton_method_of_petsc_is_refused(option):
+    words = r"snes_type and snes_linesearch_type .* have no meaning here"
+    raises(lambda: scenes.block(petsc_options=option), mpm.MPMError, words)
+
+
+def test_monitors_of_petsc_are_told_of_each_iteration():
+    problem, seen = scenes.block(), []
+    problem.solver.setMonitor(lambda snes, iteration, norm: seen.append((iteration, norm)))
+    step = next(iter(problem.steps(1)))
+    assert [iteration for iteration, _ in seen] == list(range(len(step.residuals)))
+    assert seen[-1][1] < 1e-8 * seen[0][1]
 
 
 class Springs(DoubleWell):
