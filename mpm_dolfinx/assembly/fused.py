@@ -201,6 +201,16 @@ class Coupling(Protocol):
     def add(self, blocks: CoupledBlocks) -> None:
         """Add the reduced tangent but for the block of the displacement itself."""
 
+    def sizes(
+        self, moved: NDArray[np.float64], carried: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the sizes of changes of the field's residual at own values (collective).
+
+        Args:
+            moved: Sizes of changes of displacement, on own dofs of W.
+            carried: Those of changes of the field, at own values.
+        """
+
 
 class CoupledBlocks(NamedTuple):
     """Where a coupling goes: T of each domain, and places of three blocks.

@@ -92,13 +92,15 @@ class Contact(Term):
         MPMError: There is no such law.
     """
 
+    movable = remeshable = True  # it goes with the facets of its bodies
+
     def __init__(
         self, bodies: Sequence[Particles], friction: Friction, axisymmetric: bool, law: str
     ) -> None:
         if not is_one_of(law, LAWS):
             raise MPMError(f"law must be one of {', '.join(map(repr, LAWS))}, not {law!r}.")
         super().__init__(bodies)
-        self._nitsche = law == "nitsche"
+        self._nitsche = self.takes_stress = law == "nitsche"
         self.friction = friction
         self.axisymmetric = axisymmetric
         self._materials: Sequence[PointMaterial | None] = [None] * len(self.bodies)
@@ -143,17 +145,6 @@ class Contact(Term):
     @override
     def symmetric(self) -> bool:
         return self.friction.smooth and not self._of_step and not self._nitsche
-
-    @property
-    @override
-    def takes_stress(self) -> bool:
-        return self._nitsche
-
-    @property
-    @override
-    def one_sided(self) -> bool:
-        """Whether it can only press: bodies may lift off."""
-        return True
 
     # -- In a motion ----------------------------------------------------------------------------
 
@@ -216,12 +207,6 @@ class Contact(Term):
     def _comm(self) -> MPI.Comm:
         comm: MPI.Comm = self.bodies[0].mesh.comm
         return comm
-
-    def require_movable(self, consequence: str) -> None:
-        """Raise nothing: contact goes with the facets of its bodies."""
-
-    def require_remeshable(self, consequence: str) -> None:
-        """Raise nothing: see :meth:`require_movable`."""
 
     # -- What is kept -------------------------------------------------------------------------
 

@@ -30,7 +30,6 @@ from ..io.snapshot import Kept
 from ..parallel.boundary import collective
 from ..parallel.given import as_positive, require_same
 from ..particles.particles import Particles
-from ..system.own import OwnUnknowns
 from ..system.term import PointMaterial, Term
 from .body_contact import BodyContact
 from .driven import Driven, KeptMotion
@@ -87,6 +86,8 @@ class RigidBody(Driven):
         MPMError: What makes no sense.
     """
 
+    movable = remeshable = True  # its contacts go with the facets of its bodies
+
     @collective()
     def __init__(
         self,
@@ -132,6 +133,7 @@ class RigidBody(Driven):
         motion = RigidMotion(self.mass, self._inertia, at, down, held, still)
         super().__init__(bodies, motion)
         self._balance = RigidBalance(self.contacts, motion, self._comm)
+        self.own = self._balance.own
         self._number = 0
 
     @property
@@ -232,11 +234,6 @@ class RigidBody(Driven):
         """Return false: contact is not smooth."""
         return all([contact.smooth() for contact in self.contacts])
 
-    @property
-    @override
-    def own(self) -> OwnUnknowns | None:
-        return self._balance.own
-
     @override
     def update(self) -> MPMError | None:
         return self._balance.update()
@@ -288,12 +285,6 @@ class RigidBody(Driven):
         for contact in self.contacts:
             contact.roll_back()
         self._motion.roll_back()
-
-    def require_movable(self, consequence: str) -> None:
-        """Raise nothing: contact goes with the facets of its bodies."""
-
-    def require_remeshable(self, consequence: str) -> None:
-        """Raise nothing: see :meth:`require_movable`."""
 
     # -- What is kept ---------------------------------------------------------------------------
 

@@ -46,6 +46,7 @@ from ..structures.structure import Structure
 from ..system.body import BodyTerm
 from ..system.conditions import force_at
 from ..system.errors import Errors, estimated
+from ..system.field_equation import FieldEquation
 from ..system.predictor import Predictor
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
@@ -179,7 +180,7 @@ class Problem(Hooked):
             self._background,
             how,
             self._entity_maps,
-            [field for term in self.terms for field in term.solves],
+            [term.field for term in self.terms if isinstance(term, FieldEquation)],
         )
         parts.require_own_fields()
         self.body_terms = parts.body_terms()

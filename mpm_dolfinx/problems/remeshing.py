@@ -275,8 +275,7 @@ class Remeshing:
             given.require_movable_nodes(consequence)
         setup.require_no_supports(consequence)
         require_no_conditions_on_bodies(problem.bcs, problem.bodies, consequence)
-        for term in setup.terms:
-            term.require_remeshable(consequence)
+        setup.require_remeshable(consequence)
         for body in problem.bodies:
             degree, cells = body.W.ufl_element().degree, _compat.geometry_degree(body.mesh)
             if body.is_free or not body.shares_nodes or cells not in (1, degree):

@@ -8,6 +8,7 @@ these are other ones.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from ..boundary.supports import Support
@@ -123,13 +124,24 @@ class Setup:
         for body in self.bodies:
             body.require_movable(consequence)
         self.require_no_supports(consequence)
-        for term in self.terms:
-            term.require_movable(consequence)
+        self._require_all(lambda term: term.movable, consequence)
 
     def require_no_supports(self, consequence: str) -> None:
         """Raise an error where supports lie on a present mesh; see above."""
         if self.supports:
             raise MPMError(f"supports= lie on the present body mesh, so {consequence}.")
+
+    def require_remeshable(self, consequence: str) -> None:
+        """Raise an error unless all terms follow bodies that are split or rebased; see above."""
+        self._require_all(lambda term: term.remeshable, consequence)
+
+    def _require_all(self, follows: Callable[[Term], bool], consequence: str) -> None:
+        """Raise an error unless all terms follow their bodies."""
+        for term in self.terms:
+            if not follows(term):
+                raise MPMError(
+                    f"A {type(term).__name__} lives on the present body mesh, so {consequence}."
+                )
 
     def require_divisible(self) -> None:
         """Raise an error unless domains may be split.
@@ -138,8 +150,7 @@ class Setup:
             MPMError: They may not.
         """
         self.require_movable("domains cannot be split")
-        for term in self.terms:
-            term.require_remeshable("domains cannot be split")
+        self.require_remeshable("domains cannot be split")
         for body in self.bodies:
             if body.f_bar != "none":
                 raise MPMError(

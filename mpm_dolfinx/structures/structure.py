@@ -113,6 +113,7 @@ class Structure(Term):
     results: ClassVar[tuple[str, ...]]
     evaluation = "The structure"
     symmetric = True
+    movable = True  # it finds its nodes on other ranks
 
     def __init__(
         self,
@@ -143,6 +144,7 @@ class Structure(Term):
             self._grip = None if bond is None else Grip(bond, self.layout, axisymmetric, self.comm)
             if self._grip is not None and self._alone[self._grip.nodes].any():
                 raise MPMError("Nodes that are held have no bond; leave them out by where=.")
+        self.own = None if self._grip is None else self._grip.own
         where = None if self._grip is None else self._grip.nodes
         require_same(
             self.comm, **{"held=, where it holds,": self._alone, "where= of a Bond": where}
@@ -282,10 +284,6 @@ class Structure(Term):
             self._hosts = find_hosts(self.bodies, self.layout.nodes, self._alone, what)
             self._matrices = None
 
-    @override
-    def require_movable(self, consequence: str) -> None:
-        """Raise nothing: it finds its nodes on other ranks."""
-
     # -- A step -----------------------------------------------------------------------------------
 
     @override
@@ -365,11 +363,6 @@ class Structure(Term):
     @override
     def roll_back(self) -> None:
         self._slipped, self._now = np.zeros(len(self.state.bond)), None
-
-    @property
-    @override
-    def own(self) -> OwnUnknowns | None:
-        return None if self._grip is None else self._grip.own
 
     @property
     @override

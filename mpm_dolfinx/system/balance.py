@@ -18,6 +18,7 @@ from ..parallel.interruption import Interrupted, noted
 from ..parallel.magnitudes import joint_norm, norm
 from .field import Field
 from .free_field import FreeField
+from .release import Release
 from .tangent import Tangent
 from .terms import Terms
 from .unknowns import Unknowns
@@ -109,10 +110,10 @@ class Balance:
         return None
 
     def _add_on_background(self, field: Field) -> float:
-        """Add forces of terms on dofs of a background, and return their size."""
+        """Add forces that are held back on dofs of a background, and return their size."""
         size = 0.0
         for term in self._terms:
-            forces = term.background_forces(field.V)
+            forces = term.background_forces(field.V) if isinstance(term, Release) else None
             if forces is not None:
                 field.force.array_w[:] += forces
                 size += joint_norm(forces, self._unknowns.comm)

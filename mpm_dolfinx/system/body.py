@@ -19,7 +19,7 @@ from ..constitutive.moduli import undeformed_tangent
 from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree
 from ..particles.particles import Particles
-from .term import Motion, PointMaterial, Term, Transfer
+from .term import Alternating, Motion, PointMaterial, Term, Transfer
 
 __all__ = ["ActingStress", "BodyTerm", "StepForce"]
 
@@ -98,19 +98,11 @@ class BodyTerm(Term):
         self.particles = particles
         self.forms = forms
         self._stress, self._points = stress, points
+        self.follows_load = forms.follows_load
+        if forms.internal is not None or forms.fused:
+            self.fused = [(particles, forms)]
         self._T: PETSc.Mat | None = None
         self._low_rank: ReducedLowRank | None = None
-
-    @property
-    @override
-    def fused(self) -> Sequence[tuple[Particles, BodyForms]]:
-        forms = self.forms
-        return [(self.particles, forms)] if forms.internal is not None or forms.fused else []
-
-    @property
-    @override
-    def follows_load(self) -> bool:
-        return self.forms.follows_load
 
     @override
     def begin(self) -> Sequence[PETSc.Vec]:
@@ -183,20 +175,17 @@ class BodyTerm(Term):
 
     @property
     @override
-    def alternates(self) -> bool:
-        return self._points is not None and self._points.softening is not None
-
-    @override
-    def alternate(self) -> int:
-        return 0 if self._points is None else self._points.alternate()
+    def equation(self) -> Alternating | None:
+        points = self._points
+        return None if points is None or points.softening is None else points
 
     @override
     def smooth(self) -> bool:
         """Whether all points are smooth; it may differ between ranks."""
         return self._points is None or self._points.elastic()
 
-    @override
     def yielding(self) -> NDArray[np.bool_] | None:
+        """Return whether each particle yields in the last update, if the material says so."""
         return None if self._points is None else self._points.yielding()
 
     @override

@@ -85,6 +85,10 @@ class Tie(Term):
             what makes no sense.
     """
 
+    one_sided = False
+    symmetric = True
+    movable = True  # it finds its points on other ranks
+
     @collective()
     def __init__(
         self,
@@ -115,19 +119,6 @@ class Tie(Term):
         self._degree, self.axisymmetric = int(degree), axisymmetric
         self._faces = self._found()
         self._springs = self._sprung(self._present())
-
-    @property
-    def one_sided(self) -> bool:
-        """Whether it may let its bodies go: see :attr:`Term.one_sided`."""
-        return False
-
-    @property
-    @override
-    def symmetric(self) -> bool:
-        return True
-
-    def require_movable(self, consequence: str) -> None:
-        """Raise nothing: the tie finds its points on other ranks."""
 
     @override
     def begin(self) -> Sequence[PETSc.Vec]:

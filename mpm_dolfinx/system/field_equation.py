@@ -71,6 +71,8 @@ class FieldEquation(Term):
     """
 
     from_outside = False
+    one_sided = False
+    symmetric = True  # it adds nothing to the tangent of the displacements
     evaluation = "alternate()"
 
     @collective()
@@ -119,19 +121,8 @@ class FieldEquation(Term):
 
     @property
     @override
-    def symmetric(self) -> bool:
-        """It adds nothing to the tangent of the displacements."""
-        return True
-
-    @property
-    @override
-    def one_sided(self) -> bool:
-        return False
-
-    @property
-    @override
-    def solves(self) -> Sequence[ParticleField]:
-        return [self.field]
+    def equation(self) -> FieldEquation:
+        return self
 
     @override
     def take_part(
@@ -148,8 +139,8 @@ class FieldEquation(Term):
                     f"The field '{self.field.name}' lives on a mesh that its body has left."
                 )
 
-    @override
     def alternate(self) -> int:
+        """See :class:`~mpm_dolfinx.system.term.Alternating`."""
         self._forms.assemble_external()
         p, own = self.field.x, self._own
         lower, upper = self._bounds()

@@ -178,6 +178,7 @@ class Inertia(Term):
     from_outside = True
     one_sided = False
     symmetric = True
+    movable = remeshable = True  # velocities go with the nodes
 
     def __init__(
         self,
@@ -206,10 +207,6 @@ class Inertia(Term):
         """Return whether a body has no inertia."""
         return self._state.is_static(body)
 
-    @override
-    def has_mass(self, body: Particles) -> bool:
-        return any(body is one for one in self.bodies) and not self._state.is_static(body)
-
     @property
     def _rest(self) -> _Rest:
         """The rest of the problem."""
@@ -224,6 +221,7 @@ class Inertia(Term):
             terms: All other terms.
         """
         self._others, self._mass = _Rest(problem, terms), None
+        problem.reduced.levels.massive = [one for one in self.bodies if not self.is_static(one)]
 
     def _domain_masses(self) -> list[NDArray[np.float64] | None]:
         """Return the mass of each body's domains by what densities are now (collective)."""
@@ -539,12 +537,6 @@ class Inertia(Term):
     @override
     def kept(self) -> Sequence[Kept]:
         return [self._state]
-
-    def require_movable(self, consequence: str) -> None:
-        """Raise nothing: velocities move with their bodies."""
-
-    def require_remeshable(self, consequence: str) -> None:
-        """Raise nothing: velocities are those of the same nodes."""
 
 
 def _increments(mass: NodalMass) -> list[PETSc.Vec]:

@@ -30,11 +30,15 @@ class Levels:
     Args:
         unknowns: The unknowns.
         terms: What couples them.
+
+    Attributes:
+        massive: The bodies with inertia.
     """
 
     def __init__(self, unknowns: Unknowns, terms: Terms) -> None:
         self._unknowns, self._terms = unknowns, terms
         self._comm = unknowns.comm
+        self.massive: Sequence[Particles] = ()
 
     @property
     def constrained(self) -> bool:
@@ -50,7 +54,7 @@ class Levels:
             and all(
                 isinstance(body, Particles)
                 and block.V is body.W
-                and any(term.has_mass(body) for term in self._terms)
+                and any(body is one for one in self.massive)
                 for body in block.bodies
             )
             for block in blocks

@@ -12,7 +12,6 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from ..assembly.fused import Coupling
 from ..assembly.pressure_blocks import PressureBlocks, PressurePoints
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
@@ -40,7 +39,7 @@ class PressureTerm(FieldTerm):
         material: PressurePoints,
     ) -> None:
         super().__init__(particles, [pressure])
-        self._coupling = PressureBlocks(particles, pressure, material)
+        self.coupling = PressureBlocks(particles, pressure, material)
         self._particles, self._pressure, self._material = particles, pressure, material
         nodes = particles.domain_nodes
         gdim = particles.mesh.geometry.dim
@@ -61,17 +60,6 @@ class PressureTerm(FieldTerm):
     @override
     def symmetric(self) -> bool:
         return self._material.symmetric
-
-    @property
-    @override
-    def coupling(self) -> Coupling:
-        return self._coupling
-
-    @override
-    def absolute_product(self, changes: Sequence[NDArray[np.float64]]) -> Sequence[PETSc.Vec]:
-        """The product with absolute values, without forces on the body's nodes."""
-        self._force.array_w[:] = self._coupling.sizes(*changes)
-        return [self._none, self._force]
 
     @override
     def residuals(self) -> Sequence[PETSc.Vec]:

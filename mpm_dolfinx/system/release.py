@@ -37,22 +37,15 @@ class Release(Term):
         remaining: s at the last converged step; 0 where nothing is held back.
     """
 
+    one_sided = False
+    symmetric = True
+
     def __init__(self) -> None:
         super().__init__()
         self.remaining = 0.0
         self._aim = self._factor = 0.0
         self._nodal: list[fem.Function] = []
         self._reactions: list[fem.Function] = []
-
-    @property
-    @override
-    def symmetric(self) -> bool:
-        return True
-
-    @property
-    def one_sided(self) -> bool:
-        """Whether it may let its bodies go: see :attr:`Term.one_sided`."""
-        return False
 
     def follow(
         self,
@@ -128,8 +121,8 @@ class Release(Term):
             forces.append(vector)
         return forces
 
-    @override
     def background_forces(self, V: fem.FunctionSpace) -> Array | None:
+        """Return the forces on this rank's own dofs of a background, or none (collective)."""
         if self._factor == 0.0:
             return None
         function = next(f for f in self._reactions if f.function_space is V)

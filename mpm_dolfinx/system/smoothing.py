@@ -34,6 +34,8 @@ class PressureSmoothing(FieldTerm):
             ``1 / share`` times, as the constraint does.
     """
 
+    symmetric = True
+
     def __init__(
         self, pressure: CarriedField, material: MaterialPoints, share: float = 1.0
     ) -> None:
@@ -43,11 +45,6 @@ class PressureSmoothing(FieldTerm):
         self._weight = 1.0 / share  # of the compliance in shear, 1 / (2 G)
         self._matrix: PETSc.Mat | None = None
         self._force = pressure.T.createVecLeft()
-
-    @property
-    @override
-    def symmetric(self) -> bool:
-        return True
 
     @override
     def begin(self) -> Sequence[PETSc.Vec]:

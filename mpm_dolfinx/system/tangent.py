@@ -258,11 +258,13 @@ class Tangent:
         total = field.force.duplicate()
         total.set(0.0)
         for number, (term, matrices) in enumerate(zip(self._terms, made.matrices, strict=False)):
-            if self._coupled[number]:
-                changes = [place(body)[1].change() for body in term.bodies]
-                for body, force in zip(term.bodies, term.absolute_product(changes), strict=True):
-                    if place(body)[0] is field:
-                        body.T.multTransposeAdd(force, total, total)
+            if self._coupled[number] and term.coupling is not None:
+                moved, carried = term.coupling.places
+                if place(carried)[0] is field:
+                    size = carried.T.createVecLeft()
+                    changes = [place(body)[1].change() for body in (moved, carried)]
+                    size.array_w[:] = term.coupling.sizes(*changes)
+                    carried.T.multTransposeAdd(size, total, total)
             if term.own is not None:
                 continue  # (it acts on displacements alone)
             for (a, b), K in matrices.items():

@@ -13,8 +13,6 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from dolfinx import fem
-
 from ..assembly.body_forms import BodyForms
 from ..assembly.fused import Coupling
 from ..constitutive.averaging import VolumeAveraging
@@ -22,11 +20,10 @@ from ..constitutive.pressure import MeanStress
 from ..errors import MPMError
 from ..io.snapshot import Kept
 from ..parallel.boundary import Hooked, by_itself
-from ..particles.field import ParticleField
 from ..particles.particles import Particles
 from .own import OwnUnknowns
 
-__all__ = ["Hooks", "Motion", "PointMaterial", "Term", "Transfer", "UserTerm"]
+__all__ = ["Alternating", "Hooks", "Motion", "PointMaterial", "Term", "Transfer", "UserTerm"]
 
 
 type Transfer = Callable[[Particles], PETSc.Mat]
@@ -60,12 +57,31 @@ class PointMaterial(Protocol):
         """A pressure of its own in place of the mean stress, or ``None``."""
 
 
+class Alternating(Protocol):
+    """Equations that are solved in turn with the displacements."""
+
+    def alternate(self) -> int:
+        """Solve them at the displacements of the last evaluation (collective).
+
+        It is called in turn with Newton's method for the displacements until these are in
+        equilibrium with what it has found: see :class:`mpm_dolfinx.FieldEquation`.
+
+        Returns:
+            The linear solves that it took.
+
+        Raises:
+            ConvergenceError: It does not converge, on all ranks; a smaller step is tried.
+        """
+
+
 class Term(Hooked):
     """Something that acts on the nodes of one body or of several.
 
     The residual of a step is ``sum_b T_b^T r_b`` and its tangent ``sum_ab T_a^T K_ab T_b``, where
     r_b and K_ab are sums over terms and live on the spaces W of the bodies, whatever
-    backgrounds move these. An heir overrides what it has; what is here adds nothing. All calls
+    backgrounds move these. A subclass has ``residuals`` and ``tangents``, ``update`` where these
+    depend on more than the displacements, ``commit`` and ``roll_back`` where it has a history;
+    whatever else is here adds nothing unless overridden. All calls
     are collective, and made with the displacements set. Nodes of deleted particles alone
     (``outside="delete"``) stay where they were, and forces on them are lost.
 
@@ -77,16 +93,32 @@ class Term(Hooked):
         evaluation: What :meth:`update` is called where it fails.
         from_outside: Whether its forces come from outside of its bodies: then they count for the
             scale of forces, as loads and reactions do.
+        movable: Whether it follows bodies whose particles move to other ranks.
+        remeshable: Whether it follows bodies that are split or rebased.
+        takes_stress: Whether it takes the material's stress for all that its bodies bear.
+        follows_load: Whether what the load factor does depends on the displacement.
         axisymmetric: Whether its forces are those of a body of revolution, ``None`` where it does
             not say; a problem refuses one that differs.
         name: One word by which a checkpoint knows what it remembers, if it is given (before the
             term is); otherwise it is known by the order in which terms have come to the problem.
+        own: Unknowns of its own, besides its bodies' displacements; ``None``: none. It sets their
+            residual in :meth:`update`, and :meth:`tangents` has derivatives of and by them too, in
+            the place that comes after the bodies.
+        fused: Forms whose tangent the compiled loops reduce domain by domain, with their bodies.
+        coupling: All of :meth:`tangents` by the compiled loops; ``None``: nothing.
     """
 
     evaluation: ClassVar[str] = "update()"
     from_outside: ClassVar[bool] = True
+    movable: bool = False
+    remeshable: bool = False
+    takes_stress: bool = False
+    follows_load: bool = False
     axisymmetric: bool | None = None
     name: str | None = None
+    own: OwnUnknowns | None = None
+    fused: Sequence[tuple[Particles, BodyForms]] = ()
+    coupling: Coupling | None = None
 
     def __init__(self, bodies: Sequence[Particles] = ()) -> None:
         self.bodies: tuple[Particles, ...] = tuple(bodies)
@@ -105,56 +137,8 @@ class Term(Hooked):
         return True
 
     @property
-    def takes_stress(self) -> bool:
-        """Whether it takes the material's stress for all that its bodies bear."""
-        return False
-
-    @property
-    def fused(self) -> Sequence[tuple[Particles, BodyForms]]:
-        """Forms whose tangent the compiled loops reduce domain by domain, with their bodies."""
-        return ()
-
-    @property
-    def coupling(self) -> Coupling | None:
-        """All of :meth:`tangents` by the compiled loops; ``None``: nothing."""
-        return None
-
-    @property
-    def follows_load(self) -> bool:
-        """Whether what the load factor does depends on the displacement."""
-        return False
-
-    @property
-    def solves(self) -> Sequence[ParticleField]:
-        """The fields that :meth:`alternate` finds."""
-        return ()
-
-    @property
-    def alternates(self) -> bool:
-        """Whether :meth:`alternate` is to be called, on all ranks."""
-        return bool(self.solves)
-
-    def alternate(self) -> int:
-        """Solve its own equations at the displacements of the last evaluation.
-
-        It is called in turn with Newton's method for the displacements until these are in
-        equilibrium with what it has found: see :class:`mpm_dolfinx.FieldEquation`.
-
-        Returns:
-            The linear solves that it took.
-
-        Raises:
-            ConvergenceError: It does not converge, on all ranks; a smaller step is tried.
-        """
-        return 0
-
-    @property
-    def own(self) -> OwnUnknowns | None:
-        """Unknowns of its own, besides its bodies' displacements; ``None``: none.
-
-        Then it sets their residual in :meth:`update`, and :meth:`tangents` has derivatives of
-        and by them too, in the place that comes after the bodies.
-        """
+    def equation(self) -> Alternating | None:
+        """What solves equations of its own in turn with the displacements, on all ranks."""
         return None
 
     def come_after(self, gone: Sequence[Term]) -> None:
@@ -228,10 +212,6 @@ class Term(Hooked):
                 body without inertia.
         """
 
-    def has_mass(self, body: Particles) -> bool:
-        """Return whether its forces are those of inertia at all nodes of a body."""
-        return False
-
     def end_forces(self) -> Sequence[PETSc.Vec]:
         """Return the residuals at the last converged step, but for what is of a whole step.
 
@@ -263,10 +243,6 @@ class Term(Hooked):
         """Return whether no history changes in the last residual, nor contact."""
         return True
 
-    def yielding(self) -> NDArray[np.bool_] | None:
-        """Whether the history of each particle of its first body changes in the last residual."""
-        return None
-
     def drives(self) -> bool:
         """Return whether it touches bodies and moves on its own path in this step, on this rank."""
         return False
@@ -274,13 +250,6 @@ class Term(Hooked):
     def residuals(self) -> Sequence[PETSc.Vec]:
         """Return the forces on W of each body, or nothing."""
         return ()
-
-    def background_forces(self, V: fem.FunctionSpace) -> NDArray[np.float64] | None:
-        """Return forces on this rank's own dofs of a background besides those on bodies, or none.
-
-        They stay through a step, and have no tangent.
-        """
-        return None
 
     def tangents(self) -> Mapping[tuple[int, int], PETSc.Mat]:
         """Return the derivatives of the forces on a body by the displacement of a body.
@@ -321,14 +290,6 @@ class Term(Hooked):
             K.multAdd(motions[b], forces[a], forces[a])
         return forces
 
-    def absolute_product(self, changes: Sequence[NDArray[np.float64]]) -> Sequence[PETSc.Vec]:
-        """Return the product of the absolute values of :attr:`coupling` and changes of each body.
-
-        Args:
-            changes: Sizes of changes on this rank's own dofs of W of each body.
-        """
-        return ()
-
     def absolute_contributions(self) -> Sequence[PETSc.Vec]:
         """Return the sums of absolute values of what the residuals consist of, or nothing."""
         sizes = [force.copy() for force in self.residuals()]
@@ -347,14 +308,10 @@ class Term(Hooked):
         """
         return (), 0.0
 
-    def shear_modulus(self) -> float:
-        """Return the stiffness of its body to simple shear, if it is what the body is made of."""
-        return 0.0
-
     def commit(self) -> Callable[[], None] | None:
         """Make the last evaluation the converged one.
 
-        Bodies commit first, then the terms of the user, then the hooks of a problem's heir.
+        Bodies commit first, then the terms of the user, then the hooks of a problem's subclass.
 
         Returns:
             A function that takes it back, which is called where another commit fails; ``None``
@@ -368,21 +325,6 @@ class Term(Hooked):
     def kept(self) -> Sequence[Kept]:
         """Return the objects that are saved with the term and move with the bodies."""
         return ()
-
-    def require_movable(self, consequence: str) -> None:
-        """Raise an error unless it follows bodies whose particles move to other ranks.
-
-        Args:
-            consequence: What cannot be otherwise.
-
-        Raises:
-            MPMError: It does not, as it does unless an heir can do more.
-        """
-        raise MPMError(f"A {type(self).__name__} lives on the present body mesh, so {consequence}.")
-
-    def require_remeshable(self, consequence: str) -> None:
-        """Raise an error unless it follows bodies that are split or rebased; see above."""
-        raise MPMError(f"A {type(self).__name__} lives on the present body mesh, so {consequence}.")
 
 
 class Hooks(Protocol):
@@ -409,15 +351,11 @@ class UserTerm(Term):
     """
 
     evaluation = "evaluate()"
+    one_sided = False
 
     def __init__(self, hooks: Hooks) -> None:
         super().__init__()
         self._reference = weakref.ref(hooks)
-
-    @property
-    def one_sided(self) -> bool:
-        """Whether it may let its bodies go: see :attr:`Term.one_sided`."""
-        return False
 
     @property
     def _hooks(self) -> Hooks:

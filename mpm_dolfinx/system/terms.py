@@ -18,6 +18,7 @@ from ..parallel.magnitudes import joint_norm
 from ..parallel.totals import over_ranks
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
+from .body import BodyTerm
 from .field import Field
 from .term import Term
 
@@ -57,11 +58,12 @@ class Terms:
     @property
     def alternates(self) -> bool:
         """Whether a term has equations that are solved in turn with the displacements."""
-        return any(term.alternates for term in self._terms)
+        return any(term.equation is not None for term in self._terms)
 
     def take_turns(self) -> int:
         """Let such terms solve their equations; return the linear solves that it took."""
-        return sum(term.alternate() for term in self._terms if term.alternates)
+        equations = [term.equation for term in self._terms]
+        return sum(equation.alternate() for equation in equations if equation is not None)
 
     # -- Histories --------------------------------------------------------------------------------
 
@@ -102,7 +104,7 @@ class Terms:
         displaced = [body for body in self._bodies if isinstance(body, Particles)]
         found = {id(body): np.zeros(body.num_local, dtype=bool) for body in displaced}
         for term in self._terms:
-            yields = term.yielding()
+            yields = term.yielding() if isinstance(term, BodyTerm) else None
             if yields is not None:
                 found[id(term.bodies[0])] |= yields
         return list(found.values())
@@ -125,7 +127,11 @@ class Terms:
     def shear_moduli(self, field: Field) -> list[float]:
         """Return the shear modulus of each body of a field."""
         return [
-            sum(term.shear_modulus() for term in self._terms if term.bodies == (body,))
+            sum(
+                term.shear_modulus()
+                for term in self._terms
+                if isinstance(term, BodyTerm) and term.particles is body
+            )
             for body in field.bodies
         ]
 

@@ -31,17 +31,13 @@ class FieldTerm(Term):
     """
 
     from_outside = False
+    one_sided = False
 
     def __init__(self, particles: Particles | None, fields: Sequence[CarriedField]) -> None:
         super().__init__()
         own = () if particles is None else (particles,)
         self.bodies = cast("tuple[Particles, ...]", (*own, *fields))
         self.fields = list(fields)
-
-    @property
-    def one_sided(self) -> bool:
-        """Whether it may let its bodies go: see :attr:`Term.one_sided`."""
-        return False
 
     @override
     def commit(self) -> Callable[[], None]:
@@ -81,6 +77,7 @@ class FormsTerm(FieldTerm):
     ) -> None:
         super().__init__(particles, fields)
         self._forms, self._symmetric = forms, symmetric
+        self.follows_load = forms.follows_load
         self._first = 1 if particles is None else 0
         self._none: list[PETSc.Vec] = []
         if particles is not None:
@@ -91,11 +88,6 @@ class FormsTerm(FieldTerm):
     @override
     def symmetric(self) -> bool:
         return self._symmetric
-
-    @property
-    @override
-    def follows_load(self) -> bool:
-        return self._forms.follows_load
 
     @override
     def begin(self) -> Sequence[PETSc.Vec]:

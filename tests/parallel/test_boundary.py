@@ -126,8 +126,8 @@ def in_motion(terms):
 
 REACHED = {
     **{name: lambda terms: run(made(terms=terms)) for name in (
-        "take_part", "begin", "start", "residuals", "background_forces", "tangents",
-        "reduced_tangents", "commit", "kept", "symmetric", "one_sided", "fused", "coupling",
+        "take_part", "begin", "start", "residuals", "tangents",
+        "reduced_tangents", "commit", "kept", "symmetric", "one_sided", "equation",
     )},
     **dict.fromkeys(("pace", "end_forces", "step_work"), in_motion),
 }  # fmt: skip

@@ -23,6 +23,7 @@ class Bedding(mpm.Term, Kept):
     """Springs in the volume that give way: half of their stretch is gone after each step."""
 
     key = "bedding"
+    movable = remeshable = True
 
     def __init__(self, particles):
         super().__init__([particles])
@@ -32,12 +33,6 @@ class Bedding(mpm.Term, Kept):
     @property
     def symmetric(self):
         return True
-
-    def require_movable(self, consequence):
-        pass
-
-    def require_remeshable(self, consequence):
-        pass
 
     def kept(self):
         return [self]
