@@ -419,13 +419,16 @@ class Adjoint:
     def _add_penalties(self, backgrounds: Sequence[PETSc.Vec], totals: dict[int, Array]) -> None:
         """Add derivatives by the moduli of penalties."""
         for number, (field, z) in enumerate(zip(self._reduced.fields, backgrounds, strict=True)):
-            if field.moduli is None:
+            if field.acting.moduli is None:
                 continue
-            own, slopes = np.array(field.moduli), []
+            own, slopes = np.array(field.acting.moduli), []
             for place in range(len(own)):
                 amount = np.zeros(len(own))
                 amount[place] = CHANGE * own.max()
-                parts = [field.penalty_force((own + s * amount).tolist()) for s in (1.0, -1.0)]
+                parts = [
+                    field.acting.penalty_force(field.u, (own + s * amount).tolist())
+                    for s in (1.0, -1.0)
+                ]
                 slopes.append((z.dot(parts[0]) - z.dot(parts[1])) / (2.0 * amount[place]))
             totals[number] = totals.get(number, 0.0) - np.array(slopes)
 

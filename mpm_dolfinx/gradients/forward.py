@@ -242,7 +242,7 @@ class StepDerivative:
         new = [
             number
             for number, field in enumerate(self._fields)
-            if field.moduli is not None and number not in rates.moduli
+            if field.acting.moduli is not None and number not in rates.moduli
         ]
         if not new:
             return rates.moduli
@@ -274,11 +274,11 @@ class StepDerivative:
             turn.multTransposeAdd(nodal, force, force)
         for number, rate in moduli.items():
             field = self._fields[number]
-            own = np.array(field.moduli)
+            own = np.array(field.acting.moduli)
             if np.any(rate):
                 for sign in (1.0, -1.0):
                     moduli_beside = own + sign * parameter.change * rate
-                    part = field.penalty_force(moduli_beside.tolist())
+                    part = field.acting.penalty_force(field.u, moduli_beside.tolist())
                     found[number].axpy(sign / (2.0 * parameter.change), part)
         return found
 
@@ -336,7 +336,7 @@ class StepDerivative:
     ) -> None:
         """Add to derivatives of forces what does not come of the bodies' motion."""
         for field, force, known, rate in zip(self._fields, forces, held, y_rate, strict=True):
-            field.add_product(rate, force)
+            field.acting.add_product(rate, force)
             force.axpy(1.0, known)
 
     def _move(self, motion: Sequence[fem.Function], changes: Sequence[PETSc.Vec]) -> None:

@@ -598,7 +598,7 @@ class Problem(Hooked):
         number, field = next(
             (number, field)
             for number, field in enumerate(self.reduced.fields)
-            if any(bc is known for known in field.conditions)
+            if any(bc is known for known in field.prescribed)
         )
         return force_at(bc, self._trial.converged.reaction(number), field.V)
 

@@ -194,9 +194,11 @@ def _worst_particles(reduced: ReducedSystem) -> list[int]:
     """Return the particles at the node with the largest residual."""
     best: tuple[float, list[int]] = (0.0, [])
     for field in reduced.fields:
-        residual = field.residual_at_unknowns()
-        if residual is None:
+        if field.free is None:
             continue
+        residual = field.force.duplicate()
+        residual.set(0.0)
+        residual.array_w[field.dofs] = field.force.array_r[field.dofs]
         comm: MPI.Comm = field.V.mesh.comm
         for motion in field.motions:
             body = motion.particles

@@ -242,7 +242,7 @@ class ControlledSystem:
         self._start = float(bodies[0].load.value)
         self._size = float(control.row().norm())
         self._row = reduced.unknowns.functional(control.particles, control.row())
-        if any(field.prescribes for field in reduced.fields):
+        if any(field.prescribed.changes for field in reduced.fields):
             raise MPMError(
                 "Under displacement control Dirichlet values stay as they are, but some differ "
                 "from those of the last step; move them before, by problem.step() or a path."

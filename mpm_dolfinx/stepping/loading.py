@@ -83,7 +83,7 @@ class Stepper:
             self.trial.converged.prescribed, self.trial.reduced.fields, strict=True
         ):
             held = np.zeros(len(known), dtype=bool)
-            for bc in field.conditions:
+            for bc in field.prescribed:
                 held[bc.dof_indices()[0]] = True
             known[~held] = 0.0
 

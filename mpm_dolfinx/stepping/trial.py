@@ -188,7 +188,7 @@ class Trial:
 
         They are those of the present values of the conditions.
         """
-        totals = [dirichlet_values(field.conditions, field.V) for field in self.reduced.fields]
+        totals = [dirichlet_values(field.prescribed, field.V) for field in self.reduced.fields]
         return totals if self.run is None else self.run.dirichlet_values(totals)
 
     # -- A step ---------------------------------------------------------------------------

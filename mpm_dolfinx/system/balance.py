@@ -106,7 +106,7 @@ class Balance:
                 outer[number] += self._add_on_background(field)
             self._external = _External(self._external.staying, outer)
             for field in unknowns.fields:
-                field.add_residual()
+                field.acting.add_residual(field.u, field.force)
         return None
 
     def _add_on_background(self, field: Field) -> float:
@@ -146,11 +146,23 @@ class Balance:
             return totals, whole
 
     def works(self) -> NDArray[np.float64]:
-        """Return :meth:`Field.works` of all displacements."""
-        found = [
-            field.works() for field in self._unknowns.fields if not isinstance(field, ValueField)
-        ]
-        return np.asarray(np.sum(found, axis=0))
+        """Return the work of forces on the backgrounds of displacements over the last increment.
+
+        Returns:
+            Work done against what acts on the background itself, work of the residual at Dirichlet
+            conditions, and work of the residual at the unknowns.
+        """
+        found = np.zeros(3)
+        for field in self._unknowns.fields:
+            if isinstance(field, ValueField):
+                continue
+            own = field.u.duplicate()
+            own.set(0.0)
+            if self._unknowns.sizes[1] > 0 and norm(field.u) > 0.0:
+                field.acting.add_product(field.u, own)
+            u, work = field.u.array_r, field.u.array_r * field.force.array_r
+            found += u @ own.array_r, work[field.fixed].sum(), work[field.dofs].sum()
+        return np.asarray(self._unknowns.comm.allreduce(found))
 
     # -- Sizes ------------------------------------------------------------------------------------
 
@@ -168,7 +180,7 @@ class Balance:
         fields, own, comm = unknowns.fields, unknowns.own, unknowns.comm
         scales = self._by_subspace(
             [
-                field.factor * np.array([staying, field.reactions(), outer, self._changed(field)])
+                field.factor * np.array([staying, _reactions(field), outer, self._changed(field)])
                 for field, staying, outer in zip(
                     fields, external.staying, external.outer, strict=True
                 )
@@ -222,4 +234,18 @@ class Balance:
         It is what loads and supports, as computed, differ by: the stress of a domain adds
         nothing to it, nor does round-off of the stress.
         """
-        return joint_norm([one.resultant() for one in self._unknowns.subspaces])
+        sums = [sum(map(_resultant, one.fields)) for one in self._unknowns.subspaces]
+        return joint_norm([float(np.linalg.norm(each)) for each in sums])
+
+
+def _reactions(field: Field) -> float:
+    """Return the norm of the last residual at Dirichlet conditions (collective)."""
+    return joint_norm(np.where(field.fixed, field.force.array_r, 0.0), field.V.mesh.comm)
+
+
+def _resultant(field: Field) -> NDArray[np.float64]:
+    """Return the sum of the last residual over free dofs, by component, as values (collective)."""
+    bs = field.V.dofmap.index_map_bs
+    free = field.force.array_r[field.dofs]
+    sums = np.bincount(field.dofs % bs, weights=free, minlength=bs)
+    return np.asarray(field.factor * field.V.mesh.comm.allreduce(sums))

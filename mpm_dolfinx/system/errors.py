@@ -84,7 +84,7 @@ def estimated(
     nodal, own, energy = [], [], 0.0
     for body, term, force in zip(bodies, terms, forces, strict=False):
         field = next(field for field in reduced.fields if any(b is body for b in field.bodies))
-        free = _unprescribed(body, field.conditions)
+        free = _unprescribed(body, list(field.prescribed))
         nodal.append(nodal_errors(body, reduced.terms, force, free))
         points = term.forms.internal
         if isinstance(points, MaterialPoints):

@@ -1,14 +1,13 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""A background space with the bodies that it moves: its unknowns, conditions and stabilisation."""
+"""A background space with the bodies that it moves: its unknowns and conditions."""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Sequence
-from functools import cached_property
+from collections.abc import Sequence
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -18,24 +17,21 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
-from .. import _compat
 from ..assembly.background_forms import BackgroundForms
-from ..assembly.fused import Restriction, no_ties
+from ..assembly.fused import Restriction
 from ..background.basis import PointBasis
-from ..background.grids import cell_lines, coarser, grid_lines
-from ..meshes.boxes import BOX_CELLS
 from ..parallel.magnitudes import joint_norm, norm
 from ..parallel.totals import over_ranks
 from ..particles.field import CarriedField
 from ..particles.free import FreeNodes
 from ..particles.particles import Particles
-from ..solvers.strategies import Coarsening
 from ..stabilisation.ghost_penalty import GhostPenalty
 from ..stabilisation.joints import Joints
 from ..transfer.touched import TouchedNodes, TransferRows
-from .conditions import fixed_dofs
-from .hierarchy import FieldDofs
+from .conditions import Prescribed
+from .hierarchy import Boxes, FieldDofs
 from .numbering import FreeDofs
+from .on_background import OnBackground
 from .predictor import map_to_background
 
 __all__ = ["Field", "Motion"]
@@ -147,6 +143,20 @@ class Motion:
         return np.asarray(np.linalg.norm(self.of(force).array_r.reshape(-1, bs), axis=1))
 
 
+class _Numbers(NamedTuple):
+    """Numbers of a field's unknowns among those of all fields.
+
+    Attributes:
+        part: Where they are among this rank's.
+        numbers: Of the unknown of each free dof.
+        sizes: Number of all fields' unknowns of this rank and of all ranks.
+    """
+
+    part: slice
+    numbers: NDArray[np.int64]
+    sizes: tuple[int, int]
+
+
 class Field:
     """One background space with all bodies that it moves. All calls are collective.
 
@@ -161,19 +171,20 @@ class Field:
         V: The space.
         bodies: As given.
         motions: How each body follows.
-        moduli: Shear modulus of each body as the first step with a penalty begins, which is scaled
-            by them; ``None`` before.
+        prescribed: The conditions on this space, and their values in the step.
+        acting: What acts on the background itself.
+        boxes: The boxes of multigrid over it.
         u: The increment of the last residual, on this rank's own dofs of V.
         force: The residual on all dofs of V that was evaluated last: at supports, their force.
         free: The dofs that are unknowns; ``None`` until they are found.
         dofs: Their local numbers.
+        fixed: Whether each own dof of V has been held when they were looked for.
         touched: The nodes of V that bodies touch.
-        part: Where the unknowns are among this rank's.
-        prescribes: Whether Dirichlet values change in the step that has begun.
         factor: Value on V of an unknown of size 1.
     """
 
     factor: float = 1.0
+    touched: TouchedNodes
 
     def __init__(
         self,
@@ -185,47 +196,34 @@ class Field:
     ) -> None:
         self.bodies = list(bodies)
         self.V = V = bodies[0].V
-        self._conditions = conditions
         self.motions = [Motion(body) for body in bodies]
-        self.moduli: list[float] | None = None
+        self.prescribed = Prescribed(conditions, V)
+        self.acting = OnBackground(background, ghosts)
+        self.boxes = Boxes(V)
         self.free: FreeDofs | None = None
-        self._looked_up: list[fem.DirichletBC] | None = None
-        self._lines: list[NDArray[np.float64]] | None = None
-        self._background = background
         self.dofs = np.zeros(0, dtype=np.int32)
         self._found: FreeDofs | None = None
         self._bases: list[PointBasis] = []  # by which nodes were found
-        self._ghosts = ghosts
         self._joints = joints
         self._comm: MPI.Comm = V.mesh.comm
         self._bs = V.dofmap.index_map_bs
         self._owned = V.dofmap.index_map.size_local * self._bs
-
-    @property
-    def conditions(self) -> list[fem.DirichletBC]:
-        """The Dirichlet conditions on this space."""
-        return [bc for bc in self._conditions if _compat.is_condition_on(bc, self.V)]
+        self.fixed = np.zeros(self._owned, dtype=bool)
+        self.u = PETSc.Vec().createMPI((self._owned, None), bsize=self._bs, comm=self._comm)
+        self.force = self.u.duplicate()
+        self._numbers = _Numbers(slice(0, 0), np.zeros(0, dtype=np.int64), (0, 0))
+        self._prolongation: PETSc.Mat | None = None
 
     @property
     def counts(self) -> dict[str, int]:
         """Numbers of badly supported dofs and of joints, by the names of the statistics."""
         joints = {} if self._joints is None else {"joint_nodes": self._joints.count}
-        ghosts = {} if self._ghosts is None else self._ghosts.counts
-        return ghosts | joints
+        return self.acting.counts | joints
 
     def begin(self, change: NDArray[np.float64], before: NDArray[np.float64] | None = None) -> None:
-        """Take over the Dirichlet values of a step, on the local dofs of V.
-
-        Args:
-            change: Their change in the step.
-            before: Their totals at its beginning; ``None``: zero.
-        """
-        self._change = change[: self._owned]
-        self._totals = np.zeros(self._owned) if before is None else before[: self._owned]
-        self._imposed = False
-        self.prescribes = over_ranks(self._comm, bool(np.any(change)), MPI.LOR)
-        moved = (self._change != 0.0) | (self._totals != 0.0)
-        at_rest = (self._held() & ~moved).reshape(-1, self._bs)
+        """Take over the Dirichlet values of a step: see :meth:`.Prescribed.begin`."""
+        self.prescribed.begin(change, before)
+        at_rest = self.prescribed.at_rest
         for body in self.bodies:
             if not isinstance(body, Particles) or body.is_free:
                 continue
@@ -239,29 +237,19 @@ class Field:
 
         They are the same object as long as nothing moves relative to what carries it.
         """
-        moved, ghosts = self.look(), self._ghosts
-        active = self.touched.has_weight if ghosts is None else ghosts.tie(self.touched)
-        free = self.touched.on_dofs(active)
-        if self._background is not None:
-            free[self._background.support()] = True
-        dofs = np.flatnonzero(free & ~self._fixed).astype(np.int32)
-        same = not moved and ghosts is None and np.array_equal(dofs, self.dofs)
+        moved = self.look()
+        free = self.acting.unknowns(self.touched)
+        dofs = np.flatnonzero(free & ~self.fixed).astype(np.int32)
+        same = not moved and self.acting.lasts and np.array_equal(dofs, self.dofs)
         if self._found is None or not over_ranks(self._comm, same, MPI.LAND):
-            self._take(dofs)
+            self.dofs = dofs
+            self._found = FreeDofs(self.V, dofs, self.touched)
+            for motion in self.motions:
+                motion.begin()
         self.u.set(0.0)
         self.force.set(0.0)
         self.free = self._found
-        assert self.free is not None
         return self.free
-
-    def _take(self, dofs: NDArray[np.int32]) -> None:
-        """Take other dofs for the unknowns (collective)."""
-        self.dofs = dofs
-        self._found = FreeDofs(self.V, dofs, self.touched)
-        T = self.bodies[0].T
-        self.u, self.force = T.createVecRight(), T.createVecRight()
-        for motion in self.motions:
-            motion.begin()
 
     def look(self) -> bool:
         """Find the nodes of V that bodies touch, and the dofs with a condition.
@@ -278,66 +266,40 @@ class Field:
             owned = [body.W.dofmap.index_map.size_local for body in self.bodies]
             self.touched = TouchedNodes(self.V, bases, owned)
         self._bases = bases
-        self._fixed = self.held_now()
+        self.fixed = self.held_now()
         return moved
 
     def held_now(self) -> NDArray[np.bool_]:
         """Return which of this rank's own dofs of V conditions hold where the bodies are now."""
-        return self._held()
+        return self.prescribed.held
 
     def rows_of(self, particles: Particles | CarriedField) -> TransferRows:
         """Return the rows of T of one of the bodies."""
         number = next(i for i, m in enumerate(self.motions) if m.particles is particles)
         return self.touched.rows[number]
 
-    def _held(self) -> NDArray[np.bool_]:
-        """Return which of this rank's own dofs of V have a condition, looked up once for each."""
-        conditions, known = self.conditions, self._looked_up
-        if known is None or list(map(id, conditions)) != list(map(id, known)):
-            self._looked_up, self._conditioned = conditions, fixed_dofs(conditions, self.V)
-        return self._conditioned
-
     def forget(self) -> None:
         """Forget the unknowns."""
         self.free = None
 
     def number(self, part: slice, numbers: NDArray[np.int64], sizes: tuple[int, int]) -> None:
-        """Take over the numbers of the unknowns among those of all fields.
+        """Take over the numbers of the unknowns: see :class:`_Numbers`."""
+        self._numbers = _Numbers(part, numbers, sizes)
+        self._prolongation = None
+        self.acting.renew()
 
-        Args:
-            part: Where they are among this rank's.
-            numbers: Number of the unknown of each free dof.
-            sizes: Number of all fields' unknowns of this rank and of all ranks.
-        """
-        self.part, self._numbers, self._sizes = part, numbers, sizes
-        self._prolongation: PETSc.Mat | None = None
-        self._penalty: tuple[PETSc.Mat, PETSc.Mat] | None = None
-        self._product: PETSc.Mat | None = None
+    @property
+    def part(self) -> slice:
+        """Where the unknowns are among this rank's."""
+        return self._numbers.part
 
     def restriction(self, rows: Sequence[TransferRows]) -> tuple[Restriction, tuple[int, int]]:
         """Return where a tangent goes that is reduced by rows of T, and its size."""
+        part, own, sizes = self._numbers
         numbers = np.full(self._owned, -1, dtype=np.int32)
-        numbers[self.dofs] = self._numbers
-        ties = self._ties(numbers.reshape(-1, self._bs))
-        found = Restriction(self.touched, rows, numbers, self.part, ties, self.factor)
-        return found, self._sizes
-
-    def _ties(self, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the blocks of the penalty: first row, height, first column, width of each.
-
-        Args:
-            numbers: Number of the unknown of each own dof of V, or -1, shape ``(n, bs)``.
-        """
-        if self._ghosts is None or not self._ghosts.acts:
-            return no_ties
-        counts, step = np.count_nonzero(numbers >= 0, axis=1), self._bs + 1
-        firsts = np.where(numbers >= 0, numbers, numbers.max(axis=1, keepdims=True)).min(axis=1)
-        known = self.touched.at_nodes(firsts.astype(np.int64) * step + counts, self._ghosts.tied)
-        pairs = np.broadcast_arrays(known[:, :, None], known[:, None, :])
-        span = step * max(self._sizes[1], 1)
-        rows, columns = np.divmod(np.unique(pairs[0] * span + pairs[1]), span)
-        blocks = np.column_stack([*np.divmod(rows, step), *np.divmod(columns, step)])
-        return blocks[(blocks[:, 1] > 0) & (blocks[:, 3] > 0)].astype(np.int32)
+        numbers[self.dofs] = own
+        ties = self.acting.ties(self.touched, numbers.reshape(-1, self._bs), sizes[1])
+        return Restriction(self.touched, rows, numbers, part, ties, self.factor), sizes
 
     @property
     def prolongation(self) -> PETSc.Mat:
@@ -347,38 +309,23 @@ class Field:
             offsets[1 + self.dofs] = 1
             csr = (
                 np.cumsum(offsets, dtype=PETSc.IntType),
-                self._numbers.astype(PETSc.IntType),
+                self._numbers.numbers.astype(PETSc.IntType),
                 np.full(len(self.dofs), self.factor),
             )
-            sizes = (self.u.getSizes(), self._sizes)
+            sizes = (self.u.getSizes(), self._numbers.sizes)
             self._prolongation = PETSc.Mat().createAIJ(sizes, csr=csr, comm=self._comm)
         return self._prolongation
 
     def level(self) -> FieldDofs:
         """Return this rank's unknowns as the finest level of multigrid (collective)."""
         assert self.free is not None
-        if self._lines is None:
-            lines = cell_lines(self.V)
-            self._lines = lines if self.V.ufl_element().degree > 1 else coarser(lines)
-        nodes, components = np.divmod(self.dofs, self._bs)
-        gdim = self.V.mesh.geometry.dim
-        points = self.free.collect(self.V.tabulate_dof_coordinates()[nodes, :gdim])
-        numbers = np.arange(self.part.start, self.part.stop)
-        return FieldDofs(numbers, points, self.free.collect(components), self._lines, self._bs)
-
-    @cached_property
-    def coarsening(self) -> Coarsening:
-        """How well multigrid's boxes follow the background (collective)."""
-        if grid_lines(self.V) is None:
-            return Coarsening.FAIR if self.V.ufl_element().degree == 1 else Coarsening.POOR
-        nested = self.V.ufl_element().degree == 1 or self.V.mesh.basix_cell() in BOX_CELLS
-        return Coarsening.GOOD if nested else Coarsening.POOR
+        return self.boxes.finest(self.free, self.dofs, self.part.start)
 
     # -- Vectors --------------------------------------------------------------------------
 
     def spread(self, x: PETSc.Vec) -> None:
         """Set increment and bodies to what the unknowns x and the imposed values give."""
-        values = self._lifts() if self._imposed else np.zeros(self._owned)
+        values = self.changes() if self.prescribed.imposed else np.zeros(self._owned)
         self._set(self.u, x, values)
         first, *others = [body.increment.x for body in self.bodies]
         first.array[: self._owned] = self.u.array_r
@@ -399,36 +346,24 @@ class Field:
         assert self.free is not None
         F.array_w[self.part] = self.factor * self.free.collect(force.array_r[self.dofs])
 
-    def residual_at_unknowns(self) -> PETSc.Vec | None:
-        """Return the last residual at the free dofs, zero elsewhere, if these are known."""
-        if self.free is None:
-            return None
-        values = self.force.duplicate()
-        values.set(0.0)
-        values.array_w[self.dofs] = self.force.array_r[self.dofs]
-        return values
-
     def impose(self) -> bool:
         """Impose the step's Dirichlet values from now on; return whether there are any."""
-        self._imposed = True
-        if not self.prescribes:
+        self.prescribed.imposed = True
+        if not self.prescribed.changes:
             return False
-        return over_ranks(self._comm, bool(np.any(self._lifts())), MPI.LOR)
-
-    def _lifts(self) -> NDArray[np.float64]:
-        return np.where(self._fixed, self._change, 0.0)
-
-    def lift(self) -> PETSc.Vec:
-        """Return the increment that the step's Dirichlet values are."""
-        return self.driven(self._lifts())
+        return over_ranks(self._comm, bool(np.any(self.changes())), MPI.LOR)
 
     def changes(self) -> NDArray[np.float64]:
         """Return the change of the Dirichlet values in the step, zero at other own dofs of V."""
-        return self._lifts()
+        return np.where(self.fixed, self.prescribed.change, 0.0)
+
+    def lift(self) -> PETSc.Vec:
+        """Return the increment that the step's Dirichlet values are."""
+        return self.driven(self.changes())
 
     def driven(self, values: NDArray[np.float64]) -> PETSc.Vec:
         """Return the increment with values at the fixed dofs, on own dofs of V, and no unknowns."""
-        self.u.array_w[:] = np.where(self._fixed, values, 0.0)
+        self.u.array_w[:] = np.where(self.fixed, values, 0.0)
         return self.u
 
     def on_background(self, x: PETSc.Vec) -> PETSc.Vec:
@@ -456,86 +391,3 @@ class Field:
         positive = self.V.ufl_element().degree == 1
         u = map_to_background([motion.T for motion in self.motions], increments, fit, positive)
         x.array_w[self.part] = self.free.collect(u[self.dofs]) / self.factor
-
-    def reactions(self) -> float:
-        """Return the norm of the last residual at Dirichlet conditions."""
-        forces = np.where(self._fixed, self.force.array_r, 0.0)
-        return joint_norm(forces, self._comm)
-
-    def works(self) -> NDArray[np.float64]:
-        """Return the work of forces on the background over the last increment (collective).
-
-        Returns:
-            Work done against what acts on the background itself, work of the residual at Dirichlet
-            conditions, and work of the residual at the unknowns.
-        """
-        assert self.free is not None
-        own = self.u.duplicate()
-        own.set(0.0)
-        if self._sizes[1] > 0 and norm(self.u) > 0.0:
-            self.add_product(self.u, own)
-        work = self.u.array_r * self.force.array_r
-        found = [
-            self.u.array_r @ own.array_r,
-            work[self._fixed].sum(),
-            work[self.dofs].sum(),
-        ]
-        return np.asarray(self._comm.allreduce(np.array(found)))
-
-    def resultant(self) -> NDArray[np.float64]:
-        """Return the sum of the last residual over the free dofs, by component, as values."""
-        free = self.force.array_r[self.dofs]
-        sums = np.bincount(self.dofs % self._bs, weights=free, minlength=self._bs)
-        return np.asarray(self.factor * self._comm.allreduce(sums))
-
-    # -- What acts on the background itself ---------------------------------------------------
-
-    def scale_penalty(self, moduli: Callable[[Field], list[float]]) -> None:
-        """Take the shear moduli of the bodies as the step begins, if the penalty needs them."""
-        if self._penalised and self.moduli is None:
-            self.moduli = moduli(self)
-
-    def add_residual(self) -> None:
-        """Add what acts on the background to the force of the last increment."""
-        if self._background is not None:
-            self.force.axpy(1.0, self._background.assemble_residual())
-        if self._penalised and self._sizes[1] > 0 and norm(self.u) > 0.0:
-            self._matrices()[0].multAdd(self.u, self.force, self.force)
-
-    def tangents(self) -> list[PETSc.Mat]:
-        """Return the tangents of what acts on the background, in the unknowns."""
-        found = []
-        if self._background is not None:
-            whole = self._background.assemble_tangent()
-            self._product = whole.ptap(self.prolongation, result=self._product)
-            found.append(self._product)
-        if self._penalised:
-            found.append(self._matrices()[1])
-        return found
-
-    def add_product(self, u: PETSc.Vec, force: PETSc.Vec) -> None:
-        """Add the product of these tangents on all dofs of V with an increment."""
-        if self._background is not None:
-            self._background.assemble_tangent().multAdd(u, force, force)
-        if self._penalised:
-            self._matrices()[0].multAdd(u, force, force)
-
-    @property
-    def _penalised(self) -> bool:
-        return self._ghosts is not None and self._ghosts.acts
-
-    def penalty_force(self, moduli: Sequence[float]) -> PETSc.Vec:
-        """Return the force of the penalty at the last increment with shear moduli (collective)."""
-        force = self.u.duplicate()
-        force.set(0.0)
-        if self._ghosts is not None and self._ghosts.acts:
-            self._ghosts.penalty(moduli).mult(self.u, force)
-        return force
-
-    def _matrices(self) -> tuple[PETSc.Mat, PETSc.Mat]:
-        """Return the step's penalty on all dofs of V and in the unknowns."""
-        if self._penalty is None:
-            assert self._ghosts is not None and self.moduli is not None
-            matrix = self._ghosts.penalty(self.moduli)
-            self._penalty = matrix, matrix.ptap(self.prolongation)
-        return self._penalty

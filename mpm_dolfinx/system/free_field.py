@@ -57,9 +57,9 @@ class FreeField(Field):
         self._followers = np.zeros(self._owned, dtype=bool)
         self._held()
 
-    @override
     def _held(self) -> NDArray[np.bool_]:
-        fixed = super()._held()
+        """Return which own dofs of W conditions hold; they are of free nodes."""
+        fixed = self.prescribed.held
         carried = fixed & ~self.nodes.dofs
         with agree(self._comm):
             if fixed.any() and self.nodes.particles.frees_by_itself:
@@ -99,8 +99,8 @@ class FreeField(Field):
         return fixed | self._followers
 
     @override
-    def _lifts(self) -> NDArray[np.float64]:
-        lifts = super()._lifts()
+    def changes(self) -> NDArray[np.float64]:
+        lifts = super().changes()
         if self._beneath is not None:
             given, taken = self._beneath.createVecs()
             given.array_w[:] = self.host.changes()
@@ -154,7 +154,7 @@ class Subspace:
     @property
     def prescribes(self) -> bool:
         """Whether Dirichlet values change in the step that has begun."""
-        return any(field.prescribes for field in self.fields)
+        return any(field.prescribed.changes for field in self.fields)
 
     def restriction(
         self, bodies: Sequence[Particles | CarriedField]
@@ -203,7 +203,3 @@ class Subspace:
         """Return values on the own dofs of all fields by field."""
         ends = np.cumsum([field.u.getLocalSize() for field in self.fields])
         return np.split(values, ends[:-1])
-
-    def resultant(self) -> float:
-        """Return the size of the sum of the last residual over the free dofs."""
-        return float(np.linalg.norm(np.sum([field.resultant() for field in self.fields], axis=0)))

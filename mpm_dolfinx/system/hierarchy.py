@@ -11,6 +11,7 @@ twice as large again follow, until few dofs are left.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -19,10 +20,15 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from ..background.grids import box_weights, coarser
-from ..tolerances import NEGLIGIBLE
+from dolfinx import fem
 
-__all__ = ["FieldDofs", "interpolations"]
+from ..background.grids import box_weights, cell_lines, coarser, grid_lines
+from ..meshes.boxes import BOX_CELLS
+from ..solvers.strategies import Coarsening
+from ..tolerances import NEGLIGIBLE
+from .numbering import FreeDofs
+
+__all__ = ["Boxes", "FieldDofs", "interpolations"]
 
 #: Dofs up to which a level lives on one rank.
 GATHERED = 3000
@@ -64,6 +70,45 @@ class FieldDofs(NamedTuple):
         index = np.unravel_index(nodes, shape)
         points = np.stack([line[i] for line, i in zip(self.lines, index, strict=True)], axis=1)
         return FieldDofs(numbers, points, components, coarser(self.lines), self.bs)
+
+
+class Boxes:
+    """The boxes of multigrid over one background.
+
+    Args:
+        V: The background space.
+    """
+
+    def __init__(self, V: fem.FunctionSpace) -> None:
+        self._V = V
+
+    @cached_property
+    def coarsening(self) -> Coarsening:
+        """How well they follow the background (collective)."""
+        degree = self._V.ufl_element().degree
+        if grid_lines(self._V) is None:
+            return Coarsening.FAIR if degree == 1 else Coarsening.POOR
+        nested = degree == 1 or self._V.mesh.basix_cell() in BOX_CELLS
+        return Coarsening.GOOD if nested else Coarsening.POOR
+
+    @cached_property
+    def _lines(self) -> list[NDArray[np.float64]]:
+        lines = cell_lines(self._V)
+        return lines if self._V.ufl_element().degree > 1 else coarser(lines)
+
+    def finest(self, free: FreeDofs, dofs: NDArray[np.int32], first: int) -> FieldDofs:
+        """Return unknowns of V as the finest level (collective).
+
+        Args:
+            free: The unknowns.
+            dofs: Their local numbers on V.
+            first: Place of the first among this rank's unknowns.
+        """
+        V, bs = self._V, self._V.dofmap.index_map_bs
+        nodes, components = np.divmod(dofs, bs)
+        points = free.collect(V.tabulate_dof_coordinates()[nodes, : V.mesh.geometry.dim])
+        numbers = first + np.arange(len(points))
+        return FieldDofs(numbers, points, free.collect(components), self._lines, bs)
 
 
 class _Entries(NamedTuple):

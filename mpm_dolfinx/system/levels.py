@@ -64,7 +64,7 @@ class Levels:
     def coarsening(self) -> Coarsening:
         """How well multigrid's boxes follow the tangent."""
         unknowns = self._unknowns
-        found = [one.host.coarsening for one in unknowns.subspaces]
+        found = [one.host.boxes.coarsening for one in unknowns.subspaces]
         joint = len(unknowns.subspaces) < len(unknowns.fields)
         hosts = ({id(unknowns.place(body)[0]) for body in term.bodies} for term in self._terms)
         if joint or any(len(fields) > 1 for fields in hosts):

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -122,7 +123,7 @@ class ReducedSystem:
         with self._statistics.phase("assemble"):
             self.balance.begin()
             for field in self.fields:
-                field.scale_penalty(self.terms.shear_moduli)
+                field.acting.scale(partial(self.terms.shear_moduli, field))
             if any(field.unit is None for field in unknowns.values):
                 self._find_units()
             starts = [term.start(unknowns.transfer, unknowns.prescribed) for term in self.terms]

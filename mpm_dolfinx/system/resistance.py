@@ -44,7 +44,7 @@ class Resistance:
         for field, u in zip(fields, increments, strict=True):
             force = u.duplicate()
             force.set(0.0)
-            field.add_product(u, force)
+            field.acting.add_product(u, force)
             total += force.dot(u)
         for term in self._terms:
             motions = [self._unknowns.moved(body, increments) for body in term.bodies]

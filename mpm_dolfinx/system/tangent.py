@@ -169,7 +169,7 @@ class Tangent:
             ]
             parts += [K for own in reduced for K in own]
             for field in unknowns.fields:
-                parts += field.tangents()
+                parts += field.acting.tangents(field.prolongation)
             if not self._has_diagonal:
                 made.zeros = made.zeros or self._zeros_on_diagonal()
                 parts.append(made.zeros)
@@ -225,7 +225,7 @@ class Tangent:
         unknowns = self._unknowns
         fields, forces = unknowns.fields, unknowns.zeros()
         for field, force in zip(fields, forces, strict=True):
-            field.add_product(field.lift(), force)
+            field.acting.add_product(field.lift(), force)
         lifts = [field.u for field in fields]
         on_own: list[tuple[OwnUnknowns, PETSc.Vec]] = []
         made = self._made

@@ -97,7 +97,7 @@ class Unknowns:
 
     def prescribed(self, body: Particles) -> PETSc.Vec | None:
         """Return how the step's Dirichlet values move a body, ``None``: not at all."""
-        if not any(field.prescribes for field, _ in self.ways(body)):
+        if not any(field.prescribed.changes for field, _ in self.ways(body)):
             return None
         return self.moved(body, [field.lift() for field in self.fields]).copy()
 
@@ -116,7 +116,7 @@ class Unknowns:
         found: list[float | None] = []
         for field, motion in self.places:
             number = field.motions.index(motion)
-            found.append(None if field.moduli is None else field.moduli[number])
+            found.append(None if field.acting.moduli is None else field.acting.moduli[number])
         return None if all(modulus is None for modulus in found) else found
 
     @moduli.setter
@@ -128,7 +128,7 @@ class Unknowns:
                 for value, (its, _) in zip(every, self.places, strict=True)
                 if its is field and value is not None
             ]
-            field.moduli = own or None
+            field.acting.moduli = own or None
 
     # -- Numbers ----------------------------------------------------------------------------------
 

@@ -73,7 +73,7 @@ class ValueField(Field):
     def _start(self) -> None:
         """Let values start from those of the background that fit them best (collective)."""
         start = self.start
-        start.array_w[:] = np.where(self._fixed, self._totals, 0.0)
+        start.array_w[:] = np.where(self.fixed, self.prescribed.totals, 0.0)
         scaled, right = [], start.duplicate()
         right.set(0.0)
         for carried in self.carried:

@@ -203,7 +203,7 @@ def test_the_tangent_by_both_routes(make, take):
         reduced = problem.reduced
         ends = [np.zeros(len(field.bodies[0].increment.x.array)) for field in reduced.fields]
         for end, field in zip(ends, reduced.fields, strict=True):
-            for bc in field.conditions:
+            for bc in field.prescribed:
                 bc.set(end)
         reduced.begin(ends, 1.0)
         reduced.impose()

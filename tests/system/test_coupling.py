@@ -170,7 +170,7 @@ def test_tangent_and_lift_of_a_tie_by_finite_differences():
     changes = []
     for field in system.fields:
         change = fem.Function(field.V).x.array.copy()
-        for bc in field.conditions:
+        for bc in field.prescribed:
             bc.set(change, None, 1.0)
         changes.append(change)
     system.begin(changes, 1.0)
