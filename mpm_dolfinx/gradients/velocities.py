@@ -47,7 +47,9 @@ class TakenVelocities:
             c = field.on_background(projected.unknowns)
             c.axpy(1.0, driven_on(field, values))
             self._c.append(c)
-        self._rest = problem.inertia.not_followed(projected.velocity)
+        self._rest = problem.inertia.step.not_followed(
+            problem.inertia.velocities, projected.velocity
+        )
 
     def by(
         self,
@@ -69,9 +71,11 @@ class TakenVelocities:
         for sign in (1.0, -1.0):
             amount = sign * parameter.change
             self._nearby.go(parameter, amount, rates)
-            left = inertia.not_followed(self._projected.velocity)
+            left = inertia.step.not_followed(inertia.velocities, self._projected.velocity)
             beside = [c + amount * rate for c, rate in zip(own, changes, strict=True)]
-            sides.append(([v.array_r.copy() for v in left], inertia.driven(beside)))
+            sides.append(
+                ([v.array_r.copy() for v in left], inertia.state.driven(beside, inertia.dt))
+            )
         (after, driven_after), (before, driven_before) = sides
         c_rate = [
             driven_on(field, parameter.slope(*pair))

@@ -209,7 +209,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         self, history: MaterialPoints, supports: Sequence[Support]
     ) -> tuple[StepStress, Sequence[StepForce]]:
         body = history.strain.particles
-        whole = self.inertia.scheme.stress_of_step and not self.inertia.is_static(body)
+        whole = self.inertia.scheme.stress_of_step and not self.inertia.state.is_static(body)
         stress = StepStress(history, whole, self._viscosity, self._force_share(body))
         self._step_stresses.append(stress)
         return stress, (stress, *supports)
@@ -221,11 +221,11 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
 
     @override
     def _force_share(self, body: Particles) -> float:
-        return 1.0 if self.inertia.is_static(body) else self.inertia.scheme.share
+        return 1.0 if self.inertia.state.is_static(body) else self.inertia.scheme.share
 
     @override
     def _contribution(self, given: Body) -> Contribution:
-        static = self.inertia.is_static(given.particles)
+        static = self.inertia.state.is_static(given.particles)
         return super()._contribution(given)._replace(static=static)
 
     def stored_and_done(self) -> tuple[float, float]:

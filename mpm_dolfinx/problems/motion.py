@@ -120,7 +120,7 @@ class MovingProblem(TimeProblem):
     @override
     def beginning(self) -> list[NDArray[np.float64]]:
         of_step = [array for term in self.body_terms for array in term.beginning()]
-        return [*super().beginning(), *of_step, *self.inertia.beginning()]
+        return [*super().beginning(), *of_step, *self.inertia.state.beginning()]
 
     @override
     def at_end(self) -> list[NDArray[np.float64]]:
@@ -143,7 +143,7 @@ class MovingProblem(TimeProblem):
         """Return :meth:`beginning` of a run's first step, after an update (collective)."""
         of_step = [array for term in self.body_terms for array in term.at_end()]
         forces = self._forces_at_end()
-        return [*super().beginning(), *of_step, *self.inertia.beginning(forces)]
+        return [*super().beginning(), *of_step, *self.inertia.state.beginning(forces)]
 
     def _forces_at_end(self) -> list[NDArray[np.float64]]:
         """Return forces of all bodies after the last update, on local dofs of W (collective)."""

@@ -42,9 +42,10 @@ from ..io.snapshot import Kept
 from ..particles.particles import Particles
 from .account import Account
 from .mass import NodalMass, deleted, dot, nodal_mass
+from .motion_step import MotionStep, combined
 from .projection import Projection
 from .reduced import ReducedSystem
-from .schemes import Factors, Kinematics, Rates, Scheme, rates_of
+from .schemes import Kinematics, Scheme, rates_of
 from .term import Motion, Term, Transfer
 from .velocities import Velocities
 
@@ -94,25 +95,16 @@ class _Rest:
         """Its system."""
         return self.problem.reduced
 
+    def domain_masses(self, state: Velocities) -> list[NDArray[np.float64] | None]:
+        """Return the mass of each body's domains by what densities are now (collective)."""
+        return [
+            None if state.is_static(body) else self.problem.domain_masses(number)
+            for number, body in enumerate(state.bodies)
+        ]
 
-class _Beginning(NamedTuple):
-    """A step at its beginning: vectors on W of each body.
-
-    Attributes:
-        mass: The mass of the bodies.
-        rates: The scheme's, for the step.
-        fields: The velocity, and what the scheme keeps.
-        factor: What the mass is multiplied by in the tangent.
-        staying: The part of the residual that stays.
-        sizes: The sum of absolute values of what that consists of.
-    """
-
-    mass: NodalMass
-    rates: Rates
-    fields: list[list[PETSc.Vec]]
-    factor: float
-    staying: list[PETSc.Vec]
-    sizes: list[PETSc.Vec]
+    def changes(self) -> list[NDArray[np.float64]]:
+        """Return the changes of Dirichlet values in the step, on own dofs of each background."""
+        return [field.changes() for field in self.reduced.fields]
 
 
 class _Reduced(NamedTuple):
@@ -171,7 +163,8 @@ class Inertia(Term):
 
     Attributes:
         scheme: As given.
-        velocities: At the last converged step, on W of each body.
+        state: Velocities and forces at the last converged step.
+        velocities: These, on W of each body.
         dt: Duration of the step.
     """
 
@@ -192,20 +185,16 @@ class Inertia(Term):
         super().__init__(bodies)
         self.scheme, self._damping = scheme, rayleigh[0]
         self._account = Account(energies)
-        self._state = Velocities(bodies, velocities, scheme, rayleigh, static, self._account)
-        self.velocities = self._state.velocities
+        self.state = Velocities(bodies, velocities, scheme, rayleigh, static, self._account)
+        self.velocities = self.state.velocities
         self.dt, self._end = 1.0, 1.0
         self._others: _Rest | None = None
         self._mass: NodalMass | None = None
         self._reduced: _Reduced | None = None
-        self._beginning: _Beginning | None = None
+        self._beginning: MotionStep | None = None
         self._projected: Projected | None = None
         self._increments: list[PETSc.Vec] = []  # of displacement, in the last residuals
         self._is_held = False
-
-    def is_static(self, body: Particles) -> bool:
-        """Return whether a body has no inertia."""
-        return self._state.is_static(body)
 
     @property
     def _rest(self) -> _Rest:
@@ -221,19 +210,9 @@ class Inertia(Term):
             terms: All other terms.
         """
         self._others, self._mass = _Rest(problem, terms), None
-        problem.reduced.levels.massive = [one for one in self.bodies if not self.is_static(one)]
-
-    def _domain_masses(self) -> list[NDArray[np.float64] | None]:
-        """Return the mass of each body's domains by what densities are now (collective)."""
-        problem = self._rest.problem
-        return [
-            None if self.is_static(body) else problem.domain_masses(number)
-            for number, body in enumerate(self.bodies)
+        problem.reduced.levels.massive = [
+            one for one in self.bodies if not self.state.is_static(one)
         ]
-
-    def _changes(self) -> list[NDArray[np.float64]]:
-        """Return the changes of Dirichlet values in the step, on own dofs of each background."""
-        return [field.changes() for field in self._rest.reduced.fields]
 
     def join(self, bodies: Sequence[Particles]) -> None:
         """Act on some more bodies, which are at rest, or on fewer of the last (collective).
@@ -242,7 +221,7 @@ class Inertia(Term):
             bodies: All bodies, in the problem's order.
         """
         self.bodies = tuple(bodies)
-        self._state.join(bodies)
+        self.state.join(bodies)
 
     def mass(self) -> NodalMass:
         """Return the mass for the present meshes and domains (collective).
@@ -251,10 +230,10 @@ class Inertia(Term):
         """
         present = deleted(self.bodies)
         if self._mass is None or present != self._mass.deleted:
-            self._mass = nodal_mass(self.bodies, self._domain_masses(), present)
+            self._mass = nodal_mass(self.bodies, self._rest.domain_masses(self.state), present)
             owned = [own.sum(axis=(1, 2)) for own in self._mass.domains]
             for term in self._rest.terms:
-                term.weigh([owned[self._state.number(body)] for body in term.bodies])
+                term.weigh([owned[self.state.number(body)] for body in term.bodies])
             self._account.remesh(self._mass.kinetic(self.velocities))
         return self._mass
 
@@ -268,11 +247,11 @@ class Inertia(Term):
         Args:
             time: Time of the last converged step.
         """
-        self._state.time = time
+        self.state.time = time
         mass = self.mass()
         for term in self._rest.terms:
             term.roll_back()
-        self._state.note_forces(self._rest.terms)
+        self.state.note_forces(self._rest.terms)
         self._account.begin(
             time, mass.kinetic(self.velocities), self._rest.problem.stored_and_done()[0]
         )
@@ -284,7 +263,7 @@ class Inertia(Term):
 
     def aim(self, time: float) -> None:
         """Take a time for the end of the step to try."""
-        self.dt, self._end = time - self._state.time, time
+        self.dt, self._end = time - self.state.time, time
 
     # -- A step -----------------------------------------------------------------------------------
 
@@ -293,24 +272,15 @@ class Inertia(Term):
         mass, share = self.mass(), self.scheme.share
         for term in self._rest.terms:
             term.pace(self.dt, share)
-        rates = rates_of(self.bodies[0].V.mesh.comm, self.scheme, self.dt, self._state.last)
-        fields = [mass.vectors(own) for own in (self.velocities, *self._state.kept)]
-        factors = (rates.acceleration + self._damping * rates.damped) / share
-        staying = mass.times(_combined(factors[1:], fields))
-        sizes = [force.copy() for force in staying]
-        forces = mass.vectors(self._state.forces)
-        for force, size, before in zip(staying, sizes, forces, strict=True):
-            size.abs()
-            force.axpy((1.0 - share) / share, before)
-            before.abs()
-            size.axpy((1.0 - share) / share, before)
-        self._beginning = _Beginning(mass, rates, fields, float(factors[0]), staying, sizes)
+        state = self.state
+        rates = rates_of(self.bodies[0].V.mesh.comm, self.scheme, self.dt, state.last)
+        self._beginning = MotionStep.begun(mass, state, rates, self.dt, self._damping)
         if not self._is_held:
             self._projected = None
-        return staying
+        return self.step.staying
 
     @property
-    def _step(self) -> _Beginning:
+    def step(self) -> MotionStep:
         """The step that has begun."""
         assert self._beginning is not None
         return self._beginning
@@ -324,10 +294,10 @@ class Inertia(Term):
         zero. With ``"euler"``, which loses energy, they do not: at zero all points look elastic,
         and those that flow would have to find out again.
         """
-        reduced, step = self._reduce(transfer), self._step
+        reduced, step = self._reduce(transfer), self.step
         if self.scheme.reflects:
             return None
-        rates = self.driven(self._changes())
+        rates = self.state.driven(self._rest.changes(), self.dt)
         driven = _driven(self.bodies, self._rest.reduced, rates)
         v = [v.copy() for v in step.fields[0]]
         for part, own in zip(v, driven or (), strict=False):
@@ -356,20 +326,6 @@ class Inertia(Term):
         """Velocities that the step's background can follow; ``None``: not asked for."""
         return self._projected
 
-    def driven(self, changes: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
-        """Return rates of Dirichlet values at the step's beginning by their changes in it."""
-        return self._state.driven(changes, self.dt)
-
-    def beginning(
-        self, forces: Sequence[NDArray[np.float64]] | None = None
-    ) -> list[NDArray[np.float64]]:
-        """Return the arrays that a step begins with, to be set; see :meth:`.Velocities.beginning`.
-
-        Args:
-            forces: Of all other terms, in place of those that are kept.
-        """
-        return self._state.beginning(forces)
-
     def at_end(
         self,
         forces: Sequence[NDArray[np.float64]],
@@ -383,29 +339,14 @@ class Inertia(Term):
             changes: Of Dirichlet values in it.
             taken: What it has of the velocities before, in place of :attr:`projected`.
         """
-        moved, step = self._kinematics(taken), self._step
-        parts = [moved.increment, *step.fields]
-        fields = [moved.after, *(_combined(factors, parts) for factors in step.rates.kept)]
-        values = []
-        for vectors in fields:
-            for body, vector in zip(self.bodies, vectors, strict=True):
-                function = fem.Function(body.W)
-                function.x.array[: vector.getLocalSize()] = vector.array_r
-                function.x.scatter_forward()
-                values.append(np.asarray(function.x.array, dtype=np.float64))
+        step = self.step
+        values = step.local(step.at_end(self._moved(taken)))
         return [*values, *forces, *(change / self.dt for change in changes)]
-
-    def not_followed(self, velocity: Sequence[PETSc.Vec]) -> list[PETSc.Vec]:
-        """Return M times what velocities at the step's beginning differ by from others."""
-        rest = self._step.mass.vectors(self.velocities)
-        for vector, other in zip(rest, velocity, strict=True):
-            vector.axpy(-1.0, other)
-        return self._step.mass.times(rest)
 
     def weighed(self) -> NodalMass:
         """Return the mass by what densities are now (collective)."""
         known = self.mass()
-        return nodal_mass(self.bodies, self._domain_masses(), known.deleted)
+        return nodal_mass(self.bodies, self._rest.domain_masses(self.state), known.deleted)
 
     def assume(self, mass: NodalMass) -> None:
         """Let the mass be another one in :meth:`held`."""
@@ -428,23 +369,23 @@ class Inertia(Term):
         """Return the mass reduced by T of all bodies, anew where they are others."""
         Ts = [transfer(body) for body in self.bodies]
         known = self._reduced
-        mass = self._step.mass
+        mass = self.step.mass
         if known is None or not known.is_of(mass, Ts):
             self._reduced = known = _reduced(mass, Ts, self._rest.reduced.tangent.masses)
         return known
 
     @override
     def residuals(self) -> Sequence[PETSc.Vec]:
-        self._increments = _increments(self._step.mass)
-        forces = self.stiffness_force(self._increments)
-        for force, staying in zip(forces, self._step.staying, strict=True):
+        self._increments = self.step.increments()
+        forces = self.step.pull(self._increments)
+        for force, staying in zip(forces, self.step.staying, strict=True):
             force.axpy(1.0, staying)
         return forces
 
     @override
     def absolute_contributions(self) -> Sequence[PETSc.Vec]:
-        forces = self.stiffness_force(self._increments)
-        for force, size in zip(forces, self._step.sizes, strict=True):
+        forces = self.step.pull(self._increments)
+        for force, size in zip(forces, self.step.sizes, strict=True):
             force.abs()
             force.axpy(1.0, size)
         return forces
@@ -452,7 +393,7 @@ class Inertia(Term):
     @override
     def reduced_tangents(self, transfer: Transfer) -> Sequence[PETSc.Mat]:
         """Return the mass of bodies that fused forms do not have."""
-        reduced, factor = self._reduce(transfer), self._step.factor
+        reduced, factor = self._reduce(transfer), self.step.factor
         self._rest.reduced.tangent.mass_factor = factor
         if reduced.mass is None or reduced.scaled is None:
             return []
@@ -462,57 +403,39 @@ class Inertia(Term):
 
     @override
     def stiffness_force(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
-        forces = self._step.mass.times(motions)
-        for force in forces:
-            force.scale(self._step.factor)
-        return forces
+        return self.step.pull(motions)
 
     @override
     def commit(self) -> Callable[[], None]:
         """Commit the new velocities, forces and energies."""
-        undo, step, account = self._state.undo(), self._step, self._account
-        moved = self._kinematics()
+        undo, step, account = self.state.undo(), self.step, self._account
+        moved = self._moved()
         kinetic = 0.5 * step.mass.product(moved.after, moved.after)
         works = self._works(moved)
         if deleted(self.bodies) != step.mass.deleted:
             # Forces of particles that the step's end has deleted are in its balance, but gone now.
             works["lost"] += account.missing(works, kinetic)
-        parts = [moved.increment, *step.fields]
-        kept = [_combined(factors, parts) for factors in step.rates.kept]
         account.book(works, kinetic, self._rest.problem.stored_and_done()[1])
-        self._state.commit([moved.after, *kept], self._changes(), self._end)
+        self.state.commit(step.at_end(moved), self._rest.changes(), self._end)
         self.mass()
         account.note(self._end, self._rest.problem.stored_and_done()[0])
         return undo
 
-    def _kinematics(self, projected: Sequence[PETSc.Vec] | None = None) -> Kinematics:
+    def _moved(self, projected: Sequence[PETSc.Vec] | None = None) -> Kinematics:
         """Return the motion in the step that has converged (collective).
 
         Args:
             projected: See :attr:`projected`; ``None``: that.
         """
-        mass, rates, (before, *kept) = self._step.mass, self._step.rates, self._step.fields
-        w, taken = self._increments, before
-        if rates.velocity[1] == 0.0:
-            taken = _combined(np.zeros(1), [before])
-        elif not self.scheme.reflects:
-            if projected is None:
-                assert self._projected is not None
-                projected = self._projected.velocity
-            taken = list(projected)
-        after = _combined(rates.velocity, [w, taken, *kept])
-        for body, v, own in zip(self.bodies, after, w, strict=True):
-            if self.is_static(body):
-                own.copy(v)
-                v.scale(1.0 / self.dt)
-        acceleration = _combined(rates.acceleration, [w, before, *kept])
-        return Kinematics(mass, w, acceleration, before, taken, after)
+        if projected is None and self._projected is not None:
+            projected = self._projected.velocity
+        return self.step.moved(self._increments, self.state, projected)
 
     def _works(self, moved: Kinematics) -> dict[str, float]:
         """Return the works of the step by name, and note the forces at its end (collective)."""
-        step, share, state, terms = self._step, self.scheme.share, self._state, self._rest.terms
+        step, share, state, terms = self.step, self.scheme.share, self.state, self._rest.terms
         w, mass = moved.increment, step.mass
-        drag = _combined(self._damping * step.rates.damped, [w, *step.fields])
+        drag = combined(self._damping * step.rates.damped, [w, *step.fields])
         on_background, prescribed, left = share * self._rest.reduced.balance.works()
         whole, resisted = np.sum([term.step_work() for term in terms], axis=0)
         parts = [state.forces, state.external]
@@ -536,31 +459,7 @@ class Inertia(Term):
 
     @override
     def kept(self) -> Sequence[Kept]:
-        return [self._state]
-
-
-def _increments(mass: NodalMass) -> list[PETSc.Vec]:
-    """Return the present change of displacement, on W of each body."""
-    bodies = mass.bodies
-    return mass.around(
-        [
-            body.displacement.x.array[: len(body.converged_displacement)]
-            - body.converged_displacement
-            for body in bodies
-        ]
-    )
-
-
-def _combined(factors: Factors, parts: Sequence[Sequence[PETSc.Vec]]) -> list[PETSc.Vec]:
-    """Return a linear combination of vectors on W of each body."""
-    sums = [vector.duplicate() for vector in parts[0]]
-    for total in sums:
-        total.set(0.0)
-    for factor, vectors in zip(factors, parts, strict=True):
-        if factor != 0.0:
-            for total, vector in zip(sums, vectors, strict=True):
-                total.axpy(factor, vector)
-    return sums
+        return [self.state]
 
 
 def _driven(

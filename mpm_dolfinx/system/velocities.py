@@ -37,6 +37,8 @@ class Velocities(Kept):
         account: The account of energies.
 
     Attributes:
+        bodies: As given.
+        scheme: As given.
         velocities: At the last converged step, on W of each body.
         forces: Of all terms, at the same time.
         external: Those of them that are loads.
@@ -56,8 +58,8 @@ class Velocities(Kept):
         static: Sequence[Particles],
         account: Account,
     ) -> None:
-        self._bodies = tuple(bodies)
-        self._scheme, self._rayleigh, self._static = scheme, rayleigh, static
+        self.bodies = tuple(bodies)
+        self.scheme, self._rayleigh, self._static = scheme, rayleigh, static
         self._account = account
         self.velocities = list(velocities)
         self.forces = [fem.Function(body.W) for body in bodies]
@@ -72,7 +74,7 @@ class Velocities(Kept):
 
     def number(self, body: Particles) -> int:
         """Return the number of a body."""
-        return next(i for i, one in enumerate(self._bodies) if one is body)
+        return next(i for i, one in enumerate(self.bodies) if one is body)
 
     def join(self, bodies: Sequence[Particles]) -> None:
         """Hold some more bodies, which are at rest, or fewer of the last (collective).
@@ -80,7 +82,7 @@ class Velocities(Kept):
         Args:
             bodies: All bodies, in the problem's order.
         """
-        self._bodies = tuple(bodies)
+        self.bodies = tuple(bodies)
         for functions in self._fields().values():
             del functions[len(bodies) :]
             for body in bodies[len(functions) :]:
@@ -89,8 +91,8 @@ class Velocities(Kept):
     def _fields(self) -> dict[str, list[fem.Function]]:
         """Return all fields by their names in a checkpoint."""
         own = {"velocity": self.velocities, "force": self.forces, "external": self.external}
-        kept = zip(self._scheme.keeps, self.kept, strict=True)
-        return own | {f"{self._scheme.name} {name}": functions for name, functions in kept}
+        kept = zip(self.scheme.keeps, self.kept, strict=True)
+        return own | {f"{self.scheme.name} {name}": functions for name, functions in kept}
 
     # -- Steps ------------------------------------------------------------------------------------
 
@@ -183,9 +185,9 @@ class Velocities(Kept):
     @override
     def numbers(self) -> dict[str, Any]:
         return {
-            "scheme": [self._scheme.name, "reflect" if self._scheme.reflects else "project"],
+            "scheme": [self.scheme.name, "reflect" if self.scheme.reflects else "project"],
             "rayleigh": list(self._rayleigh),
-            "static": [number for number, body in enumerate(self._bodies) if self.is_static(body)],
+            "static": [number for number, body in enumerate(self.bodies) if self.is_static(body)],
             "time": self.time,
             "rates": self.last,
             **self._account.numbers(),
@@ -200,7 +202,7 @@ class Velocities(Kept):
     @override
     def on_background(self, number: int) -> dict[str, Column]:
         """Return the rates of Dirichlet values in the last step."""
-        spaces = spaces_of(self._bodies)
+        spaces = spaces_of(self.bodies)
         if number >= len(spaces):  # that of a pressure, which has no rates
             return {}
         function = fem.Function(spaces[number])
@@ -233,14 +235,14 @@ class Velocities(Kept):
     @override
     def restore(self, taken: Taken) -> None:
         for name, functions in self._fields().items():
-            for number, body in enumerate(self._bodies):
+            for number, body in enumerate(self.bodies):
                 if functions[number].function_space is not body.W:
                     functions[number] = fem.Function(body.W, name=functions[number].name)
                 fill(functions[number], taken.columns[number][name])
         self.time, self.last = taken.numbers["time"], taken.numbers["rates"]
         self._account.restore(taken.numbers)
         self._rates = []
-        for V, columns in zip(spaces_of(self._bodies), taken.backgrounds, strict=False):
+        for V, columns in zip(spaces_of(self.bodies), taken.backgrounds, strict=False):
             function = fem.Function(V)
             fill(function, columns["rates"])
             owned = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
