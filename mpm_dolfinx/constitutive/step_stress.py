@@ -60,8 +60,7 @@ class _Beginning(NamedTuple):
         reference: What the body's mesh is strained by, the same object while it is the same.
         gradient: F - I.
         stress: First Piola stress, without that of a pressure of its own.
-        energy: Elastic energy per volume.
-        potential: That of which the stress is the derivative.
+        potential: Energy of which the stress is the derivative, where stress is of the whole step.
         volume: What the pressure works on, if there is one.
         undeformed: Tangent of the undeformed body, if there is damping in proportion to it.
     """
@@ -69,14 +68,13 @@ class _Beginning(NamedTuple):
     reference: Reference | None
     gradient: Array
     stress: Array
-    energy: Array
-    potential: Array
+    potential: Array | None
     volume: _Volume | None
     undeformed: Array | None
 
-    def arrays(self, conserving: bool) -> list[Array]:
-        """Return the arrays that the stress of a step depends on, conserving or not."""
-        whole = [self.stress, self.potential] if conserving else []
+    def arrays(self) -> list[Array]:
+        """Return the arrays that the stress of a step depends on."""
+        whole = [] if self.potential is None else [self.stress, self.potential]
         if self.undeformed is not None:
             whole.append(self.undeformed)
         return [self.gradient, *whole] if whole else []
@@ -328,11 +326,11 @@ class StepStress:
 
     def beginning(self) -> list[Array]:
         """Return the arrays of :meth:`settle` that stress depends on, to be set."""
-        return self._begin.arrays(self._conserving)
+        return self._begin.arrays()
 
     def at_end(self) -> list[Array]:
         """Return them as :meth:`settle` would leave them after the last update (collective)."""
-        return self._settled(self._found, trial=True)[0].arrays(self._conserving)
+        return self._settled(self._found, trial=True)[0].arrays()
 
     def _settled(self, found: _Evaluation, trial: bool = False) -> tuple[_Beginning, _Evaluation]:
         """Return the beginning of the next step, and the last evaluation as it is seen then.
@@ -343,17 +341,19 @@ class StepStress:
         """
         points, part, volume = self._points, self._part, None
         H = _gradient(points).copy()  # (which is that of the points until they are strained again)
-        stress, potential = points.first_piola.copy(), points.potential(trial)
+        stress = points.first_piola.copy()
+        potential = points.potential(trial) if self._conserving else None
         if part is not None:
             p, volume = part.converged, part.volume(H)
-            potential = potential - part.stored(p)
+            if potential is not None:
+                potential = potential - part.stored(p)
             stress -= p[:, None, None] * volume.slope
             slope = volume.slope / self._share
             found = replace(found, own=stress, slope=slope, by_pressure=slope)
-        energy, reference = points.strain_energy(trial), _reference(points)
+        reference = _reference(points)
         # (a body that was rebased or split learns what its mesh is strained by after that)
         undeformed = undeformed_tangent(points.laws) if self._viscosity > 0.0 else None
-        return _Beginning(reference, H, stress, energy, potential, volume, undeformed), found
+        return _Beginning(reference, H, stress, potential, volume, undeformed), found
 
     def update(self) -> None:
         """Update stress and tangent for the present displacement (collective with F-bar).
@@ -401,7 +401,7 @@ class StepStress:
     def _whole(self, end: _Evaluation, gradients: Gradients) -> _Evaluation:
         """Return the discrete gradient over the step (collective with F-bar)."""
         begin, potentials, factor = self._begin, None, 1.0 / self._share
-        if (self._kind >= 2).any():
+        if begin.potential is not None and (self._kind >= 2).any():
             potential = self._points.potential(trial=True)
             if self._part is not None:
                 potential = potential - self._part.stored(self._part.pressure)
@@ -476,10 +476,10 @@ class StepStress:
         return self._works.stress
 
     def strain_energy(self) -> float:
-        """Return this rank's elastic energy at the last converged step; perhaps not a number."""
-        weights = self._points.weights.ravel()
+        """Return this rank's elastic energy, last converged; perhaps not a number (collective)."""
+        weights, energy = self._points.weights.ravel(), self._points.strain_energy()
         present = weights > 0.0
-        return float(weights[present] @ self._begin.energy[present])
+        return float(weights[present] @ energy[present])
 
 
 def _between(share: float, before: Array, after: Array) -> Array:

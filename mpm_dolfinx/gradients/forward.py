@@ -49,7 +49,7 @@ type Array = NDArray[np.float64]
 
 #: What the residual of a derivative falls to, relative to what it begins with; what of it is
 #: round-off of differences, relative to the forces; most corrections; and what must not be left.
-SOLVED, NOISE, MOST, LEFT = 1e-10, 1e-8, 6, 1e-3
+SOLVED, NOISE, MOST, LEFT = 1e-10, 1e-7, 6, 1e-3
 
 
 class _Side(NamedTuple):
@@ -139,15 +139,19 @@ class StepDerivative:
         self._move(motion, y_rate)
         held = self._held(parameter, moduli, turns)
         first, last = 0.0, np.inf
+        signs = [1.0, -1.0]
         for tried in range(MOST + 1):
-            sides = [self._beside(parameter, s, rates, motion, change) for s in (1.0, -1.0)]
+            signs.reverse()  # it goes on where it is
+            whole = tried > 0  # what the step leaves is of a motion that has been corrected
+            found = {s: self._beside(parameter, s, rates, motion, change, whole) for s in signs}
+            sides = [found[1.0], found[-1.0]]
             forces = self._forces(parameter, sides)
             self._add_background(forces, held, y_rate)
             rest = self._reduced.unknowns.restricted(forces)
             size = norm(rest)
             first = first or size
             small = max(SOLVED * first, NOISE * self._size * CHANGE / parameter.change)
-            if size <= small or size > 0.5 * last or tried == MOST:
+            if whole and (size <= small or size > 0.5 * last or tried == MOST):
                 break
             last = size
             step = rest.duplicate()
@@ -291,8 +295,12 @@ class StepDerivative:
         rates: Rates,
         motion: Sequence[fem.Function],
         change: _Change,
+        whole: bool,
     ) -> _Side:
-        """Return an evaluation on one side of the state, in the direction of a motion."""
+        """Return an evaluation on one side of the state, in the direction of a motion.
+
+        Only its forces, unless it is to be whole.
+        """
         points = self._problem.points
         arrays = [function.x.array for function in motion]
         self._nearby.go(parameter, sign * parameter.change, rates, arrays)
@@ -301,6 +309,8 @@ class StepDerivative:
                 blocks.enter_context(own.without_tangents())
             self._require(self._reduced.balance.evaluate(), parameter)
         forces = [force.array_r.copy() for force in self._reduced.unknowns.forces]
+        if not whole:
+            return _Side(forces, [], [], [])
         # (what follows may ask the laws again, which may answer in the same arrays)
         states = [[_copies(varying(one)) for one in own.trial.states] for own in points]
         seen = [own.trial.gradient.copy() for own in points]

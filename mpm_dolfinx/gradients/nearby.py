@@ -72,6 +72,7 @@ class _Here:
         states: What materials keep of it.
         seen: ``F - I`` that they have seen.
         moved: The parameter that was changed last, ``None`` where all have their own numbers.
+        side: That with its change and the derivatives of the state that has been gone to.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -83,6 +84,7 @@ class _Here:
         self.states = [points.last.states for points in self.points]
         self.seen = [points.last.gradient for points in self.points]
         self.moved: Parameter | None = None
+        self.side: tuple[Parameter, float, Rates] | None = None
         self._own = [points.governing() for points in self.points]
         self._governing: dict[tuple[int, float], list[Governing]] = {}
 
@@ -144,7 +146,7 @@ class Nearby:
 
     def _restore(self) -> None:
         """Give the parameter that was changed last its own value."""
-        moved, self._here.moved = self._here.moved, None
+        moved, self._here.moved, self._here.side = self._here.moved, None, None
         if moved is not None:
             self._shift(moved, 0.0)
 
@@ -183,13 +185,16 @@ class Nearby:
             motion: Those of displacements and values of fields, if others, on local dofs of W.
         """
         here = self._here
+        motions = motion or [function.x.array for function in rates.motion]
+        for (array, values), rate in zip(here.arrays, motions, strict=False):
+            array[...] = values + amount * rate
+        if here.side is not None and _same(here.side, (parameter, amount, rates)):
+            return  # only what moves is another one
         if here.moved is not parameter:
             self._restore()
-        here.moved = parameter
-        motions = motion or [function.x.array for function in rates.motion]
+        here.moved, here.side = parameter, (parameter, amount, rates)
         # (forces that were held back are last, and gone where they have been let go)
-        arrays = zip(here.arrays, (*motions, *rates.kept), strict=False)
-        for (array, values), rate in arrays:
+        for (array, values), rate in zip(here.arrays[len(motions) :], rates.kept, strict=False):
             array[...] = values + amount * rate
         for body, values, function in zip(
             self._problem.bodies, here.begun, rates.motion, strict=False
@@ -236,6 +241,11 @@ def add_product(function: fem.Function, matrix: PETSc.Mat, change: PETSc.Vec) ->
 def varying(state: State) -> State:
     """Return the parts of a state that can vary little by little, in one order."""
     return {name: values for name, values in sorted(state.items()) if values.dtype.kind == "f"}
+
+
+def _same(side: tuple[Parameter, float, Rates], other: tuple[Parameter, float, Rates]) -> bool:
+    """Return whether two states beside are of the same parameter, change and derivatives."""
+    return side[0] is other[0] and side[1] == other[1] and side[2] is other[2]
 
 
 def _moved(state: State, rate: State, amount: float) -> State:
