@@ -34,7 +34,6 @@ from ..parallel.given import PACKAGE, is_number, require_same
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
 from ..solvers.newton import NewtonSolver
-from ..solvers.strategies import chosen
 from ..stepping.adaptivity import Adaptivity
 from ..stepping.automatic import ErrorControl
 from ..stepping.displacement_control import DisplacementControl
@@ -200,7 +199,6 @@ class Problem(Hooked):
             statistics,
             Predictor(how.predictor and self._predicts),
         )
-        degree = max(body.V.ufl_element().degree for body in self.bodies)
         newton = NewtonSolver(
             self._comm,
             how.petsc_options_prefix,
@@ -211,7 +209,7 @@ class Problem(Hooked):
             how.line_search,
             statistics,
             self.bodies[0].V.mesh.geometry.dim,
-            chosen(how.linear, degree),
+            how.linear,
         )
         self._trial.follow(System(self.bodies, self.body_terms, reduced, newton, clean_up))
         for body in self.bodies:

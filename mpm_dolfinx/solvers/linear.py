@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import ConvergenceError, MPMError
 from ..history import Statistics
 from ..parallel.totals import over_ranks
-from ..tolerances import HALF_DIGITS, ROUND_OFF, SOLVED
+from ..tolerances import HALF_DIGITS, SOLVED
 from .multigrid import Multigrid
 from .problem import Levels
 from .refinement import KRYLOV, Refinement
@@ -29,13 +29,6 @@ __all__ = ["ShiftedFactor"]
 
 #: Most unknowns of the coarsest level of multigrid, which is factorised.
 COARSEST = 600
-#: Order of PETSc's own Cholesky, and the pivot, relative to its row, that counts as none: those of
-#: the shift are as small as round-off.
-ORDER, NO_PIVOT = "nd", 0.0
-#: How many times as many iterations as cost as much as a factor a solve by multigrid may have.
-MOST_BEARABLE = 2.0
-#: Steps in a row in which a factorisation may take over before no step begins with multigrid.
-ENDURED = 3
 #: Relative residual of what multigrid solves besides Newton's steps, and its most iterations.
 ACCURATE, ITERATIONS = 1e-6, 200
 #: Relative residuals of the first and the roughest of Newton's steps by multigrid (Eisenstat &
@@ -47,11 +40,6 @@ PATIENCE = 3
 INDEFINITE = (
     PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT,
     PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC,
-)
-#: By which they say that of the preconditioner, as where sweeps divide by what is round-off.
-SINGULAR = (
-    PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC,
-    PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED,
 )
 
 
@@ -95,12 +83,10 @@ class ShiftedFactor:
         self.shift = shift
         self.iterates = False
         self._own_rtol = self._own_type = False
-        self._failures = 0  # steps in a row
         self._longest = ITERATIONS
         self._dear = False  # what multigrid takes, beside a factorisation
         self._left: float | None = None  # of the residual, by the linear model
         self._bent, self._curved = 1.0, 1.0  # what that lacked in the first solve of a step
-        self._shifts = False  # what multigrid sweeps over
         self._multigrid: Multigrid | SaddleMultigrid | None = None
         self._constrained = False
         self._levels: Levels | None = None
@@ -162,17 +148,16 @@ class ShiftedFactor:
             for key in options:
                 database.delValue(key)
 
-    def begin(self, size: int, levels: Levels, in_motion: bool = False) -> None:
+    def begin(self, size: int, levels: Levels) -> None:
         """Begin a step (collective).
 
         Args:
             size: Number of all unknowns.
             levels: What multigrid must know of the unknowns.
-            in_motion: Whether the tangent has masses.
         """
         self.D = self._left = None
         self._constrained = levels.constrained
-        iterates = self._prefers_multigrid(size, levels, in_motion)
+        iterates = self._prefers_multigrid(size, levels)
         if iterates != self.iterates:
             self._choose(iterates)
         if not iterates:
@@ -190,8 +175,8 @@ class ShiftedFactor:
         self.K = None
         pc.setFactorSolverType(package)
         if few:
-            pc.setFactorOrdering(ORDER)
-            pc.setFactorPivot(NO_PIVOT)
+            pc.setFactorOrdering("nd")
+            pc.setFactorPivot(0.0)  # pivots of the shift are as small as round-off
 
     def _compresses(self, size: int) -> bool:
         """Return whether factors have blocks of low rank."""
@@ -212,20 +197,18 @@ class ShiftedFactor:
             self._ksp.setType(self._direct[0])
             self._ksp.setNormType(PETSc.KSP.NormType.NORM_DEFAULT)
 
-    def _prefers_multigrid(self, size: int, levels: Levels, in_motion: bool) -> bool:
+    def _prefers_multigrid(self, size: int, levels: Levels) -> bool:
         if size <= COARSEST:
             return False  # a factor is all that its levels would be
-        if self._own_type or self._failures >= ENDURED or self._dear:
+        if self._own_type or self._dear:
             return False
         if self._linear_solver != "auto":
             return self._linear_solver == "multigrid"
         least = self._strategy.crossover
         if least is None or not self._symmetric or self._constrained:
             return False
-        if size < min(least.values()):
-            return False
-        moving = self._strategy.in_motion if in_motion else 0
-        return size >= max(least[levels.coarsening], moving)
+        # (how well boxes follow the tangent is asked of many unknowns alone: that takes time)
+        return size >= min(least.values()) and size >= least[levels.coarsening]
 
     def _bearable(self, size: int) -> float:
         """Return the iterations for a decade of the residual that cost as much as a factor."""
@@ -341,7 +324,6 @@ class ShiftedFactor:
         """Make the levels of multigrid for K; the shift, which is none of them, matters little."""
         known = self.K is K
         damped = damping > self.shift
-        matrix = K
         with self._statistics.phase("factorise"), self._own_options(), options_refused():
             if not known:
                 self._refining = self._flexible = self._shifted = None
@@ -354,9 +336,9 @@ class ShiftedFactor:
                     self._multigrid = Multigrid(pc, interpolations, symmetric)
                     pc.setFromOptions()
             assert self._multigrid is not None
-            relative = damping if damped else HALF_DIGITS if self._shifts else ROUND_OFF
-            if damped or self._shifts or not self._multigrid.levels or _has_zeros(K):
-                matrix = self._shifted_copy(K, relative * levels.diagonal(K))
+            # (sweeps must not divide by what is round-off)
+            relative = damping if damped else HALF_DIGITS
+            matrix = self._shifted_copy(K, relative * levels.diagonal(K))
             if self._symmetric:
                 matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
             self._ksp.setOperators(matrix if damped else K, matrix)
@@ -400,25 +382,20 @@ class ShiftedFactor:
         if norms and norms[-1] > 0.0:
             rtol = max(rtol, min(FINAL * tolerance / norms[-1], ROUGHEST))
         rtol = max(rtol, SOLVED)
-        assert self.K is not None
-        bearable = -math.log10(min(rtol, ROUGHEST)) * self._bearable(self.K.getSize()[0])
-        most = min(MOST_BEARABLE * bearable, self._longest)
-        self._ksp.setTolerances(rtol=rtol, max_it=math.ceil(most))
+        self._ksp.setTolerances(rtol=rtol, max_it=self._longest)
 
     def end(self) -> None:
         """End a step that has converged."""
         self._indefinite = 0
         self._bent = self._curved
-        if self.iterates:
-            self._failures = 0
 
     def step(self, b: PETSc.Vec, x: PETSc.Vec, shorten: bool = False) -> str | None:
         """Solve for a Newton step, or say why that failed (collective).
 
         Where the method of conjugate gradients has found the tangent indefinite, that of
         generalised minimal residuals solves. Where multigrid comes to nothing a factor takes over
-        for the rest of the step, and after three steps in a row for good, unless there are so many
-        unknowns that it would take far longer.
+        for the rest of the step, and by ``"auto"`` for good, unless there are so many unknowns that
+        it would take far longer.
 
         Args:
             b: The right-hand side.
@@ -434,11 +411,6 @@ class ShiftedFactor:
         self._statistics["krylov_iterations"] += self._ksp.getIterationNumber()
         K, levels = self.K, self._levels
         assert K is not None and levels is not None
-        if self._ksp.getConvergedReason() in SINGULAR and not self._shifts:
-            self._shifts = True
-            self._make_levels(K, levels, 0.0)
-            self._ksp.solve(b, x)
-            self._statistics["krylov_iterations"] += self._ksp.getIterationNumber()
         reason = self._ksp.getConvergedReason()
         if reason >= 0 or self._does(b):
             self._assess(self._ksp, b)
@@ -451,7 +423,6 @@ class ShiftedFactor:
             self.give_up(shorten)
         if K.getSize()[0] > self._strategy.taken_over:
             return "as multigrid does not solve for a step; use linear='direct'"
-        self._failures += 1
         self._dear = self._linear_solver == "auto"
         self._choose(False)
         self._iterate_with_factor(K.getSize()[0])
@@ -562,10 +533,3 @@ def _failure(ksp: PETSc.KSP) -> str | None:
     if reason == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
         return "as the factorisation of the tangent failed"
     return "as a linear solve failed" if reason < 0 else None
-
-
-def _has_zeros(K: PETSc.Mat) -> bool:
-    """Return whether the diagonal of a matrix has zeros (collective)."""
-    diagonal = K.getDiagonal()
-    diagonal.abs()
-    return bool(diagonal.min()[1] == 0.0)

@@ -150,7 +150,7 @@ class NewtonSolver:
         problem = self._now.problem
         K = problem.tangent()
         if anew:
-            self._factor.begin(K.getSize()[0], problem.levels, self.lets_go)
+            self._factor.begin(K.getSize()[0], problem.levels)
             self._start(K.getSizes()[0])
         self._factor.set(K, problem.levels)
 
@@ -194,7 +194,7 @@ class NewtonSolver:
         self.has_another_way = self._searches and not potential
         x = self._start(sizes)
         now = self._begin(problem, shorten, self.gives_up_early and shorten, again)
-        self._factor.begin(sizes[1], problem.levels, self.lets_go)
+        self._factor.begin(sizes[1], problem.levels)
         if sizes[1] == 0:
             problem.impose()
         if (failure := now.residual.at(x)) is not None:
@@ -232,7 +232,7 @@ class NewtonSolver:
         assert self.x is not None and self.F is not None
         last, first = self._now, norm(self.F)
         now = self._begin(last.problem, last.shorten, False, False, share * first)
-        self._factor.begin(self.x.getSize(), now.problem.levels, self.lets_go)
+        self._factor.begin(self.x.getSize(), now.problem.levels)
         now.steps.count = last.steps.count
         now.judge.first = first
         now.residual.let_go()

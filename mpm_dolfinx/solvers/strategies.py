@@ -8,12 +8,10 @@ from collections.abc import Mapping
 from enum import IntEnum
 from typing import Any, NamedTuple
 
-__all__ = ["LINEAR_SOLVERS", "STRATEGIES", "Coarsening", "Strategy", "chosen", "mumps_options"]
+__all__ = ["LINEAR_SOLVERS", "STRATEGIES", "Coarsening", "Strategy", "mumps_options"]
 
 #: Values of ``linear_solver``.
 LINEAR_SOLVERS = ("auto", "direct", "multigrid")
-#: Degree of the background up to which multigrid may be chosen.
-HIGHEST = 2
 
 
 class Coarsening(IntEnum):
@@ -21,7 +19,7 @@ class Coarsening(IntEnum):
 
     GOOD = 0  # backgrounds are grids, of degree 1 or of boxes
     FAIR = 1  # of degree 1 and no grid, or a term couples two backgrounds
-    POOR = 2  # of a higher degree, of simplices or no grid
+    POOR = 2  # of degree 2, of simplices or no grid, or of a higher one, whose rows are long
 
 
 class Strategy(NamedTuple):
@@ -35,7 +33,6 @@ class Strategy(NamedTuple):
             neighbours of each other, as few may be.
         compressed: Least from which MUMPS's factors have blocks of low rank.
         crossover: Least from which on multigrid takes less time than a factorisation.
-        in_motion: The same in a motion, where the mass takes it three times the iterations.
         bearable: Power p and divisor d: with n unknowns ``n^p / d`` iterations for a decade of the
             residual cost as much as a factor, whose operations grow as n^2 in space.
         taken_over: Most up to which a factorisation takes over where multigrid comes to nothing.
@@ -45,7 +42,6 @@ class Strategy(NamedTuple):
     ordered: int | None = None
     compressed: int | None = None
     crossover: Mapping[Coarsening, int] | None = None
-    in_motion: int = 0
     bearable: tuple[float, float] | None = None
     taken_over: int = 0
 
@@ -60,7 +56,6 @@ STRATEGIES = {
         few=400,
         ordered=10000,
         crossover=dict.fromkeys(Coarsening, 40000),
-        in_motion=40000,
         bearable=(0.5, 30.0),
         taken_over=500000,
     ),
@@ -68,20 +63,10 @@ STRATEGIES = {
         few=150,
         compressed=20000,
         crossover={Coarsening.GOOD: 3000, Coarsening.FAIR: 8000, Coarsening.POOR: 50000},
-        in_motion=5000,
         bearable=(1.0, 450.0),
         taken_over=50000,
     ),
 }
-
-
-def chosen(linear_solver: str, degree: int) -> str:
-    """Return the linear solver of backgrounds of a degree.
-
-    From degree 3 on rows have so many entries that a factorisation is cheaper up to ten thousand
-    unknowns and more, and ``"auto"`` means that.
-    """
-    return "direct" if linear_solver == "auto" and degree > HIGHEST else linear_solver
 
 
 def mumps_options(strategy: Strategy, size: int, saddle: bool, compressed: bool) -> dict[str, Any]:

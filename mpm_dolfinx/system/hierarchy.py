@@ -88,7 +88,7 @@ class Boxes:
         degree = self._V.ufl_element().degree
         if grid_lines(self._V) is None:
             return Coarsening.FAIR if degree == 1 else Coarsening.POOR
-        nested = degree == 1 or self._V.mesh.basix_cell() in BOX_CELLS
+        nested = degree == 1 or (degree == 2 and self._V.mesh.basix_cell() in BOX_CELLS)
         return Coarsening.GOOD if nested else Coarsening.POOR
 
     @cached_property

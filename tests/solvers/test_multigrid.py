@@ -247,7 +247,7 @@ def test_a_factorisation_takes_over_where_multigrid_comes_to_nothing():
     ]
     for run in runs:
         run.solve(steps=4)
-    assert_same(*runs, failures=linear.ENDURED)
+    assert_same(*runs, failures=4)
 
 
 def from_on(*unknowns):
@@ -265,14 +265,12 @@ def test_many_unknowns_are_for_multigrid(monkeypatch):
     run = heavy(20, linear_solver="auto", petsc_options={"pc_type": "lu"})
     run.solve(steps=1)
     assert run.history.statistics["krylov_iterations"] == 0
-    for crossover, used in ((2000, False), (700, True)):
-        change(monkeypatch, in_motion=crossover)
-        still = heavy(20)
-        motion = posed(
-            mpm.DynamicProblem, still.particles, PLASTIC, 1.0, body_force=(0.0, -8e3), bcs=still.bcs
-        )
-        motion.step(1e-3)
-        assert (motion.history.statistics["krylov_iterations"] > 0) == used
+    still = heavy(20)
+    motion = posed(
+        mpm.DynamicProblem, still.particles, PLASTIC, 1.0, body_force=(0.0, -8e3), bcs=still.bcs
+    )
+    motion.step(1e-3)
+    assert motion.history.statistics["krylov_iterations"] > 0
 
 
 @pytest.mark.parametrize(
@@ -319,7 +317,7 @@ def test_a_factorisation_goes_on_where_multigrid_takes_longer(monkeypatch):
 
 
 def test_a_background_of_degree_3_is_factorised(monkeypatch):
-    change(monkeypatch, crossover=from_on(100))
+    change(monkeypatch, crossover=from_on(100, 100, 10**6))
     for degree, used in ((2, True), (3, False)):
         run = heavy(24 // degree, degree=degree, linear_solver="auto")
         run.solve(steps=1)
