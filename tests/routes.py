@@ -17,7 +17,8 @@ from mpm_dolfinx.assembly.petsc import MatrixSum
 from mpm_dolfinx.constitutive.strain import strain_of
 from mpm_dolfinx.materials.base import StrainMaterial
 from mpm_dolfinx.materials.compiled import CompiledMaterial
-from mpm_dolfinx.problems import parts
+from mpm_dolfinx.problems import parts, quasistatic
+from mpm_dolfinx.system.pressure import PressureTerm
 
 #: Where tangents come from: compiled loops, domain by domain, or the reference.
 ROUTES = ["loops", "reference"]
@@ -34,6 +35,7 @@ def on_route(route):
         return
     with (
         patch.object(parts, "BodyForms", ReferenceForms),
+        patch.object(quasistatic, "PressureTerm", ReferencePressure),
         patch.object(CompiledMaterial, "update", StrainMaterial.update),
         patch.object(CompiledMaterial, "at_pressure", StrainMaterial.at_pressure),
         patch.object(CompiledMaterial, "integrate", returns.integrate),
@@ -114,3 +116,68 @@ class ReferenceForms(BodyForms):
 
     def stiffness_force(self, w):
         return self.K * w
+
+
+class ReferencePressure(PressureTerm):
+    """A constraint on volume whose blocks are matrices on points and nodes, reduced by products."""
+
+    def __init__(self, particles, pressure, material):
+        super().__init__(particles, pressure, material)
+        self.coupling = None
+        nodes = particles.domain_nodes
+        gdim = particles.mesh.geometry.dim
+        n, nq = particles.num_local, particles.num_points
+        numbers = particles.W.dofmap.index_map.local_to_global(nodes.ravel()).reshape(nodes.shape)
+        self._order = np.argsort(numbers, axis=1)
+        columns = np.take_along_axis(numbers, self._order, axis=1)[:, :, None] * gdim
+        columns = (columns + np.arange(gdim)).reshape(n, 1, nodes.shape[1] * gdim)
+        self._columns = np.repeat(columns, nq, axis=1).ravel().astype(PETSc.IntType)
+        width = nodes.shape[1] * gdim
+        self._offsets = (width * np.arange(n * nq + 1)).astype(PETSc.IntType)
+        self._mats = None
+
+    def _rows(self, slope):
+        return np.take_along_axis(
+            self.by_nodes(slope), self._order[:, None, :, None], axis=2
+        ).ravel()
+
+    def tangents(self):
+        found = self._material.volume_strain
+        diagonal = self._force.duplicate()
+        diagonal.array_w[:] = -self._material.weights.ravel() * found.compliance
+        if self._mats is None:
+            self._mats = self._matrices()
+        of_strain, of_stress, by_points, alone = self._mats
+        of_strain.setValuesCSR(self._offsets, self._columns, self._rows(found.slope))
+        of_strain.assemble()
+        if of_stress is not of_strain:
+            values = self._rows(self._material.by_pressure)
+            of_stress.setValuesCSR(self._offsets, self._columns, values)
+            of_stress.assemble()
+        of_stress.transpose(by_points)
+        alone.setDiagonal(diagonal)
+        return {(0, 1): by_points, (1, 0): of_strain, (1, 1): alone}
+
+    def stiffness_force(self, motions):
+        found = self.tangents()
+        forces = [motion.duplicate() for motion in motions]
+        for force in forces:
+            force.set(0.0)
+        for (a, b), K in found.items():
+            K.multAdd(motions[b], forces[a], forces[a])
+        return forces
+
+    def _matrices(self):
+        """Return matrices of strain and of stress, points by nodes, and the other two blocks."""
+        points, nodes = self._force.getSizes(), self._none.getSizes()
+        comm = self._particles.mesh.comm
+        csr = self._offsets, self._columns, np.zeros(len(self._columns))
+        of_strain = of_stress = PETSc.Mat().createAIJ((points, nodes), csr=csr, comm=comm)
+        if not self._material.symmetric:
+            of_stress = of_strain.duplicate()
+            of_stress.assemble()
+        first = of_strain.getOwnershipRange()[0]
+        own = np.arange(first, first + points[0], dtype=PETSc.IntType)
+        ones = np.arange(points[0] + 1, dtype=PETSc.IntType), own, np.zeros(points[0])
+        alone = PETSc.Mat().createAIJ((points, points), csr=ones, comm=comm)
+        return of_strain, of_stress, of_stress.transpose(PETSc.Mat()), alone

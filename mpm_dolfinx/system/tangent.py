@@ -69,7 +69,6 @@ class Tangent:
         self._unknowns, self._terms, self._statistics = unknowns, terms, statistics
         self.mass_factor = 0.0
         self._numbering: Numbering | None = None
-        self._coupled = [self._is_fused(term.coupling) for term in terms]
         pairs = [self._fused_on(one.host) for one in unknowns.subspaces]
         self.loops = (
             FusedTangent(unknowns.comm, pairs, self._numbered_couplings(), statistics)
@@ -85,18 +84,10 @@ class Tangent:
         every = [pair for term in self._terms for pair in term.fused]
         return [pair for pair in every if any(pair[0] is body for body in field.bodies)]
 
-    def _is_fused(self, coupling: Coupling | None) -> bool:
-        """Return whether the compiled loops reduce what couples a body and a field on it."""
-        if coupling is None:
-            return False
-        moving = self._unknowns.place(coupling.places[0])[0]
-        return any(body is coupling.places[0] for body, _ in self._fused_on(moving))
-
     @property
     def _couplings(self) -> list[Coupling]:
-        """Couplings of a body and a field on it that the compiled loops reduce."""
-        pairs = zip(self._terms, self._coupled, strict=True)
-        return [term.coupling for term, coupled in pairs if coupled and term.coupling is not None]
+        """Couplings of a body and a field on it, which the compiled loops reduce."""
+        return [term.coupling for term in self._terms if term.coupling is not None]
 
     def _numbered_couplings(self) -> list[tuple[int, int, Coupling]]:
         """Return :attr:`_couplings` with the numbers of their subspaces."""
@@ -152,12 +143,11 @@ class Tangent:
             whole = [] if self.loops is None else [self.loops.assemble(self.mass_factor)]
             parts: list[PETSc.Mat] = []
             made.matrices = [
-                {} if coupled else term.tangents()
-                for term, coupled in zip(self._terms, self._coupled, strict=True)
+                {} if term.coupling is not None else term.tangents() for term in self._terms
             ]
             made.whole = [
-                coupled or bool(own) or bool(term.fused)
-                for term, coupled, own in zip(self._terms, self._coupled, reduced, strict=True)
+                term.coupling is not None or bool(own) or bool(term.fused)
+                for term, own in zip(self._terms, reduced, strict=True)
             ]
             made.sizes = {}
             parts += [
@@ -258,7 +248,7 @@ class Tangent:
         total = field.force.duplicate()
         total.set(0.0)
         for number, (term, matrices) in enumerate(zip(self._terms, made.matrices, strict=False)):
-            if self._coupled[number] and term.coupling is not None:
+            if term.coupling is not None:
                 moved, carried = term.coupling.places
                 if place(carried)[0] is field:
                     size = carried.T.createVecLeft()
