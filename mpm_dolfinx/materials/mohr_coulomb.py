@@ -261,6 +261,38 @@ class MohrCoulomb(FrictionalMaterial):
 
     _loop: ClassVar[str] = "mohr_coulomb"
 
+    def davis(self) -> Self:
+        """Return the law with associated flow that slides at the stresses at which this one does.
+
+        Along a plane that does not change its length soil bears b (c + s tan(phi)) under a pressure
+        s, with b = cos(psi) cos(phi) / (1 - sin(psi) sin(phi)) (Davis 1968). The law that is
+        returned has this strength, and dilates as it rubs: its limit loads are unique and its
+        tangents symmetric. A cut-off stays as it is.
+
+        Raises:
+            MPMError: It softens, or has parameters that are Functions or Constants.
+        """
+        angles = tuple(self.parameters[angle] for angle in _ANGLES)
+        if not all(
+            isinstance(v, float | np.ndarray) for v in (self.parameters["cohesion"], *angles)
+        ):
+            raise MPMError(
+                "davis() needs a cohesion and angles that are numbers or arrays; give the strength "
+                "of each layer to a law of its own, by cell_tags."
+            )
+        if "decay" in self.parameters:
+            raise MPMError("davis() is for strength that stays; ask it before with_softening().")
+        sine, other, cosine = self._sines()
+        share = np.sqrt(1.0 - other**2) * cosine / (1.0 - other * sine)
+        angle = np.degrees(np.arctan(share * np.tan(np.radians(angles[0]))))
+        values = {"cohesion": share * self.parameters["cohesion"]}
+        values |= dict.fromkeys(_ANGLES, angle)
+        law = self.with_parameters(
+            **{n: v if isinstance(v, np.ndarray) else float(v) for n, v in values.items()}
+        )
+        law.symmetric = True
+        return law
+
     def yield_function(self, stress: Array, plastic_strain: Array) -> Array:
         """Return f, shape ``(n,)``, in units of stress, of stresses ``(n, m)``.
 

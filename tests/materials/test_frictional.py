@@ -349,6 +349,49 @@ def test_parameters_per_point():
             np.testing.assert_allclose(P[p], one, rtol=1e-12, atol=1e-12)
 
 
+def sheared(law, pressure, steps=400, step=1e-3):
+    """Return what a layer bears that is sheared far under a pressure, and does not get longer."""
+    elastic = np.zeros((1, 4))
+    variables = {"plastic_strain": np.zeros(1)}
+    for _ in range(steps):
+        change = np.array([[0.0, 0.0, 0.0, step / np.sqrt(2.0)]])
+        for _ in range(20):  # the height that it takes
+            done = law.integrate(elastic + change, variables, True)
+            change[0, 1] -= (done.stress[0, 1] + pressure) / max(done.tangent[0, 1, 1], 0.1 * G)
+            if abs(done.stress[0, 1] + pressure) < 1e-12 * pressure:
+                break
+        elastic, variables = done.elastic_strain, done.variables
+    return done.stress[0, 3] / np.sqrt(2.0)
+
+
+@pytest.mark.parametrize("dilation", [0.0, 10.0, 30.0])
+def test_davis_is_what_soil_without_dilation_bears_along_planes(dilation):
+    # a Mohr circle whose plane without extension has the pressure
+    law, pressure = MohrCoulomb(*ELASTIC, COHESION, 30.0, dilation), 100.0
+    phi, psi = np.radians([30.0, dilation])
+    radius = pressure * np.sin(phi) + COHESION * np.cos(phi)
+    exact = radius * np.cos(psi) / (1.0 - np.sin(phi) * np.sin(psi))
+    assert sheared(law, pressure) == pytest.approx(exact, rel=1e-6)
+    assert sheared(law.davis(), pressure) == pytest.approx(exact, rel=1e-6)
+    assert law.davis().symmetric
+
+
+def test_davis_of_values_per_point_and_what_it_is_refused_for():
+    angle, less = np.array([20.0, 30.0]), np.array([0.0, 10.0])
+    every = MohrCoulomb(*ELASTIC, COHESION, angle, less).davis()
+    for point, values in enumerate(zip(angle, less, strict=True)):
+        alone = MohrCoulomb(*ELASTIC, COHESION, *values).davis()
+        for name in ("cohesion", "friction_angle", "dilation_angle"):
+            assert every.parameters[name][point] == pytest.approx(alone.parameters[name], rel=1e-14)
+    assert every.symmetric and every.at(np.array([1])).symmetric
+    assert Tresca(*ELASTIC, COHESION).davis().parameters["cohesion"] == COHESION
+    with pytest.raises(MPMError, match="ask it before with_softening"):
+        SOFTENING["pyramid"].davis()
+    body = box([0.0, 0.0], [1.0, 1.0], [1, 1], QUADRILATERAL)
+    with pytest.raises(MPMError, match="numbers or arrays; give the strength of each layer"):
+        MohrCoulomb(*ELASTIC, fem.Constant(body, COHESION), 30.0).davis()
+
+
 def test_symmetry_is_that_of_associated_flow():
     angle = np.full(3, 30.0)
     assert LAWS["associated"].symmetric and LAWS["tresca"].symmetric
