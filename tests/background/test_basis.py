@@ -296,3 +296,13 @@ def test_a_boundary_that_is_held_goes_on_beyond_it(name):
     np.testing.assert_allclose((change / 2e-6)[smooth], slopes[smooth], atol=1e-5)
     assert not evaluator.at(far).found.any() and not evaluator.at(above).found.any()
     assert evaluator.hold(np.zeros_like(at_rest)) and not evaluator.at(below).found.any()
+
+
+def test_a_boundary_holds_what_is_less_than_a_cell_beyond_it():
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 1.0], [8, 2], scenes.QUADRILATERAL))
+    evaluator = BackgroundBasis(V)
+    x = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local]
+    evaluator.hold(np.column_stack([np.zeros(len(x), dtype=bool), x[:, 1] < 1e-9]))
+    depths = np.array([0.01, 0.25, 0.49, 0.51, 0.75])
+    found = evaluator.at(np.column_stack([np.full(5, 0.9), -depths])).found
+    np.testing.assert_array_equal(found, depths < 0.5)

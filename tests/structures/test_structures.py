@@ -15,7 +15,7 @@ from dolfinx import fem, mesh
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import Hencky, LinearElastic
 from mpm_dolfinx.structures.laws import Bar, Sheet
-from mpm_dolfinx.structures.layout import Layout
+from mpm_dolfinx.structures.layout import Layout, layout_of
 from mpm_dolfinx.structures.stretching import rule_of, stretched
 
 YOUNG, POISSON = 1e3, 0.3
@@ -810,3 +810,14 @@ def test_no_force_where_the_bodies_were_taken_away(kind):
     assert not one.force[points[:-1, 0] > 1.01].any()
     for values in one.fields().values():
         assert not values[points[:-1, 0] > 1.01].any()
+
+
+def test_nodes_and_cells_of_a_mesh_have_its_own_order_on_any_number_of_ranks():
+    count = 31
+    points = np.column_stack([np.linspace(0.0, 1.0, count), np.sin(np.arange(count))])
+    first = np.arange(count - 1)
+    ends = np.column_stack([first, first + 1])
+    lines = mesh_of(points, np.random.default_rng(3).permutation(ends))
+    drawn = layout_of(lines, WORLD, 2, "Truss", False)
+    np.testing.assert_array_equal(drawn.nodes, points)
+    np.testing.assert_array_equal(np.sort(drawn.cells, axis=1), ends)
