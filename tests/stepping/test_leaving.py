@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Particles that leave the background: the policies, and what deletion does to a body."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 import scenes
@@ -89,6 +91,18 @@ def test_the_last_particle_is_not_deleted():
     assert problem.history.load[-1] == 0.25
     assert 0 < scenes.total(p, ~p.deleted) <= 8
     np.testing.assert_allclose(p.centroid[~p.deleted, 1], p.initial_centroid[~p.deleted, 1] - 1.0)
+
+
+def test_a_boundary_that_has_been_moved_holds_nothing_beyond_it_at_rest_either():
+    V = scenes.vectors(scenes.box([-0.5, -0.5], [1.5, 1.5], [4, 4], QUADRILATERAL))
+    bc, u = scenes.everywhere(V)
+    u.x.array.reshape(-1, 2)[:] = [0.0, -0.52]
+    body = mpm.Body(mpm.Particles(scenes.unit(4, TRIANGLE), V), LinearElastic(1e4, 0.3))
+    problem = mpm.QuasiStaticProblem(body, bcs=[bc])
+    with pytest.warns(UserWarning, match="outside the back") if WORLD.rank == 0 else nullcontext():
+        problem.solve(steps=5)
+    with pytest.raises(mpm.ParticleOutsideError):
+        problem.step()
 
 
 def test_two_bodies_one_of_which_must_stay():
