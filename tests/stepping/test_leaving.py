@@ -10,6 +10,8 @@ import scenes
 from posed import posed
 from scenes import QUADRILATERAL, TRIANGLE, WORLD, falling
 
+from dolfinx import fem
+
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import LinearElastic, VonMises
 
@@ -167,6 +169,26 @@ def test_what_is_below_its_floor_stays_there_over_a_restart(mpi_tmp_path):
     np.testing.assert_allclose(
         again.particles.domains, problem.particles.domains, rtol=0, atol=1e-9
     )
+
+
+@pytest.mark.skip_in_parallel  # (round-off of ranks decides the way of sand below its floor)
+@pytest.mark.parametrize("moves", [False, True])
+def test_what_is_below_a_floor_that_is_let_go_or_moved_is_outside(moves):
+    problem = sand(None, up=False)
+    V = problem.particles.V
+    lift = fem.Constant(V.mesh, np.zeros(2))
+    side = mpm.held(V, 0, x=0.0)
+    problem.stage(bcs=[side, mpm.held(V, value=lift, y=(-np.inf, 0.0))])
+    problem.solve(time=0.68, dt=0.04)
+    assert scenes.largest(np.maximum(-problem.particles.domains[..., 1], 0.0)) > 1e-6
+    assert problem.particles.node_basis.found.all()  # (known before the step, too)
+    if moves:
+        lift.value[1] = 0.01
+    else:
+        problem.stage(bcs=[side])
+    with pytest.raises(mpm.ParticleOutsideError) as caught:
+        problem.solve(time=0.72, dt=0.04)
+    assert caught.value.where[1] < 0.0
 
 
 def sand(component, up, kind=QUADRILATERAL, row=False):
