@@ -52,7 +52,7 @@ struct Foot
 };
 
 template <typename T, int dim, int bends>
-Foot<T, dim> foot_of(const Ways<T, dim, bends>& ways, double outward)
+HOT_PART Foot<T, dim> foot_of(const Ways<T, dim, bends>& ways, double outward)
 {
   constexpr int sides = dim - 1;
   Foot<T, dim> foot{};
@@ -214,7 +214,8 @@ const std::array<double, dim>* places_of(const double* x, std::size_t p, int cou
 
 // Changes of some places less their rigid motion about where these are in the middle of a step.
 template <typename T>
-void take_rigid_motion(const std::vector<std::array<T, 2>>& arm, std::vector<std::array<T, 2>>& v)
+HOT_PART void take_rigid_motion(const std::vector<std::array<T, 2>>& arm,
+                                std::vector<std::array<T, 2>>& v)
 {
   T moment(0.0), inertia(0.0);
   for (std::size_t k = 0; k < v.size(); ++k)
@@ -234,7 +235,8 @@ std::array<T, 3> cross(const std::array<T, 3>& a, const std::array<T, 3>& b)
 }
 
 template <typename T>
-void take_rigid_motion(const std::vector<std::array<T, 3>>& arm, std::vector<std::array<T, 3>>& v)
+HOT_PART void take_rigid_motion(const std::vector<std::array<T, 3>>& arm,
+                                std::vector<std::array<T, 3>>& v)
 {
   std::array<T, 3> moment{}, turn{};
   std::array<std::array<T, 3>, 3> J{};
@@ -324,6 +326,14 @@ struct Acting
   }
 };
 
+template <typename T, int dim>
+HOT_PART Traction<T, dim> traction_at(const core::Touching& known, std::size_t p,
+                                      const Press<T>& press, const T& gap,
+                                      const std::array<T, dim>& n, const std::array<T, dim>& delta)
+{
+  return traction_of(known, p, press, gap, n, delta);
+}
+
 // Set what acts at a point by places of its stencil.
 template <int bends, int dim, typename T>
 void act_at(const core::Meeting& m, std::size_t p, const std::array<T, dim>* x,
@@ -336,7 +346,7 @@ void act_at(const core::Meeting& m, std::size_t p, const std::array<T, dim>* x,
   {
     auto press = pressing(m.known, p, foot.gap, foot.n);
     put_on_top(press);
-    found.acts = traction_of(m.known, p, press, foot.gap, foot.n, delta);
+    found.acts = traction_at<T, dim>(m.known, p, press, foot.gap, foot.n, delta);
     found.point(foot, shapes);
     found.rub(foot, shapes);
     found.push();
@@ -357,7 +367,7 @@ void act_at(const core::Meeting& m, std::size_t p, const std::array<T, dim>* x,
   const auto half = foot_of(ways_of<T, dim, bends>(there, middle.data()), m.outward[p]);
   const auto press = mean_pressing(m.known, p, m.before[p] - m.offset[p],
                                    T(foot.gap - T(m.offset[p])));
-  found.acts = traction_of(m.known, p, press, foot.gap, half.n, delta);
+  found.acts = traction_at<T, dim>(m.known, p, press, foot.gap, half.n, delta);
   found.point(half, there);
   found.rub(half, there);
   // (what corrects the gradient has no sum nor moment in the middle)
@@ -429,64 +439,71 @@ void see_in(const core::Meeting& m, double* gap, double* n, double* delta)
   }
 }
 
+// How many derivatives are carried along together.
+constexpr int together = 4;
+
 // Set the derivative of all forces at a point by the places of its stencil, (1 + nodes, dim, count,
 // dim), by way of that of the vectors that they are made of.
-template <int dim, int bends, bool rubs>
-void differentiate_at(const core::Meeting& m, std::size_t p, double* D, std::vector<double>& work)
+template <int dim, int bends>
+HOT_PART void differentiate_at(const core::Meeting& m, std::size_t p, double* D,
+                               std::vector<double>& work)
 {
-  constexpr int sides = dim - 1, vectors = 1 + sides + bends, lanes = dim * (vectors + rubs);
-  using T = Dual<lanes>;
+  constexpr int sides = dim - 1, vectors = 1 + sides + bends, most = (vectors + 1) * dim + together;
+  using T = Dual<together>;
+  const bool rubs = !m.known.smooth;
   const auto* x = places_of<dim>(m.x, p, m.count);
   const auto given = ways_of<double, dim, bends>({m.table, p, m.nodes}, x);
   const auto way = delta_of<double, dim>(m, p, x);
-  Ways<T, dim, bends> ways;
-  std::array<T, dim> delta;
-  for (int i = 0; i < dim; ++i)
-  {
-    ways.r[i] = T(given.r[i]);
-    ways.r[i].by[i] = 1.0;
-    for (int e = 0; e < sides; ++e)
-    {
-      ways.A[e][i] = T(given.A[e][i]);
-      ways.A[e][i].by[(1 + e) * dim + i] = 1.0;
-    }
-    for (int b = 0; b < bends; ++b)
-    {
-      ways.B[b][i] = T(given.B[b][i]);
-      ways.B[b][i].by[(1 + sides + b) * dim + i] = 1.0;
-    }
-    delta[i] = T(way[i]);
-    if constexpr (rubs)
-      delta[i].by[vectors * dim + i] = 1.0;
-  }
-  const auto foot = foot_of(ways, m.outward[p]);
-  const auto acts = traction_of(m.known, p, pressing(m.known, p, foot.gap, foot.n), foot.gap,
-                                foot.n, delta);
-  std::array<T, sides> lag{};
-  if (rubs && acts.inside)
-    lag = lag_of<T, dim>(foot, acts.shear);
   // What acts on a node is a sum of vectors: that on the point, and by each slope and bend.
-  constexpr int parts = rubs ? vectors : 1 + sides;
-  std::array<std::array<T, dim>, parts> made;
-  for (int i = 0; i < dim; ++i)
+  const int parts = rubs ? vectors : 1 + sides, numbers = (vectors + rubs) * dim;
+  double by[vectors][dim][most];
+  for (int first = 0; first < numbers; first += together)
   {
-    const T force = acts.pressure * foot.n[i] + acts.shear[i];
-    made[0][i] = force;
-    if constexpr (rubs)
+    std::array<std::array<T, dim>, vectors + 1> all;
+    for (int i = 0; i < dim; ++i)
     {
+      all[0][i] = T(given.r[i]);
+      for (int e = 0; e < sides; ++e)
+        all[1 + e][i] = T(given.A[e][i]);
+      for (int b = 0; b < bends; ++b)
+        all[1 + sides + b][i] = T(given.B[b][i]);
+      all[vectors][i] = T(way[i]);
+    }
+    for (int k = 0; k < std::min(together, numbers - first); ++k)
+      all[(first + k) / dim][(first + k) % dim].by.set(k, 1.0);
+    Ways<T, dim, bends> ways;
+    ways.r = all[0];
+    for (int e = 0; e < sides; ++e)
+      ways.A[e] = all[1 + e];
+    for (int b = 0; b < bends; ++b)
+      ways.B[b] = all[1 + sides + b];
+    const auto foot = foot_of(ways, m.outward[p]);
+    const auto acts = traction_at<T, dim>(m.known, p, pressing(m.known, p, foot.gap, foot.n),
+                                          foot.gap, foot.n, all[vectors]);
+    std::array<T, sides> lag{};
+    if (rubs && acts.inside)
+      lag = lag_of<T, dim>(foot, acts.shear);
+    std::array<std::array<T, dim>, vectors> made{};
+    for (int i = 0; i < dim; ++i)
+    {
+      const T force = acts.pressure * foot.n[i] + acts.shear[i];
+      made[0][i] = force;
+      for (int e = 0; e < sides; ++e)
+        made[1 + e][i] = foot.moved[e] * force;
+      if (!rubs)
+        continue;
       const T arm = foot.gap * foot.n[i];
       for (int e = 0; e < sides; ++e)
-        made[1 + e][i] = foot.moved[e] * force - lag[e] * arm;
-      for (int b = 0; b < bends; ++b)
-        made[1 + sides + b][i] = T(0.0);
+        made[1 + e][i] -= lag[e] * arm;
       for (int e = 0; e < sides; ++e)
         for (int f = 0; f < sides; ++f)
           if (const int b = bend_of<dim, bends>(e, f); b >= 0)
             made[1 + sides + b][i] = made[1 + sides + b][i] + lag[e] * foot.moved[f] * arm;
     }
-    else
-      for (int e = 0; e < sides; ++e)
-        made[1 + e][i] = foot.moved[e] * force;
+    for (int part = 0; part < parts; ++part)
+      for (int i = 0; i < dim; ++i)
+        for (int k = 0; k < together; ++k)
+          by[part][i][first + k] = made[part][i].by[k];
   }
   // How the vectors go with each node.
   const double* slope = m.table.slope + p * sides * m.nodes;
@@ -509,20 +526,20 @@ void differentiate_at(const core::Meeting& m, std::size_t p, double* D, std::vec
   for (int part = 0; part < parts; ++part)
     for (int i = 0; i < dim; ++i)
     {
-      const double* by = made[part][i].by.data();
+      const double* mine = by[part][i];
       double* row = half + (part * dim + i) * width;
       for (int j = 0; j < dim; ++j)
-        row[j] = rubs ? by[j] + by[vectors * dim + j] : by[j];
+        row[j] = rubs ? mine[j] + mine[vectors * dim + j] : mine[j];
       for (int k = 0; k < m.nodes; ++k)
         for (int j = 0; j < dim; ++j)
         {
           double sum = 0.0;
           for (int v = 0; v < vectors; ++v)
-            sum += factors[k * vectors + v] * by[v * dim + j];
+            sum += factors[k * vectors + v] * mine[v * dim + j];
           row[(1 + k) * dim + j] = sum;
-          if constexpr (rubs)
+          if (rubs)
             row[(1 + m.nodes + k) * dim + j]
-                = -m.anchored[p * m.nodes + k] * by[vectors * dim + j];
+                = -m.anchored[p * m.nodes + k] * mine[vectors * dim + j];
         }
     }
   std::copy_n(half, dim * width, D);
@@ -542,11 +559,11 @@ void differentiate_at(const core::Meeting& m, std::size_t p, double* D, std::vec
   }
 }
 
-// Set the same of a step of a motion, node by node.
+// Set the same of a step of a motion, by the places of all nodes.
 template <int dim, int bends>
-void differentiate_step_at(const core::Meeting& m, std::size_t p, double* D)
+HOT_PART void differentiate_step_at(const core::Meeting& m, std::size_t p, double* D)
 {
-  using T = Dual<dim>;
+  using T = Dual<together>;
   Acting<T, dim> found(m.nodes);
   std::vector<std::array<T, dim>> x(m.count);
   const auto* places = places_of<dim>(m.x, p, m.count);
@@ -555,21 +572,22 @@ void differentiate_step_at(const core::Meeting& m, std::size_t p, double* D)
   const int width = m.count * dim, rows = (1 + m.nodes) * dim;
   for (int row = 0; row < rows; ++row)
     std::fill_n(D + row * width, dim, 0.0);
-  for (int node = 1; node < m.count; ++node)
+  for (int first = dim; first < width; first += together)
   {
-    for (int j = 0; j < dim; ++j)
-      x[node][j].by[j] = 1.0;
+    const int here = std::min(together, width - first);
+    for (int k = 0; k < here; ++k)
+      x[(first + k) / dim][(first + k) % dim].by.set(k, 1.0);
     act_at<bends, dim>(m, p, x.data(), found);
-    for (int j = 0; j < dim; ++j)
-      x[node][j].by[j] = 0.0;
+    for (int k = 0; k < here; ++k)
+      x[(first + k) / dim][(first + k) % dim].by.set(k, 0.0);
     for (int row = 0; row < rows; ++row)
     {
       const T force = found.pushes[row / dim][row % dim] + found.rubs[row / dim][row % dim];
-      for (int j = 0; j < dim; ++j)
+      for (int k = 0; k < here; ++k)
       {
-        D[row * width + node * dim + j] = force.by[j];
+        D[row * width + first + k] = force.by[k];
         // (nothing acts where all are shifted)
-        D[row * width + j] -= force.by[j];
+        D[row * width + (first + k) % dim] -= force.by[k];
       }
     }
   }
@@ -600,7 +618,7 @@ void add_at(const core::Sums& sums, std::size_t p, int nodes, int count, const d
   }
 }
 
-template <int dim, int bends, bool rubs>
+template <int dim, int bends>
 HOT_LOOP void add_tangents_in(const core::Meeting& m, const core::Sums& sums)
 {
   constexpr int vectors = dim + bends;
@@ -611,7 +629,7 @@ HOT_LOOP void add_tangents_in(const core::Meeting& m, const core::Sums& sums)
     if (m.start)
       differentiate_step_at<dim, bends>(m, p, D.data());
     else
-      differentiate_at<dim, bends, rubs>(m, p, D.data(), work);
+      differentiate_at<dim, bends>(m, p, D.data(), work);
     add_at<dim>(sums, p, m.nodes, m.count, D.data());
   }
 }
@@ -664,10 +682,6 @@ void core::see(const Meeting& meeting, int dim, double* gap, double* n, double* 
 void core::add_tangents(const Meeting& meeting, int dim, const Sums& sums)
 {
   with_kind(dim, meeting.nodes, [&](auto kind) {
-    constexpr int dimension = decltype(kind)::dim, bends = decltype(kind)::bends;
-    if (meeting.known.smooth)
-      add_tangents_in<dimension, bends, false>(meeting, sums);
-    else
-      add_tangents_in<dimension, bends, true>(meeting, sums);
+    add_tangents_in<decltype(kind)::dim, decltype(kind)::bends>(meeting, sums);
   });
 }

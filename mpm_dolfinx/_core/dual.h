@@ -11,39 +11,70 @@
 
 namespace core
 {
+// Derivatives by some numbers, as vectors of four. (Compilers would take lanes one by one in several
+// times the time; vectors may lie anywhere in memory.)
+template <int count>
+struct Lanes
+{
+  static constexpr int vectors = (count + 3) / 4;
+  typedef double Four __attribute__((vector_size(4 * sizeof(double)), aligned(sizeof(double))));
+  Four parts[vectors] = {};
+
+  double operator[](int i) const { return parts[i / 4][i % 4]; }
+  void set(int i, double number) { parts[i / 4][i % 4] = number; }
+};
+
+template <>
+struct Lanes<1>
+{
+  static constexpr int vectors = 1;
+  double parts[1] = {};
+
+  double operator[](int) const { return parts[0]; }
+  void set(int, double number) { parts[0] = number; }
+};
+
+template <int count>
+struct Dual;
+
+// f(a), of a known derivative.
+template <int count>
+Dual<count> chain(const Dual<count>& a, double value, double slope)
+{
+  Dual<count> result(value);
+  for (int i = 0; i < Lanes<count>::vectors; ++i)
+    result.by.parts[i] = slope * a.by.parts[i];
+  return result;
+}
+
 // A number with its derivatives by some others; it is compared by its value.
 template <int count>
 struct Dual
 {
+  using By = Lanes<count>;
   double value = 0.0;
-  std::array<double, count> by{};
+  By by;
 
   Dual() = default;
   Dual(double number) : value(number) {}
 
-  friend Dual operator+(Dual a, const Dual& b) { return a += b; }
-  friend Dual operator-(Dual a, const Dual& b) { return a -= b; }
+  friend Dual operator+(const Dual& a, const Dual& b) { return Dual(a) += b; }
+  friend Dual operator-(const Dual& a, const Dual& b) { return Dual(a) -= b; }
   friend Dual operator*(const Dual& a, const Dual& b)
   {
     Dual result(a.value * b.value);
-    for (int i = 0; i < count; ++i)
-      result.by[i] = a.value * b.by[i] + b.value * a.by[i];
+    for (int i = 0; i < By::vectors; ++i)
+      result.by.parts[i] = a.value * b.by.parts[i] + b.value * a.by.parts[i];
     return result;
   }
-  friend Dual operator*(double a, Dual b)
-  {
-    b.value *= a;
-    for (int i = 0; i < count; ++i)
-      b.by[i] *= a;
-    return b;
-  }
+  friend Dual operator*(double a, const Dual& b) { return chain(b, a * b.value, a); }
   friend Dual operator*(const Dual& a, double b) { return b * a; }
   friend Dual operator/(const Dual& a, double b) { return 1.0 / b * a; }
   friend Dual operator/(const Dual& a, const Dual& b)
   {
     Dual result(a.value / b.value);
-    for (int i = 0; i < count; ++i)
-      result.by[i] = (a.by[i] - result.value * b.by[i]) / b.value;
+    for (int i = 0; i < By::vectors; ++i)
+      result.by.parts[i] = (a.by.parts[i] - result.value * b.by.parts[i]) / b.value;
     return result;
   }
   friend Dual operator-(const Dual& a) { return -1.0 * a; }
@@ -55,29 +86,19 @@ struct Dual
   Dual& operator+=(const Dual& b)
   {
     value += b.value;
-    for (int i = 0; i < count; ++i)
-      by[i] += b.by[i];
+    for (int i = 0; i < By::vectors; ++i)
+      by.parts[i] += b.by.parts[i];
     return *this;
   }
   Dual& operator-=(const Dual& b)
   {
     value -= b.value;
-    for (int i = 0; i < count; ++i)
-      by[i] -= b.by[i];
+    for (int i = 0; i < By::vectors; ++i)
+      by.parts[i] -= b.by.parts[i];
     return *this;
   }
   Dual& operator*=(const Dual& b) { return *this = *this * b; }
 };
-
-// f(a), of a known derivative.
-template <int count>
-Dual<count> chain(const Dual<count>& a, double value, double slope)
-{
-  Dual<count> result(value);
-  for (int i = 0; i < count; ++i)
-    result.by[i] = slope * a.by[i];
-  return result;
-}
 
 inline double value_of(double a) { return a; }
 inline double inverse(double a) { return 1.0 / a; }

@@ -97,9 +97,6 @@ struct Update
 // given pressure, that have no volume strain for it.
 std::vector<std::int64_t> update_logarithmic(const Update& update, int dim);
 
-// The same, of laws that soften by an average.
-std::vector<std::int64_t> update_averaged(const Update& update, int dim);
-
 // What a law has derivatives by: its parameters, and the share of a return.
 constexpr std::size_t num_numbers(Law law) { return num_parameters(law) + 1; }
 

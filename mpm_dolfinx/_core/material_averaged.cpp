@@ -3,7 +3,7 @@
 //
 // Laws that soften with an average of the plastic strain.
 
-#include "material_update.h"
+#include "law_answer.h"
 
 #include <algorithm>
 #include <array>
@@ -12,6 +12,8 @@
 
 namespace
 {
+using namespace core;
+
 // What a law that softens is made of, and the law with a share of what its strength falls by.
 template <typename Law>
 struct Strength;
@@ -205,15 +207,15 @@ struct Averaged
 
 } // namespace
 
-std::vector<std::int64_t> core::update_averaged(const Update& update, int dim)
+core::LawAnswer core::answer_averaged(Law law)
 {
-  switch (update.law)
+  switch (law)
   {
   case Law::von_mises_averaged:
-    return update_all<Averaged<VonMises<>>>(update, dim);
+    return answer<Averaged<VonMises<>>>;
   case Law::mohr_coulomb_averaged:
-    return update_all<Averaged<MohrCoulomb<>>>(update, dim);
+    return answer<Averaged<MohrCoulomb<>>>;
   default:
-    return update_all<Averaged<DruckerPrager<>>>(update, dim);
+    return answer<Averaged<DruckerPrager<>>>;
   }
 }

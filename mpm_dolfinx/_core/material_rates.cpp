@@ -104,20 +104,20 @@ void answer(const Change& u, std::size_t p, const std::array<double, 3>& strain,
   for (int k = 0; k < constants; ++k)
   {
     numbers[k] = values[k] = u.parameters[k](p);
-    numbers[k].by[3 + variables + k] = 1.0;
+    numbers[k].by.set(3 + variables + k, 1.0);
   }
   for (int a = 0; a < 3; ++a)
   {
     strains[a] = strain[a];
-    strains[a].by[a] = 1.0;
+    strains[a].by.set(a, 1.0);
   }
   for (int k = 0; k < variables; ++k)
   {
     law.variables[k] = result.own.variables[k] = u.old_variables[k][p];
-    law.variables[k].by[3 + k] = 1.0;
+    law.variables[k].by.set(3 + k, 1.0);
   }
   T in_time = u.share(p);
-  in_time.by[share] = 1.0;
+  in_time.by.set(share, 1.0);
   const LawOf<double> plain(values);
   InTime<LawOf<double>>{plain, values[0], values[1], in_time.value}(strain, u.tolerance, result.own);
   InTime<LawOf<T>, T>{LawOf<T>(numbers), numbers[0], numbers[1], in_time}(strains, u.tolerance, law);

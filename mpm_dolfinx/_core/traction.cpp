@@ -95,10 +95,11 @@ void differentiate_in(const Touching& known, const Separation& all, const double
     Seen<T, dim> seen(all, p);
     for (int j = 0; j < dim; ++j)
     {
-      seen.gap.by[j] = of_gap[p * dim + j];
-      seen.delta[j].by[j] = seen.change[j].by[j] = 1.0;
+      seen.gap.by.set(j, of_gap[p * dim + j]);
+      seen.delta[j].by.set(j, 1.0);
+      seen.change[j].by.set(j, 1.0);
       for (int i = 0; i < dim; ++i)
-        seen.n[i].by[j] = of_normal[(p * dim + i) * dim + j];
+        seen.n[i].by.set(j, of_normal[(p * dim + i) * dim + j]);
     }
     const auto acts = acting<T, dim>(known, all, p, seen, normal);
     for (int i = 0; i < dim; ++i)

@@ -67,7 +67,7 @@ void put_on_top(Press<T>&)
 {
 }
 
-inline void put_on_top(Press<Dual<1>>& press) { press.value.by[0] = press.acts ? 1.0 : 0.0; }
+inline void put_on_top(Press<Dual<1>>& press) { press.value.by.set(0, press.acts ? 1.0 : 0.0); }
 
 // The mean pressure of a step between two gaps: the loss of the energy k/2 <-gap>^2 over the change.
 template <typename T>
