@@ -7,7 +7,8 @@
 # Make the environment $VENV (default .venv) where it is missing, and install this package in
 # it, editable, with the extras named. What was installed for which pyproject.toml, modules and
 # compiled sources is noted in $VENV/.mpm-dolfinx, after it has succeeded, so that a second call has
-# nothing to do.
+# nothing to do, and one with further extras installs what these ask for and no more. What builds the
+# package stays in the environment: where sources change, only these are compiled again.
 set -eu
 
 cd "$(dirname "$0")/.."
@@ -60,14 +61,16 @@ key="$root $({
     cat pyproject.toml CMakeLists.txt mpm_dolfinx/_core/*.cpp mpm_dolfinx/_core/*.h
 } | cksum)"
 installed=$state/installed
+built=no
 if [ "$(sed -n 1p "$installed" 2>/dev/null)" = "$key" ]; then
+    built=yes
     missing=
     for extra in "$@"; do
         grep -qx "$extra" "$installed" || missing="$missing $extra"
     done
     [ -n "$missing" ] || exit 0
-    # shellcheck disable=SC2046,SC2086  # lists of words
-    set -- $(sed 1d "$installed") $missing
+    # shellcheck disable=SC2086  # a list of words
+    set -- $missing
 fi
 
 # An environment that brings a DOLFINx of its own (conda, apt, source) does without the wheel.
@@ -86,7 +89,7 @@ for extra in "$@"; do
             continue
         fi
     fi
-    extras="$extras${extras:+,}$extra"
+    extras="$extras $extra"
 done
 
 # FFCx compiles each form when it is first used.
@@ -98,14 +101,56 @@ sys.exit(shutil.which(shlex.split(cc)[0]) is None)' ||
         fail "DOLFINx needs a C compiler at run time and there is none: install gcc."
 fi
 
-echo "Installing this package with [$extras] into $venv (the first time this takes a minute or so)"
-rm -f "$installed"
-"$py" -m pip install --quiet --disable-pip-version-check --editable ".[$extras]"
-case ",$extras," in
-*,adjoint,*) "$py" -m pip install --quiet --disable-pip-version-check --no-deps dolfinx-adjoint fenicsx-compat ;;
+wanted=$state/requirements.txt
+
+pip_install() {
+    "$py" -m pip install --quiet --disable-pip-version-check "$@"
+}
+
+install_wanted() {
+    if grep -q . "$wanted"; then
+        pip_install --requirement "$wanted"
+    fi
+}
+
+# Install what pyproject.toml asks for: for the package and what builds it (package), and for extras.
+install_for() {
+    "$py" - "$@" <<'END' >"$wanted"
+import sys
+import tomllib
+
+with open("pyproject.toml", "rb") as file:
+    data = tomllib.load(file)
+known = data["project"]["optional-dependencies"]
+known["package"] = data["project"]["dependencies"] + data["build-system"]["requires"]
+print("\n".join(line for name in sys.argv[1:] for line in known[name]))
+END
+    install_wanted
+}
+
+# shellcheck disable=SC2086  # a list of words
+if [ "$built" = yes ]; then
+    echo "Installing what [${extras# }] asks for into $venv"
+    install_for $extras
+else
+    echo "Installing this package with [${extras# }] into $venv (the first time this takes a minute or so)"
+    rm -f "$installed"
+    install_for package $extras
+    # CMake and Ninja, where the machine has none
+    "$py" -c '
+from scikit_build_core.build import get_requires_for_build_editable
+print("\n".join(get_requires_for_build_editable()))' >"$wanted"
+    install_wanted
+    pip_install --no-build-isolation --no-deps --editable .
+fi
+case "$extras " in
+*" adjoint "*) pip_install --no-deps dolfinx-adjoint fenicsx-compat ;;
 esac
 {
     echo "$key"
-    printf '%s\n' "$@"
+    {
+        [ "$built" = no ] || sed 1d "$installed"
+        printf '%s\n' "$@"
+    } | LC_ALL=C sort -u
 } >"$installed.new"
 mv "$installed.new" "$installed"
