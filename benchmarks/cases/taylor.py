@@ -5,7 +5,8 @@
 It is a body of revolution of von Mises' law with linear hardening, and meets the wall by contact;
 `--wall roller` holds it there instead. After 80 us it has come to rest. `length` and `radius` are
 then its own in mm, `strain` its largest plastic strain. Codes of finite elements, which hold it on
-the wall, have 21.4 to 21.5, 7.0 to 7.24 and 2.5 to 3.2.
+the wall on meshes of 5 by 50, have 21.4 to 21.5, 7.0 to 7.24 and 2.5 to 3.2. With `--wall roller
+--cells 5 --domains-per-cell 1 --steps 640` that is met: shorter steps damp less.
 
 The impact makes waves that steps of 0.5 us do not resolve. By the schemes that keep energy they
 ring on, with pressures of 10 times the strength, and lift the rim off the wall; so the scheme is
