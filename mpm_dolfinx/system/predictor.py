@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assembly.petsc import absolute
+from ..tolerances import EQUAL
 
 __all__ = ["Predictor", "extrapolated", "map_to_background"]
 
 type Increments = list[NDArray[np.float64]]
 
-#: Most iterations that fit increments of the background to those of the bodies, and to what share
-#: of its start their squared residual falls.
-FIT, FITTED = 30, 1e-12
+#: Most iterations that fit increments of the background to those of the bodies.
+FIT = 30
 
 
 class Predictor:
@@ -174,7 +174,7 @@ def _fit(
     scaled = direction.copy()
     first = size = rest.dot(scaled)
     for _ in range(FIT):
-        if not (np.isfinite(size) and size > FITTED * first):
+        if not (np.isfinite(size) and size > EQUAL * first):
             break
         image.set(0.0)
         for T, w in zip(transfers, nodal, strict=True):

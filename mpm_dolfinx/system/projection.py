@@ -13,18 +13,12 @@ from petsc4py import PETSc
 import numpy as np
 
 from ..errors import ConvergenceError
-from ..tolerances import ROUND_OFF, SOLVED
+from ..tolerances import EQUAL, LOCAL_ITERATIONS, ROUND_OFF, SOLVED
 
 __all__ = ["Projection"]
 
-#: Most iterations and refinements of a projection, to ``ROUND_OFF``.
-MOST_ITERATIONS, REFINEMENTS = 100, 6
 #: What iterations go on to beyond it, so that momentum does not wander in thousands of steps.
 BEYOND = 0.01
-#: How often what the shift holds back is let go.
-RELEASES = 3
-#: What is added to it in turn where the factor is at round-off.
-RAISES = (0.0, 1e-12, 1e-11, 1e-10)
 
 
 class Projection:
@@ -74,9 +68,7 @@ class Projection:
         if guess is not None:
             y.pointwiseDivide(guess, self._unit)
         rest = self._rest(scaled, y)
-        for _ in range(1 + RELEASES):
-            if rest.norm() <= 2.0 * BEYOND * ROUND_OFF * size:
-                break
+        while rest.norm() > 2.0 * BEYOND * ROUND_OFF * size:
             part = y.duplicate()
             self._solve_scaled(rest, part, size)
             part.axpy(1.0, y)
@@ -106,29 +98,29 @@ class Projection:
             if self._incomplete is None:
                 self._incomplete = _incomplete(self._shifted)
             ksp = self._incomplete
-            ksp.setTolerances(rtol=0.0, atol=BEYOND * ROUND_OFF * size, max_it=MOST_ITERATIONS)
+            ksp.setTolerances(rtol=0.0, atol=BEYOND * ROUND_OFF * size, max_it=LOCAL_ITERATIONS)
             ksp.solve(right, y)
             if ksp.getConvergedReason() > 0:
                 return
             self._iterates = False
-        for more in RAISES:
+        more = 0.0
+        while more <= SOLVED:
             if self._factor is None:
                 self._shifted.shift(more)
                 self._held.shift(more)
                 self._factor = _solver(self._shifted, "preonly", "cholesky")
                 self._factor.getPC().setFactorSolverType("mumps")
             y.set(0.0)
-            rest, part = right.copy(), y.duplicate()
-            for _ in range(REFINEMENTS):
+            rest, part, before = right.copy(), y.duplicate(), np.inf
+            while ROUND_OFF * size < rest.norm() < 0.5 * before:
+                before = rest.norm()
                 self._factor.solve(rest, part)
                 y.axpy(1.0, part)
                 self._shifted.mult(y, rest)
                 rest.aypx(-1.0, right)
-                if rest.norm() <= ROUND_OFF * size:
-                    return
             if rest.norm() <= SOLVED * size:
                 return
-            self._factor = None
+            self._factor, more = None, max(10.0 * more, EQUAL)  # the factor is at round-off
         raise ConvergenceError("The projection of the velocities on the range of T failed")
 
 

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 from typing import override
 
-from mpi4py import MPI
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +14,7 @@ from dolfinx import fem, mesh
 from .. import _compat
 from ..background.basis import BackgroundBasis, PointBasis
 from ..background.cells import TOLERANCE
+from ..background.grids import grid_lines
 from ..errors import MPMError, agree
 from ..meshes.boxes import BOX_CELLS
 from ..tolerances import LAST_PLACES
@@ -44,7 +43,7 @@ class GIMP(Method):
     name = "gimp"
 
     def __init__(self, V: fem.FunctionSpace, domain_update: str) -> None:
-        self._grid = BoxGrid(V.mesh)
+        self._grid = BoxGrid(V)
         self._stretch = domain_update == "stretch"
 
     @override
@@ -101,7 +100,7 @@ class BoxGrid:
     """The grid lines of a structured background of rectangles or boxes.
 
     Args:
-        background: The background mesh.
+        V: Background space (collective).
 
     Attributes:
         lower: Lower corner of the background, shape ``(gdim,)``.
@@ -112,19 +111,19 @@ class BoxGrid:
         MPMError: The background is not such a grid.
     """
 
-    def __init__(self, background: mesh.Mesh) -> None:
+    def __init__(self, V: fem.FunctionSpace) -> None:
+        background, lines = V.mesh, grid_lines(V)
         gdim = background.geometry.dim
         count = background.topology.index_map(background.topology.dim).size_local
         x = background.geometry.x[_compat.geometry_dofmap(background)[:count], :gdim]
-        self._lines = [_merge(background.comm, x[:, :, i].ravel()) for i in range(gdim)]
         with agree(background.comm):
-            if background.basix_cell() not in BOX_CELLS or not all(
-                _spans_one(x[:, :, i], self._lines[i]) for i in range(gdim)
-            ):
+            boxes = background.basix_cell() in BOX_CELLS and lines is not None
+            if lines is None or not boxes or not all(map(_spans_one, np.moveaxis(x, 2, 0), lines)):
                 raise MPMError(
                     "Method 'gimp' needs a structured background of axis-aligned rectangles or "
                     "boxes; use 'cpdi2' or 'cpdi' on this one."
                 )
+        self._lines = lines
         self.lower = np.array([line[0] for line in self._lines])
         self.upper = np.array([line[-1] for line in self._lines])
         self.reach = np.array(
@@ -207,13 +206,6 @@ def _right_stretch(F: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the diagonal of ``U = (F^T F)^(1/2)``, shape ``(n, gdim)``."""
     squares, axes = np.linalg.eigh(F.swapaxes(1, 2) @ F)
     return np.asarray(np.einsum("nia,na->ni", axes**2, np.sqrt(squares)))
-
-
-def _merge(comm: MPI.Comm, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distinct coordinates of all ranks, sorted."""
-    together = np.unique(np.concatenate(comm.allgather(np.unique(values))))
-    tolerance = 1e-9 * (together[-1] - together[0])
-    return np.asarray(together[np.diff(together, prepend=-np.inf) > tolerance])
 
 
 def _spans_one(x: NDArray[np.float64], line: NDArray[np.float64]) -> bool:
