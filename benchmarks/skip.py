@@ -22,6 +22,7 @@ from dolfinx import fem
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import _compat
+from mpm_dolfinx.meshes.cells import disconnected_mesh
 
 
 def heavy(
@@ -32,7 +33,7 @@ def heavy(
     body = box([1.0, 1.0], [2 * n, 2 * n], QUADRILATERAL)
     if apart:
         corners = body.geometry.x[_compat.geometry_dofmap(body)][:, :, :2]
-        body = _compat.disconnected_mesh(MPI.COMM_WORLD, corners, body.basix_cell())
+        body = disconnected_mesh(MPI.COMM_WORLD, corners, body.basix_cell())
     particles = mpm.Particles(body, V)
     bcs = rollers(V, (0, 0.0), (0, 1.0), (1, 0.0))
     heap = mpm.Body(particles, law, body_force=(0.0, -weight))

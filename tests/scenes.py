@@ -15,8 +15,8 @@ import ufl
 from dolfinx import fem, la, mesh
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx import _compat
 from mpm_dolfinx.materials import LinearElastic
+from mpm_dolfinx.meshes.cells import input_cell_index
 
 WORLD = MPI.COMM_WORLD
 TRIANGLE, QUADRILATERAL = mesh.CellType.triangle, mesh.CellType.quadrilateral
@@ -419,7 +419,7 @@ def anywhere(body, seed=1):
     """Return a rank for each cell, by its input index."""
     cells = body.topology.index_map(body.topology.dim)
     every = np.random.default_rng(seed).integers(0, WORLD.size, cells.size_global)
-    return every[_compat.input_cell_index(body)]
+    return every[input_cell_index(body)]
 
 
 def pulled(material, end=0.4, **options):

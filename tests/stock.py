@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Mixed problems solved with DOLFINx alone, to compare with."""
 
+from inspect import signature
+
 from petsc4py import PETSc
 
 import numpy as np
@@ -12,6 +14,55 @@ import basix.ufl
 import ufl
 from dolfinx import fem, mesh
 from dolfinx.fem import petsc as fem_petsc
+
+
+class _NonlinearProblem:
+    """``dolfinx.fem.petsc.NonlinearProblem`` as it is since 0.10, by Newton's method of 0.9.
+
+    Takes ``snes_rtol`` alone of the PETSc options, as a bound of the increment.
+    """
+
+    def __init__(
+        self,
+        F,
+        u,
+        bcs=(),
+        J=None,
+        petsc_options_prefix="",
+        petsc_options=None,
+    ):
+        from dolfinx.nls.petsc import NewtonSolver
+
+        old = fem_petsc.NonlinearProblem
+        self._u = u
+        self._newton = NewtonSolver(u.function_space.mesh.comm, old(F, u, list(bcs), J))
+        self._newton.convergence_criterion = "incremental"
+        self._newton.rtol = self._newton.atol = (petsc_options or {}).get("snes_rtol", 1e-9)
+        self._newton.error_on_nonconvergence = False
+        self._reason = 0
+
+    @property
+    def solver(self):
+        """The object that tells whether the last solve converged."""
+        return self
+
+    def getConvergedReason(self):
+        """Return a positive number where the last solve converged."""
+        return self._reason
+
+    def solve(self):
+        """Solve from the present values on."""
+        converged = self._newton.solve(self._u)[1]
+        self._reason = 1 if converged else -1
+        return self._u
+
+
+#: DOLFINx's nonlinear problem, for comparisons with finite elements.
+NonlinearProblem = (
+    fem_petsc.NonlinearProblem
+    if "petsc_options_prefix" in signature(fem_petsc.NonlinearProblem).parameters
+    else _NonlinearProblem
+)
 
 
 def values_at(function, x):

@@ -19,9 +19,10 @@ from mpi4py import MPI
 import numpy as np
 
 from dolfinx import mesh
+from dolfinx.fem.petsc import NonlinearProblem  # noqa: F401 (for cases)
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx._compat import NonlinearProblem, interpolation_points  # noqa: F401 (for cases)
+from mpm_dolfinx._compat import interpolation_points  # noqa: F401 (for cases)
 from mpm_dolfinx.stepping.progress import with_bar
 
 comm = MPI.COMM_WORLD

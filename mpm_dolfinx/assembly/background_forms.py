@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx.fem import petsc as fem_petsc
 
-from .. import _compat
 from ..errors import MPMError
 from ..parallel.compilation import compiled_form
 from ..particles.particles import Particles
-from .petsc import MatrixSum, assemble_into, assemble_matrix
+from .petsc import MatrixSum, assemble_into, assemble_matrix, create_vector
 from .rules import depends_on, form_of_rank, split_by_rule
 
 __all__ = ["BackgroundForms"]
@@ -44,7 +43,7 @@ class BackgroundForms:
         self._tangents = [compiled_form(t, **options) for t in tangents]
         self._matrices = [fem_petsc.create_matrix(t) for t in self._tangents]
         self._sum = MatrixSum()
-        self.r: PETSc.Vec = _compat.create_vector(particles.V)
+        self.r: PETSc.Vec = create_vector(particles.V)
 
     def assemble_residual(self) -> PETSc.Vec:
         """Assemble the residual on V."""

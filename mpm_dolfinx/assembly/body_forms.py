@@ -25,7 +25,7 @@ from ..meshes.quadrature import nodal_forces, with_hoop
 from ..parallel.compilation import compiled_form
 from ..particles.particles import Particles
 from .low_rank import LowRankTangent
-from .petsc import assemble_into, assemble_matrix
+from .petsc import assemble_into, assemble_matrix, create_vector, load_quotient
 from .rules import couples_cells, depends_on, follows, form_of_rank, is_zero, split_by_rule
 from .volume_ratio import average_in
 
@@ -160,8 +160,8 @@ class BodyForms:
         self._low_rank = None if source is None else LowRankTangent(particles, source)
         whole = internal is not None and particles.num_points > 1
         self._by_domains = whole and source is not None and source.groups.single
-        self.r: PETSc.Vec = _compat.create_vector(particles.W)
-        self.external: PETSc.Vec = _compat.create_vector(particles.W)
+        self.r: PETSc.Vec = create_vector(particles.W)
+        self.external: PETSc.Vec = create_vector(particles.W)
 
     def takes(self, form: ufl.Form) -> bool:
         """Return whether the compiled loops can assemble a form of the tangent.
@@ -226,17 +226,7 @@ class BodyForms:
         Returns:
             The quotient, and the size of what it is the difference of.
         """
-        load, coefficients = self._particles.load, {1: (-1.0, 1.0), 2: (1.0, -2.0, 1.0)}[order]
-        present, size = load.value.copy(), 0.0
-        total, at = self.r.duplicate(), self.r.duplicate()
-        total.set(0.0)
-        for factor, coefficient in enumerate(coefficients):
-            load.value[...] = factor
-            assemble_into(at, self._loaded)
-            total.axpy(coefficient, at)
-            size += float(at.norm())
-        load.value[...] = present
-        return total, size
+        return load_quotient(self._particles.load, self.r, self._loaded, order)
 
     def assemble_residual(self) -> PETSc.Vec:
         """Assemble the residual; the external parts are those of ``assemble_external``."""
@@ -406,7 +396,7 @@ class BodyForms:
         )
         swap = {self._test: ufl.TestFunction(broken)}
         forms = self._compile([ufl.replace(part, swap) for part in self._parts])
-        return forms, _compat.create_vector(broken)
+        return forms, create_vector(broken)
 
     def absolute_contributions(self, domain_nodes: NDArray[np.int32]) -> PETSc.Vec:
         """Return the sum over domains of the absolute values of what each adds to the residual.

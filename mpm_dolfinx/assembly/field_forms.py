@@ -16,12 +16,11 @@ from dolfinx import fem
 from dolfinx.fem import petsc as fem_petsc
 from ufl.algorithms import expand_derivatives
 
-from .. import _compat
 from ..errors import MPMError
 from ..parallel.compilation import compiled_form
 from ..particles.field import ParticleField
 from ..particles.particles import Particles
-from .petsc import assemble_into, assemble_matrix
+from .petsc import assemble_into, assemble_matrix, create_vector, load_quotient
 from .rules import couples_cells, follows, form_of_rank, is_zero, split_by_rule
 
 __all__ = ["FieldForms"]
@@ -76,8 +75,8 @@ class FieldForms:
             loaded = [(part, form) for part, form in compiled if self._has_load(part)]
             self._loaded.append([form for _, form in loaded])
             self.follows_load |= any(follows(part, *unknowns) for part, _ in loaded)
-        self._vectors = [_compat.create_vector(field.W) for field in fields]
-        self.external = [_compat.create_vector(field.W) for field in fields]
+        self._vectors = [create_vector(field.W) for field in fields]
+        self.external = [create_vector(field.W) for field in fields]
         self._blocks = self._tangents(parts, unknowns, R is not None)
         for number, field in enumerate(fields, start=1):
             if not any(number in pair for pair in self._blocks):
@@ -165,7 +164,7 @@ class FieldForms:
             for part in self._parts[number]:
                 swap = {part.arguments()[0]: ufl.TestFunction(space)}
                 forms.append(compiled_form(ufl.replace(part, swap), **self._options))
-            self._broken[number] = forms, _compat.create_vector(space)
+            self._broken[number] = forms, create_vector(space)
         broken = self._broken[number]
         assert broken is not None
         assemble_into(broken[1], broken[0])
@@ -183,19 +182,9 @@ class FieldForms:
 
         See :meth:`BodyForms.load_derivative` (collective).
         """
-        load, coefficients = self._particles.load, {1: (-1.0, 1.0), 2: (1.0, -2.0, 1.0)}[order]
-        present, size, totals = load.value.copy(), 0.0, []
-        for vector, forms in zip(self._vectors, self._loaded, strict=True):
-            total, at = vector.duplicate(), vector.duplicate()
-            total.set(0.0)
-            for factor, coefficient in enumerate(coefficients):
-                load.value[...] = factor
-                assemble_into(at, forms)
-                total.axpy(coefficient, at)
-                size += float(at.norm())
-            totals.append(total)
-        load.value[...] = present
-        return totals, size
+        pairs = zip(self._vectors, self._loaded, strict=True)
+        found = [load_quotient(self._particles.load, *pair, order) for pair in pairs]
+        return [quotient for quotient, _ in found], sum(size for _, size in found)
 
 
 def _component(argument: ufl.Argument) -> ufl.core.expr.Expr:

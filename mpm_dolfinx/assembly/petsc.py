@@ -24,6 +24,8 @@ __all__ = [
     "assemble_matrix",
     "assembled",
     "blocked",
+    "create_vector",
+    "load_quotient",
     "marked",
 ]
 
@@ -151,3 +153,43 @@ def absolute(matrix: PETSc.Mat) -> PETSc.Mat:
     indptr, columns, values = matrix.getValuesCSR()
     csr = indptr, columns, np.abs(values)
     return PETSc.Mat().createAIJ(matrix.getSizes(), csr=csr, comm=matrix.comm)
+
+
+def create_vector(V: fem.FunctionSpace) -> PETSc.Vec:
+    """Return a vector with ghosts for a space, on the communicator of its mesh (collective).
+
+    DOLFINx makes it on the index map's own communicator, which is out of reach once the space is
+    gone; then PETSc could not free the vector any more, nor the communicator.
+    """
+    places, block = V.dofmap.index_map, V.dofmap.index_map_bs
+    sizes = (block * places.size_local, block * places.size_global)
+    ghosts = places.ghosts.astype(PETSc.IntType)
+    return PETSc.Vec().createGhost(ghosts, sizes, bsize=block, comm=V.mesh.comm)
+
+
+def load_quotient(
+    load: fem.Constant, like: PETSc.Vec, forms: list[fem.Form], order: int
+) -> tuple[PETSc.Vec, float]:
+    """Return a difference quotient of vectors by the load factor (collective).
+
+    Args:
+        load: The load factor.
+        like: A vector of the same layout.
+        forms: The vectors, which add up.
+        order: 1, which is the derivative where they are affine in the load factor, or 2, which is
+            zero there.
+
+    Returns:
+        The quotient, and the size of what it is the difference of.
+    """
+    coefficients = {1: (-1.0, 1.0), 2: (1.0, -2.0, 1.0)}[order]
+    present, size = load.value.copy(), 0.0
+    total, at = like.duplicate(), like.duplicate()
+    total.set(0.0)
+    for factor, coefficient in enumerate(coefficients):
+        load.value[...] = factor
+        assemble_into(at, forms)
+        total.axpy(coefficient, at)
+        size += float(at.norm())
+    load.value[...] = present
+    return total, size

@@ -15,8 +15,8 @@ from .._core import loops
 from ..constitutive.pressure import VolumeStrain
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
+from .blocks import CoupledBlocks
 from .body_forms import no_values
-from .fused import CoupledBlocks
 
 __all__ = ["PressureBlocks", "PressurePoints"]
 

@@ -15,9 +15,9 @@ from ufl.algorithms.estimate_degrees import estimate_total_polynomial_degree
 from ufl.classes import Division, Grad, Indexed, SpatialCoordinate
 from ufl.corealg.traversal import traverse_unique_terminals, unique_pre_traversal
 
-from .. import _compat
 from ..errors import MPMError
 from ..meshes.quadrature import quadrature_rule
+from .expansion import expanded
 
 __all__ = [
     "couples_cells",
@@ -76,7 +76,7 @@ def data_at_points(form: ufl.Form) -> set[fem.Function]:
 
 def vanishes(integral: Any) -> bool:
     """Return whether an integral is zero, as in ``0.0 * form``: FFCx makes nothing of it."""
-    return isinstance(_compat.expanded(integral), ufl.constantvalue.Zero)
+    return isinstance(expanded(integral), ufl.constantvalue.Zero)
 
 
 def _rule(integral: Any) -> tuple[int, str]:
@@ -108,14 +108,14 @@ def _rule(integral: Any) -> tuple[int, str]:
     if at_points:
         _require_no_gradient(integral)
     if degree == -1:
-        estimate = estimate_total_polynomial_degree(_compat.expanded(integral))
+        estimate = estimate_total_polynomial_degree(expanded(integral))
         degree = max(estimate) if isinstance(estimate, tuple) else estimate
     return int(degree), scheme
 
 
 def _require_no_gradient(integral: Any) -> None:
     """Raise an error where an integral has a gradient of what is known at points alone."""
-    for node in unique_pre_traversal(_compat.expanded(integral)):
+    for node in unique_pre_traversal(expanded(integral)):
         if not isinstance(node, Grad):
             continue
         inner = node.ufl_operands[0]

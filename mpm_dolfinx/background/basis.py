@@ -15,8 +15,8 @@ from dolfinx import fem
 
 from .. import _compat
 from ..parallel.totals import over_ranks
-from ..tolerances import BLOCK, ROUND_OFF
-from .cells import TOLERANCE, Cells, CellTable
+from ..tolerances import BLOCK, NEGLIGIBLE, ROUND_OFF
+from .cells import Cells, CellTable
 from .points import PointBasis
 from .tiles import Tiles
 from .walls import Walls
@@ -104,7 +104,7 @@ class BackgroundBasis:
             cell, reference, violation = cells.locate(points[part])
             reference = cells.clip(cell, reference)
             table = _compat.tabulated(self._basis, int(gradients), reference)
-            found[part] = violation <= TOLERANCE
+            found[part] = violation <= NEGLIGIBLE
             inside = found[part, None]
             values[part] = np.where((np.abs(table[0]) >= ROUND_OFF) & inside, table[0], 0.0)
             if slopes is not None:

@@ -13,16 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import basix.ufl
-from dolfinx import fem, mesh
+from dolfinx import fem, geometry, mesh
 
 from .. import _compat
 from .._core import loops
-from ..tolerances import BLOCK, EQUAL, LAST_PLACES
+from ..meshes.cells import disconnected_mesh, input_cell_index
+from ..tolerances import BLOCK, EQUAL, LAST_PLACES, NEGLIGIBLE
 
-__all__ = ["TOLERANCE", "CellTable", "Cells", "cell_volumes"]
-
-#: Reference distance within which a point outside a cell counts as on its boundary.
-TOLERANCE = 1e-10
+__all__ = ["CellTable", "Cells", "cell_volumes"]
 
 
 class CellTable(NamedTuple):
@@ -52,7 +50,7 @@ class CellTable(NamedTuple):
         return cls(
             background.geometry.x[corners][:, :, : background.geometry.dim],
             V.dofmap.index_map.local_to_global(dofs.ravel()).reshape(dofs.shape),
-            _compat.input_cell_index(background),
+            input_cell_index(background),
             np.arange(count, dtype=np.int32),
             np.full(count, background.comm.rank, dtype=np.int32),
         )
@@ -108,11 +106,10 @@ class Cells:
         domain = self._background
         if domain.comm.size > 1:
             degree = self.map.degree
-            domain = _compat.disconnected_mesh(
-                MPI.COMM_SELF, self.vertices, self._name, degree=degree
-            )
+            domain = disconnected_mesh(MPI.COMM_SELF, self.vertices, self._name, degree=degree)
         cells = np.arange(len(self.vertices), dtype=np.int32)
-        return _compat.cell_tree(domain, cells, max(1e2 * TOLERANCE * size, self.roundoff))
+        slack = max(1e2 * NEGLIGIBLE * size, self.roundoff)
+        return geometry.bb_tree(domain, domain.topology.dim, padding=slack, entities=cells)
 
     def _is_affine(self) -> bool:
         if len(self.vertices) == 0 or (self.simplex and self.map.degree == 1):
@@ -202,11 +199,11 @@ class Cells:
         violation = np.full(n, np.inf)
         if self.grid is not None:
             self._locate_in_grid(self.grid, points, cell, reference, violation)
-        if violation.max(initial=0.0) <= TOLERANCE:
+        if violation.max(initial=0.0) <= NEGLIGIBLE:
             return cell, reference, violation
         for start in range(0, n if len(self.vertices) else 0, BLOCK):
             block = np.arange(start, min(start + BLOCK, n))
-            block = block[violation[block] > TOLERANCE]
+            block = block[violation[block] > NEGLIGIBLE]
             block = block[np.isfinite(points[block]).all(axis=1)]
             if len(block) == 0:
                 continue
@@ -245,7 +242,8 @@ class Cells:
         """Return which points lie in a cell's bounding box, and for them what ``locate`` does."""
         padded = np.zeros((len(points), 3))
         padded[:, : self.gdim] = points
-        offsets, candidates = _compat.candidate_cells(self.tree, padded)
+        found = geometry.compute_collisions_points(self.tree, padded)
+        offsets, candidates = found.offsets, found.array
         counts = np.diff(offsets)
         hit = np.flatnonzero(counts)
         if len(hit) == 0:

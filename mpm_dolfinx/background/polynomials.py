@@ -17,9 +17,6 @@ from .. import _compat
 
 __all__ = ["CellPolynomials", "Frame"]
 
-#: Reach of the polynomials in cells, the range in which their basis is well conditioned.
-REACH = 1.5
-
 
 class Frame(NamedTuple):
     """Affine coordinates of cells: zero at the middle, one cell long.
@@ -83,7 +80,7 @@ class CellPolynomials:
     def at(self, points: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
         """Return the polynomials at points ``(n, q, gdim)``, shape ``(n, q, a)``."""
         local = np.einsum("nij,nqj->nqi", frame.axes, points - frame.origin[:, None])
-        table = np.polynomial.legendre.legvander(local / REACH, self._degree)
+        table = np.polynomial.legendre.legvander(local, self._degree)
         values = np.ones((*points.shape[:2], self._powers.shape[1]))
         for axis, power in enumerate(self._powers):
             values *= table[:, :, axis][:, :, power]

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..parallel.exchange import swap
-from ..tolerances import LAST_PLACES
-from .cells import TOLERANCE, CellTable
+from ..tolerances import LAST_PLACES, NEGLIGIBLE
+from .cells import CellTable
 
 __all__ = ["Tiles"]
 
@@ -45,7 +45,7 @@ class Tiles:
         self._shape = np.maximum(size / edge, 1.0).astype(np.int64)
         self._edges = size / self._shape
         error = 2.0 * LAST_PLACES * (np.abs(self._low) + size).max()
-        pad = max(1e2 * TOLERANCE * size.max(), error)
+        pad = max(1e2 * NEGLIGIBLE * size.max(), error)
         self._ranks = self._place(boxes + np.array([[-pad], [pad]]))
         self._ranges = self._place(low - pad), self._place(high + pad)
         self._known = np.zeros(self._shape.prod(), dtype=bool)

@@ -235,7 +235,7 @@ class Assignment:
     @property
     def has_small_strain(self) -> NDArray[np.bool_]:
         """Which points have a law of small strains, shape ``(n nq,)``."""
-        return self.where(lambda part: getattr(part.material, "kinematics", None) == "small")
+        return self.where(lambda part: part.material.kinematics == "small")
 
     def answers(
         self, gradient: NDArray[np.float64], states: list[State]

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
+from ..materials.tensors import growth
 from .groups import Groups, patches, singles
 from .strain import Strain
 
@@ -245,7 +246,7 @@ class VolumeAveraging:
             gradient: Displacement gradient F - I with det F > 0, shape ``(n, nq, dim, dim)``.
         """
         a = 1.0 / self._dim
-        excess = _determinant_minus_one(gradient)
+        excess = growth(gradient)
         weights = self._weights
         volume, of_domain = weights.sum(axis=1), (weights * excess).sum(axis=1)
         present = ~self._particles.deleted
@@ -396,16 +397,6 @@ class VolumeAveraging:
         for i in range(3):
             result[present, i, i] += change[present, i // self._dim]
         return result
-
-
-def _determinant_minus_one(gradient: Array) -> Array:
-    """Return det(I + H) - 1 with the relative precision of a small H."""
-    dim = gradient.shape[-1]
-    minors = 0.5 * (
-        np.einsum("...ii->...", gradient) ** 2 - np.einsum("...ij,...ji->...", gradient, gradient)
-    )
-    change = np.einsum("...ii->...", gradient) + minors
-    return np.asarray(change if dim == 2 else change + np.linalg.det(gradient))
 
 
 def _dyad(a: Array, b: Array) -> Array:

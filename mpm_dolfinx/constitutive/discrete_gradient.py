@@ -28,9 +28,6 @@ from .averaging import LowRankTerm, VolumeAveraging
 
 __all__ = ["Ends", "Gradients", "abandon", "by_end", "mean", "mean_of_groups"]
 
-#: How many numbers of each domain are summed over its group in an evaluation.
-SUMS = 4
-
 type Array = NDArray[np.float64]
 
 
@@ -134,7 +131,23 @@ def by_end(gradients: Gradients, small: NDArray[np.bool_]) -> Array:
 
 def abandon(averaging: VolumeAveraging) -> None:
     """Take part in the sums of an evaluation that failed on this rank (collective)."""
-    averaging.groups.sum(np.zeros((averaging.counted().shape[0], SUMS)))
+    averaging.groups.sum(np.zeros((averaging.counted().shape[0], len(_Sums._fields))))
+
+
+class _Sums(NamedTuple):
+    """Numbers of domains that are summed over their groups, shape ``(n, nq)`` or ``(n,)``.
+
+    Attributes:
+        change: Numerator of c.
+        size: Its denominator.
+        whole: The change of strain along the part of the tangent from the group, on the left.
+        gamma: That along the part on the right.
+    """
+
+    change: Array
+    size: Array
+    whole: Array
+    gamma: Array
 
 
 def mean_of_groups(
@@ -164,15 +177,18 @@ def mean_of_groups(
     change, slope = gradients.strain()
     turned = np.einsum("nIi,nIJ->niJ", inverse, change)
     whole = h[:, None, None, None] * gamma + left
-    own = [
-        *(part.reshape(volumes.shape) for part in _quotient(ends, S_mean, change)),
+    over, under = _quotient(ends, S_mean, change)
+    own = _Sums(
+        over.reshape(volumes.shape),
+        under.reshape(volumes.shape),
         np.einsum("nqiJ,nqiJ->nq", turned.reshape(shape), whole),
         np.einsum("nqiJ,nqiJ->nq", turned.reshape(shape), gamma),
-    ]
-    sums = averaging.groups.sum(np.stack([(volumes * part).sum(axis=1) for part in own], 1))
-    size = np.where(sums[:, 1] > 0.0, sums[:, 1], 1.0)
+    )
+    summed = averaging.groups.sum(np.stack([(volumes * part).sum(axis=1) for part in own], 1))
+    sums = _Sums(*summed.T)
+    size = np.where(sums.size > 0.0, sums.size, 1.0)
     kind = ends.kind.reshape(volumes.shape)[:, 0]
-    c = sums[:, 0] / size
+    c = sums.change / size
     exact = (kind == 2) | ((kind == 3) & (c > 0.0))
     each = np.repeat(np.where(exact, c, 0.0), volumes.shape[1])[:, None, None]
     # how c changes with F at the points, times its denominator
@@ -184,14 +200,14 @@ def mean_of_groups(
     tangent += _times(F_mean, each[:, :, :, None, None] * slope)
     for i in range(F_mean.shape[-1]):
         tangent[:, i, :, i, :] += 0.5 * each * change
-    over = np.where(exact, 1.0 / size, 0.0)[:, None, None]
+    inverse_size = np.where(exact, 1.0 / size, 0.0)[:, None, None]
     half = factor * by_end(gradients, small)
     first, second = (
         averaging.nodal((half @ one.reshape(S.shape)).reshape(shape)) for one in (whole, gamma)
     )
-    along = averaging.nodal((factor * F_mean @ change).reshape(shape)) * over
-    first -= 0.5 * sums[:, 2, None, None] * along
-    second -= 0.5 * sums[:, 3, None, None] * along
+    along = averaging.nodal((factor * F_mean @ change).reshape(shape)) * inverse_size
+    first -= 0.5 * sums.whole[:, None, None] * along
+    second -= 0.5 * sums.gamma[:, None, None] * along
     after = (averaging.nodal(gamma), averaging.nodal(right), averaging.nodal(X.reshape(shape)))
     return stress, tangent, LowRankTerm(averaging.groups, (first, second, along), after)
 

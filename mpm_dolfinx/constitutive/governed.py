@@ -23,7 +23,7 @@ from .pressure import VolumeStrain
 __all__ = ["Answer", "Carried", "Governed"]
 
 FLOAT = np.dtype(np.float64)
-NO_TANGENT = np.zeros((0, 3, 3, 3, 3))
+no_tangent: NDArray[np.float64] = np.zeros((0, 3, 3, 3, 3))
 #: What a law answers first of all.
 STRESS = "stress P"
 #: Parts of a state that updates of this package do not read, or that displacements tell.
@@ -83,8 +83,8 @@ class Governed:
     @cached_property
     def inelastic_variables(self) -> tuple[str, ...]:
         """Internal variables that change where a point yields."""
-        own = getattr(self.material, "internal_variables", ())
-        return tuple(name for name in own if name not in self.material.reversible)
+        material = self.material
+        return tuple(n for n in material.internal_variables if n not in material.reversible)
 
     def given_away(self, state: State) -> State:
         """Return an answered state that the law will not write into any more."""
@@ -301,7 +301,7 @@ class Governed:
             before = state[name]
             self._require(f"state {name!r}", values, before.shape, before.dtype)
         P = np.ascontiguousarray(answer.first_piola)
-        A = NO_TANGENT if answer.tangent is None else np.ascontiguousarray(answer.tangent)
+        A = no_tangent if answer.tangent is None else np.ascontiguousarray(answer.tangent)
         return Answer(P, A, answer.state)
 
     def _require(

@@ -115,7 +115,7 @@ class PointState:
     def is_elastic_since(self, before: PointState) -> bool:
         """Return whether no internal variable is another one than before."""
         for part, was, now in zip(self.laws.governed, before.states, self.states, strict=True):
-            if was.keys() == {"stress"} or not getattr(part.material, "inelastic", True):
+            if was.keys() == {"stress"} or not part.material.inelastic:
                 continue
             variables = part.inelastic_variables
             if not variables or not all(np.array_equal(was[v], now[v]) for v in variables):

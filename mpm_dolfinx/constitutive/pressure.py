@@ -29,6 +29,7 @@ from ..particles.field import ParticleField
 __all__ = [
     "MeanStress",
     "VolumeStrain",
+    "is_linear_in_volume",
     "is_split",
     "slope_of_volume",
     "with_pressure",
@@ -68,6 +69,11 @@ def is_split(material: Material) -> bool:
             f"mixed='pressure' needs a law whose mean stress rises with the volume: a "
             f"{type(material).__name__} may soften under a given shape; use f_bar='patch'."
         )
+    return is_linear_in_volume(material)
+
+
+def is_linear_in_volume(material: Material) -> bool:
+    """Return whether a law's class says for itself that it is linear in volume."""
     return bool(vars(type(material)).get("linear_in_volume", False))
 
 
@@ -157,7 +163,7 @@ class MeanStress:
             soft: That of the law in use.
         """
         self.strain.compliance[points], self._soft[points] = 1.0 / np.asarray(bulk), soft
-        self._small[points] = getattr(material, "kinematics", "") == "small"
+        self._small[points] = material.kinematics == "small"
 
     def replace(
         self,

@@ -36,10 +36,11 @@ from ..meshes.quadrature import volume_ratio
 from ..particles.reference import Reference
 from .averaging import Linearised, LowRankTerm, VolumeAveraging
 from .discrete_gradient import Ends, Gradients, abandon, by_end, mean, mean_of_groups
+from .energies import elastic_energy, has_potential, potential_energy
 from .groups import Groups
 from .moduli import undeformed_tangent
 from .points import MaterialPoints
-from .pressure import MeanStress, VolumeStrain, slope_of_volume
+from .pressure import MeanStress, VolumeStrain, is_linear_in_volume, slope_of_volume
 
 __all__ = ["StepStress"]
 
@@ -235,9 +236,9 @@ class StepStress:
         self._part = _PressurePart(points) if splits else None
         pressed = points.laws.at_pressure & splits
         self._small = points.laws.has_small_strain
-        bounded = _may_part(points) & ~np.isnan(points.strain_energy()) & ~pressed
+        bounded = _may_part(points) & ~np.isnan(elastic_energy(points)) & ~pressed
         self._kind = np.where(bounded, 3, 1).astype(np.uint8)
-        self._kind[points.has_potential & ~self._small], self._kind[self._small] = 2, 0
+        self._kind[has_potential(points) & ~self._small], self._kind[self._small] = 2, 0
         plain = not conserving and viscosity == 0.0 and not splits
         plain = plain or (bool(self._small.all()) and not pressed.any())
         self.symmetric: bool = points.symmetric and plain
@@ -342,7 +343,7 @@ class StepStress:
         points, part, volume = self._points, self._part, None
         H = _gradient(points).copy()  # (which is that of the points until they are strained again)
         stress = points.first_piola.copy()
-        potential = points.potential(trial) if self._conserving else None
+        potential = potential_energy(points, trial) if self._conserving else None
         if part is not None:
             p, volume = part.converged, part.volume(H)
             if potential is not None:
@@ -402,7 +403,7 @@ class StepStress:
         """Return the discrete gradient over the step (collective with F-bar)."""
         begin, potentials, factor = self._begin, None, 1.0 / self._share
         if begin.potential is not None and (self._kind >= 2).any():
-            potential = self._points.potential(trial=True)
+            potential = potential_energy(self._points, trial=True)
             if self._part is not None:
                 potential = potential - self._part.stored(self._part.pressure)
             potentials = potential, begin.potential
@@ -477,7 +478,7 @@ class StepStress:
 
     def strain_energy(self) -> float:
         """Return this rank's elastic energy, last converged; perhaps not a number (collective)."""
-        weights, energy = self._points.weights.ravel(), self._points.strain_energy()
+        weights, energy = self._points.weights.ravel(), elastic_energy(self._points)
         present = weights > 0.0
         return float(weights[present] @ energy[present])
 
@@ -489,9 +490,7 @@ def _between(share: float, before: Array, after: Array) -> Array:
 
 def _may_part(points: MaterialPoints) -> NDArray[np.bool_]:
     """Return which points have a law whose pressure may vanish by yielding, shape ``(n nq,)``."""
-    return points.laws.where(
-        lambda part: not vars(type(part.material)).get("linear_in_volume", False)
-    )
+    return points.laws.where(lambda part: not is_linear_in_volume(part.material))
 
 
 def _gradient(points: MaterialPoints) -> Array:

@@ -192,7 +192,7 @@ def _completed(before: Sequence[Episode], part: Governed, known: _Known, carried
 
 def _variables(before: Sequence[Episode], part: Governed, rows: NDArray[np.int64]) -> State:
     """Return internal variables of some of the points of a law, which others of its class knew."""
-    names = tuple(getattr(part.material, "internal_variables", ()))
+    names = tuple(part.material.internal_variables)
     first = part.initial_state() if names else {}
     variables = {name: first[name].copy() for name in names}
     for episode in before:

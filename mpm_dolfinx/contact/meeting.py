@@ -12,7 +12,7 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import _compat
+from ..assembly.petsc import create_vector
 from .approach import Approach
 from .behind import At
 from .contact import Outcome
@@ -69,7 +69,7 @@ class Meeting:
         """Return the forces on the nodes of both bodies (collective)."""
         around = self.approach.around
         first = around.sides.source.force(self.outcome.traction, which=around.facets)
-        second = _compat.create_vector(around.sides.target.particles.W)
+        second = create_vector(around.sides.target.particles.W)
         values = around.weights[self.stencil.which][:, None, None] * self.reaction
         dofs = around.near.dofs[self.facet].astype(PETSc.IntType)
         second.setValues(dofs.ravel(), values.ravel(), addv=PETSc.InsertMode.ADD_VALUES)

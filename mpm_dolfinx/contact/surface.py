@@ -19,6 +19,7 @@ from dolfinx import fem, la, mesh
 
 from .. import _compat
 from ..assembly.inputs import is_tag, known_tags
+from ..assembly.petsc import create_vector
 from ..errors import MPMError
 from ..meshes.remesh import Column
 from ..parallel.given import require_truth, require_whole
@@ -423,7 +424,7 @@ def nodal_vector(
         nodes: Local nodes, shape ``(...)``.
         forces: Shape ``(..., gdim)``.
     """
-    vector = _compat.create_vector(W)
+    vector = create_vector(W)
     gdim = forces.shape[-1]
     with vector.localForm() as whole:
         whole.set(0.0)

@@ -171,7 +171,7 @@ class Backward:
             _add_to(motion, term.forms.force_of(stress))
         with ExitStack() as blocks:
             for points, tangent in zip(problem.points, tangents, strict=True):
-                blocks.enter_context(points.with_tangent(tangent))
+                blocks.enter_context(points.asked.with_tangent(tangent))
             # (F-bar has been asked for other stresses since the step was evaluated)
             averages = any(p.averaging is not None for p in problem.points)
             if averages or any(tangent is not None for tangent in tangents):

@@ -306,7 +306,7 @@ class StepDerivative:
         self._nearby.go(parameter, sign * parameter.change, rates, arrays)
         with ExitStack() as blocks:
             for own in points:
-                blocks.enter_context(own.without_tangents())
+                blocks.enter_context(own.asked.without_tangents())
             self._require(self._reduced.balance.evaluate(), parameter)
         forces = [force.array_r.copy() for force in self._reduced.unknowns.forces]
         if not whole:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
-from ..constitutive.points import Governing
+from ..constitutive.numbers import Governing
 from ..materials.base import State
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
@@ -85,7 +85,7 @@ class _Here:
         self.seen = [points.last.gradient for points in self.points]
         self.moved: Parameter | None = None
         self.side: tuple[Parameter, float, Rates] | None = None
-        self._own = [points.governing() for points in self.points]
+        self._own = [points.numbers.present() for points in self.points]
         self._governing: dict[tuple[int, float], list[Governing]] = {}
 
     def return_to(self) -> None:
@@ -104,10 +104,10 @@ class _Here:
         if known is None:
             for points in self.points:
                 parameter.govern(points, amount)
-            self._governing[key] = [points.governing() for points in self.points]
+            self._governing[key] = [points.numbers.present() for points in self.points]
         else:
             for points, governing in zip(self.points, known, strict=True):
-                points.govern_by(governing)
+                points.numbers.take(governing)
 
 
 class Nearby:

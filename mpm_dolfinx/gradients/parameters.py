@@ -107,7 +107,7 @@ class _Values(Parameter):
 
     @override
     def govern(self, points: MaterialPoints, amount: float) -> None:
-        points.follow_parameters()
+        points.numbers.follow()
 
     @override
     def require_unchanged(self) -> None:
@@ -134,7 +134,7 @@ class _OfLaw(Parameter):
     @override
     def govern(self, points: MaterialPoints, amount: float) -> None:
         value = self._law.parameters[self._parameter]
-        points.assume(self._law, self._parameter, value + amount if amount else value)
+        points.numbers.assume(self._law, self._parameter, value + amount if amount else value)
 
 
 def as_parameter(given: Any, problem: Problem, scale: float | None) -> Parameter:

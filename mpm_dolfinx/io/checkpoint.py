@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from ..errors import MPMError, agree
 from ..meshes.remesh import Place
+from ..tolerances import BLOCK
 from .files import kind_of, replace
 
 __all__ = ["VERSION", "Snapshot", "Table", "read", "write"]
@@ -33,8 +34,6 @@ __all__ = ["VERSION", "Snapshot", "Table", "read", "write"]
 MAGIC = b"mpm_dolfinx checkpoint\n"
 VERSION = 1
 START = struct.Struct("<IQI")
-#: Most rows of a chunk, and most bytes that one call writes.
-CHUNK = 1 << 15
 
 
 class Table(NamedTuple):
@@ -96,7 +95,7 @@ def _layout(tables: list[dict[str, Any]], start: int) -> tuple[list[list[_Column
 
 def _chunks(rows: int) -> list[int]:
     """Return the rows of each chunk."""
-    return [min(CHUNK, rows - first) for first in range(0, rows, CHUNK)]
+    return [min(BLOCK, rows - first) for first in range(0, rows, BLOCK)]
 
 
 def _bytes(values: NDArray[Any]) -> bytes:

@@ -14,11 +14,14 @@ from typing import Any, cast
 
 from mpi4py import MPI
 
+import numpy as np
+
 from ..errors import MPMError, agree
 
 __all__ = ["as_path", "complaint", "kind_of", "replace", "require_ordinary"]
 
-PIECE = 1 << 28
+#: Most bytes that one call of MPI writes, which counts in this type.
+PIECE = int(np.iinfo(np.int32).max)
 
 
 def as_path(path: Any) -> Path:

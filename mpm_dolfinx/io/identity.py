@@ -16,6 +16,7 @@ from dolfinx import mesh
 
 from .. import _compat
 from ..errors import MPMError, agree
+from ..meshes.cells import input_cell_index
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..tolerances import EQUAL
@@ -88,7 +89,7 @@ def identity(problem: Identifiable) -> dict[str, Any]:
 def _mesh(domain: mesh.Mesh) -> list[Any]:
     """Return kind, number of cells, size and a weighted mean of the positions of all cells."""
     cells = domain.topology.index_map(domain.topology.dim)
-    index = _compat.input_cell_index(domain)
+    index = input_cell_index(domain)
     corners = domain.geometry.x[_compat.geometry_dofmap(domain)[: len(index)]]
     size = domain.comm.allreduce(float(np.abs(corners).max(initial=0.0)), MPI.MAX)
     places = 1.0 + corners.reshape(len(index), 3 * corners.shape[1]) / (size or 1.0)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 import basix
 
-from .. import _compat
 from ..errors import MPMError, agree
+from ..meshes.order import vtk_cell
 from ..particles.particles import Particles
 from .files import kind_of, replace, require_ordinary
 
@@ -133,7 +133,7 @@ def drawing(
     """
     now, start = (np.pad(x, ((0, 0), (0, 3 - x.shape[1]))) for x in places)
     m, k = cells.shape
-    number, order = _compat.vtk_cell(kind, 1, k)
+    number, order = vtk_cell(kind, 1, k)
     return {
         "Points": {"Points": now},
         "Cells": {
@@ -173,7 +173,7 @@ def _grid(particles: Particles) -> Drawing:
         numbers = first + np.arange(n * k).reshape(n, k)
         points = np.stack([now, start], axis=2).reshape(n * k, 2, gdim)
     points = np.pad(points, ((0, 0), (0, 0), (0, 3 - gdim)))
-    kind, order = _compat.vtk_cell(particles.mesh.basix_cell(), degree, k)
+    kind, order = vtk_cell(particles.mesh.basix_cell(), degree, k)
     return {
         "Points": {"Points": points[:, 0]},
         "Cells": {

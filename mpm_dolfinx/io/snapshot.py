@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
-from .. import _compat
 from ..errors import MPMError, agree
+from ..meshes.cells import input_cell_index
 from ..meshes.remesh import PLACES, Column
 from ..parallel.boundary import Hooked, collective
 from ..parallel.exchange import RowExchange
@@ -134,7 +134,7 @@ def _cells_of(V: fem.FunctionSpace, bodies: Sequence[Particles]) -> NDArray[np.i
     for body in bodies:
         if V.mesh is body.mesh:
             return body.global_index
-    return _compat.input_cell_index(V.mesh)
+    return input_cell_index(V.mesh)
 
 
 def capture(

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import MPMError, agree
 from ..reals import as_reals
 from .given_pressure import AtPressure, at_pressure
-from .kinematics import KINEMATICS, Kinematics
+from .kinematics import KINEMATICS, LogarithmicStrain, SmallStrain
 from .mandel import norm, num_components, to_tensor, to_vector
 
 __all__ = [
@@ -32,6 +32,8 @@ __all__ = [
     "StrainMaterial",
     "Update",
     "check_parameter",
+    "checked",
+    "exceeds",
     "per_row",
 ]
 
@@ -132,6 +134,10 @@ class Material(ABC):
             strain, and nothing else in the law depends on either; each class says so for itself,
             as ``mixed="pressure"`` needs it (with ``young``, ``poisson``, ``bulk``, ``shear``).
         limits: What the values of a parameter must be: keywords of ``check_parameter`` by name.
+        kinematics: ``"small"`` where its strain is, else that of a :class:`StrainMaterial` or
+            ``None``.
+        inelastic: Whether it keeps a history that yielding changes, as far as is known.
+        internal_variables: Shape per point of each of its own internal variables.
         reversible: Internal variables that change where nothing yields.
         parameters: Parameters by name: numbers, or arrays ``(n,)`` with one value per point.
             A piecewise constant Function or a Constant may stand here; the problem works with
@@ -141,6 +147,9 @@ class Material(ABC):
     symmetric: bool
     linear_in_volume: ClassVar[bool] = False
     limits: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType({})
+    kinematics: ClassVar[str | None] = None
+    inelastic: ClassVar[bool] = True
+    internal_variables: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType({})
     reversible: ClassVar[tuple[str, ...]] = ()
     _parameters: Parameters = Parameters({})
 
@@ -262,12 +271,8 @@ class Material(ABC):
                     f"A {type(self).__name__} has no parameter {name!r}; there are "
                     f"{', '.join(sorted(known))}."
                 )
-        checked = {
-            name: check_parameter(name, value, **self.limits.get(name, {}))
-            for name, value in parameters.items()
-        }
         other = copy.copy(self)
-        other.parameters = {**self.parameters, **checked}
+        other.parameters = {**self.parameters, **checked(self.limits, **parameters)}
         return other
 
     def weakened(self, factor: float) -> Self:
@@ -408,7 +413,7 @@ class StrainMaterial(Material):
         return not self.inelastic and not self.internal_variables
 
     @property
-    def _kinematics(self) -> type[Kinematics]:
+    def _kinematics(self) -> type[SmallStrain] | type[LogarithmicStrain]:
         """The strain measure at work."""
         return KINEMATICS[self.kinematics]
 
@@ -419,7 +424,8 @@ class StrainMaterial(Material):
                 raise MPMError(value.message)
         state: State = {"stress": np.zeros((n, num_components(dim)))}
         if self.inelastic:
-            state |= self._kinematics.initial_history(n, dim)
+            unstrained = np.zeros_like(state["stress"]), np.zeros((n, dim, dim))
+            state |= self._kinematics.history_of(*unstrained)
         for name, shape in self.internal_variables.items():
             state[name] = np.zeros((n, *shape))
         return state
@@ -517,6 +523,41 @@ class StrainMaterial(Material):
 def per_row(value: Parameter) -> Parameter:
     """Return a number, or an array ``(n,)`` as a column ``(n, 1)``, to scale arrays ``(n, m)``."""
     return value[:, None] if isinstance(value, np.ndarray) else value
+
+
+def checked(
+    limits: Mapping[str, Mapping[str, float]], **values: ArrayLike | Field | None
+) -> dict[str, Parameter]:
+    """Return parameters by name, those that are given, if their values are within limits.
+
+    Args:
+        limits: Keywords of :func:`check_parameter` by name.
+        **values: The parameters; ``None``: not given.
+
+    Raises:
+        MPMError: A value is not finite or out of range.
+    """
+    given = {name: value for name, value in values.items() if value is not None}
+    return {name: check_parameter(name, v, **limits.get(name, {})) for name, v in given.items()}
+
+
+def exceeds(
+    parameters: Mapping[str, Any], one: str, other: str, wrong: np.ufunc = np.greater
+) -> bool:
+    """Return whether a parameter is above another at some point, as far as that is known.
+
+    Fields have no values yet, and arrays of other lengths are refused where they are used.
+
+    Args:
+        parameters: Parameters by name; one that is missing is 0.
+        one: Name of the one that should be at most the other.
+        other: Name of that.
+        wrong: How they compare where it is.
+    """
+    small, large = (parameters.get(name, 0.0) for name in (one, other))
+    known = all(isinstance(value, float | np.ndarray) for value in (small, large))
+    apart = np.ndim(small) and np.ndim(large) and np.shape(small) != np.shape(large)
+    return bool(known and not apart and np.any(wrong(small, large)))
 
 
 class Refused(np.ndarray):

@@ -6,19 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, override
+from typing import ClassVar, Literal, override
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
-from .base import (
-    Field,
-    Parameter,
-    State,
-    check_parameter,
-    per_row,
-)
+from .base import Field, Parameter, State, checked, exceeds, per_row
 from .compiled import CompiledMaterial
 from .mandel import deviator, norm, trace
 
@@ -101,33 +95,24 @@ class ModifiedCamClay(CompiledMaterial):
         Raises:
             MPMError: A value is out of range.
         """
-        given: dict[str, Any] = {
-            "compression": compression,
-            "swelling": swelling,
-            "critical_ratio": critical_ratio,
-            "shear_modulus": shear_modulus,
-            "preconsolidation": preconsolidation,
-            "reference_pressure": reference_pressure,
-        }
-        self.parameters = {
-            name: check_parameter(name, value, **self.limits[name]) for name, value in given.items()
-        }
+        self.parameters = checked(
+            self.limits,
+            compression=compression,
+            swelling=swelling,
+            critical_ratio=critical_ratio,
+            shear_modulus=shear_modulus,
+            preconsolidation=preconsolidation,
+            reference_pressure=reference_pressure,
+        )
         self._require_order()
 
     def _require_order(self) -> None:
         """Raise an error where values that are known are not in order."""
-        for less, more in (
-            ("swelling", "compression"),
-            ("reference_pressure", "preconsolidation"),
-        ):
-            small, large = self.parameters[less], self.parameters[more]
-            if not all(isinstance(value, float | np.ndarray) for value in (small, large)):
-                continue
-            shapes = {np.shape(small), np.shape(large)} - {()}
-            wrong = np.greater_equal if less == "swelling" else np.greater
-            if len(shapes) < 2 and np.any(wrong(small, large)):
-                order = "less than" if less == "swelling" else "at most"
-                raise MPMError(f"{less} must be {order} {more}, at each point.")
+        own = self.parameters
+        if exceeds(own, "swelling", "compression", np.greater_equal):
+            raise MPMError("swelling must be less than compression, at each point.")
+        if exceeds(own, "reference_pressure", "preconsolidation"):
+            raise MPMError("reference_pressure must be at most preconsolidation, at each point.")
 
     @override
     def initial_state(self, n: int, dim: int) -> State:

@@ -66,7 +66,7 @@ def check_tangent(
     arrays = [v for v in material.parameters.values() if isinstance(v, np.ndarray)]
     points = len(arrays[0]) if arrays else points
     if rotation is None:
-        rotation = 0.0 if getattr(material, "kinematics", None) == "small" else 1.0
+        rotation = 0.0 if material.kinematics == "small" else 1.0
     random = np.random.default_rng(seed)
     F = np.broadcast_to(np.eye(dim), (points, dim, dim))
     state = material.initial_state(points, dim)

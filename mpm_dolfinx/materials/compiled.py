@@ -46,6 +46,7 @@ class CompiledMaterial(StrainMaterial):
     """
 
     _loop: ClassVar[str] = ""
+    yield_tolerance: ClassVar[float] = 0.0
 
     def _has_compiled_update(self) -> bool:
         """Return whether updates are compiled as a whole."""
@@ -77,7 +78,7 @@ class CompiledMaterial(StrainMaterial):
             [np.ascontiguousarray(variables[name]) for name in new],
             [_values(parameter) for parameter in self._constants()],
             _values(self._share()),
-            getattr(self, "yield_tolerance", 0.0),
+            self.yield_tolerance,
             stress,
             D,
             elastic,
@@ -193,7 +194,7 @@ class CompiledMaterial(StrainMaterial):
             before[1:] = (np.ascontiguousarray(state[name]) for name in names)
         variables = [np.ascontiguousarray(state[name]) for name in self.internal_variables]
         parameters = [_values(parameter) for parameter in self._constants()]
-        tolerance = getattr(self, "yield_tolerance", 0.0)
+        tolerance = self.yield_tolerance
         return self._loop, before, variables, parameters, _values(self._share()), tolerance
 
     def _in_order(self, gradient: Array, values: State, state: State) -> list[Array]:
@@ -238,7 +239,7 @@ class CompiledMaterial(StrainMaterial):
             [np.ascontiguousarray(state[name]) for name in names],
             parameters,
             _values(self._share()),
-            getattr(self, "yield_tolerance", 0.0),
+            self.yield_tolerance,
             *given,
             P,
             A,

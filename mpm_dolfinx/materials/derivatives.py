@@ -22,8 +22,10 @@ __all__ = ["difference_by_stress", "slope_by_plastic_strain", "slope_by_stress"]
 type Function = Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
 """Function of stress ``(n, m)`` and plastic strain ``(n,)`` with values ``(n, ...)``."""
 
-IMAGINARY_STEP = 1e-30
-RELATIVE_STEP = 2e-3
+#: Complex steps have no round-off: so small that nothing is left of their square.
+IMAGINARY_STEP = float(np.sqrt(np.finfo(float).tiny))
+#: Step at which errors of differences of fourth order and of round-off are equal.
+RELATIVE_STEP = float(np.finfo(float).eps ** (1.0 / 5.0))
 
 
 def slope_by_stress(

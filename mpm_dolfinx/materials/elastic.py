@@ -16,7 +16,7 @@ from .base import (
     Integration,
     Parameter,
     State,
-    check_parameter,
+    checked,
     per_row,
 )
 from .compiled import CompiledMaterial
@@ -43,10 +43,7 @@ class IsotropicElastic(CompiledMaterial):
         Raises:
             MPMError: Not ``young > 0`` or not ``-1 < poisson < 0.5``.
         """
-        self.parameters = {
-            "young": check_parameter("young", young, **self.limits["young"]),
-            "poisson": check_parameter("poisson", poisson, **self.limits["poisson"]),
-        }
+        self.parameters = checked(self.limits, young=young, poisson=poisson)
 
     @property
     def bulk(self) -> Parameter:

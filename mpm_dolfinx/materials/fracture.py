@@ -21,7 +21,7 @@ from .base import (
     Parameter,
     State,
     StrainMaterial,
-    check_parameter,
+    checked,
     per_row,
 )
 from .elastic import IsotropicElastic
@@ -100,21 +100,15 @@ class Fracture(StrainMaterial):
             )
         self.law, self.model, self.split = law, model, split
         self.kinematics = law.kinematics  # type: ignore[misc]
-        self.parameters = {
-            **law.parameters,
-            "toughness": check_parameter("toughness", toughness, above=0.0),
-            "length": check_parameter("length", length, above=0.0),
-        }
+        own = checked(self.limits, toughness=toughness, length=length)
+        self.parameters = {**law.parameters, **own}
 
     @override
     def with_parameters(self, **parameters: Parameter) -> Self:
-        own = {name: value for name, value in parameters.items() if name in OWN}
-        checked = {n: check_parameter(n, v, **self.limits[n]) for n, v in own.items()}
         other = copy.copy(self)
-        its = {name: value for name, value in parameters.items() if name not in OWN}
-        other.law = self.law.with_parameters(**its)
-        kept = {name: checked.get(name, self.parameters[name]) for name in OWN}
-        other.parameters = {**other.law.parameters, **kept}
+        own = {name: parameters.pop(name, self.parameters[name]) for name in OWN}
+        other.law = self.law.with_parameters(**parameters)
+        other.parameters = {**other.law.parameters, **checked(self.limits, **own)}
         return other
 
     def __repr__(self) -> str:

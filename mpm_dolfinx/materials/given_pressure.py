@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConvergenceError
-from ..tolerances import LOCAL_ITERATIONS, SMALL
+from ..tolerances import HALF_DIGITS, LOCAL_ITERATIONS, ROUND_OFF, SMALL
 from .kinematics import KINEMATICS
 from .mandel import trace
 
@@ -40,8 +40,6 @@ type Array = NDArray[np.float64]
 #: Share of the shear modulus that alpha is: no more than lets a pressure beyond an apex have an
 #: answer, as limit loads rise with it (by 3 % with 1e-2, where G is 4e5 times the cohesion).
 ALPHA = SMALL
-#: How well the pressure is met, relative to the stresses at hand; or well enough for one more step.
-TOLERANCE, NEARLY = 1e-13, 1e-8
 #: Largest compression in the first iteration, twice as much in each that follows: stiffness grows
 #: under compression, so that Newton's method goes too far then.
 STRIDE = 0.05
@@ -164,8 +162,8 @@ def _solve(
         over = mean + extra - p
         slope = answer.tangent[:, :3, :3].sum(axis=(1, 2)) / 9.0 + a
         size = np.abs(mean) + np.abs(extra) + np.abs(p) + np.abs(slope * x)
-        open_ = (np.abs(over) > TOLERANCE * size) & ~near[active]
-        near[active] = np.abs(over) <= NEARLY * size
+        open_ = (np.abs(over) > ROUND_OFF * size) & ~near[active]
+        near[active] = np.abs(over) <= HALF_DIGITS * size  # then one step more
         low[active] = np.where(over < 0.0, np.maximum(low[active], x), low[active])
         high[active] = np.where(over > 0.0, np.minimum(high[active], x), high[active])
         stride = min(STRIDE * 2.0**iteration, 1e300)

@@ -13,7 +13,6 @@ strains keep their full relative precision.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 
 import numpy as np
@@ -55,63 +54,17 @@ def require_valid(valid: NDArray[np.bool_]) -> None:
         )
 
 
-class Kinematics(ABC):
-    """The strain of a set of points, and the stress that a law answers with.
+class SmallStrain:
+    """Infinitesimal strain: one stress, no difference of configurations.
+
+    Args:
+        displacement_gradient: Gradient of the total displacement with respect to the undeformed
+            body, shape ``(n, dim, dim)``.
+        history: State of the last converged step, ``None`` for elastic laws.
 
     Attributes:
         trial_strain: Trial elastic strain for the law, shape ``(n, m)``.
     """
-
-    trial_strain: Array
-
-    @abstractmethod
-    def __init__(self, displacement_gradient: Array, history: Mapping[str, Array] | None) -> None:
-        """Compute the trial strain.
-
-        Args:
-            displacement_gradient: Gradient of the total displacement with respect to the
-                undeformed body, shape ``(n, dim, dim)``.
-            history: State of the last converged step, ``None`` for elastic laws.
-        """
-
-    @staticmethod
-    @abstractmethod
-    def initial_history(n: int, dim: int) -> dict[str, Array]:
-        """Return the history of ``n`` unstrained points."""
-
-    @staticmethod
-    @abstractmethod
-    def history_of(elastic_strain: Array, displacement_gradient: Array) -> dict[str, Array]:
-        """Return the history of points of an elastic strain ``(n, m)`` at ``(n, dim, dim)``."""
-
-    @abstractmethod
-    def history(self, elastic_strain: Array) -> dict[str, Array]:
-        """Return the new history for the law's elastic strain, shape ``(n, m)``."""
-
-    @abstractmethod
-    def first_piola(self, stress: Array) -> Array:
-        """Return the first Piola stress ``(n, dim, dim)`` of the law's stress ``(n, m)``."""
-
-    @abstractmethod
-    def tangent(self, stress: Array, tangent: Array) -> Array:
-        """Return dP_iJ/dF_kL.
-
-        Args:
-            stress: The law's stress, shape ``(n, m)``.
-            tangent: Its derivative by the trial strain, shape ``(n, m, m)``.
-
-        Returns:
-            Shape ``(n, dim, dim, dim, dim)``.
-        """
-
-    @staticmethod
-    @abstractmethod
-    def volume_ratio(displacement_gradient: Array) -> Array:
-        """Return the law's stress over Cauchy's, shape ``(n,)``."""
-
-
-class SmallStrain(Kinematics):
-    """Infinitesimal strain: one stress, no difference of configurations."""
 
     def __init__(self, displacement_gradient: Array, history: Mapping[str, Array] | None) -> None:
         self._gradient = points_last(displacement_gradient)
@@ -123,32 +76,24 @@ class SmallStrain(Kinematics):
             self.trial_strain = pack(increment).T + history["elastic_strain"]
 
     @staticmethod
-    def initial_history(n: int, dim: int) -> dict[str, Array]:
-        """Return displacement gradient and elastic strain of unstrained points."""
-        return {
-            "displacement_gradient": np.zeros((n, dim, dim)),
-            "elastic_strain": np.zeros((n, num_components(dim))),
-        }
-
-    @staticmethod
     def history_of(elastic_strain: Array, displacement_gradient: Array) -> dict[str, Array]:
-        """Return displacement gradient and elastic strain."""
+        """Return the history of points of an elastic strain ``(n, m)`` at ``(n, dim, dim)``."""
         return {
             "displacement_gradient": displacement_gradient.copy(),
             "elastic_strain": elastic_strain.copy(),
         }
 
     def history(self, elastic_strain: Array) -> dict[str, Array]:
-        """Return displacement gradient and elastic strain."""
+        """Return the new history for the law's elastic strain, shape ``(n, m)``."""
         gradient = np.moveaxis(self._gradient, -1, 0)
         return {"displacement_gradient": gradient, "elastic_strain": elastic_strain}
 
     def first_piola(self, stress: Array) -> Array:
-        """Return the stress itself."""
+        """Return the first Piola stress ``(n, dim, dim)`` of the law's stress ``(n, m)``: it."""
         return points_first(unpack(stress.T, self._dim))
 
     def tangent(self, stress: Array, tangent: Array) -> Array:
-        """Return the law's tangent as a fourth-order tensor."""
+        """Return dP_iJ/dF_kL, ``(n, dim, dim, dim, dim)``, of the law's tangent ``(n, m, m)``."""
         n, dim, m = len(tangent), self._dim, tangent.shape[1]
         at = POSITIONS[:dim, :dim].ravel()
         weights = WEIGHTS[:dim, :dim].ravel()
@@ -158,11 +103,11 @@ class SmallStrain(Kinematics):
 
     @staticmethod
     def volume_ratio(displacement_gradient: Array) -> Array:
-        """Return one."""
+        """Return the law's stress over Cauchy's, shape ``(n,)``: one."""
         return np.ones(len(displacement_gradient))
 
 
-class LogarithmicStrain(Kinematics):
+class LogarithmicStrain:
     """Logarithmic strain and Kirchhoff stress, with the elastic left Cauchy-Green tensor b.
 
     Trial state b = f b_n f^T with f = F F_n^-1, strain 1/2 ln b, exponential return, of which
@@ -198,14 +143,6 @@ class LogarithmicStrain(Kinematics):
         if m == 4:
             strain[2] = 0.5 * np.log1p(c[2])
         self.trial_strain = strain.T
-
-    @staticmethod
-    def initial_history(n: int, dim: int) -> dict[str, Array]:
-        """Return displacement gradient and b - I of unstrained points."""
-        return {
-            "displacement_gradient": np.zeros((n, dim, dim)),
-            "elastic_b_minus_identity": np.zeros((n, num_components(dim))),
-        }
 
     @staticmethod
     def history_of(elastic_strain: Array, displacement_gradient: Array) -> dict[str, Array]:
@@ -287,7 +224,9 @@ def _exponential(strain: Array, dim: int) -> Array:
     return c
 
 
-KINEMATICS: dict[str, type[Kinematics]] = {
+type Kinematics = SmallStrain | LogarithmicStrain
+
+KINEMATICS: dict[str, type[SmallStrain] | type[LogarithmicStrain]] = {
     "small": SmallStrain,
     "logarithmic": LogarithmicStrain,
 }

@@ -35,7 +35,7 @@ __all__ = [
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 """Tensor indices of each component."""
 
-POSITIONS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2]])
+POSITIONS = np.array([[PAIRS.index((min(i, j), max(i, j))) for i in range(3)] for j in range(3)])
 """Component that holds each tensor entry."""
 
 WEIGHTS = np.where(np.eye(3, dtype=bool), 1.0, np.sqrt(0.5))

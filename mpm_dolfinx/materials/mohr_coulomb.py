@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
-from .base import Field, Parameter, State, check_parameter
+from .base import Field, Parameter, State, checked, exceeds
 from .mandel import to_tensor
 from .plastic import PlasticMaterial
 from .softening import SofteningMaterial
@@ -85,19 +85,18 @@ class FrictionalMaterial(SofteningMaterial):
             MPMError: A value is out of range.
         """
         super().__init__(young, poisson)
-        given: dict[str, Any] = {
-            "cohesion": cohesion,
-            "friction_angle": friction_angle,
-            "dilation_angle": dilation_angle,
-        }
-        if tension_cutoff is not None:
-            given["tension_cutoff"] = tension_cutoff
-        checked = {name: check_parameter(name, v, **self.limits[name]) for name, v in given.items()}
-        self.parameters = {**self.parameters, **checked}
-        friction, dilation = (checked[angle] for angle in _ANGLES)
+        own = checked(
+            self.limits,
+            cohesion=cohesion,
+            friction_angle=friction_angle,
+            dilation_angle=dilation_angle,
+            tension_cutoff=tension_cutoff,
+        )
+        self.parameters = {**self.parameters, **own}
+        friction, dilation = (own[angle] for angle in _ANGLES)
         numbers = isinstance(friction, float) and isinstance(dilation, float)
         self.symmetric = friction == dilation if numbers else friction_angle is dilation_angle
-        _require_less_dilation(checked["friction_angle"], checked["dilation_angle"])
+        _require_less_dilation(own)
         self.volume_correction = bool(volume_correction)
 
     def with_softening(
@@ -180,7 +179,7 @@ class FrictionalMaterial(SofteningMaterial):
 
     @override
     def initial_state(self, n: int, dim: int) -> State:
-        _require_less_dilation(*(self.parameters[angle] for angle in _ANGLES))
+        _require_less_dilation(self.parameters)
         _require_softening(self.parameters)
         return super().initial_state(n, dim)
 
@@ -223,22 +222,13 @@ def _require_softening(parameters: Mapping[str, Parameter]) -> None:
             f"given: {', '.join(given) or 'decay'}."
         )
     for name, residual in _RESIDUALS.items():
-        first, last = parameters[name], parameters.get(residual, 0.0)
-        if not all(isinstance(value, float | np.ndarray) for value in (first, last)):
-            continue
-        if np.shape(first) and np.shape(last) and np.shape(first) != np.shape(last):
-            continue  # said where they are used
-        if np.any(np.asarray(last) > np.asarray(first)):
+        if exceeds(parameters, residual, name):
             raise MPMError(f"{residual} is larger than {name}; give at most that.")
 
 
-def _require_less_dilation(friction: Any, dilation: Any) -> None:
+def _require_less_dilation(parameters: Mapping[str, Parameter]) -> None:
     """Raise an error where values that are known dilate more than associated flow does."""
-    if not all(isinstance(value, float | np.ndarray) for value in (friction, dilation)):
-        return
-    if np.shape(friction) and np.shape(dilation) and np.shape(friction) != np.shape(dilation):
-        return  # said where they are used
-    if np.any(np.asarray(dilation) > np.asarray(friction)):
+    if exceeds(parameters, "dilation_angle", "friction_angle"):
         raise MPMError(
             "dilation_angle is larger than friction_angle: plastic flow would create energy; give "
             "at most the angle of friction."

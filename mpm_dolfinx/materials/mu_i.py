@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
-from .base import Field, Integration, Parameter, State, check_parameter
+from .base import Field, Integration, Parameter, State, checked, exceeds
 from .compiled import CompiledMaterial
 from .elastic import IsotropicElastic
 from .mandel import deviator, norm, trace
@@ -94,15 +94,15 @@ class MuIRheology(IsotropicElastic):
             MPMError: A value is out of range, or the friction at the limit is the smaller one.
         """
         super().__init__(young, poisson)
-        given: dict[str, Any] = {
-            "static_friction": static_friction,
-            "limit_friction": limit_friction,
-            "grain_size": grain_size,
-            "grain_density": grain_density,
-            "inertial_number": inertial_number,
-        }
-        checked = {name: check_parameter(name, v, **self.limits[name]) for name, v in given.items()}
-        self.parameters = {**self.parameters, **checked}
+        own = checked(
+            self.limits,
+            static_friction=static_friction,
+            limit_friction=limit_friction,
+            grain_size=grain_size,
+            grain_density=grain_density,
+            inertial_number=inertial_number,
+        )
+        self.parameters = {**self.parameters, **own}
         self.duration = math.inf
         _require_rising(self.parameters)
 
@@ -152,10 +152,5 @@ class MuIRheology(IsotropicElastic):
 
 def _require_rising(parameters: Mapping[str, Any]) -> None:
     """Raise an error where values that are known have friction that falls with the rate."""
-    first, last = parameters["static_friction"], parameters["limit_friction"]
-    if not all(isinstance(value, float | np.ndarray) for value in (first, last)):
-        return
-    if np.shape(first) and np.shape(last) and np.shape(first) != np.shape(last):
-        return  # said where they are used
-    if np.any(np.asarray(last) < np.asarray(first)):
+    if exceeds(parameters, "static_friction", "limit_friction"):
         raise MPMError("limit_friction is less than static_friction; give at least that.")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..tolerances import LOCAL_ITERATIONS
-from .base import Field, Parameter, State, check_parameter, per_row
+from .base import Field, Parameter, State, checked, per_row
 from .compiled import CompiledMaterial
 from .mandel import to_tensor, to_vector, trace
 
@@ -45,10 +45,7 @@ class NeoHooke(CompiledMaterial):
         Raises:
             MPMError: Not ``young > 0`` or not ``0 <= poisson < 0.5``.
         """
-        self.parameters = {
-            "young": check_parameter("young", young, **self.limits["young"]),
-            "poisson": check_parameter("poisson", poisson, **self.limits["poisson"]),
-        }
+        self.parameters = checked(self.limits, young=young, poisson=poisson)
 
     @property
     def shear(self) -> Parameter:

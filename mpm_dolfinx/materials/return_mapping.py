@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConvergenceError
-from ..tolerances import LAST_PLACES, ROUND_OFF
+from ..tolerances import LAST_PLACES, ROUND_OFF, SOLVED
 from .base import Integration, State
 from .derivatives import difference_by_stress, slope_by_plastic_strain, slope_by_stress
 from .mandel import norm
@@ -19,8 +19,6 @@ from .plastic import PlasticMaterial
 
 __all__ = ["ReturnMapping"]
 
-FLOOR = 1e-10
-"""Relative residual from which round-off may be what stops the decrease."""
 HALVINGS = 12
 """Times that the line search halves a Newton step."""
 
@@ -296,7 +294,7 @@ def _solve(system: _System, max_iterations: int) -> tuple[NDArray[np.float64], N
         new = old + step
         new_residual = now.residual(new)
         new_size = norm(new_residual) / goal[active]
-        at_floor = old_size <= FLOOR
+        at_floor = old_size <= SOLVED  # round-off may be what stops the decrease
         for _ in range(HALVINGS):
             (rising,) = np.nonzero(~(new_size < old_size) & ~at_floor)
             if len(rising) == 0:

@@ -16,6 +16,7 @@ from .mandel import PAIRS, POSITIONS, WEIGHTS, num_components
 __all__ = [
     "determinant",
     "eigen",
+    "growth",
     "inverse",
     "logarithm_quotient",
     "pack",
@@ -56,6 +57,13 @@ def unpack(vector: Array, dim: int) -> Array:
 def determinant(gradient: Array) -> Array:
     """Return det(I + H), shape ``(n,)``, of displacement gradients ``(dim, dim, n)``."""
     return inverse(gradient)[1]
+
+
+def growth(gradient: Array) -> Array:
+    """Return det(I + H) - 1 with the relative precision of a small H, shape ``(..., dim, dim)``."""
+    trace = np.einsum("...ii->...", gradient)
+    change = trace + 0.5 * (trace**2 - np.einsum("...ij,...ji->...", gradient, gradient))
+    return np.asarray(change if gradient.shape[-1] == 2 else change + np.linalg.det(gradient))
 
 
 def inverse(gradient: Array) -> tuple[Array, Array]:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import MPMError
 from .base import Field, Material, Parameter, State, Update, check_parameter
 from .kinematics import require_valid
+from .tensors import growth
 
 __all__ = ["EXCESS", "Undrained"]
 
@@ -57,9 +58,10 @@ class Undrained(Material):
         own = check_parameter("water_bulk", water_bulk, **self.limits["water_bulk"])
         self.law = law
         self.symmetric = law.symmetric
-        self.kinematics = getattr(law, "kinematics", None)
-        known = getattr(law, "internal_variables", {})
-        self.internal_variables = MappingProxyType({**known, EXCESS: (), VOLUME: ()})
+        self.kinematics = law.kinematics  # type: ignore[misc]
+        known = law.internal_variables
+        own_variables = MappingProxyType({**known, EXCESS: (), VOLUME: ()})
+        self.internal_variables = own_variables  # type: ignore[misc]
         self.parameters = {**law.parameters, "water_bulk": own}
 
     def _with(self, law: Material) -> Self:
@@ -144,12 +146,9 @@ class Undrained(Material):
         if self.kinematics == "small":
             one = np.broadcast_to(np.eye(dim), gradient.shape)
             return np.trace(gradient, axis1=1, axis2=2), np.ones(n), one
-        H = gradient
-        minors = np.trace(H, axis1=1, axis2=2)
-        minors = minors + 0.5 * (minors**2 - np.einsum("nij,nji->n", H, H))
-        grown = minors + (np.linalg.det(H) if dim == 3 else 0.0)  # (det F - 1 without cancellation)
+        grown = growth(gradient)
         require_valid(grown > -1.0)
-        Z = np.linalg.inv(np.eye(dim) + H).transpose(0, 2, 1)
+        Z = np.linalg.inv(np.eye(dim) + gradient).transpose(0, 2, 1)
         return np.log1p(grown), 1.0 + grown, Z
 
     def _own(self, state: State) -> State:

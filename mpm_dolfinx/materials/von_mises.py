@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError
-from .base import Field, Parameter, State, check_parameter
+from .base import Field, Parameter, State, checked
 from .mandel import deviator, norm
 from .plastic import PlasticMaterial
 from .softening import SofteningMaterial
@@ -76,11 +76,8 @@ class VonMises(SofteningMaterial):
         name, strength = ("rho_y", rho_y) if rho_y is not None else ("yield_stress", yield_stress)
         if strength is None or (rho_y is not None and yield_stress is not None):
             raise MPMError("give exactly one of rho_y and yield_stress, which is sqrt(3/2) rho_y")
-        self.parameters = {
-            **self.parameters,
-            name: check_parameter(name, strength, **self.limits[name]),
-            "hardening": check_parameter("hardening", hardening, **self.limits["hardening"]),
-        }
+        own = checked(self.limits, **{name: strength}, hardening=hardening)
+        self.parameters = {**self.parameters, **own}
 
     def with_softening(self, decay: ArrayLike | Field, *, residual: ArrayLike | Field) -> Self:
         """Return this law with a stress at first yield that falls with the plastic strain.

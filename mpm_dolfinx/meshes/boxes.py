@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 import basix
 from dolfinx import mesh
 
-from .. import _compat
 from ..errors import MPMError, agree
 from ..parallel.exchange import swap
 from ..reals import as_finite, as_reals
 from ..tolerances import SMALL
+from .cells import disconnected_mesh
 
 __all__ = ["BOX_CELLS", "mesh_of_boxes"]
 
@@ -53,7 +53,7 @@ def mesh_of_boxes(comm: MPI.Comm, points: Any, lengths: Any, gdim: int) -> mesh.
     cell = BOX_CELLS[gdim - 2]
     unit = basix.geometry(cell) - 0.5
     corners = centres[:, None] + unit * sides[:, None]
-    return _compat.disconnected_mesh(comm, corners, cell)
+    return disconnected_mesh(comm, corners, cell)
 
 
 def _require_apart(comm: MPI.Comm, centres: NDArray[np.float64], sides: Any) -> None:

@@ -27,11 +27,11 @@ type Array = NDArray[np.float64]
 GROWTH = 1.2
 #: Most cells along an axis, and most halvings: more is a mistake in units.
 MOST, DEEPEST = 1_000_000, 20
-#: Cells by the number of axes, the first by default.
-CELLS = {
-    2: (mesh.CellType.quadrilateral, mesh.CellType.triangle),
-    3: (mesh.CellType.hexahedron, mesh.CellType.tetrahedron),
-}
+#: Cells in the plane and in space, the first by default.
+CELLS = (
+    (mesh.CellType.quadrilateral, mesh.CellType.triangle),
+    (mesh.CellType.hexahedron, mesh.CellType.tetrahedron),
+)
 
 
 def grid_lines(
@@ -145,7 +145,7 @@ def grid(
                 raise MPMError("The lines along an axis of grid() are two or more, ascending.")
             if not np.isfinite(along).all():
                 raise MPMError("The lines along an axis of grid() must be finite.")
-        kinds = CELLS[len(axes)]
+        kinds = CELLS[len(axes) - 2]
         if cell_type is not None and cell_type not in kinds:
             named = " or ".join(kind.name for kind in kinds)
             raise MPMError(

@@ -14,6 +14,7 @@ from dolfinx import fem, la, mesh
 from .. import _compat
 from ..errors import MPMError
 from ..parallel.exchange import RowExchange
+from .cells import coordinate_element, disconnected_mesh, input_cell_index, tags_from_nodes
 
 __all__ = ["Carrier", "Redistribution", "cell_centres", "neighbour_ranks"]
 
@@ -60,7 +61,7 @@ class Carrier:
         if move.mesh is self.mesh:
             return self
         comm = self.mesh.comm
-        cells = RowExchange(comm, _compat.input_cell_index(self.mesh), move.origin)
+        cells = RowExchange(comm, input_cell_index(self.mesh), move.origin)
         nodes = self.mesh.geometry
         owned = nodes.index_map().size_local
         have = np.asarray(nodes.input_global_indices[:owned], dtype=np.int64)
@@ -91,7 +92,7 @@ class Carrier:
 
     def of_cells(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return values of the owned cells on the mesh after, shape ``(n, ...)`` (collective)."""
-        have = _compat.input_cell_index(self.source)
+        have = input_cell_index(self.source)
         return RowExchange(self.mesh.comm, have, self.origin)(values)
 
     def _cell_tags(self, tags: mesh.MeshTags) -> mesh.MeshTags:
@@ -113,7 +114,7 @@ class Carrier:
         nodes = _compat.entity_nodes(self.source, dim, tags.indices[own])
         self.mesh.topology.create_connectivity(dim, 0)
         self.mesh.topology.create_connectivity(dim, self.mesh.topology.dim)
-        moved = _compat.tags_from_nodes(
+        moved = tags_from_nodes(
             self.mesh, dim, self.numbers[nodes], tags.values[own].astype(np.int32)
         )
         moved.name = tags.name
@@ -152,20 +153,20 @@ class Redistribution(Carrier):
         moved, numbers = (source, None) if source.comm.size == 1 else _moved(source, ranks)
         if numbers is None:
             numbers = np.asarray(source.geometry.input_global_indices, dtype=np.int64)
-        super().__init__(source, moved, _compat.input_cell_index(moved), numbers)
+        super().__init__(source, moved, input_cell_index(moved), numbers)
 
 
 def _moved(source: mesh.Mesh, ranks: NDArray[np.int64]) -> tuple[mesh.Mesh, NDArray[np.int64]]:
     """Return a mesh with cells on other ranks, and its input numbers of the local nodes."""
     comm, gdim = source.comm, source.geometry.dim
-    index = _compat.input_cell_index(source)
+    index = input_cell_index(source)
     nodes = _compat.geometry_dofmap(source)[: len(index)]
     numbering = source.geometry.index_map()
     cells = source.topology.index_map(source.topology.dim)
     apart = numbering.size_global == cells.size_global * nodes.shape[1]
     if apart and _compat.NUMBERS_CELLS:
         moved = _moved_apart(source, ranks, index, source.geometry.x[nodes][:, :, :gdim])
-        exchange = RowExchange(comm, _compat.input_cell_index(moved), index)
+        exchange = RowExchange(comm, input_cell_index(moved), index)
         places = _compat.geometry_dofmap(moved)
         told = exchange(moved.geometry.input_global_indices[places].astype(np.int64))
         numbers = np.zeros(len(source.geometry.x), dtype=np.int64)
@@ -179,7 +180,7 @@ def _moved(source: mesh.Mesh, ranks: NDArray[np.int64]) -> tuple[mesh.Mesh, NDAr
     where = exchange(np.column_stack([ranks, neighbour_ranks(source, ranks)]))
     targets = [[row[0], *sorted({*row[1:]} - {row[0], -1})] for row in where.tolist()]
     x = source.geometry.x[: numbering.size_local, :gdim].copy()
-    element = _compat.coordinate_element(source)
+    element = coordinate_element(source)
     return _compat.mesh_on_ranks(comm, corners, element, x, targets), numbers
 
 
@@ -194,7 +195,7 @@ def _moved_apart(
     parts = comm.alltoall([(index[ranks == r], corners[ranks == r]) for r in range(comm.size)])
     numbers, places = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(numbers)
-    return _compat.disconnected_mesh(comm, places[order], source.basix_cell(), numbers[order])
+    return disconnected_mesh(comm, places[order], source.basix_cell(), numbers[order])
 
 
 def _with_ghosts(cells: Any, values: NDArray[Any]) -> NDArray[Any]:

@@ -23,6 +23,7 @@ from dolfinx import fem, mesh
 from .. import _compat
 from ..parallel.exchange import RowExchange
 from ..tolerances import SMALL
+from .cells import coordinate_element, input_cell_index
 from .redistribution import Carrier, neighbour_ranks
 
 __all__ = ["HALVES", "HALVES_OF_MASS", "PLACES", "Column", "Cuts", "Place", "Remesh", "diagonals"]
@@ -61,7 +62,8 @@ class Column(NamedTuple):
 #: new vertex in the place of its last one.
 HALVES = np.array([[[0, 1, 3, 3], [0, 3, 2, 3]], [[1, 3, 2, 2], [1, 2, 0, 2]]])
 DOUBLED = (2, 1)
-#: What share of the mass at its corners each half gets.
+#: What share of the mass at its corners each half gets: half of those on the diagonal, of which two
+#: in one place share that.
 HALVES_OF_MASS = np.array([[0.5, 1.0, 0.25, 0.25], [0.5, 0.25, 1.0, 0.25]])
 
 
@@ -110,7 +112,7 @@ class _Nodes(NamedTuple):
         geometry = source.geometry
         x = geometry.x[:, : geometry.dim].copy()
         same = np.arange(len(x), dtype=np.int64)
-        element = _compat.coordinate_element(source)
+        element = coordinate_element(source)
         return cls(_compat.geometry_dofmap(source), x, geometry.index_map(), element, same)
 
     @classmethod
@@ -156,7 +158,7 @@ class Remesh(Carrier):
         space: fem.FunctionSpace | None = None,
     ) -> None:
         comm = source.comm
-        index = _compat.input_cell_index(source)
+        index = input_cell_index(source)
         count = source.topology.index_map(source.topology.dim).size_global
         self._count, self._cut = count, cuts[:, 0]
         order = np.argsort(index)
@@ -206,7 +208,7 @@ class Remesh(Carrier):
         targets = [[row[0], *sorted({*row[1:]} - {row[0], -1})] for row in exchange(seen).tolist()]
         element = places.element
         after = _compat.mesh_on_ranks(comm, exchange(cells), element, points, targets)
-        origin = _compat.input_cell_index(after).copy()
+        origin = input_cell_index(after).copy()
         second = origin >= count
         origin[second] = cuts[origin[second] - count, 0]
         super().__init__(source, after, origin, numbers[places.of_geometry_nodes])
@@ -214,7 +216,7 @@ class Remesh(Carrier):
     @property
     def halves(self) -> NDArray[np.bool_]:
         """Whether each owned cell of the new mesh is half of one of the old mesh, ``(n,)``."""
-        index = _compat.input_cell_index(self.mesh)
+        index = input_cell_index(self.mesh)
         return np.asarray(np.isin(index, self._cut) | (index >= self._count))
 
     def rows(self, values: NDArray[Any], nodal: bool = False) -> NDArray[Any]:
@@ -262,7 +264,7 @@ class Remesh(Carrier):
 
         A half has that of the corner which is its own, and half of those on the diagonal.
         """
-        want = _compat.input_cell_index(self.mesh)
+        want = input_cell_index(self.mesh)
         exchange = RowExchange(self.mesh.comm, self.index, want)
         shares = self.rows(nodal, nodal=True)
         return np.asarray(exchange(shares * self._parts if len(self._cut) else shares))

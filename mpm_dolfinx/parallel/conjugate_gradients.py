@@ -11,9 +11,6 @@ from ..tolerances import ROUND_OFF
 
 __all__ = ["conjugate_gradients"]
 
-#: More iterations than any system of this kind takes.
-MOST_ITERATIONS = 10000
-
 
 def conjugate_gradients(comm: MPI.Comm) -> PETSc.KSP:
     """Return conjugate gradients with a diagonal preconditioner (collective).
@@ -24,5 +21,5 @@ def conjugate_gradients(comm: MPI.Comm) -> PETSc.KSP:
     ksp = PETSc.KSP().create(comm)
     ksp.setType("cg")
     ksp.getPC().setType("jacobi")
-    ksp.setTolerances(rtol=ROUND_OFF, max_it=MOST_ITERATIONS)
+    ksp.setTolerances(rtol=ROUND_OFF)
     return ksp

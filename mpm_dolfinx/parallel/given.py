@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 #: What all modules of this package begin with.
-PACKAGE = __name__.partition(".")[0]
+PACKAGE, *_ = __name__.split(".")
 #: What describes a law besides its parameters.
 KINDS = ("symmetric", "kinematics", "inelastic")
 

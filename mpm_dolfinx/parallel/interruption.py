@@ -26,7 +26,6 @@ __all__ = ["Hold", "Interrupted", "held", "interrupted", "note", "noted", "settl
 #: Seconds from which another signal is another Ctrl-C, and for which a rank waits for its signal
 #: of the same one.
 SAME = 1.0
-LATE = 0.5
 
 
 class Interrupted(MPMError):
@@ -140,4 +139,4 @@ def interrupted(comm: MPI.Comm, pending: bool = False) -> bool:
 
 def settle(comm: MPI.Comm) -> None:
     """Forget the signal that is obeyed now, also where it is still on its way to this rank."""
-    _SIGINT.forget(LATE if comm.size > 1 else 0.0)
+    _SIGINT.forget(SAME if comm.size > 1 else 0.0)

@@ -13,8 +13,8 @@ import basix
 import ufl
 from dolfinx import fem, mesh
 
-from .. import _compat
 from ..errors import DomainDistortionError, agree
+from ..meshes.cells import equispaced_element, input_cell_index
 from ..meshes.jacobian_bound import JacobianBound
 from ..meshes.quadrature import (
     DomainQuadrature,
@@ -69,7 +69,7 @@ class Geometry:
         cells = body.topology.index_map(body.topology.dim)
         self.num_local = int(cells.size_local)
         self.num_global = int(cells.size_global)
-        self.global_index = _compat.input_cell_index(body)
+        self.global_index = input_cell_index(body)
         self.domain_nodes: NDArray[np.int32] = self.W.dofmap.list[: self.num_local]
         self.nodes: NDArray[np.float64] = self.W.tabulate_dof_coordinates()[:, : self.gdim].copy()
 
@@ -154,7 +154,7 @@ class Geometry:
         if degree == 1:
             return domains
         cell = self.mesh.basix_cell()
-        element = _compat.equispaced_element(cell, degree, self.gdim).basix_element
+        element = equispaced_element(cell, degree, self.gdim).basix_element
         table = self.shape_functions.tabulate(0, element.points)[0, :, :, 0]
         return np.asarray(np.einsum("qk,nki->nqi", table, domains))
 

@@ -19,7 +19,9 @@ from dolfinx import fem, mesh
 from .. import _compat
 from ..errors import DomainDistortionError, MPMError, agree, name_particles
 from ..meshes.boxes import BOX_CELLS
+from ..meshes.cells import cell_vertices, input_cell_index
 from ..meshes.jacobian_bound import JacobianBound
+from ..meshes.order import gmsh_order
 from ..meshes.quadrature import default_degree
 from ..parallel.exchange import swap
 from ..parallel.given import require_whole
@@ -242,14 +244,14 @@ def validate_cells(domain: mesh.Mesh, what: str) -> None:
         DomainDistortionError: It names the cells, as particles are named.
     """
     comm, gdim, cell = domain.comm, domain.geometry.dim, domain.basix_cell()
-    index = _compat.input_cell_index(domain)
+    index = input_cell_index(domain)
     nodes = domain.geometry.x[_compat.geometry_dofmap(domain)[: len(index)], :gdim]
     span = np.ptp(nodes, axis=1).max(axis=1, initial=0.0)
     sign, volume, folded = _shapes(cell, _compat.geometry_degree(domain), nodes)
     flat = ~(np.abs(volume) > 1e-12 * span**gdim)
     wrong, every = comm.allreduce(np.array([np.count_nonzero(folded), len(index)]))
     if 2 * wrong > every:
-        order = _compat.gmsh_order(cell, nodes.shape[1])
+        order = gmsh_order(cell, nodes.shape[1])
         still = _shapes(cell, _compat.geometry_degree(domain), nodes[:, order])[2].sum()
         if comm.allreduce(int(still)) == 0:
             raise DomainDistortionError(
@@ -301,7 +303,7 @@ def _on_each_other(
 ) -> NDArray[np.int64]:
     """Return input indices of cells that are on the same side of a facet as a neighbour."""
     comm, cell = domain.comm, domain.basix_cell()
-    vertices = _compat.cell_vertices(domain, len(index))
+    vertices = cell_vertices(domain, len(index))
     corners = basix.geometry(cell)
     keys, sides = [], []
     for facet in basix.topology(cell)[-2]:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from dolfinx import geometry
 
-from .. import _compat
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
 from ..parallel.totals import over_ranks
@@ -78,8 +77,9 @@ def _cells(particles: Particles, points: NDArray[np.float64]) -> NDArray[np.int3
     names = np.full(len(points), none)
     cells = np.full(len(points), -1, dtype=np.int32)
     if len(own):
-        tree = _compat.cell_tree(mesh, own, slack)
-        offsets, near = _compat.candidate_cells(tree, points)
+        tree = geometry.bb_tree(mesh, mesh.topology.dim, padding=slack, entities=own)
+        found = geometry.compute_collisions_points(tree, points)
+        offsets, near = found.offsets, found.array
         of = np.repeat(np.arange(len(points)), np.diff(offsets))
         squares = geometry.squared_distance(mesh, mesh.topology.dim, near, points[of])
         for point, cell in zip(of[squares <= slack**2], near[squares <= slack**2], strict=True):

@@ -18,6 +18,7 @@ from dolfinx import fem, mesh
 
 from .. import _compat
 from ..errors import MPMError, agree
+from ..meshes.order import vtk_cell
 from ..parallel.boundary import collective
 from ..parallel.given import is_number
 from ..particles.particles import Particles
@@ -140,7 +141,7 @@ def background(
 def edges(grid_mesh: mesh.Mesh) -> NDArray[np.float64] | None:
     """Return the cells of a grid in the plane as polygons ``(n, k, 2)`` on rank 0 (collective)."""
     own = grid_mesh.topology.index_map(grid_mesh.topology.dim).size_local
-    _, corners = _compat.vtk_cell(grid_mesh.basix_cell(), 1, 0)
+    _, corners = vtk_cell(grid_mesh.basix_cell(), 1, 0)
     nodes = _compat.geometry_dofmap(grid_mesh)[:own, corners]
     cells = grid_mesh.comm.gather(grid_mesh.geometry.x[nodes, :2])
     return None if cells is None else np.concatenate(cells)
@@ -167,7 +168,7 @@ def grid(particles: Particles) -> Any:
     """
     comm: MPI.Comm = particles.mesh.comm
     pyvista = imported("pyvista", comm)
-    cell_type, nodes = _compat.vtk_cell(
+    cell_type, nodes = vtk_cell(
         particles.mesh.basix_cell(),
         particles.W.ufl_element().degree,
         particles.domain_nodes.shape[1],
@@ -201,7 +202,7 @@ def grid(particles: Particles) -> Any:
 def outlines(particles: Particles, warp: float) -> NDArray[np.float64]:
     """Return the boundaries of the owned domains as polygons, shape ``(n, m, 2)``."""
     cell = particles.mesh.basix_cell()
-    corners = basix.geometry(cell)[_compat.vtk_cell(cell, 1, 0)[1]]
+    corners = basix.geometry(cell)[vtk_cell(cell, 1, 0)[1]]
     shape_functions = particles.W.ufl_element().basix_element
     pieces = 1 if shape_functions.degree == 1 else 8  # straight ones of a curved edge
     share = np.arange(pieces)[:, None] / pieces

@@ -32,19 +32,20 @@ from .outlines import (
 
 __all__ = ["Shot", "draw", "framed", "new_figure", "scene", "take"]
 
-#: Room around the bodies, relative to their extent, and pixels of the longer side in space.
-MARGIN, PIXELS = 0.04, 1500
+#: Room around the bodies, relative to their extent; size of a background over theirs up to which it
+#: is shown whole; pixels of the longer side in space.
+MARGIN, NEARBY, PIXELS = 0.04, 2.0, 1500
 #: Height over width of what is shown, below which the colour bar lies beneath it.
 FLAT = 0.4
-#: Colour of obstacles; in the plane and in space, how far they are shown around the bodies, over
-#: the extent of these, and samples of their distance along the longest side.
+#: Colour of obstacles.
 OBSTACLE = "#b9b2a6"
 #: Colour of structures without a field, and their width in points and in pixels of space. In
 #: space bodies are as transparent as this where a field is that of structures within them.
 STRUCTURE, WIDE, WIDE_IN_SPACE, CLEAR = "0.1", 2.0, 6.0, 0.2
 #: Grey of bodies without a field.
 NO_FIELD = "0.8"
-NEAR, SAMPLES = {2: 0.3, 3: 0.2}, {2: 300, 3: 60}
+#: How far obstacles are shown around bodies, over the extent of these; samples of their distance.
+NEAR, SAMPLES = 0.3, 1e5
 
 
 @dataclass(frozen=True)
@@ -139,19 +140,20 @@ def scene(
 
 
 def framed(
-    extent: NDArray[np.float64], around: NDArray[np.float64] | None, most: float | None = None
+    extent: NDArray[np.float64], around: NDArray[np.float64] | None, whole: bool = False
 ) -> NDArray[np.float64]:
     """Return a box with some room around the bodies, and around a background near them.
 
     Args:
         extent: Box around the bodies.
         around: That around the background, if it is drawn.
-        most: Its size over theirs up to which it is in the picture; by default 2 in space, and in
-            the plane it is not.
+        whole: Whether it is shown in the plane too, if it is not much larger.
     """
-    if most is None:
-        most = 2.0 if extent.shape[1] == 3 else 0.0
-    if around is not None and np.ptp(around, axis=0).max() <= most * np.ptp(extent, axis=0).max():
+    shown = whole or extent.shape[1] == 3
+    near = (
+        around is not None and np.ptp(around, axis=0).max() <= NEARBY * np.ptp(extent, axis=0).max()
+    )
+    if around is not None and shown and near:
         extent = np.array([np.minimum(extent[0], around[0]), np.maximum(extent[1], around[1])])
     room = MARGIN * float((extent[1] - extent[0]).max())
     return np.array([extent[0] - room, extent[1] + room])
@@ -222,7 +224,7 @@ def take(problem: Any, bodies: Sequence[Particles], field: Field, look: Look) ->
 
 def _with_obstacles(extent: NDArray[np.float64], obstacles: Sequence[Any]) -> NDArray[np.float64]:
     """Return the box around the bodies, and around obstacles as far as they are near."""
-    room = NEAR[extent.shape[1]] * float((extent[1] - extent[0]).max())
+    room = NEAR * float((extent[1] - extent[0]).max())
     low, high = extent[0] - room, extent[1] + room
     for obstacle in obstacles:
         bounds = obstacle.bounds
@@ -377,7 +379,7 @@ def _sampled(
     obstacle: Any, low: NDArray[np.float64], high: NDArray[np.float64]
 ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
     """Return places along each axis and the distances at all, shape ``(n, m)`` or ``(n, m, k)``."""
-    step = float((high - low).max()) / SAMPLES[len(low)]
+    step = float((high - low).max()) / SAMPLES ** (1.0 / len(low))
     counts = np.ceil((high - low) / step).astype(int) + 1
     axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)

@@ -43,10 +43,6 @@ COLOURS = {
 }
 #: Most marks of one kind, and the length of arrows, over the size of the bodies.
 MOST, ARROW = 60, 0.07
-#: Domains up to which their edges are drawn.
-LINED = 1500
-#: Size of a background, over that of the bodies, up to which all of it is shown.
-WHOLE = 3.0
 
 
 @dataclass(frozen=True)
@@ -128,8 +124,8 @@ def sketch(problem: Any, path: str | Path | None = None, *, ax: Any = None, box:
         cmap = import_module("matplotlib.colors").ListedColormap(colours)
         limits = (-0.5, len(colours) - 0.5)
         if shown is None and gdim == 2:
-            shown = framed(shot.extent, shot.around, WHOLE)
-        look = Look("", cmap, limits, box=shown, lines=sum(map(len, shot.values or ())) < LINED)
+            shown = framed(shot.extent, shot.around, whole=True)
+        look = Look("", cmap, limits, box=shown)
         if gdim == 3:
             shot = _with_points(shot, marks, len(names))
         figure = ax.figure if ax is not None else new_figure(figures, shot, look)

@@ -15,6 +15,7 @@ from dolfinx import fem
 
 from ..assembly.inputs import Density
 from ..boundary.supports import Support
+from ..constitutive.beginning import take_over
 from ..constitutive.points import MaterialPoints
 from ..constitutive.step_stress import StepStress
 from ..errors import MPMError, warn
@@ -128,7 +129,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
             self.inertia.mass()
             if after is not None:
                 for points, before in zip(self.points, after.points, strict=True):
-                    points.take_over(before)
+                    take_over(points, before)
         except BaseException:
             for body, by in zip(particles, governed, strict=True):
                 body.governed_by = by

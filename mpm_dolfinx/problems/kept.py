@@ -86,7 +86,7 @@ class Material(Kept):
 
     @override
     def numbers(self) -> dict[str, Any]:
-        factors = [points.weakening for points in self._points]
+        factors = [points.laws.weakening for points in self._points]
         return {"weakening": factors} if factors else {}
 
     @override
@@ -119,8 +119,8 @@ class Material(Kept):
     def restore(self, taken: Taken) -> None:
         """Restore; a state that has no strength leaves it as it is."""
         for points, factor in zip(self._points, taken.numbers.get("weakening", ()), strict=False):
-            if factor != points.weakening:
-                points.weaken(factor)
+            if factor != points.laws.weakening:
+                points.laws.weaken(factor)
         self._put(taken.columns[:-1])
 
 

@@ -19,7 +19,9 @@ from ..assembly.loads import VirtualWork, changeable
 from ..assembly.rules import depends_on
 from ..boundary.supports import Support
 from ..constitutive.assignment import equal_laws
+from ..constitutive.beginning import begin_unstrained, begin_with_stress
 from ..constitutive.groups import background_cells
+from ..constitutive.identity import identity
 from ..constitutive.points import MaterialPoints
 from ..constitutive.step_stress import StepStress
 from ..constitutive.strain import Strain, strain_of
@@ -229,7 +231,7 @@ class QuasiStaticProblem(Problem):
             return
         for body, points, stress in zip(self.bodies, self._built.points, stresses, strict=True):
             if stress is not None:
-                points.begin_with(initial_stress_at_points(stress, body))
+                begin_with_stress(points, initial_stress_at_points(stress, body))
         if self._gradual:
             self._staging.hold_all()
 
@@ -241,8 +243,8 @@ class QuasiStaticProblem(Problem):
         super().begin_anew()
         self._held.let_go()
         for body, points in zip(self.bodies, self._built.points, strict=True):
-            points.follow_parameters()
-            points.begin_anew()
+            points.numbers.follow()
+            begin_unstrained(points)
             for support in self.setup.supports_of(body):
                 support.follow(points.initial_modulus)
         self._carry_stress([body.initial_stress for body in self.setup.given])
@@ -585,7 +587,7 @@ class QuasiStaticProblem(Problem):
         for _, density in self._built.densities:
             density.require()
         for stress in self._built.points:
-            stress.follow_parameters()
+            stress.numbers.follow()
 
     @override
     def masses(self, number: int) -> NDArray[np.float64]:
@@ -711,7 +713,7 @@ class QuasiStaticProblem(Problem):
 
     @override
     def laws(self) -> list[list[Law]]:
-        return [stress.identity() for stress in self._built.points]
+        return [identity(stress) for stress in self._built.points]
 
     @property
     def yield_function(self) -> NDArray[np.float64]:

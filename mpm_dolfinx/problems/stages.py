@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
+from ..constitutive.beginning import begin_with_stress, take_over
 from ..constitutive.moduli import mean_shear_modulus
 from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree
@@ -134,7 +135,7 @@ class Given(_Change):
             problem.bodies, self._changed, problem.points, self._points, strict=True
         ):
             if changed & OF_LAWS:
-                points.take_over(before)
+                take_over(points, before)
                 factors[id(body)] = _shear(points) / _shear(before)
         if self._moduli is not None:
             problem.reduced.unknowns.moduli = [
@@ -213,7 +214,7 @@ class Addition(_Change):
         stress = self._given.initial_stress
         if stress is not None:
             body, points = self._given.particles, self.problem.points[-1]
-            points.begin_with(initial_stress_at_points(stress, body))
+            begin_with_stress(points, initial_stress_at_points(stress, body))
 
     @override
     def renews(self, body: int | None, name: str) -> bool:

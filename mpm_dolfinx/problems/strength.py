@@ -149,10 +149,10 @@ def strength_reduction(
     factor = 1.0
     try:
         for points in problem.points:
-            points.weaken(search.next())  # laws that do not say what it is refuse that
+            points.laws.weaken(search.next())  # laws that do not say what it is refuse that
         while True:
             for points in problem.points:
-                points.weaken(factor)
+                points.laws.weaken(factor)
             found = _equilibrium(problem, start, limit)
             if isinstance(found, MPMError):
                 failures[factor] = found
@@ -169,7 +169,7 @@ def strength_reduction(
             factor = search.next()
     finally:
         for points in problem.points:
-            points.weaken(1.0)
+            points.laws.weaken(1.0)
     result = _result(search, ways, failures, limit)
     if result.failure is not None:
         _warn_if_far(problem, result)

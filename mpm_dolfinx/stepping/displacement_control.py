@@ -17,7 +17,6 @@ from dolfinx import fem, la
 
 from ..assembly.rules import depends_on, split_by_rule
 from ..background.basis import BackgroundBasis
-from ..background.cells import TOLERANCE
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
@@ -170,7 +169,7 @@ class DisplacementControl:
         numbers = particles.W.dofmap.index_map.local_to_global(nodes[best].ravel())
         mine = inside[best].max(initial=-np.inf), numbers, weights[best].ravel()
         most, numbers, values = max(particles.mesh.comm.allgather(mine), key=lambda one: one[0])
-        return numbers, values, bool(most >= -TOLERANCE)
+        return numbers, values, bool(most >= -NEGLIGIBLE)
 
     def _of_form(self, functional: Any) -> NDArray[np.float64]:
         particles = self.particles

@@ -21,11 +21,11 @@ from ..reals import as_reals
 
 __all__ = ["Layout", "chosen", "layout_of"]
 
-#: Kinds of cells by the dimension of a structure.
-KINDS = {
-    1: (basix.CellType.interval,),
-    2: (basix.CellType.triangle, basix.CellType.quadrilateral),
-}
+#: Kinds of cells of lines and of surfaces.
+KINDS = (
+    (basix.CellType.interval,),
+    (basix.CellType.triangle, basix.CellType.quadrilateral),
+)
 
 
 class Layout(NamedTuple):
@@ -144,7 +144,7 @@ def _of_mesh(given: mesh.Mesh, comm: MPI.Comm, gdim: int, what: str, surfaces: b
                 f"The mesh of a {what} lies in {given.geometry.dim} dimensions, and its bodies in "
                 f"{gdim}."
             )
-        if dim >= gdim or kind not in KINDS[1] + (KINDS[2] if surfaces else ()):
+        if dim >= gdim or kind not in KINDS[0] + (KINDS[1] if surfaces else ()):
             kinds = "lines" + (", in space also of surfaces" if surfaces else "")
             raise MPMError(f"The mesh of a {what} is one of {kinds}, not of {kind.name} cells.")
         if _compat.geometry_degree(given) > 1:

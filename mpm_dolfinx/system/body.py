@@ -182,11 +182,13 @@ class BodyTerm(Term):
     @override
     def smooth(self) -> bool:
         """Whether all points are smooth; it may differ between ranks."""
-        return self._points is None or self._points.elastic()
+        points = self._points
+        return points is None or points.trial.is_elastic_since(points.last)
 
     def yielding(self) -> NDArray[np.bool_] | None:
         """Return whether each particle yields in the last update, if the material says so."""
-        return None if self._points is None else self._points.yielding()
+        points = self._points
+        return None if points is None else points.trial.has_yielded_since(points.last)
 
     @override
     def residuals(self) -> Sequence[PETSc.Vec]:

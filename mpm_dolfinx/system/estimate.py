@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from dolfinx import la
 
-from ..assembly.fused import FusedTangent, Restriction
+from ..assembly.blocks import Restriction
+from ..assembly.fused import FusedTangent
 from ..background.basis import PointBasis
 from ..history import Statistics
 from ..particles.particles import Particles

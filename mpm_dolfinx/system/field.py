@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from ..assembly.background_forms import BackgroundForms
-from ..assembly.fused import Restriction
+from ..assembly.blocks import Restriction
 from ..background.basis import PointBasis
 from ..parallel.magnitudes import joint_norm, norm
 from ..parallel.totals import over_ranks

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
-from ..assembly.fused import Restriction
+from ..assembly.blocks import Restriction
 from ..errors import MPMError, agree
 from ..parallel.totals import over_ranks
 from ..particles.field import CarriedField

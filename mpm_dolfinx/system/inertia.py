@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
-from ..assembly.fused import Masses
+from ..assembly.blocks import Masses
 from ..history import Energy
 from ..io.snapshot import Kept
 from ..particles.particles import Particles

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assembly.background_forms import BackgroundForms
-from ..assembly.fused import no_ties
+from ..assembly.blocks import no_ties
 from ..parallel.magnitudes import norm
 from ..stabilisation.ghost_penalty import GhostPenalty
 from ..transfer.touched import TouchedNodes

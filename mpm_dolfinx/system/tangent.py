@@ -12,8 +12,9 @@ from petsc4py import PETSc
 
 import numpy as np
 
+from ..assembly.blocks import Coupling, Masses
 from ..assembly.body_forms import BodyForms
-from ..assembly.fused import Coupling, FusedTangent, Masses
+from ..assembly.fused import FusedTangent
 from ..assembly.petsc import MatrixSum, absolute
 from ..history import Statistics
 from ..parallel.magnitudes import norm

@@ -13,8 +13,8 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
+from ..assembly.blocks import Coupling
 from ..assembly.body_forms import BodyForms
-from ..assembly.fused import Coupling
 from ..constitutive.averaging import VolumeAveraging
 from ..constitutive.pressure import MeanStress
 from ..errors import MPMError

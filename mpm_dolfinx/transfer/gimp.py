@@ -13,11 +13,10 @@ from dolfinx import fem, mesh
 
 from .. import _compat
 from ..background.basis import BackgroundBasis, PointBasis
-from ..background.cells import TOLERANCE
 from ..background.grids import grid_lines
 from ..errors import MPMError, agree
 from ..meshes.boxes import BOX_CELLS
-from ..tolerances import LAST_PLACES
+from ..tolerances import LAST_PLACES, NEGLIGIBLE
 from .method import CornerBasis, DomainState, Method, affine
 
 __all__ = ["GIMP", "BoxGrid"]
@@ -128,7 +127,7 @@ class BoxGrid:
         self.upper = np.array([line[-1] for line in self._lines])
         self.reach = np.array(
             [
-                max(TOLERANCE * np.diff(line).min(), LAST_PLACES * np.abs(line).max())
+                max(NEGLIGIBLE * np.diff(line).min(), LAST_PLACES * np.abs(line).max())
                 for line in self._lines
             ]
         )

@@ -16,7 +16,7 @@ from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx._core import loops
-from mpm_dolfinx.assembly import fused
+from mpm_dolfinx.assembly import supports
 
 QUADRILATERAL, TRIANGLE = mesh.CellType.quadrilateral, mesh.CellType.triangle
 HEXAHEDRON, TETRAHEDRON = mesh.CellType.hexahedron, mesh.CellType.tetrahedron
@@ -169,7 +169,7 @@ def test_the_tangent_is_one_matrix_where_a_penalty_ties_cells():
 def test_groups_of_domains_do_not_matter(degree, monkeypatch):
 
     def tangent(most):
-        monkeypatch.setattr(fused, "GROUP", most)
+        monkeypatch.setattr(supports, "GROUP", most)
         particles = mpm.Particles(bent(QUADRILATERAL), space(2, degree), degree=degree)
         problem = quasi_static(particles)
         return evaluated(lambda: problem, False)[1]

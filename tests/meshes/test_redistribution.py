@@ -17,6 +17,7 @@ from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import _compat
+from mpm_dolfinx.meshes.cells import disconnected_mesh
 from mpm_dolfinx.meshes.redistribution import Redistribution
 from mpm_dolfinx.meshes.remesh import Remesh
 
@@ -63,7 +64,7 @@ def pieces(body):
     """Return a copy of a mesh whose cells share no vertex."""
     nodes = _compat.geometry_dofmap(body)[: body.topology.index_map(body.topology.dim).size_local]
     corners = body.geometry.x[nodes][:, :, : body.geometry.dim]
-    return _compat.disconnected_mesh(WORLD, corners, body.basix_cell())
+    return disconnected_mesh(WORLD, corners, body.basix_cell())
 
 
 def moved_once(body):

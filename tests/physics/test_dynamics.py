@@ -1320,7 +1320,7 @@ def test_a_body_in_equilibrium_stays_at_rest(scheme, out, f_bar):
 def test_what_was_weakened_in_equilibrium_stays_weak_in_motion():
     law = VonMises(40.0, 0.3, rho_y=1.5)
     particles, static, given = resting(law, cell=QUADRILATERAL, quadrature_degree=2)
-    static.points[0].weaken(1.5)
+    static.points[0].laws.weaken(1.5)
     static.step()
     strength = 1.0
 
@@ -1335,7 +1335,7 @@ def test_what_was_weakened_in_equilibrium_stays_weak_in_motion():
     given["body_force"] = (0.0, -3.0)
     problem = posed(mpm.DynamicProblem, particles, law, 2.0, scheme="euler", after=static, **given)
     problem.solve(time=0.2, dt=0.05)
-    assert problem.points[0].weakening == 1.5
+    assert problem.points[0].laws.weakening == 1.5
     assert strength * 0.95 < most() < 1.05 * strength  # (means over domains)
 
 

@@ -191,4 +191,4 @@ def test_a_stage_within_a_reduction_of_strength_is_refused():
     problem.acts = True
     with pytest.raises(mpm.MPMError, match="stage was begun within strength_reduction"):
         mpm.strength_reduction(problem)
-    assert problem.points[0].weakening == 1.0
+    assert problem.points[0].laws.weakening == 1.0

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import scenes
+import stock
 from bad_input import body, held_background
 from compare import raises
 from posed import posed
@@ -77,7 +78,7 @@ def finite_elements(particles, residual, bcs, J=None):
     d = fem.Function(W)
     F = residual(d, ufl.TestFunction(W))
     tangent = None if J is None else J(d, ufl.TestFunction(W), ufl.TrialFunction(W))
-    problem = _compat.NonlinearProblem(
+    problem = stock.NonlinearProblem(
         F, d, bcs=bcs(W), J=tangent, petsc_options_prefix="fem_", petsc_options=FEM_OPTIONS
     )
     problem.solve()

@@ -171,9 +171,9 @@ CHANGES = {
 def test_what_is_weak_stays_weak(change, mpi_tmp_path):
     problem = block()
     problem.solve(2)
-    problem.points[0].weaken(2.2)
+    problem.points[0].laws.weaken(2.2)
     CHANGES[change](problem)
-    assert problem.points[0].weakening == 2.2
+    assert problem.points[0].laws.weakening == 2.2
     problem.solve() if change in ("stage", "remove") else problem.step()
 
     def most(problem):
@@ -188,7 +188,7 @@ def test_what_is_weak_stays_weak(change, mpi_tmp_path):
     problem.save(mpi_tmp_path / "weak")
     again = block()
     again.restore(mpi_tmp_path / "weak")
-    assert again.points[0].weakening == 2.2
+    assert again.points[0].laws.weakening == 2.2
     for one in (problem, again):
         one.particles.load.value = 1.02
         one.step()
@@ -229,7 +229,7 @@ class Watched(mpm.QuasiStaticProblem):
     """A problem that notes with which factors it is tried, and does something before or after."""
 
     def step(self):
-        factor = self.points[0].weakening
+        factor = self.points[0].laws.weakening
         if not hasattr(self, "tried"):
             self.tried = []
         self.tried.append(factor)
@@ -294,7 +294,7 @@ def test_states_that_cannot_repeat_their_step_are_refused():
     problem.before = newton
     with pytest.raises(mpm.MPMError, match="a factor would mean nothing: It does not") as caught:
         mpm.strength_reduction(problem)
-    assert caught.value.particles == [3] and problem.points[0].weakening == 1.0
+    assert caught.value.particles == [3] and problem.points[0].laws.weakening == 1.0
     problem.before = lambda factor: None
     with pytest.raises(mpm.MPMError, match="beyond the limit 1e-30"):
         problem.particles.load.value = 1.01
@@ -345,7 +345,7 @@ def test_interrupted_reduction_leaves_the_last_state_that_counts(ends, limit):
     problem.after = after
     with pytest.raises(KeyboardInterrupt if ends is ctrl_c else ZeroDivisionError):
         mpm.strength_reduction(problem, displacement=limit)
-    assert problem.tried == [1.0, 1.1, 1.2, 1.3] and problem.points[0].weakening == 1.0
+    assert problem.tried == [1.0, 1.1, 1.2, 1.3] and problem.points[0].laws.weakening == 1.0
     np.testing.assert_array_equal(problem.particles.converged_displacement, here["d"])
     assert problem.points[0] is law and len(problem.history.steps) == here["steps"]
     problem.step()  # and with the strength that was given it stands there

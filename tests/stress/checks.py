@@ -18,6 +18,7 @@ import basix
 import basix.ufl
 
 from mpm_dolfinx import _compat
+from mpm_dolfinx.meshes.cells import input_cell_index
 
 EPS = np.finfo(float).eps
 
@@ -93,7 +94,7 @@ class Background(Cells):
         nodes = V.dofmap.index_map.local_to_global(nodes.ravel()).reshape(nodes.shape)
         super().__init__(np.concatenate(comm.allgather(x)), domain.basix_cell())
         self.nodes = np.concatenate(comm.allgather(nodes))
-        self.index = np.concatenate(comm.allgather(_compat.input_cell_index(domain)))
+        self.index = np.concatenate(comm.allgather(input_cell_index(domain)))
         self.size = V.dofmap.index_map.size_global
         self.basis = V.ufl_element().basix_element
 
