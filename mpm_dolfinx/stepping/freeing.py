@@ -197,7 +197,7 @@ def _without(
     T.multTranspose(one, together)
     T.mult(together, one)
     moved = (one.array_r > 0.0).reshape(-1, bs).any(axis=1)
-    carried = chosen_nodes(body.W, np.flatnonzero(moved)) & rows.found & body.free
+    carried = chosen_nodes(body.W, np.flatnonzero(moved)) & body.free
     for thing in (T, one, together):
         thing.destroy()
     return body.free & ~carried if _any(body, carried) else None
