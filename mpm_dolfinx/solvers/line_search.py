@@ -22,8 +22,6 @@ HALVINGS = 8
 SUFFICIENT = 0.8
 #: Least share by which the norm falls where it alone is searched on.
 LEAST = 1e-4
-#: Halvings after which a step is taken if its end can be evaluated, in a solve that hurries.
-FEW_HALVINGS = 3
 #: Share of its start that the work may keep where points yield, and most evaluations that look
 #: for such a step.
 SHARP = 0.3
@@ -76,14 +74,12 @@ class Rules(NamedTuple):
     Attributes:
         potential: Whether the residual is the gradient of a potential.
         works: Whether its work on a step tells if that is stable.
-        hurries: Whether a solve that is hard is better given up: see :func:`stalled`.
         by_norm: Whether steps are judged by the residual's norm alone: without a potential, its
             work on them may mean nothing.
     """
 
     potential: bool
     works: bool
-    hurries: bool
     by_norm: bool
 
 
@@ -224,8 +220,6 @@ class LineSearch:
             self._statistics.count("halvings")
             if self._reduces(step, F, trial):
                 self._sharpen(step, 2.0 ** (halvings + 1), F, trial)
-                break
-            if self._rules.hurries and halvings + 1 >= FEW_HALVINGS and np.isfinite(norm(F)):
                 break
 
     def _sharpen(self, step: _Step, longest: float, F: PETSc.Vec, trial: PETSc.Vec) -> bool:

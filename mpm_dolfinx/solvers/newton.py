@@ -265,7 +265,7 @@ class NewtonSolver:
         assert self.F is not None
         factor, statistics, tells = self._factor, self.statistics, problem.work_tells()
         potential = self._symmetric and tells
-        rules = Rules(potential, tells, hurries and not potential, by_norm and not potential)
+        rules = Rules(potential, tells, by_norm and not potential)
         residual = Residual(problem, factor, self.F, self._room[0], statistics)
         steps = Steps(problem, factor, self._symmetric, shorten)
         judge = Judge(problem, residual, steps, factor, statistics, enough)
@@ -275,7 +275,8 @@ class NewtonSolver:
             search = LineSearch(
                 rules, residual.at, steps.uphill, steps.redirect, smooth, statistics
             )
-        now = Attempt(problem, shorten, rules.hurries, residual, steps, judge, search)
+        hurries = hurries and not potential
+        now = Attempt(problem, shorten, hurries, residual, steps, judge, search)
         self._attempt = now
         return now
 

@@ -86,7 +86,7 @@ def test_work_that_tells_nothing_judges_a_step_by_its_size(works):
 
     statistics = Statistics()
     search = LineSearch(
-        Rules(False, works, False, False),
+        Rules(False, works, False),
         evaluate,
         lambda *_: False,
         lambda *_: False,
