@@ -6,9 +6,11 @@ What acts on bodies lives on their nodes, whatever moves these: it is a term
 (:mod:`~mpm_dolfinx.system.term`). A body's own stress and loads are one
 (:mod:`~mpm_dolfinx.system.body`), what couples two bodies is another
 (:mod:`~mpm_dolfinx.system.coupling`), inertia a third (:mod:`~mpm_dolfinx.system.inertia`) by a
-scheme (:mod:`~mpm_dolfinx.system.schemes`). Each background space with the bodies on it is a field
+scheme (:mod:`~mpm_dolfinx.system.schemes`) that says what a step makes of velocities
+(:mod:`~mpm_dolfinx.system.motion_step`). Each background space with the bodies on it is a field
 (:mod:`~mpm_dolfinx.system.field`), with unknowns, conditions
-(:mod:`~mpm_dolfinx.system.conditions`) and a cure of its own. T takes terms down to fields,
+(:mod:`~mpm_dolfinx.system.conditions`), and what acts on it beside the bodies, as a cure of badly
+supported dofs (:mod:`~mpm_dolfinx.system.on_background`). T takes terms down to fields,
 
     r = sum_b T_b^T r_b,    K = sum_ab T_a^T K_ab T_b,
 
