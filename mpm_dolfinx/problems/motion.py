@@ -56,7 +56,7 @@ class MovingProblem(TimeProblem):
     def _build(self) -> None:
         self.inertia.join(self.bodies)
         super()._build()
-        self._trial.newton.lets_go = self._trial.newton.gives_up_early = True
+        self._trial.newton.lets_go = True
         others = [*self.body_terms, *(term for term in self.terms if term is not self.inertia)]
         self.inertia.follow(self, others)
 

@@ -29,7 +29,6 @@ class Attempt:
     Attributes:
         problem: As given to :meth:`NewtonSolver.solve`.
         shorten: As there.
-        hurries: Whether it is given up soon where it makes no headway.
         residual: The residual.
         steps: Finds Newton steps.
         judge: Says when it is at an end.
@@ -39,7 +38,6 @@ class Attempt:
 
     problem: ReducedProblem
     shorten: bool
-    hurries: bool
     residual: Residual
     steps: Steps
     judge: Judge

@@ -71,8 +71,6 @@ class NewtonSolver:
             a motion it is a viscosity, and the same in each step.
         has_another_way: Whether an attempt that fails may be made in another way at once: there is
             no potential, or it began at a prediction and no smaller step is tried.
-        gives_up_early: Whether a solve whose residual is not the gradient of a potential is given
-            up soon where it makes no headway: in a motion half of the step is much easier.
     """
 
     def __init__(
@@ -96,7 +94,7 @@ class NewtonSolver:
         self.x: PETSc.Vec | None = None
         self.F: PETSc.Vec | None = None
         self._room: list[PETSc.Vec] = []  # of the same size
-        self.lets_go = self.gives_up_early = False
+        self.lets_go = False
         self.snes = PETSc.SNES().create(comm)
         self.snes.setOptionsPrefix(prefix)
         self.snes.setTolerances(rtol=1e-9, atol=0.0, stol=0.0, max_it=30)
@@ -193,7 +191,7 @@ class NewtonSolver:
         potential = self._symmetric and problem.work_tells()
         self.has_another_way = self._searches and not potential
         x = self._start(sizes)
-        now = self._begin(problem, shorten, self.gives_up_early and shorten, again)
+        now = self._begin(problem, shorten, again)
         self._factor.begin(sizes[1], problem.levels)
         if sizes[1] == 0:
             problem.impose()
@@ -231,7 +229,7 @@ class NewtonSolver:
         """
         assert self.x is not None and self.F is not None
         last, first = self._now, norm(self.F)
-        now = self._begin(last.problem, last.shorten, False, False, share * first)
+        now = self._begin(last.problem, last.shorten, False, share * first)
         self._factor.begin(self.x.getSize(), now.problem.levels)
         now.steps.count = last.steps.count
         now.judge.first = first
@@ -257,7 +255,6 @@ class NewtonSolver:
         self,
         problem: ReducedProblem,
         shorten: bool,
-        hurries: bool,
         by_norm: bool,
         enough: float = 0.0,
     ) -> Attempt:
@@ -275,8 +272,7 @@ class NewtonSolver:
             search = LineSearch(
                 rules, residual.at, steps.uphill, steps.redirect, smooth, statistics
             )
-        hurries = hurries and not potential
-        now = Attempt(problem, shorten, hurries, residual, steps, judge, search)
+        now = Attempt(problem, shorten, residual, steps, judge, search)
         self._attempt = now
         return now
 
@@ -368,7 +364,7 @@ class NewtonSolver:
         if now.judge.is_at_rest(x, self.lets_go):
             return True
         norms = now.judge.norms
-        if now.search is not None and stalled(norms, now.hurries and not now.search.trusts):
+        if now.search is not None and stalled(norms):
             self.gave_up = True
             raise ConvergenceError(
                 f"Newton's method makes no headway: in {self.iterations} linear solves the "
