@@ -248,7 +248,7 @@ def test_written_by_one_rank_read_by_all(mpi_tmp_path):
 
 
 def test_a_file_in_many_chunks(mpi_tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoint, "CHUNK", 3)
+    monkeypatch.setattr(checkpoint, "BLOCK", 3)
     monkeypatch.setattr(files, "PIECE", 10)
     interrupt(two_bodies, 2, mpi_tmp_path / "bodies.ckpt", 0)
 
