@@ -130,7 +130,7 @@ beside = np.array([np.sum(np.log(stiffness.x.array[:own][above] / young)), np.su
 (inside, cells), (outside, others) = comm.allreduce(np.array([within, beside]))
 soft, stiff = np.exp(inside / cells), np.exp(outside / others)
 if comm.rank == 0:
-    print(f"slope beside a difference: {gap:.1e}")
+    print(f"slope along a direction {slope @ way:.2f}, by a difference {difference:.2f}")
     print(f"misfit {first:.1f} to {found.fun:.1f} in {found.nfev} evaluations")
     told = f"in the lens {soft:.2f}, left of it {stiff:.2f}"
     print(f"mean stiffness over {young / 1e6:.0f} MPa {told}")
@@ -157,8 +157,8 @@ if comm.size == 1:
         axes[2].plot(nodes[row, 0], settled, ".", ms=3, label=f"plate at {place} m")
     settled = 1e3 * problem.particles.displacement.x.array[1::2][row]
     axes[2].plot(nodes[row, 0], settled, "k", lw=0.8, label="with the stiffness found")
-    axes[2].set(xlabel="x, m", ylabel="mm", title="surveys of the surface")
-    axes[2].legend(fontsize="small", loc="lower left")
+    axes[2].set(xlabel="x, m", ylabel="mm", ylim=(-31, 3), title="surveys of the surface")
+    axes[2].legend(fontsize="small", loc="lower center", ncols=3)
 if comm.rank == 0:
     fig.savefig("soft_lens.png", dpi=110)
 
