@@ -130,7 +130,8 @@ beside = np.array([np.sum(np.log(stiffness.x.array[:own][above] / young)), np.su
 (inside, cells), (outside, others) = comm.allreduce(np.array([within, beside]))
 soft, stiff = np.exp(inside / cells), np.exp(outside / others)
 if comm.rank == 0:
-    print(f"slope along a direction {slope @ way:.2f}, by a difference {difference:.2f}")
+    told = f"{slope @ way:.2f}, by a difference {difference:.2f}"
+    print(f"slope along a direction {told}")
     print(f"misfit {first:.1f} to {found.fun:.1f} in {found.nfev} evaluations")
     told = f"in the lens {soft:.2f}, left of it {stiff:.2f}"
     print(f"mean stiffness over {young / 1e6:.0f} MPa {told}")
