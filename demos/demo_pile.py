@@ -74,8 +74,8 @@ steel = mpm.contact.polygon(outline, radius=0.3 * R)
 hole, ground = mpm.region(x=h), mpm.region(y=0.0)
 free = mpm.facet_tags(clay.mesh, {1: lambda x: hole(x) | ground(x)})
 look = {"facet_tags": free, "tag": 1, "axisymmetric": True, "modulus": 4 * G}
-adheres = mpm.contact.Coulomb(cohesion=adhesion)
-pile = mpm.contact.Rigid(clay, steel, adheres, tangential_penalty=0.1, **look)
+adheres = mpm.contact.Coulomb(cohesion=adhesion, stiffness=0.1)
+pile = mpm.contact.Rigid(clay, steel, adheres, **look)
 problem = mpm.QuasiStaticProblem(
     mpm.Body(
         clay,

@@ -61,7 +61,8 @@ def pressed(friction):
     """Press the pipe in; return problem, contact, and depth and force."""
     clay = mpm.Particles(box([0.0, -2.0], [3.0, 0.0], h / 2), V, quadrature_degree=2)
     circle = mpm.contact.disc((0.0, diameter / 2), diameter / 2)
-    pipe = mpm.contact.Rigid(clay, circle, friction, tangential_penalty=0.1)
+    rubs = mpm.contact.Coulomb(friction, stiffness=0.1)
+    pipe = mpm.contact.Rigid(clay, circle, rubs)
     problem = mpm.QuasiStaticProblem(
         mpm.Body(
             clay,
@@ -136,5 +137,5 @@ assert excess < 1e-9 * strength and 0 < sliding < touching
 #
 # 1. Go on to half a diameter. Look at the first domains under the smooth pipe: their facets become
 #    chords of the circle, and the clay cannot follow it. What do cells of half the size do?
-# 2. Limit friction by half of the strength, `mpm.contact.Coulomb(0.3, limit=0.5 * strength)`.
+# 2. Limit friction by half of the strength, `limit=0.5 * strength` of the `mpm.contact.Coulomb`.
 # 3. Press in a polygon of your own, with rounded corners, or pull the pipe out again.

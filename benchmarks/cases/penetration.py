@@ -98,12 +98,11 @@ tags = mpm.facet_tags(soil.mesh, {1: lambda x: surface(x) | (axis(x) & parted)})
 obstacle = mpm.contact.Rigid(
     soil,
     shape,
-    args.friction,
+    mpm.contact.Coulomb(args.friction, stiffness=args.tangential_penalty),
     facet_tags=tags,
     tag=1,
     penalty=args.penalty,
     law=args.law,
-    tangential_penalty=args.tangential_penalty,
 )
 
 

@@ -685,3 +685,12 @@ void core::add_tangents(const Meeting& meeting, int dim, const Sums& sums)
     add_tangents_in<decltype(kind)::dim, decltype(kind)::bends>(meeting, sums);
   });
 }
+
+void core::add_slopes(std::size_t points, int dim, const double* slopes, const Sums& sums)
+{
+  for (std::size_t p = 0; p < points; ++p)
+    if (dim == 2)
+      add_at<2>(sums, p, 0, 1, slopes + p * 4);
+    else
+      add_at<3>(sums, p, 0, 1, slopes + p * 9);
+}

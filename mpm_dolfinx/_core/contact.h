@@ -63,4 +63,7 @@ struct Sums
 
 // Add the derivatives of what acts.
 void add_tangents(const Meeting& meeting, int dim, const Sums& sums);
+
+// Add given derivatives of tractions at points by their positions, (points, dim, dim).
+void add_slopes(std::size_t points, int dim, const double* slopes, const Sums& sums);
 } // namespace core

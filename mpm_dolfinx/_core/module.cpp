@@ -1037,6 +1037,19 @@ NB_MODULE(_loops, m)
         "group"_a, "positions"_a, "values"_a.noconvert(),
         "Add the derivatives of what acts between points and facets to blocks between nodes.");
 
+  m.def("add_slopes",
+        [](Reals slopes, Reals weights, Reals shapes, Offsets group, Indices positions,
+           RealsOut values) {
+    require(slopes.ndim() == 3 && slopes.shape(1) == slopes.shape(2)
+                && (slopes.shape(1) == 2 || slopes.shape(1) == 3),
+            "derivatives (n, dim, dim)");
+    const auto dim = static_cast<int>(slopes.shape(1));
+    add_slopes(slopes.shape(0), dim, slopes.data(),
+               sums_of(slopes.shape(0), dim, 0, 1, weights, shapes, group, positions, values));
+  },
+        "slopes"_a, "weights"_a, "shapes"_a, "group"_a, "positions"_a, "values"_a.noconvert(),
+        "Add derivatives of tractions at points to blocks between nodes.");
+
   m.def("tabulate",
         [](Reals place, Reals coefficients, const std::tuple<int, bool>& kind, double close, int most,
            RealsOut shape, RealsOut slope, RealsOut bend) {

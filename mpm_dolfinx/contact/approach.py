@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 import basix
 
 from .facets import Closest, separated
+from .memory import FacetMemory
 from .neighbourhood import Neighbourhood
-from .pass_memory import Memory
 
 __all__ = ["LINGER", "Approach", "OverStep"]
 
@@ -56,7 +56,7 @@ class Approach:
     """
 
     around: Neighbourhood
-    last: Memory
+    last: FacetMemory
     x: NDArray[np.float64]
     nodes: NDArray[np.float64]
 
@@ -223,14 +223,13 @@ class Approach:
         start = np.where((found.facet >= 0)[:, None], found.place, 0.5)
         return at, near.project(points, self.nodes[at], start)
 
-    def leaks(self, memory: Memory, found: Closest) -> bool:
+    def leaks(self, found: Closest) -> bool:
         """Return whether a point has gone through the other body since the last step.
 
         Args:
-            memory: That of the points at the last step.
             found: The facets that they meet now.
         """
-        near, x, reach = self.around.near, self.x, self.around.sides.reach
+        near, x, reach, memory = self.around.near, self.x, self.around.sides.reach, self.last
         at = near.find(memory.facet)
         # (one beside a thin body may have been behind its far side already)
         before = np.isfinite(memory.gap) & (memory.gap > -0.25 * reach)

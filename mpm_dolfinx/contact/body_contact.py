@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 
 from ..errors import MPMError
 from ..particles.particles import Particles
+from .contact import Contact
 from .law import Friction
 from .placed import distance_within, framed
-from .rigid import Rigid, Slopes
+from .rigid import Rigid
 from .rotation import Pose, cayley_variation, crossing
+from .shape_pass import Touch
 from .shapes import Shape
-from .surface import Blocks, PointMatrix
+from .surface import Blocks, PointMatrix, global_dofs
 
 __all__ = ["BodyContact", "Coupled"]
 
@@ -73,19 +75,16 @@ class BodyContact(Rigid):
         """
         raise MPMError("A contact of a RigidBody is moved by it; use move() of the RigidBody.")
 
+    @property
     @override
-    def _turn(self, last: Pose, pose: Pose) -> float:
-        """Return the turn in the step; a vector of rotation in space tells no whole turns."""
-        return pose.least_turn_from(last)
+    def _counts_turns(self) -> bool:
+        """Whether whole turns count; a vector of rotation in space tells none."""
+        return False
 
     @override
     def begin(self) -> Sequence[PETSc.Vec]:
         """Begin a step; where the rigid body goes is found later."""
-        self._settle()
-        self._surface.look_at_deleted()
-        self._new_pattern()
-        self._look_near()
-        return ()
+        return Contact.begin(self)
 
     def couple(self, layout: tuple[int, int]) -> None:
         """Take how many unknowns the rigid body has, of this rank and of all."""
@@ -101,22 +100,28 @@ class BodyContact(Rigid):
         Raises:
             MPMError: That cannot be.
         """
-        self._pose = self._aim = pose
-        self._trial = self._evaluated()
+        self._pose = self._aim = self._pass.pose = pose
+        self._passes.evaluate()
+
+    @property
+    def _touch(self) -> Touch:
+        """What acts at the place where the shape was put last."""
+        assert self._pass.evaluation is not None
+        return self._pass.evaluation
 
     @property
     def whole_stiffness(self) -> float:
         """Stiffness of all of this rank's points together."""
-        return float((self._surface.weights * self._tractions.stiffnesses()[0]).sum())
+        return float((self._pass.source.weights * self._pass.penalties).sum())
 
     @property
     def extent(self) -> float:
         """Largest coordinate of the undeformed body."""
-        return self._surface.layout.extent
+        return self._pass.source.layout.extent
 
     def span(self) -> float:
         """Return the largest length of the undeformed body along an axis (collective)."""
-        x = self.bodies[0].initial_domains.reshape(-1, self._surface.gdim)
+        x = self.bodies[0].initial_domains.reshape(-1, self.shape.dim)
         ends = np.concatenate([x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)])
         self.bodies[0].mesh.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MAX)
         above, below = np.split(ends, 2)
@@ -132,17 +137,14 @@ class BodyContact(Rigid):
             Force, moment about the centre, size of the force, and number of points that touch,
             ``(gdim + nr + 2,)``.
         """
-        assert self._trial is not None
-        trial, traction = self._trial, self._trial.outcome.traction
-        here = np.flatnonzero(traction.any(axis=(1, 2)))
-        which = trial.numbers(here)
-        f = self._surface.weights[which, :, None] * traction[here]
+        touch, outcome = self._touch, self._touch.outcome
+        here = np.flatnonzero(outcome.traction.any(axis=(1, 2)))
+        f = touch.source.weights[touch.numbers[here], :, None] * outcome.traction[here]
         arm = self._arms(here, centres)
         moments = np.einsum("mqij,mqi->j", crossing(arm), f)
         size = np.linalg.norm(f, axis=2).sum()
-        return np.concatenate(
-            [f.sum(axis=(0, 1)), moments, [size, np.count_nonzero(trial.touched)]]
-        )
+        count = np.count_nonzero(outcome.inside)
+        return np.concatenate([f.sum(axis=(0, 1)), moments, [size, count]])
 
     def _arms(
         self, here: NDArray[np.int64], centres: tuple[NDArray[np.float64], ...]
@@ -153,11 +155,10 @@ class BodyContact(Rigid):
             here: Places of facets among those that were looked at.
             centres: As for :meth:`total`.
         """
-        assert self._trial is not None
-        after = self._trial.outcome.positions[here]
+        after = self._touch.x[here]
         if not self._of_step:
             return after - centres[1]
-        before = self._known(self._trial).outcome.positions[here]
+        before = self._touch.last.outcome.positions[here]
         return np.asarray(0.5 * (before - centres[0] + after - centres[1]))
 
     def works(self, motion: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Any:
@@ -166,22 +167,17 @@ class BodyContact(Rigid):
         Args:
             motion: Returns the motions of the rigid body at arms of the middle.
         """
-        assert self._trial is not None
-        trial = self._trial
-        if trial.step is None or trial.step.push is None:
+        touch = self._pass.evaluation
+        if touch is None or touch.middle is None:
             return np.zeros(2)
-        memory, w = self._known(trial), self._tractions.weights(trial)[:, :, None]
-        f = w * trial.outcome.traction
-        change = trial.outcome.positions - memory.outcome.positions
-        normal = trial.step.push @ self._tractions.rotation(trial, memory).T
-        shear = trial.outcome.traction - normal.reshape(f.shape)
-        slid = change - motion(0.5 * change + memory.outcome.positions)
-        taken = -float((w * shear * slid).sum())
-        return np.array([-float((f * change).sum()) - taken, taken])
+        w = touch.source.weights[touch.numbers][:, :, None]
+        slid = touch.moves - motion(touch.x - 0.5 * touch.moves)
+        taken = -float((w * touch.rub * slid).sum())
+        return np.array([-float((w * touch.outcome.traction * touch.moves).sum()) - taken, taken])
 
     def least(self, pose: Pose) -> float:
         """Return the least gap of this rank's points with the shape in some place."""
-        surface = self._surface
+        surface = self._pass.source
         borne = np.flatnonzero((surface.weights > 0.0).any(axis=1))
         x = surface.positions(which=borne)[surface.weights[borne] > 0.0]
         return float(
@@ -190,11 +186,9 @@ class BodyContact(Rigid):
 
     def energy(self) -> float:
         """Return this rank's energy of penetration at the last converged step."""
-        self._outcome()
-        assert self._memory is not None
-        points, gap = self._tractions.points(self._memory), self._memory.gap.ravel()
-        pressed = np.where(gap <= self._surface.touch, gap, 0.0)
-        return float(0.5 * self._surface.weights.ravel() @ (points.stiffness * pressed**2))
+        gap, source = self._every()[0].gap, self._pass.source
+        pressed = np.where(gap <= source.touch, gap, 0.0)
+        return float(0.5 * (source.weights * self._pass.penalties * pressed**2).sum())
 
     def coupled(
         self,
@@ -211,19 +205,25 @@ class BodyContact(Rigid):
             per_unknown: Displacement and Cayley vector by each unknown, ``(gdim + nr, n)``.
             secants: Whether points that have changed their slip take secants instead.
         """
-        slopes = self._slopes(secants and not self.friction.smooth)
-        rows, by_s, own = self._by_motion(slopes, centres, theta)
-        N, w = self._surface.shapes, self._surface.weights[slopes.facets]
-        m, k = slopes.dofs.shape
-        keys, n = slopes.facets, per_unknown.shape[1]
+        K = self._passes.tangents(-1.0 / self._share, secants).get((0, 0))
+        rows, by_s, own = self._by_motion(self._pass.tangent, centres, theta)
+        touch, source = self._touch, self._touch.source
+        facets, places = touch.of_acting
+        N, w = source.shapes[places], source.weights[facets, places]
+        keys, block = np.unique(facets, return_inverse=True)
+        m, k, n = len(keys), source.shapes.shape[1] * source.gdim, per_unknown.shape[1]
+        of, by = np.zeros((m, n, k)), np.zeros((m, k, n))
+        part = np.einsum("p,pa,psi,sn->pnai", w, N, rows, per_unknown, optimize=True)
+        np.add.at(of, block, part.reshape(len(w), n, k))
+        part = np.einsum("p,pa,pis,sn->pain", -w, N, by_s, per_unknown, optimize=True)
+        np.add.at(by, block, part.reshape(len(w), k, n))
+        dofs = global_dofs(source.particles.W, source.layout.nodes[keys])
         motions = np.broadcast_to(np.arange(n), (m, n))
-        of = np.einsum("mq,qa,mqsi,sn->mnai", w, N, rows, per_unknown, optimize=True)
-        by = np.einsum("mq,qa,mqis,sn->main", -w, N, by_s, per_unknown, optimize=True)
         of_motion, by_motion = self._couplings
         return Coupled(
-            self._matrix.of([self._blocks_of(slopes)]),
-            of_motion.of([Blocks(keys, motions, slopes.dofs, of.reshape(m, n, k))]),
-            by_motion.of([Blocks(keys, slopes.dofs, motions, by.reshape(m, k, n))]),
+            K,
+            of_motion.of([Blocks(keys, motions, dofs, of)]),
+            by_motion.of([Blocks(keys, dofs, motions, by)]),
             own,
         )
 
@@ -231,36 +231,43 @@ class BodyContact(Rigid):
         self, centres: tuple[NDArray[np.float64], ...], theta: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return this rank's derivative of force and moment by a step of the rigid body."""
-        return self._by_motion(self._slopes(False), centres, theta)[2]
+        return self._by_motion(self._touch.slopes(), centres, theta)[2]
 
     def _by_motion(
         self,
-        slopes: Slopes,
+        slopes: NDArray[np.float64],
         centres: tuple[NDArray[np.float64], ...],
         theta: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return derivatives by and of a step ``(dX, theta)`` of the rigid body.
 
+        Args:
+            slopes: Derivatives of tractions where something acts by positions, ``(n, gdim, gdim)``.
+            centres: As for :meth:`total`.
+            theta: Cayley vector of the step.
+
         Returns:
-            Of force and moment at points by their positions ``(m, nq, n, gdim)``, of tractions by
-            the step ``(m, nq, gdim, n)``, and of all force and moment by it ``(n, n)``.
+            Of force and moment at these points by their positions ``(n, r, gdim)``, of tractions by
+            the step ``(n, gdim, r)``, and of all force and moment by it ``(r, r)``.
         """
-        trial, memory = slopes.trial, self._known(slopes.trial)
-        here, D = slopes.acting.here, slopes.by_position
+        touch, flat = self._touch, self._touch.acting
         share = 0.5 if self._of_step else 1.0
-        gdim, force = D.shape[3], trial.outcome.traction[here] / self._share
-        within = np.linalg.solve(self._tractions.rotation(trial, memory), force[..., None])[..., 0]
+        D = slopes / self._share
+        gdim = D.shape[2]
+        force = touch.outcome.traction.reshape(-1, gdim)[flat] / self._share
+        within = np.linalg.solve(touch.rotation, force.T).T
         H = cayley_variation(theta)
-        arm = trial.outcome.positions[here] - centres[1]
-        middle = self._arms(here, centres)
-        unit = np.broadcast_to(np.eye(gdim), (*arm.shape, gdim))
-        by_s = -D @ np.concatenate([unit, crossing(arm) @ H], axis=3)
-        by_s[..., gdim:] += share * crossing(within @ trial.pose.Q.T) @ H
-        rigid = np.concatenate([unit, crossing(middle)], axis=3).swapaxes(2, 3)
-        turning = share * crossing(force).swapaxes(2, 3)
-        w = self._surface.weights[slopes.facets][:, :, None, None]
-        own = (w * (rigid @ by_s)).sum(axis=(0, 1))
-        own[gdim:, :gdim] += (w * turning).sum(axis=(0, 1))
+        arm = touch.x.reshape(-1, gdim)[flat] - centres[1]
+        middle = self._arms(np.arange(len(touch.x)), centres).reshape(-1, gdim)[flat]
+        unit = np.broadcast_to(np.eye(gdim), D.shape)
+        by_s = -D @ np.concatenate([unit, crossing(arm) @ H], axis=2)
+        by_s[..., gdim:] += share * crossing(within @ touch.pose.Q.T) @ H
+        rigid = np.concatenate([unit, crossing(middle)], axis=2).swapaxes(1, 2)
+        turning = share * crossing(force).swapaxes(1, 2)
+        facets, places = touch.of_acting
+        w = touch.source.weights[facets, places][:, None, None]
+        own = (w * (rigid @ by_s)).sum(axis=0)
+        own[gdim:, :gdim] += (w * turning).sum(axis=0)
         rows = rigid @ D
-        rows[:, :, gdim:] -= turning
+        rows[:, gdim:] -= turning
         return rows, by_s, own

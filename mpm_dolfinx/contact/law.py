@@ -26,7 +26,7 @@ with its traction at the step's end, within the cone of the step's pressure: it 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, override
 
 import numpy as np
@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 from .._core import is_as_inherited, loops
 from ..errors import MPMError, as_ours
+from ..parallel.given import as_positive
 from ..reals import as_finite
 from ..tolerances import DIFFERENCE, EQUAL, HALF_DIGITS, LOCAL_ITERATIONS, ROUND_OFF, SMALL
 
@@ -97,9 +98,11 @@ class Friction:
 
     Attributes:
         memory: What each point remembers before it has touched anything.
+        stiffness: Stiffness of points that stick, over that of the domain behind, without unit.
     """
 
     memory: Sequence[float] = ()
+    stiffness: float = 1.0
 
     @property
     def smooth(self) -> bool:
@@ -152,6 +155,7 @@ class Coulomb(Friction):
         cohesion: Shear traction that is borne without pressure, where bodies touch, per area of
             the facets as they were at the last converged step.
         limit: Largest shear traction, such as the undrained strength of clay on a pile, as well.
+        stiffness: See :class:`Friction`.
 
     Raises:
         MPMError: A negative or no number.
@@ -160,6 +164,7 @@ class Coulomb(Friction):
     friction: float = 0.0
     cohesion: float = 0.0
     limit: float = np.inf
+    stiffness: float = 1.0
     _loop: ClassVar[str] = "coulomb"
 
     def __post_init__(self) -> None:
@@ -190,7 +195,7 @@ class Coulomb(Friction):
     @override
     def shared(self, share: float) -> Friction:
         if self.compiled:
-            return Coulomb(self.friction, share * self.cohesion, share * self.limit)
+            return replace(self, cohesion=share * self.cohesion, limit=share * self.limit)
         return super().shared(share)
 
 
@@ -203,7 +208,8 @@ class _Shared(Friction):
     """
 
     def __init__(self, whole: Friction, share: float) -> None:
-        self._whole, self._share, self.memory = whole, share, whole.memory
+        self._whole, self._share = whole, share
+        self.memory, self.stiffness = whole.memory, whole.stiffness
 
     @property
     @override
@@ -236,10 +242,12 @@ def as_friction(value: Any) -> Friction:
     """Return a coefficient of friction, or a law, as a law.
 
     Raises:
-        MPMError: It is neither, or a law whose memory does not begin with numbers.
+        MPMError: It is neither, or a law without a stiffness, or whose memory does not begin with
+            numbers.
     """
     if not isinstance(value, Friction):
         return Coulomb(friction=value)
+    as_positive(value.stiffness, f"{value.told[0]}.stiffness")
     if as_finite(value.memory, None) is None:
         raise MPMError(
             f"{value.told[0]}.memory must be a list of finite numbers, not {value.memory!r}."

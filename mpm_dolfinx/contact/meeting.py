@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from petsc4py import PETSc
@@ -15,16 +14,16 @@ from numpy.typing import NDArray
 from ..assembly.petsc import create_vector
 from .approach import Approach
 from .behind import At
-from .contact import Outcome
 from .facets import Closest
 from .law import Friction
+from .memory import FacetMemory, no_memory, spread
 from .nitsche import Spread
+from .outcome import Outcome, untouched
 from .pair_matrices import Met
-from .pass_memory import State, no_memory, spread
 from .stencil import Stencil, Sums, add_tangents, by_stress, remembered
-from .surface import Surface, global_nodes
+from .surface import global_nodes
 
-__all__ = ["Meeting", "untouched"]
+__all__ = ["Meeting"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +64,7 @@ class Meeting:
     of_step: bool
     frozen: bool
 
-    def forces(self) -> tuple[PETSc.Vec, PETSc.Vec]:
+    def forces(self) -> list[PETSc.Vec]:
         """Return the forces on the nodes of both bodies (collective)."""
         around = self.approach.around
         first = around.sides.source.force(self.outcome.traction, which=around.facets)
@@ -74,7 +73,7 @@ class Meeting:
         dofs = around.near.dofs[self.facet].astype(PETSc.IntType)
         second.setValues(dofs.ravel(), values.ravel(), addv=PETSc.InsertMode.ADD_VALUES)
         second.assemble()
-        return first, second
+        return [first, second]
 
     def met(self) -> Met:
         """Return the facets that meet at the points where something acts."""
@@ -105,11 +104,11 @@ class Meeting:
         which, around = self.stencil.which, self.approach.around
         shapes = around.sides.source.shapes
         sums = Sums(
-            -factor * around.weights[which], shapes[which % len(shapes)], group, positions, values
+            factor * around.weights[which], shapes[which % len(shapes)], group, positions, values
         )
         add_tangents(self.law, self.stencil, around.sides.touch, sums)
 
-    def by_stress(self, factor: float) -> tuple[At, Sequence[Spread]]:
+    def by_stress(self, factor: float) -> tuple[At, list[Spread]]:
         """Return points with normals, and how forces on both bodies grow with the stress behind.
 
         Args:
@@ -118,15 +117,15 @@ class Meeting:
         around, near = self.approach.around, self.approach.around.near
         source, which = around.sides.source, self.stencil.which
         normals, forces = by_stress(self.law, self.stencil, around.sides.touch)
-        w = -factor * self.share * around.weights[which]
+        w = factor * self.share * around.weights[which]
         forces = w[:, None, None] * forces
         at = At(around.facets[which // source.nq], which % source.nq, normals)
         numbers, dofs = near.number[self.facet], near.dofs[self.facet]
         others = Spread.over_met(at, numbers, dofs, forces[:, 1:], len(source.layout.cells))
         return at, [Spread.over_facets(source, at, forces[:, 0]), others]
 
-    def state(self, friction: NDArray[np.float64]) -> State:
-        """Return the state of all points, if this is the evaluation of a step.
+    def state(self, friction: NDArray[np.float64]) -> tuple[FacetMemory, Outcome]:
+        """Return what is known of all points, and their outcome, if a step ends with this.
 
         Args:
             friction: What the law of friction has remembered of all points.
@@ -176,14 +175,6 @@ class Meeting:
         )
         x = sides.source.positions()
         rest = no_memory(self.law, x.reshape(-1, x.shape[2]))._replace(friction=friction)
-        base = untouched(sides.source, x)
+        base = untouched(x)
         parts = (spread(one, around.facets, whole) for one, whole in zip(trial, base, strict=True))
-        outcome = Outcome(*parts)
-        return State(rest.with_some(around.which, own), outcome)
-
-
-def untouched(source: Surface, x: NDArray[np.float64]) -> Outcome:
-    """Return the outcome without contact, at positions ``(m, nq, gdim)`` of a surface's points."""
-    shape = len(source.layout.cells), source.nq
-    place, zero, none = x.reshape(*shape, x.shape[-1]), np.zeros(shape), np.zeros(shape, bool)
-    return Outcome(place, np.full(shape, np.inf), zero, np.zeros_like(place), none, none)
+        return rest.with_some(around.which, own), Outcome(*parts)

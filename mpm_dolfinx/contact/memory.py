@@ -1,106 +1,111 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Memory of an obstacle at the points of a body: of a converged step, and of a trial."""
+"""Memory of points at the last converged step: of a shape, and of facets of another body."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .contact import Outcome
-from .law import Begun
+from .facets import Closest
+from .law import Friction, unworn
+from .outcome import Outcome
 from .rotation import Pose
-from .surface import Surface
 
-__all__ = ["Grip", "Memory", "Step"]
-
-
-class Grip(NamedTuple):
-    """How points of a body hold on to an obstacle at a converged step.
-
-    Attributes:
-        surface: Where the points are.
-        touched: Which were in contact, shape ``(m, nq)``.
-        gap: Shape ``(m, nq)``.
-        normal: Normals, shape ``(m, nq, gdim)``.
-        anchor: Their anchors.
-        outcome: What acted.
-        friction: What the law of friction remembers, shape ``(m, nq, k)``.
-    """
-
-    surface: Surface
-    touched: NDArray[np.bool_]
-    gap: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    anchor: NDArray[np.float64]
-    outcome: Outcome
-    friction: NDArray[np.float64]
-
-
-class Step(NamedTuple):
-    """A step of a motion, at some points, in the frame of the shape.
-
-    Attributes:
-        middle: Positions in the middle, shape ``(n, gdim)``.
-        normal: Normals there.
-        begun: How it began.
-        push: Traction by pressure; ``None``: not known yet.
-    """
-
-    middle: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    begun: Begun
-    push: NDArray[np.float64] | None = None
+__all__ = ["FacetMemory", "ShapeMemory", "no_memory", "spread"]
 
 
 @dataclass(frozen=True)
-class Memory:
-    """State of the points at the last converged step.
+class ShapeMemory:
+    """Points that a shape may touch.
 
     Attributes:
         pose: Where the shape was.
-        touched: Which points were in contact, shape ``(m, nq)``.
         anchor: Their anchors, or where points were, in the frame of the shape, ``(m, nq, gdim)``.
-        gap: Shape ``(m, nq)``.
         normal: Normals, in the frame of the shape.
         outcome: What acted.
         friction: What the law of friction remembers, shape ``(m, nq, k)``.
-        works: What was done against pressure and against friction in the step, if there is motion.
-        step: The step of a motion, at all points, by whose middle the forces are.
-        behind: Tractions by the stress behind the facets, where these count, ``(m, nq, gdim)``.
-        facets: Numbers of the facets that were looked at, as nothing acts on others; ``None``: all.
+        facets: Numbers of their facets; ``None``: all.
         exact: Whether all gaps are known, and not only what some are at least.
     """
 
     pose: Pose
-    touched: NDArray[np.bool_]
     anchor: NDArray[np.float64]
-    gap: NDArray[np.float64]
     normal: NDArray[np.float64]
     outcome: Outcome
     friction: NDArray[np.float64]
-    works: tuple[float, float] = (0.0, 0.0)
-    step: Step | None = None
-    behind: NDArray[np.float64] | None = None
     facets: NDArray[np.int64] | None = None
     exact: bool = True
 
-    def numbers(self, here: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the numbers of facets by their places among those that were looked at."""
-        return here if self.facets is None else self.facets[here]
+    @property
+    def gap(self) -> NDArray[np.float64]:
+        """Gaps, shape ``(m, nq)``."""
+        return self.outcome.gap
 
-    def of(self, which: NDArray[np.int64]) -> Memory:
+    def of(self, which: NDArray[np.int64]) -> ShapeMemory:
         """Return the memory of some facets."""
-        return Memory(
+        return ShapeMemory(
             self.pose,
-            self.touched[which],
             self.anchor[which],
-            self.gap[which],
             self.normal[which],
             self.outcome.of(which),
             self.friction[which],
-            facets=which,
+            which,
         )
+
+
+class FacetMemory(NamedTuple):
+    """Points that may meet facets of another body.
+
+    Attributes:
+        touched: Which points were in contact, shape ``(n,)``.
+        facet: Number of the facet of their anchors, or of the closest where they touched nothing,
+            -1 where none was near, shape ``(n,)``.
+        place: Place on it, shape ``(n, gdim - 1)``.
+        closest: Number of the closest facet, shape ``(n,)``.
+        gap: Shape ``(n,)``.
+        within: Which points were behind their facets, shape ``(n,)``.
+        offset: Gap at which each begins to be pressed in a motion, shape ``(n,)``: negative for
+            points that came there from the side and not through a facet, or they would gain energy.
+        points: Where they were, shape ``(n, gdim)``.
+        anchors: Where their anchors were, shape ``(n, gdim)``.
+        friction: What the law of friction remembers, shape ``(n, k)``.
+    """
+
+    touched: NDArray[np.bool_]
+    facet: NDArray[np.int64]
+    place: NDArray[np.float64]
+    closest: NDArray[np.int64]
+    gap: NDArray[np.float64]
+    within: NDArray[np.bool_]
+    offset: NDArray[np.float64]
+    points: NDArray[np.float64]
+    anchors: NDArray[np.float64]
+    friction: NDArray[np.float64]
+
+    def of(self, points: NDArray[np.int64]) -> FacetMemory:
+        """Return the memory of some points."""
+        parts: list[Any] = [part[points] for part in self]
+        return FacetMemory(*parts)
+
+    def with_some(self, points: NDArray[np.int64], known: FacetMemory) -> FacetMemory:
+        """Return the memory of all points where some have another one."""
+        parts: list[Any] = [spread(new, points, old) for new, old in zip(known, self, strict=True)]
+        return FacetMemory(*parts)
+
+
+def no_memory(law: Friction, x: NDArray[np.float64]) -> FacetMemory:
+    """Return the memory of points at x ``(n, gdim)`` that nothing has touched or was near."""
+    n, gdim = x.shape
+    facet, place, gap, near, beside = Closest.none(n, gdim - 1)
+    return FacetMemory(near, facet, place, facet, gap, near, beside, x, x, unworn(law, (n,)))
+
+
+def spread(part: NDArray[Any], which: NDArray[np.int64], base: NDArray[Any]) -> NDArray[Any]:
+    """Return an array with others in some places."""
+    whole = base.copy()
+    whole[which] = part
+    return whole

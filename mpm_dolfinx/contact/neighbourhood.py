@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .facets import Closest, NearFacets
-from .pass_memory import spread
+from .memory import spread
 from .surface import Surface
 
 __all__ = ["Neighbourhood", "Sides"]

@@ -37,7 +37,7 @@ def require_stress(material: PointMaterial | None, what: str) -> None:
 
     Args:
         material: The material of its body.
-        what: The contact.
+        what: The class of the contact.
 
     Raises:
         MPMError: There is none, or it has no stress of the displacement alone.
@@ -45,12 +45,12 @@ def require_stress(material: PointMaterial | None, what: str) -> None:
     instead = "use law='penalty'"
     if material is None:
         raise MPMError(
-            f"law='nitsche' of {what} takes the stress of the body's material, which is in the "
+            f"law='nitsche' of a {what} takes the stress of the body's material, which is in the "
             f"forms of this problem alone; use a QuasiStaticProblem, or {instead}."
         )
     if material.mean_stress is not None:
         raise MPMError(
-            f"law='nitsche' of {what} does not go with mixed='pressure', whose stress depends "
+            f"law='nitsche' of a {what} does not go with mixed='pressure', whose stress depends "
             f"on another field; {instead}, or f_bar='patch'."
         )
 

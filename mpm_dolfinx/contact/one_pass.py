@@ -1,313 +1,213 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Points of one body against facets of another, through steps."""
+"""Points of a body's surface against a target: a shape, or facets of another body."""
 
 from __future__ import annotations
 
-from mpi4py import MPI
+from typing import Any, Protocol
+
+from petsc4py import PETSc
 
 import numpy as np
 from numpy.typing import NDArray
 
-import basix
-
-from .approach import Approach, OverStep
-from .contact import Outcome
-from .facets import Closest
-from .law import Friction, Points
-from .meeting import Meeting, untouched
-from .neighbourhood import Neighbourhood, Sides
-from .nitsche import Nitsche
-from .pass_memory import Memory, State, no_memory, spread
-from .stencil import Start, Stencil, acting
+from .behind import At
+from .law import Friction
+from .nitsche import Nitsche, Spread
+from .outcome import Outcome
+from .pair_matrices import Met
 from .surface import Surface
 
-__all__ = ["Pass"]
+__all__ = ["Evaluation", "Pass"]
 
-#: How near surfaces are looked for, in facets' sizes.
-REACH = 2.0
-#: Residuals of an attempt after which points stay with their facets.
-FREEZE = 12
+type Array = NDArray[np.float64]
 
 
-class Pass:
-    """Points of one body against facets of another, on meshes that stay the same (collective).
+class Evaluation(Protocol):
+    """What acts on points somewhere."""
 
-    In a step it looks at those points alone that may come near to a facet.
+    @property
+    def outcome(self) -> Outcome:
+        """Tractions at the points that were looked at."""
+
+    @property
+    def works(self) -> tuple[float, float]:
+        """Work against pressure and against friction in a step of a motion."""
+
+    def met(self) -> Met:
+        """Return the facets that meet at the points where something acts."""
+
+    def by_stress(self, factor: float) -> tuple[At, list[Spread]]:
+        """Return points with normals, and how forces on bodies grow with the stress behind.
+
+        Args:
+            factor: What forces are multiplied by.
+        """
+
+
+class Pass[State, Found: Evaluation]:
+    """Points of a body's surface against a target, on meshes that stay the same.
 
     Args:
         source: The points.
-        target: The facets.
-        law: Friction, of both passes.
-        penalties: In the normal direction and along the surface.
-        stiffnesses: Of the facets of both, shape ``(m,)`` each.
-        share: Share of what both passes bear.
+        law: The law of friction.
+        penalty: Stiffness in the normal direction, without unit.
+        share: Share of all that bears.
 
     Attributes:
         source: As given.
         share: As given.
         of_step: Whether forces are those of whole steps of a motion.
         stress: The stress behind the points, where that presses.
-        state: The points at the last converged step, and what acted on them.
-        meeting: The last evaluation in a step; ``None``: there is none yet.
+        state: The points at the last converged step.
+        evaluation: The last evaluation in a step; ``None``: there is none yet.
         learned: How often it has learned of other facets.
     """
 
-    def __init__(
-        self,
-        source: Surface,
-        target: Surface,
-        law: Friction,
-        penalties: tuple[float, float],
-        stiffnesses: tuple[NDArray[np.float64], NDArray[np.float64]],
-        share: float,
-    ) -> None:
+    #: What is said of points that are deep in the target from the beginning.
+    WITHIN: str
+
+    state: State
+    _stiffness: Array
+    _normal: Array
+
+    def __init__(self, source: Surface, law: Friction, penalty: float, share: float = 1.0) -> None:
         self.source, self.share = source, share
-        self._law = law.shared(share)  # (pressure has its share by stiffness)
-        self._penalties = penalties
-        self._comm: MPI.Comm = source.particles.mesh.comm
-        self._stiffness = self._normal = self._in_series(*stiffnesses)
-        reach = REACH * max(
-            float(np.median(np.concatenate(self._comm.allgather(surface.sizes))))
-            for surface in (source, target)
-        )
-        body = target.particles
-        facets = len(basix.topology(body.mesh.basix_cell())[target.gdim - 1])
-        number = body.global_index[target.layout.cells] * facets + target.layout.facets
-        self._sides = Sides(source, target, number, reach, self._law.by_area)
+        self._law, self._penalty = law, penalty
         self.of_step = False
         self.stress: Nitsche | None = None
-        self.meeting: Meeting | None = None
-        self.learned, self._evaluations = 0, 0
-        self._paired: Closest | None = None
-        self._around = self._learn(None)
-        self.state, self._approach = self._anew()
+        self.evaluation: Found | None = None
+        self.learned = 0
 
-    def stiffen(self, source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
-        """Take other stiffnesses for what presses (collective)."""
-        self._normal = self._in_series(source, target)
+    def stiffen(self, *stiffnesses: Array) -> None:
+        """Take other stiffnesses for what presses (collective).
 
-    def _in_series(
-        self, source: NDArray[np.float64], target: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the share of both bodies' stiffnesses one behind the other (collective)."""
-        facing = float(np.median(np.concatenate(self._comm.allgather(target))))
-        return self.share / (1.0 / source + 1.0 / facing) if len(source) else source
+        Args:
+            stiffnesses: Of the facets of the points, and of the other body's, shape ``(m,)``.
+        """
+        raise NotImplementedError
 
-    # -- Beginnings -------------------------------------------------------------------------------
+    def _behind(self, facets: NDArray[np.int64] | None, touch: float) -> tuple[Array, Array]:
+        """Return tractions by the stress behind points, and gaps up to which these may press."""
+        assert self.stress is not None
+        some = slice(None) if facets is None else facets
+        behind = self.share * self.stress.tractions(facets).reshape(-1, self.source.gdim)
+        k = np.repeat(self._penalty * self._normal[some], self.source.nq)
+        return behind, touch + np.linalg.norm(behind, axis=1) / k
 
-    def _learn(self, memory: Memory | None) -> Neighbourhood:
-        """Return the facets near the points at the last converged step (collective)."""
-        mine, nodes = (s.own_nodes(converged=True) for s in self._sides[:2])
-        return self._neighbourhood(mine, nodes, memory)
+    # -- What it tells ----------------------------------------------------------------------------
 
-    def _neighbourhood(
-        self, mine: NDArray[np.float64], nodes: NDArray[np.float64], memory: Memory | None
-    ) -> Neighbourhood:
-        self.learned += 1
-        followed = None if memory is None else memory.facet >= 0
-        return Neighbourhood(self._sides, mine, nodes, followed)
+    @property
+    def told(self) -> Outcome:
+        """What acted at the last converged step."""
+        raise NotImplementedError
 
-    def _anew(self) -> tuple[State, Approach]:
-        """Return the state at converged positions, of points that nothing has touched yet."""
-        around, near = self._around, self._around.near
-        at = self.source.positions(converged=True)
-        x = at.reshape(-1, self.source.gdim)
-        whole = no_memory(self._law, x)
-        last = whole.of(around.which)
-        approach = Approach(around, last, last.points, around.before)
-        found = near.closest(
-            last.points, approach.normals(converged=True), around.before, self._sides.reach
-        )
-        numbers = near.numbers(found.facet)
-        within = found.near & (found.gap <= self._sides.touch)
-        known = last._replace(
-            facet=numbers, place=found.place, closest=numbers, gap=found.gap, within=within
-        )
-        base = untouched(self.source, at)
-        gap = np.where(found.near, found.gap, np.inf).reshape(-1, self.source.nq)
-        outcome = base._replace(gap=spread(gap, around.facets, base.gap))
-        return State(whole.with_some(around.which, known), outcome), approach
+    @property
+    def gap(self) -> Array:
+        """Gaps then, shape ``(m, nq)``."""
+        return self.told.gap
 
-    def restore(
-        self,
-        touched: NDArray[np.bool_],
-        anchors: NDArray[np.float64],
-        offset: NDArray[np.float64],
-        friction: NDArray[np.float64] | None = None,
-    ) -> None:
-        """Take what was remembered of points that it knows nothing of yet."""
-        near, memory = self._around.near, self.state.memory
-        nodes, anchors = self._around.before, anchors.reshape(-1, self.source.gdim)
-        which = np.flatnonzero(touched.ravel())
-        numbers, place = memory.facet.copy(), memory.place.copy()
-        found = near.closest(anchors[which], None, nodes, self._sides.reach)
-        there = found.facet >= 0
-        numbers[which[there]] = near.number[found.facet[there]]
-        place[which[there]] = found.place[there]
-        rubbed = memory.friction
-        if friction is not None and friction.shape[2] == rubbed.shape[1]:
-            rubbed = friction.reshape(rubbed.shape)
-        memory = memory._replace(
-            touched=touched.ravel(),
-            facet=numbers,
-            place=place,
-            within=touched.ravel() | memory.within,
-            offset=offset.ravel(),
-            anchors=anchors,
-            friction=rubbed,
-        )
-        self.state = self.state._replace(memory=memory)
+    @property
+    def anchors(self) -> Array:
+        """Anchors then, or where points were that touched nothing, shape ``(m, nq, gdim)``."""
+        raise NotImplementedError
 
-    # -- A step ---------------------------------------------------------------------------------
-
-    def begin(self) -> None:
-        """Learn of the facets near the points as they are (collective)."""
-        self._around = self._learn(self.state.memory)
-        self._paired = self.meeting = None
-        self._evaluations = 0
-
-    def look(self) -> None:
-        """Learn where points and facets are now, and of others where bodies have gone far."""
-        source, memory = self.source, self.state.memory
-        mine, nodes = (s.own_nodes() for s in self._sides[:2])
-        before = self._around
-        if before.is_left(mine, nodes):
-            self._around = self._neighbourhood(mine, nodes, memory)
-            if self._paired is not None:
-                self._paired = self._around.taken_over(self._paired, before)
-        around = self._around
-        x = (source.shapes @ mine[source.layout.own[around.facets]]).reshape(-1, source.gdim)
-        last, corners = memory.of(around.which), around.near.positions(nodes)
-        self._approach = Approach(around, last, x, corners)
-
-    def evaluate(self) -> Meeting:
-        """Return the forces and tractions there (not collective)."""
-        approach, sides, source = self._approach, self._sides, self.source
-        around, x = approach.around, approach.x
-        self._evaluations += 1
-        frozen = self._evaluations > FREEZE
-        paired = self._paired = approach.met(self._paired, frozen)
-        borne = around.weights > 0.0
-        gap = np.where(paired.near, paired.gap, np.inf)
-        within = paired.near & (gap <= sides.touch) & borne
-        behind: NDArray[np.float64] | None = None
-        inside = pressed = within
-        if self.stress is not None:
-            behind = self.share * self.stress.tractions(around.facets).reshape(x.shape)
-            # as far as it may press
-            k = self._penalties[0] * np.repeat(self._normal[around.facets], source.nq)
-            reach = sides.touch + np.linalg.norm(behind, axis=1) / k
-            pressed = paired.near & (paired.gap <= reach) & borne
-        step: OverStep | None = None
-        if self.of_step:
-            step = approach.over_step(paired, within)
-            inside, pressed = step.inside, step.pressed & borne
-        which = np.flatnonzero(pressed)
-        found = paired if step is None else step.found
-        stencil, anchor = self._stencil(which, found, behind, step)
-        shape = (len(around.facets), source.nq)
-        force = np.zeros_like(x)
-        pressure, slips = np.zeros(len(x)), np.zeros(len(x), dtype=bool)
-        pushes, rubs, acts = acting(self._law, stencil, sides.touch)
-        both = pushes + rubs
-        force[which], pressure[which], slips[which] = both[:, 0], acts.pressure, acts.slips
-        if behind is not None:
-            inside = within.copy()
-            inside[which] = acts.inside
-        works = 0.0, 0.0
-        if stencil.start is not None:
-            change = stencil.x[:, : both.shape[1]] - stencil.start.x
-            w = around.weights[which]
-            done = [-float(w @ (part * change).sum(axis=(1, 2))) for part in (pushes, rubs)]
-            works = done[0], done[1]
-        outcome = Outcome(
-            x.reshape(*shape, x.shape[-1]),
-            gap.reshape(shape),
-            pressure.reshape(shape),
-            force.reshape(*shape, x.shape[-1]),
-            inside.reshape(shape),
-            slips.reshape(shape),
-        )
-        self.meeting = Meeting(
-            law=self._law,
-            share=self.share,
-            approach=approach,
-            found=paired,
-            within=within,
-            offset=np.zeros(len(x)) if step is None else step.offset,
-            stencil=stencil,
-            facet=found.facet[which],
-            anchor=anchor,
-            outcome=outcome,
-            shear=acts.shear,
-            reaction=both[:, 1:],
-            works=works,
-            of_step=self.of_step,
-            frozen=frozen,
-        )
-        return self.meeting
-
-    def _stencil(
-        self,
-        which: NDArray[np.int64],
-        found: Closest,
-        behind: NDArray[np.float64] | None,
-        step: OverStep | None,
-    ) -> tuple[Stencil, NDArray[np.int64]]:
-        """Return the quantities that tractions at points depend on, and the anchors' facets."""
-        approach, memory = self._approach, self._approach.last
-        around, near = approach.around, approach.around.near
-        x, nodes = approach.x, approach.nodes
-        facet = found.facet[which]
-        anchor = near.find(memory.facet[which])
-        lost = anchor < 0
-        # what has come from where nothing was near has no anchor yet
-        anchor = np.where(lost, facet, anchor)
-        anchored = np.where(lost[:, None], found.place[which], memory.place[which])
-        parts = [x[which][:, None], nodes[facet]]
-        if not self._law.smooth:
-            parts.append(nodes[anchor])
-        own = around.facets[which // self.source.nq]
-        points = Points(
-            self._penalties[0] * self._normal[own],
-            np.where(lost, 0.0, self._penalties[1] * self._stiffness[own]),
-            memory.touched[which] | lost,
-            np.zeros((len(which), 0)),
-            np.where(lost, 0.0, memory.gap[which]),
-            around.stretch[which],
-            memory.friction[which],
-        )
-        start = None
-        if step is not None:
-            before = np.concatenate([memory.points[which][:, None], around.before[facet]], axis=1)
-            middle = 0.5 * (before + np.concatenate(parts[:2], axis=1))
-            place = near.project(middle[:, 0], middle[:, 1:], found.place[which])
-            start = Start(before, near.tabulate(place), step.gap[which], step.begins[which])
-        stencil = Stencil(
-            which,
-            found.place[which],
-            near.tabulate(found.place[which]),
-            near.tabulate(anchored)[0],
-            np.concatenate(parts, axis=1),
-            points,
-            near.outward[facet],
-            start,
-            None if behind is None else behind[which],
-        )
-        return stencil, anchor
+    @property
+    def rubbed(self) -> Array:
+        """Memory of the law of friction, shape ``(n, k)``."""
+        raise NotImplementedError
 
     def touches(self) -> bool:
         """Return whether any point of this rank touches, or has (not collective)."""
-        inside = self.meeting is not None and self.meeting.outcome.inside.any()
-        return bool(inside or self.state.memory.touched.any())
+        now = self.evaluation is not None and self.evaluation.outcome.inside.any()
+        return bool(now or self.told.inside.any())
 
-    def leaks(self) -> bool:
-        """Return whether a point has gone through the other body since the last step."""
-        assert self._paired is not None
-        return self._approach.leaks(self._approach.last, self._paired)
+    # -- A step ---------------------------------------------------------------------------------
+
+    def prepare(self) -> None:
+        """Prepare a step, or another try of it."""
+
+    def begin(self) -> None:
+        """Begin a step that was prepared, before it is evaluated first (collective)."""
+
+    def look(self) -> None:
+        """Learn where points and target are now (collective)."""
+
+    def evaluate(self) -> None:
+        """Evaluate what acts there (not collective)."""
+        raise NotImplementedError
+
+    def forces(self, factor: float) -> list[PETSc.Vec]:
+        """Return forces on the nodes of the points' body, and of the other one (collective).
+
+        Args:
+            factor: What they are multiplied by.
+        """
+        raise NotImplementedError
+
+    def add_tangents(
+        self,
+        factor: float,
+        secants: bool,
+        group: NDArray[np.int64],
+        positions: NDArray[np.int32],
+        values: Array,
+    ) -> None:
+        """Add the derivatives of the forces to blocks; see :class:`Sums`.
+
+        Args:
+            factor: What they are multiplied by.
+            secants: Whether points that have changed their slip may take secants instead.
+            group: Group of each point where something acts.
+            positions: Blocks of each group.
+            values: The blocks.
+        """
+        raise NotImplementedError
 
     def after(self) -> State:
-        """Return the state after the last evaluation, if it is that of a step."""
-        assert self.meeting is not None
-        return self.meeting.state(self.state.memory.friction)
+        """Return the state after the last evaluation.
+
+        Raises:
+            ConvergenceError: Points have gone through the target in the step.
+        """
+        raise NotImplementedError
+
+    def roll_back(self) -> None:
+        """Return to the last converged step."""
+        self.evaluation = None
+
+    # -- What is kept ---------------------------------------------------------------------------
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Return what is kept of the points, each of shape ``(m, nq, ...)``."""
+        told = self.told
+        kept: dict[str, NDArray[Any]] = {
+            "touches": told.inside,
+            "slips": told.slips,
+            "pressure": told.pressure,
+            "traction": told.traction,
+            "anchor": self.anchors,
+        }
+        if self._law.memory:
+            kept["friction"] = self.rubbed.reshape(*told.gap.shape, len(self._law.memory))
+        return kept
+
+    def restore(self, columns: dict[str, NDArray[Any]]) -> None:
+        """Take what was kept of points of which nothing is known yet."""
+        raise NotImplementedError
+
+
+def retold(outcome: Outcome, columns: dict[str, NDArray[Any]]) -> Outcome:
+    """Return an outcome with what was kept of it."""
+    return outcome._replace(
+        inside=columns["touches"],
+        slips=columns["slips"],
+        pressure=columns["pressure"],
+        traction=columns["traction"],
+    )
+
+
+def worn(kept: NDArray[np.float64] | None, new: Array) -> Array:
+    """Return a memory of friction as it was kept, where that is one of the same law."""
+    known = kept is not None and kept.shape[2] == new.shape[-1]
+    return np.asarray(kept).reshape(new.shape) if known else new

@@ -1,10 +1,10 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Matrices between the nodes of two bodies whose facets meet, each pair of nodes once.
+"""Matrices between the nodes of bodies whose facets are touched, each pair of nodes once.
 
-Points of a facet meet facets of the other body, and remember anchors on others. Their derivatives
-are added to blocks between nodes; where a block is, depends on the three facets alone, so that
-points have it in groups.
+Points of a facet meet a shape, or facets of another body, and remember anchors on others. Their
+derivatives are added to blocks between nodes; where a block is, depends on these facets alone, so
+that points have it in groups.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Met(NamedTuple):
     """Facets that meet at the points of a pass.
 
     Attributes:
-        facets: Numbers of the point's facet, of the one that it meets, and where there is friction
-            of that of its anchor, shape ``(n, 2)`` or ``(n, 3)``.
+        facets: Numbers of the point's facet, of the one of another body that it meets, and where
+            there is friction of that of its anchor, shape ``(n, 1)``, ``(n, 2)`` or ``(n, 3)``.
         nodes: Global nodes of each of these, shapes ``(n, k)``.
     """
 
@@ -47,10 +47,10 @@ class Met(NamedTuple):
 
 
 class PairMatrices:
-    """Matrices on W of two bodies, whose patterns grow as facets come to meet others.
+    """Matrices on W of one body or two, whose patterns grow as facets come to be touched.
 
     Args:
-        spaces: W of both bodies.
+        spaces: W of the bodies.
 
     Attributes:
         values: Their blocks, shape ``(b, gdim, gdim)``, to be added to: see :meth:`groups`.
@@ -62,7 +62,8 @@ class PairMatrices:
         self._gdim: int = spaces[0].mesh.geometry.dim
         self._known: list[Met] = []
         self._matrices: dict[tuple[int, int], PETSc.Mat] = {}
-        self._counts = dict.fromkeys([(i, j) for i in (0, 1) for j in (0, 1)], 0)
+        sides = range(len(spaces))
+        self._counts = dict.fromkeys([(i, j) for i in sides for j in sides], 0)
         self._positions: list[NDArray[np.int32]] = []
         self.values = np.zeros((0, self._gdim, self._gdim))
 
@@ -101,7 +102,7 @@ class PairMatrices:
 
     def _make(self) -> None:
         """Find the blocks between all nodes of facets that have met (collective)."""
-        seen: list[list[NDArray[np.int64]]] = [[], []]
+        seen: list[list[NDArray[np.int64]]] = [[] for _ in self._sizes]
         for number, known in enumerate(self._known):
             for side, nodes in enumerate(known.nodes):
                 seen[number if side == 0 else 1 - number].append(nodes.ravel())
@@ -186,6 +187,8 @@ def _sides(
         return np.searchsorted(names[body], nodes).astype(np.int32)
 
     mine = slice(0, size), numbered(number, own)
+    if not other:
+        return {number: mine}, {number: mine}
     rows = slice(size, None), numbered(1 - number, other[0])
     columns = slice(size, None), numbered(1 - number, np.concatenate(other, axis=1))
     return {number: mine, 1 - number: rows}, {number: mine, 1 - number: columns}

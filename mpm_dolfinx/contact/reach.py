@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .memory import Memory
+from .memory import ShapeMemory
 from .rotation import Pose
 from .shapes import Shape
 from .surface import Surface
@@ -39,7 +39,7 @@ class Near(NamedTuple):
         margin: How far points may come nearer until others could touch.
     """
 
-    memory: Memory
+    memory: ShapeMemory
     nodes: NDArray[np.float64]
     radius: float
     margin: float
@@ -62,7 +62,7 @@ class Reach:
         """Take all facets for near, until they are looked for."""
         self._near = self._wider = None
 
-    def look(self, memory: Memory) -> None:
+    def look(self, memory: ShapeMemory) -> None:
         """Note which facets may touch in a step, and what others may move until they could.
 
         Args:
@@ -70,7 +70,7 @@ class Reach:
         """
         self._near, self._wider = self._within(memory, 0.0), None
 
-    def of(self, memory: Memory, pose: Pose) -> Memory | None:
+    def of(self, memory: ShapeMemory, pose: Pose) -> ShapeMemory | None:
         """Return the memory of facets that may touch at the present positions; ``None``: all.
 
         Args:
@@ -87,21 +87,7 @@ class Reach:
         wider = self._wider
         return wider.memory if wider is not None and moved < wider.margin else None
 
-    def known(self, trial: Memory, memory: Memory) -> Memory:
-        """Return the memory of the facets that were looked at in a trial.
-
-        Args:
-            trial: The trial.
-            memory: What is known of all facets.
-        """
-        if trial.facets is None:
-            return memory
-        for near in (self._near, self._wider):
-            if near is not None and near.memory.facets is trial.facets:
-                return near.memory
-        return memory.of(trial.facets)
-
-    def _within(self, memory: Memory, distance: float) -> Near | None:
+    def _within(self, memory: ShapeMemory, distance: float) -> Near | None:
         """Return the facets that are within a distance, or some domains; ``None``: nearly all."""
         surface, shape = self._surface, self._shape
         if not shape.measures or memory.gap.size == 0:
@@ -118,7 +104,7 @@ class Reach:
         margin = float(memory.gap[~near].min()) - surface.touch
         return Near(memory.of(which), nodes, radius, margin)
 
-    def _approach(self, near: Near, memory: Memory, pose: Pose) -> float:
+    def _approach(self, near: Near, memory: ShapeMemory, pose: Pose) -> float:
         """Return by how much points have come nearer to the obstacle in the step at most."""
         shifted = float(np.linalg.norm(pose.offset - memory.pose.offset))
         turned = float(np.linalg.norm(pose.Q - memory.pose.Q, 2)) * near.radius
@@ -127,7 +113,7 @@ class Reach:
         return self._surface.spread * (moved + turned) + shifted
 
 
-def is_near(memory: Memory, surface: Surface, distance: float = 0.0) -> NDArray[np.bool_]:
+def is_near(memory: ShapeMemory, surface: Surface, distance: float = 0.0) -> NDArray[np.bool_]:
     """Return which facets of a surface are near to an obstacle, shape ``(m,)``.
 
     Args:

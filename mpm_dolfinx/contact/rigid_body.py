@@ -32,6 +32,7 @@ from ..parallel.given import as_positive, require_same
 from ..particles.particles import Particles
 from ..system.term import PointMaterial, Term
 from .body_contact import BodyContact
+from .contact import KeptContact
 from .driven import Driven, KeptMotion
 from .law import Friction
 from .placed import Placed
@@ -292,6 +293,6 @@ class RigidBody(Driven):
     def kept(self) -> Sequence[Kept]:
         of_contacts = self.name or f"contact{self._number}"
         return [
-            *(one.remembered(f"{of_contacts}_{i}") for i, one in enumerate(self.contacts)),
+            *(KeptContact(one, f"{of_contacts}_{i}") for i, one in enumerate(self.contacts)),
             KeptMotion(self._motion, self.own, self.name or f"rigid_body{self._number}"),
         ]

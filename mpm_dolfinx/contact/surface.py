@@ -157,6 +157,7 @@ class Surface:
     Attributes:
         particles: As given.
         axisymmetric: As given.
+        what: As given.
         nq: Number of points on each facet.
         element: The basix element of a facet.
         shapes: Its shape functions at the points, shape ``(nq, k)``.
@@ -182,6 +183,7 @@ class Surface:
         require_truth(f"axisymmetric of {what}", axisymmetric)
         self.particles = particles
         self.axisymmetric = axisymmetric
+        self.what = what
         self._where = Facets(particles, facet_tags, tag, what)
         self._space: fem.FunctionSpace | None = None
         body, whole = particles.mesh, particles.W.ufl_element().basix_element

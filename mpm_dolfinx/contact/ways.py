@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .memory import Memory
+from .memory import ShapeMemory
 from .placed import framed
 from .rotation import Pose
 from .shapes import Shape
@@ -40,7 +40,7 @@ OPPOSITE, OPPOSITE_FREE = -0.5, -0.1
 
 
 def passes(
-    shape: Shape, surface: Surface, memory: Memory, x: NDArray[np.float64], pose: Pose
+    shape: Shape, surface: Surface, memory: ShapeMemory, x: NDArray[np.float64], pose: Pose
 ) -> bool:
     """Return whether points get deep into an obstacle, or through it, on a straight way.
 

@@ -300,7 +300,7 @@ def test_a_collision_is_the_same_on_any_number_of_ranks():
 
 def test_the_account_closes_where_points_have_stayed_with_their_facets(monkeypatch):
     # the forces of a step are those that were in balance, not those of facets looked for again
-    monkeypatch.setattr("mpm_dolfinx.contact.one_pass.FREEZE", 1)
+    monkeypatch.setattr("mpm_dolfinx.contact.facet_pass.FREEZE", 1)
     problem, touch = colliding(0.3, scheme="euler", out_of_range="project")
     pushed = 0
     for _ in problem.steps(time=0.4, dt=0.04):

@@ -75,7 +75,7 @@ def test_a_new_contact_knows_the_undeformed_areas_of_a_body_that_was_rebased(axi
     new = contact.Rigid(problem.particles, contact.disc((9.0, 9.0), 0.1), **options)
     problem.stage(terms=[disc, new])
     np.testing.assert_allclose(new.area, disc.area, rtol=1e-9)
-    stiffness = [one.remembered("a").columns(0)["thickness"].values for one in (new, disc)]
+    stiffness = [one.kept()[0].columns(0)["thickness"].values for one in (new, disc)]
     np.testing.assert_allclose(*stiffness, rtol=1e-9)
 
 
@@ -92,7 +92,7 @@ def test_a_new_contact_knows_the_boundary_of_a_body_that_was_split():
         upper = contact.Rigid(problem.particles, far, facet_tags=top, tag=1)
         problem.stage(terms=[disc, new, upper])
         for name, one, length in (("disc", disc, 7.2), ("new", new, 7.2), ("upper", upper, 2.6)):
-            columns = one.remembered(name).columns(0)
+            columns = one.kept()[0].columns(0)
             area, height = columns["area"].values, columns["thickness"].values
             assert WORLD.allreduce(area.sum()) == pytest.approx(length, rel=1e-12)
             behind = WORLD.allreduce((area * height).sum())

@@ -417,7 +417,10 @@ def test_a_body_that_nothing_holds_yet_is_no_false_verdict():
         ({"friction": -0.1}, "friction must be a number from 0"),
         ({"penalty": 0.0}, "penalty must be a positive number"),
         ({"modulus": -1.0}, "modulus must be a positive number"),
-        ({"tangential_penalty": "1"}, "tangential_penalty must be a positive number"),
+        (
+            {"friction": contact.Coulomb(stiffness="1")},
+            "Coulomb.stiffness must be a positive number",
+        ),
         ({"quadrature_degree": -1}, "whole number from 0 to 100, not -1"),
         ({"quadrature_degree": True}, "whole number from 0 to 100, not True"),
         ({"quadrature_degree": 1000}, "whole number from 0 to 100, not 1000"),

@@ -33,7 +33,7 @@ from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import materials
-from mpm_dolfinx.contact import one_pass
+from mpm_dolfinx.contact import facet_pass
 
 LOAD = 1e-6
 
@@ -501,7 +501,7 @@ def test_it_goes_on_where_particles_leave_and_over_stages():
 
 def test_contact_that_changes_facets_after_a_step(monkeypatch):
     """Points kept to facets of a step's beginning, which they leave, share their forces anew."""
-    monkeypatch.setattr(one_pass, "FREEZE", 0)
+    monkeypatch.setattr(facet_pass, "FREEZE", 0)
     ground = mpm.Particles(box([0.0, -0.5], [2.0, 0.0], [8, 2], QUADRILATERAL))
     block = mpm.Particles(box([0.3, 0.0], [0.9, 0.4], [3, 2], QUADRILATERAL))
     moved = fem.Constant(block.mesh, (0.0, 0.0))

@@ -1,0 +1,356 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Points of one body against facets of another, through steps."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, override
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+from numpy.typing import NDArray
+
+import basix
+
+from ..errors import ConvergenceError
+from .approach import Approach, OverStep
+from .facets import Closest
+from .law import Friction, Points
+from .meeting import Meeting
+from .memory import FacetMemory, no_memory, spread
+from .neighbourhood import Neighbourhood, Sides
+from .one_pass import Pass, retold, worn
+from .outcome import Outcome, untouched
+from .stencil import Start, Stencil, acting
+from .surface import Surface
+
+__all__ = ["FacetPass"]
+
+#: How near surfaces are looked for, in facets' sizes.
+REACH = 2.0
+#: Residuals of an attempt after which points stay with their facets.
+FREEZE = 12
+
+
+type Array = NDArray[np.float64]
+
+
+class State(NamedTuple):
+    """Points at the last converged step.
+
+    Attributes:
+        memory: What is known of all of them.
+        outcome: What acted on them.
+    """
+
+    memory: FacetMemory
+    outcome: Outcome
+
+
+class FacetPass(Pass[State, Meeting]):
+    """Points of one body against facets of another, on meshes that stay the same (collective).
+
+    In a step it looks at those points alone that may come near to a facet.
+
+    Args:
+        source: The points.
+        target: The facets.
+        law: Friction, of both passes.
+        penalty: Stiffness in the normal direction, without unit.
+        stiffnesses: Of the facets of both, shape ``(m,)`` each.
+        share: Share of what both passes bear.
+    """
+
+    WITHIN = (
+        "The bodies of a Pair overlap at the beginning: {particles} are up to {depth:.3g} deep in "
+        "the other body; move the bodies apart."
+    )
+
+    def __init__(
+        self,
+        source: Surface,
+        target: Surface,
+        law: Friction,
+        penalty: float,
+        stiffnesses: tuple[Array, Array],
+        share: float,
+    ) -> None:
+        super().__init__(source, law.shared(share), penalty, share)  # (pressure by stiffness)
+        self._comm: MPI.Comm = source.particles.mesh.comm
+        self._stiffness = self._normal = self._in_series(*stiffnesses)
+        reach = REACH * max(
+            float(np.median(np.concatenate(self._comm.allgather(surface.sizes))))
+            for surface in (source, target)
+        )
+        body = target.particles
+        facets = len(basix.topology(body.mesh.basix_cell())[target.gdim - 1])
+        number = body.global_index[target.layout.cells] * facets + target.layout.facets
+        self._sides = Sides(source, target, number, reach, self._law.by_area)
+        self._evaluations = 0
+        self._paired: Closest | None = None
+        self._around = self._learn(None)
+        self.state, self._approach = self._anew()
+
+    @override
+    def stiffen(self, *stiffnesses: Array) -> None:
+        self._normal = self._in_series(*stiffnesses)
+
+    def _in_series(self, source: Array, target: Array) -> Array:
+        """Return the share of both bodies' stiffnesses one behind the other (collective)."""
+        facing = float(np.median(np.concatenate(self._comm.allgather(target))))
+        return self.share / (1.0 / source + 1.0 / facing) if len(source) else source
+
+    # -- What it tells ----------------------------------------------------------------------------
+
+    @property
+    @override
+    def told(self) -> Outcome:
+        return self.state.outcome
+
+    @property
+    @override
+    def anchors(self) -> Array:
+        return self.state.memory.anchors.reshape(self.told.positions.shape)
+
+    @property
+    @override
+    def rubbed(self) -> Array:
+        return self.state.memory.friction
+
+    # -- Beginnings -------------------------------------------------------------------------------
+
+    def _learn(self, memory: FacetMemory | None) -> Neighbourhood:
+        """Return the facets near the points at the last converged step (collective)."""
+        mine, nodes = (s.own_nodes(converged=True) for s in self._sides[:2])
+        return self._neighbourhood(mine, nodes, memory)
+
+    def _neighbourhood(
+        self, mine: NDArray[np.float64], nodes: NDArray[np.float64], memory: FacetMemory | None
+    ) -> Neighbourhood:
+        self.learned += 1
+        followed = None if memory is None else memory.facet >= 0
+        return Neighbourhood(self._sides, mine, nodes, followed)
+
+    def _anew(self) -> tuple[State, Approach]:
+        """Return the state at converged positions, of points that nothing has touched yet."""
+        around, near = self._around, self._around.near
+        at = self.source.positions(converged=True)
+        x = at.reshape(-1, self.source.gdim)
+        whole = no_memory(self._law, x)
+        last = whole.of(around.which)
+        approach = Approach(around, last, last.points, around.before)
+        found = near.closest(
+            last.points, approach.normals(converged=True), around.before, self._sides.reach
+        )
+        numbers = near.numbers(found.facet)
+        within = found.near & (found.gap <= self._sides.touch)
+        known = last._replace(
+            facet=numbers, place=found.place, closest=numbers, gap=found.gap, within=within
+        )
+        base = untouched(at)
+        gap = np.where(found.near, found.gap, np.inf).reshape(-1, self.source.nq)
+        outcome = base._replace(gap=spread(gap, around.facets, base.gap))
+        return State(whole.with_some(around.which, known), outcome), approach
+
+    # -- What is kept ---------------------------------------------------------------------------
+
+    @override
+    def columns(self) -> dict[str, NDArray[Any]]:
+        offset = self.state.memory.offset.reshape(self.told.gap.shape)
+        return super().columns() | {"offset": offset}
+
+    @override
+    def restore(self, columns: dict[str, NDArray[Any]]) -> None:
+        near, memory = self._around.near, self.state.memory
+        touched = columns["touches"].ravel()
+        anchors = columns["anchor"].reshape(-1, self.source.gdim)
+        which = np.flatnonzero(touched)
+        numbers, place = memory.facet.copy(), memory.place.copy()
+        found = near.closest(anchors[which], None, self._around.before, self._sides.reach)
+        there = found.facet >= 0
+        numbers[which[there]] = near.number[found.facet[there]]
+        place[which[there]] = found.place[there]
+        known = memory._replace(
+            touched=touched,
+            facet=numbers,
+            place=place,
+            within=touched | memory.within,
+            offset=columns["offset"].ravel(),
+            anchors=anchors,
+            friction=worn(columns.get("friction"), memory.friction),
+        )
+        self.state = State(known, retold(self.state.outcome, columns))
+
+    # -- A step ---------------------------------------------------------------------------------
+
+    @override
+    def begin(self) -> None:
+        """Learn of the facets near the points as they are (collective)."""
+        self._around = self._learn(self.state.memory)
+        self._paired = self.evaluation = None
+        self._evaluations = 0
+
+    @override
+    def look(self) -> None:
+        """Learn where points and facets are now, and of others where bodies have gone far."""
+        source, memory = self.source, self.state.memory
+        mine, nodes = (s.own_nodes() for s in self._sides[:2])
+        before = self._around
+        if before.is_left(mine, nodes):
+            self._around = self._neighbourhood(mine, nodes, memory)
+            if self._paired is not None:
+                self._paired = self._around.taken_over(self._paired, before)
+        around = self._around
+        x = (source.shapes @ mine[source.layout.own[around.facets]]).reshape(-1, source.gdim)
+        last, corners = memory.of(around.which), around.near.positions(nodes)
+        self._approach = Approach(around, last, x, corners)
+
+    @override
+    def evaluate(self) -> None:
+        approach, sides, source = self._approach, self._sides, self.source
+        around, x = approach.around, approach.x
+        self._evaluations += 1
+        frozen = self._evaluations > FREEZE
+        paired = self._paired = approach.met(self._paired, frozen)
+        borne = around.weights > 0.0
+        gap = np.where(paired.near, paired.gap, np.inf)
+        within = paired.near & (gap <= sides.touch) & borne
+        behind: NDArray[np.float64] | None = None
+        inside = pressed = within
+        if self.stress is not None:
+            behind, reach = self._behind(around.facets, sides.touch)
+            pressed = paired.near & (paired.gap <= reach) & borne
+        step: OverStep | None = None
+        if self.of_step:
+            step = approach.over_step(paired, within)
+            inside, pressed = step.inside, step.pressed & borne
+        which = np.flatnonzero(pressed)
+        found = paired if step is None else step.found
+        stencil, anchor = self._stencil(which, found, behind, step)
+        shape = (len(around.facets), source.nq)
+        force = np.zeros_like(x)
+        pressure, slips = np.zeros(len(x)), np.zeros(len(x), dtype=bool)
+        pushes, rubs, acts = acting(self._law, stencil, sides.touch)
+        both = pushes + rubs
+        force[which], pressure[which], slips[which] = both[:, 0], acts.pressure, acts.slips
+        if behind is not None:
+            inside = within.copy()
+            inside[which] = acts.inside
+        works = 0.0, 0.0
+        if stencil.start is not None:
+            change = stencil.x[:, : both.shape[1]] - stencil.start.x
+            w = around.weights[which]
+            done = [-float(w @ (part * change).sum(axis=(1, 2))) for part in (pushes, rubs)]
+            works = done[0], done[1]
+        outcome = Outcome(
+            x.reshape(*shape, x.shape[-1]),
+            gap.reshape(shape),
+            pressure.reshape(shape),
+            force.reshape(*shape, x.shape[-1]),
+            inside.reshape(shape),
+            slips.reshape(shape),
+        )
+        self.evaluation = Meeting(
+            law=self._law,
+            share=self.share,
+            approach=approach,
+            found=paired,
+            within=within,
+            offset=np.zeros(len(x)) if step is None else step.offset,
+            stencil=stencil,
+            facet=found.facet[which],
+            anchor=anchor,
+            outcome=outcome,
+            shear=acts.shear,
+            reaction=both[:, 1:],
+            works=works,
+            of_step=self.of_step,
+            frozen=frozen,
+        )
+
+    def _stencil(
+        self,
+        which: NDArray[np.int64],
+        found: Closest,
+        behind: NDArray[np.float64] | None,
+        step: OverStep | None,
+    ) -> tuple[Stencil, NDArray[np.int64]]:
+        """Return the quantities that tractions at points depend on, and the anchors' facets."""
+        approach, memory = self._approach, self._approach.last
+        around, near = approach.around, approach.around.near
+        x, nodes = approach.x, approach.nodes
+        facet = found.facet[which]
+        anchor = near.find(memory.facet[which])
+        lost = anchor < 0
+        # what has come from where nothing was near has no anchor yet
+        anchor = np.where(lost, facet, anchor)
+        anchored = np.where(lost[:, None], found.place[which], memory.place[which])
+        parts = [x[which][:, None], nodes[facet]]
+        if not self._law.smooth:
+            parts.append(nodes[anchor])
+        own = around.facets[which // self.source.nq]
+        points = Points(
+            self._penalty * self._normal[own],
+            np.where(lost, 0.0, self._law.stiffness * self._stiffness[own]),
+            memory.touched[which] | lost,
+            np.zeros((len(which), 0)),
+            np.where(lost, 0.0, memory.gap[which]),
+            around.stretch[which],
+            memory.friction[which],
+        )
+        start = None
+        if step is not None:
+            before = np.concatenate([memory.points[which][:, None], around.before[facet]], axis=1)
+            middle = 0.5 * (before + np.concatenate(parts[:2], axis=1))
+            place = near.project(middle[:, 0], middle[:, 1:], found.place[which])
+            start = Start(before, near.tabulate(place), step.gap[which], step.begins[which])
+        stencil = Stencil(
+            which,
+            found.place[which],
+            near.tabulate(found.place[which]),
+            near.tabulate(anchored)[0],
+            np.concatenate(parts, axis=1),
+            points,
+            near.outward[facet],
+            start,
+            None if behind is None else behind[which],
+        )
+        return stencil, anchor
+
+    @override
+    def forces(self, factor: float) -> list[PETSc.Vec]:
+        if self.evaluation is None:
+            self.evaluate()
+        assert self.evaluation is not None
+        found = self.evaluation.forces()
+        for force in found:
+            force.scale(factor)
+        return found
+
+    @override
+    def add_tangents(
+        self,
+        factor: float,
+        secants: bool,
+        group: NDArray[np.int64],
+        positions: NDArray[np.int32],
+        values: Array,
+    ) -> None:
+        assert self.evaluation is not None
+        self.evaluation.add_tangents(factor, group, positions, values)
+
+    @override
+    def after(self) -> State:
+        """Return the state after the last evaluation.
+
+        Raises:
+            ConvergenceError: One body has gone through the other.
+        """
+        assert self.evaluation is not None and self._paired is not None
+        if self._approach.leaks(self._paired):
+            raise ConvergenceError(
+                "A body goes through the other one of a Pair in one step; take smaller steps"
+            )
+        return State(*self.evaluation.state(self.state.memory.friction))
