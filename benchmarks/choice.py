@@ -157,9 +157,7 @@ def stacked(solver: str, n: int, friction: float) -> Made:
     top.geometry.x[:, 2] += 2.0
     bodies = [mpm.Particles(base, lower), mpm.Particles(top, upper)]
     tags = [tagged(base, 2, 2.0), tagged(top, 2, 2.0, 4.0)]
-    touch = mpm.contact.Pair(
-        bodies[1], bodies[0], friction, facet_tags=[tags[1], tags[0]], tags=(1, 1)
-    )
+    touch = mpm.contact.Pair(bodies[1], bodies[0], friction, facets=[(tags[1], 1), (tags[0], 1)])
     walls = [(0, 0.0), (1, 0.0)]
     problem = mpm.QuasiStaticProblem(
         [

@@ -73,7 +73,7 @@ outline = [(0, tip), (R, shoulder), (R, 20 * R), (-R, 20 * R), (-R, shoulder)]
 steel = mpm.contact.polygon(outline, radius=0.3 * R)
 hole, ground = mpm.region(x=h), mpm.region(y=0.0)
 free = mpm.facet_tags(clay.mesh, {1: lambda x: hole(x) | ground(x)})
-look = {"facet_tags": free, "tag": 1, "axisymmetric": True, "modulus": 4 * G}
+look = {"facets": (free, 1), "axisymmetric": True, "modulus": 4 * G}
 adheres = mpm.contact.Coulomb(cohesion=adhesion, stiffness=0.1)
 pile = mpm.contact.Rigid(clay, steel, adheres, **look)
 problem = mpm.QuasiStaticProblem(

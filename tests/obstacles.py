@@ -113,7 +113,7 @@ def hertz(n, penalty, steps, depth=0.0108, law="penalty"):
     particles = mpm.Particles(graded(x, y, 2), V)
     top = scenes.facet_tags(particles.mesh, scenes.at(1, 0.0))
     disc = contact.disc((0.0, radius), radius)
-    die = contact.Rigid(particles, disc, facet_tags=top, tag=1, penalty=penalty, law=law)
+    die = contact.Rigid(particles, disc, facets=(top, 1), penalty=penalty, law=law)
     problem = mpm.QuasiStaticProblem(
         mpm.Body(particles, LinearElastic(1e3, POISSON)),
         bcs=[scenes.fix(V, scenes.at(0, 0.0), component=0), scenes.fix(V, scenes.at(1, y[0]))],

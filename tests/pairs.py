@@ -31,7 +31,7 @@ def spaces(lower, upper, n, count=2, comm=WORLD, degree=1):
     return [scenes.vectors(domain, degree) for _ in range(count)]
 
 
-def patch(passes, degree, tilt=30.0, cells=(QUADRILATERAL, QUADRILATERAL), n=(9, 5), law="penalty"):
+def patch(passes, tilt=30.0, cells=(QUADRILATERAL, QUADRILATERAL), n=(9, 5), law="penalty"):
     """Return two blocks, one on the other, under a uniform pressure; the largest stress error."""
     origin = (0.53, 0.31)
     Va, Vb = spaces([-1.0, -1.0], [4.0, 4.0], [20, 20])
@@ -46,9 +46,7 @@ def patch(passes, degree, tilt=30.0, cells=(QUADRILATERAL, QUADRILATERAL), n=(9,
         for body, V in ((upper, Va), (lower, Vb))
     )
     c, s = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
-    touch = contact.Pair(
-        a, b, facet_tags=tags, tags=(1, 1), passes=passes, quadrature_degree=degree, law=law
-    )
+    touch = contact.Pair(a, b, facets=[(one, 1) for one in tags], passes=passes, law=law)
     problem = mpm.QuasiStaticProblem(
         [
             mpm.Body(
@@ -111,9 +109,7 @@ def hertz(passes, order, n=8, ratio=1.3, moduli=(YOUNG, YOUNG), **options):
         bodies.append(particles)
         tags.append(scenes.facet_tags(particles.mesh, low, scenes.at(1, sign * end)))
     a, b = (bodies[i] for i in order)
-    touch = contact.Pair(
-        a, b, facet_tags=[tags[i] for i in order], tags=(1, 1), passes=passes, **options
-    )
+    touch = contact.Pair(a, b, facets=[(tags[i], 1) for i in order], passes=passes, **options)
     motion = fem.Constant(bodies[0].mesh, (0.0, -0.0135))
     supports = [
         mpm.boundary.fixed(bodies[0], tags[0], 2, value=motion),
@@ -156,7 +152,7 @@ def two(
         method=method,
     )
     if tags_of is not None:
-        options |= {"facet_tags": tags_of(a.mesh, b.mesh), "tags": (1, 1)}
+        options["facets"] = [(one, 1) for one in tags_of(a.mesh, b.mesh)]
     touch = contact.Pair(a, b, friction, **options)
     top = fem.locate_dofs_geometrical(Va, lambda x: x[1] > 1.39)
     base = fem.locate_dofs_geometrical(Vb, lambda x: x[1] < 0.01)

@@ -99,8 +99,7 @@ obstacle = mpm.contact.Rigid(
     soil,
     shape,
     mpm.contact.Coulomb(args.friction, stiffness=args.tangential_penalty),
-    facet_tags=tags,
-    tag=1,
+    facets=(tags, 1),
     penalty=args.penalty,
     law=args.law,
 )
@@ -109,7 +108,7 @@ obstacle = mpm.contact.Rigid(
 terms, held = [obstacle], [mpm.held(V, 0, x=wide), mpm.held(V, y=-deep)]
 if parted:
     plane = mpm.contact.plane((0.0, 0.0), (1.0, 0.0))
-    terms.append(mpm.contact.Rigid(soil, plane, facet_tags=tags, tag=1))
+    terms.append(mpm.contact.Rigid(soil, plane, facets=(tags, 1)))
 else:
     held.append(mpm.held(V, 0, x=0.0))
 problem = mpm.QuasiStaticProblem(

@@ -154,9 +154,7 @@ def pressed(shape: mpm.contact.Shape, domain: str) -> Pressed:
     body = mpm.Particles(kit.grid(halves, kit.DOMAINS[domain]), V, quadrature_degree=rule)
     ground = np.sort(mesh.locate_entities_boundary(body.mesh, 1, lambda x: np.isclose(x[1], 0.0)))
     tags = mesh.meshtags(body.mesh, 1, ground, np.full(len(ground), 1, np.int32))
-    obstacle = mpm.contact.Rigid(
-        body, shape, mpm.contact.Coulomb(stiffness=0.1), facet_tags=tags, tag=1
-    )
+    obstacle = mpm.contact.Rigid(body, shape, mpm.contact.Coulomb(stiffness=0.1), facets=(tags, 1))
     problem = mpm.QuasiStaticProblem(
         mpm.Body(body, mpm.materials.VonMises(500.0, 0.45, rho_y=np.sqrt(2.0)), f_bar="patch"),
         bcs=rollers(V, (0, 0.0), (0, 4.0), (1, -2.5)),

@@ -39,7 +39,7 @@ class Contact(Results):
         surfaces: Facets of the bodies.
         friction: The law of friction.
         law: What the pressure is made of.
-        moduli: Moduli of the bodies; ``None``: those of their materials.
+        modulus: Modulus of the bodies; ``None``: those of their materials.
         make: Makes passes; see :class:`Passes`.
         count: How many.
 
@@ -54,7 +54,7 @@ class Contact(Results):
         surfaces: Sequence[Surface],
         friction: Friction,
         law: str,
-        moduli: Sequence[float | None],
+        modulus: float | None,
         make: Maker,
         count: int = 1,
     ) -> None:
@@ -64,7 +64,7 @@ class Contact(Results):
         self._nitsche = self.takes_stress = law == "nitsche"
         self.friction = friction
         self.axisymmetric = surfaces[0].axisymmetric
-        self._passes = Passes(surfaces, moduli, make, surfaces[0].what, self._nitsche)
+        self._passes = Passes(surfaces, modulus, make, surfaces[0].what, self._nitsche)
         self._materials: Sequence[PointMaterial | None] = [None] * len(self.bodies)
         self._count, self._number = count, 0
         self._share = 1.0
@@ -112,6 +112,10 @@ class Contact(Results):
                 passes.restore(every, mine)
             passes.require_apart()
             self._joins, self._gone = False, []
+
+    def held(self) -> list[KeptOnBody] | None:
+        """Return what is kept on each body; ``None``: it belongs to no problem."""
+        return self._passes.kept()
 
     def _held_by(self, before: Contact) -> list[KeptOnBody] | None:
         """Return what this contact takes over of one that is gone, on each body; ``None``: nothing.

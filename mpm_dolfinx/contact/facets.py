@@ -19,6 +19,7 @@ import basix
 
 from .._core import loops
 from ..parallel.exchange import swap
+from ..tolerances import HALF_DIGITS, LOCAL_ITERATIONS
 from .surface import Surface, global_dofs, normals
 
 __all__ = ["Closest", "NearFacets", "Table", "separated"]
@@ -26,9 +27,6 @@ __all__ = ["Closest", "NearFacets", "Table", "separated"]
 #: Cosine of the angle of two normals below which surfaces face each other; and in the middle of a
 #: facet, below which they may do so somewhere, and below which they do so for sure.
 FACING, MAY_FACE, SURELY_FACING = -0.1, 0.5, -0.4
-#: Most Newton steps of a projection, and the step that ends them: the next one is its square.
-PROJECTIONS, CLOSE = 20, 1e-10
-
 
 #: Shape functions of a facet at points, ``(n, k)``, with their first and second derivatives.
 type Table = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
@@ -92,7 +90,7 @@ class NearFacets:
         # shape functions by monomials
         powers = grid[grid.sum(axis=1) <= degree] if simplex else grid
         values = np.prod(self.element.points[:, None, :] ** powers, axis=2)
-        self._shape = np.linalg.inv(values), (degree, simplex), CLOSE, PROJECTIONS
+        self._shape = np.linalg.inv(values), (degree, simplex), HALF_DIGITS, LOCAL_ITERATIONS
         empty = np.full((1, self.gdim), np.inf)
         low = np.append(points, empty, axis=0).min(axis=0) - around
         high = np.append(points, -empty, axis=0).max(axis=0) + around

@@ -15,13 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..tolerances import EQUAL, LAST_PLACES
+
 __all__ = ["FacetTree", "Nearest"]
 
 #: Boxes in a box of the next level, and points that are looked at together.
 ARITY, AT_ONCE = 4, 2048
-#: Relative difference of squared distances below which they are equal, and distance, relative to
-#: coordinates, below which it is nothing.
-EQUAL, NOTHING = 1e-12, 1e-15
 
 
 class Nearest(NamedTuple):
@@ -49,7 +48,7 @@ class FacetTree:
     def __init__(self, corners: NDArray[np.float64]) -> None:
         m, dim = len(corners), corners.shape[-1]
         self._corners, self._dim = corners, dim
-        self._nothing = (NOTHING * np.abs(corners).max()) ** 2
+        self._nothing = (LAST_PLACES * np.abs(corners).max()) ** 2
         self._hints: dict[int, NDArray[np.int64]] = {}
         order = _along_curve(corners.mean(axis=1))
         self._facets = order

@@ -54,13 +54,10 @@ class Pair(Contact):
         a: A body; what the contact tells is told at its points first.
         b: The other body.
         friction: As for :class:`Rigid`.
-        facet_tags: Tags of the facets of a and of b, where not all of their boundaries may touch.
-        tags: The tags of those that may.
-        moduli: Moduli of a and b; those of their materials by default.
+        facets: For each body tags of its facets and the tag of those that may touch, ``(tags, 1)``,
+            or ``None``: its whole boundary.
         passes: 2, or 1: points of a (best the body with the finer facets) against facets of b.
         penalty: As for :class:`Rigid`.
-        quadrature_degree: Degree of the rule on each facet; ``None`` is 9 in the plane and 5 in
-            space, since the facets on the other side have kinks.
         axisymmetric: As there.
         law: As there: with ``"nitsche"`` each pass takes the stress of its own points' body.
 
@@ -75,12 +72,9 @@ class Pair(Contact):
         b: Particles,
         friction: float | Friction = 0.0,
         *,
-        facet_tags: Sequence[mesh.MeshTags | None] = (None, None),
-        tags: Sequence[int | None] = (None, None),
-        moduli: Sequence[float | None] = (None, None),
+        facets: Sequence[tuple[mesh.MeshTags, int] | None] = (None, None),
         passes: int = 2,
         penalty: float = 1.0,
-        quadrature_degree: int | None = None,
         axisymmetric: bool = False,
         law: str = "penalty",
     ) -> None:
@@ -100,17 +94,15 @@ class Pair(Contact):
             )
         if isinstance(passes, bool) or passes not in (1, 2):
             raise MPMError(f"A Pair has 1 or 2 passes, not {passes!r}.")
-        for name, value in (("facet_tags", facet_tags), ("tags", tags), ("moduli", moduli)):
-            if not isinstance(value, list | tuple) or len(value) != 2:
-                raise MPMError(f"{name} of a Pair must be two, one for each body, not {value!r}.")
+        if not isinstance(facets, list | tuple) or len(facets) != 2:
+            raise MPMError(f"facets= of a Pair must be two, one for each body, not {facets!r:.80}.")
         self._penalty = as_positive(penalty, "penalty")
-        degree = DEGREES[a.mesh.geometry.dim] if quadrature_degree is None else quadrature_degree
+        degree = DEGREES[a.mesh.geometry.dim]
         surfaces = [
-            Surface(body, some, tag, degree, axisymmetric, "A Pair")
-            for body, some, tag in zip((a, b), facet_tags, tags, strict=True)
+            Surface(body, some, degree, axisymmetric, "A Pair")
+            for body, some in zip((a, b), facets, strict=True)
         ]
-        known = [None if m is None else as_positive(m, "modulus") for m in moduli]
-        super().__init__(surfaces, as_friction(friction), law, known, self._made, passes)
+        super().__init__(surfaces, as_friction(friction), law, None, self._made, passes)
 
     def _made(self, stiffnesses: Sequence[NDArray[np.float64]]) -> list[FacetPass]:
         """Return its passes."""
@@ -132,7 +124,7 @@ class Pair(Contact):
     def _held_by(self, before: Contact) -> list[Kept] | None:
         if not isinstance(before, Pair) or set(before.bodies) != set(self.bodies):
             return None
-        kept = before._passes.kept()
+        kept = before.held()
         if kept is not None and before.bodies != self.bodies:
             kept = kept[::-1]
         return kept if kept is not None and self._passes.fits(kept) else None

@@ -41,7 +41,7 @@ class Passes:
 
     Args:
         surfaces: Facets of the bodies.
-        moduli: Moduli of these; ``None``: those of their materials.
+        modulus: Modulus of these; ``None``: those of their materials.
         make: Makes the passes on the present meshes.
         what: The contact, in a sentence.
         stressed: Whether the stress behind the points presses.
@@ -54,12 +54,12 @@ class Passes:
     def __init__(
         self,
         surfaces: Sequence[Surface],
-        moduli: Sequence[float | None],
+        modulus: float | None,
         make: Maker,
         what: str,
         stressed: bool,
     ) -> None:
-        self.surfaces, self._moduli, self._make, self._what = surfaces, moduli, make, what
+        self.surfaces, self._modulus, self._make, self._what = surfaces, modulus, make, what
         self._stressed = stressed
         self._comm = surfaces[0].particles.mesh.comm
         self.every: Sequence[Pass[Any, Any]] = ()
@@ -81,10 +81,8 @@ class Passes:
             return
         of_step = bool(self.every) and self.every[0].of_step
         self._stiffnesses = [
-            stiffness(surface, modulus, material, self._what)
-            for surface, modulus, material in zip(
-                self.surfaces, self._moduli, materials, strict=True
-            )
+            stiffness(surface, self._modulus, material, self._what)
+            for surface, material in zip(self.surfaces, materials, strict=True)
         ]
         self.every = self._make(self._stiffnesses)
         self.of_step(of_step)
@@ -309,8 +307,8 @@ def stiffness(
     """
     if modulus is None and material is None:
         raise MPMError(
-            f"{what} needs modulus=, since no material says how stiff the body is; give the "
-            "confined modulus (lambda + 2 mu) or its like."
+            f"{what} needs materials that say how stiff bodies are; a Rigid takes a modulus= in "
+            "their place, the confined one (lambda + 2 mu) or its like."
         )
     if modulus is not None:
         moduli = np.full(len(surface.layout.cells), modulus)

@@ -5,7 +5,7 @@
 At the beginning of a step facets within some domains of the obstacle are noted. Others cannot touch
 until points have come nearer by a margin, which is told by the motion of nodes and of the shape
 (distances change no faster than positions do). Where they have, facets are looked for anew, farther
-away, and where nearly all are near there is nothing to be left out.
+away, and where all are near there is nothing to be left out.
 """
 
 from __future__ import annotations
@@ -22,11 +22,9 @@ from .surface import Surface
 
 __all__ = ["Reach", "is_near"]
 
-#: Gap, over the thickness of the domain behind, up to which a facet may touch in a step; and share
-#: of facets that do so up to which others are left out.
-NEAR, MOST_NEAR = 2.0, 0.7
-#: How much farther facets are looked for than they have come nearer, where that was too far.
-FARTHER = 1.4
+#: Gap, over the thickness of the domain behind, up to which a facet may touch in a step; and how
+#: much farther facets are looked for than they have come nearer, where that was too far.
+NEAR = 2.0
 
 
 class Near(NamedTuple):
@@ -83,17 +81,17 @@ class Reach:
         if (moved := self._approach(near, memory, pose)) < near.margin:
             return near.memory
         if self._wider is None or moved >= self._wider.margin:
-            self._wider = self._within(memory, FARTHER * moved)
+            self._wider = self._within(memory, NEAR * moved)
         wider = self._wider
         return wider.memory if wider is not None and moved < wider.margin else None
 
     def _within(self, memory: ShapeMemory, distance: float) -> Near | None:
-        """Return the facets that are within a distance, or some domains; ``None``: nearly all."""
+        """Return the facets that are within a distance, or some domains; ``None``: all."""
         surface, shape = self._surface, self._shape
         if not shape.measures or memory.gap.size == 0:
             return None
         near = is_near(memory, surface, distance)
-        if near.mean() > MOST_NEAR:
+        if near.all():
             return None
         which = np.flatnonzero(near)
         nodes = surface.own_nodes(converged=True)

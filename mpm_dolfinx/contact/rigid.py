@@ -56,13 +56,11 @@ class Rigid(Contact):
         shape: The obstacle, of :mod:`mpm_dolfinx.contact`, as it lies at the beginning.
         friction: Coefficient of friction, a :class:`Coulomb` with cohesion and a limit, or another
             law of :class:`Friction`.
-        facet_tags: Tags of the body's facets, where not all of its boundary may touch.
-        tag: The tag of those that may.
+        facets: Tags of the body's facets and the tag of those that may touch, ``(tags, 1)``, where
+            not all of its boundary may.
         modulus: Modulus of the body; that of the material by default.
         penalty: Stiffness in the normal direction, without unit.
         tangential_penalty: Stiffness of points that stick, without unit.
-        quadrature_degree: Degree of the rule on each facet; ``None`` is one more than twice the
-            degree of the shape functions.
         axisymmetric: Whether ``x[0]`` is a radius.
         law: ``"penalty"``, or ``"nitsche"``: the pressure is that of the stress behind the facet,
             and the penalty holds the gap at zero. It takes the body's material, and a solver for
@@ -79,11 +77,9 @@ class Rigid(Contact):
         shape: Shape,
         friction: float | Friction = 0.0,
         *,
-        facet_tags: mesh.MeshTags | None = None,
-        tag: int | None = None,
+        facets: tuple[mesh.MeshTags, int] | None = None,
         modulus: float | None = None,
         penalty: float = 1.0,
-        quadrature_degree: int | None = None,
         axisymmetric: bool = False,
         law: str = "penalty",
     ) -> None:
@@ -100,8 +96,8 @@ class Rigid(Contact):
         rubs = as_friction(friction)
         own = None if modulus is None else as_positive(modulus, "modulus")
         self._penalty = as_positive(penalty, "penalty")
-        surface = Surface(particles, facet_tags, tag, quadrature_degree, axisymmetric, "A Rigid")
-        super().__init__([surface], rubs, law, [own], self._made)
+        surface = Surface(particles, facets, None, axisymmetric, "A Rigid")
+        super().__init__([surface], rubs, law, own, self._made)
         self.shape = shape
         self._pose = self._aim = Pose(np.zeros(gdim), np.zeros(1 if gdim == 2 else 3))
 
@@ -195,24 +191,29 @@ class Rigid(Contact):
     def _held_by(self, before: Contact) -> list[Kept] | None:
         if not isinstance(before, Rigid) or before.bodies != self.bodies:
             return None
-        kept = before._passes.kept()
+        kept = before.held()
         if kept is None or not self._passes.fits(kept):
             return None
-        mine, other, surface = self._pass, before._pass, self._passes.surfaces[0]
-
-        def seen(values: NDArray[Any]) -> NDArray[Any]:
-            return surface.of_column(other.source.column(values).values)
-
-        there = np.abs(seen(other.gap) - mine.gap) <= NEGLIGIBLE * surface.layout.extent
+        mine, surface, held = self._pass, self._passes.surfaces[0], kept[0]
+        gap, normal = (surface.of_column(held[name]) for name in ("gap", "normal"))
+        there = np.abs(gap - mine.gap) <= NEGLIGIBLE * surface.layout.extent
+        alike = there & (np.abs(normal - mine.normals).max(axis=2) <= NEGLIGIBLE)
         whole = surface.column(there & there.all(axis=1)[:, None]).values
-        alike = there & (np.abs(seen(other.normals) - mine.normals).max(axis=2) <= NEGLIGIBLE)
         same = surface.column(alike).values
-        for name, values in kept[0].items():
+        for name, values in held.items():
             here = whole if name in ("area", "thickness") else same
             more = (1,) * (values.ndim - here.ndim)
-            kept[0][name] = np.where(
-                here.reshape(*here.shape, *more), values, np.zeros_like(values)
-            )
+            none = np.zeros_like(values)
+            held[name] = np.where(here.reshape(*here.shape, *more), values, none)
+        return kept
+
+    @override
+    def held(self) -> list[Kept] | None:
+        """Return what is kept on its body, with gaps and normals; ``None``: it has no problem."""
+        kept, surface = super().held(), self._passes.surfaces[0]
+        if kept is not None:
+            kept[0]["gap"] = surface.column(self._pass.gap).values
+            kept[0]["normal"] = surface.column(self._pass.normals).values
         return kept
 
     # -- What is kept ---------------------------------------------------------------------------

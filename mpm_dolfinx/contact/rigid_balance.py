@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..errors import ConvergenceError, MPMError, agree, agreed
 from ..system.own import OwnUnknowns
+from ..tolerances import HALF_DIGITS, LAST_PLACES, LOCAL_ITERATIONS
 from .body_contact import BodyContact
 from .rigid_motion import RigidMotion, State
 from .rotation import Pose
@@ -29,16 +30,13 @@ __all__ = ["RigidBalance"]
 #: Stiffness, relative to the largest, below which nothing holds a body.
 LOOSE = 1e-11
 #: Share of its forces that nothing bears above which a body at rest is brought nearer to balance
-#: before a step, and most iterations of that.
-UNBALANCED, MOST_ITERATIONS = 0.1, 60
+#: before a step.
+UNBALANCED = 0.1
 #: Drag on a body that creeps to its balance, over the largest stiffness, to begin with; by how much
 #: it rises where the residual becomes larger than by a factor.
 DRAG, RISES, GROWS = 0.1, 4.0, 2.0
-#: Most that it turns in a step that is tried.
+#: Most that it turns in a step that is tried: the Cayley vector of a quarter of a turn.
 MOST_TURN = 2.0
-#: Gap, over twice the length of what it falls on, to which a body without a hold falls; at least
-#: this much times the round-off of coordinates.
-NEAR, LEAST = 1e-7, 8.0
 #: What is said where forces and moments on a body at rest are left.
 ADVICE = (
     "{} of the forces on a RigidBody do not balance: where it slides or rolls away, hold more of "
@@ -230,7 +228,7 @@ class RigidBalance:
         """
         each, motion = self._each, self._motion
         drag, now = 0.0, self._tried(step)
-        for _ in range(MOST_ITERATIONS):
+        for _ in range(LOCAL_ITERATIONS):
             norm = float(np.linalg.norm(now.left))
             if norm <= UNBALANCED * now.size or (now.touches and not self._creeps):
                 break
@@ -269,7 +267,8 @@ class RigidBalance:
         way[len(self._motion.start) :] = 0.0
         size = float(np.linalg.norm(way))
         extent = max(contact.extent for contact in self._contacts)
-        close = max(2.0 * NEAR * self._span, LEAST * float(np.finfo(np.float64).eps) * extent)
+        # (where it falls to: into what it falls on, by more than round-off of coordinates)
+        close = HALF_DIGITS * self._span + LAST_PLACES * extent
         gap, gone = self._least_gap(step), 0.0
         far = 2.0 * (self._span + gap)
         while size > 0.0 and 0.0 < gap and gone < far:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..errors import ConvergenceError, MPMError, as_ours
 from ..parallel.given import as_positive, is_number
 from ..reals import as_finite, as_reals
+from ..tolerances import DIFFERENCE, HALF_DIGITS
 
 __all__ = [
     "Shape",
@@ -30,12 +31,13 @@ __all__ = [
     "sphere",
 ]
 
-#: Steps of the differences of a user's distance, relative to the size of coordinates.
-FIRST, SECOND = 1e-6, 1e-4
+#: Step of second differences of a user's distance, relative to the size of coordinates: errors by
+#: it and by round-off are equal.
+SECOND = float(np.sqrt(HALF_DIGITS))
 #: How far a gradient of a distance may be from a unit vector.
 UNIT = 1e-2
-#: What keeps a square root off zero, far below any square of a length.
-TINY = 1e-200
+#: Added to squares of lengths, so that none of their roots is zero.
+TINY = np.finfo(float).tiny
 
 
 class Shape:
@@ -237,9 +239,9 @@ class _Given(Shape):
 
     def distance(self, y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         phi = self._values(y)
-        n = self._slopes(y, FIRST * _size(y))
+        n = self._slopes(y, DIFFERENCE * _size(y))
         length = np.linalg.norm(n, axis=1)
-        near = np.abs(phi) <= FIRST ** (1 / 3) * _size(y)
+        near = np.abs(phi) <= DIFFERENCE ** (1 / 3) * _size(y)
         if np.any(near & (np.abs(length - 1.0) > UNIT)):
             wrong = length[near & (np.abs(length - 1.0) > UNIT)][0]
             raise MPMError(

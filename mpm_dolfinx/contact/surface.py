@@ -22,7 +22,7 @@ from ..assembly.inputs import is_tag, known_tags
 from ..assembly.petsc import create_vector
 from ..errors import MPMError
 from ..meshes.remesh import Column
-from ..parallel.given import require_truth, require_whole
+from ..parallel.given import require_truth
 from ..particles.particles import Particles
 from ..tolerances import ROUND_OFF
 
@@ -49,19 +49,25 @@ class Facets:
 
     Args:
         particles: The body.
-        facet_tags: Tags of its facets, or ``None``.
-        tag: The tag of those that may be in contact; ``None``: the whole boundary.
+        facets: Tags of its facets, and the tag of those that may be in contact; ``None``: the whole
+            boundary.
         what: What they are for, in a sentence.
 
     Raises:
         MPMError: Tags that are none.
     """
 
-    def __init__(self, particles: Particles, facet_tags: Any, tag: Any, what: str) -> None:
+    def __init__(self, particles: Particles, facets: Any, what: str) -> None:
         body = particles.mesh
         dim = body.topology.dim - 1
         outer = _marked(body, particles.boundary())
-        if tag is not None or facet_tags is not None:
+        if facets is not None:
+            if not isinstance(facets, list | tuple) or len(facets) != 2:
+                raise MPMError(
+                    f"facets= of {what[0].lower()}{what[1:]} must be tags and one of them, "
+                    f"(tags, 1), not {facets!r:.80}."
+                )
+            facet_tags, tag = facets
             known = known_tags(particles, facet_tags, what)
             if not is_tag(tag) or tag not in known:
                 raise MPMError(f"There is no facet tag {tag!r}; there are {sorted(known)}.")
@@ -147,8 +153,7 @@ class Surface:
 
     Args:
         particles: The body.
-        facet_tags: As for :class:`Facets`.
-        tag: As there.
+        facets: As for :class:`Facets`.
         degree: Degree of the rule on each facet; ``None`` is one more than twice the degree of
             the shape functions.
         axisymmetric: Whether ``x[0]`` is a radius.
@@ -171,20 +176,18 @@ class Surface:
     def __init__(
         self,
         particles: Particles,
-        facet_tags: Any,
-        tag: Any,
+        facets: Any,
         degree: int | None,
         axisymmetric: bool,
         what: str,
     ) -> None:
         if degree is None:
             degree = 2 * int(particles.W.ufl_element().degree) + 1
-        require_whole(f"quadrature_degree of {what}", degree, 100)  # 51 points each way
         require_truth(f"axisymmetric of {what}", axisymmetric)
         self.particles = particles
         self.axisymmetric = axisymmetric
         self.what = what
-        self._where = Facets(particles, facet_tags, tag, what)
+        self._where = Facets(particles, facets, what)
         self._space: fem.FunctionSpace | None = None
         body, whole = particles.mesh, particles.W.ufl_element().basix_element
         cell, dim = body.basix_cell(), body.topology.dim - 1

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..tolerances import BLOCK, LOCAL_ITERATIONS
 from .memory import ShapeMemory
 from .placed import framed
 from .rotation import Pose
@@ -25,9 +26,8 @@ from .surface import Surface
 
 __all__ = ["OPPOSITE", "crosses", "gets_deep", "passes"]
 
-#: Most places on the way of a point that are looked at, of all points at once, and by steps of
-#: the distance.
-MOST_PLACES, MOST_AT_ONCE, MOST_STEPS = 1000, 100_000, 100
+#: Most places on the way of a point that are looked at.
+MOST_PLACES = 1000
 #: How near to the surface a point is on it, over the thickness of the domain behind.
 ON = 1e-3
 #: Least length of a way through an obstacle, over the same: less is cut off a sharp corner.
@@ -86,7 +86,7 @@ def gets_deep(
     a, way, deep, gap = a[reached], (b - a)[reached], deep[reached], gap[reached]
     steps = np.ceil(2.0 * np.linalg.norm(way, axis=1) / deep) + 1.0
     count = np.minimum(steps, MOST_PLACES).astype(np.int64) + 1
-    for part in np.array_split(np.arange(len(a)), 1 + count.sum() // MOST_AT_ONCE):
+    for part in np.array_split(np.arange(len(a)), 1 + count.sum() // BLOCK):
         number = count[part]
         which = np.repeat(part, number)
         place = np.arange(len(which)) - np.repeat(np.cumsum(number) - number, number)
@@ -162,7 +162,7 @@ def _reached(
     size = np.linalg.norm(way, axis=1)
     share, normals = np.zeros(len(a)), np.zeros_like(a)
     going = np.arange(len(a))
-    for _ in range(MOST_STEPS):
+    for _ in range(LOCAL_ITERATIONS):
         if len(going) == 0:
             break
         phi, normals[going] = shape.distance(a[going] + share[going, None] * way[going])

@@ -23,7 +23,7 @@ def near_a_body(kind, degree=1):
     V = scenes.vectors(box([-1.0] * dim, [2.0] * dim, [3] * dim, GRID[dim], WORLD))
     mesh = box([0.0] * dim, [1.0] * dim, [5, 4, 3][:dim], kind, WORLD)
     body = mpm.Particles(mesh, V, degree=degree)
-    surface = Surface(body, None, None, 3, False, "A test")
+    surface = Surface(body, None, 3, False, "A test")
     surface.settle()
     nodes = surface.own_nodes()
     nodes = nodes + 0.03 * np.sin(5.0 * nodes[:, ::-1])
@@ -133,7 +133,7 @@ def test_points_beside_the_end_of_a_surface_touch_nothing(kind):
     V = scenes.vectors(box([-1.0] * dim, [2.0] * dim, [3] * dim, GRID[dim], WORLD))
     mesh = box([0.0] * dim, [1.0] * dim, [5, 4, 3][:dim], kind, WORLD)
     tags = scenes.facet_tags(mesh, scenes.at(dim - 1, 1.0))
-    surface = Surface(mpm.Particles(mesh, V), tags, 1, 3, False, "A test")
+    surface = Surface(mpm.Particles(mesh, V), (tags, 1), 3, False, "A test")
     surface.settle()
     nodes = surface.own_nodes()
     x = np.full((400, dim), 0.4)
@@ -159,7 +159,7 @@ def test_points_over_the_edges_of_a_bent_surface_face_it():
         return np.abs(np.hypot(x[0], x[1]) - 1.0) < 1e-9
 
     tags = scenes.facet_tags(mesh, outer)
-    surface = Surface(mpm.Particles(mesh, V), tags, 1, 3, False, "A test")
+    surface = Surface(mpm.Particles(mesh, V), (tags, 1), 3, False, "A test")
     surface.settle()
     nodes = surface.own_nodes()
     angle = np.linspace(-0.66, 0.66, 400)

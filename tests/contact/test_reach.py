@@ -37,7 +37,7 @@ def test_no_facet_that_touches_is_left_out(name):
     cell = QUADRILATERAL if dim == 2 else HEXAHEDRON
     V = scenes.vectors(scenes.box([-0.5] * dim, [1.5] * dim, [4] * dim, cell))
     body = mpm.Particles(scenes.unit(8 if dim == 2 else 5, cell), V)
-    surface = Surface(body, None, None, None, False, "It")
+    surface = Surface(body, None, None, False, "It")
     surface.settle()
     memory = at_rest(surface, shape, Pose(np.zeros(dim), np.zeros(spin)))
     reach = Reach(surface, shape)

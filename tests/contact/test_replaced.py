@@ -89,7 +89,7 @@ def test_a_new_contact_knows_the_boundary_of_a_body_that_was_split():
         top = mpm.facet_tags(problem.particles.mesh, {1: mpm.region(y=1.0)})
         far = contact.disc((9.0 + len(cuts), 9.0), 0.1)
         new = contact.Rigid(problem.particles, far)
-        upper = contact.Rigid(problem.particles, far, facet_tags=top, tag=1)
+        upper = contact.Rigid(problem.particles, far, facets=(top, 1))
         problem.stage(terms=[disc, new, upper])
         for name, one, length in (("disc", disc, 7.2), ("new", new, 7.2), ("upper", upper, 2.6)):
             columns = one.kept()[0].columns(0)
@@ -309,7 +309,7 @@ def test_equals_of_two_pairs_in_their_places_change_nothing(law):
 
         def of_sides(a=a, b=b, tags=(bottom, top)):
             return [
-                contact.Pair(a, b, 0.3, law=law, passes=1, facet_tags=tags, tags=(side, 1))
+                contact.Pair(a, b, 0.3, law=law, passes=1, facets=((tags[0], side), (tags[1], 1)))
                 for side in (1, 2)
             ]
 

@@ -215,7 +215,7 @@ def hertz(cells, offset, degree, free=False):
     body = mpm.Particles(block, V, degree=degree, quadrature_degree=2 * degree)
     tags = facet_tags(block, at(1, 0.0), at(1, 1.0))
     disc = mpm.contact.disc((0.5, 9.0), 8.0)
-    ball = mpm.contact.Rigid(body, disc, facet_tags=tags, tag=2, law="nitsche")
+    ball = mpm.contact.Rigid(body, disc, facets=(tags, 2), law="nitsche")
     problem = mpm.QuasiStaticProblem(
         mpm.Body(body, materials.LinearElastic(2.5, 0.25)),
         supports=[mpm.boundary.fixed(body, tags, 1)],

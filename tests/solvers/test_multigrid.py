@@ -376,7 +376,7 @@ def test_an_indefinite_tangent_whose_step_does_needs_no_smaller_load():
             scenes.facet_tags(top, scenes.at(1, 2.0), scenes.at(1, 4.0)),
         ]
         bodies = [mpm.Particles(base, lower), mpm.Particles(top, upper)]
-        touch = mpm.contact.Pair(bodies[1], bodies[0], facet_tags=tags[::-1], tags=(1, 1))
+        touch = mpm.contact.Pair(bodies[1], bodies[0], facets=[(one, 1) for one in tags[::-1]])
         run = posed(
             mpm.QuasiStaticProblem,
             bodies,

@@ -213,7 +213,7 @@ def test_a_body_of_free_nodes_meets_another_as_finite_elements_do():
         second = mpm.Particles(above)
         tops = scenes.facet_tags(mesh, at(1, 0.5), at(1, 0.0))
         bottoms = scenes.facet_tags(above, at(1, 0.5), at(1, 0.8))
-        contact = mpm.contact.Pair(first, second, 0.3, facet_tags=(tops, bottoms), tags=(1, 1))
+        contact = mpm.contact.Pair(first, second, 0.3, facets=((tops, 1), (bottoms, 1)))
         push = scenes.fix(second.W, at(1, 0.8), np.array([0.01, -0.03]))
         problem = mpm.QuasiStaticProblem(
             [mpm.Body(first, Hencky(YOUNG, POISSON)), mpm.Body(second, Hencky(YOUNG, POISSON))],
