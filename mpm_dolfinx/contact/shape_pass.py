@@ -399,19 +399,15 @@ class ShapePass(Pass[ShapeMemory, Touch]):
         phi, n = np.zeros(len(y)), memory.normal.reshape(y.shape).copy()
         near = np.ones(len(y), dtype=bool)
         if self._shape.costly:
-            phi = memory.gap.ravel() - np.linalg.norm(y - self._before(memory, y), axis=1)
+            phi = memory.gap.ravel() - np.linalg.norm(y - _started(self._shape, memory, y), axis=1)
             near = ~(phi > reach)
         phi[near], n[near] = distance_within(self._shape, y[near])
         return phi, n
 
-    def _before(self, memory: ShapeMemory, y: Array) -> Array:
-        """Return where points at y were, in the frame of the shape."""
-        return framed(self._shape, memory.pose, memory.outcome.positions).reshape(y.shape)
-
     def _over_step(self, memory: ShapeMemory, y: Array, at: Separation) -> tuple[Array, Separation]:
         """Return the middle of a step of a motion, and where points are over it."""
         before = memory.gap.ravel()
-        change = y - self._before(memory, y)
+        change = y - _started(self._shape, memory, y)
         middle = y - 0.5 * change
         n = memory.normal.reshape(y.shape).copy()
         acts = (before <= at.touch) | (at.gap <= at.touch)
@@ -484,7 +480,8 @@ class ShapePass(Pass[ShapeMemory, Touch]):
             raise ConvergenceError(
                 "A body goes through the obstacle of a Rigid in one step; take smaller steps"
             )
-        turn = self._turn(before.pose, trial.pose)
+        last, pose = before.pose, trial.pose
+        turn = pose.turn_from(last) if self._whole_turns else pose.least_turn_from(last)
         rubs = not self._law.smooth and bool(trial.outcome.inside.any())
         if rubs and turn > MOST_TURN * (1.0 + NEGLIGIBLE):
             raise ConvergenceError(
@@ -494,10 +491,6 @@ class ShapePass(Pass[ShapeMemory, Touch]):
             )
         self._forget_step()
         return trial
-
-    def _turn(self, last: Pose, pose: Pose) -> float:
-        """Return the angle by which the shape has turned in a step."""
-        return pose.turn_from(last) if self._whole_turns else pose.least_turn_from(last)
 
     @override
     def roll_back(self) -> None:
@@ -518,3 +511,8 @@ class ShapePass(Pass[ShapeMemory, Touch]):
             outcome=retold(memory.outcome, columns),
             friction=worn(columns.get("friction"), memory.friction),
         )
+
+
+def _started(shape: Shape, memory: ShapeMemory, y: Array) -> Array:
+    """Return where points at y were at the last converged step, in the frame of a shape."""
+    return framed(shape, memory.pose, memory.outcome.positions).reshape(y.shape)
