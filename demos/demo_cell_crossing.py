@@ -50,7 +50,7 @@ g0 = young * np.log(stretch) / stretch / length  # N/m3
 MARKED = (4.25, 0.25)  # where the particle that is followed begins, m
 RUNS = {
     "mpm": {"method": "mpm"},
-    "gimp, fixed boxes": {"method": "gimp", "domain_update": "fixed"},
+    "gimp, fixed boxes": {"method": "ugimp"},
     "gimp": {"method": "gimp"},
     "cpdi": {"method": "cpdi"},
     "cpdi2": {"method": "cpdi2"},

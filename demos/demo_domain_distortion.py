@@ -116,4 +116,4 @@ assert gaps["cpdi2"] < 1e-12 < gaps["cpdi"] < gaps["gimp"]
 # ## Exercises
 #
 # 1. Replace the swirl by a simple shear, then by a rigid rotation. Which methods are exact?
-# 2. Stretch by `x * [2.0**t, 1.0]`, also with boxes of fixed size, `domain_update="fixed"`.
+# 2. Stretch by `x * [2.0**t, 1.0]`, also with boxes of fixed size, `method="ugimp"`.

@@ -57,7 +57,7 @@ def strip(hot):
     """A strip at a hot wall, or insulated, and what a step is given."""
     body = mesh.create_rectangle(comm, [[0.0, 0.0], [L, h]], [48, 2], quadrilateral)
     particles = mpm.Particles(body, V, degree=2)
-    theta = particles.field(Q, at="nodes", name="temperature")
+    theta = mpm.ParticleField(particles, Q, at="nodes", name="temperature")
     d, v, q = particles.displacement, ufl.TestFunction(particles.W), ufl.TestFunction(theta.W)
     before, dt, pull = fem.Function(particles.W), fem.Constant(body, 0.0), fem.Constant(body, 0.0)
     X, dx, G = ufl.SpatialCoordinate(body), particles.dx, ufl.inv(ufl.Identity(2) + ufl.grad(d)).T

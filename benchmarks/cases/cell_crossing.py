@@ -31,7 +31,7 @@ h = length / args.cells
 
 RUNS = {
     "mpm": {"method": "mpm"},
-    "gimp_fixed": {"method": "gimp", "domain_update": "fixed"},
+    "gimp_fixed": {"method": "ugimp"},
     "gimp": {"method": "gimp"},
     "cpdi": {"method": "cpdi"},
     "cpdi2": {"method": "cpdi2"},

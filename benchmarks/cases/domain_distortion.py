@@ -63,7 +63,7 @@ def two_domains(method, **options):
 
 
 figure_2 = {
-    "boxes": two_domains("gimp", domain_update="fixed"),
+    "boxes": two_domains("ugimp"),
     "cpdi2": two_domains("cpdi2"),
 }
 

@@ -188,7 +188,9 @@ def surface_of(d: fem.Function) -> ufl.core.expr.Expr:
 
 def monolithic() -> tuple[mpm.ParticleProblem, mpm.ParticleField]:
     """The same energy in UFL, all unknowns at once; a penalty keeps damage from falling."""
-    d = particles.field(fem.functionspace(body, ("Lagrange", 1)), "nodes", "body", "damage")
+    d = mpm.ParticleField(
+        particles, fem.functionspace(body, ("Lagrange", 1)), "nodes", "body", "damage"
+    )
     u, dx = particles.displacement, particles.dx
     (driving, rest), surface = energies(u), surface_of(d)
     penalty = toughness / length * (27 / 64 if args.model == "AT1" else 1.0) * 1e4

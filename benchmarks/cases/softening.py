@@ -142,7 +142,7 @@ except mpm.MPMError as error:
 
 rate = points.weights * (last - before)
 nodes = particles.W.tabulate_dof_coordinates()[particles.domain_nodes, :2]
-places = np.einsum("qk,nki->nqi", particles.quadrature.shapes, nodes)
+places = np.einsum("qk,nki->nqi", particles.undeformed.rule.shapes, nodes)
 whole = max(kit.total(rate), 1e-300)
 centre = np.array([kit.total(rate * places[:, :, i]) / whole for i in range(2)])
 away = places - centre

@@ -76,7 +76,7 @@ def errors(kind: Any, k: int, m: int, elements: int) -> tuple[float, float]:
         mpm.Body(body, mpm.materials.Hencky(YOUNG, 0.0), body_force=(0.0, -WEIGHT)), bcs=bcs
     )
     problem.solve(steps=40)
-    volumes = body.point_volumes()
+    volumes = body.undeformed.point_volumes()
     gap = body.point_stress[..., 1, 1] + WEIGHT * (LENGTH - body.initial_points[..., 1])
     Y = body.W.tabulate_dof_coordinates()[:, 1]
     w, bottom = (lambert(WEIGHT / YOUNG * (LENGTH - y)) for y in (Y, 0.0))

@@ -342,7 +342,7 @@ class BodyForms:
     @property
     def _domains(self) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
         """Nodes and gradients of the domains, for the compiled loops."""
-        return self._particles.domain_nodes, self._particles.quadrature.gradients
+        return self._particles.domain_nodes, self._particles.undeformed.rule.gradients
 
     def _local(self, w: PETSc.Vec) -> NDArray[np.float64]:
         """Return a vector on W at this rank's own and ghost dofs (collective)."""
@@ -372,7 +372,7 @@ class BodyForms:
     ) -> NDArray[np.float64]:
         """Return the internal pointwise tangent times local values on W, at own and ghost dofs."""
         nodal = self._at_domains(values)
-        gradient = self._particles.quadrature.displacement_gradient(nodal)
+        gradient = self._particles.undeformed.rule.displacement_gradient(nodal)
         if internal.hoop is not None:
             gradient = with_hoop(gradient, internal.hoop, nodal)
         gradient = gradient.reshape(internal.first_piola.shape)
@@ -431,5 +431,5 @@ class BodyForms:
         P = self.internal.first_piola.reshape(
             *self.internal.weights.shape, *self.internal.first_piola.shape[1:]
         )
-        gradients = self._particles.quadrature.gradients[part]
+        gradients = self._particles.undeformed.rule.gradients[part]
         return nodal_forces(P[part], weights, gradients, None if hoop is None else hoop[part])

@@ -71,7 +71,7 @@ class PressureBlocks:
         hoop = self._material.hoop
         return (
             self._particles.domain_nodes,
-            self._particles.quadrature.gradients,
+            self._particles.undeformed.rule.gradients,
             self._material.weights,
             no_values if hoop is None else hoop,
         )

@@ -141,7 +141,7 @@ class AveragedVolumeRatio(fem.Function):
 
     def _group_sum(self, values: Array) -> Array:
         """Return the integral of values at points over each owned domain's group (collective)."""
-        integrals = (self.particles.point_volumes() * values).sum(axis=1)
+        integrals = (self.particles.undeformed.point_volumes() * values).sum(axis=1)
         sums = self._averaging.groups.sum(np.where(self.particles.deleted, 0.0, integrals))
         return np.where(self.particles.deleted, integrals, sums)
 
@@ -160,7 +160,7 @@ class AveragedVolumeRatio(fem.Function):
         _, twice, mixed, slope = self._forms
         shape = (self.particles.domain_nodes.shape[1], self.particles.mesh.geometry.dim)
         groups = self._averaging.groups
-        volume = self._group_sum(np.ones_like(self.particles.point_volumes()))
+        volume = self._group_sum(np.ones_like(self.particles.undeformed.point_volumes()))
         g = self._of_domains(slope, shape) / volume[:, None, None]
         cross = self._of_domains(mixed, shape)
         h = groups.sum(self._of_domains(twice))

@@ -110,7 +110,7 @@ class GradientAverage:
         """
         self._prepare()
         assert self._present is not None
-        shapes, nodes = self._body.quadrature.shapes, self._body.domain_nodes
+        shapes, nodes = self._body.undeformed.rule.shapes, self._body.domain_nodes
         volumes = np.where(self._present[:, None], self._strain.volumes(), 0.0)
         loads = np.einsum("nq,nq,qk->nk", volumes, np.where(volumes > 0.0, values, 0.0), shapes)
         b, x = self._vector(), self._vector()

@@ -39,7 +39,7 @@ def stress_errors(particles: Particles, points: MaterialPoints) -> Array:
     weights = points.weights
     at_nodes = _continued(particles, stress, weights)
     smooth = np.empty_like(stress)
-    shapes = particles.quadrature.shapes
+    shapes = particles.undeformed.rule.shapes
     for law in range(len(points.laws.governed)):
         mine = points.laws.numbers == law
         means = _means(particles, at_nodes, weights.sum(axis=1) * mine)
@@ -66,7 +66,7 @@ def _continued(particles: Particles, values: Array, weights: Array) -> Array:
     gdim = nodes.shape[2]
     if values.shape[1] <= gdim:
         return np.repeat(mean, nodes.shape[1], axis=1)
-    places = np.einsum("qk,nki->nqi", particles.quadrature.shapes, nodes)
+    places = np.einsum("qk,nki->nqi", particles.undeformed.rule.shapes, nodes)
     middle = np.einsum("nq,nqi->ni", parts, places)[:, None]
     slopes = np.einsum("niq,nqab->niab", np.linalg.pinv(places - middle), values - mean)
     return np.asarray(mean + np.einsum("nki,niab->nkab", nodes - middle, slopes))

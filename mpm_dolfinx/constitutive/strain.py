@@ -13,6 +13,7 @@ import ufl
 
 from ..errors import MPMError
 from ..meshes.quadrature import nodal_forces
+from ..particles.domains import behind_axis
 from ..particles.particles import Particles
 
 __all__ = ["Revolution", "Strain", "strain_of"]
@@ -48,7 +49,7 @@ class Strain:
 
     def volumes(self) -> Array:
         """Return the undeformed volume of each point, shape ``(n, nq)``."""
-        return self.particles.point_volumes()
+        return self.particles.undeformed.point_volumes()
 
     def present_volumes(self) -> Array:
         """Return the undeformed volume of each point, 0 where deleted, shape ``(n, nq)``."""
@@ -70,7 +71,7 @@ class Strain:
             stress: Shape ``(n, nq, dim, dim)``.
             volumes: Of the points, shape ``(n, nq)``.
         """
-        gradients = self.particles.quadrature.gradients
+        gradients = self.particles.undeformed.rule.gradients
         return nodal_forces(stress, volumes, gradients, self.hoop)
 
     def beyond(self) -> tuple[str, NDArray[np.int64]]:
@@ -130,7 +131,7 @@ class Revolution(Strain):
         super().__init__(particles)
         undeformed = particles.undeformed
         undeformed.require_radius()
-        if not particles.moves_at_nodes:
+        if not particles.mover.method.at_nodes:
             raise MPMError(
                 f"A body of revolution needs method='cpdi2' or 'cpdi': the weights of "
                 f"{particles.method!r} are means in the plane, and stresses at the axis would be "
@@ -153,13 +154,13 @@ class Revolution(Strain):
     @override
     def volumes(self) -> Array:
         """Volumes all around the axis."""
-        return self.particles.point_volumes(axisymmetric=True)
+        return self.particles.undeformed.point_volumes(axisymmetric=True)
 
     @override
     def beyond(self) -> tuple[str, NDArray[np.int64]]:
         """Displacements beyond the mesh; the axis stays where it is."""
         words = "reach across the axis x[0] = 0 (nodes on it must be held against the radius)"
-        return words, self.particles.behind_axis()
+        return words, behind_axis(self.particles)
 
     @override
     def before_mesh(self) -> Array | None:

@@ -95,7 +95,7 @@ class Behind:
         self.nodes: NDArray[np.int64] = particles.domain_nodes[surface.layout.cells].astype(
             np.int64
         )
-        rule, _ = quadrature_rule(cell, particles.quadrature_degree)
+        rule, _ = quadrature_rule(cell, particles.geometry.quadrature_degree)
         degree = int(particles.W.ufl_element().degree)
         taken = np.zeros((len(self._cells), surface.nq, len(rule)))
         for side, places in enumerate(surface.reference_points):
@@ -151,7 +151,7 @@ class Behind:
         cells, M = self._cells[which], self._weights[which]
         A = stress.tangent.reshape(-1, M.shape[2], *stress.tangent.shape[1:])[cells]
         change = np.einsum("fqi,fqpJ,fpiJkL->fqpkL", along, M, A[:, :, :gdim, :gdim], optimize=True)
-        gradients = self.surface.particles.quadrature.gradients[cells]
+        gradients = self.surface.particles.undeformed.rule.gradients[cells]
         slopes = np.einsum("fqpkL,fpaL->fqak", change[..., :gdim, :gdim], gradients, optimize=True)
         if stress.hoop is not None:
             slopes[..., 0] += np.einsum("fqp,fpa->fqa", change[..., 2, 2], stress.hoop[cells])

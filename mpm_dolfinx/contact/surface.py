@@ -243,7 +243,9 @@ class Surface:
         middle = x[W.dofmap.list[cells]].mean(axis=1)
         centre = (self.shapes @ x[nodes]).mean(axis=1)
         n = normals(edges).mean(axis=1)
-        narrows = (body.basix_cell() in SIMPLICES) | self.particles.halves[cells]
+        own = self.particles
+        halves = own.trail.halves(own.global_index, own.num_global)
+        narrows = (body.basix_cell() in SIMPLICES) | halves[cells]
         extent = float(np.abs(self.particles.initial_domains).max(initial=0.0))
         around = np.ones_like(self._areas)
         if self.axisymmetric:

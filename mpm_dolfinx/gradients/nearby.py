@@ -93,7 +93,7 @@ class _Here:
         for array, values in self.arrays:
             array[...] = values
         for body, values in zip(self._bodies, self.begun, strict=True):
-            body.begin_from(values)
+            body.placement.displacement[...] = body.carried_by(values)
         for points, states in zip(self.points, self.states, strict=True):
             points.go_from(states)
 
@@ -199,7 +199,8 @@ class Nearby:
         for body, values, function in zip(
             self._problem.bodies, here.begun, rates.motion, strict=False
         ):
-            body.begin_from(values + amount * function.x.array)
+            moved = values + amount * function.x.array
+            body.placement.displacement[...] = body.carried_by(moved)
         for points, states, own in zip(here.points, here.states, rates.states, strict=True):
             points.go_from([_moved(*pair, amount) for pair in zip(states, own, strict=True)])
         self._shift(parameter, amount)

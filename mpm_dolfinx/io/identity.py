@@ -67,7 +67,7 @@ def identity(problem: Identifiable) -> dict[str, Any]:
     for i, (body, law) in enumerate(zip(problem.bodies, problem.laws(), strict=True)):
         of = f" of body {i}" if len(problem.bodies) > 1 else ""
         found[f"the body mesh{of}"] = _mesh(body.mesh)
-        found[f"the particles' method{of}"] = body.options()
+        found[f"the particles' method{of}"] = _options(body)
         found[f"the material{of}"] = [
             [name, {key: _parameter(body, value) for key, value in parameters.items()}]
             for name, parameters in law
@@ -84,6 +84,17 @@ def identity(problem: Identifiable) -> dict[str, Any]:
             _mesh(one.V.mesh),
         ]
     return found
+
+
+def _options(body: Particles) -> dict[str, Any]:
+    """Return method and degrees of particles, and what may become of them."""
+    return {
+        "method": body.method,
+        "degree": body.W.ufl_element().degree,
+        "quadrature_degree": body.geometry.quadrature_degree,
+        "delete": body.deletion is not None,
+        **({} if body.free_nodes is None else {"free": True}),
+    }
 
 
 def _mesh(domain: mesh.Mesh) -> list[Any]:

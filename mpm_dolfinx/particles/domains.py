@@ -11,12 +11,11 @@ import basix
 import ufl
 from dolfinx import fem, mesh
 
-from ..meshes.quadrature import DomainQuadrature, quadrature_rule, volume_ratio, with_hoop
+from ..meshes.quadrature import quadrature_rule, volume_ratio, with_hoop
 from .deletion import Deletion
-from .geometry import Geometry
 from .undeformed import Undeformed, reach_behind_axis
 
-__all__ = ["Domains"]
+__all__ = ["Domains", "behind_axis", "crossed"]
 
 
 class Domains:
@@ -31,24 +30,16 @@ class Domains:
         deletion: Which domains are deleted, or ``None`` where none may be.
     """
 
-    def _live_on(self, geometry: Geometry, undeformed: Undeformed, deletable: bool) -> None:
+    def _live_on(self, undeformed: Undeformed, deletion: Deletion | None) -> None:
         """Take the cells of a mesh, where nothing is displaced, for the domains (collective).
 
         Args:
-            geometry: The mesh and what follows from it.
-            undeformed: What the domains are counted from.
-            deletable: Whether domains may be deleted.
+            undeformed: What the domains are counted from, and the mesh.
+            deletion: Which of them are deleted, if any may be.
         """
-        self.geometry, self.undeformed = geometry, undeformed
-        self.displacement = fem.Function(geometry.W, name="displacement")
-        self.deletion = Deletion(geometry.mesh, geometry.W) if deletable else None
-
-    def allow_deletion(self, allowed: bool) -> None:
-        """Let domains be deleted, or no longer, where none of them is (collective)."""
-        if not allowed:
-            self.deletion = None
-        elif self.deletion is None:
-            self.deletion = Deletion(self.geometry.mesh, self.geometry.W)
+        self.geometry, self.undeformed = undeformed.geometry, undeformed
+        self.displacement = fem.Function(self.geometry.W, name="displacement")
+        self.deletion = deletion
 
     # -- The mesh -------------------------------------------------------------------------
 
@@ -92,16 +83,6 @@ class Domains:
         """Local nodes of W of each owned domain, shape ``(n, k)``."""
         return self.geometry.domain_nodes
 
-    @property
-    def quadrature_degree(self) -> int:
-        """Degree of the rule that carries the history."""
-        return self.geometry.quadrature_degree
-
-    @property
-    def quadrature(self) -> DomainQuadrature:
-        """The rule that carries the history, on each owned domain."""
-        return self.undeformed.rule
-
     def quadrature_function(self, name: str, shape: tuple[int, ...] = ()) -> fem.Function:
         """Return a Function for data at the history's points, to be injected into a form.
 
@@ -118,21 +99,22 @@ class Domains:
     @property
     def num_points(self) -> int:
         """Number of quadrature points of each domain."""
-        return int(self.quadrature.weights.shape[1])
+        return int(self.undeformed.rule.weights.shape[1])
 
-    def of_domains(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return displacements of nodes ``(N, gdim)`` for each domain, shape ``(n, k, gdim)``."""
+    def of_domains(self, motion: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """Return displacements of nodes for each domain, shape ``(n, k, gdim)``.
+
+        Args:
+            motion: On the local dofs of W; ``None``: the present displacement.
+        """
+        nodal = self.displacement.x.array if motion is None else motion
+        nodal = np.asarray(nodal, dtype=np.float64).reshape(-1, self.geometry.gdim)
         values: NDArray[np.float64] = nodal[self.domain_nodes]
         return values if self.deletion is None else self.deletion.kept(values)
 
-    def _nodal(self) -> NDArray[np.float64]:
-        """Displacement of the domains' nodes now, shape ``(n, k, gdim)``."""
-        nodal = self.displacement.x.array.reshape(-1, self.geometry.gdim)
-        return self.of_domains(np.asarray(nodal, dtype=np.float64))
-
-    def _corners(self) -> NDArray[np.float64]:
-        """Positions of the domains' nodes now, shape ``(n, k, gdim)``."""
-        return np.asarray(self.geometry.corners + self._nodal())
+    def corners(self) -> NDArray[np.float64]:
+        """Return positions of the domains' nodes now, shape ``(n, k, gdim)``."""
+        return np.asarray(self.geometry.corners + self.of_domains())
 
     def displacement_gradient(self, axisymmetric: bool = False) -> NDArray[np.float64]:
         """Return ``grad d`` at the history's points.
@@ -146,21 +128,13 @@ class Domains:
         if self.deletion is None:
             gradient = self.undeformed.gradient(np.asarray(self.displacement.x.array))
         else:
-            gradient = self.undeformed.gradient_of(self._nodal())
+            gradient = self.undeformed.gradient_of(self.of_domains())
         if not axisymmetric:
             return gradient
-        moved = self._nodal()
+        moved = self.of_domains()
         if self.undeformed.differs:
-            moved = self._corners() - self.undeformed.domains
+            moved = self.corners() - self.undeformed.domains
         return with_hoop(gradient, self.undeformed.hoop, moved)
-
-    def point_volumes(self, axisymmetric: bool = False) -> NDArray[np.float64]:
-        """Return the reference volume of the history's points, shape ``(n, nq)``.
-
-        Args:
-            axisymmetric: Whether it is that of a body of revolution, all around.
-        """
-        return self.undeformed.point_volumes(axisymmetric)
 
     @property
     def deleted(self) -> NDArray[np.bool_]:
@@ -183,44 +157,28 @@ class Domains:
     def volume(self) -> NDArray[np.float64]:
         """Volume of the domains now, shape ``(n,)``; an area in the plane."""
         exact = self.geometry.exact_rule()
-        ratio = volume_ratio(exact.displacement_gradient(self._nodal()))
+        ratio = volume_ratio(exact.displacement_gradient(self.of_domains()))
         return np.asarray((exact.weights * ratio).sum(axis=1))
 
     @property
     def initial_centroid(self) -> NDArray[np.float64]:
         """Centroid of the undeformed domains, shape ``(n, gdim)``."""
-        return self.mean(self.initial_domains)
+        return self.undeformed.mean(self.initial_domains)
 
     @property
     def centroid(self) -> NDArray[np.float64]:
         """Particle positions: mean of ``X + d`` over the domains, shape ``(n, gdim)``."""
-        return self.mean(self._corners())
+        return self.undeformed.mean(self.corners())
 
     @property
     def initial_points(self) -> NDArray[np.float64]:
         """Undeformed positions of the quadrature points, shape ``(n, nq, gdim)``."""
-        return self.at_points(self.initial_domains)
+        return self.undeformed.at_points(self.initial_domains)
 
     @property
     def points(self) -> NDArray[np.float64]:
         """Positions of the quadrature points, shape ``(n, nq, gdim)``."""
-        return self.at_points(self._corners())
-
-    def mean(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return averages over the undeformed domains of values at nodes ``(n, k, gdim)``."""
-        return np.asarray(np.einsum("nk,nki->ni", self.undeformed.averages, nodal))
-
-    def at_points(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values at the domains' nodes, ``(n, k, gdim)``, at the history's points.
-
-        The point of a triangle that was cut from a quadrilateral is its centroid.
-        """
-        points = np.asarray(np.einsum("qk,nki->nqi", self.quadrature.shapes, nodal))
-        cut = self.geometry.triangular
-        if cut.any():
-            averages = self.geometry.averages[cut]
-            points[cut] = np.einsum("nk,nki->ni", averages, nodal[cut])[:, None]
-        return points
+        return self.undeformed.at_points(self.corners())
 
     def inverted(self) -> NDArray[np.int64]:
         """Return global indices of domains with ``det F <= 0`` or not finite at a point."""
@@ -229,32 +187,6 @@ class Domains:
             return self.global_index[:0]
         return np.asarray(self.global_index[~positive.all(axis=1)])
 
-    def crossed(self) -> NDArray[np.int64]:
-        """Return global indices of quadrilaterals whose edges cross.
-
-        A quadrilateral with one corner turned inwards is concave, with two it crosses itself
-        and part of it is inverted. Other domains cannot cross without ``det F <= 0``.
-        """
-        shapes = self.geometry.shape_functions
-        quadrilateral = self.mesh.basix_cell() == basix.CellType.quadrilateral
-        if not quadrilateral or shapes.discontinuous or shapes.degree > 1:
-            return self.global_index[:0]
-        turned = self.corner_jacobians() <= 0.0
-        if not turned.any():
-            return self.global_index[:0]
-        inwards = turned.sum(axis=1)
-        return np.asarray(self.global_index[(inwards >= 2) & ~self.geometry.triangular])
-
-    def behind_axis(self) -> NDArray[np.int64]:
-        """Return global indices of domains that reach from a positive radius to a negative one.
-
-        Nodes that are shared stay at ``x[0] >= 0``, but for little of the domain's width.
-        """
-        if self.geometry.shape_functions.discontinuous:
-            return self.global_index[:0]
-        behind = reach_behind_axis(self._corners())
-        return np.asarray(self.global_index[behind & ~self.deleted])
-
     def folded(self) -> NDArray[np.int64]:
         """Return global indices of domains whose map is not one to one everywhere.
 
@@ -262,7 +194,7 @@ class Domains:
         present displacement. Such a domain covers a part of itself twice; it goes on as long as
         ``det F > 0`` at its quadrature points.
         """
-        now = self._corners()
+        now = self.corners()
         sign = self.geometry.orientation
         folded = self.geometry.jacobian_bound.vanishes(now, sign) & ~self.geometry.triangular
         return np.asarray(self.global_index[folded])
@@ -275,14 +207,32 @@ class Domains:
         bound from below.
         """
         mean = self.volume / quadrature_rule(self.mesh.basix_cell(), 0)[1].sum()
-        now = self._corners()
+        now = self.corners()
         least = self.geometry.jacobian_bound.lower_bound(now, self.geometry.orientation)
         return np.where(self.geometry.triangular, 1.0, least / np.abs(mean))
 
-    def corner_jacobians(self) -> NDArray[np.float64]:
-        """Return det J at the corners of the present domains, positive as in the undeformed.
 
-        Returns:
-            Shape ``(n, corners)``.
-        """
-        return self.geometry.corner_jacobians(self._corners())
+def behind_axis(domains: Domains) -> NDArray[np.int64]:
+    """Return global indices of domains that reach from a positive radius to a negative one.
+
+    Nodes that are shared stay at ``x[0] >= 0``, but for little of the domain's width.
+    """
+    if domains.geometry.shape_functions.discontinuous:
+        return domains.global_index[:0]
+    behind = reach_behind_axis(domains.corners())
+    return np.asarray(domains.global_index[behind & ~domains.deleted])
+
+
+def crossed(domains: Domains) -> NDArray[np.int64]:
+    """Return global indices of quadrilaterals whose edges cross.
+
+    A quadrilateral with one corner turned inwards is concave, with two it crosses itself
+    and part of it is inverted. Other domains cannot cross without ``det F <= 0``.
+    """
+    geometry = domains.geometry
+    shapes = geometry.shape_functions
+    quadrilateral = geometry.mesh.basix_cell() == basix.CellType.quadrilateral
+    if not quadrilateral or shapes.discontinuous or shapes.degree > 1:
+        return domains.global_index[:0]
+    inwards = (geometry.corner_jacobians(domains.corners()) <= 0.0).sum(axis=1)
+    return np.asarray(domains.global_index[(inwards >= 2) & ~geometry.triangular])

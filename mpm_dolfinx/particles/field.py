@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from petsc4py import PETSc
 
@@ -17,11 +17,12 @@ from dolfinx import fem, mesh
 from .. import _compat
 from ..background.basis import BackgroundBasis, PointBasis
 from ..errors import MPMError, ParticleOutsideError, agree
-from ..meshes.quadrature import DomainQuadrature, quadrature_rule
+from ..meshes.quadrature import quadrature_rule
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_expression
 from ..transfer.matrix import transfer_matrix
 from ..transfer.transfer import Transfer
+from .particles import Particles
 
 __all__ = ["CarriedField", "ParticleField"]
 
@@ -29,88 +30,27 @@ KINDS = ("total", "increment", "body")
 PLACES = ("nodes", "points")
 
 
-class Body(Protocol):
-    """Body, as a field on it knows it."""
-
-    @property
-    def mesh(self) -> mesh.Mesh:
-        """The body mesh."""
-
-    @property
-    def V(self) -> fem.FunctionSpace:
-        """The background space of the displacement."""
-
-    @property
-    def domain_nodes(self) -> NDArray[np.int32]:
-        """Local nodes of W of each owned domain."""
-
-    @property
-    def global_index(self) -> NDArray[np.int64]:
-        """Input index of each owned particle."""
-
-    @property
-    def deletion(self) -> object | None:
-        """Which domains are deleted, if any may be."""
-
-    @property
-    def quadrature(self) -> DomainQuadrature:
-        """The rule that carries the history, on each owned domain."""
-
-    @property
-    def dx(self) -> ufl.Measure:
-        """Measure with the rule that carries the history."""
-
-    @property
-    def transfer(self) -> Transfer:
-        """T and what follows from it, at the last converged positions."""
-
-    @property
-    def shares_nodes(self) -> bool:
-        """Whether neighbours share their nodes."""
-
-    @property
-    def deleted(self) -> NDArray[np.bool_]:
-        """Whether each owned domain is deleted."""
-
-    @property
-    def num_local(self) -> int:
-        """Number of particles this rank owns."""
-
-    @property
-    def num_points(self) -> int:
-        """Number of quadrature points of each domain."""
-
-    @property
-    def quadrature_degree(self) -> int:
-        """Degree of the rule that carries the history."""
-
-    def quadrature_function(self, name: str, shape: tuple[int, ...] = ()) -> fem.Function:
-        """Return a Function for data at the history's points."""
-
-    @property
-    def W(self) -> fem.FunctionSpace:
-        """Space of the displacement."""
-
-    @property
-    def converged_displacement(self) -> NDArray[np.float64]:
-        """Displacement at the last converged step, on the local dofs of W."""
-
-    def converged_points(self) -> NDArray[np.float64]:
-        """Return positions of all history's points, last converged, ``(n, nq, gdim)``."""
-
-    def of_domains(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return displacements of nodes ``(N, gdim)`` for each domain, shape ``(n, k, gdim)``."""
-
-    def at_points(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values at the domains' nodes, ``(n, k, gdim)``, at the history's points."""
-
-
 class ParticleField(fem.Function):
-    """An unknown on a body, such as a pressure or a temperature; :meth:`Particles.field` makes it.
+    """An unknown on a body besides its displacement, such as a pressure or a temperature.
 
-    It is a Function on the body mesh, and stands in UFL as such. Its values are those of a
-    background space at the body's points or nodes: ``p = T_p x``, or ``p = p_n + T_p x`` for
-    ``kind="increment"``.
+    It is a Function on the body mesh, and stands in UFL as such; give it to
+    ``ParticleProblem(..., fields=[...])``. Its values are those of a background space where the
+    body is: ``p = T_p x``. The space may have another degree, shape and mesh than that of the
+    displacement.
+
+    Args:
+        particles: The body.
+        V: Background space: scalar, vector or tensor Lagrange elements, continuous or not.
+        at: Where the body has values: at the ``"points"`` of ``particles.dx``, for forms
+            without the gradient of the field, or at the ``"nodes"`` of a Lagrange space of
+            the same degree on the body mesh, for those with it.
+        kind: ``"total"``: the background has the values themselves; ``"increment"``: it has
+            the change in each step, ``p = p_n + T_p x``, for what does not diffuse;
+            ``"body"``: T_p is that of the undeformed body in all steps.
+        name: Its name: an identifier, another one for each field of a body.
+
+    Raises:
+        MPMError: A space or options that do not go together.
 
     Attributes:
         particles: The body.
@@ -125,8 +65,15 @@ class ParticleField(fem.Function):
 
     @collective()
     def __init__(
-        self, particles: Body, V: fem.FunctionSpace, at: str, kind: str, name: str
+        self,
+        particles: Particles,
+        V: fem.FunctionSpace,
+        at: str = "points",
+        kind: str = "total",
+        name: str = "field",
     ) -> None:
+        if not isinstance(particles, Particles):
+            raise MPMError(f"A field is one of mpm.Particles, not of {type(particles).__name__}.")
         _validate(particles, V, at, kind, name)
         shape = tuple(V.ufl_element().reference_value_shape)
         if at == "points":
@@ -148,7 +95,7 @@ class ParticleField(fem.Function):
         body, block = self.particles, self.W.dofmap.bs
         values = self.x.array.reshape(-1, block)[self.W.dofmap.list[: body.num_local]]
         if self.at == "nodes":
-            points, _ = quadrature_rule(body.mesh.basix_cell(), body.quadrature_degree)
+            points, _ = quadrature_rule(body.mesh.basix_cell(), body.geometry.quadrature_degree)
             shapes = _compat.tabulated(self.W.ufl_element().basix_element, 0, points)[0]
             values = np.einsum("qk,nki->nqi", shapes, values)
         return np.asarray(values[..., 0] if block == 1 else values)
@@ -191,7 +138,7 @@ class ParticleField(fem.Function):
         return given
 
 
-def _validate(particles: Body, V: Any, at: str, kind: str, name: str) -> None:
+def _validate(particles: Particles, V: Any, at: str, kind: str, name: str) -> None:
     if not isinstance(V, fem.FunctionSpace):
         raise MPMError(f"A field needs a dolfinx FunctionSpace, not {type(V).__name__}.")
     if at not in PLACES:
@@ -302,7 +249,7 @@ class CarriedField:
         count = self.W.dofmap.index_map.size_local
         if self.field.at == "nodes":
             return np.ones(count)
-        return np.asarray(self.field.particles.quadrature.weights.ravel())
+        return np.asarray(self.field.particles.undeformed.rule.weights.ravel())
 
     def inverted(self) -> NDArray[np.int64]:
         """Return no particles: values cannot turn a domain inside out."""
@@ -342,7 +289,7 @@ class CarriedField:
         """Return where this rank's own values live, shape ``(N, gdim)`` (collective)."""
         body, gdim = self.field.particles, self.mesh.geometry.dim
         if self.field.at == "points":
-            points = _undeformed_points(body) if self.is_frozen else body.converged_points()
+            points = _undeformed_points(body) if self.is_frozen else body.placement.points()
             return points.reshape(-1, gdim)
         if self.is_frozen:
             x = self.W.tabulate_dof_coordinates()[:, :gdim]
@@ -386,7 +333,7 @@ class CarriedField:
         body = self.field.particles
         gdim = self.mesh.geometry.dim
         if self.field.at == "points":
-            moved = body.at_points(body.of_domains(motion.reshape(-1, gdim)))
+            moved = body.undeformed.at_points(body.of_domains(motion))
             return moved.reshape(-1, gdim)
         return self._at_nodes(motion)
 
@@ -429,7 +376,7 @@ class CarriedField:
         self.increment.x.array[:] = 0.0
 
 
-def _undeformed_points(body: Body) -> NDArray[np.float64]:
+def _undeformed_points(body: Particles) -> NDArray[np.float64]:
     """Return the undeformed positions of a body's points, ``(n, nq, gdim)`` (collective)."""
     gdim = body.mesh.geometry.dim
     x = body.quadrature_function("x", (gdim,))

@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -21,31 +22,9 @@ from ..meshes.regions import marked
 from ..parallel.given import require_same
 from ..reals import as_wholes
 from ..transfer.matrix import transfer_matrix
+from .response import MaterialDomains
 
 __all__ = ["FreeNodes", "chosen_nodes"]
-
-
-class Body(Protocol):
-    """A body as its free nodes know it."""
-
-    @property
-    def mesh(self) -> mesh.Mesh:
-        """The body mesh."""
-
-    @property
-    def W(self) -> fem.FunctionSpace:
-        """Space of the displacement."""
-
-    @property
-    def shares_nodes(self) -> bool:
-        """Whether neighbours share their nodes."""
-
-    @property
-    def frees_by_itself(self) -> bool:
-        """Whether nodes are free as long as the domains around them are good."""
-
-    def locate(self) -> None:
-        """Find the background cells of all nodes (collective)."""
 
 
 class FreeNodes:
@@ -57,18 +36,26 @@ class FreeNodes:
 
     Args:
         particles: The body, of which no node is free at first.
+        locate: Finds the background cells of all nodes (collective).
+        automatic: Whether nodes are free as long as the domains around them are good.
 
     Attributes:
         particles: As given.
         V: Space of the unknowns: W.
         W: The same.
+        locate: As given.
+        automatic: As given.
         increment: Their increment in the step being solved.
         chosen: Which of this rank's nodes of W are free, ghosts too.
         spent: Which have been free until the domains around them were bad, and stay carried.
     """
 
-    def __init__(self, particles: Body) -> None:
-        self.particles = particles
+    shares_nodes = True
+
+    def __init__(
+        self, particles: MaterialDomains, locate: Callable[[], None], automatic: bool
+    ) -> None:
+        self.particles, self.locate, self.automatic = particles, locate, automatic
         self.V = self.W = particles.W
         self.increment = fem.Function(self.W, name="increment of free nodes")
         self._beneath: PointBasis | None = None
@@ -84,11 +71,6 @@ class FreeNodes:
     def mesh(self) -> mesh.Mesh:
         """The body mesh."""
         return self.particles.mesh
-
-    @property
-    def shares_nodes(self) -> bool:
-        """Whether neighbours share their nodes."""
-        return self.particles.shares_nodes
 
     def choose(self, chosen: NDArray[np.bool_], spent: NDArray[np.bool_]) -> None:
         """Let others of this rank's nodes of W, ghosts too, be free, and others stay carried."""

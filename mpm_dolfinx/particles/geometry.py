@@ -23,6 +23,7 @@ from ..meshes.quadrature import (
     quadrature_element,
     volumes_and_averages,
 )
+from .options import Coordinates
 
 __all__ = ["RING", "Geometry"]
 
@@ -42,6 +43,7 @@ class Geometry:
 
     Attributes:
         mesh: The mesh.
+        coordinates: Its coordinates at the beginning.
         gdim: Its dimension.
         W: Space of the domains' displacement.
         shape_functions: basix element of W.
@@ -58,6 +60,7 @@ class Geometry:
         self, body: mesh.Mesh, family: str, degree: int, quadrature_degree: int | None
     ) -> None:
         self.mesh = body
+        self.coordinates = Coordinates(body, "body")
         self.gdim = body.geometry.dim
         cell = body.basix_cell()
         self.W = fem.functionspace(body, (family, degree, (self.gdim,)))

@@ -165,7 +165,6 @@ def validate_options(
     degree: int,
     quadrature_degree: int | None,
     outside: str,
-    domain_update: str,
     free: bool,
 ) -> None:
     """Raise an error unless method, degrees and policies go together.
@@ -201,8 +200,6 @@ def validate_options(
         raise MPMError(f"Unknown policy outside={outside!r}; choose 'error', 'stop' or 'delete'.")
     if V is None and outside != "error":
         raise MPMError(f"Finite elements have no background to leave; omit outside={outside!r}.")
-    if not is_one_of(domain_update, ("stretch", "fixed")):
-        raise MPMError(f"Unknown domain_update={domain_update!r}; choose 'stretch' or 'fixed'.")
 
 
 def validate_free(V: fem.FunctionSpace | None, method: str, on_distortion: str) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
+from .deletion import Deletion
 from .domains import Domains
-from .geometry import Geometry
 from .undeformed import Undeformed
 
 __all__ = ["MaterialDomains", "Response"]
@@ -73,9 +73,9 @@ class MaterialDomains(Domains):
     governed_by: object | None = None
 
     @override
-    def _live_on(self, geometry: Geometry, undeformed: Undeformed, deletable: bool) -> None:
+    def _live_on(self, undeformed: Undeformed, deletion: Deletion | None) -> None:
         """Live on another mesh, for whose domains no response answers yet."""
-        super()._live_on(geometry, undeformed, deletable)
+        super()._live_on(undeformed, deletion)
         self._response: Response | None = None
         self._unknowns: Sequence[Unknown] = ()
         self._water: Sequence[Unknown] = ()
@@ -100,7 +100,7 @@ class MaterialDomains(Domains):
         """Return volume averages of values ``(n, nq, ...)`` over the undeformed domains."""
         if self._response is not None:
             return self._response.strain.average(values)
-        weights = self.point_volumes()
+        weights = self.undeformed.point_volumes()
         parts = weights / weights.sum(axis=1, keepdims=True)
         return np.asarray(np.einsum("nq,nq...->n...", parts, values))
 

@@ -14,7 +14,7 @@ import ufl
 from dolfinx import fem
 
 from ..errors import MPMError, agree
-from ..meshes.quadrature import means_around_axis, volume_ratio
+from ..meshes.quadrature import means_around_axis
 from ..tolerances import SMALL
 from .geometry import Geometry
 from .means import MeansInUFL
@@ -37,6 +37,7 @@ class Undeformed:
         moved: Whether the mesh's nodes are elsewhere.
 
     Attributes:
+        geometry: As given.
         rule: The rule that carries the history, on each owned domain; its arrays stay the same.
         mass_share: Factor of the density that keeps the mass at each node where domains were
             split or the body rebased, otherwise ``None``.
@@ -47,7 +48,7 @@ class Undeformed:
     """
 
     def __init__(self, geometry: Geometry, cut: bool = False, moved: bool = False) -> None:
-        self._geometry = geometry
+        self.geometry = geometry
         self.rule = geometry.rule()
         self.mass_share: fem.Function | None = None
         if cut or moved:
@@ -70,9 +71,9 @@ class Undeformed:
         """The undeformed body."""
         if self._reference is not None:
             return self._reference
-        gdim = self._geometry.gdim
+        gdim = self.geometry.gdim
         gradient = np.zeros((*self.rule.weights.shape, gdim, gdim))
-        geometry = self._geometry
+        geometry = self.geometry
         return Reference(gradient, geometry.volumes, geometry.averages, geometry.corners)
 
     def refer(self, reference: Reference) -> None:
@@ -83,8 +84,8 @@ class Undeformed:
         self._reference = reference
         self._set_rule()
         if self.origin is not None:
-            nodes = self._geometry.domain_nodes
-            self.origin.x.array.reshape(-1, self._geometry.gdim)[nodes] = reference.domains
+            nodes = self.geometry.domain_nodes
+            self.origin.x.array.reshape(-1, self.geometry.gdim)[nodes] = reference.domains
             self.origin.x.scatter_forward()
 
     def revolve(self, around: bool) -> None:
@@ -94,43 +95,59 @@ class Undeformed:
         then, and so are the hoop strains: at the axis, values at the middle would not be near
         them however small domains are.
         """
-        quadrilateral = self._geometry.mesh.basix_cell() == basix.CellType.quadrilateral
+        quadrilateral = self.geometry.mesh.basix_cell() == basix.CellType.quadrilateral
         before = self.means
         self.means = None
         if around and quadrilateral and self.rule.weights.shape[1] == 1:
-            self.means = before or MeansInUFL(self._geometry)
+            self.means = before or MeansInUFL(self.geometry)
         if self.means is not before:
             self._set_rule()
 
     def _set_rule(self) -> None:
         """Set the volumes and gradients of the history's rule."""
         rule, self._gradient = self.rule, None
-        plain = self._geometry.rule()
+        plain = self.geometry.rule()
         if self.means is not None:
-            exact = self._geometry.exact_rule()
+            exact = self.geometry.exact_rule()
             rule.gradients[:, 0] = means_around_axis(exact, self.domains)
             rule.weights[:, 0] = self.volume
             share = self.point_volumes(axisymmetric=True) / plain.weights
             self.means.set(rule.gradients[:, 0], self.hoop[:, 0], share[:, 0])
             return
-        before = np.eye(self._geometry.gdim) + self.reference.gradient
+        before = np.eye(self.geometry.gdim) + self.reference.gradient
         np.matmul(plain.gradients, before, out=rule.gradients)
         np.divide(plain.weights, np.linalg.det(before), out=rule.weights)
 
     @property
     def domains(self) -> Array:
         """Nodes of the domains, shape ``(n, k, gdim)``."""
-        return self._geometry.corners if self._reference is None else self._reference.domains
+        return self.geometry.corners if self._reference is None else self._reference.domains
 
     @property
     def volume(self) -> Array:
         """Volume of the domains, shape ``(n,)``; an area in the plane."""
-        return self._geometry.volumes if self._reference is None else self._reference.volume
+        return self.geometry.volumes if self._reference is None else self._reference.volume
 
     @property
     def averages(self) -> Array:
         """Averages of the shape functions over the domains, shape ``(n, k)``."""
-        return self._geometry.averages if self._reference is None else self._reference.averages
+        return self.geometry.averages if self._reference is None else self._reference.averages
+
+    def mean(self, nodal: Array) -> Array:
+        """Return averages over the domains of values at their nodes ``(n, k, gdim)``."""
+        return np.asarray(np.einsum("nk,nki->ni", self.averages, nodal))
+
+    def at_points(self, nodal: Array) -> Array:
+        """Return values at the domains' nodes, ``(n, k, gdim)``, at the history's points.
+
+        The point of a triangle that was cut from a quadrilateral is its centroid.
+        """
+        points = np.asarray(np.einsum("qk,nki->nqi", self.rule.shapes, nodal))
+        cut = self.geometry.triangular
+        if cut.any():
+            averages = self.geometry.averages[cut]
+            points[cut] = np.einsum("nk,nki->ni", averages, nodal[cut])[:, None]
+        return points
 
     # -- Gradients ---------------------------------------------------------------------------
 
@@ -146,7 +163,7 @@ class Undeformed:
         if self._gradient is not None and np.array_equal(self._gradient[0], displacement):
             return self._gradient[1]
         self._gradient = None  # one at a time in memory
-        gradient = self.rule.gradient_of(displacement, self._geometry.domain_nodes)
+        gradient = self.rule.gradient_of(displacement, self.geometry.domain_nodes)
         if self._reference is not None:
             gradient = gradient + self._reference.gradient
         self._gradient = np.array(displacement, dtype=np.float64), gradient
@@ -165,15 +182,15 @@ class Undeformed:
 
     def require_radius(self) -> None:
         """Raise an error unless ``x[0]`` can be a radius (collective)."""
-        with agree(self._geometry.mesh.comm):
-            if self._geometry.gdim != 2:
+        with agree(self.geometry.mesh.comm):
+            if self.geometry.gdim != 2:
                 raise MPMError("An axisymmetric body is a mesh in the (r, z) plane.")
             left = reach_behind_axis(self.domains)
             if left.any():
                 raise MPMError(
                     "The domains of {particles} have a negative radius; an axisymmetric body "
                     "lies at x[0] >= 0.",
-                    self._geometry.global_index[left],
+                    self.geometry.global_index[left],
                 )
 
     @property
@@ -182,7 +199,7 @@ class Undeformed:
         if self.means is not None:
             return self.averages[:, None]
         shapes = self.rule.shapes
-        return np.broadcast_to(shapes, (self._geometry.num_local, *shapes.shape))
+        return np.broadcast_to(shapes, (self.geometry.num_local, *shapes.shape))
 
     @property
     def radii(self) -> Array:
@@ -225,35 +242,21 @@ class Undeformed:
         if self.origin is None:
             return 1.0
         F = ufl.grad(self.origin)
-        area = ufl.det(F) * ufl.inv(F).T * ufl.FacetNormal(self._geometry.mesh)
+        area = ufl.det(F) * ufl.inv(F).T * ufl.FacetNormal(self.geometry.mesh)
         return ufl.sqrt(ufl.inner(area, area))
 
     def mass_shares(self) -> Array:
         """Return the factors of the density at the nodes of the owned domains, ``(n, k)``."""
         assert self.mass_share is not None
-        dofs = self.mass_share.function_space.dofmap.list[: self._geometry.num_local]
+        dofs = self.mass_share.function_space.dofmap.list[: self.geometry.num_local]
         return np.array(self.mass_share.x.array[dofs], dtype=np.float64)
 
     def set_mass_shares(self, shares: Array) -> None:
         """Set the factors of the density at the nodes of the owned domains, shape ``(n, k)``."""
         assert self.mass_share is not None
-        dofs = self.mass_share.function_space.dofmap.list[: self._geometry.num_local]
+        dofs = self.mass_share.function_space.dofmap.list[: self.geometry.num_local]
         self.mass_share.x.array[dofs] = shares
         self.mass_share.x.scatter_forward()
-
-    def refer_mass_shares(self) -> None:
-        """Take the mass shares for such per volume of the mesh, which older files have.
-
-        They become those per undeformed volume with the same masses at the nodes.
-        """
-        assert self.origin is not None
-        geometry, exact = self._geometry, self._geometry.exact_rule()
-        N, own = exact.shapes, exact.weights
-        moved = self.origin.x.array.reshape(-1, geometry.gdim) - geometry.nodes
-        before = own * volume_ratio(exact.displacement_gradient(moved[geometry.domain_nodes]))
-        masses = np.einsum("nq,qc,qd,nd->nc", own, N, N, self.mass_shares(), optimize=True)
-        matrices = np.einsum("nq,qc,qd->ncd", before, N, N, optimize=True)
-        self.set_mass_shares(np.linalg.solve(matrices, masses[:, :, None])[:, :, 0])
 
 
 def reach_behind_axis(domains: Array) -> NDArray[np.bool_]:

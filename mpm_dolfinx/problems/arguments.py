@@ -109,7 +109,7 @@ def as_fields(fields: Any, bodies: Sequence[Particles]) -> list[ParticleField]:
     """
     known = isinstance(fields, list | tuple) and all(isinstance(f, ParticleField) for f in fields)
     if not known:
-        raise MPMError("fields must be a list of fields made by particles.field().")
+        raise MPMError("fields must be a list of mpm.ParticleField.")
     if len({id(field) for field in fields}) < len(fields):
         raise MPMError("The same field is given twice.")
     for body in bodies:

@@ -152,7 +152,9 @@ def initial_stress_at_points(value: Any, particles: Particles) -> Array:
     if isinstance(value, ufl.core.expr.Expr):
         made = as_expression(value, particles, "initial_stress", (3, 3))
         made = fem.Constant(particles.mesh, 1.0) * made  # a constant one knows no ranks
-        points, _ = quadrature_rule(particles.mesh.basix_cell(), particles.quadrature_degree)
+        points, _ = quadrature_rule(
+            particles.mesh.basix_cell(), particles.geometry.quadrature_degree
+        )
         cells = np.arange(n, dtype=np.int32)
         at_points = compiled_expression(made, points, particles.mesh.comm)
         evaluated: Any = at_points.eval(particles.mesh, cells)

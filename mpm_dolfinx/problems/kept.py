@@ -22,7 +22,9 @@ from ..history import Attempt, History, Loss, Stage, Statistics, Step
 from ..io.snapshot import Kept, Taken, fill, of_cells
 from ..meshes.remesh import Column
 from ..particles.field import CarriedField
+from ..particles.free import chosen_nodes
 from ..particles.particles import Particles
+from ..particles.reference import Reference
 from ..stepping.automatic import control_of
 from ..stepping.control import Converged, Progress, Run
 from ..system.reduced import ReducedSystem
@@ -36,31 +38,64 @@ class Bodies(Kept):
     def __init__(self, bodies: Sequence[Particles]) -> None:
         self._bodies = bodies
 
+    @override
     def numbers(self) -> dict[str, Any]:
-        """Return how quadrilaterals were cut, and which volume shares of masses are per."""
-        cuts = [body.cuts.tolist() for body in self._bodies]
-        return {"cuts": cuts, "mass share per": "undeformed volume"}
+        return {"cuts": [body.trail.cuts.tolist() for body in self._bodies]}
 
     @override
     def columns(self, body: int | None) -> dict[str, Column]:
-        return {} if body is None else self._bodies[body].converged_state()
+        return {} if body is None else _columns_of(self._bodies[body])
 
     def require(self, source: str, taken: Taken) -> None:
         """Raise an error where a state holds what nothing here takes."""
         for body, columns in zip(self._bodies, taken.columns, strict=False):
-            unknown = sorted(columns.keys() - body.converged_state().keys())
-            if unknown:
+            kept = _columns_of(body).keys()
+            if unknown := sorted(columns.keys() - kept):
                 raise MPMError(f"{source} holds {unknown}, which this problem does not keep.")
-            missing = sorted(body.converged_state().keys() - columns.keys())
-            if missing:
+            if missing := sorted(kept - columns.keys()):
                 raise MPMError(f"{source} does not hold {missing}, which this problem keeps.")
 
     @override
     def restore(self, taken: Taken) -> None:
         for body, columns in zip(self._bodies, taken.columns, strict=False):
-            body.set_converged_state(columns)
-            if "mass share per" not in taken.numbers and body.undeformed.origin is not None:
-                body.undeformed.refer_mass_shares()
+            _restore_body(body, columns)
+
+
+def _columns_of(body: Particles) -> dict[str, Column]:
+    """Return the last converged step of a body, cell by cell."""
+    nodal = body.placement.displacement[body.domain_nodes]
+    columns = {"displacement": Column(nodal, "nodes")}
+    if body.free_nodes is not None:
+        state = body.free_nodes.chosen.astype(np.float64) - body.free_nodes.spent
+        columns["free"] = Column(state[body.domain_nodes], "nodes")
+    if body.deletion is not None:
+        columns["deleted"] = Column(body.deletion.mask, "cells")
+        columns["kept"] = Column(body.deletion.kept(nodal), "nodes")
+    undeformed = body.undeformed
+    if undeformed.mass_share is not None:
+        columns |= undeformed.reference.columns()
+        columns["mass share"] = Column(undeformed.mass_shares(), "nodes")
+    if undeformed.origin is not None:
+        columns["mesh nodes"] = Column(body.geometry.corners, "nodes")
+    return columns
+
+
+def _restore_body(body: Particles, columns: dict[str, NDArray[Any]]) -> None:
+    """Make what :func:`_columns_of` once returned the last converged step (collective)."""
+    d, placement, undeformed = body.displacement.x, body.placement, body.undeformed
+    d.array.reshape(-1, body.geometry.gdim)[body.domain_nodes] = columns["displacement"]
+    d.scatter_forward()
+    if body.free_nodes is not None:
+        states = (columns["free"] > 0.5, columns["free"] < -0.5)
+        nodes = (np.unique(body.domain_nodes[state]) for state in states)
+        placement.choose_free(*(chosen_nodes(body.W, some) for some in nodes))
+    if body.deletion is not None:
+        placement.restore_deleted(columns["deleted"], columns["kept"])
+    if undeformed.mass_share is not None:
+        reference = (columns[f"reference {name}"] for name in Reference._fields)
+        undeformed.refer(Reference(*reference))
+        undeformed.set_mass_shares(columns["mass share"])
+    body.commit()
 
 
 class Material(Kept):

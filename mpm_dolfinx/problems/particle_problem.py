@@ -103,5 +103,5 @@ class ParticleProblem(Problem):
     def repartition(self, threshold: float = 0.1) -> bool:
         raise MPMError(
             "The residual is written on the present body mesh, so its particles cannot move; "
-            "place them at the start with Particles(..., partition='background')."
+            "call particles.repartition() before the residual is written."
         )

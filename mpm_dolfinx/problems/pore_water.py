@@ -63,7 +63,9 @@ class PoreWater:
         if known is not None:
             p = as_expression(known, particles, self.name, ())
             p = fem.Constant(particles.mesh, 1.0) * p  # (a constant one knows no ranks)
-            rule, _ = quadrature_rule(particles.mesh.basix_cell(), particles.quadrature_degree)
+            rule, _ = quadrature_rule(
+                particles.mesh.basix_cell(), particles.geometry.quadrature_degree
+            )
             self._known = compiled_expression(p, rule, particles.mesh.comm)
 
     def at_points(self) -> Array:

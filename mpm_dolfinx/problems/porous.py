@@ -223,7 +223,7 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         kind = "body" if body.is_free else "total"
         return _Filled(
             body,
-            body.field(V, at="nodes", kind=kind, name="pore_pressure"),
+            ParticleField(body, V, at="nodes", kind=kind, name="pore_pressure"),
             fem.Function(body.W, name="displacement before"),
             fem.Constant(body.mesh, 1.0),
         )

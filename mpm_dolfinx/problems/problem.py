@@ -881,7 +881,8 @@ class Problem(Hooked):
         self._require_governing()
         with agree(self._comm):
             for body in self.bodies:
-                body.require_meshes_as_they_were()
+                for coordinates in (body.geometry.coordinates, body.mover.coordinates):
+                    coordinates.require_same()
         load = [float(body.load.value) for body in self.bodies]
         require_same(self._comm, load=load, bcs=self.bcs, constants=self._constants)
 

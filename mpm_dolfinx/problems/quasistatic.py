@@ -27,6 +27,7 @@ from ..constitutive.step_stress import StepStress
 from ..constitutive.strain import Strain, strain_of
 from ..errors import MPMError, agree, warn
 from ..io.checkpoint import Snapshot
+from ..meshes.redistribution import Redistribution
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
 from ..parallel.given import is_number
@@ -476,7 +477,7 @@ class QuasiStaticProblem(Problem):
             V = fem.functionspace(body.V.mesh, ("Lagrange", degree))
             self._spaces_of_pressure.append((body, V))
         kind = "body" if body.is_free else "total"
-        return body.field(V, at="points", kind=kind, name="pressure")
+        return ParticleField(body, V, at="points", kind=kind, name="pressure")
 
     def _contribution(self, given: Body) -> Contribution:
         """Return the contribution of one body to the system (collective)."""
@@ -618,7 +619,7 @@ class QuasiStaticProblem(Problem):
             raise MPMError(f"threshold must be a share from 0 to 1, not {threshold!r}.")
         self.setup.require_movable()
         require_no_conditions_on_bodies(self.bcs, self.bodies, "the particles cannot move")
-        ranks = [body.ranks_of_background() for body in self.bodies]
+        ranks = [body.best_ranks() for body in self.bodies]
         leaving = sum(int(np.count_nonzero(r != self._comm.rank)) for r in ranks)
         share = self._comm.allreduce(leaving) / sum(body.num_global for body in self.bodies)
         if share <= threshold or share == 0.0:
@@ -627,7 +628,7 @@ class QuasiStaticProblem(Problem):
         def move() -> None:
             for body, targets in zip(self.bodies, ranks, strict=True):
                 if not body.is_free:
-                    body.move(targets)
+                    body.live_on(Redistribution(body.mesh, targets))
 
         self.renew(move, lambda snapshot: snapshot)
         self.history.statistics.count("repartitions")

@@ -162,7 +162,7 @@ class Remeshing:
             MPMError: The problem has others.
         """
         problem = self._problem
-        present = [body.cuts for body in problem.bodies]
+        present = [body.trail.cuts for body in problem.bodies]
         wanted = [
             np.array(cuts, dtype=np.int64).reshape(-1, 2)
             for cuts in snapshot.numbers.get("cuts", [[]] * len(present))
@@ -221,7 +221,7 @@ class Remeshing:
             return 0
         problem.setup.require_divisible()
         cuts = [_cuts(body, which) for body, which in zip(problem.bodies, wanted, strict=True)]
-        gradients = [body.converged_gradient() for body in problem.bodies]
+        gradients = [body.placement.gradient() for body in problem.bodies]
         masses = [problem.nodal_masses(number) for number in range(len(chosen))]
         moves = self._remesh(cuts)
         for number, (body, move, gradient, mass) in enumerate(
@@ -236,7 +236,7 @@ class Remeshing:
             shares = undeformed.mass_shares()
             earlier = reference.gradient.copy()
             rule, gdim = body.geometry.rule(), earlier.shape[-1]
-            nodal = body.of_domains(body.converged_displacement.reshape(-1, gdim))
+            nodal = body.of_domains(body.converged_displacement)
             in_mesh = rule.displacement_gradient(nodal)
             earlier[halves] = _earlier(gradient[halves], in_mesh[halves])
             volume = rule.weights / np.linalg.det(np.eye(gdim) + earlier)
@@ -259,7 +259,7 @@ class Remeshing:
         self._require_movable_nodes()
         masses = [problem.nodal_masses(number) for number in range(len(problem.bodies))]
         none = np.zeros((0, 2), dtype=np.int64)
-        positions = [body.converged_domains for body in problem.bodies]
+        positions = [body.placement.domains for body in problem.bodies]
         moves = self._remesh([none] * len(positions), positions)
         for number, (body, move, mass) in enumerate(
             zip(problem.bodies, moves, masses, strict=True)
@@ -320,7 +320,9 @@ class Remeshing:
 
         def change() -> None:
             for body, some, x in zip(problem.bodies, cuts, places, strict=True):
-                moves.append(body.rebase(some, x))
+                own = body.W if x is not None and body.W.ufl_element().degree > 1 else None
+                moves.append(Remesh(body.mesh, some, x, own))
+                body.live_on(moves[-1], some, x)
 
         def carry(snapshot: Snapshot) -> Snapshot:
             tables = []
@@ -336,7 +338,7 @@ class Remeshing:
                 if x is not None:
                     columns["displacement"] = np.zeros_like(columns["displacement"])
                 tables.append(Table(move.index, columns))
-            snapshot.numbers["cuts"] = [body.cuts.tolist() for body in problem.bodies]
+            snapshot.numbers["cuts"] = [body.trail.cuts.tolist() for body in problem.bodies]
             return Snapshot(snapshot.numbers, [*tables, *snapshot.tables[len(tables) :]])
 
         problem.keep_identity()
@@ -346,7 +348,7 @@ class Remeshing:
 
 def _diagonals(body: Particles) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the diagonal of each owned domain, and whether it can be cut along it."""
-    diagonal, least = diagonals(body.corner_jacobians())
+    diagonal, least = diagonals(body.geometry.corner_jacobians(body.corners()))
     return diagonal, (least > 0.0) & ~body.geometry.triangular & ~body.deleted
 
 
@@ -356,7 +358,11 @@ def _cuts(body: Particles, which: list[int]) -> Cuts:
         return np.zeros((0, 2), dtype=np.int64)
     comm = body.mesh.comm
     validate_distortion(
-        body.mesh, body.method, body.W.ufl_element().degree, body.quadrature_degree, "split"
+        body.mesh,
+        body.method,
+        body.W.ufl_element().degree,
+        body.geometry.quadrature_degree,
+        "split",
     )
     diagonal, good = _diagonals(body)
     mine = np.isin(body.global_index, which) & good

@@ -239,7 +239,9 @@ class ProblemState:
         Raises:
             MPMError: Functions that cannot be kept, or that are missing.
         """
-        if functions and any(len(body.cuts) or body.rebases for body in self._problem.bodies):
+        if functions and any(
+            len(body.trail.cuts) or body.trail.rebases for body in self._problem.bodies
+        ):
             raise MPMError(
                 "Domains were split or the body rebased, so functions= on its new mesh could not "
                 "be restored; save the state without them."

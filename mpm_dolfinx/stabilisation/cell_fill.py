@@ -41,11 +41,11 @@ def _points(body: Particles) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     They are those of the last converged step, without particles that are deleted or of which no
     node is carried.
     """
-    nodes, gradient = body.domain_nodes, body.converged_gradient()
+    nodes, gradient = body.domain_nodes, body.placement.gradient()
     there = np.ones(len(nodes), dtype=bool)
     if body.deletion is not None or body.free_nodes is not None:
         there = ~(body.deleted | body.free[nodes].all(axis=1))
-    rule, corners = body.quadrature, body.node_positions[nodes[there]]
+    rule, corners = body.undeformed.rule, body.node_positions[nodes[there]]
     points = np.einsum("qk,nki->nqi", rule.shapes, corners)
     volumes = rule.weights[there] * volume_ratio(gradient[there])
     return points.reshape(-1, corners.shape[-1]), volumes.ravel()
@@ -81,7 +81,7 @@ class CellFill(NamedTuple):
         bit = np.uint64(1) << np.arange(V.dofmap.list.shape[1], dtype=np.uint64)
         for number, body in enumerate(bodies):
             points, volumes = _points(body)
-            at = body.background_basis.at(points)
+            at = body.mover.basis.at(points)
             for cells, values in _sent(comm, at, at.found, volumes):
                 volume[:, number] += np.bincount(cells, weights=values, minlength=count)
             rows = body.node_basis.part(body.W.dofmap.index_map.size_local)

@@ -44,7 +44,7 @@ def stabilisation_of(
         return None
     least = CROWDED if kind == "auto" and simple else 0.0
     for body in bodies:
-        if not body.moves_at_nodes:
+        if not body.mover.method.at_nodes:
             if least > 0.0:
                 return None
             raise MPMError(

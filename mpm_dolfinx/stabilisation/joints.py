@@ -81,7 +81,7 @@ class Joints:
             nodes = np.flatnonzero(on[0] & on[1] & ~done)
             if over_ranks(comm, len(nodes)) == 0:
                 continue
-            basis, outside = body.beside(nodes)
+            basis, outside = body.placement.beside(nodes)
             firm = (touched.at_nodes(hold, basis.nodes) >= HARDLY).all(axis=2)
             far = np.round(np.where(firm, outside, np.inf), 9)
             best = far.argmin(axis=1)
@@ -91,7 +91,7 @@ class Joints:
                 None if part is None else part[row, best][found] for part in basis
             )
             rows.values[np.abs(rows.values) < ROUND_OFF] = 0.0
-            body.carry_by(nodes[found], rows)
+            body.placement.carry_by(nodes[found], rows)
             done[nodes[found]] = True
             changed |= bool(found.any())
         return over_ranks(comm, changed, MPI.LOR)

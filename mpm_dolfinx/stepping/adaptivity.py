@@ -56,7 +56,7 @@ class Adaptivity:
     @staticmethod
     def adapts(body: Particles) -> bool:
         """Return whether nodes of a body are freed."""
-        return body.free_nodes is not None and not body.frees_by_itself
+        return body.free_nodes is not None and not body.free_nodes.automatic
 
     def chosen(
         self, bodies: Sequence[Particles], errors: Errors

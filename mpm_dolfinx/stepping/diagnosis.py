@@ -16,6 +16,7 @@ from ..constitutive.points import MaterialPoints
 from ..errors import TRIAL_ERRORS, ConvergenceError, DomainDistortionError, MPMError, agreed
 from ..history import Statistics
 from ..parallel.totals import over_ranks
+from ..particles.domains import crossed
 from ..particles.particles import Particles
 from ..stabilisation.joints import HARDLY
 from ..system.field import Field
@@ -49,7 +50,7 @@ def improper(bodies: Sequence[Particles], materials: Sequence[MaterialPoints]) -
             how += (
                 ", as one quadrature point lets them; Particles(..., quadrature_degree=2) does not"
             )
-        found = found or DomainDistortionError.of(how, body.crossed())
+        found = found or DomainDistortionError.of(how, crossed(body))
     for points in materials:
         found = found or DomainDistortionError.of(*points.strain.beyond())
     return agreed(bodies[0].mesh.comm, found)

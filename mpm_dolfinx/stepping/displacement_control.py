@@ -87,7 +87,7 @@ class DisplacementControl:
         self.value = float(value)
         self.functional = functional
         self._space: fem.FunctionSpace | None = None
-        self._rebases = particles.rebases
+        self._rebases = particles.trail.rebases
         self.row()
 
     def require_for(self, bodies: Sequence[Particles], path: bool) -> None:
@@ -111,7 +111,7 @@ class DisplacementControl:
         Raises:
             MPMError: The body was rebased meanwhile.
         """
-        if self._rebases != self.particles.rebases:
+        if self._rebases != self.particles.trail.rebases:
             raise MPMError(
                 "The body was rebased since this displacement control was made; make a new one, "
                 "with a point of the rebased body and a displacement that is counted from there."
@@ -133,7 +133,7 @@ class DisplacementControl:
     def _of_point(self) -> NDArray[np.float64]:
         W, comm = self.particles.W, self.particles.mesh.comm
         found = False
-        if len(self.particles.cuts):
+        if len(self.particles.trail.cuts):
             nodes, values, found = self._in_triangles()
         if not found:
             asked = self._point[None][: int(comm.rank == 0)]

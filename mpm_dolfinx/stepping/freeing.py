@@ -37,7 +37,7 @@ class Carried(NamedTuple):
         """Carry them, for good; return whether there are any."""
         for body, free in self.free:
             assert body.free_nodes is not None
-            body.choose_free(free, body.free_nodes.spent | (body.free & ~free))
+            body.placement.choose_free(free, body.free_nodes.spent | (body.free & ~free))
         return bool(self.free)
 
 
@@ -58,7 +58,11 @@ class TriedNodes:
         Args:
             adapts: Whether nodes are freed where the background errs.
         """
-        return [body for body in self._bodies if adapts or body.frees_by_itself]
+        return [
+            body
+            for body in self._bodies
+            if adapts or (body.free_nodes is not None and body.free_nodes.automatic)
+        ]
 
     def keep(self) -> None:
         """Note which nodes are free, unless that is done since the last converged step."""
@@ -72,7 +76,7 @@ class TriedNodes:
     def put_back(self) -> None:
         """Let the nodes be free that were so at the last converged step."""
         for body, nodes in zip(self._bodies, self._before or (), strict=False):
-            body.choose_free(*nodes)
+            body.placement.choose_free(*nodes)
         self._before = None
 
     def settle(self) -> None:
@@ -95,7 +99,7 @@ class TriedNodes:
         before = self._count()
         for body, free in chosen:
             assert body.free_nodes is not None
-            body.choose_free(free, body.free_nodes.spent)
+            body.placement.choose_free(free, body.free_nodes.spent)
         return self._count() - before
 
     def _count(self) -> int:
@@ -124,7 +128,7 @@ def carried_after(bodies: Sequence[Particles]) -> Carried:
         ahead = 2.0 * after - before
         nodes = np.flatnonzero(free)
         points = np.concatenate([x[nodes] for x in (before, after, ahead)])
-        was, stays, remains = body.background_basis.within(points).found.reshape(3, -1)
+        was, stays, remains = body.mover.basis.within(points).found.reshape(3, -1)
         left = _any(body, was & ~stays)
         too_late = too_late or left
         here = before if left else after
@@ -187,7 +191,7 @@ def _without(
     """
     if not _any(body, seeds):
         return None
-    rows = body.background_basis.within(positions)
+    rows = body.mover.basis.within(positions)
     T = transfer_matrix(rows._replace(values=np.abs(rows.values)), body.W, body.V)
     one, together = T.createVecLeft(), T.createVecRight()
     bs = body.W.dofmap.index_map_bs

@@ -61,7 +61,7 @@ def move_bodies(
         with history.statistics.phase("locate"):
             for body in bodies:
                 if body.outside == "delete" or not last:
-                    leaving.append(body.leaving())
+                    leaving.append(body.placement.leaving(body.outside == "delete"))
                 else:
                     leaving.append(np.zeros(0, dtype=np.int64))
     except ParticleOutsideError:
@@ -71,7 +71,7 @@ def move_bodies(
     for number, (body, which) in enumerate(zip(bodies, leaving, strict=True)):
         if over_ranks(body.V.mesh.comm, len(which)) > 0:
             _record(history, _loss(body, number, masses(number), which, load))
-            body.delete(which)
+            body.placement.delete(which)
 
 
 def _loss(

@@ -386,7 +386,7 @@ class Stepper:
         return step
 
     def _rejects(self, run: Run, end: float) -> Callable[[float], bool] | None:
-        """Return what takes converged steps back, if they are chosen by their errors.
+        """Return a function that takes converged steps back, if they are chosen by their errors.
 
         Args:
             run: The run.
@@ -436,7 +436,7 @@ class Stepper:
 
 
 def _control_of(steps: int | ErrorControl) -> Control:
-    """Return what chooses the ends of steps."""
+    """Return the control that chooses the ends of steps."""
     if isinstance(steps, ErrorControl):
         return steps
     if isinstance(steps, int | np.integer) and steps >= 1 and not isinstance(steps, bool):

@@ -37,7 +37,7 @@ MOST_ALTERNATIONS = 5000
 
 
 class System(NamedTuple):
-    """What a problem is solved by, on the present meshes of its bodies.
+    """Residual, tangent and solver of a problem, on the present meshes of its bodies.
 
     Attributes:
         bodies: The bodies.

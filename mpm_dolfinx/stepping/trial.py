@@ -169,7 +169,7 @@ class Trial:
 
     @property
     def solver(self) -> StepSolver:
-        """What solves steps on the present meshes."""
+        """Solver of steps on the present meshes."""
         assert self._solver is not None
         return self._solver
 
@@ -180,7 +180,7 @@ class Trial:
 
     @property
     def newton(self) -> NewtonSolver:
-        """What finds a root of the residual."""
+        """Newton's method, which finds a root of the residual."""
         return self.solver.system.newton
 
     def prescribed(self) -> list[NDArray[np.float64]]:

@@ -26,6 +26,7 @@ from ..meshes.quadrature import exact_degree
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
 from ..parallel.totals import over_ranks
+from ..particles.field import ParticleField
 from ..particles.free import chosen_nodes
 from ..particles.particles import Particles
 from .field_equation import FieldEquation
@@ -62,7 +63,7 @@ class Damage(FieldEquation):
     ) -> None:
         body, comm = particles.mesh, particles.mesh.comm
         Q = fem.functionspace(body, ("Lagrange", 1))
-        d = particles.field(Q, at="nodes", kind="body", name="damage")
+        d = ParticleField(particles, Q, at="nodes", kind="body", name="damage")
         cells = fem.functionspace(body, ("Discontinuous Lagrange", 0))
         self._toughness, self._length = (fem.Function(cells) for _ in range(2))
         with agree(comm):

@@ -227,7 +227,7 @@ class Field:
         for body in self.bodies:
             if not isinstance(body, Particles) or body.is_free:
                 continue
-            if body.background_basis.hold(at_rest):
+            if body.mover.basis.hold(at_rest):
                 body.forget_transfer()
 
     # -- Unknowns -------------------------------------------------------------------------

@@ -55,7 +55,7 @@ class FieldEquation(Term):
     with a line search: Bertsekas 1982, SIAM J. Control Optim. 20).
 
     Args:
-        field: The field, made by ``particles.field(Q, at="nodes", kind="body")``.
+        field: The field, ``mpm.ParticleField(particles, Q, at="nodes", kind="body")``.
         residual: Its residual, with a test function of ``field.W``.
         lower: Least value: a number, a Function on ``field.W``, or ``"previous"``: the field never
             falls below its values at the last converged step.
@@ -90,7 +90,7 @@ class FieldEquation(Term):
         if not isinstance(body, Particles) or field.kind != "body" or field.at != "nodes":
             raise MPMError(
                 f"The field '{field.name}' cannot be solved for in turn with the displacements; "
-                "make it by particles.field(Q, at='nodes', kind='body')."
+                "make it by mpm.ParticleField(particles, Q, at='nodes', kind='body')."
             )
         super().__init__([body])
         self.field, self.lower, self.upper = field, lower, upper

@@ -62,7 +62,7 @@ class FreeField(Field):
         fixed = self.prescribed.held
         carried = fixed & ~self.nodes.dofs
         with agree(self._comm):
-            if fixed.any() and self.nodes.particles.frees_by_itself:
+            if fixed.any() and self.nodes.automatic:
                 raise MPMError(
                     "A Dirichlet condition on particles.W holds nodes that free='auto' may let the "
                     "background carry; hold them by conditions on V or a support."
@@ -84,7 +84,7 @@ class FreeField(Field):
         self._beneath = None
         if not over_ranks(self._comm, bool(held.any()), MPI.LOR):
             return fixed
-        self.nodes.particles.locate()
+        self.nodes.locate()
         rows = self.nodes.beneath
         sizes = transfer_matrix(rows._replace(values=np.abs(rows.values)), self.V, self.host.V)
         whole, loose = (sizes.createVecLeft() for _ in range(2))

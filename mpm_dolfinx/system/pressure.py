@@ -71,7 +71,7 @@ class PressureTerm(FieldTerm):
         """Return volumes times strains of the nodes by a slope, ``(n, nq, k, gdim)``."""
         weights = self._material.weights
         n, nq = weights.shape
-        gradients = self._particles.quadrature.gradients
+        gradients = self._particles.undeformed.rule.gradients
         gdim = gradients.shape[-1]
         slope = slope.reshape(n, nq, *slope.shape[1:])
         strains = gradients @ slope[:, :, :gdim, :gdim].swapaxes(2, 3)

@@ -22,7 +22,6 @@ class FiniteElements(Method):
 
     Args:
         V: Space of the body's own displacement.
-        domain_update: Not used.
     """
 
     name = "fem"
@@ -31,8 +30,8 @@ class FiniteElements(Method):
     one_point = False
     free = True
 
-    def __init__(self, V: fem.FunctionSpace, domain_update: str) -> None:
-        super().__init__(V, domain_update)
+    def __init__(self, V: fem.FunctionSpace) -> None:
+        super().__init__(V)
         layout = V.dofmap.index_map
         local = np.arange(layout.size_local + layout.num_ghosts, dtype=np.int32)
         nodes: NDArray[np.int64] = layout.local_to_global(local)[:, None]

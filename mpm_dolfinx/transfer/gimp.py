@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import override
+from typing import ClassVar, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from ..meshes.boxes import BOX_CELLS
 from ..tolerances import LAST_PLACES, NEGLIGIBLE
 from .method import CornerBasis, DomainState, Method, affine
 
-__all__ = ["GIMP", "BoxGrid"]
+__all__ = ["GIMP", "UGIMP", "BoxGrid"]
 
 
 class GIMP(Method):
@@ -32,8 +32,10 @@ class GIMP(Method):
 
     Args:
         V: Space on a structured background (collective).
-        domain_update: ``"stretch"``: half-lengths follow the diagonal of the right stretch U
-            (Charlton, Coombs & Augarde 2017); ``"fixed"``: they stay.
+
+    Attributes:
+        stretches: Whether half-lengths follow the diagonal of the right stretch U (Charlton,
+            Coombs & Augarde 2017).
 
     Raises:
         MPMError: The background is no grid of rectangles or boxes.
@@ -41,9 +43,10 @@ class GIMP(Method):
 
     name = "gimp"
 
-    def __init__(self, V: fem.FunctionSpace, domain_update: str) -> None:
+    stretches: ClassVar[bool] = True
+
+    def __init__(self, V: fem.FunctionSpace) -> None:
         self._grid = BoxGrid(V)
-        self._stretch = domain_update == "stretch"
 
     @override
     def require(
@@ -56,8 +59,8 @@ class GIMP(Method):
         with agree(body.comm):
             if len(skew) or body.basix_cell() not in BOX_CELLS:
                 raise MPMError(
-                    "Method 'gimp' needs particle domains that are axis-aligned rectangles or "
-                    "boxes; use 'cpdi2' or 'cpdi' for this body.",
+                    f"Method {self.name!r} needs particle domains that are axis-aligned rectangles "
+                    "or boxes; use 'cpdi2' or 'cpdi' for this body.",
                     skew,
                 )
 
@@ -89,10 +92,17 @@ class GIMP(Method):
         original = state.nodes[state.domains]
         centre, centroid, F = state.particles
         half = 0.5 * np.ptp(original, axis=1)
-        if self._stretch:
+        if self.stretches:
             half = half * _right_stretch(F)
         side = np.sign(original - centre[:, None])
         return np.asarray(centroid[:, None] + side * half[:, None])
+
+
+class UGIMP(GIMP):
+    """GIMP with boxes that keep their size, and move with their particle alone."""
+
+    name = "ugimp"
+    stretches = False
 
 
 class BoxGrid:

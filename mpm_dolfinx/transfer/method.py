@@ -111,7 +111,6 @@ class Method(ABC):
 
     Args:
         V: Background space (collective).
-        domain_update: Whether domains ``"stretch"`` or stay ``"fixed"``, where the method asks.
 
     Attributes:
         name: What users call it.
@@ -127,8 +126,8 @@ class Method(ABC):
     one_point: ClassVar[bool] = True
     free: ClassVar[bool] = False
 
-    def __init__(self, V: fem.FunctionSpace, domain_update: str) -> None:
-        del V, domain_update  # most methods need neither
+    def __init__(self, V: fem.FunctionSpace) -> None:
+        del V  # most methods do not need it
 
     def require(
         self, body: mesh.Mesh, corners: NDArray[np.float64], index: NDArray[np.int64]

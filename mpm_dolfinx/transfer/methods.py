@@ -6,12 +6,12 @@ from __future__ import annotations
 
 from .cpdi import CPDI, CPDI2
 from .elements import FiniteElements
-from .gimp import GIMP
+from .gimp import GIMP, UGIMP
 from .method import Method
 from .points import Points
 
 __all__ = ["METHODS"]
 
 METHODS: dict[str, type[Method]] = {
-    method.name: method for method in (CPDI2, CPDI, GIMP, Points, FiniteElements)
+    method.name: method for method in (CPDI2, CPDI, GIMP, UGIMP, Points, FiniteElements)
 }

@@ -276,8 +276,8 @@ def test_a_law_without_symmetry_beside_deleted_domains(f_bar, rule, axisymmetric
         bent(QUADRILATERAL), space(2), quadrature_degree=rule, outside="delete"
     )
     particles.commit()
-    particles.leaving()
-    particles.delete(np.flatnonzero(particles.global_index == 5))
+    particles.placement.leaving(True)
+    particles.placement.delete(np.flatnonzero(particles.global_index == 5))
     law = Friction(1e3, 0.3)
     compare(lambda: quasi_static(particles, material=law, f_bar=f_bar, axisymmetric=axisymmetric))
 

@@ -9,20 +9,20 @@ from scenes import QUADRILATERAL, TRIANGLE, WORLD
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import Hencky
+from mpm_dolfinx.meshes.redistribution import Redistribution
 
 
 def test_particles_are_where_their_background_is():
     # The body fills the background.
     V = scenes.vectors(scenes.box([0.0, 0.0], [4.0, 4.0], [32, 32], QUADRILATERAL))
     body = scenes.box([0.0, 0.0], [4.0, 4.0], [64, 64], TRIANGLE)
+    particles = mpm.Particles(body, V)
+    particles.repartition()
     problem = mpm.QuasiStaticProblem(
-        mpm.Body(
-            mpm.Particles(body, V, partition="background"), Hencky(1e3, 0.3), body_force=(0.0, -1.0)
-        ),
+        mpm.Body(particles, Hencky(1e3, 0.3), body_force=(0.0, -1.0)),
         bcs=[scenes.fix(V, scenes.at(i, 0.0, 4.0), component=i) for i in (0, 1)],
     )
-    particles = problem.particles
-    assert np.all(particles.ranks_of_background() == WORLD.rank)
+    assert np.all(particles.best_ranks() == WORLD.rank)
     problem.solve(1)
     statistics = problem.history.statistics
     assert statistics["off_rank_rows"] <= 0.03 * 2 * (WORLD.size - 1)
@@ -51,7 +51,8 @@ def test_idle_ranks_get_particles():
     # All in one corner, and all on one rank: nobody has more than its share afterwards.
     problem = scenes.block()
     particles = problem.particles
-    particles.move(np.zeros(particles.num_local, dtype=np.int64))
+    ranks = np.zeros(particles.num_local, dtype=np.int64)
+    particles.live_on(Redistribution(particles.mesh, ranks))
     problem = mpm.QuasiStaticProblem(mpm.Body(particles, Hencky(1e3, 0.3)), bcs=problem.bcs)
     assert (particles.num_local == 0) == (WORLD.rank > 0)
     assert problem.repartition(0.1)

@@ -89,7 +89,7 @@ def averaged_energy(problem, displacement):
     particles.displacement.x.array[:] = displacement.ravel()
     dim = particles.mesh.geometry.dim
     F = np.eye(dim) + particles.displacement_gradient()
-    J, weights = np.linalg.det(F), particles.quadrature.weights
+    J, weights = np.linalg.det(F), particles.undeformed.rule.weights
     history = problem.points[0].averaging
     groups = np.concatenate(WORLD.allgather(history.groups.number))
     sizes = np.stack([weights.sum(axis=1), (weights * J).sum(axis=1)], axis=1)
@@ -239,8 +239,8 @@ def test_deleted_domains_leave_their_patch():
     particles = problem.particles
     residual(problem, waves(particles))
     particles.commit()
-    particles.leaving()
-    particles.delete(np.flatnonzero(particles.global_index % 3 == 0))
+    particles.placement.leaving(True)
+    particles.placement.delete(np.flatnonzero(particles.global_index % 3 == 0))
     require_exact_tangent(problem, 0.1)
     problem.commit()
     assert np.isfinite(particles.stress).all()

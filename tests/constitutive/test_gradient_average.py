@@ -35,7 +35,7 @@ def test_average_is_that_of_finite_elements(kind, degree, axisymmetric):
     particles = body_of(degree, mesh.CellType[kind], 2)
     strain = strain_of(particles, axisymmetric)
     values = particles.quadrature_function("values")
-    points = particles.converged_points()
+    points = particles.placement.points()
     numbers = np.sin(3.0 * points[:, :, 0]) * points[:, :, 1] ** 2
     values.x.array[: numbers.size] = numbers.ravel()
     found = GradientAverage(strain, LENGTH, np.ones(particles.num_local, dtype=bool)).of(numbers)

@@ -172,7 +172,7 @@ class Warm:
         named = {name: fem.Constant(body, value) for name, value in values.items()}
         self.named = named | {"heat": fem.Constant(grid, heat)}
         Q = fem.functionspace(body if kind == "body" else grid, ("Lagrange", 1))
-        T = p.field(Q, at=at, kind=kind, name="temperature")
+        T = mpm.ParticleField(p, Q, at=at, kind=kind, name="temperature")
         d, v, q = p.displacement, ufl.TestFunction(p.W), ufl.TestFunction(T.W)
         growth = 1.0 + named["spread"] * T
         F = (ufl.Identity(2) + ufl.grad(d)) / growth

@@ -329,7 +329,7 @@ def test_domains_that_are_deleted_stay_apart(mpi_tmp_path):
     body = scenes.box([0.0, 0.0], [1.0, 1.0], [2, 2], QUADRILATERAL)
     particles = mpm.Particles(body, V, outside="delete")
     scenes.move(particles, lambda X: 0.1 * X)
-    particles.delete(np.flatnonzero(particles.global_index == 0))
+    particles.placement.delete(np.flatnonzero(particles.global_index == 0))
     scenes.move(particles, lambda X: 0.5 * X)
     path = mpi_tmp_path / "lost.pvd"
     TimeSeries(path, particles).write(1.0)

@@ -237,7 +237,7 @@ def test_both_diagonals():
         thing.strength = p.initial_domains.mean(axis=1)[:, None]
         problem.keep(thing)
         problem.split([3, 4, 5])
-        assert set(problem.particles.cuts[:, 1]) == {0 if turn > 0 else 1}
+        assert set(problem.particles.trail.cuts[:, 1]) == {0 if turn > 0 else 1}
         check(problem, thing, problem.particles.initial_domains, cut=[3, 4, 5])
 
 

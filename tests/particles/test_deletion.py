@@ -124,7 +124,7 @@ def test_a_deleted_domain_may_turn_inside_out():
     problem = mpm.ParticleProblem(R, p, bcs=[fem.dirichletbc(values, nodes)])
     X = p.initial_centroid
     gone = np.flatnonzero((np.abs(X[:, 0] - 0.6) < 0.13) & (np.abs(X[:, 1] - 0.4) < 0.13))
-    p.delete(gone)
+    p.placement.delete(gone)
     values.x.array[:] = V.tabulate_dof_coordinates()[:, :2].ravel() * [-0.2]
     problem.step()
     # Fold the deleted domains' nodes.

@@ -245,7 +245,6 @@ def test_what_makes_no_sense():
         ({"degree": 2, "quadrature_degree": 3}, "quadrature_degree=4 or more"),
         ({"degree": 4}, "must be 1, 2 or 3"),
         ({"outside": "delete"}, "no background to leave"),
-        ({"partition": "background"}, "there is no background"),
         ({"on_distortion": "split"}, "can be split"),
         ({"V": vectors(body)}, "or omit it for finite elements"),
     ):

@@ -18,6 +18,7 @@ import ufl
 from dolfinx import fem
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.meshes.remesh import Remesh
 
 
 def far_corner(scale):
@@ -319,10 +320,10 @@ def test_tags_of_the_first_mesh_and_of_the_last_eight_are_carried():
     """Each mesh that is known holds communicators, of which there are not many."""
     V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
     particles = mpm.Particles(scenes.box([0.2, 0.2], [1.2, 1.2], [3, 3], QUADRILATERAL), V)
-    every = []
+    every, none = [], np.zeros((0, 2), dtype=np.int64)
     for _ in range(12):
         every.append(mpm.facet_tags(particles.mesh, {7: mpm.region(x=0.2)}))
-        particles.rebase(np.zeros((0, 2), dtype=np.int64))
+        particles.live_on(Remesh(particles.mesh, none), none)
     present = mpm.facet_tags(particles.mesh, {7: mpm.region(x=0.2)})
     own = particles.mesh.topology.index_map(1).size_local
     for number, tags in enumerate(every):
@@ -338,4 +339,6 @@ def test_tags_of_the_first_mesh_and_of_the_last_eight_are_carried():
 def test_a_body_that_is_dealt_out_anew_at_first_was_not_rebased():
     V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
     block = scenes.box([0.2, 0.2], [1.2, 1.2], [3, 3], QUADRILATERAL)
-    assert mpm.Particles(block, V, partition="background").rebases == 0
+    moved = mpm.Particles(block, V)
+    moved.repartition()
+    assert moved.trail.rebases == 0

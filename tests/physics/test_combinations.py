@@ -668,7 +668,7 @@ class Wet(Scene):
         """Compare the volume of each body with that of the beginning, as no water has left."""
         for body in self.problem.bodies:
             if any(p.particles is body for p in self.problem.pore_pressure):
-                volume = WORLD.allreduce(float(body.point_volumes().sum()))
+                volume = WORLD.allreduce(float(body.undeformed.point_volumes().sum()))
                 before = WORLD.allreduce(float(body.initial_volume.sum()))
                 assert volume == pytest.approx(before, rel=1e-7)
 

@@ -31,7 +31,9 @@ def column(n, offset=0.37, settlement=1e-3, comm=WORLD):
     shape = scenes.box([0.0, low], [2 * h, 1 + low], (4, 2 * n), QUADRILATERAL, comm)
     V = scenes.vectors(background, 2)
     particles = mpm.Particles(shape, V, degree=2, quadrature_degree=4)
-    p = particles.field(fem.functionspace(background, ("Lagrange", 1)), at="nodes", name="pressure")
+    p = mpm.ParticleField(
+        particles, fem.functionspace(background, ("Lagrange", 1)), at="nodes", name="pressure"
+    )
     oedometric, poisson = 1.0 / settlement, 0.25
     shear = oedometric * (1.0 - 2.0 * poisson) / 2.0 / (1.0 - poisson)
     lame = oedometric - 2.0 * shear

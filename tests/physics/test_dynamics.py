@@ -37,6 +37,7 @@ import mpm_dolfinx as mpm
 from mpm_dolfinx.boundary import dashpot, fixed
 from mpm_dolfinx.errors import ConvergenceError
 from mpm_dolfinx.materials import Hencky, LinearElastic, VonMises
+from mpm_dolfinx.meshes.redistribution import Redistribution
 from mpm_dolfinx.system.inertia import Inertia
 from mpm_dolfinx.system.term import Term
 
@@ -888,8 +889,9 @@ def test_ranks_and_moves_between_them_change_nothing(scheme):
     moving = thrown(**options)
     for number, _ in enumerate(moving.steps(time=0.5, dt=0.05)):
         if number % 3 == 0:
-            ranks = anywhere(moving.particles.mesh, number)
-            moving.renew(lambda ranks=ranks: moving.particles.move(ranks), lambda state: state)
+            mesh = moving.particles.mesh
+            move = Redistribution(mesh, anywhere(mesh, number))
+            moving.renew(lambda move=move: moving.particles.live_on(move), lambda state: state)
     require_same(run_of(moving), run_of(alone), 1e-9)
 
 

@@ -58,7 +58,7 @@ def errors(problem, case):
     """Return the errors of stress at the points and of the nodes' positions."""
     particles = problem.particles
     up = particles.mesh.geometry.dim - 1
-    volumes = particles.point_volumes()
+    volumes = particles.undeformed.point_volumes()
     gap = np.abs(
         particles.point_stress[..., up, up] - case.stress(particles.initial_points[..., up])[1]
     )
@@ -187,7 +187,7 @@ def test_patch_in_space(domain):
 def test_points_and_averages():
     problem = column(A, 4, TRIANGLE, 2, steps=4)
     particles = problem.particles
-    volumes = particles.point_volumes()
+    volumes = particles.undeformed.point_volumes()
     assert volumes.shape == (particles.num_local, 3)
     assert np.allclose(volumes.sum(axis=1), particles.initial_volume)
     mean = np.einsum("nq,nqij->nij", volumes, particles.point_stress)

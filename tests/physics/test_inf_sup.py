@@ -31,7 +31,7 @@ def inf_sup(cell, n, offset, degree=2, smooth=False):
     background = scenes.box([-h] * dim, [1.0 + 2 * h] * dim, [n + 3] * dim, cell, comm)
     body = scenes.box([offset * h] * dim, [1.0 + offset * h] * dim, [2 * n] * dim, cell, comm)
     particles = mpm.Particles(body, scenes.vectors(background, degree), degree=degree)
-    p = particles.field(fem.functionspace(background, ("Lagrange", 1)), name="p")
+    p = mpm.ParticleField(particles, fem.functionspace(background, ("Lagrange", 1)), name="p")
     d, v, q = particles.displacement, ufl.TestFunction(particles.W), ufl.TestFunction(p.W)
     product = ufl.inner(ufl.sym(ufl.grad(d)), ufl.sym(ufl.grad(v))) + ufl.inner(d, v)
     R_u = (2.0 * product + p * ufl.div(v)) * particles.dx

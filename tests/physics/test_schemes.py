@@ -11,6 +11,7 @@ from scenes import QUADRILATERAL, WORLD, anywhere, box, in_order, largest, vecto
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import LinearElastic, VonMises
+from mpm_dolfinx.meshes.redistribution import Redistribution
 
 
 class BDF2(mpm.Scheme):
@@ -163,8 +164,9 @@ def test_what_a_scheme_keeps_goes_with_bodies_to_other_ranks_and_meshes():
     there, moving = bouncing(BDF2(), False), bouncing(BDF2(), False)
     there.solve(time=0.2, dt=0.02)
     for number, _ in enumerate(moving.steps(time=0.2, dt=0.02)):
-        ranks = anywhere(moving.particles.mesh, number)
-        moving.renew(lambda ranks=ranks: moving.particles.move(ranks), lambda state: state)
+        mesh = moving.particles.mesh
+        move = Redistribution(mesh, anywhere(mesh, number))
+        moving.renew(lambda move=move: moving.particles.live_on(move), lambda state: state)
     require_same(moving, there, 1e-9)
 
     flying = bar(BDF2())

@@ -89,7 +89,7 @@ def shear(problem):
 def width(problem):
     """Width of the band by its second moment."""
     (points,) = problem.points
-    x = problem.bodies[0].converged_points()[:, :, 0]
+    x = problem.bodies[0].placement.points()[:, :, 0]
     rate = points.last.plastic_strain() * points.weights
     moments = [comm.allreduce((rate * (x - 0.5 * SPAN) ** k).sum()) for k in (0, 1, 2)]
     return np.sqrt(12.0 * (moments[2] / moments[0] - (moments[1] / moments[0]) ** 2))

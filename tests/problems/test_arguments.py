@@ -321,7 +321,7 @@ PROBLEMS = {
         r"interior of facet_tags\(\) must be True or False, not 'no'",
     ),
     "field of a kind that is an array": (
-        lambda: (p := particles()).field(scenes.vectors(p.V.mesh), kind=np.ones(2)),
+        lambda: mpm.ParticleField(p := particles(), scenes.vectors(p.V.mesh), kind=np.ones(2)),
         r"kind of field\(\) must be str, not array\(\[1\., 1\.\]\)",
     ),
     # bodies

@@ -44,7 +44,7 @@ def taylor_hood(cell, fields=("nodes",), bulk=1e6, degree=2, **options):
     """Return a problem of a nearly incompressible beam that bends, particles being cells."""
     particles = mpm.Particles(beam(cell), scenes.vectors(beam(cell), degree), degree=degree)
     V_p = scalars(particles.V.mesh, degree - 1)
-    p = particles.field(V_p, at=fields[0], name="pressure")
+    p = mpm.ParticleField(particles, V_p, at=fields[0], name="pressure")
     d, v, q = particles.displacement, ufl.TestFunction(particles.W), ufl.TestFunction(p.W)
     dx = particles.dx
     psi = potential(d, p, bulk) * dx
@@ -85,7 +85,7 @@ def test_biot_against_stock_finite_elements():
     domain, dt, conductivity, storage = beam(TRIANGLE), 0.1, 0.2, 1e-3
     particles = mpm.Particles(domain, scenes.vectors(beam(TRIANGLE), 2), degree=2)
     V_p = scalars(particles.V.mesh)
-    p = particles.field(V_p, at="nodes", name="p")
+    p = mpm.ParticleField(particles, V_p, at="nodes", name="p")
     x = p.W.tabulate_dof_coordinates()
     p.set(1.0 + x[:, 0] * x[:, 1])
     d, v, q, dx = (
@@ -134,7 +134,7 @@ def heat(cell, **options):
     """Return a problem of heat alone in a body at rest."""
     particles = mpm.Particles(beam(cell), scenes.vectors(beam(cell)))
     V_T = scalars(particles.V.mesh, 2)
-    T = particles.field(V_T, at="nodes", name="T")
+    T = mpm.ParticleField(particles, V_T, at="nodes", name="T")
     hot = fem.Constant(V_T.mesh, 0.0)
     dofs = fem.locate_dofs_geometrical(V_T, scenes.at(0, 0.0))
     bcs = [fem.dirichletbc(hot, dofs, V_T)]
@@ -201,7 +201,7 @@ def immersed(at="points", kind="total", cells=QUADRILATERAL, outside="error", co
     background = scenes.box([0.0, 0.0], [2.5, 2.0], (5, 4), cells, comm)
     shape = scenes.box([0.0, 0.61], [2.0, 1.11], (8, 2), cells, comm)
     particles = mpm.Particles(shape, scenes.vectors(background, 2), degree=2, outside=outside)
-    p = particles.field(scalars(background), at=at, kind=kind, name="p")
+    p = mpm.ParticleField(particles, scalars(background), at=at, kind=kind, name="p")
     d, v, q = particles.displacement, ufl.TestFunction(particles.W), ufl.TestFunction(p.W)
     psi = potential(d, p, 1e5) * particles.dx
     load = particles.load * 0.1 * v[1] * particles.dx_exact
@@ -294,7 +294,7 @@ def test_two_bodies_share_a_field_on_one_space():
     for start in (0.0, 1.0):
         half = scenes.box([start, 0.61], [start + 1.0, 1.11], (4, 2), QUADRILATERAL)
         bodies.append(mpm.Particles(half, V, degree=2))
-        fields.append(bodies[-1].field(V_p, name="p"))
+        fields.append(mpm.ParticleField(bodies[-1], V_p, name="p"))
     for each in (0, 1):
         body, field = bodies[each], fields[each]
         psi = potential(body.displacement, field, 1e5) * body.dx
@@ -317,7 +317,7 @@ def test_values_at_the_start_of_a_step_fit_those_of_the_body():
     background = scenes.unit(5, QUADRILATERAL)
     shape = scenes.box([0.13, 0.21], [0.53, 0.61], (6, 6), QUADRILATERAL)
     particles = mpm.Particles(shape, scenes.vectors(background))
-    T = particles.field(scalars(background), at="nodes", name="T")
+    T = mpm.ParticleField(particles, scalars(background), at="nodes", name="T")
     q = ufl.TestFunction(T.W)
     R = ((T - T.previous) * q) * ufl.dx
     problem = mpm.ParticleProblem([None, R], particles, fields=[T])
@@ -336,11 +336,19 @@ def test_values_at_the_start_of_a_step_fit_those_of_the_body():
 def test_what_does_not_go_together_is_refused():
     particles = mpm.Particles(body(), scenes.vectors(held_background()))
     V_p = scalars(particles.V.mesh)
-    raises(lambda: particles.field(particles.V), mpm.MPMError, "a background space of its own")
-    raises(lambda: particles.field(V_p, at="cells"), mpm.MPMError, "choose 'nodes' or 'points'")
-    raises(lambda: particles.field(V_p, kind="rate"), mpm.MPMError, "Unknown kind")
-    raises(lambda: particles.field(V_p, name="a b"), mpm.MPMError, "identifier")
-    p = particles.field(V_p, name="p")
+    raises(
+        lambda: mpm.ParticleField(particles, particles.V),
+        mpm.MPMError,
+        "a background space of its own",
+    )
+    raises(
+        lambda: mpm.ParticleField(particles, V_p, at="cells"),
+        mpm.MPMError,
+        "choose 'nodes' or 'points'",
+    )
+    raises(lambda: mpm.ParticleField(particles, V_p, kind="rate"), mpm.MPMError, "Unknown kind")
+    raises(lambda: mpm.ParticleField(particles, V_p, name="a b"), mpm.MPMError, "identifier")
+    p = mpm.ParticleField(particles, V_p, name="p")
     d, v = particles.displacement, ufl.TestFunction(particles.W)
     q = ufl.TestFunction(p.W)
     R_u = ufl.inner(scenes.linear_stress(d, 1e3, 0.3) + p * ufl.Identity(2), ufl.grad(v))
@@ -364,14 +372,14 @@ def test_what_does_not_go_together_is_refused():
     pushed = ufl.dot(ufl.grad(p.previous), v) * particles.dx
     raises(make([R_u + pushed, R_p], fields=[p]), mpm.MPMError, "a gradient of 'p before'")
     other = mpm.Particles(body(), scenes.vectors(held_background()))
-    foreign = other.field(scalars(other.V.mesh), name="p")
+    foreign = mpm.ParticleField(other, scalars(other.V.mesh), name="p")
     raises(make([R_u, R_p], fields=[foreign]), mpm.MPMError, "particles that this problem has not")
 
 
 @pytest.mark.parametrize("at", ["points", "nodes"])
 def test_values_that_make_no_sense_are_refused(at):
     particles = mpm.Particles(body(), scenes.vectors(held_background()))
-    p = particles.field(scalars(particles.V.mesh), at=at, name="p")
+    p = mpm.ParticleField(particles, scalars(particles.V.mesh), at=at, name="p")
     p.set(np.full(len(p.x.array), 2))
     one = np.ones(len(p.x.array))
     last = WORLD.rank == WORLD.size - 1  # what is wrong on one rank is an error on all
@@ -395,7 +403,9 @@ def test_a_field_that_nothing_holds_is_said_to_be_one(cells, symmetric):
     grid = mesh.create_rectangle(scenes.WORLD, [[0, 0], [1, 1]], [4, 4], scenes.QUADRILATERAL)
     body = mesh.create_rectangle(scenes.WORLD, [[0, 0], [1, 1]], cells, scenes.QUADRILATERAL)
     particles = mpm.Particles(body, fem.functionspace(grid, ("Lagrange", 1, (2,))))
-    heat = particles.field(fem.functionspace(grid, ("Lagrange", 1)), at="nodes", name="heat")
+    heat = mpm.ParticleField(
+        particles, fem.functionspace(grid, ("Lagrange", 1)), at="nodes", name="heat"
+    )
     q = ufl.TestFunction(heat.W)
     flow = (ufl.dot(ufl.grad(heat), ufl.grad(q)) - particles.load * q) * particles.dx
     problem = mpm.ParticleProblem([None, flow], particles, fields=[heat], symmetric=symmetric)

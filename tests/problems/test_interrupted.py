@@ -74,7 +74,9 @@ def in_ufl(terms):
 
 def with_temperature(terms):
     p = body()
-    T = p.field(fem.functionspace(p.V.mesh, ("Lagrange", 1)), at="nodes", name="temperature")
+    T = mpm.ParticleField(
+        p, fem.functionspace(p.V.mesh, ("Lagrange", 1)), at="nodes", name="temperature"
+    )
     T.interpolate(lambda x: 1.0 + x[0])
     T.previous.x.array[:] = T.x.array
     S, dx = ufl.TestFunction(T.W), p.dx

@@ -147,7 +147,7 @@ def test_the_same_as_in_ufl():
     problem.solve(time=0.06, dt=0.02)
     body, k, dt = other.particles, 1.0 / confined(SOIL), 0.02
     V_p = fem.functionspace(body.V.mesh, ("Lagrange", 1))
-    field = body.field(V_p, at="nodes", name="pore_pressure")
+    field = mpm.ParticleField(body, V_p, at="nodes", name="pore_pressure")
     d, v, q = body.displacement, ufl.TestFunction(body.W), ufl.TestFunction(field.W)
     before, n, size = fem.Function(body.W), ufl.FacetNormal(body.mesh), 0.125
     tags = scenes.facet_tags(body.mesh, scenes.at(1, 1.0))

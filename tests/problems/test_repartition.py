@@ -66,9 +66,12 @@ def flowing(partition, comm=WORLD, **options):
     young = fem.Function(fem.functionspace(body, ("DG", 0)))
     young.interpolate(lambda x: 1e6 * (1.0 + 0.05 * x[1]))
     law = VonMises(young, 0.3, rho_y=20e3, hardening=2e4)
+    particles = mpm.Particles(body, V)
+    if partition == "background":
+        particles.repartition()
     return posed(
         mpm.QuasiStaticProblem,
-        mpm.Particles(body, V, partition=partition),
+        particles,
         {1: law, 2: Hencky(1e6, 0.3)},
         density=1000.0,
         body_force=lambda domain: ufl.as_vector(
@@ -100,7 +103,9 @@ def test_clouds_of_boxes(mpi_tmp_path):
     own = x[WORLD.rank :: WORLD.size]
     values = []
     for partition in ("given", "background"):
-        particles = mpm.Particles.from_points(own, 0.25, V, method="gimp", partition=partition)
+        particles = mpm.Particles.from_points(own, 0.25, V, method="gimp")
+        if partition == "background":
+            particles.repartition()
         bcs = [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)]
         problem = mpm.QuasiStaticProblem(
             mpm.Body(particles, Hencky(1e3, 0.3), body_force=(0.0, -10.0)), bcs=bcs
@@ -163,6 +168,8 @@ def test_what_cannot_move():
     R = ufl.derivative(scenes.neo_hookean(d) * particles.dx, d, v)
     with pytest.raises(mpm.MPMError, match="residual is written on the present body mesh"):
         mpm.ParticleProblem(R, particles, bcs=problem.bcs).repartition()
-    with pytest.raises(mpm.MPMError, match="partition='somewhere'"):
-        mpm.Particles(body, V, partition="somewhere")
+    with pytest.raises(mpm.MPMError, match=r"moved by problem\.repartition"):
+        problem.particles.repartition()
+    with pytest.raises(mpm.MPMError, match="have no background"):
+        mpm.Particles(body).repartition()
     assert len(cell_centres(body)) == particles.num_local

@@ -397,7 +397,7 @@ def test_what_cannot_be_is_refused():
 def test_nodes_that_are_carried_for_good_are_not_freed():
     """Those that the background had to take, as domains around them were bad."""
     problem, own = angle()
-    own.choose_free(own.free, np.ones(len(own.free), dtype=bool))
+    own.placement.choose_free(own.free, np.ones(len(own.free), dtype=bool))
     with pytest.warns(UserWarning, match="is not met") if WORLD.rank == 0 else quiet():
         problem.solve(1, adapt=0.1)
     assert freed(problem) == [0] and not own.free.any()

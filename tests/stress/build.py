@@ -336,7 +336,7 @@ def make(scene, comm) -> Run:
     options = {"method": scene["method"], "quadrature_degree": scene["quadrature_degree"]}
     options |= {k: scene[k] for k in ("outside",) if k in scene}
     if "update" in scene and scene["method"] == "gimp":
-        options["domain_update"] = scene["update"]
+        options["method"] = "gimp" if scene["update"] == "stretch" else "ugimp"
     if "domain_degree" in scene:
         options["degree"] = scene["domain_degree"]
     pair = "passes" in scene.get("contact", {})

@@ -245,7 +245,7 @@ class Domains:
     def _boxes(self, background, x, F, arms):
         """Return the rows of contiguous boxes, by products of averaged hat functions."""
         half = 0.5 * np.ptp(self.X[self.nodes], axis=1)
-        if self.particles.options()["domain_update"] == "stretch":
+        if self.particles.method == "gimp":
             size, turn = np.linalg.eigh(np.einsum("nji,njk->nik", F, F))
             U = np.einsum("nij,nj,nkj->nik", turn, np.sqrt(size), turn)
             half = half * np.diagonal(U, axis1=1, axis2=2)

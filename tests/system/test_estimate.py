@@ -104,7 +104,7 @@ def test_shares_of_nodes_go_to_the_domains_that_are_left():
     shares = shares_of_domains(body, nodal)
     assert WORLD.allreduce(shares.sum()) == pytest.approx(25.0)  # of 5 x 5 nodes
     gone = np.flatnonzero(np.isin(body.global_index, (0, 1)))
-    body.delete(gone)
+    body.placement.delete(gone)
     left = shares_of_domains(body, nodal)
     assert not left[gone].any() and len(gone) == np.count_nonzero(body.deleted)
     assert WORLD.allreduce(left.sum()) == pytest.approx(25.0 - lone_nodes(body))

@@ -40,7 +40,9 @@ class Pulled:
             V = fem.functionspace(grid, ("Lagrange", 1, (2,)))
         self.particles = mpm.Particles(body, V, quadrature_degree=3)
         Q = fem.functionspace(body, ("Lagrange", 1))
-        self.damage = d = self.particles.field(Q, at="nodes", kind="body", name="damage")
+        self.damage = d = mpm.ParticleField(
+            self.particles, Q, at="nodes", kind="body", name="damage"
+        )
         u = self.particles.displacement
         strain = ufl.sym(ufl.grad(u))
         energy = (1 - d) ** 2 * YOUNG / 2 * ufl.inner(strain, strain) + surface(model, d)
@@ -137,7 +139,7 @@ def test_without_bounds_it_is_the_equation_of_dolfinx() -> None:
     body = mesh.create_rectangle(comm, [[0, 0], [2, 1]], [9, 5], mesh.CellType.triangle)
     particles = mpm.Particles(body)
     Q = fem.functionspace(body, ("Lagrange", 1))
-    p = particles.field(Q, at="nodes", kind="body", name="average")
+    p = mpm.ParticleField(particles, Q, at="nodes", kind="body", name="average")
     x, q = ufl.SpatialCoordinate(body), ufl.TestFunction(p.W)
     source = ufl.cos(3 * x[0]) + x[1]
     dx = particles.dx_exact
@@ -168,7 +170,7 @@ def test_bounds_hold_where_the_equation_does_not() -> None:
     body = mesh.create_rectangle(comm, [[0, 0], [1, 1]], [12, 12], QUADRILATERAL)
     particles = mpm.Particles(body)
     Q = fem.functionspace(body, ("Lagrange", 1))
-    p = particles.field(Q, at="nodes", kind="body", name="height")
+    p = mpm.ParticleField(particles, Q, at="nodes", kind="body", name="height")
     q, x = ufl.TestFunction(p.W), ufl.SpatialCoordinate(body)
     load = ufl.conditional(ufl.lt(abs(x[0] - 0.5), 0.3), -60.0, 60.0)
     dx = ufl.dx(body)
@@ -191,8 +193,8 @@ def test_bounds_hold_where_the_equation_does_not() -> None:
 def test_an_equation_that_is_not_linear_is_solved_to_round_off() -> None:
     body = mesh.create_rectangle(comm, [[0, 0], [1, 1]], [3, 3], QUADRILATERAL)
     particles = mpm.Particles(body)
-    p = particles.field(
-        fem.functionspace(body, ("Lagrange", 1)), at="nodes", kind="body", name="root"
+    p = mpm.ParticleField(
+        particles, fem.functionspace(body, ("Lagrange", 1)), at="nodes", kind="body", name="root"
     )
     residual = (p**3 + p - 10.0) * ufl.TestFunction(p.W) * ufl.dx(body)
     equation = mpm.FieldEquation(p, residual)
@@ -204,8 +206,8 @@ def test_an_equation_that_is_not_linear_is_solved_to_round_off() -> None:
 def test_an_upper_bound_below_what_never_heals_gives_way() -> None:
     body = mesh.create_rectangle(comm, [[0, 0], [1, 1]], [3, 3], QUADRILATERAL)
     particles = mpm.Particles(body)
-    p = particles.field(
-        fem.functionspace(body, ("Lagrange", 1)), at="nodes", kind="body", name="height"
+    p = mpm.ParticleField(
+        particles, fem.functionspace(body, ("Lagrange", 1)), at="nodes", kind="body", name="height"
     )
     upper = fem.Function(p.W)
     upper.x.array[:] = 1.0
@@ -224,13 +226,17 @@ def test_what_cannot_be_alternated_is_refused() -> None:
     body = mesh.create_rectangle(comm, [[0, 0], [1, 1]], [4, 4], QUADRILATERAL)
     grid = mesh.create_rectangle(comm, [[0, 0], [1, 1]], [2, 2], QUADRILATERAL)
     particles = mpm.Particles(body, fem.functionspace(grid, ("Lagrange", 1, (2,))))
-    total = particles.field(fem.functionspace(grid, ("Lagrange", 1)), at="nodes", name="total")
+    total = mpm.ParticleField(
+        particles, fem.functionspace(grid, ("Lagrange", 1)), at="nodes", name="total"
+    )
     residual = total * ufl.TestFunction(total.W) * particles.dx
     with pytest.raises(mpm.MPMError, match="kind='body'"):
         mpm.FieldEquation(total, residual)
     with pytest.raises(mpm.MPMError, match="not of 3"):
         mpm.FieldEquation(3, residual)  # type: ignore[arg-type]
-    own = particles.field(fem.functionspace(body, ("Lagrange", 1)), "nodes", "body", "own")
+    own = mpm.ParticleField(
+        particles, fem.functionspace(body, ("Lagrange", 1)), "nodes", "body", "own"
+    )
     residual = own * ufl.TestFunction(own.W) * particles.dx
     for wrong in ("last", np.nan, np.inf, True):
         with pytest.raises(mpm.MPMError, match="must be a finite number"):

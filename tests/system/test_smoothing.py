@@ -20,7 +20,9 @@ def test_forces_are_those_of_deviations_from_the_means_of_cells():
     V = scenes.vectors(scenes.box([0.0, 0.0], [4.0 / 3.0, 1.0], [4, 3], QUADRILATERAL))
     body = scenes.box([0.1, 0.1], [0.9, 0.95], [7, 6], QUADRILATERAL)
     particles = mpm.Particles(body, V)
-    field = particles.field(fem.functionspace(V.mesh, ("Lagrange", 1)), at="points", name="p")
+    field = mpm.ParticleField(
+        particles, fem.functionspace(V.mesh, ("Lagrange", 1)), at="points", name="p"
+    )
     at = particles.initial_centroid
     volumes = particles.initial_volume * (1.0 + at[:, 0])
     shear = 50.0 * (1.0 + at[:, 1])
