@@ -74,7 +74,7 @@ class Scene:
         d[:] = 1e-3 * h * random.standard_normal(d.size)
 
     def prepared(self, problem: mpm.ParticleProblem) -> mpm.ParticleProblem:
-        assert all(body.update() is None for body in problem.body_terms)
+        assert all(body.update() is None for body in problem.built.body_terms)
         problem.reduced.begin([np.zeros_like(problem.bodies[0].increment.x.array)], 1.0)
         return problem
 
@@ -152,7 +152,7 @@ def plastic_update(count: float, dim: int = 2) -> float:
     shear = np.zeros_like(X)
     shear[:, 0] = 0.1 * X[:, 1]
     scene.particles.displacement.x.array[:] = shear.ravel()
-    (body,) = problem.body_terms
+    (body,) = problem.built.body_terms
     assert body.update() is None
     assert problem.yield_function.max() < 0.0  # of the last converged step
     (time_of,) = seconds(body.update)
@@ -174,8 +174,8 @@ def whole(count: float) -> dict[str, float]:
         problem.reduced.unknowns.forget()
         problem.reduced.begin([np.zeros_like(problem.bodies[0].increment.x.array)], 1.0)
         for _ in range(5):
-            problem.body_terms[0].update()
-            problem.body_terms[0].forms.assemble_residual()
+            problem.built.body_terms[0].update()
+            problem.built.body_terms[0].forms.assemble_residual()
             problem.reduced.tangent()
 
     (time_of,) = seconds(step, repeats=2)

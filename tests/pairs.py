@@ -13,6 +13,7 @@ from dolfinx import fem
 import mpm_dolfinx as mpm
 from mpm_dolfinx import contact
 from mpm_dolfinx.materials import Hencky, LinearElastic
+from mpm_dolfinx.meshes.redistribution import Redistribution
 
 YOUNG, POISSON = 1e3, 0.3
 
@@ -228,9 +229,9 @@ def go_on_other_meshes(what, **options):
 
             def change(ranks=ranks):
                 for body, to in zip(problem.bodies, ranks, strict=True):
-                    body.move(to)
+                    body.live_on(Redistribution(body.mesh, to))
 
-            problem.renew(change, lambda state: state)
+            problem.state.renew(change, lambda state: state)
         elif what == "rebase":
             problem.rebase()
         else:

@@ -17,7 +17,7 @@ from mpm_dolfinx.assembly.petsc import MatrixSum
 from mpm_dolfinx.constitutive.strain import strain_of
 from mpm_dolfinx.materials.base import StrainMaterial
 from mpm_dolfinx.materials.compiled import CompiledMaterial
-from mpm_dolfinx.problems import parts, quasistatic
+from mpm_dolfinx.problems import parts, physics
 from mpm_dolfinx.system.pressure import PressureTerm
 
 #: Where tangents come from: compiled loops, domain by domain, or the reference.
@@ -35,7 +35,7 @@ def on_route(route):
         return
     with (
         patch.object(parts, "BodyForms", ReferenceForms),
-        patch.object(quasistatic, "PressureTerm", ReferencePressure),
+        patch.object(physics, "PressureTerm", ReferencePressure),
         patch.object(CompiledMaterial, "update", StrainMaterial.update),
         patch.object(CompiledMaterial, "at_pressure", StrainMaterial.at_pressure),
         patch.object(CompiledMaterial, "integrate", returns.integrate),

@@ -391,7 +391,7 @@ def block(material=None, cell=TRIANGLE, n=4, comm=WORLD, force=(0.0, -10.0), **o
 
 def times_tangent(problem, values):
     """Return the tangent of the last residual times a vector on W, at this rank's own dofs."""
-    forms = problem.body_terms[0].forms
+    forms = problem.built.body_terms[0].forms
     if forms.stock:
         forms.assemble_tangent()
     vector = forms.r.duplicate()

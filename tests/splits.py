@@ -57,14 +57,14 @@ def on_background(particles, vector):
 def sums(problem):
     """Return what a split must leave as it is: sums over the body, and at background nodes."""
     p = problem.particles
-    volume, masses = p.initial_volume, problem.nodal_masses(0)
+    volume, masses = p.initial_volume, problem.built.mass_matrices(0).sum(axis=2)
     degree = p.W.ufl_element().degree
     at_nodes = fem.Function(fem.functionspace(p.mesh, ("Lagrange", degree)))
     np.add.at(at_nodes.x.array, at_nodes.function_space.dofmap.list[: p.num_local], masses)
     at_nodes.x.scatter_reverse(la.InsertMode.add)
     work = p.T.createVecLeft()
     work.array_w.reshape(-1, p.mesh.geometry.dim)[:] = scenes.own(at_nodes)[:, None]
-    forms = problem.body_terms[0].forms
+    forms = problem.built.body_terms[0].forms
     forms.assemble_external()
     (stress,) = problem.points
     strain = stress.strain.average(stress.last.variable("elastic_b_minus_identity"))

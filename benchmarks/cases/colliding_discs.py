@@ -74,7 +74,7 @@ problem = mpm.DynamicProblem(
 def mean_speed(number: int) -> float:
     """Mean velocity of a disc along x, by its mass."""
     body = bodies[number]
-    mass = problem.nodal_masses(number)
+    mass = problem.built.mass_matrices(number).sum(axis=2)
     v = problem.velocity[number].x.array.reshape(-1, 2)[body.domain_nodes][: body.num_local, :, 0]
     return kit.mean(v.ravel(), mass.ravel())
 

@@ -63,7 +63,7 @@ problem = mpm.DynamicProblem(
 
 x = particles.W.tabulate_dof_coordinates()[:, 0] - left
 momentum, mass = problem.momentum[0], h
-weight = problem.nodal_masses(0).ravel()
+weight = problem.built.mass_matrices(0).sum(axis=2).ravel()
 nodes = particles.domain_nodes[: particles.num_local].ravel()
 
 

@@ -134,7 +134,7 @@ def ours() -> tuple[fem.Function, float, mpm.History]:
 def stock() -> tuple[fem.Function, float]:
     """The body in stock DOLFINx."""
     start = time.process_time()
-    rule = mpm.Particles(body_mesh(), degree=args.degree).quadrature_degree
+    rule = mpm.Particles(body_mesh(), degree=args.degree).geometry.quadrature_degree
     domain = body_mesh()
     W = fem.functionspace(domain, ("Lagrange", args.degree, (dim,)))
     d, load = fem.Function(W), fem.Constant(domain, 0.0)

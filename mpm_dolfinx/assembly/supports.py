@@ -93,7 +93,7 @@ class BodyLoops:
     def __init__(self, particles: Particles, forms: BodyForms, coupled: bool) -> None:
         self.particles = particles
         self._forms = forms
-        self._domains = (particles.domain_nodes, particles.quadrature.gradients)
+        self._domains = (particles.domain_nodes, particles.undeformed.rule.gradients)
         internal = forms.internal
         one = particles.num_points == 1
         self._points = internal is not None and one and internal.hoop is None

@@ -178,7 +178,7 @@ class Adjoint:
         self._trial: Trial | None = None
         self._reduced = problem.reduced
         self._values = [one.function.x.array.copy() if one.function else None for one in self._many]
-        problem.record(self)
+        problem.trial.record(self)
 
     @property
     def displacements(self) -> list[list[Array]]:
@@ -191,7 +191,7 @@ class Adjoint:
         """Do nothing: this is for motions."""
 
     def solved(self, trial: Trial) -> Callable[[], None]:
-        """Note a step that is solved; see :meth:`Problem.record`."""
+        """Note a step that is solved; see :class:`.Recorder`."""
         problem = self.problem
         self._require_present()
         if trial.run is not None and trial.run.goal is not None:
@@ -217,7 +217,7 @@ class Adjoint:
     def _data(self) -> list[Array]:
         """Return the data of forms besides displacements, to be set."""
         constants = [c for body in self.problem.bodies for c in (body.load, body.proportional)]
-        found = [*constants, *self.problem.loads(), *self.problem.constants()]
+        found = [*constants, *self.problem.built.loads, *self.problem.built.constants]
         mine = [one.function for one in self._many]
         return [
             value.x.array if isinstance(value, fem.Function) else value.value
@@ -402,7 +402,7 @@ class Adjoint:
         """Add what forces depend on besides laws."""
         problem, parameter = self.problem, one.parameter
         if one.function is not None:
-            for term, motion in zip(problem.body_terms, moved, strict=True):
+            for term, motion in zip(problem.built.body_terms, moved, strict=True):
                 one.total -= term.forms.work_by(one.function, motion)
             return
         sides = []

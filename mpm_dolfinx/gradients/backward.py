@@ -159,7 +159,7 @@ class Backward:
         for law, points, term, motion, own in zip(
             laws,
             problem.points,
-            problem.body_terms,
+            problem.built.body_terms,
             weights.motion,
             weights.states,
             strict=True,
@@ -233,7 +233,7 @@ class Backward:
     def _stiffness(self, motion: Sequence[fem.Function]) -> list[Array]:
         """Return the tangent times a motion, on own dofs of W of each body."""
         found = []
-        for term, function in zip(self._problem.body_terms, motion, strict=True):
+        for term, function in zip(self._problem.built.body_terms, motion, strict=True):
             (force,) = term.stiffness_force([_vector(function)])
             found.append(force.array_r.copy())
         return found

@@ -56,7 +56,7 @@ class Rates:
 
 def followed(problem: Problem) -> list[Particles | CarriedField]:
     """Return the motions of a problem: of its bodies, then of their other fields."""
-    return [*problem.bodies, *problem.carried]
+    return [*problem.bodies, *problem.built.carried]
 
 
 class _Here:

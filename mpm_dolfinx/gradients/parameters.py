@@ -203,7 +203,7 @@ def _along(
     laws = [law for points in problem.points for law in points.laws.given]
     numbers: list[Any] = [value for law in laws for value in law.parameters.values()]
     of_law = any(value is thing for value in numbers)
-    elsewhere = any(load is thing for load in problem.loads())
+    elsewhere = any(load is thing for load in problem.built.loads)
     elsewhere = elsewhere or any(_compat.holds(bc, thing) for bc in problem.bcs)
     with agree(problem.bodies[0].mesh.comm):
         if not of_law and not elsewhere and _is_in_none(thing, problem):
@@ -230,7 +230,7 @@ def _is_in_none(thing: fem.Constant | fem.Function, problem: Problem) -> bool:
         return False
     if isinstance(thing, fem.Function):
         return not any(problem.setup.supports_of(body) for body in problem.bodies)
-    return all(constant is not thing for constant in problem.constants())
+    return all(constant is not thing for constant in problem.built.constants)
 
 
 def largest(sizes: Any, problem: Problem) -> float:

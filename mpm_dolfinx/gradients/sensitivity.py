@@ -95,7 +95,7 @@ class Sensitivity:
         self._run: Run | None = None
         self._rates, self._nearby = self._beginning()
         self._note()
-        problem.record(self)
+        problem.trial.record(self)
 
     # -- Results --------------------------------------------------------------------------
 
@@ -155,7 +155,7 @@ class Sensitivity:
         converged = self._trial.converged
         before = converged.supports, converged.force
         try:
-            converged.supports = [support.reaction for support in self.problem.supports]
+            converged.supports = [support.reaction for support in self.problem.built.supports]
             converged.force = None
             yield
         finally:
@@ -164,7 +164,7 @@ class Sensitivity:
     # -- What follows the run --------------------------------------------------------------
 
     def solved(self, trial: Trial) -> Callable[[], None]:
-        """Find the derivatives of a step that is solved; see :meth:`Problem.record`.
+        """Find the derivatives of a step that is solved; see :class:`.Recorder`.
 
         Raises:
             MPMError: There are none.
@@ -341,6 +341,7 @@ def _not_in(problem: Problem) -> list[str]:
         "hooks of a subclass (evaluate, commit, roll_back)": any(
             getattr(kind, name) is not getattr(Problem, name) for name in hooks
         ),
-        "Functions at quadrature points in a residual": bool(problem.data_at_points()),
+        "Functions at quadrature points in a residual": bool(problem.built.data)
+        and not problem.keeps_data,
     }
     return [name for name, present in missing.items() if present]

@@ -32,7 +32,7 @@ from .files import kind_of, replace
 __all__ = ["VERSION", "Snapshot", "Table", "read", "write"]
 
 MAGIC = b"mpm_dolfinx checkpoint\n"
-VERSION = 1
+VERSION = 2
 START = struct.Struct("<IQI")
 
 
@@ -193,7 +193,12 @@ def _read_header(path: Path) -> tuple[dict[str, Any], int]:
             if version > VERSION:
                 raise MPMError(
                     f"The checkpoint '{path}' was written by a newer mpm_dolfinx (format "
-                    f"{version}, this one reads up to {VERSION}); update the package."
+                    f"{version}, this one reads {VERSION}); update the package."
+                )
+            if version < VERSION:
+                raise MPMError(
+                    f"The checkpoint '{path}' was written by an older mpm_dolfinx (format "
+                    f"{version}, this one reads {VERSION}); restore it by that, or begin anew."
                 )
             size = os.fstat(file.fileno()).st_size
             if size < len(MAGIC) + START.size + length:

@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import Any
 
 from mpi4py import MPI
 
@@ -23,7 +24,7 @@ from ..tolerances import EQUAL
 from .checkpoint import Snapshot
 from .snapshot import spaces_of
 
-__all__ = ["Identifiable", "identity", "require_same", "same"]
+__all__ = ["identity", "require_same", "same"]
 
 
 def require_same(present: dict[str, Any], snapshot: Snapshot, source: str, comm: MPI.Comm) -> None:
@@ -35,26 +36,22 @@ def require_same(present: dict[str, Any], snapshot: Snapshot, source: str, comm:
                 raise MPMError(f"{source} is of another problem: {name} is not the same.")
 
 
-class Identifiable(Protocol):
-    """Something that has an identity among problems."""
-
-    bodies: list[Particles]
-
-    @property
-    def carried(self) -> list[CarriedField]:
-        """The unknowns besides displacements."""
-
-    def laws(self) -> list[list[tuple[str, dict[str, Any]]]]:
-        """Return name and parameters of each body's materials."""
-
-
-def identity(problem: Identifiable) -> dict[str, Any]:
+def identity(
+    bodies: Sequence[Particles],
+    carried: Sequence[CarriedField],
+    laws: Sequence[Sequence[tuple[str, dict[str, Any]]]],
+) -> dict[str, Any]:
     """Return the properties that two problems must share to exchange states (collective).
 
-    It is that of the problem as it is now: see :class:`ProblemState` for what it was made as.
+    It is that of a problem as it is now: see :class:`ProblemState` for what it was made as.
+
+    Args:
+        bodies: Its bodies.
+        carried: Its unknowns besides displacements.
+        laws: Name and parameters of each body's materials.
     """
-    found: dict[str, Any] = {"the number of bodies": len(problem.bodies)}
-    spaces = [V for V in spaces_of(problem.bodies) if any(V is b.V for b in problem.bodies)]
+    found: dict[str, Any] = {"the number of bodies": len(bodies)}
+    spaces = [V for V in spaces_of(bodies) if any(V is b.V for b in bodies)]
     for i, V in enumerate(spaces):
         of = f" of field {i}" if i else ""
         element = V.ufl_element()
@@ -62,19 +59,19 @@ def identity(problem: Identifiable) -> dict[str, Any]:
         found[f"the background space{of}"] = [element.family_name, element.degree]
     if len(spaces) > 1:
         found["the field of each body"] = [
-            next(i for i, V in enumerate(spaces) if V is body.V) for body in problem.bodies
+            next(i for i, V in enumerate(spaces) if V is body.V) for body in bodies
         ]
-    for i, (body, law) in enumerate(zip(problem.bodies, problem.laws(), strict=True)):
-        of = f" of body {i}" if len(problem.bodies) > 1 else ""
+    for i, (body, law) in enumerate(zip(bodies, laws, strict=True)):
+        of = f" of body {i}" if len(bodies) > 1 else ""
         found[f"the body mesh{of}"] = _mesh(body.mesh)
         found[f"the particles' method{of}"] = _options(body)
         found[f"the material{of}"] = [
             [name, {key: _parameter(body, value) for key, value in parameters.items()}]
             for name, parameters in law
         ]
-    for one in problem.carried:
+    for one in carried:
         field, element = one.field, one.V.ufl_element()
-        number = next(i for i, body in enumerate(problem.bodies) if body.mesh is one.mesh)
+        number = next(i for i, body in enumerate(bodies) if body.mesh is one.mesh)
         found[f"the field {field.name} of body {number}"] = [
             field.at,
             field.kind,

@@ -37,13 +37,73 @@ from .motion import (
 )
 from .particle_problem import ParticleProblem
 from .parts import Contribution
+from .physics import Physics
 from .quasistatic import QuasiStaticProblem
+from .setup import Setup
 from .stages import join
 
 __all__ = ["DynamicParticleProblem", "DynamicProblem"]
 
 #: Share of the energies of a motion that stress may give it beyond what is stored.
 GAIN = 0.1
+
+
+class _Motion(Physics):
+    """Stress and forces of bodies that move.
+
+    Args:
+        inertia: The term that has the velocities.
+        viscosity: Damping in proportion to the stiffness, a time.
+
+    Attributes:
+        stresses: Of each body.
+    """
+
+    further = ("velocity",)
+    gradual = False
+    takes_time = True
+
+    def __init__(self, inertia: Inertia, viscosity: float) -> None:
+        self._inertia, self._viscosity = inertia, viscosity
+        self.stresses: list[StepStress] = []
+
+    @override
+    def not_for_cracks(self) -> dict[str, bool]:
+        # (that stress makes up for any change of the energy, also that which goes into cracks, and
+        # this damping is that of bodies which are whole)
+        scheme = self._inertia.scheme
+        return {
+            f"scheme={scheme.name!r}; use 'euler'": scheme.stress_of_step,
+            "a part of the stiffness in rayleigh=; omit it": self._viscosity > 0.0,
+        }
+
+    @override
+    def require(self, bodies: Sequence[Body], kind: str) -> None:
+        super().require(bodies, kind)
+        if any(body.density is None for body in bodies):
+            raise MPMError("A body that moves needs a density; give density= to its mpm.Body.")
+
+    @override
+    def begin(self, setup: Setup) -> None:
+        self.stresses = []
+
+    @override
+    def acting(
+        self, points: MaterialPoints, supports: Sequence[Support]
+    ) -> tuple[StepStress, Sequence[StepForce]]:
+        body = points.strain.particles
+        whole = self._inertia.scheme.stress_of_step and not self.is_static(body)
+        stress = StepStress(points, whole, self._viscosity, self.share(body))
+        self.stresses.append(stress)
+        return stress, (stress, *supports)
+
+    @override
+    def share(self, body: Particles) -> float:
+        return 1.0 if self.is_static(body) else self._inertia.scheme.share
+
+    @override
+    def is_static(self, body: Particles) -> bool:
+        return self._inertia.state.is_static(body)
 
 
 class DynamicProblem(MovingProblem, QuasiStaticProblem):
@@ -107,7 +167,6 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         require_same(particles[0].V.mesh.comm, quasi_static=numbers)
         self._goes_on = after is not None
         damping = rayleigh_of(rayleigh)
-        self._viscosity = damping[1]
         require_motion("DynamicProblem", options)
         rule = as_scheme(scheme, out_of_range)
         if rule.reflects and options.get("mixed") == "stabilised pressure":
@@ -119,6 +178,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         start = _at_first(given)
         self._energies = []
         self.inertia = Inertia(particles, start, rule, damping, self._energies, static)
+        self._physics = self._motion = _Motion(self.inertia, damping[1])
         own = as_terms(terms, particles)
         if after is not None:
             join(own, after.terms)
@@ -135,8 +195,6 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
                 body.governed_by = by
             raise
 
-    _gradual = False
-
     @staticmethod
     def _require_before(
         after: QuasiStaticProblem, bodies: Sequence[Body], options: dict[str, Any]
@@ -152,7 +210,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         )
         if not same:
             raise MPMError("after= needs a problem of the same particles, in the same order.")
-        if not after.governs:
+        if not after.reign.holds:
             raise MPMError(
                 "after= is a problem that no longer governs its particles, as another one was made "
                 "of them since; begin from that, or make all of them anew."
@@ -167,26 +225,9 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
             if options.get(name, default) != its_own:
                 raise MPMError(f"after= is a problem with {name}={its_own!r}; give the same here.")
 
-    _further = ("velocity",)
-
-    @override
-    def _not_for_cracks(self) -> dict[str, bool]:
-        # (that stress makes up for any change of the energy, also that which goes into cracks, and
-        # this damping is that of bodies which are whole)
-        return {
-            f"scheme={self.inertia.scheme.name!r}; use 'euler'": self.inertia.scheme.stress_of_step,
-            "a part of the stiffness in rayleigh=; omit it": self._viscosity > 0.0,
-        }
-
     @override
     def _initial_velocities(self) -> list[fem.Function]:
         return _at_first(self.setup.given)
-
-    @override
-    def _require_given(self, bodies: Sequence[Body]) -> None:
-        super()._require_given(bodies)
-        if any(body.density is None for body in bodies):
-            raise MPMError("A body that moves needs a density; give density= to its mpm.Body.")
 
     @override
     def _carry_stress(self, stresses: Sequence[Any]) -> None:
@@ -205,33 +246,9 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
     def _own_terms(self) -> list[Term]:
         return [*super()._own_terms(), self.inertia]
 
-    @override
-    def _in_time(
-        self, history: MaterialPoints, supports: Sequence[Support]
-    ) -> tuple[StepStress, Sequence[StepForce]]:
-        body = history.strain.particles
-        whole = self.inertia.scheme.stress_of_step and not self.inertia.state.is_static(body)
-        stress = StepStress(history, whole, self._viscosity, self._force_share(body))
-        self._step_stresses.append(stress)
-        return stress, (stress, *supports)
-
-    @override
-    def _contributions(self) -> list[Contribution]:
-        self._step_stresses: list[StepStress] = []
-        return super()._contributions()
-
-    @override
-    def _force_share(self, body: Particles) -> float:
-        return 1.0 if self.inertia.state.is_static(body) else self.inertia.scheme.share
-
-    @override
-    def _contribution(self, given: Body) -> Contribution:
-        static = self.inertia.state.is_static(given.particles)
-        return super()._contribution(given)._replace(static=static)
-
     def stored_and_done(self) -> tuple[float, float]:
         """Return elastic energy, and the work done against stress in the last step (collective)."""
-        own = [(s.strain_energy(), s.stress_work) for s in self._step_stresses]
+        own = [(s.strain_energy(), s.stress_work) for s in self._motion.stresses]
         energy, work = self._comm.allreduce(np.sum(own, axis=0))
         return float(energy), float(work)
 
@@ -254,11 +271,6 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
                 f"than they had stored, as scheme={scheme.name!r} lets it; take scheme='euler'.",
             )
 
-    @override
-    def _mass_form(self, number: int, product: Any) -> ufl.Form:
-        work, density = self._built.densities[number]
-        return work.mass(density.value, product)
-
 
 class DynamicParticleProblem(MovingProblem, ParticleProblem):
     """Motion of bodies whose forces are a UFL residual: a :class:`ParticleProblem` with inertia.
@@ -273,7 +285,6 @@ class DynamicParticleProblem(MovingProblem, ParticleProblem):
         particles: As there.
         density: Mass per volume of the body mesh, positive: a number, Constant, Function or UFL; a
             list has one for each body.
-        J: As in :class:`ParticleProblem`.
         velocity: At the beginning: as that of a :class:`Body`; a list has one for each body.
         scheme: ``"midpoint"``, ``"euler"`` or a :class:`Scheme`. Stress of a whole step
             (``"conserving"``) is for materials: write the law as one.
@@ -281,8 +292,8 @@ class DynamicParticleProblem(MovingProblem, ParticleProblem):
         damping: Damping in proportion to the mass, one over a time; not negative.
         supports: Supports with a modulus, of :mod:`mpm_dolfinx.boundary`. One-sided ones and
             dashpots must be given here, not be written into R.
-        terms: As in :class:`ParticleProblem`.
-        **options: All else that :class:`ParticleProblem` has but ``background`` and ``fields``.
+        **options: All else that :class:`ParticleProblem` has, as ``J``, ``bcs`` and ``terms``, but
+            ``background`` and ``fields``.
 
     Raises:
         MPMError: As there; and what does not go with inertia.
@@ -294,14 +305,12 @@ class DynamicParticleProblem(MovingProblem, ParticleProblem):
         R: ufl.Form | Sequence[ufl.Form],
         particles: Particles | Sequence[Particles],
         density: Any,
-        J: ufl.Form | Sequence[ufl.Form | None] | None = None,
         *,
         velocity: Any = None,
         scheme: str | Scheme = "midpoint",
         out_of_range: str = "project",
         damping: float = 0.0,
         supports: Sequence[Support] = (),
-        terms: Sequence[Term] = (),
         **options: Any,
     ) -> None:
         bodies = as_bodies(particles)
@@ -315,7 +324,7 @@ class DynamicParticleProblem(MovingProblem, ParticleProblem):
                 f"scheme={rule.name!r} needs the stress at points, which a residual in UFL does "
                 "not tell; write the law as a material, and make a DynamicProblem."
             )
-        self._supports = as_supports(supports, bodies)
+        self.supports = tuple(as_supports(supports, bodies))
         self._velocity = velocity
         start = initial_velocities(velocity, particles)
         given = density if isinstance(density, list) else [density] * len(bodies)
@@ -324,43 +333,34 @@ class DynamicParticleProblem(MovingProblem, ParticleProblem):
         self._densities = [Density(rho, body) for rho, body in zip(given, bodies, strict=True)]
         self._energies = []
         self.inertia = Inertia(bodies, start, rule, rayleigh, self._energies)
-        every = [self.inertia, *as_terms(terms, bodies)]
-        super().__init__(R, particles, J, terms=every, **options)
+        every = [self.inertia, *as_terms(options.pop("terms", ()), bodies)]
+        super().__init__(R, particles, terms=every, **options)
         self.history.energies = self._energies
         self.inertia.mass()
 
-    @property
-    @override
-    def supports(self) -> tuple[Support, ...]:
-        return tuple(self._supports)
-
     @override
     def _contributions(self) -> list[Contribution]:
-        return [
-            self._with_supports(given, [s for s in self._supports if s.particles is body])
-            for given, body in zip(super()._contributions(), self.bodies, strict=True)
-        ]
+        every = zip(super()._contributions(), self.bodies, self._densities, strict=True)
+        return [self._with_inertia(given, body, density) for given, body, density in every]
 
     @override
     def _initial_velocities(self) -> list[fem.Function]:
         return initial_velocities(self._velocity, self.particles)
 
-    def _with_supports(self, given: Contribution, supports: list[Support]) -> Contribution:
-        """Return a body's contribution with those of its supports (collective)."""
+    def _with_inertia(self, given: Contribution, body: Particles, density: Density) -> Contribution:
+        """Return a body's contribution with its mass and its supports (collective)."""
+        given = given._replace(mass=lambda product: density.value * product * body.dx_exact)
+        supports = [s for s in self.supports if s.particles is body]
         if not supports:
             return given
         forms = [s.at_body(_no_moduli, 1.0, self.inertia.scheme.share) for s in supports]
-        form, d = sum(forms[1:], forms[0]), supports[0].particles.displacement
+        form, d = sum(forms[1:], forms[0]), body.displacement
         return given._replace(
             residual=form if given.residual is None else given.residual + form,
             tangent=None if given.tangent is None else given.tangent + ufl.derivative(form, d),
             of_step=tuple(supports),
+            supports=tuple(supports),
         )
-
-    @override
-    def _mass_form(self, number: int, product: Any) -> ufl.Form:
-        form: ufl.Form = self._densities[number].value * product * self.bodies[number].dx_exact
-        return form
 
     @override
     def begin_step(self) -> None:

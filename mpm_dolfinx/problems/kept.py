@@ -4,9 +4,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any, Literal, override
 
 from mpi4py import MPI
@@ -271,7 +269,7 @@ class Values(Kept):
                 fill(one.field.previous, columns[one.field.name])
                 one.roll_back()
         fields = self._reduced.unknowns.values
-        for field, unit in zip(fields, taken.numbers.get("units") or (), strict=False):
+        for field, unit in zip(fields, taken.numbers["units"], strict=False):
             field.unit = unit
 
 
@@ -338,9 +336,9 @@ class Increments(Kept):
                     found[self._number(one)] = _owned(_filled(one.W, columns[f"{key}{name}"]))
             return found
 
-        self._predictor.clear(numbers.get("measures", False))
+        self._predictor.clear(numbers["measures"])
         self._predictor.past = [(size, increments(str(i))) for i, size in enumerate(numbers[""])]
-        if numbers.get("moved", False):
+        if numbers["moved"]:
             self._predictor.moved = increments("moved")
 
 
@@ -384,12 +382,12 @@ class Past(Kept):
     def restore(self, taken: Taken) -> None:
         numbers, history = taken.numbers, self._history
         self._reduced.unknowns.moduli = numbers["moduli"]
-        history.steps[:] = _steps(numbers["steps"])
+        history.steps[:] = [Step(*entry) for entry in numbers["steps"]]
         history.cutbacks = numbers["cutbacks"]
         history.failed_iterations = numbers["failed_iterations"]
-        history.taken_back[:] = [Attempt(**entries) for entries in numbers.get("taken_back", [])]
+        history.taken_back[:] = [Attempt(**entries) for entries in numbers["taken_back"]]
         history.losses[:] = [Loss(**entries) for entries in numbers["losses"]]
-        history.stages[:] = [Stage(*entries) for entries in numbers.get("stages", [])]
+        history.stages[:] = [Stage(*entries) for entries in numbers["stages"]]
         stopped = numbers["stopped"]
         history.stopped = None if stopped is None else ParticleOutsideError(*stopped)
         history.statistics.update(numbers["statistics"])
@@ -401,16 +399,13 @@ class Standing(Kept):
     Args:
         progress: How far it is; after :meth:`restore`, how far it was.
         spaces: The background spaces.
-        history: What the run did, restored before.
 
     Attributes:
         progress: As given, or restored.
     """
 
-    def __init__(
-        self, progress: Progress, spaces: Sequence[fem.FunctionSpace], history: History
-    ) -> None:
-        self.progress, self._spaces, self._history = progress, spaces, history
+    def __init__(self, progress: Progress, spaces: Sequence[fem.FunctionSpace]) -> None:
+        self.progress, self._spaces = progress, spaces
 
     @override
     def numbers(self) -> dict[str, Any]:
@@ -458,42 +453,25 @@ class Standing(Kept):
             for name in ("prescribed", "reactions", "base")
         }
         reactions = [_owned(f) for f in totals["reactions"]] if numbers["reactions"] else None
-        supports = numbers.get("supports")
+        supports = numbers["supports"]
         converged = Converged(
             numbers["load"],
             numbers["parameter"],
             [np.asarray(f.x.array) for f in totals["prescribed"]],
             reactions,
-            numbers.get("proportional", True),
+            numbers["proportional"],
             [
                 _owned(_filled(V, columns["followed"])) if "followed" in columns else None
                 for V, columns in zip(self._spaces, taken.backgrounds, strict=True)
             ],
             None if supports is None else [np.array(force) for force in supports],
-            numbers.get("force"),
+            numbers["force"],
         )
         run = None
         if numbers["run"] is not None:
             base = [np.asarray(f.x.array) for f in totals["base"]]
-            run = Run.of(numbers["run"], base, self._history.time, control_of)
+            run = Run.of(numbers["run"], base, control_of)
         self.progress = Progress(converged, tuple(numbers["experience"]), run)
-
-
-def _steps(entries: list[list[Any]]) -> list[Step]:
-    """Return the steps of a checkpoint; those of files of before have no time."""
-    steps: list[Step] = []
-    stage, load = 0.0, 0.0
-    for number, entry in enumerate(entries):
-        step = Step(*entry)
-        if len(entry) == 4:
-            controlled = step.displacement is not None
-            if not controlled and step.load <= load:
-                stage = float(math.ceil(steps[-1].time)) if steps else 0.0
-            time = number + 1.0 if controlled else stage + max(step.load, 0.0)
-            step = replace(step, time=time)
-            load = step.load
-        steps.append(step)
-    return steps
 
 
 def _function(space: fem.FunctionSpace, owned: NDArray[np.float64] | None) -> fem.Function:

@@ -14,7 +14,6 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-import basix.ufl
 import ufl
 from dolfinx import fem
 
@@ -23,11 +22,11 @@ from ..assembly.inputs import as_expression
 from ..boundary.supports import Support
 from ..errors import MPMError, agree, as_ours
 from ..history import Energy
-from ..parallel.compilation import compiled_expression, compiled_form
+from ..parallel.compilation import compiled_expression
 from ..particles.particles import Particles
 from ..reals import as_finite, as_reals
 from ..system.inertia import Inertia
-from ..system.term import PointMaterial, Term
+from ..system.term import Term
 from .arguments import as_bodies
 from .through_time import TimeProblem
 
@@ -48,25 +47,18 @@ class MovingProblem(TimeProblem):
     """
 
     # (bodies that have met part again, which a joint would not let them)
-    _keeps_joints = False
+    keeps_joints = False
     inertia: Inertia
     _energies: list[Energy]
 
     @override
-    def _build(self) -> None:
+    def build(self) -> None:
         self.inertia.join(self.bodies)
-        super()._build()
-        self._trial.newton.lets_go = True
-        others = [*self.body_terms, *(term for term in self.terms if term is not self.inertia)]
-        self.inertia.follow(self, others)
-
-    @override
-    def _let_take_part(self, materials: Sequence[PointMaterial | None]) -> None:
-        """Let terms take part, and learn that there is motion."""
-        super()._let_take_part(materials)
-        for term in self.terms:
-            if term is not self.inertia:
-                term.pace(self.inertia.dt, self.inertia.scheme.share)
+        self._pace = self.inertia.dt, self.inertia.scheme.share
+        super().build()
+        self.trial.newton.lets_go = True
+        others = [term for term in self.terms if term is not self.inertia]
+        self.inertia.follow(self, [*self.built.body_terms, *others])
 
     def stored_and_done(self) -> tuple[float, float]:
         """Return elastic energy, and the work done against stress in the last step (collective).
@@ -75,27 +67,11 @@ class MovingProblem(TimeProblem):
         """
         return math.nan, 0.0
 
-    @abstractmethod
-    def _mass_form(self, number: int, product: Any) -> ufl.Form:
-        """Return the integral of a body's density times a product of functions."""
-
     def domain_masses(self, number: int) -> NDArray[np.float64]:
         """Return the consistent mass of each owned domain of a body, ``(n, k, k)`` (collective)."""
-        body = self.bodies[number]
-        (element,) = set(body.W.ufl_element().sub_elements)
-        broken = basix.ufl.element(
-            "Lagrange", element.cell_type, element.degree, discontinuous=True
-        )
-        space = fem.functionspace(body.mesh, broken)
-        product = body.undeformed.mass_ratio * ufl.inner(
-            ufl.TrialFunction(space), ufl.TestFunction(space)
-        )
-        form = self._mass_form(number, product)
-        if body.deletion is not None:
-            form = body.deletion.present_only(form)
-        matrix = fem.assemble_matrix(compiled_form(form, **self._how.of_forms))
-        n, k = body.domain_nodes.shape
-        return np.array(matrix.data[: n * k * k].reshape(n, k, k))
+        masses = self.built.mass_matrices(number)
+        masses[self.bodies[number].deleted] = 0.0
+        return masses
 
     # -- What steps begin with ----------------------------------------------------------------
 
@@ -114,12 +90,12 @@ class MovingProblem(TimeProblem):
         if self.inertia.dt > 0.0:
             super().renew_external()
             return
-        for term in self.body_terms:  # at a run's beginning, where no step is on its way
+        for term in self.built.body_terms:  # at a run's beginning, where no step is on its way
             term.begin()
 
     @override
     def beginning(self) -> list[NDArray[np.float64]]:
-        of_step = [array for term in self.body_terms for array in term.beginning()]
+        of_step = [array for term in self.built.body_terms for array in term.beginning()]
         return [*super().beginning(), *of_step, *self.inertia.state.beginning()]
 
     @override
@@ -135,13 +111,13 @@ class MovingProblem(TimeProblem):
             changes: Of Dirichlet values in the step, on own dofs of each background.
             taken: See :meth:`.Inertia.at_end`.
         """
-        of_step = [array for term in self.body_terms for array in term.at_end()]
+        of_step = [array for term in self.built.body_terms for array in term.at_end()]
         forces = self._forces_at_end()
         return [*super().at_end(), *of_step, *self.inertia.at_end(forces, changes, taken)]
 
     def before_motion(self) -> list[NDArray[np.float64]]:
         """Return :meth:`beginning` of a run's first step, after an update (collective)."""
-        of_step = [array for term in self.body_terms for array in term.at_end()]
+        of_step = [array for term in self.built.body_terms for array in term.at_end()]
         forces = self._forces_at_end()
         return [*super().beginning(), *of_step, *self.inertia.state.beginning(forces)]
 
@@ -150,7 +126,7 @@ class MovingProblem(TimeProblem):
         found = []
         for body in self.bodies:
             total = fem.Function(body.W)
-            for term in self.body_terms:
+            for term in self.built.body_terms:
                 if term.particles is body:
                     for force in term.forces_at_end():
                         total.x.array[: force.getLocalSize()] += force.array_r
@@ -196,7 +172,7 @@ class MovingProblem(TimeProblem):
     @override
     def _begin_run(self, now: float) -> None:
         self.inertia.begin_run(now)
-        for recorder in self._trial.recorders:
+        for recorder in self.trial.recorders:
             recorder.begins()
 
     @override

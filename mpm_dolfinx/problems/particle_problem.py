@@ -88,15 +88,14 @@ class ParticleProblem(Problem):
             Contribution(r, j, symmetric) for r, j in zip(residuals, tangents, strict=True)
         ]
         self._entity_maps = entity_maps
-        super().__init__(particles, bcs, background, as_solver(solver), terms, fields)
+        spaces = list({id(field.background): field.background for field in fields}.values())
+        super().__init__(
+            particles, bcs, background, as_solver(solver), terms, fields, spaces=spaces
+        )
 
     @override
     def _contributions(self) -> list[Contribution]:
         return self._given
-
-    @override
-    def _made_of(self) -> list[str]:
-        return ["residual in UFL"] * len(self.bodies)
 
     @override
     @collective()

@@ -4,9 +4,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 import ufl
 from dolfinx import fem
@@ -15,19 +18,22 @@ from ..assembly.background_forms import BackgroundForms
 from ..assembly.body_forms import BodyForms
 from ..assembly.field_forms import FieldForms
 from ..assembly.rules import data_at_points
+from ..boundary.supports import Support
 from ..constitutive.points import MaterialPoints
 from ..errors import MPMError
+from ..parallel.compilation import compiled_form
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
+from ..particles.undeformed import separate_nodes
 from ..stabilisation.choice import joints_of, stabilisation_of
 from ..system.body import ActingStress, BodyTerm, StepForce
 from ..system.field import Field
 from ..system.free_field import FreeField
-from ..system.values import FormsTerm
+from ..system.values import FieldTerm, FormsTerm
 from .arguments import by_space, require_background_fields, require_own_fields
 from .solver import Solver
 
-__all__ = ["Contribution", "Parts"]
+__all__ = ["Built", "Contribution", "Parts"]
 
 
 class Contribution(NamedTuple):
@@ -41,6 +47,11 @@ class Contribution(NamedTuple):
         points: The material at its points, of which that is.
         of_step: What among its forces may be of a whole step in time.
         static: Whether the body is in equilibrium at each step's end, in a motion of others.
+        supports: The supports among its forces.
+        loads: Constants and Functions of its loads, which a user may change.
+        mass: The integral of its density times a product of functions, if it has a density.
+        couplings: Terms that have unknowns besides its displacement.
+        words: Describes its material and its loads.
     """
 
     residual: ufl.Form | None
@@ -50,6 +61,80 @@ class Contribution(NamedTuple):
     points: MaterialPoints | None = None
     of_step: Sequence[StepForce] = ()
     static: bool = False
+    supports: Sequence[Support] = ()
+    loads: Sequence[fem.Constant | fem.Function] = ()
+    mass: Callable[[Any], ufl.Form] | None = None
+    couplings: Sequence[FieldTerm] = ()
+    words: Callable[[], str] = lambda: "residual in UFL"
+
+
+@dataclass(frozen=True)
+class Built:
+    """A problem on the present meshes of its bodies.
+
+    Attributes:
+        bodies: The bodies.
+        contributions: What each adds to the system.
+        body_terms: What each is made of and loaded by, where it moves.
+        field_terms: Terms that have unknowns besides displacements.
+        constants: Constants of all forms, without loads of bodies.
+        data: Functions at quadrature points in the forms, without unknowns.
+        form_options: Options with which forms are compiled.
+    """
+
+    bodies: Sequence[Particles]
+    contributions: Sequence[Contribution]
+    body_terms: list[BodyTerm]
+    field_terms: Sequence[FieldTerm]
+    constants: list[fem.Constant]
+    data: set[fem.Function]
+    form_options: dict[str, Any]
+
+    @property
+    def carried(self) -> list[CarriedField]:
+        """The unknowns besides displacements, as the system moves them."""
+        return [one for term in self.field_terms for one in term.fields]
+
+    @property
+    def points(self) -> list[MaterialPoints]:
+        """The materials at the points of each body."""
+        return [given.points for given in self.contributions if given.points is not None]
+
+    @property
+    def supports(self) -> list[Support]:
+        """The supports that hold, but for those that a residual in UFL has."""
+        return [support for given in self.contributions for support in given.supports]
+
+    @property
+    def loads(self) -> list[fem.Constant | fem.Function]:
+        """The loads that the load factor multiplies and the user may change, if known."""
+        return [load for given in self.contributions for load in given.loads]
+
+    @property
+    def words(self) -> list[str]:
+        """A description of each body: its material and its loads."""
+        return [given.words() for given in self.contributions]
+
+    def mass_matrices(self, number: int, ratio: Any = None) -> NDArray[np.float64]:
+        """Return ``int density ratio Q_c Q_d dX`` of each owned domain, ``(n, k, k)`` (collective).
+
+        Args:
+            number: Number of the body.
+            ratio: UFL; ``None``: that of the mass per volume of its mesh to the density.
+        """
+        body, mass = self.bodies[number], self.contributions[number].mass
+        assert mass is not None
+        space = separate_nodes(body.W)
+        product = ufl.TrialFunction(space) * ufl.TestFunction(space)
+        ratio = body.undeformed.mass_ratio if ratio is None else ratio
+        matrix = fem.assemble_matrix(compiled_form(mass(ratio * product), **self.form_options))
+        n, k = body.num_local, space.dofmap.list.shape[1]
+        return np.array(matrix.data[: n * k * k].reshape(n, k, k))
+
+    def masses(self, number: int) -> NDArray[np.float64] | None:
+        """Return the mass of each particle of a body that this rank owns, if it is known."""
+        known = self.contributions[number].mass is not None
+        return self.mass_matrices(number).sum(axis=(1, 2)) if known else None
 
 
 @dataclass(frozen=True)
@@ -134,9 +219,9 @@ class Parts:
             if self._moves(given)
         ]
 
-    def field_terms(self) -> list[FormsTerm]:
+    def field_terms(self) -> list[FieldTerm]:
         """Return the terms of unknowns besides displacements (collective)."""
-        found: list[FormsTerm] = []
+        found = [term for given in self.contributions for term in given.couplings]
         for number, (body, given) in enumerate(zip(self.bodies, self.contributions, strict=True)):
             own = [
                 (field, form)
@@ -216,17 +301,24 @@ class Parts:
         pairs = [(given.residual, given.tangent) for given in self.contributions]
         return [*(form for pair in pairs for form in pair if form), *self.residuals]
 
-    def constants(self) -> list[fem.Constant]:
-        """Return the Constants of all forms, without loads of bodies."""
+    def built(self) -> Built:
+        """Return the terms of the problem, and what else is known of its forms (collective)."""
+        self.require_own_fields()
         loads = [constant for body in self.bodies for constant in (body.load, body.proportional)]
-        return [
+        constants = [
             constant
             for form in (*self._forms, *self._background_forms)
             for constant in form.constants()
             if not any(constant is load for load in loads)
         ]
-
-    def data_at_points(self) -> set[fem.Function]:
-        """Return Functions at quadrature points in the forms, without unknowns."""
         own = {function for field in self._known for function in (field, field.previous)}
-        return set().union(*map(data_at_points, self._forms)) - own
+        data = set().union(*map(data_at_points, self._forms)) - own
+        return Built(
+            self.bodies,
+            self.contributions,
+            self.body_terms(),
+            self.field_terms(),
+            constants,
+            data,
+            self.solver.of_forms,
+        )

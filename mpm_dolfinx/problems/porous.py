@@ -37,11 +37,12 @@ from ..parallel.given import is_number, require_same
 from ..particles.field import ParticleField
 from ..particles.particles import Particles
 from ..reals import as_reals
-from ..system.term import PointMaterial
 from .body import Body, PoreFluid, as_given
 from .parts import Contribution
+from .physics import Physics
 from .problem import Law
 from .quasistatic import QuasiStaticProblem
+from .setup import Setup
 from .through_time import TimeProblem
 
 __all__ = ["PorousProblem"]
@@ -72,141 +73,41 @@ class _Filled:
     checked: Sequence[NotNegative] = ()
 
 
-class PorousProblem(TimeProblem, QuasiStaticProblem):
-    """Consolidation of saturated bodies: equilibrium, and the flow of water through their pores.
-
-    Displacement and pore pressure are unknowns together (the pair of Taylor & Hood 1973), in finite
-    strain where the materials are of finite strain. ``material`` is the law of the effective stress
-    (Terzaghi 1943): total stress is that of the law less the pore pressure. Loads act in full from
-    the beginning unless a path sets others: ``problem.solve(time=..., dt=..., update=...)``.
+class _Water(Physics):
+    """The flow of water through bodies, and its pressure.
 
     Args:
-        bodies: One :class:`Body`, or a list, of degree 2 or 3 on a background of degree 2 or 3
-            where they have a ``pore_fluid``. Bodies without, such as a footing, are dry; all may
-            be, if a law has a ``relaxation_time``: that is equilibrium through time.
-        bcs: As in :class:`QuasiStaticProblem`, and on the space of the pore pressure.
-        pressure_space: Background space of the pore pressure, for Dirichlet conditions on it in
-            ``bcs``; ``None``: continuous, of one degree less than V on its mesh.
-        **options: All else that :class:`QuasiStaticProblem` has but ``mixed`` and ``background``.
+        spaces: Bodies with water, and the background spaces of their pressure.
 
     Attributes:
-        pore_pressure: Of each body with water, a :class:`mpm_dolfinx.ParticleField` at its nodes.
-
-    Raises:
-        MPMError: As there; and what does not go with water.
+        spaces: As given.
+        filled: The water of each body that has any.
     """
 
-    _gradual = False
+    further = ("pore_fluid",)
+    gradual = False
+    takes_time = True
 
-    _further = ("pore_fluid",)
-
-    @override
-    def _not_for_cracks(self) -> dict[str, bool]:
-        return {"a PorousProblem": True}
-
-    @collective()
-    def __init__(
-        self,
-        bodies: Body | Sequence[Body],
-        bcs: Sequence[fem.DirichletBC] = (),
-        *,
-        pressure_space: fem.FunctionSpace | None = None,
-        **options: Any,
-    ) -> None:
-        given = as_given(bodies)
-        for name in ("mixed", "background", "fields"):
-            if name in options:
-                raise MPMError(f"A PorousProblem has no {name}=; omit it.")
-        if not any(body.pore_fluid is not None or body.takes_time for body in given):
-            raise MPMError(
-                "A PorousProblem needs a body with a pore_fluid=, or a law by with_relaxation()."
-            )
-        self._spaces_of_water = _spaces(given, pressure_space)
-        self._filled: list[_Filled] = []
-        super().__init__(bodies, bcs, **options)
-        for filled in self._filled:
-            fluid = self.body(filled.particles).pore_fluid
-            assert fluid is not None
-            _begin_with(filled.field, fluid.pressure)
-
-    @override
-    def laws(self) -> list[list[Law]]:
-        """Laws of the bodies; the pore fluid goes with the material."""
-        found = super().laws()
-        for own, body in zip(found, self.setup.bodies, strict=True):
-            if body.pore_fluid is not None:
-                water: dict[str, Any] = {
-                    name: value
-                    if isinstance(value, float | int | np.number)
-                    else type(value).__name__  # it may have changed since, as loads may
-                    for name, value in (
-                        ("permeability", body.pore_fluid.permeability),
-                        ("storage", body.pore_fluid.storage),
-                        ("fluid_density", body.pore_fluid.density),
-                    )
-                }
-                own.append(("water", water))
-        return found
+    def __init__(self, spaces: list[tuple[Particles, fem.FunctionSpace]]) -> None:
+        self.spaces = spaces
+        self.filled: list[_Filled] = []
 
     @property
-    def pore_pressure(self) -> list[ParticleField]:
-        """The pore pressure of each body with water; new Functions after a repartition."""
-        return [filled.field for filled in self._filled]
+    @override
+    def field_spaces(self) -> list[fem.FunctionSpace]:
+        return list({id(V): V for _, V in self.spaces}.values())
 
     @override
-    def beginning(self) -> list[NDArray[np.float64]]:
-        before = [np.asarray(f.before.x.array, np.float64) for f in self._filled]
-        return [*super().beginning(), *before]
+    def not_for_cracks(self) -> dict[str, bool]:
+        return {"a PorousProblem": True}
 
     @override
-    def at_end(self) -> list[NDArray[np.float64]]:
-        moved = [np.asarray(f.particles.displacement.x.array, np.float64) for f in self._filled]
-        return [*super().at_end(), *moved]
+    def begin(self, setup: Setup) -> None:
+        before = self.filled
+        wet = [body.particles for body in setup.bodies if body.pore_fluid is not None]
+        self.filled = [self._of(body, before) for body in wet]
 
-    # -- The system -----------------------------------------------------------------------
-
-    @override
-    def _require_change(self, body: Body) -> None:
-        super()._require_change(body)
-        if (body.pore_fluid is None) != (self.body(body.particles).pore_fluid is None):
-            raise MPMError("Water cannot come to a dry body in a stage, nor leave a wet one.")
-
-    @override
-    def _spaces_of_fields(self) -> list[fem.FunctionSpace]:
-        spaces: list[fem.FunctionSpace] = []
-        for _, V in self._spaces_of_water:
-            if all(V is not known for known in spaces):
-                spaces.append(V)
-        return spaces
-
-    @override
-    def _contributions(self) -> list[Contribution]:
-        self._filled = [
-            self._water(body.particles) for body in self.setup.bodies if body.pore_fluid is not None
-        ]
-        contributions = super()._contributions()
-        self.fields = self.pore_pressure
-        self._of_fields = [f.residual for f in self._filled if f.residual is not None]
-        return contributions
-
-    @override
-    def _let_take_part(self, materials: Sequence[PointMaterial | None]) -> None:
-        wet = [filled.particles for filled in self._filled]
-        for term in self.terms:
-            if term.takes_stress and any(body is its for body in wet for its in term.bodies):
-                raise MPMError(
-                    "law='nitsche' takes the stress of the material, which does not know the pore "
-                    "pressure of a body with water; use law='penalty'."
-                )
-        super()._let_take_part(materials)
-
-    @override
-    def _build(self) -> None:
-        super()._build()
-        for filled in self._filled:
-            filled.particles.fill_pores([filled.field])
-
-    def _water(self, body: Particles) -> _Filled:
+    def _of(self, body: Particles, before: Sequence[_Filled]) -> _Filled:
         """Return the water of a body, with the same pressure while its mesh is the same.
 
         Raises:
@@ -216,10 +117,10 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
             raise MPMError(
                 "Particles cannot be taken from a body with water, whose pressure lives at nodes."
             )
-        for known in self._filled:
+        for known in before:
             if known.particles is body and known.field.W.mesh is body.mesh:
                 return known
-        V = next(V for its, V in self._spaces_of_water if its is body)
+        V = next(V for its, V in self.spaces if its is body)
         kind = "body" if body.is_free else "total"
         return _Filled(
             body,
@@ -229,9 +130,9 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         )
 
     @override
-    def _further_work(self, given: Body, strain: Strain) -> tuple[list[ufl.Form], bool]:
+    def work(self, given: Body, strain: Strain) -> tuple[list[ufl.Form], bool]:
         body = given.particles
-        filled = next((f for f in self._filled if f.particles is body), None)
+        filled = next((f for f in self.filled if f.particles is body), None)
         if filled is None:
             return [], True
         pores = given.pore_fluid
@@ -287,11 +188,125 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
                 R += area * dt * as_expression(value, body, "an inflow", ()) * q * ds(tag)
         return R
 
+
+class PorousProblem(TimeProblem, QuasiStaticProblem):
+    """Consolidation of saturated bodies: equilibrium, and the flow of water through their pores.
+
+    Displacement and pore pressure are unknowns together (the pair of Taylor & Hood 1973), in finite
+    strain where the materials are of finite strain. ``material`` is the law of the effective stress
+    (Terzaghi 1943): total stress is that of the law less the pore pressure. Loads act in full from
+    the beginning unless a path sets others: ``problem.solve(time=..., dt=..., update=...)``.
+
+    Args:
+        bodies: One :class:`Body`, or a list, of degree 2 or 3 on a background of degree 2 or 3
+            where they have a ``pore_fluid``. Bodies without, such as a footing, are dry; all may
+            be, if a law has a ``relaxation_time``: that is equilibrium through time.
+        bcs: As in :class:`QuasiStaticProblem`, and on the space of the pore pressure.
+        pressure_space: Background space of the pore pressure, for Dirichlet conditions on it in
+            ``bcs``; ``None``: continuous, of one degree less than V on its mesh.
+        **options: All else that :class:`QuasiStaticProblem` has but ``mixed`` and ``background``.
+
+    Attributes:
+        pore_pressure: Of each body with water, a :class:`mpm_dolfinx.ParticleField` at its nodes.
+
+    Raises:
+        MPMError: As there; and what does not go with water.
+    """
+
+    @collective()
+    def __init__(
+        self,
+        bodies: Body | Sequence[Body],
+        bcs: Sequence[fem.DirichletBC] = (),
+        *,
+        pressure_space: fem.FunctionSpace | None = None,
+        **options: Any,
+    ) -> None:
+        given = as_given(bodies)
+        for name in ("mixed", "background", "fields"):
+            if name in options:
+                raise MPMError(f"A PorousProblem has no {name}=; omit it.")
+        if not any(body.pore_fluid is not None or body.takes_time for body in given):
+            raise MPMError(
+                "A PorousProblem needs a body with a pore_fluid=, or a law by with_relaxation()."
+            )
+        self._physics = self._water = _Water(_spaces(given, pressure_space))
+        super().__init__(bodies, bcs, **options)
+        for filled in self._water.filled:
+            fluid = self.body(filled.particles).pore_fluid
+            assert fluid is not None
+            _begin_with(filled.field, fluid.pressure)
+
+    @override
+    def laws(self) -> list[list[Law]]:
+        """Laws of the bodies; the pore fluid goes with the material."""
+        found = super().laws()
+        for own, body in zip(found, self.setup.bodies, strict=True):
+            if body.pore_fluid is not None:
+                water: dict[str, Any] = {
+                    name: value
+                    if isinstance(value, float | int | np.number)
+                    else type(value).__name__  # it may have changed since, as loads may
+                    for name, value in (
+                        ("permeability", body.pore_fluid.permeability),
+                        ("storage", body.pore_fluid.storage),
+                        ("fluid_density", body.pore_fluid.density),
+                    )
+                }
+                own.append(("water", water))
+        return found
+
+    @property
+    def pore_pressure(self) -> list[ParticleField]:
+        """The pore pressure of each body with water; new Functions after a repartition."""
+        return [filled.field for filled in self._water.filled]
+
+    @override
+    def beginning(self) -> list[NDArray[np.float64]]:
+        before = [np.asarray(f.before.x.array, np.float64) for f in self._water.filled]
+        return [*super().beginning(), *before]
+
+    @override
+    def at_end(self) -> list[NDArray[np.float64]]:
+        moved = [
+            np.asarray(f.particles.displacement.x.array, np.float64) for f in self._water.filled
+        ]
+        return [*super().at_end(), *moved]
+
+    # -- The system -----------------------------------------------------------------------
+
+    @override
+    def _require_change(self, body: Body) -> None:
+        super()._require_change(body)
+        if (body.pore_fluid is None) != (self.body(body.particles).pore_fluid is None):
+            raise MPMError("Water cannot come to a dry body in a stage, nor leave a wet one.")
+
+    @override
+    def _contributions(self) -> list[Contribution]:
+        contributions = super()._contributions()
+        filled = self._water.filled
+        wet = [one.particles for one in filled]
+        for term in self.terms:
+            if term.takes_stress and any(body is its for body in wet for its in term.bodies):
+                raise MPMError(
+                    "law='nitsche' takes the stress of the material, which does not know the pore "
+                    "pressure of a body with water; use law='penalty'."
+                )
+        self.fields = self.pore_pressure
+        self._of_fields = [one.residual for one in filled if one.residual is not None]
+        return contributions
+
+    @override
+    def build(self) -> None:
+        super().build()
+        for filled in self._water.filled:
+            filled.particles.fill_pores([filled.field])
+
     # -- Through time ---------------------------------------------------------------------
 
     @override
     def _aim(self, t: float) -> None:
-        for filled in self._filled:
+        for filled in self._water.filled:
             np.copyto(filled.dt.value, t - self.history.time)
         for points in self.points:
             points.laws.pace(t - self.history.time)
@@ -299,7 +314,7 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
     @override
     def begin_step(self) -> None:
         super().begin_step()
-        for filled in self._filled:
+        for filled in self._water.filled:
             before = filled.particles.converged_displacement
             filled.before.x.array[:] = before.ravel()
             for one in filled.checked:
@@ -309,14 +324,14 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
     def add(self, body: Body, name: str | None = None, *, sudden: bool = False) -> None:
         """Add a body: see :meth:`QuasiStaticProblem.add`; what changes does so at once."""
         (given,) = as_given(body)
-        self._require_given([given])
-        before = list(self._spaces_of_water)
+        self._physics.require([given], type(self).__name__)
+        before = list(self._water.spaces)
         known = {id(particles.V): V for particles, V in before}
-        self._spaces_of_water = before + _spaces([given], None, known)
+        self._water.spaces = before + _spaces([given], None, known)
         try:
             super().add(given, name, sudden=sudden)
         except BaseException:
-            self._spaces_of_water = before
+            self._water.spaces = before
             raise
 
 

@@ -19,48 +19,44 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem
 
-from .. import _compat
 from ..boundary.supports import Support
 from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree
 from ..history import History, Step
-from ..io import checkpoint
 from ..io.files import as_path
 from ..io.series import Output
 from ..io.snapshot import Kept, spaces_of
 from ..parallel.boundary import Hooked, by_itself, collective
 from ..parallel.garbage import Cleaner
 from ..parallel.given import PACKAGE, is_number, require_same
-from ..particles.field import CarriedField, ParticleField
+from ..particles.field import ParticleField
 from ..particles.particles import Particles
 from ..solvers.newton import NewtonSolver
-from ..stepping.adaptivity import Adaptivity
 from ..stepping.automatic import ErrorControl
 from ..stepping.displacement_control import DisplacementControl
 from ..stepping.loading import Mender, Stepper
 from ..stepping.progress import with_bar
 from ..stepping.solving import System
-from ..stepping.trial import Recorder, Trial
+from ..stepping.trial import Trial
 from ..structures.structure import Structure
-from ..system.body import BodyTerm
 from ..system.conditions import force_at
-from ..system.errors import Errors, estimated
 from ..system.field_equation import FieldEquation
 from ..system.predictor import Predictor
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
-from ..system.term import PointMaterial, Term, UserTerm
+from ..system.term import Term, UserTerm
 from ..system.value_field import ValueField
-from ..system.values import FieldTerm
+from .accuracy import adaptivity_of, errors_of
 from .arguments import (
     as_bodies,
     as_conditions,
     as_terms,
     by_space,
 )
-from .parts import Contribution, Parts
+from .parts import Built, Contribution, Parts
+from .reign import Reign
 from .solver import Solver
-from .staging import Change, Staging
+from .staging import Staging
 from .state import ProblemState
 from .summary import in_one_line, on_a_screen
 
@@ -68,6 +64,8 @@ __all__ = ["Law", "Problem"]
 
 #: What goes with automatic steps, and is of no meaning to others.
 AUTOMATIC = {"tolerance": 1e-2, "output_at": (), "length": None}
+#: What is there of a problem that is not built.
+NOTHING = Built([], [], [], [], [], set(), {})
 
 
 type Law = tuple[str, dict[str, Any]]
@@ -90,6 +88,7 @@ class Problem(Hooked):
         terms: What else acts on the bodies.
         fields: Unknowns besides displacements, with residuals of their own.
         mender: What changes meshes between steps, if anything.
+        spaces: Background spaces of fields.
 
     Attributes:
         particles: The body or bodies, as given.
@@ -99,12 +98,17 @@ class Problem(Hooked):
         bcs: The Dirichlet conditions.
         terms: As given.
         fields: As given.
-        body_terms: What each body is made of and loaded by.
+        trial: Tries load steps, and knows the last that has converged.
+        state: All that goes with it to other meshes, to other ranks, into files and back.
+        staging: Takes it from one stage to the next.
+        built: What it is on the present meshes.
+        reign: Whether it governs the bodies.
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Refuse what a user derives from what all problems have alone."""
         super().__init_subclass__(**options)
+        cls.keeps_data = cls.converged_state is not Problem.converged_state
         if Problem in cls.__bases__ and cls.__module__.partition(".")[0] != PACKAGE:
             raise MPMError(
                 f"{cls.__name__} is of mpm.Problem, which is what all problems have and can be "
@@ -121,30 +125,26 @@ class Problem(Hooked):
         terms: Sequence[Term],
         fields: Sequence[ParticleField] = (),
         mender: Mender | None = None,
+        spaces: Sequence[fem.FunctionSpace] = (),
     ) -> None:
         self.particles, self.fields = particles, fields
         self.bodies = as_bodies(particles)
-        spaces = [*spaces_of(self.bodies), *self._spaces_of_fields()]
-        self.bcs = as_conditions(bcs, spaces)
+        self.bcs = as_conditions(bcs, [*spaces_of(self.bodies), *spaces])
         self.terms = as_terms(terms, self.bodies)
         self.history = History()
         self._comm: MPI.Comm = self.bodies[0].V.mesh.comm
         self._background, self._how = background, solver
         self._output = Output()
         self._held = Release()
-        self._trial = Trial(self)
-        self._stepper = Stepper(self._trial, self._held, mender)
-        self._state = ProblemState(self, self._stepper, self._held, self._output, self._history_at)
-        self._staging = Staging(self, self._state, self._stepper, self._held)
-        self.body_terms: list[BodyTerm] = []
-        self._field_terms: Sequence[FieldTerm] = ()
-        self._constants: list[fem.Constant] = []
-        self._data: set[fem.Function] = set()
-        self._reign = object()
-        self._build()
-        self._state.keep_terms()
+        self.trial = Trial(self)
+        self._stepper = Stepper(self.trial, self._held, mender)
+        self.state = ProblemState(self, self._stepper, self._held, self._output, mender)
+        self.staging = Staging(self.state, self._stepper, self._held)
+        self.built = NOTHING
+        self.build()
+        self.state.keep_terms()
 
-    def _build(self) -> None:
+    def build(self) -> None:
         """Make the system and its solver for the present meshes of the bodies (collective).
 
         It is called again whenever these are other ones.
@@ -152,28 +152,22 @@ class Problem(Hooked):
         meshes = [group[0].V.mesh for group in by_space(self.bodies)]
         clean_up = Cleaner(self._comm, [*meshes, *(body.mesh for body in self.bodies)])
         try:
-            self._build_system(clean_up)
+            self.trial.follow(self._system(clean_up))
         except BaseException:
             clean_up.end()  # what is half built is freed by the next problem
             raise
-        self._govern()
+        self.reign = Reign(self.bodies)
 
-    def _let_take_part(self, materials: Sequence[PointMaterial | None]) -> None:
-        """Tell terms of bodies and materials (collective)."""
-        for term in self.terms:
-            term.take_part(self._state.number(term), self.bodies, materials)
-
-    def _build_system(self, clean_up: Cleaner) -> None:
-        """Make the system and its solver (collective).
+    def _system(self, clean_up: Cleaner) -> System:
+        """Return the system on the present meshes (collective).
 
         Args:
             clean_up: Frees what is out of use.
         """
         how = self._how
-        contributions = self._contributions()
         parts = Parts(
             self.bodies,
-            contributions,
+            self._contributions(),
             self.fields,
             self._of_fields,
             self._background,
@@ -181,13 +175,15 @@ class Problem(Hooked):
             self._entity_maps,
             [term.field for term in self.terms if isinstance(term, FieldEquation)],
         )
-        parts.require_own_fields()
-        self.body_terms = parts.body_terms()
-        self._field_terms = self._couplings(parts)
-        carried = self.carried
-        self._let_take_part([given.stress for given in contributions])
+        built = self.built = parts.built()
+        for term in self.terms:
+            materials = [given.stress for given in built.contributions]
+            term.take_part(self.state.number(term), self.bodies, materials)
+        for term in self.terms if self._pace else ():
+            term.pace(*self._pace)
+        carried = built.carried
         fields = [
-            *parts.displacement_fields(self.bcs, self._keeps_joints),
+            *parts.displacement_fields(self.bcs, self.keeps_joints),
             *(ValueField(group, self.bcs) for group in by_space(carried)),
         ]
         statistics = self.history.statistics
@@ -195,27 +191,36 @@ class Problem(Hooked):
         reduced = ReducedSystem(
             [*parts.moving, *carried],
             fields,
-            [*self.body_terms, *self._field_terms, *self.terms, UserTerm(self), self._held],
+            [*built.body_terms, *built.field_terms, *self.terms, UserTerm(self), self._held],
             statistics,
-            Predictor(how.predictor and self._predicts),
+            Predictor(how.predictor and self.predicts),
         )
         newton = NewtonSolver(
             self._comm,
             how.petsc_options_prefix,
             how.petsc_options or {},
-            all(given.symmetric for given in contributions)
-            and all(term.symmetric for term in (*self._field_terms, *self.terms)),
+            all(given.symmetric for given in built.contributions)
+            and all(term.symmetric for term in (*built.field_terms, *self.terms)),
             how.shift,
             how.line_search,
             statistics,
             self.bodies[0].V.mesh.geometry.dim,
             how.linear,
         )
-        self._trial.follow(System(self.bodies, self.body_terms, reduced, newton, clean_up))
         for body in self.bodies:
             known = [*self.fields, *parts.alternating]
             body.attach_unknowns([one for one in known if one.particles is body])
-        self._constants, self._data = parts.constants(), parts.data_at_points()
+        return System(
+            self.bodies,
+            built.body_terms,
+            reduced,
+            newton,
+            clean_up,
+            built.points,
+            built.supports,
+            built.loads,
+            built.masses,
+        )
 
     def _contributions(self) -> list[Contribution]:
         """Return the contribution of each body to the system, on its present mesh (collective)."""
@@ -224,37 +229,19 @@ class Problem(Hooked):
     #: How body meshes are related to others that forms have Functions on.
     _entity_maps: Any = None
     #: Whether bodies that bear on each other are kept together where the background would let go.
-    _keeps_joints = True
+    keeps_joints: ClassVar[bool] = True
     #: Whether steps may start from an extrapolation of those before.
-    _predicts = True
+    predicts: ClassVar[bool] = True
     #: Whether a step ends in equilibrium.
     at_rest: ClassVar[bool] = True
+    #: Duration of a step of a motion, and the share of force in its last residual.
+    _pace: tuple[float, ...] = ()
     #: Residuals of the fields.
     _of_fields: Sequence[ufl.Form] = ()
 
-    def _spaces_of_fields(self) -> list[fem.FunctionSpace]:
-        """Return the background spaces of fields, in the order in which they come first."""
-        spaces: list[fem.FunctionSpace] = []
-        for field in self.fields:
-            if all(field.background is not V for V in spaces):
-                spaces.append(field.background)
-        return spaces
-
-    def _couplings(self, parts: Parts) -> Sequence[FieldTerm]:
-        """Return the terms that have unknowns besides displacements (collective).
-
-        Args:
-            parts: What the system is put together from.
-        """
-        return parts.field_terms()
-
-    def __copy__(self) -> NoReturn:
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
         """Raise an error: a copy would have the bodies and their state in common."""
         raise MPMError("A problem cannot be copied; make another one, of particles of its own.")
-
-    def __deepcopy__(self, memo: Any) -> NoReturn:
-        """Raise an error: a problem cannot be copied."""
-        self.__copy__()
 
     def __del__(self) -> None:
         """Leave PETSc's objects to the next clean-up; at the program's end PETSc drops them.
@@ -263,8 +250,8 @@ class Problem(Hooked):
         """
         if sys.is_finalizing():
             return
-        if hasattr(self, "_trial"):
-            self._release()
+        if hasattr(self, "trial"):
+            self.release()
         vars(self).clear()
 
     def __repr__(self) -> str:
@@ -277,125 +264,43 @@ class Problem(Hooked):
         Bodies with their materials, how far they have moved and yielded, background, solver, steps,
         linear solves and seconds (mean of the ranks): ``print(problem.summary())``.
         """
-        return on_a_screen(self, self._comm, self._how.in_words(), self._made_of())
+        return on_a_screen(self, self._comm, self._how.in_words(), self.built.words)
 
-    def _made_of(self) -> list[str]:
-        """Return a description of each body: its material and its loads."""
-        raise NotImplementedError
-
-    def _release(self) -> None:
+    def release(self) -> None:
         """Let go of what was built for the present meshes."""
         for body in self.bodies:
             body.forget_transfer()
-        for term in self._field_terms:
-            for field in term.fields:
-                field.forget_transfer()
-        self.body_terms = []
-        self._field_terms = []
-        self._trial.release()
-
-    def renew(
-        self,
-        change: Callable[[], None],
-        carry: Callable[[checkpoint.Snapshot], checkpoint.Snapshot],
-        undo: Callable[[], None] | None = None,
-    ) -> None:
-        """Make the problem again, in the same state: on other meshes, of other things (collective).
-
-        Args:
-            change: Changes what the problem is made of: gives the particles their meshes.
-            carry: Makes of the state before the one of the problem as it is then.
-            undo: Takes the change back where something fails, and all stays as it was.
-        """
-        snapshot = self._state.capture()
-        seconds = self.history.statistics.seconds
-        self._release()
-        try:
-            change()
-            self._build()
-            self._state.adopt(carry(snapshot))
-        except BaseException:
-            if undo is not None:
-                undo()
-                self._release()
-                self._build()
-                self._state.adopt(snapshot)
-            raise
-        self.history.statistics.update(seconds)
-
-    # -- Stages ---------------------------------------------------------------------------
-
-    def begin_stage(self, name: str, change: Change, sudden: bool) -> None:
-        """Change what the problem is, in the same state, and let the next run be a stage.
-
-        What acts at once is held back and goes over the next run, unless the stage is sudden. Where
-        it cannot be changed all stays as it was (collective).
-
-        Args:
-            name: Name of the stage.
-            change: What changes.
-            sudden: Whether nothing is held back.
-
-        Raises:
-            MPMError: What is to be changed does not go together.
-        """
-        self._require_governing()
-        if not isinstance(name, str):
-            raise MPMError(f"The name of a stage must be a string, not {name!r}.")
-        self._staging.begin(name, change, bool(sudden))
-
-    @property
-    def held_back(self) -> float:
-        """How much of what the last stage changes is held back yet, from 1 to 0."""
-        return self._held.remaining
+        for field in self.built.carried:
+            field.forget_transfer()
+        self.built = NOTHING
+        self.trial.release()
 
     # -- PETSc objects --------------------------------------------------------------------
 
     @property
     def reduced(self) -> ReducedSystem:
         """Residual and tangent in the free dofs of V."""
-        return self._trial.reduced
+        return self.trial.reduced
 
     @property
     def solver(self) -> PETSc.SNES:
         """The nonlinear solver."""
-        return self._trial.newton.snes
+        return self.trial.newton.snes
 
     @property
     def A(self) -> PETSc.Mat | None:
         """The reduced tangent of the last Newton iteration."""
-        return self._trial.newton.K
+        return self.trial.newton.K
 
     @property
     def b(self) -> PETSc.Vec | None:
         """The reduced residual that was evaluated last."""
-        return self._trial.newton.F
+        return self.trial.newton.F
 
     @property
     def x(self) -> PETSc.Vec | None:
         """The free dofs of the last step's increment."""
-        return self._trial.newton.x
-
-    # -- Which problem governs the bodies -----------------------------------------------------
-
-    def _govern(self) -> None:
-        """Take the bodies over from problems that were made of them before."""
-        self._reign = object()
-        for body in self.bodies:
-            body.governed_by = self._reign
-
-    @property
-    def governs(self) -> bool:
-        """Whether no later problem was made of the bodies."""
-        return all(body.governed_by is self._reign for body in self.bodies)
-
-    def _require_governing(self) -> None:
-        """Raise an error where a later problem has taken a body over."""
-        if not self.governs:
-            raise MPMError(
-                "Another problem was made of these particles since, and governs them now; go on "
-                "with that one, or give each problem particles of its own."
-            )
+        return self.trial.newton.x
 
     # -- Loading --------------------------------------------------------------------------
 
@@ -497,7 +402,7 @@ class Problem(Hooked):
         Raises:
             MPMError: As in :meth:`solve`.
         """
-        self._require_governing()
+        self.reign.require()
         automatic = {
             "tolerance": tolerance,
             "output_at": output_at,
@@ -511,27 +416,10 @@ class Problem(Hooked):
             )
         else:
             chosen = steps
-        adaptivity = None if adapt is None else self._adaptivity(adapt)
+        adaptivity = None if adapt is None else adaptivity_of(self.trial, self.bcs, adapt)
         return self._stepper.steps(
             self, chosen, update, repartition, control, adaptivity=adaptivity
         )
-
-    def _adaptivity(self, tolerance: float) -> Adaptivity:
-        """Return the rule by which nodes are freed, or raise an error where they cannot be."""
-        adaptivity = Adaptivity(tolerance)
-        self._require_error()
-        adapted = [body for body in self.bodies if adaptivity.adapts(body)]
-        if not adapted:
-            raise MPMError(
-                "adapt= frees nodes of bodies whose particles may have free ones; make them with "
-                "free=[]."
-            )
-        if any(_compat.is_condition_on(bc, body.W) for bc in self.bcs for body in adapted):
-            raise MPMError(
-                "A Dirichlet condition on particles.W holds nodes that adapt= may let the "
-                "background carry; hold them by conditions on V or a support."
-            )
-        return adaptivity
 
     @collective()
     def step(self) -> Step:
@@ -547,7 +435,7 @@ class Problem(Hooked):
         Raises:
             MPMError: It does not converge; the state is that of the last converged step.
         """
-        self._require_governing()
+        self.reign.require()
         return self._stepper.step()
 
     # -- Results --------------------------------------------------------------------------
@@ -585,7 +473,7 @@ class Problem(Hooked):
                 raise MPMError(f"reaction() needs one of the {what} of this problem.")
         require_same(self._comm, bc=f"number {place} of the {what}")
         if isinstance(bc, Support):
-            own, known = self.supports, self._trial.converged.supports or ()
+            own, known = self.built.supports, self.trial.converged.supports or ()
             number = next((i for i, one in enumerate(own) if one is bc), len(own))
             return known[number].copy() if number < len(known) == len(own) else bc.reaction
         if isinstance(bc, Term):
@@ -598,7 +486,7 @@ class Problem(Hooked):
             for number, field in enumerate(self.reduced.fields)
             if any(bc is known for known in field.prescribed)
         )
-        return force_at(bc, self._trial.converged.reaction(number), field.V)
+        return force_at(bc, self.trial.converged.reaction(number), field.V)
 
     @collective()
     def error(self) -> float:
@@ -621,7 +509,7 @@ class Problem(Hooked):
             MPMError: A motion, or a flow of water, which is in no equilibrium of its own, particles
                 that do not hang together, or forces that are not those of that step.
         """
-        found = self._errors().total(self.bodies)
+        found = errors_of(self.trial).total(self.bodies)
         steps = self.history.steps
         if steps:
             steps[-1] = replace(steps[-1], error=found)
@@ -644,26 +532,7 @@ class Problem(Hooked):
         with agree(self._comm):
             if not isinstance(body, int | np.integer) or body not in range(len(self.bodies)):
                 raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
-        return self._errors().of_particles(body, self.bodies[body])
-
-    def _errors(self) -> Errors:
-        self._require_error()
-        self._require_governing()
-        return estimated(self.bodies, self.body_terms, self.reduced, self._trial.converged.force)
-
-    def _require_error(self) -> None:
-        """Raise an error unless an error can be told."""
-        if not self.at_rest:
-            raise MPMError(
-                f"A {type(self).__name__} is in no equilibrium of which an error could be told; "
-                "error() is for problems at rest."
-            )
-        alone = next((body for body in self.bodies if not body.shares_nodes), None)
-        if alone is not None:
-            raise MPMError(
-                f"Particles of method {alone.method!r} do not hang together, so that nothing tells "
-                "what their background cannot do; error() is for 'cpdi2' and finite elements."
-            )
+        return errors_of(self.trial).of_particles(body, self.bodies[body])
 
     @collective()
     def write(self, path: str | Path, time: float | None = None) -> None:
@@ -687,7 +556,7 @@ class Problem(Hooked):
             MPMError: The name does not end in ``.pvd``, the time lies before that of the state
                 that was written last, or a file cannot be written, or not all of it.
         """
-        self._require_governing()
+        self.reign.require()
         moment = self.history.time if time is None else time
         with agree(self._comm):
             if not is_number(moment) or not abs(moment) < np.inf:
@@ -696,10 +565,6 @@ class Problem(Hooked):
         self._output.write(
             as_path(path), self.bodies, others, float(moment), len(self.history.steps)
         )
-
-    def keep_identity(self) -> None:
-        """Note what this problem is known by, before its body meshes change (collective)."""
-        self._state.before_remeshing()
 
     @collective()
     def repartition(self, threshold: float = 0.1) -> bool:
@@ -733,35 +598,8 @@ class Problem(Hooked):
         Raises:
             MPMError: The file cannot be written, or functions that cannot be kept.
         """
-        self._require_governing()
-        self._state.save(as_path(path), functions)
-
-    @collective()
-    def capture(self) -> checkpoint.Snapshot:
-        """Return the state at the last converged step, for :meth:`return_to` (collective)."""
-        return self._state.capture()
-
-    @collective("snapshot")
-    def return_to(self, snapshot: checkpoint.Snapshot) -> None:
-        """Return to a state of this problem on the present meshes (collective)."""
-        self._state.adopt(snapshot)
-
-    @property
-    def carried(self) -> list[CarriedField]:
-        """The unknowns besides displacements, as the system moves them."""
-        return [one for term in self._field_terms for one in term.fields]
-
-    def record(self, recorder: Recorder) -> None:
-        """Let something follow the steps of runs, as :class:`mpm_dolfinx.Sensitivity` does.
-
-        Args:
-            recorder: Called when a step is solved; it is not kept alive.
-        """
-        self._trial.record(recorder)
-
-    def constants(self) -> list[fem.Constant]:
-        """Return the Constants of all forms, without loads of bodies."""
-        return list(self._constants)
+        self.reign.require()
+        self.state.save(as_path(path), functions)
 
     def begin_anew(self) -> None:
         """Let bodies that have not moved be what parameters make of them now (collective)."""
@@ -794,7 +632,7 @@ class Problem(Hooked):
         Raises:
             MPMError: It is something else, or its key is taken.
         """
-        self._state.keep(thing)
+        self.state.keep(thing)
 
     @collective()
     def restore(
@@ -818,20 +656,8 @@ class Problem(Hooked):
                 damaged, or that of another problem, or a time series that it was writing cannot
                 be read; the state is what it was.
         """
-        self._require_governing()
-        self._state.restore(as_path(path), functions, resume)
-
-    def cut_as(self, snapshot: checkpoint.Snapshot, functions: bool, source: str) -> None:
-        """Split the domains that were split in a state (collective).
-
-        Args:
-            snapshot: The state, one of this problem.
-            functions: Whether it is to be restored with Functions on the present mesh.
-            source: What to call it in an error.
-
-        Raises:
-            MPMError: Domains were split that are not, or the other way round.
-        """
+        self.reign.require()
+        self.state.restore(as_path(path), functions, resume)
 
     # -- What a problem with a material adds -----------------------------------------------
 
@@ -855,22 +681,6 @@ class Problem(Hooked):
         """
         return None
 
-    def loads(self) -> Sequence[fem.Constant | fem.Function]:
-        """Return the loads that the load factor multiplies and the user may change, if known.
-
-        A residual in UFL says itself what it multiplies by ``particles.load``.
-        """
-        return ()
-
-    @property
-    def supports(self) -> tuple[Support, ...]:
-        """The supports that hold, but for those that a residual in UFL has."""
-        return ()
-
-    def masses(self, number: int) -> NDArray[np.float64] | None:
-        """Return the mass of each particle of a body that this rank owns, if it is known."""
-        return None
-
     def begin_step(self) -> None:
         """Look at what may have changed since the last step (collective).
 
@@ -878,13 +688,13 @@ class Problem(Hooked):
             MPMError: The coordinates of a mesh have, other problems govern the bodies, or ranks
                 have different loads.
         """
-        self._require_governing()
+        self.reign.require()
         with agree(self._comm):
             for body in self.bodies:
                 for coordinates in (body.geometry.coordinates, body.mover.coordinates):
                     coordinates.require_same()
         load = [float(body.load.value) for body in self.bodies]
-        require_same(self._comm, load=load, bcs=self.bcs, constants=self._constants)
+        require_same(self._comm, load=load, bcs=self.bcs, constants=self.built.constants)
 
     def commit(self) -> None:
         """Make the last evaluation the converged one."""
@@ -898,10 +708,13 @@ class Problem(Hooked):
     @property
     def points(self) -> list[MaterialPoints]:
         """The materials at the points of each body; none where the residual is all."""
-        return []
+        return self.built.points
 
     #: Where arrays of :meth:`converged_state` live that do not say it; ``None``: they must.
-    _history_at: str | None = "cells"
+    history_at: ClassVar[str | None] = "cells"
+
+    #: Whether :meth:`converged_state` has all data at points that forms hold.
+    keeps_data: ClassVar[bool] = False
 
     def converged_state(self) -> list[dict[str, Any]]:
         """Return the history at the last converged step, for a checkpoint.
@@ -925,8 +738,3 @@ class Problem(Hooked):
     def laws(self) -> list[list[Law]]:
         """Return the materials of each body, for a checkpoint to know them by."""
         return [[] for _ in self.bodies]
-
-    def data_at_points(self) -> set[fem.Function]:
-        """Return Functions at quadrature points that the forms hold and no history keeps."""
-        keeps = type(self).converged_state is not Problem.converged_state
-        return set() if keeps else self._data

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, override
 
 import numpy as np
@@ -14,67 +14,34 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem
 
-from ..assembly.inputs import Density, functions_of
-from ..assembly.loads import VirtualWork, changeable
-from ..assembly.rules import depends_on
+from ..assembly.inputs import functions_of
 from ..boundary.supports import Support
 from ..constitutive.assignment import equal_laws
 from ..constitutive.beginning import begin_unstrained, begin_with_stress
 from ..constitutive.groups import background_cells
 from ..constitutive.identity import identity
-from ..constitutive.points import MaterialPoints
-from ..constitutive.step_stress import StepStress
-from ..constitutive.strain import Strain, strain_of
 from ..errors import MPMError, agree, warn
-from ..io.checkpoint import Snapshot
 from ..meshes.redistribution import Redistribution
 from ..parallel.boundary import collective
-from ..parallel.compilation import compiled_form
 from ..parallel.given import is_number
-from ..particles.field import CarriedField, ParticleField
+from ..particles.field import ParticleField
 from ..particles.particles import Particles
-from ..particles.undeformed import separate_nodes
-from ..system.body import StepForce
-from ..system.damage import Damage
-from ..system.pressure import PressureTerm
-from ..system.smoothing import PressureSmoothing
 from ..system.term import Term
-from ..system.values import FieldTerm
 from .arguments import as_bodies, as_supports, as_terms, require_no_conditions_on_bodies
 from .body import INITIAL, Body, as_given
 from .initial_stress import initial_stress_at_points
-from .parts import Contribution, Parts
-from .pore_water import water_in
+from .parts import Contribution
+from .physics import MaterialBodies, Physics, damages
 from .problem import Law, Problem
 from .remeshing import Remeshing, as_indices
 from .setup import Setup
 from .solver import Solver, as_solver
 from .stages import Addition, Given, Removal, chosen_cells
-from .summary import counted
 
 __all__ = ["QuasiStaticProblem"]
 
 #: Mean share of a background cell that a domain fills, from which one point is too few.
 CROWDED = 0.5
-
-
-@dataclass(frozen=True)
-class _Built:
-    """Parts of a problem on the present meshes of its bodies.
-
-    Attributes:
-        new_pressures: The pressures in place of mean stresses that were not there before.
-        points: The materials at the points of each body.
-        acting: The stress that acts on each.
-        densities: The work on each and its density.
-        loads: Constants and Functions of all loads.
-    """
-
-    new_pressures: list[ParticleField]
-    points: list[MaterialPoints] = field(default_factory=list)
-    acting: list[MaterialPoints | StepStress] = field(default_factory=list)
-    densities: list[tuple[VirtualWork, Density]] = field(default_factory=list)
-    loads: list[fem.Constant | fem.Function] = field(default_factory=list)
 
 
 class QuasiStaticProblem(Problem):
@@ -106,8 +73,6 @@ class QuasiStaticProblem(Problem):
         particles: The particles of the body, or of each in a list.
         damage: The :class:`mpm_dolfinx.Damage` of each body whose law is a
             :class:`mpm_dolfinx.materials.Fracture`.
-        pressure: With ``mixed``, the pressure of each body: a :class:`mpm_dolfinx.ParticleField` at
-            its points. It is the mean of the laws' own stress, positive in tension.
 
     Raises:
         MPMError: Materials, loads or conditions that do not go together.
@@ -127,13 +92,13 @@ class QuasiStaticProblem(Problem):
         solver: Solver | None = None,
     ) -> None:
         given = as_given(bodies)
-        self._require_given(given)
+        self._physics.require(given, type(self).__name__)
         listed = [body.particles for body in given]
         particles = as_bodies(listed if isinstance(bodies, list | tuple) else listed[0])
         supports = as_supports(supports, particles)
         terms = as_terms(terms, particles)
         setup = Setup(tuple(given), tuple(supports), tuple(terms), axisymmetric, mixed)
-        self.damage = self._damages(setup)
+        self.damage = damages(setup, self._physics)
         terms = [*terms, *self.damage]
         setup = replace(setup, terms=tuple(terms))
         if any(body.on_distortion == "split" for body in particles):
@@ -144,66 +109,38 @@ class QuasiStaticProblem(Problem):
                 if support.particles is body and not moved:
                     support.forget_modulus()
         self.setup = setup
-        self._parameters = self._functions()
-        self._spaces_of_pressure: list[tuple[Particles, fem.FunctionSpace]] = []
-        self.pressure: list[ParticleField] = []
-        self._left: dict[int, tuple[fem.Function, NDArray[np.float64]]] = {}
+        self._parameters = _Parameters(setup)
+        self._materials = MaterialBodies(self._physics)
         self._remeshing = Remeshing(self)
         one = particles if isinstance(bodies, list | tuple) else particles[0]
-        super().__init__(one, bcs, background, as_solver(solver), terms, mender=self._remeshing)
+        super().__init__(
+            one,
+            bcs,
+            background,
+            as_solver(solver),
+            terms,
+            mender=self._remeshing,
+            spaces=self._physics.field_spaces,
+        )
         self._carry_stress([body.initial_stress for body in given])
         for body in particles:
             _warn_of_hourglass(body)
 
-    def _damages(self, setup: Setup) -> list[Damage]:
-        """Return the damage of each body that may crack (collective)."""
-        found = []
-        for body in setup.given:
-            if not body.may_crack:
-                continue
-            self._require_for_cracks(body, setup)
-            found.append(Damage(body.particles, body.material, body.cell_tags))
-        return found
+    #: Laws besides that of equilibrium.
+    _physics: Physics = Physics()
 
-    def _require_for_cracks(self, body: Body, setup: Setup) -> None:
-        """Raise an error where a body that may crack has what does not go with that."""
-        refused = {
-            "mixed=": setup.mixed is not None,
-            "f_bar=": body.f_bar != "none",
-            "axisymmetric=True": setup.axisymmetric,
-            "initial_stress=": body.initial_stress is not None,
-            f"method={body.particles.method!r}": not body.particles.shares_nodes,
-            "outside='delete'": body.particles.deletion is not None,
-            "on_distortion='split'": body.particles.on_distortion == "split",
-            **self._not_for_cracks(),
-        }
-        for what, given in refused.items():
-            if given:
-                raise MPMError(f"Fracture does not go with {what}.")
+    @property
+    def pressure(self) -> list[ParticleField]:
+        """With ``mixed``, the pressure of each body: a :class:`mpm_dolfinx.ParticleField`.
 
-    def _not_for_cracks(self) -> dict[str, bool]:
-        """Return further options that cracks do not go with, and whether they are there."""
-        return {}
+        It lives at the body's points and is the mean of the laws' own stress, positive in tension.
+        """
+        return self._materials.pressure
 
-    #: What bodies may have besides, which is for some problems alone.
-    _further: tuple[str, ...] = ()
-
-    #: Whether time passes in steps.
-    _has_time = False
-
-    def _require_given(self, bodies: Sequence[Body]) -> None:
-        """Raise an error where bodies have what is for other problems alone."""
-        if not self._has_time and any(body.takes_time for body in bodies):
-            raise MPMError(
-                "A law with a relaxation_time needs steps with a duration, which a "
-                f"{type(self).__name__} does not have; make a PorousProblem, of dry bodies too, or "
-                "a DynamicProblem; or omit it: that is the law of loads that last."
-            )
-        for name, kind in (("velocity", "DynamicProblem"), ("pore_fluid", "PorousProblem")):
-            if name not in self._further and any(getattr(b, name) is not None for b in bodies):
-                raise MPMError(
-                    f"{name}= of a Body is for a {kind}; omit it in a {type(self).__name__}."
-                )
+    @property
+    def supports(self) -> tuple[Support, ...]:
+        """The supports on the bodies' own boundaries."""
+        return self.setup.supports
 
     def body(self, particles: Particles | None = None) -> Body:
         """Return the body of particles, as it was given last.
@@ -230,20 +167,17 @@ class QuasiStaticProblem(Problem):
         """
         if all(stress is None for stress in stresses):
             return
-        for body, points, stress in zip(self.bodies, self._built.points, stresses, strict=True):
+        for body, points, stress in zip(self.bodies, self.points, stresses, strict=True):
             if stress is not None:
                 begin_with_stress(points, initial_stress_at_points(stress, body))
-        if self._gradual:
-            self._staging.hold_all()
-
-    #: Whether loads and stages act little by little.
-    _gradual = True
+        if self._physics.gradual:
+            self.staging.hold_all()
 
     @override
     def begin_anew(self) -> None:
         super().begin_anew()
         self._held.let_go()
-        for body, points in zip(self.bodies, self._built.points, strict=True):
+        for body, points in zip(self.bodies, self.points, strict=True):
             points.numbers.follow()
             begin_unstrained(points)
             for support in self.setup.supports_of(body):
@@ -268,25 +202,16 @@ class QuasiStaticProblem(Problem):
         return [*(support.stiffness for support in supports), *averaged, *self._held.held]
 
     @override
-    def _build(self) -> None:
+    def build(self) -> None:
         self.setup = self.setup.carried()
-        present = self._functions()
-        for function in self._parameters:
-            if id(function) not in self._left and all(function is not f for f in present):
-                self._left[id(function)] = function, function.x.array.copy()
-        super()._build()
-        for body, stress in zip(self.bodies, self._built.points, strict=True):
-            body.attach(stress)
+        self._parameters.carry(self.setup)
+        super().build()
+        for body, points in zip(self.bodies, self.points, strict=True):
+            body.attach(points)
 
     @override
-    def _made_of(self) -> list[str]:
-        whole = ["body of revolution"] if self.setup.axisymmetric else []
-        found = []
-        for body in self.setup.bodies:
-            held = self.setup.supports_of(body.particles)
-            more = [counted(len(held), "support")] if held else []
-            found.append("; ".join([body.in_words(), *more, *whole]))
-        return found
+    def _contributions(self) -> list[Contribution]:
+        return self._materials.contributions(self.setup)
 
     # -- Stages ---------------------------------------------------------------------------
 
@@ -324,7 +249,7 @@ class QuasiStaticProblem(Problem):
         changed = as_given(bodies) if bodies != () else []
         if changed:
             as_bodies([body.particles for body in changed])
-        self._require_given(changed)
+        self._physics.require(changed, type(self).__name__)
         for body in changed:
             self._require_change(body)
         setup = self.setup.with_bodies(*changed)
@@ -406,7 +331,7 @@ class QuasiStaticProblem(Problem):
         given, *more = as_given(body)
         if more:
             raise MPMError("add() takes one mpm.Body; call it again for the next.")
-        self._require_given([given])
+        self._physics.require([given], type(self).__name__)
         if given.may_crack:
             raise MPMError("A body with a law of fracture cannot be added; begin with it.")
         particles = given.particles
@@ -416,11 +341,7 @@ class QuasiStaticProblem(Problem):
             ).require_divisible()
         np.copyto(particles.load.value, float(self.bodies[0].load.value))
         np.copyto(particles.proportional.value, float(self.bodies[0].proportional.value))
-        self._go_on(name, self._addition(given), sudden)
-
-    def _addition(self, given: Body) -> Addition:
-        """Return the change that adds a body."""
-        return Addition(self, given)
+        self._go_on(name, Addition(self, given), sudden)
 
     def _own_terms(self) -> list[Term]:
         """Return the terms that the problem itself has."""
@@ -428,171 +349,21 @@ class QuasiStaticProblem(Problem):
 
     def _go_on(self, name: str | None, change: Any, sudden: bool) -> None:
         """Begin a stage."""
-        known = self._parameters
-        number = len(self.history.stages) + 1
-        self.begin_stage(
-            f"stage {number}" if name is None else name, change, sudden or not self._gradual
-        )
-        present = self._functions()
-        for function in known:
-            if all(function is not f for f in present):
-                self._left.pop(id(function), None)
-        self._parameters = present
-
-    @property
-    @override
-    def points(self) -> list[MaterialPoints]:
-        return self._built.points
-
-    @override
-    def loads(self) -> list[fem.Constant | fem.Function]:
-        return self._built.loads
-
-    @property
-    @override
-    def supports(self) -> tuple[Support, ...]:
-        return self.setup.supports
-
-    def _functions(self) -> list[fem.Function]:
-        """Return the parameters of materials that are Functions."""
-        return [f for body in self.setup.bodies for f in functions_of(body.material)]
-
-    @override
-    def _contributions(self) -> list[Contribution]:
-        bodies = [given.particles for given in self.setup.bodies]
-        known = self.pressure
-        self.pressure = [self._pressure_of(body) for body in bodies if self.setup.mixed]
-        new = [field for field in self.pressure if all(field is not other for other in known)]
-        self._built = _Built(new)
-        return [self._contribution(given) for given in self.setup.bodies]
-
-    def _pressure_of(self, body: Particles) -> ParticleField:
-        """Return the pressure of a body, a new one where its mesh is (collective)."""
-        for known in self.pressure:
-            if known.particles is body and known.W.mesh is body.mesh:
-                return known
-        V = next((V for its, V in self._spaces_of_pressure if its is body), None)
-        if V is None:
-            degree = max(body.V.ufl_element().degree - 1, 1)
-            V = fem.functionspace(body.V.mesh, ("Lagrange", degree))
-            self._spaces_of_pressure.append((body, V))
-        kind = "body" if body.is_free else "total"
-        return ParticleField(body, V, at="points", kind=kind, name="pressure")
-
-    def _contribution(self, given: Body) -> Contribution:
-        """Return the contribution of one body to the system (collective)."""
-        body = given.particles
-        supports = self.setup.supports_of(body)
-        strain = strain_of(body, self.setup.axisymmetric)
-        history = MaterialPoints(
-            strain,
-            given.material,
-            given.cell_tags,
-            given.f_bar,
-            next((field for field in self.pressure if field.particles is body), None),
-            given.length,
-        )
-        if any(field.particles is body for field in self._built.new_pressures):
-            assert history.mean_stress is not None
-            history.mean_stress.begin_with(history.last.mean_stress())
-        self._built.points.append(history)
-        body.fill_pores(water_in(body, given.pore_pressure, history))
-        work = VirtualWork(strain)
-        density = Density(1.0 if given.density is None else given.density, body)
-        density.require()
-        self._built.densities.append((work, density))
-        mass = density.value * body.undeformed.mass_ratio
-        acting, of_step = self._in_time(history, supports)
-        self._built.acting.append(acting)
-        symmetric = acting.symmetric and not given.pressures
-        loads: list[ufl.Form] = []
-        if given.body_force is not None:
-            loads.append(-work.body_force(mass, given.body_force))
-        if given.pore_pressure is not None:
-            loads.append(-work.seepage(given.pore_pressure))
-        if given.tractions:
-            loads.append(-work.tractions(given.tractions, given.facet_tags))
-            symmetric = symmetric and not depends_on(loads[-1], body.displacement)
-        for load in loads:
-            self._built.loads.extend(changeable(load, body))
-        share = self._force_share(body)
-        loads += [s.at_body(history.initial_modulus, strain.turn, share) for s in supports]
-        if given.pressures:
-            loads.append(work.pressures(given.pressures, given.facet_tags))
-            self._built.loads.extend(changeable(loads[-1], body))
-        further, plain = self._further_work(given, strain)
-        loads += further
-        symmetric = symmetric and plain
-        slopes = [
-            ufl.derivative(load, body.displacement)
-            for load in loads
-            if depends_on(load, body.displacement)
-        ]
-        return Contribution(
-            sum(loads[1:], loads[0]) if loads else None,
-            sum(slopes[1:], slopes[0]) if slopes else None,
-            symmetric,
-            acting,
-            history,
-            of_step,
-        )
-
-    def _further_work(self, given: Body, strain: Strain) -> tuple[list[ufl.Form], bool]:
-        """Return forms of the residual besides those of stress and loads (collective).
-
-        Args:
-            given: The body, what it is made of and loaded by.
-            strain: What it is strained in.
-
-        Returns:
-            The forms, and whether the tangent of all that they belong to is symmetric.
-        """
-        return [], True
-
-    def _in_time(
-        self, history: MaterialPoints, supports: Sequence[Support]
-    ) -> tuple[MaterialPoints | StepStress, Sequence[StepForce]]:
-        """Return the stress that acts on a body, and its forces that act over a whole step."""
-        return history, ()
-
-    def _force_share(self, body: Particles) -> float | None:
-        """Return the share of force in a body's last residual; ``None`` without motion."""
-        return None
-
-    @override
-    def _couplings(self, parts: Parts) -> Sequence[FieldTerm]:
-        if self.setup.mixed is None:
-            return super()._couplings(parts)
-        found: list[FieldTerm] = []
-        for body, pressure, acting, points in zip(
-            self.bodies, self.pressure, self._built.acting, self._built.points, strict=True
-        ):
-            carried = CarriedField(pressure)
-            found.append(PressureTerm(body, carried, acting))
-            if self.setup.mixed == "stabilised pressure":
-                found.append(PressureSmoothing(carried, points, self._force_share(body) or 1.0))
-        return found
+        self.reign.require()
+        name = f"stage {len(self.history.stages) + 1}" if name is None else name
+        self.staging.begin(name, change, bool(sudden) or not self._physics.gradual)
+        self._parameters.replace(self.setup)
 
     @override
     def begin_step(self) -> None:
         """Begin a step, in which parameters of materials have new values."""
         super().begin_step()
         with agree(self._comm):
-            for function, values in self._left.values():
-                if not np.array_equal(function.x.array, values):
-                    raise MPMError(
-                        f"A parameter of a material ('{function.name}') was changed on a mesh that "
-                        "the particles have left; make a new problem with a Function on "
-                        "particles.mesh."
-                    )
-        for _, density in self._built.densities:
+            self._parameters.require()
+        for density in self._materials.densities:
             density.require()
-        for stress in self._built.points:
-            stress.numbers.follow()
-
-    @override
-    def masses(self, number: int) -> NDArray[np.float64]:
-        return self.nodal_masses(number).sum(axis=1)
+        for points in self.points:
+            points.numbers.follow()
 
     @collective()
     def repartition(self, threshold: float = 0.1) -> bool:
@@ -614,7 +385,7 @@ class QuasiStaticProblem(Problem):
             MPMError: The problem holds what cannot move: UFL expressions, supports or arrays of
                 parameters on the present body mesh. Nothing is changed.
         """
-        self._require_governing()
+        self.reign.require()
         if not is_number(threshold) or not 0.0 <= threshold <= 1.0:
             raise MPMError(f"threshold must be a share from 0 to 1, not {threshold!r}.")
         self.setup.require_movable()
@@ -630,7 +401,7 @@ class QuasiStaticProblem(Problem):
                 if not body.is_free:
                     body.live_on(Redistribution(body.mesh, targets))
 
-        self.renew(move, lambda snapshot: snapshot)
+        self.state.renew(move, lambda snapshot: snapshot)
         self.history.statistics.count("repartitions")
         return True
 
@@ -652,7 +423,7 @@ class QuasiStaticProblem(Problem):
         Raises:
             MPMError: Domains or a problem that cannot be split. Nothing is changed.
         """
-        self._require_governing()
+        self.reign.require()
         if body not in range(len(self.bodies)):
             raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
         chosen = [np.zeros(0, dtype=np.int64) for _ in self.bodies]
@@ -672,49 +443,23 @@ class QuasiStaticProblem(Problem):
         Raises:
             MPMError: Domains or a problem that cannot be rebased. Nothing is changed.
         """
-        self._require_governing()
+        self.reign.require()
         self._remeshing.rebase()
 
-    def nodal_masses(self, number: int) -> NDArray[np.float64]:
-        """Return ``int density Q_c dX`` of each owned domain of a body, ``(n, k)`` (collective)."""
-        body, (work, density) = self.bodies[number], self._built.densities[number]
-        space = separate_nodes(body.W)
-        test = body.undeformed.mass_ratio * ufl.TestFunction(space)
-        vector = fem.assemble_vector(compiled_form(work.mass(density.value, test)))
-        return np.asarray(vector.array[space.dofmap.list[: body.num_local]])
-
-    def mass_matrices(self, number: int) -> NDArray[np.float64]:
-        """Return ``int density Q_c Q_d dX`` of each owned domain, ``(n, k, k)`` (collective).
-
-        Shares that masses have where domains were cut are left out.
-        """
-        body, (work, density) = self.bodies[number], self._built.densities[number]
-        space = separate_nodes(body.W)
-        product = body.undeformed.volume_ratio * (
-            ufl.TrialFunction(space) * ufl.TestFunction(space)
-        )
-        matrix = fem.assemble_matrix(compiled_form(work.mass(density.value, product)))
-        n, k = body.num_local, space.dofmap.list.shape[1]
-        return matrix.data[: n * k * k].reshape(n, k, k)
-
-    @override
-    def cut_as(self, snapshot: Snapshot, functions: bool, source: str) -> None:
-        self._remeshing.repeat(snapshot, functions, source)
-
-    _history_at = None
+    history_at = None
 
     @override
     def converged_state(self) -> list[dict[str, Any]]:
-        return [dict(points.columns()) for points in self._built.points]
+        return [dict(points.columns()) for points in self.points]
 
     @override
     def set_converged_state(self, states: list[dict[str, NDArray[Any]]]) -> None:
-        for stress, arrays in zip(self._built.points, states, strict=True):
+        for stress, arrays in zip(self.points, states, strict=True):
             stress.restore(arrays)
 
     @override
     def laws(self) -> list[list[Law]]:
-        return [identity(stress) for stress in self._built.points]
+        return [identity(stress) for stress in self.points]
 
     @property
     def yield_function(self) -> NDArray[np.float64]:
@@ -723,8 +468,50 @@ class QuasiStaticProblem(Problem):
         In the unit of the material's own function; -1 where a material has none.
         With several bodies, their particles one body after the other.
         """
-        values = [s.last.yield_function().max(axis=1, initial=-np.inf) for s in self._built.points]
+        values = [s.last.yield_function().max(axis=1, initial=-np.inf) for s in self.points]
         return np.concatenate(values)
+
+
+class _Parameters:
+    """Functions that are parameters of materials, on the present meshes and on those of before.
+
+    Args:
+        setup: The bodies.
+    """
+
+    def __init__(self, setup: Setup) -> None:
+        self._present = _functions(setup)
+        self._left: dict[int, tuple[fem.Function, NDArray[np.float64]]] = {}
+
+    def carry(self, setup: Setup) -> None:
+        """Take bodies on other meshes, and note the values on those that they leave."""
+        present = _functions(setup)
+        for function in self._present:
+            if id(function) not in self._left and all(function is not f for f in present):
+                self._left[id(function)] = function, function.x.array.copy()
+
+    def replace(self, setup: Setup) -> None:
+        """Take other parameters: those that are gone do not matter any more."""
+        present = _functions(setup)
+        for function in self._present:
+            if all(function is not f for f in present):
+                self._left.pop(id(function), None)
+        self._present = present
+
+    def require(self) -> None:
+        """Raise an error where values on a mesh of before have changed."""
+        for function, values in self._left.values():
+            if not np.array_equal(function.x.array, values):
+                raise MPMError(
+                    f"A parameter of a material ('{function.name}') was changed on a mesh that "
+                    "the particles have left; make a new problem with a Function on "
+                    "particles.mesh."
+                )
+
+
+def _functions(setup: Setup) -> list[fem.Function]:
+    """Return the parameters of materials that are Functions."""
+    return [f for body in setup.bodies for f in functions_of(body.material)]
 
 
 def _warn_of_hourglass(particles: Particles) -> None:

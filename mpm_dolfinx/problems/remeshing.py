@@ -13,17 +13,14 @@ kept by a factor of the density, linear in each half.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dolfinx import fem
-
 from .. import _compat
 from ..errors import MPMError, agree, warn
-from ..history import History
 from ..io.checkpoint import Snapshot, Table
 from ..meshes.remesh import Column, Cuts, Remesh, diagonals
 from ..parallel.exchange import RowExchange
@@ -32,7 +29,8 @@ from ..particles.particles import Particles
 from ..particles.reference import Reference
 from ..reals import as_wholes
 from .arguments import require_no_conditions_on_bodies
-from .setup import Setup
+from .stages import Staged
+from .state import ProblemState
 
 __all__ = ["Remeshable", "Remeshing", "as_indices"]
 
@@ -42,32 +40,14 @@ TRIES = 5
 FEW = 0.02
 
 
-class Remeshable(Protocol):
+class Remeshable(Staged, Protocol):
     """A problem that can be made on other meshes of its bodies.
 
     Attributes:
-        bodies: The bodies.
-        bcs: Dirichlet conditions.
-        history: What was computed.
-        setup: What the user has given.
+        state: Its state.
     """
 
-    bodies: list[Particles]
-    bcs: list[fem.DirichletBC]
-    history: History
-    setup: Setup
-
-    def keep_identity(self) -> None:
-        """Remember what the problem is, as it was made at first (collective)."""
-
-    def renew(self, change: Callable[[], None], carry: Callable[[Snapshot], Snapshot]) -> None:
-        """Make the problem on other meshes of the same bodies, in the same state (collective)."""
-
-    def nodal_masses(self, number: int) -> NDArray[np.float64]:
-        """Return ``int density Q_c dX`` of each owned domain of a body, ``(n, k)`` (collective)."""
-
-    def mass_matrices(self, number: int) -> NDArray[np.float64]:
-        """Return ``int density Q_c Q_d dX`` of each owned domain, ``(n, k, k)`` (collective)."""
+    state: ProblemState
 
 
 def as_indices(particles: Any) -> NDArray[np.int64]:
@@ -164,8 +144,7 @@ class Remeshing:
         problem = self._problem
         present = [body.trail.cuts for body in problem.bodies]
         wanted = [
-            np.array(cuts, dtype=np.int64).reshape(-1, 2)
-            for cuts in snapshot.numbers.get("cuts", [[]] * len(present))
+            np.array(cuts, dtype=np.int64).reshape(-1, 2) for cuts in snapshot.numbers["cuts"]
         ]
         for mine, theirs in zip(present, wanted, strict=True):
             if not np.array_equal(mine, theirs[: len(mine)]):
@@ -222,12 +201,12 @@ class Remeshing:
         problem.setup.require_divisible()
         cuts = [_cuts(body, which) for body, which in zip(problem.bodies, wanted, strict=True)]
         gradients = [body.placement.gradient() for body in problem.bodies]
-        masses = [problem.nodal_masses(number) for number in range(len(chosen))]
+        masses = [problem.built.mass_matrices(number).sum(axis=2) for number in range(len(chosen))]
         moves = self._remesh(cuts)
         for number, (body, move, gradient, mass) in enumerate(
             zip(problem.bodies, moves, gradients, masses, strict=True)
         ):
-            masses_of_nodes, matrices = move.masses(mass), problem.mass_matrices(number)
+            masses_of_nodes, matrices = move.masses(mass), _unshared(problem, number)
             gradient = move.of_cells(gradient)
             undeformed = body.undeformed
             if undeformed.mass_share is None:
@@ -257,16 +236,15 @@ class Remeshing:
         """
         problem = self._problem
         self._require_movable_nodes()
-        masses = [problem.nodal_masses(number) for number in range(len(problem.bodies))]
+        built, count = problem.built, len(problem.bodies)
+        masses = [built.mass_matrices(number).sum(axis=2) for number in range(count)]
         none = np.zeros((0, 2), dtype=np.int64)
         positions = [body.placement.domains for body in problem.bodies]
         moves = self._remesh([none] * len(positions), positions)
         for number, (body, move, mass) in enumerate(
             zip(problem.bodies, moves, masses, strict=True)
         ):
-            body.undeformed.set_mass_shares(
-                _shares(problem.mass_matrices(number), move.masses(mass))
-            )
+            body.undeformed.set_mass_shares(_shares(_unshared(problem, number), move.masses(mass)))
 
     def _require_movable_nodes(self) -> None:
         problem = self._problem
@@ -341,9 +319,15 @@ class Remeshing:
             snapshot.numbers["cuts"] = [body.trail.cuts.tolist() for body in problem.bodies]
             return Snapshot(snapshot.numbers, [*tables, *snapshot.tables[len(tables) :]])
 
-        problem.keep_identity()
-        problem.renew(change, carry)
+        problem.state.before_remeshing()
+        problem.state.renew(change, carry)
         return moves
+
+
+def _unshared(problem: Remeshable, number: int) -> NDArray[np.float64]:
+    """Return the mass matrix of each domain of a body without shares of masses (collective)."""
+    ratio = problem.bodies[number].undeformed.volume_ratio
+    return problem.built.mass_matrices(number, ratio)
 
 
 def _diagonals(body: Particles) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Changes of a stage: new input, cells that are taken away, bodies that come.
 
-Each change is made in the same state: displacement, stress and history stay where they were
-(:meth:`Problem.begin_stage`).
+Each is a :class:`~mpm_dolfinx.problems.staging.Change`.
 """
 
 from __future__ import annotations
@@ -15,8 +14,6 @@ from typing import Any, Protocol, override
 import numpy as np
 from numpy.typing import NDArray
 
-from dolfinx import fem
-
 from ..constitutive.beginning import begin_with_stress, take_over
 from ..constitutive.moduli import mean_shear_modulus
 from ..constitutive.points import MaterialPoints
@@ -25,12 +22,13 @@ from ..io.snapshot import spaces_of
 from ..meshes.regions import marked
 from ..particles.particles import Particles
 from ..reals import as_wholes
-from ..system.reduced import ReducedSystem
 from ..system.term import Term
 from .arguments import as_bodies, as_conditions, as_terms
 from .body import Body
 from .initial_stress import initial_stress_at_points
 from .setup import Setup
+from .staging import Change
+from .state import Stateful
 
 __all__ = ["Addition", "Given", "Removal", "Staged", "chosen_cells", "join"]
 
@@ -38,64 +36,34 @@ __all__ = ["Addition", "Given", "Removal", "Staged", "chosen_cells", "join"]
 OF_LAWS = {"material", "cell_tags"}
 
 
-class Staged(Protocol):
+class Staged(Stateful, Protocol):
     """A problem that goes through stages.
 
     Attributes:
-        particles: Its body or bodies, as given.
-        bodies: Its bodies.
-        bcs: Its Dirichlet conditions.
-        terms: What else acts on the bodies.
-        setup: What the user has given for them.
-        points: The materials at the points of each body.
-        reduced: The system.
+        setup: What the user has given for the bodies.
     """
 
-    particles: Particles | Sequence[Particles]
-    bodies: list[Particles]
-    bcs: list[fem.DirichletBC]
-    terms: list[Term]
     setup: Setup
 
-    @property
-    def points(self) -> list[MaterialPoints]:
-        """The materials at the points of each body."""
 
-    @property
-    def reduced(self) -> ReducedSystem:
-        """The system."""
-
-
-class _Change:
-    """Base of all changes, which holds the problem as it was.
+class _OfSetup(Change):
+    """Base of the changes of a problem with materials.
 
     Args:
         problem: The problem.
     """
 
-    kind = ""
-
     def __init__(self, problem: Staged) -> None:
-        self.problem = problem
-        self._was = problem.setup, problem.bcs, problem.terms, problem.bodies, problem.particles
+        super().__init__(problem)
+        self.problem, self._setup_before = problem, problem.setup
 
-    def make(self) -> None:
-        """Change what the problem is made of; here nothing."""
-
-    def settle(self) -> None:
-        """Give what is new its state; here nothing is."""
-
-    def renews(self, body: int | None, name: str) -> bool:
-        """Return whether something of a state is new; here nothing is."""
-        return False
-
+    @override
     def undo(self) -> None:
-        """Take back what was changed."""
-        p = self.problem
-        p.setup, p.bcs, p.terms, p.bodies, p.particles = self._was
+        super().undo()
+        self.problem.setup = self._setup_before
 
 
-class Given(_Change):
+class Given(_OfSetup):
     """Other materials, loads, conditions or terms.
 
     Args:
@@ -120,7 +88,7 @@ class Given(_Change):
             set(new.changed_from(old))
             for new, old in zip(setup.given, problem.setup.given, strict=True)
         ]
-        self._points, self._moduli = list(problem.points), problem.reduced.unknowns.moduli
+        self._points, self._moduli = list(problem.built.points), problem.reduced.unknowns.moduli
 
     @override
     def make(self) -> None:
@@ -132,7 +100,7 @@ class Given(_Change):
     def settle(self) -> None:
         problem, factors = self.problem, {}
         for body, changed, points, before in zip(
-            problem.bodies, self._changed, problem.points, self._points, strict=True
+            problem.bodies, self._changed, problem.built.points, self._points, strict=True
         ):
             if changed & OF_LAWS:
                 take_over(points, before)
@@ -155,7 +123,7 @@ def _shear(points: MaterialPoints) -> float:
     return mean_shear_modulus(points.laws, points.strain.volumes())
 
 
-class Removal(_Change):
+class Removal(_OfSetup):
     """Cells that are taken away.
 
     Args:
@@ -186,7 +154,7 @@ class Removal(_Change):
         self._body.allow_deletion(self._deletable)
 
 
-class Addition(_Change):
+class Addition(_OfSetup):
     """A body that comes.
 
     Args:
@@ -213,7 +181,7 @@ class Addition(_Change):
     def settle(self) -> None:
         stress = self._given.initial_stress
         if stress is not None:
-            body, points = self._given.particles, self.problem.points[-1]
+            body, points = self._given.particles, self.problem.built.points[-1]
             begin_with_stress(points, initial_stress_at_points(stress, body))
 
     @override

@@ -8,9 +8,8 @@ the next run (:mod:`mpm_dolfinx.system.release`).
 
 from __future__ import annotations
 
-import weakref
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,30 +17,38 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from ..errors import MPMError
-from ..history import History, Stage
+from ..history import Stage
 from ..io.checkpoint import Snapshot
 from ..io.snapshot import belongs, merged
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..stepping.loading import Stepper
-from ..system.reduced import ReducedSystem
 from ..system.release import Release
-from .state import ProblemState
+from .state import ProblemState, Stateful
 
-__all__ = ["Change", "Renewable", "Staging"]
+__all__ = ["Change", "Staging"]
 
 
-class Change(Protocol):
-    """Change of a problem by a stage. All calls are collective.
+class Change:
+    """Change of a problem by a stage, made in the same state; the problem stays as it was.
+
+    Displacement, stress and history stay where they were. All calls are collective.
+
+    Args:
+        problem: The problem.
 
     Attributes:
-        kind: What kind of change it is.
+        kind: A word for what kind of change it is.
     """
 
-    kind: str
+    kind = ""
+
+    def __init__(self, problem: Stateful) -> None:
+        self._whole = problem
+        self._was = problem.bcs, problem.terms, problem.bodies, problem.particles
 
     def make(self) -> None:
-        """Change what the problem is made of."""
+        """Change what the problem is made of; here nothing."""
 
     def settle(self) -> None:
         """Give what is new its state; the system is built, the bodies are where they were."""
@@ -53,37 +60,12 @@ class Change(Protocol):
             body: Number of the body, or ``None`` for numbers.
             name: What it is called in a state.
         """
+        return False
 
     def undo(self) -> None:
         """Take back what was changed."""
-
-
-class Renewable(Protocol):
-    """A problem that can be made again in the same state; see :class:`Problem`.
-
-    Attributes:
-        bodies: The bodies.
-        history: What was computed.
-    """
-
-    bodies: list[Particles]
-    history: History
-
-    @property
-    def reduced(self) -> ReducedSystem:
-        """The system."""
-
-    @property
-    def carried(self) -> list[CarriedField]:
-        """The unknowns besides displacements."""
-
-    def renew(
-        self,
-        change: Callable[[], None],
-        carry: Callable[[Snapshot], Snapshot],
-        undo: Callable[[], None] | None = None,
-    ) -> None:
-        """Make the problem again, in the same state (collective)."""
+        p = self._whole
+        p.bcs, p.terms, p.bodies, p.particles = self._was
 
 
 class _Standing(NamedTuple):
@@ -112,27 +94,37 @@ class Staging:
     """Takes a problem from one stage to the next.
 
     Args:
-        problem: The problem, which is not kept alive.
-        state: Its state.
+        state: State of the problem.
         stepper: Knows the reactions of its last converged step.
         release: Holds back what a stage changes at once.
     """
 
-    def __init__(
-        self, problem: Renewable, state: ProblemState, stepper: Stepper, release: Release
-    ) -> None:
-        self._reference = weakref.ref(problem)
+    def __init__(self, state: ProblemState, stepper: Stepper, release: Release) -> None:
         self._state, self._stepper, self._release = state, stepper, release
 
     @property
-    def _problem(self) -> Renewable:
-        problem = self._reference()
-        assert problem is not None
-        return problem
+    def held_back(self) -> float:
+        """How much of what the last stage changes is held back yet, from 1 to 0."""
+        return self._release.remaining
 
     def begin(self, name: str, change: Change, sudden: bool) -> None:
-        """Begin a stage: see :meth:`Problem.begin_stage` (collective)."""
-        problem, state, release = self._problem, self._state, self._release
+        """Change what the problem is, in the same state, and let the next run be a stage.
+
+        What acts at once is held back and goes over the next run, unless the stage is sudden. Where
+        it cannot be changed all stays as it was (collective).
+
+        Args:
+            name: Name of the stage.
+            change: What changes.
+            sudden: Whether nothing is held back.
+
+        Raises:
+            MPMError: What is to be changed does not go together.
+        """
+        if not isinstance(name, str):
+            raise MPMError(f"The name of a stage must be a string, not {name!r}.")
+        state, release = self._state, self._release
+        problem = state.problem
         if sudden and release.remaining > 0.0:
             raise MPMError(
                 f"{100 * release.remaining:.3g} % of what the last stage changes is held back "
@@ -164,7 +156,7 @@ class Staging:
             change.undo()
             state.kept, state.numbered = kept, numbered
 
-        problem.renew(change.make, carry, undo)
+        state.renew(change.make, carry, undo)
         self._stepper.begin_stage()
         state.after_stage(f"{change.kind} {name!r}", first)
         problem.history.stages.append(Stage(name, problem.history.stage))
@@ -173,18 +165,18 @@ class Staging:
 
     def hold_all(self) -> None:
         """Hold the forces back that bodies are under now; they go as loads come (collective)."""
-        reduced = self._problem.reduced
+        reduced = self._state.problem.reduced
         V = [field.V.dofmap for field in reduced.fields]
         none = [np.zeros(m.index_map.size_local * m.index_map_bs) for m in V]
         self._release.hold(reduced.terms.nodal_forces(), none)
 
     def _moved(self) -> list[Particles | CarriedField]:
         """Return all that has unknowns, in the order of :meth:`.Terms.nodal_forces`."""
-        return [*self._problem.bodies, *self._problem.carried]
+        return [*self._state.problem.bodies, *self._state.problem.built.carried]
 
     def _standing_forces(self) -> _Standing:
         """Return the forces of the last converged state (collective)."""
-        reduced = self._problem.reduced
+        reduced = self._state.problem.reduced
         forces = reduced.terms.nodal_forces()
         return _Standing(
             [_identity(one) for one in self._moved()],
@@ -198,13 +190,13 @@ class Staging:
 
     def _hold_difference(self, before: _Standing) -> None:
         """Hold back what the forces are other now than before a stage (collective)."""
-        after = self._problem.reduced.terms.nodal_forces()
+        after = self._state.problem.reduced.terms.nodal_forces()
         freed = self._gathered(after)
         for one, new in zip(self._moved(), after, strict=True):
             if (known := _identity(one)) in before.moved:
                 new -= before.forces[before.moved.index(known)]
             new *= one.shares_nodes
-        for field, new in zip(self._problem.reduced.fields, freed, strict=True):
+        for field, new in zip(self._state.problem.reduced.fields, freed, strict=True):
             held = field.held_now()
             number = _number_of(field.V, before.spaces)
             if number is None:
@@ -225,7 +217,7 @@ class Staging:
             forces: On this rank's own dofs of W of each body, and of each of its fields.
         """
         totals = []
-        for field in self._problem.reduced.fields:
+        for field in self._state.problem.reduced.fields:
             total = np.zeros(field.V.dofmap.index_map.size_local * field.V.dofmap.index_map_bs)
             for body, force in zip(self._moved(), forces, strict=True):
                 if body.V is field.V and not body.shares_nodes:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,21 +15,20 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
-from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree
 from ..history import History
 from ..io import checkpoint, identity
 from ..io.series import Output, read_series
 from ..io.snapshot import Kept, adopt, capture, require_key
 from ..parallel.given import require_same
-from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..stepping.control import Run
-from ..stepping.loading import Stepper
+from ..stepping.loading import Mender, Stepper
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
 from ..system.term import Term
 from . import kept
+from .parts import Built
 
 __all__ = ["ProblemState", "Stateful"]
 
@@ -38,41 +37,47 @@ class Stateful(Protocol):
     """A problem that has a state; see :class:`Problem` for each.
 
     Attributes:
+        particles: Its body or bodies, as given.
         bodies: The bodies.
+        bcs: Dirichlet conditions.
         history: What was computed.
         terms: What else acts on the bodies.
+        built: What it is on the present meshes.
     """
 
+    particles: Particles | Sequence[Particles]
     bodies: list[Particles]
+    bcs: list[fem.DirichletBC]
     history: History
     terms: list[Term]
+    built: Built
 
     @property
     def reduced(self) -> ReducedSystem:
         """The system."""
 
-    @property
-    def carried(self) -> list[CarriedField]:
-        """The unknowns besides displacements."""
+    def build(self) -> None:
+        """Make the system and its solver for the present meshes of the bodies."""
+
+    def release(self) -> None:
+        """Let go of what was built."""
 
     def laws(self) -> list[list[tuple[str, dict[str, Any]]]]:
         """Return name and parameters of each body's materials."""
 
     @property
-    def points(self) -> list[MaterialPoints]:
-        """The materials at the points of each body."""
+    def history_at(self) -> str | None:
+        """Where arrays of the history live that do not say it; ``None``: they must."""
+
+    @property
+    def keeps_data(self) -> bool:
+        """Whether the history has all data at points that forms hold."""
 
     def converged_state(self) -> list[dict[str, Any]]:
         """Return the history at the points of each body."""
 
     def set_converged_state(self, states: list[dict[str, NDArray[Any]]]) -> None:
         """Take it again."""
-
-    def data_at_points(self) -> set[fem.Function]:
-        """Return Functions at quadrature points that no history keeps."""
-
-    def cut_as(self, snapshot: checkpoint.Snapshot, functions: bool, source: str) -> None:
-        """Split the domains that were split in a state (collective)."""
 
 
 class ProblemState:
@@ -86,8 +91,7 @@ class ProblemState:
         stepper: Knows how far it is.
         release: What stages hold back, a term that every problem has.
         output: The time series that it writes.
-        history_at: Where arrays of the problem's ``converged_state`` live that do not say it;
-            ``None``: they must.
+        mender: What changes meshes of its bodies, if anything.
 
     Attributes:
         kept: What goes with the problem besides what every problem has, and the term that it
@@ -102,31 +106,32 @@ class ProblemState:
         stepper: Stepper,
         release: Release,
         output: Output,
-        history_at: str | None,
+        mender: Mender | None,
     ) -> None:
         self._reference = weakref.ref(problem)
         self._stepper, self._release = stepper, release
-        self._output, self._history_at = output, history_at
+        self._output, self._mender = output, mender
         self.kept: list[tuple[Term | None, Kept]] = []
         self.numbered: list[Term | None] = []
         self._stages: list[str] = []
         self._identity: dict[str, Any] | None = None
 
     @property
-    def _problem(self) -> Stateful:
+    def problem(self) -> Stateful:
+        """The problem."""
         problem = self._reference()
         assert problem is not None
         return problem
 
     @property
     def _comm(self) -> MPI.Comm:
-        comm: MPI.Comm = self._problem.bodies[0].V.mesh.comm
+        comm: MPI.Comm = self.problem.bodies[0].V.mesh.comm
         return comm
 
     @property
     def spaces(self) -> list[fem.FunctionSpace]:
         """All background spaces."""
-        return [field.V for field in self._problem.reduced.fields]
+        return [field.V for field in self.problem.reduced.fields]
 
     # -- What goes with it ----------------------------------------------------------------
 
@@ -140,7 +145,7 @@ class ProblemState:
         Raises:
             MPMError: It is something else, or its key is taken.
         """
-        comm = self._problem.bodies[0].mesh.comm
+        comm = self.problem.bodies[0].mesh.comm
         with agree(comm):
             if not isinstance(thing, Kept):
                 raise MPMError(f"keep() needs an heir of mpm_dolfinx.io.Kept, not {thing!r}.")
@@ -148,7 +153,7 @@ class ProblemState:
                 raise MPMError(f"The key of what is kept must be a string, not {thing.key!r}.")
         require_same(comm, key=thing.key)
         things, _ = self._all((), whole=False)
-        require_key(thing.key, things, len(self._problem.bodies))
+        require_key(thing.key, things, len(self.problem.bodies))
         self.kept.append((owner, thing))
 
     def number(self, term: Term) -> int:
@@ -161,7 +166,7 @@ class ProblemState:
 
     def keep_terms(self) -> None:
         """Let go with the problem what its terms keep, and what other terms kept no longer."""
-        terms = [*self._problem.terms, self._release]
+        terms = [*self.problem.terms, self._release]
 
         def acts(owner: Term | None) -> bool:
             return any(owner is term for term in terms)
@@ -185,19 +190,20 @@ class ProblemState:
         Raises:
             MPMError: Functions that cannot be kept, or that are missing.
         """
-        problem = self._problem
-        standing = kept.Standing(self._stepper.trial.progress(), self.spaces, problem.history)
+        problem = self.problem
+        standing = kept.Standing(self._stepper.trial.progress(), self.spaces)
         carried = [
-            [one for one in problem.carried if one.mesh is body.mesh] for body in problem.bodies
+            [one for one in problem.built.carried if one.mesh is body.mesh]
+            for body in problem.bodies
         ]
-        needed = problem.data_at_points() if whole else set()
+        needed = problem.built.data if whole and not problem.keeps_data else set()
         things = [
             kept.Bodies(problem.bodies),
             kept.Material(
                 problem.converged_state,
                 problem.set_converged_state,
-                self._history_at,
-                problem.points,
+                problem.history_at,
+                problem.built.points,
             ),
             kept.Functions(functions, problem.bodies, needed),
             kept.Values(carried, problem.reduced),
@@ -212,7 +218,11 @@ class ProblemState:
 
     def identity(self) -> dict[str, Any]:
         """Return the identity of the problem, as it was made at first (collective)."""
-        return identity.identity(self._problem) if self._identity is None else self._identity
+        return self._present() if self._identity is None else self._identity
+
+    def _present(self) -> dict[str, Any]:
+        problem = self.problem
+        return identity.identity(problem.bodies, problem.built.carried, problem.laws())
 
     def before_remeshing(self) -> None:
         """Note what the problem is known by, before its body meshes change (collective)."""
@@ -240,14 +250,14 @@ class ProblemState:
             MPMError: Functions that cannot be kept, or that are missing.
         """
         if functions and any(
-            len(body.trail.cuts) or body.trail.rebases for body in self._problem.bodies
+            len(body.trail.cuts) or body.trail.rebases for body in self.problem.bodies
         ):
             raise MPMError(
                 "Domains were split or the body rebased, so functions= on its new mesh could not "
                 "be restored; save the state without them."
             )
         things, _ = self._all(functions)
-        snapshot = capture(things, self._problem.bodies, self.spaces)
+        snapshot = capture(things, self.problem.bodies, self.spaces)
         snapshot.numbers["identity"] = self.identity() | {"the stages": list(self._stages)}
         snapshot.numbers["series"] = self._output.written()
         snapshot.numbers["keys"] = self._keys()
@@ -274,9 +284,38 @@ class ProblemState:
             MPMError: It is that of another problem; the state is what it was.
         """
         things, standing = self._all(functions)
-        adopt(things, self._problem.bodies, snapshot, source, self.spaces)
+        adopt(things, self.problem.bodies, snapshot, source, self.spaces)
         self._stepper.trial.take(standing.progress)
         return standing.progress.run
+
+    def renew(
+        self,
+        change: Callable[[], None],
+        carry: Callable[[checkpoint.Snapshot], checkpoint.Snapshot],
+        undo: Callable[[], None] | None = None,
+    ) -> None:
+        """Make the problem again, in the same state: on other meshes, of other things (collective).
+
+        Args:
+            change: Changes what the problem is made of: gives the particles their meshes.
+            carry: Makes of the state before the one of the problem as it is then.
+            undo: Takes the change back where something fails, and all stays as it was.
+        """
+        problem, snapshot = self.problem, self.capture()
+        seconds = problem.history.statistics.seconds
+        problem.release()
+        try:
+            change()
+            problem.build()
+            self.adopt(carry(snapshot))
+        except BaseException:
+            if undo is not None:
+                undo()
+                problem.release()
+                problem.build()
+                self.adopt(snapshot)
+            raise
+        problem.history.statistics.update(seconds)
 
     def save(self, path: Path, functions: Sequence[fem.Function]) -> None:
         """Write a checkpoint: see :meth:`Problem.save`."""
@@ -284,30 +323,31 @@ class ProblemState:
 
     def restore(self, path: Path, functions: Sequence[fem.Function], resume: bool) -> None:
         """Return to the state of a checkpoint: see :meth:`Problem.restore`."""
-        problem = self._problem
+        problem = self.problem
         snapshot, source = checkpoint.read(self._comm, path), f"The checkpoint '{path}'"
         with agree(self._comm):
-            stages = snapshot.numbers["identity"].get("the stages", [])
+            stages = snapshot.numbers["identity"]["the stages"]
             if stages != self._stages:
                 raise MPMError(
                     f"{source} was made after the stages {stages}, and this problem has gone "
                     f"through {self._stages}; make it as at first and repeat the calls of stage, "
                     "remove and add."
                 )
-            self._require_keys(snapshot.numbers.get("keys"), source)
+            self._require_keys(snapshot.numbers["keys"], source)
         identity.require_same(self.identity(), snapshot, source, self._comm)
-        written = snapshot.numbers.get("series", {})
+        written = snapshot.numbers["series"]
         series = read_series(self._comm, written)
-        problem.cut_as(snapshot, bool(functions), source)
+        if self._mender is not None:
+            self._mender.repeat(snapshot, bool(functions), source)
         run = self.adopt(snapshot, functions, source)
         self._stepper.resume(run if resume else None)
         history = problem.history
         self._output.go_back(series, written, history.time, len(history.steps))
 
-    def _require_keys(self, there: list[str] | None, source: str) -> None:
+    def _require_keys(self, there: list[str], source: str) -> None:
         """Raise an error unless terms keep the same things as in a state, by name."""
         here = self._keys()
-        if there is None or set(there) == set(here):
+        if set(there) == set(here):
             return
         raise MPMError(
             f"{source} is of a problem in which terms keep {_listed(there)}, and here "

@@ -263,7 +263,7 @@ def _require(
         raise MPMError(f"step and tolerance must be at least {NEGLIGIBLE:g}.")
     if most <= 1.0:
         raise MPMError(f"most= is a factor at which to stop, above 1, not {most:g}.")
-    if any(body.load.value < 1.0 for body in problem.bodies) or problem.held_back > 0.0:
+    if any(body.load.value < 1.0 for body in problem.bodies) or problem.staging.held_back > 0.0:
         raise MPMError("strength_reduction() begins at the whole load; call solve() first.")
     laws = [law for points in problem.points for law in points.laws.given]
     if all(isinstance(law, StrainMaterial) and law.is_elastic for law in laws):
@@ -317,7 +317,7 @@ def _equilibrium(problem: QuasiStaticProblem, start: list[Array], limit: float) 
     comm, stages = problem.bodies[0].V.mesh.comm, len(problem.history.stages)
     found: float | MPMError
     with held() as hold:
-        before = problem.capture()
+        before = problem.state.capture()
         try:
             problem.step()
             found = _moved(problem, start)
@@ -327,7 +327,7 @@ def _equilibrium(problem: QuasiStaticProblem, start: list[Array], limit: float) 
         except FAILURES as error:
             found = error
         except BaseException:
-            problem.return_to(before)
+            problem.state.adopt(before)
             raise
         if len(problem.history.stages) != stages:
             raise MPMError(
@@ -335,7 +335,7 @@ def _equilibrium(problem: QuasiStaticProblem, start: list[Array], limit: float) 
                 "a factor is of one stage alone."
             )
         if not isinstance(found, MPMError) and found > limit:
-            problem.return_to(before)
+            problem.state.adopt(before)
     if interrupted(comm, hold.left):
         raise KeyboardInterrupt
     return found

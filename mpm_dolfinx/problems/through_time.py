@@ -26,8 +26,7 @@ type Path_ = Callable[[float], None]
 class TimeProblem(Problem):
     """A problem whose steps have a duration. Loads act in full unless a path says otherwise."""
 
-    _has_time = True
-    _predicts = False
+    predicts = False
     at_rest = False
 
     def _aim(self, t: float) -> None:
@@ -118,7 +117,7 @@ class TimeProblem(Problem):
         Raises:
             MPMError: As in :meth:`solve`.
         """
-        self._require_governing()
+        self.reign.require()
         if update is not None and not callable(update):
             raise MPMError(f"update= is a function of t, not {update!r}.")
         now = self.history.time

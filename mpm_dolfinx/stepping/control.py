@@ -350,7 +350,6 @@ class Run:
         cls,
         numbers: dict[str, Any],
         base: list[NDArray[np.float64]],
-        time: float,
         make: Callable[[dict[str, Any]], Control],
     ) -> Self:
         """Return the run that gave these numbers.
@@ -358,16 +357,15 @@ class Run:
         Args:
             numbers: What :meth:`numbers` returned.
             base: The Dirichlet values, for each field.
-            time: Time of its last step, from which files of before must tell when it began.
             make: Makes the control of its attributes.
         """
-        control = make(numbers["control"])
-        began = numbers.get("began", time - control.share)
-        goal, end = numbers.get("goal"), numbers.get("end")
-        held, adapt = numbers.get("held", 0.0), numbers.get("adapt")
-        run = cls(control, numbers["path"], numbers["start"], base, goal, began, end, held)
-        run.adaptivity = None if adapt is None else Adaptivity(adapt)
-        return run
+        adapt = numbers["adapt"]
+        return cls(
+            make(numbers["control"]),
+            base=base,
+            adaptivity=None if adapt is None else Adaptivity(adapt),
+            **{name: numbers[name] for name in ("path", "start", "goal", "began", "end", "held")},
+        )
 
 
 @dataclass

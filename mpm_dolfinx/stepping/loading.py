@@ -18,6 +18,7 @@ from dolfinx import fem
 
 from ..errors import TRIAL_ERRORS, MPMError, ParticleOutsideError, warn
 from ..history import Step
+from ..io.checkpoint import Snapshot
 from ..log import STEPS, tell
 from ..parallel.boundary import of_user
 from ..parallel.interruption import Hold, Interrupted, held, interrupted, settle
@@ -46,6 +47,9 @@ class Mender(Protocol):
 
     def mend(self, error: MPMError) -> bool:
         """Change what made the smallest step fail; return whether to go on."""
+
+    def repeat(self, snapshot: Snapshot, functions: bool, source: str) -> None:
+        """Make the changes with which a state was made."""
 
 
 class Stepper:
@@ -252,13 +256,13 @@ class Stepper:
     def _go_along(self, run: Run, update: Path) -> None:
         """Let a path set loads; warn, once, where the load factor multiplies them besides."""
         owner, comm = self.trial.owner, self.trial.solver.system.comm
-        grows = run.end is None and run.aim < 1.0
-        before = _values(owner.loads()) if grows else []
+        grows, loads = run.end is None and run.aim < 1.0, self.trial.solver.system.loads
+        before = _values(loads) if grows else []
         update(run.control.target if run.end is None else run.time)
         if not grows:
             return
         factor = float(owner.bodies[0].load.value)
-        pairs = zip(before, _values(owner.loads()), strict=True)
+        pairs = zip(before, _values(loads), strict=True)
         mine = factor == run.aim and any(not np.array_equal(*pair) for pair in pairs)
         if run.warned or not over_ranks(comm, mine, MPI.LOR):
             return
@@ -312,7 +316,8 @@ class Stepper:
         for tries in range(MOST_FREED + 1):
             try:
                 with owner.history.statistics.phase("assemble"):
-                    errors = estimated(owner.bodies, owner.body_terms, trial.reduced)
+                    terms = trial.solver.system.body_terms
+                    errors = estimated(owner.bodies, terms, trial.reduced)
             except ParticleOutsideError:  # as the last step of a run may leave them
                 break
             steps[-1] = step = replace(step, error=errors.total(owner.bodies))

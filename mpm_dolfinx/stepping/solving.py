@@ -12,6 +12,10 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
+from dolfinx import fem
+
+from ..boundary.supports import Support
+from ..constitutive.points import MaterialPoints
 from ..errors import TRIAL_ERRORS, ConvergenceError
 from ..history import History
 from ..log import NEWTON, tell
@@ -45,6 +49,10 @@ class System(NamedTuple):
         reduced: Residual and tangent.
         newton: What finds a root of the residual.
         clean_up: Frees what is out of use.
+        points: The materials at the points of each body.
+        supports: The supports that the problem was given.
+        loads: The loads that the load factor multiplies and the user may change.
+        masses: Masses of the particles of a body, by its number.
     """
 
     bodies: Sequence[Particles]
@@ -52,6 +60,10 @@ class System(NamedTuple):
     reduced: ReducedSystem
     newton: NewtonSolver
     clean_up: Cleaner
+    points: Sequence[MaterialPoints]
+    supports: Sequence[Support]
+    loads: Sequence[fem.Constant | fem.Function]
+    masses: Masses
 
     @property
     def comm(self) -> MPI.Comm:
@@ -127,7 +139,7 @@ class StepSolver:
         Returns:
             How often equations of terms were solved in turn with the displacements.
         """
-        bodies, terms, reduced, newton, _ = self.system
+        bodies, terms, reduced, newton = self.system[:4]
         before, again = converged.prescribed, False
         changes = [new - old for new, old in zip(goal.values, before, strict=True)]
         while True:
@@ -209,23 +221,22 @@ class StepSolver:
             term.begin()  # (with a load factor that is found, loads are those before yet)
         return self.system.reduced.terms.size_of_forces()
 
-    def commit(self, goal: Goal, parameter: float, masses: Masses) -> Converged:
+    def commit(self, goal: Goal, parameter: float) -> Converged:
         """Make the step that was solved the converged one (collective).
 
         Args:
             goal: Where it went.
             parameter: Load factor, or parameter of the path, at its end.
-            masses: Masses of particles, for what is deleted.
 
         Returns:
-            What is known of it, but for supports and the size of forces.
+            What is known of it, but for the size of forces.
 
         Raises:
             MPMError: A body is outside that must not be, or a term fails; all is as before then.
         """
-        bodies, _, reduced, _, _ = self.system
+        bodies, reduced = self.system.bodies, self.system.reduced
         before = [body.converged_displacement for body in bodies]
-        move_bodies(bodies, self._history, masses, parameter, goal.last)
+        move_bodies(bodies, self._history, self.system.masses, parameter, goal.last)
         with self._history.statistics.phase("commit"):
             try:
                 reduced.terms.commit()
@@ -240,4 +251,5 @@ class StepSolver:
             [force.array_r.copy() for force in reduced.unknowns.forces],
             bool(bodies[0].proportional.value),
             reduced.balance.followed(),
+            [support.reaction for support in self.system.supports],
         )

@@ -5,22 +5,17 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dolfinx import fem
-
-from ..boundary.supports import Support
-from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, warn
 from ..history import Attempt, History, Step
 from ..log import STEPS, tell
 from ..particles.particles import Particles
 from ..solvers.newton import NewtonSolver
-from ..system.body import BodyTerm
 from ..system.conditions import dirichlet_values
 from ..system.reduced import ReducedSystem
 from .control import Converged, Progress, Run
@@ -40,31 +35,15 @@ class Owner(Protocol):
 
     Attributes:
         bodies: The bodies.
-        body_terms: What each is made of and loaded by.
         history: Where steps are written down.
     """
 
     bodies: list[Particles]
-    body_terms: list[BodyTerm]
     history: History
 
     @property
     def at_rest(self) -> bool:
         """Whether a step ends in equilibrium."""
-
-    @property
-    def points(self) -> list[MaterialPoints]:
-        """The materials at the points of each body."""
-
-    @property
-    def supports(self) -> tuple[Support, ...]:
-        """The supports that it was given."""
-
-    def loads(self) -> Sequence[fem.Constant | fem.Function]:
-        """Return the loads that the load factor multiplies and the user may change."""
-
-    def masses(self, number: int) -> NDArray[np.float64] | None:
-        """Return the mass of each particle of a body that this rank owns, if it is known."""
 
     def begin_step(self) -> None:
         """Take over what the user may change between two steps, if that is allowed."""
@@ -218,7 +197,7 @@ class Trial:
             size = abs(parameter - control.present())
         experience = self.newton.experience
         turns = solver.solve(goal, size, control, self.converged, self.run is not None)
-        if (failure := improper(owner.bodies, owner.points)) is not None:
+        if (failure := improper(owner.bodies, solver.system.points)) is not None:
             raise failure
         carried = carried_after(self._looked_after)
         if carried.too_late:
@@ -235,13 +214,12 @@ class Trial:
             parameter = float(owner.bodies[0].load.value)
         force = solver.size_of_forces() if owner.at_rest else None
         try:
-            converged = solver.commit(goal, parameter, owner.masses)
+            converged = solver.commit(goal, parameter)
         except BaseException:
             self.newton.experience = experience
             raise
         with history.statistics.phase("commit"):
             self.converged = converged
-            converged.supports = [support.reaction for support in owner.supports]
             if len(history.losses) == losses:
                 converged.force = force
             self.reduced.end(goal.again)
@@ -302,7 +280,7 @@ class Trial:
 
     def miss(self) -> None:
         """Let bodies expect nothing in the next try of a step, as this one has failed."""
-        for term in self.owner.body_terms:
+        for term in self.solver.system.body_terms:
             term.miss()
 
     def give_up(self, update: Path | None = None) -> None:

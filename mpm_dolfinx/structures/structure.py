@@ -45,7 +45,7 @@ class State(NamedTuple):
         reference: Displacement of its nodes where it has no stretch, shape ``(N, gdim)``.
         offset: Force at no stretch, shape ``(m, q)``.
         slip: Of its nodes from the body; of those that are held their path, shape ``(N, gdim)``.
-        bond: Force of the bond per length, at the nodes that have it, shape ``(b,)``.
+        bond: Force of the bond per length, zero at nodes without one, shape ``(N,)``.
         forces: Principal forces at its points, shape ``(m, q, c)``.
         reaction: Force that holds the nodes which are held, shape ``(gdim,)``.
     """
@@ -151,12 +151,20 @@ class Structure(Term):
         )
         self._hosts: Hosts = find_hosts(self.bodies, self.layout.nodes, self._alone, what)
         self._path = np.zeros(gdim)
+        whole, count = self.layout, len(self.results)
+
+        def ruled(reference: Array) -> Rule:
+            """Return its points where it is displaced to have no stretch."""
+            return rule_of(whole, whole.nodes + reference, count, axisymmetric)
+
+        self._ruled = ruled
         self.state = self._drawn()
         self._rule = self._ruled(self.state.reference)
         self._now: _Now | None = None
-        self._slipped = np.zeros(len(self.state.bond))
+        bonded = 0 if self._grip is None else len(self._grip.nodes)
+        self._slipped = np.zeros(bonded)
         self._matrices: Matrices | None = None
-        self._step = _Step(np.ones(len(self.cells)), np.zeros((len(self.state.bond), gdim)))
+        self._step = _Step(np.ones(len(self.cells)), np.zeros((bonded, gdim)))
 
     # -- What it is -------------------------------------------------------------------------------
 
@@ -212,15 +220,10 @@ class Structure(Term):
             reference,
             np.zeros(rule.weights.shape),
             np.zeros_like(self.layout.nodes),
-            np.zeros(0 if self._grip is None else len(self._grip.nodes)),
+            np.zeros(len(self.layout.nodes)),
             np.zeros((*rule.weights.shape, len(self.results))),
             np.zeros(self.layout.nodes.shape[1]),
         )
-
-    def _ruled(self, reference: Array) -> Rule:
-        """Return its points where it is displaced to have no stretch."""
-        places = self.layout.nodes + reference
-        return rule_of(self.layout, places, len(self.results), bool(self.axisymmetric))
 
     def take(self, state: State) -> None:
         """Take a state for that of the last converged step."""
@@ -235,15 +238,10 @@ class Structure(Term):
         Args:
             other: The other, at its last converged step.
         """
-        mine = slice(0) if self._grip is None else self._grip.nodes
-        return other.state._replace(bond=other.bond_at_nodes()[mine])
-
-    def bond_at_nodes(self) -> Array:
-        """Return the force of the bond per length, zero at nodes without one, shape ``(N,)``."""
-        every = np.zeros(len(self.layout.nodes))
+        bonded = np.zeros(len(self.layout.nodes))
         if self._grip is not None:
-            every[self._grip.nodes] = self.state.bond
-        return every
+            bonded[self._grip.nodes] = 1.0
+        return other.state._replace(bond=bonded * other.state.bond)
 
     @override
     def come_after(self, gone: Sequence[Term]) -> None:
@@ -305,7 +303,7 @@ class Structure(Term):
         slip[self._alone] = self._path
         if self._grip is not None:
             slip[self._grip.nodes] += self._slipped[:, None] * self._step.along
-            skin = self._grip.skin(self.state.bond, self._slipped)
+            skin = self._grip.skin(self.state.bond[self._grip.nodes], self._slipped)
         places = self.layout.nodes + self._hosts.displacement() + slip
         nodal = stretched(self._rule, self.law, places, self.state.offset, self._step.present)
         forces = np.zeros_like(self.layout.nodes)
@@ -345,11 +343,14 @@ class Structure(Term):
     @override
     def commit(self) -> Callable[[], None]:
         before, now = self.state, self._evaluated()
+        bond = before.bond.copy()
+        if self._grip is not None and now.skin is not None:
+            bond[self._grip.nodes] = now.skin.bears
         self.state = State(
             before.reference,
             now.nodal.offset,
             now.slip,
-            before.bond if now.skin is None else now.skin.bears,
+            bond,
             now.nodal.principal,
             now.forces[self._alone].sum(axis=0),
         )
@@ -362,7 +363,7 @@ class Structure(Term):
 
     @override
     def roll_back(self) -> None:
-        self._slipped, self._now = np.zeros(len(self.state.bond)), None
+        self._slipped, self._now = np.zeros_like(self._slipped), None
 
     @property
     @override

@@ -75,8 +75,8 @@ def evaluated(make, symmetric):
         body.load.value = 1.0
     system.begin([change], 1.0)
     first, local = system.unknowns.sizes[1], system.unknowns.sizes[0]
-    problem._trial.newton._start(system.unknowns.sizes)
-    x, F = problem._trial.newton.x, problem._trial.newton.F
+    problem.trial.newton._start(system.unknowns.sizes)
+    x, F = problem.trial.newton.x, problem.trial.newton.F
     assert system.residual(x, F) is None
     system.tangent()
     system.impose()
@@ -85,7 +85,7 @@ def evaluated(make, symmetric):
     assert system.residual(x, F) is None
     K = system.tangent()
     lift = system.lift()
-    modulus = [share.shear_modulus() for share in problem.body_terms]
+    modulus = [share.shear_modulus() for share in problem.built.body_terms]
     if symmetric:
         skew = K.copy()
         skew.transpose()

@@ -106,7 +106,7 @@ def test_tangent_is_exact_and_symmetric(cell, over, rule):
     ratio = mpm.AveragedVolumeRatio(particles, over)
     R = ratio.residual(rubber(particles.displacement, ratio) * particles.dx)
     problem = mpm.ParticleProblem(R, particles, bcs=bcs)
-    forms, d = problem.body_terms[0].forms, particles.displacement.x
+    forms, d = problem.built.body_terms[0].forms, particles.displacement.x
     dim = particles.mesh.geometry.dim
     X = particles.W.tabulate_dof_coordinates()[:, :dim]
     start, ahead = (0.02 * np.sin(X @ (shift + np.eye(dim))).ravel() for shift in (1.0, 2.0))

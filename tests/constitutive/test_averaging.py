@@ -26,8 +26,8 @@ def waves(particles, size=0.1, step=0.0):
 
 def residual(problem, displacement):
     problem.particles.displacement.x.array[:] = displacement.ravel()
-    assert problem.body_terms[0].update() is None
-    return problem.body_terms[0].forms.assemble_residual().array_r.copy()
+    assert problem.built.body_terms[0].update() is None
+    return problem.built.body_terms[0].forms.assemble_residual().array_r.copy()
 
 
 def norm(values):

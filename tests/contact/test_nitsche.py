@@ -284,7 +284,7 @@ def test_extrapolation_of_stresses_is_exact_for_their_polynomials(cell, degree):
         scenes.unit(1, cell), scenes.vectors(scenes.unit(1, cell), 1), degree=degree
     )
     cell = particles.mesh.basix_cell()
-    rule, _ = quadrature_rule(cell, particles.quadrature_degree)
+    rule, _ = quadrature_rule(cell, particles.geometry.quadrature_degree)
     places = np.random.default_rng(3).uniform(0.0, 0.3, (4, rule.shape[1]))
     taken = extrapolation(cell, rule, places, degree)
     assert np.allclose(taken.sum(axis=1), 1.0, atol=1e-12)

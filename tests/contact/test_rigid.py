@@ -29,6 +29,7 @@ from dolfinx import fem
 import mpm_dolfinx as mpm
 from mpm_dolfinx import contact
 from mpm_dolfinx.materials import Hencky, LinearElastic
+from mpm_dolfinx.meshes.redistribution import Redistribution
 
 
 @pytest.mark.parametrize(
@@ -233,7 +234,10 @@ def test_contact_moves_with_the_particles_to_other_ranks():
         body = problem.particles
         ranks = anywhere(body.mesh, number)
         if number < 9:
-            problem.renew(lambda ranks=ranks, body=body: body.move(ranks), lambda state: state)
+            problem.state.renew(
+                lambda ranks=ranks, body=body: body.live_on(Redistribution(body.mesh, ranks)),
+                lambda state: state,
+            )
             close(before, told(die), 1e-10)
     other.solve(10, update=still)
     close(told(die), told(alone), 1e-7)

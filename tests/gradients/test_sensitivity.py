@@ -302,9 +302,9 @@ def test_what_is_not_followed_is_refused():
     with pytest.raises(mpm.MPMError, match="has changed"):
         problem.step()
     young.value = VON_MISES["young"]
-    before = problem.capture()
+    before = problem.state.capture()
     problem.step()
-    problem.return_to(before)
+    problem.state.adopt(before)
     with pytest.raises(mpm.MPMError, match="another state"):
         gradient.of(lambda: 1.0)
     other = Slump(von_mises, VON_MISES)

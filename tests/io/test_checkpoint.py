@@ -441,7 +441,7 @@ def test_damaged_files(mpi_tmp_path):
     refuse(problem, altered(b""), "is not a checkpoint")
     refuse(problem, altered(b"x" * len(content)), "is not a checkpoint")
     newer = content[:start] + struct.pack("<I", checkpoint.VERSION + 1) + content[start + 4 :]
-    refuse(problem, altered(newer), r"a newer mpm_dolfinx \(format 2, this one reads up to 1\)")
+    refuse(problem, altered(newer), r"a newer mpm_dolfinx \(format 3, this one reads 2\)")
     refuse(problem, altered(content + b"\0"), "is damaged")
     dice = np.random.default_rng(3)
     for place in dice.integers(start + checkpoint.START.size, len(content), 12):

@@ -227,7 +227,7 @@ def test_an_error_in_any_one_evaluation_ends_the_step(refused):
         problem = scenes.slump(TRIANGLE, 15e3, h=1.0)
         done = at_evaluation(problem, number, divide, WORLD.size - 1)
         if refused:  # at the same evaluation, by a term before that and by the first rank
-            refuse_after(problem.body_terms[0], done, number - 1)
+            refuse_after(problem.built.body_terms[0], done, number - 1)
         error = interrupt(problem, mpm.MPMError, steps=2)
         assert "ZeroDivisionError" in str(error)
 

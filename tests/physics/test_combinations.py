@@ -401,7 +401,7 @@ class Scene:
         problem = self.problem
         weight = 0.0
         for number, body in enumerate(problem.bodies):
-            masses = problem.masses(number)[~body.deleted]
+            masses = problem.built.masses(number)[~body.deleted]
             weight += GRAVITY * float(body.load.value) * WORLD.allreduce(masses.sum())
         held = sum(problem.reaction(s)[-1] for s in (*self.bases, *self.supports))
         if self.contact is not None:

@@ -421,7 +421,7 @@ def bounced(n, dt):
         terms=[wall(particles, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), penalty=1.0)],
         solver=mpm.Solver(petsc_options={"snes_rtol": 1e-11}),
     )
-    masses, heights = problem.nodal_masses(0), []
+    masses, heights = problem.built.mass_matrices(0).sum(axis=2), []
     mass = WORLD.allreduce(float(masses.sum()))
     for _ in problem.steps(time=1.1, dt=dt):
         z = particles.node_positions[:, 2][particles.domain_nodes[: particles.num_local]]
@@ -891,7 +891,9 @@ def test_ranks_and_moves_between_them_change_nothing(scheme):
         if number % 3 == 0:
             mesh = moving.particles.mesh
             move = Redistribution(mesh, anywhere(mesh, number))
-            moving.renew(lambda move=move: moving.particles.live_on(move), lambda state: state)
+            moving.state.renew(
+                lambda move=move: moving.particles.live_on(move), lambda state: state
+            )
     require_same(run_of(moving), run_of(alone), 1e-9)
 
 

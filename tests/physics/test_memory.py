@@ -26,7 +26,7 @@ def kept_and_most(cells):
         particles = mpm.Particles(body, V)
         law = mpm.materials.VonMises(1e6, 0.3, rho_y=20e3)
         problem = mpm.QuasiStaticProblem(mpm.Body(particles, law, body_force=(0.0, -1.0)))
-        (term,) = problem.body_terms
+        (term,) = problem.built.body_terms
         problem.reduced.begin([np.zeros_like(particles.increment.x.array)], 1.0)
         tracemalloc.reset_peak()
         for stretch in (1e-3, 2e-3):

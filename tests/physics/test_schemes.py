@@ -166,7 +166,7 @@ def test_what_a_scheme_keeps_goes_with_bodies_to_other_ranks_and_meshes():
     for number, _ in enumerate(moving.steps(time=0.2, dt=0.02)):
         mesh = moving.particles.mesh
         move = Redistribution(mesh, anywhere(mesh, number))
-        moving.renew(lambda move=move: moving.particles.live_on(move), lambda state: state)
+        moving.state.renew(lambda move=move: moving.particles.live_on(move), lambda state: state)
     require_same(moving, there, 1e-9)
 
     flying = bar(BDF2())

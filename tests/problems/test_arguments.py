@@ -322,7 +322,7 @@ PROBLEMS = {
     ),
     "field of a kind that is an array": (
         lambda: mpm.ParticleField(p := particles(), scenes.vectors(p.V.mesh), kind=np.ones(2)),
-        r"kind of field\(\) must be str, not array\(\[1\., 1\.\]\)",
+        r"kind of ParticleField\(\) must be str, not array\(\[1\., 1\.\]\)",
     ),
     # bodies
     "particles twice by a copy": (lambda: copy.copy(particles()), r"Particles cannot be copied"),

@@ -223,7 +223,7 @@ KINDS = {
 
 def captured(problem):
     """Return all that a checkpoint would hold, but for what tells of attempts and was asked for."""
-    snapshot = problem.capture()
+    snapshot = problem.state.capture()
     arrays = {
         f"{number} {name}": np.array(values)
         for number, table in enumerate(snapshot.tables)

@@ -17,7 +17,7 @@ from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import Hencky, VonMises
-from mpm_dolfinx.meshes.redistribution import cell_centres
+from mpm_dolfinx.meshes.redistribution import Redistribution, cell_centres
 
 
 @pytest.mark.mpi
@@ -31,7 +31,10 @@ def test_meshes_between_are_forgotten():
     meshes = []
     for seed in range(11):
         ranks = anywhere(particles.mesh, seed)
-        problem.renew(lambda ranks=ranks: particles.move(ranks), lambda state: state)
+        problem.state.renew(
+            lambda ranks=ranks: particles.live_on(Redistribution(particles.mesh, ranks)),
+            lambda state: state,
+        )
         meshes.append(weakref.ref(particles.mesh))
         last = particles.carry(last)
         if seed == 4:

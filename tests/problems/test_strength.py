@@ -163,7 +163,7 @@ CHANGES = {
     "repartition": lambda problem: problem.repartition(0.0),
     "stage": lambda problem: problem.stage(bodies=problem.body().replace(body_force=(0.0, -4.0))),
     "remove": lambda problem: problem.remove(lambda x: (x[0] > 1.5) & (x[1] > 1.5)),
-    "state": lambda problem: problem.return_to(problem.capture()),
+    "state": lambda problem: problem.state.adopt(problem.state.capture()),
 }
 
 

@@ -186,7 +186,7 @@ def test_response_is_smooth_where_nothing_yields(strain):
     problem = scenes.slump(QUADRILATERAL, 1e3, h=1.0)
     problem.solve(steps=1)
     problem.particles.displacement.interpolate(lambda x: (strain * x[1], 0.0 * x[0]))
-    (term,) = problem.body_terms
+    (term,) = problem.built.body_terms
     assert term.update() is None
     assert problem.reduced.terms.smooth() == (strain < 1e-2)
     problem.reduced.terms.roll_back()

@@ -314,10 +314,10 @@ def test_bodies_that_stick_are_not_parted():
     )
     problem.solve(1)
     problem.add(mpm.Body(lift, law, density=1.0, body_force=(0.0, -5.0)))
-    carried = problem.capture()
+    carried = problem.state.capture()
     problem.solve(2)
     before, sunk = problem.error(), scenes.total(lift, lift.centroid[:, 1])
-    problem.return_to(carried)
+    problem.state.adopt(carried)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         problem.solve(2, adapt=0.5 * before)

@@ -33,7 +33,7 @@ def whole_state(problem):
         arrays |= {f"history {i} {name}": c.values.copy() for name, c in kept.items()}
     for i, (size, increments) in enumerate(problem.reduced.predictor.past):
         arrays[f"past {i}"] = np.concatenate([[size], *increments])
-    trial = problem._trial
+    trial = problem.trial
     arrays["prescribed"] = trial.converged.prescribed.copy()
     arrays["experience"] = np.array(trial.newton.experience)
     arrays["steps"] = np.array(problem.history.load)

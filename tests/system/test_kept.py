@@ -12,7 +12,7 @@ from scenes import QUADRILATERAL, at, box, facet_tags, vectors
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import materials
-from mpm_dolfinx.particles.particles import Particles
+from mpm_dolfinx.particles.placement import Placement
 from mpm_dolfinx.transfer.elements import FiniteElements
 
 LAW = materials.Hencky(1e3, 0.3)
@@ -20,19 +20,20 @@ LAW = materials.Hencky(1e3, 0.3)
 
 def forgetful(monkeypatch):
     """Let bodies of finite elements make their T anew in each step."""
-    rows, restore = FiniteElements.rows, Particles.restore
+    rows, go = FiniteElements.rows, Placement.go
 
     def copied(self, *where):
         found = rows(self, *where)
         basis = found.basis._replace(nodes=found.basis.nodes.copy())
         return found._replace(basis=basis)
 
-    def forgets(self, converged):
-        restore(self, converged)
+    def forgets(self, displacement):
+        before = go(self, displacement)
         self.forget_transfer()
+        return before
 
     monkeypatch.setattr(FiniteElements, "rows", copied)
-    monkeypatch.setattr(Particles, "restore", forgets)
+    monkeypatch.setattr(Placement, "go", forgets)
 
 
 def column(degree=1, left=0.0):
