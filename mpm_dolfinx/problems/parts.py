@@ -274,8 +274,6 @@ class Parts:
         """
         own: list[list[Any]] = [[] for _ in groups]
         for form in self._background_forms:
-            if not isinstance(form, ufl.Form):
-                raise MPMError(f"background must be UFL forms, not {type(form).__name__}.")
             arguments = form.arguments()
             spaces = [argument.ufl_function_space() for argument in arguments]
             number = next((n for n, group in enumerate(groups) if group[0].V in spaces), 0)
@@ -304,6 +302,9 @@ class Parts:
     def built(self) -> Built:
         """Return the terms of the problem, and what else is known of its forms (collective)."""
         self.require_own_fields()
+        for form in self._background_forms:
+            if not isinstance(form, ufl.Form):
+                raise MPMError(f"background must be UFL forms, not {type(form).__name__}.")
         loads = [constant for body in self.bodies for constant in (body.load, body.proportional)]
         constants = [
             constant
