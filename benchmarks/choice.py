@@ -133,8 +133,7 @@ def pressed(solver: str, n: int, friction: float) -> Made:
         particles,
         mpm.contact.sphere((3.0, 3.0, 5.0), 2.0),
         friction,
-        facet_tags=tagged(body, 2, 3.0),
-        tag=1,
+        facets=(tagged(body, 2, 3.0), 1),
     )
     base = mesh.locate_entities_boundary(V.mesh, 2, lambda x: np.isclose(x[2], 0.0))
     floor = fem.dirichletbc(np.zeros(3), fem.locate_dofs_topological(V, 2, base), V)

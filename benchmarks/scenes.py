@@ -451,8 +451,7 @@ def hertz(
     die = mpm.contact.Rigid(
         particles,
         mpm.contact.disc((0.0, radius), radius),
-        facet_tags=hertz_top(particles.mesh),
-        tag=1,
+        facets=(hertz_top(particles.mesh), 1),
     )
     V = particles.V
     base = mesh.locate_entities_boundary(V.mesh, 1, lambda x: np.isclose(x[1], y[0]))

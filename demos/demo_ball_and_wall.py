@@ -63,7 +63,6 @@ rubber, contacts = mpm.materials.Hencky(5e5, 0.3), [*grounds, *pairs]
 weight = {"density": density, "body_force": (0.0, 0.0, -gravity)}
 heavy = [mpm.Body(body, rubber, **weight) for body in bodies]
 problem = mpm.DynamicProblem(heavy, terms=contacts, scheme="conserving", rayleigh=(0.0, 1e-3))
-
 mass = density * comm.allreduce(bodies[0].initial_volume.sum())
 rows, shapes, pushed, rolls = [], [], [0.0], []
 for step in problem.steps(time=1.4, dt=0.02, output_at=[0.5, 0.9, 1.1]):

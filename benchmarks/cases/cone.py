@@ -54,7 +54,7 @@ particles = mpm.Particles(clay, V, quadrature_degree=args.quadrature_degree or 2
 aside, top = mpm.region(x=wide), mpm.region(y=above)
 inside = {1: lambda x: x[0] <= np.clip(x[1] / height, hole, 1.0) + 1e-9}
 tags = mpm.facet_tags(clay, inside | {2: lambda x: aside(x) | top(x)})
-look = {"facet_tags": tags, "tag": 1, "axisymmetric": True, "modulus": 4.0 * shear}
+look = {"facets": (tags, 1), "axisymmetric": True, "modulus": 4.0 * shear}
 outline = [(0.0, 0.0), (1.0, height), (1.0, 60.0), (-1.0, 60.0), (-1.0, height)]
 steel = mpm.contact.polygon(outline, radius=0.3)
 cone = mpm.contact.Rigid(particles, steel, args.friction, **look)

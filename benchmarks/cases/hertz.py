@@ -55,8 +55,7 @@ tags = mesh.meshtags(block.mesh, 2, np.sort(ground), np.full(len(ground), 1, np.
 ball = mpm.contact.Rigid(
     block,
     mpm.contact.sphere((0.0, 0.0, radius), radius),
-    facet_tags=tags,
-    tag=1,
+    facets=(tags, 1),
     penalty=args.penalty,
     law=args.law,
 )

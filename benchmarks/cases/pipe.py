@@ -70,8 +70,7 @@ pipe = mpm.contact.Rigid(
     clay,
     mpm.contact.disc((0.0, 0.0), radius),
     mpm.contact.Coulomb(cohesion=1.0) if args.rough else 0.0,
-    facet_tags=tags,
-    tag=1,
+    facets=(tags, 1),
     modulus=2.0 * args.young / (1.0 + poisson),
 )
 problem = mpm.QuasiStaticProblem(

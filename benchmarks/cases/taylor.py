@@ -74,7 +74,7 @@ few = 2 if args.f_bar == "domain" else None
 rod = mpm.Particles(body, V, quadrature_degree=args.quadrature_degree or few)
 end, side = mpm.region(y=base), mpm.region(x=radius)
 tags = mpm.facet_tags(body, {1: lambda x: end(x) | side(x)})
-look = {"facet_tags": tags, "tag": 1, "axisymmetric": True}
+look = {"facets": (tags, 1), "axisymmetric": True}
 wall = mpm.contact.Rigid(rod, mpm.contact.plane((0.0, base), (0.0, 1.0)), **look)
 copper = mpm.materials.VonMises(117.0, 0.35, yield_stress=0.4, hardening=0.1)
 problem = mpm.DynamicProblem(

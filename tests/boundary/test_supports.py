@@ -155,7 +155,7 @@ def test_a_moving_plane_squeezes_a_block(angle):
     # Confined between smooth walls: Cauchy's stress is M ln(stretch) / stretch.
     markers = scenes.at(1, 0.0), scenes.at(0, 0.0, 1.0), scenes.at(1, 2.0)
     p, tags, Q = turned(angle, [0.0, 0.0], [1.0, 2.0], [4, 8], TRIANGLE, markers, 0.3)
-    top = wall(p, Q @ [0, 2.0], Q @ [0, -1], facet_tags=tags, tag=3)
+    top = wall(p, Q @ [0, 2.0], Q @ [0, -1], facets=(tags, 3))
     supports = [roller(p, tags, 1, Q @ [0, 1]), roller(p, tags, 2, Q @ [1, 0])]
     body = mpm.Body(p, Hencky(1e4, 0.25))
     problem = mpm.QuasiStaticProblem(body, supports=supports, terms=[top])

@@ -223,8 +223,7 @@ def pressed(law=None):
     disc = Noting(
         particles,
         mpm.contact.disc((2.0, 3.0), 1.0),
-        facet_tags=scenes.facet_tags(body, scenes.at(1, 2.0)),
-        tag=1,
+        facets=(scenes.facet_tags(body, scenes.at(1, 2.0)), 1),
     )
     problem = mpm.QuasiStaticProblem(
         mpm.Body(particles, law or mpm.materials.VonMises(500.0, 0.3, rho_y=1.0)),
