@@ -105,7 +105,7 @@ class BodyContact(Rigid):
 
     @property
     def _touch(self) -> Touch:
-        """What acts at the place where the shape was put last."""
+        """Contact at the place where the shape was put last."""
         assert self._pass.evaluation is not None
         return self._pass.evaluation
 

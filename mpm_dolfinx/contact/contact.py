@@ -114,11 +114,11 @@ class Contact(Results):
             self._joins, self._gone = False, []
 
     def held(self) -> list[KeptOnBody] | None:
-        """Return what is kept on each body; ``None``: it belongs to no problem."""
+        """Return the kept columns of each body; ``None``: it belongs to no problem."""
         return self._passes.kept()
 
     def _held_by(self, before: Contact) -> list[KeptOnBody] | None:
-        """Return what this contact takes over of one that is gone, on each body; ``None``: nothing.
+        """Return the kept columns of one that is gone that this takes over; ``None``: nothing.
 
         Args:
             before: Any contact.

@@ -125,7 +125,7 @@ class Meeting:
         return at, [Spread.over_facets(source, at, forces[:, 0]), others]
 
     def state(self, friction: NDArray[np.float64]) -> tuple[FacetMemory, Outcome]:
-        """Return what is known of all points, and their outcome, if a step ends with this.
+        """Return the memory of all points, and their outcome, if a step ends with this.
 
         Args:
             friction: What the law of friction has remembered of all points.

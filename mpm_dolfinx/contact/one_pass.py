@@ -24,7 +24,7 @@ type Array = NDArray[np.float64]
 
 
 class Evaluation(Protocol):
-    """What acts on points somewhere."""
+    """Tractions on points, where their facets were put."""
 
     @property
     def outcome(self) -> Outcome:
@@ -99,7 +99,7 @@ class Pass[State, Found: Evaluation]:
 
     @property
     def told(self) -> Outcome:
-        """What acted at the last converged step."""
+        """Outcome at the last converged step."""
         raise NotImplementedError
 
     @property
@@ -179,7 +179,7 @@ class Pass[State, Found: Evaluation]:
     # -- What is kept ---------------------------------------------------------------------------
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return what is kept of the points, each of shape ``(m, nq, ...)``."""
+        """Return the kept values of the points by name, each of shape ``(m, nq, ...)``."""
         told = self.told
         kept: dict[str, NDArray[Any]] = {
             "touches": told.inside,

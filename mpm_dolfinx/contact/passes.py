@@ -257,7 +257,7 @@ class Passes:
             each.restore({name: each.source.of_column(columns[name]) for name in known})
 
     def kept(self) -> list[Kept] | None:
-        """Return what is kept on each body; ``None``: the contact belongs to no problem."""
+        """Return the kept columns of each body; ``None``: the contact belongs to no problem."""
         if not self.every:
             return None
         every = [self.columns(number) for number in range(len(self.surfaces))]
@@ -275,7 +275,7 @@ class Passes:
 
 
 def both(one: Kept, other: Kept) -> Kept:
-    """Return what is kept of two contacts as one: what the second alone has, or touches."""
+    """Return the values of two contacts as one: the second's where it alone has any or touches."""
     found: Kept = {}
     for name, values in one.items():
         new = one["area"] == 0.0

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What a contact tells, at the last converged step."""
+"""Results of a contact, at the last converged step."""
 
 from __future__ import annotations
 

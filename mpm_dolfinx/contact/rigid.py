@@ -209,7 +209,7 @@ class Rigid(Contact):
 
     @override
     def held(self) -> list[Kept] | None:
-        """Return what is kept on its body, with gaps and normals; ``None``: it has no problem."""
+        """Return the columns of its body, with gaps and normals; ``None``: it has no problem."""
         kept, surface = super().held(), self._passes.surfaces[0]
         if kept is not None:
             kept[0]["gap"] = surface.column(self._pass.gap).values

@@ -112,7 +112,7 @@ class Touch:
 
     @cached_property
     def outcome(self) -> Outcome:
-        """What acts on the points."""
+        """Tractions on the points, and which of them touch, stick or slip."""
         shape, at, acts = self.x.shape[:2], self.at, self.acts
         inside = at.gap <= at.touch if at.behind is None else acts.inside
         return Outcome(
@@ -180,7 +180,7 @@ class Touch:
         return at, [Spread.over_facets(source, at, force)]
 
     def state(self) -> ShapeMemory:
-        """Return what is to be remembered of the points."""
+        """Return the memory of the points, if a step ends with this."""
         acts, points, shape = self.acts, self.points, self.x.shape
         outcome = self.outcome
         inside = outcome.inside.ravel()
@@ -354,7 +354,7 @@ class ShapePass(Pass[ShapeMemory, Touch]):
         self.evaluation = self._evaluated(self.state if near is None else near)
 
     def _evaluated(self, memory: ShapeMemory) -> Touch:
-        """Return what acts on facets of which something is known."""
+        """Return the contact of facets of which something is known."""
         source, shape, pose, touch = self.source, self._shape, self.pose, self.source.touch
         x = source.positions(which=memory.facets)
         y = framed(shape, pose, x).reshape(-1, source.gdim)

@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""What acts on a background itself: terms of the user's on it, and the ghost penalty."""
+"""Forces on a background itself: terms of the user's on it, and the ghost penalty."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ class Term(Hooked):
 
     @property
     def equation(self) -> Alternating | None:
-        """What solves equations of its own in turn with the displacements, on all ranks."""
+        """Solver of equations of its own, in turn with the displacements, on all ranks."""
         return None
 
     def come_after(self, gone: Sequence[Term]) -> None:
