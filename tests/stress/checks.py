@@ -97,9 +97,20 @@ class Background(Cells):
         self.index = np.concatenate(comm.allgather(input_cell_index(domain)))
         self.size = V.dofmap.index_map.size_global
         self.basis = V.ufl_element().basix_element
+        corners = self.x.reshape(-1, dim)  # (backgrounds fill boxes, and only inner nodes jitter)
+        self.box = corners.min(axis=0), corners.max(axis=0)
+
+    def beyond(self, points):
+        """Return in which directions points are off the background."""
+        return np.abs(points - np.clip(points, *self.box)) > 1e-10 * self.scale
 
     def at(self, points):
-        """Return nodes and values of the basis at points, and their gradients."""
+        """Return nodes and values of the basis at points, and their gradients.
+
+        What has gone through a boundary that is held moves as the nearest place on it does.
+        """
+        beyond = self.beyond(points)
+        points = np.clip(points, *self.box)
         _, cells = self.tree.query(points / self.scale, k=self.near)
         cells = np.reshape(cells, (len(points), -1))
         best = np.full(len(points), np.inf)
@@ -115,7 +126,7 @@ class Background(Cells):
         table = self.basis.tabulate(1, where)[:, :, :, 0]
         J = np.einsum("jpk,pki->pij", self.map.tabulate(1, where)[1:, :, :, 0], self.x[chosen])
         slopes = np.einsum("jpk,pji->pki", table[1:], np.linalg.inv(J))
-        return self.nodes[chosen], table[0], slopes, best
+        return self.nodes[chosen], table[0], np.where(beyond[:, None], 0.0, slopes)
 
 
 def hats(lines, a, b):
@@ -227,20 +238,20 @@ class Domains:
         method = self.particles.method
         n, k = self.nodes.shape
         if method == "cpdi2":
-            nodes, values, _, outside = background.at(self.X + d)
-            return nodes[self.nodes], values[self.nodes], outside.max(initial=0.0)
+            nodes, values, _ = background.at(self.X + d)
+            return nodes[self.nodes], values[self.nodes]
         F = self.gradient(d)[..., : self.dim, : self.dim]
         F = np.einsum("nq,nqij->nij", self.weights / self.weights.sum(axis=1, keepdims=True), F)
         x = self._mean(self.X[self.nodes] + d[self.nodes])
         arms = np.einsum("nij,nkj->nki", F, self.X[self.nodes] - self.centroid[:, None])
         if method == "cpdi":
-            nodes, values, _, outside = background.at((x[:, None] + arms).reshape(-1, self.dim))
-            return nodes.reshape(n, k, -1), values.reshape(n, k, -1), outside.max(initial=0.0)
+            nodes, values, _ = background.at((x[:, None] + arms).reshape(-1, self.dim))
+            return nodes.reshape(n, k, -1), values.reshape(n, k, -1)
         if method == "mpm":
-            nodes, values, slopes, outside = background.at(x)
+            nodes, values, slopes = background.at(x)
             whole = values[:, None] + np.einsum("nmi,nki->nkm", slopes, arms)
-            return np.repeat(nodes[:, None], k, axis=1), whole, outside.max(initial=0.0)
-        return (*self._boxes(background, x, F, arms), 0.0)
+            return np.repeat(nodes[:, None], k, axis=1), whole
+        return self._boxes(background, x, F, arms)
 
     def _boxes(self, background, x, F, arms):
         """Return the rows of contiguous boxes, by products of averaged hat functions."""
@@ -578,6 +589,8 @@ class Observer:
         self._check_mass(found, figures)
         # Of what follows much is collective, and one rank may have found what others have not.
         if self.steps and not any(self.comm.allgather(bool(found))):
+            if self.whole and self.scene["method"] == "cpdi2":
+                self._check_floor(found)
             if self.exact and self.pair:
                 self._check_pair(found, figures)
             elif self.exact:
@@ -658,7 +671,7 @@ class Observer:
         Besides it returns how much of each background node the body has.
         """
         domains, background = self.domains[i], self.backgrounds[i]
-        nodes, values, _ = domains.rows(background, self.previous[i])
+        nodes, values = domains.rows(background, self.previous[i])
         self._nodal(i)
         parts = [*self._by_domain, self._pushed(i)]
         totals = np.zeros((len(parts), background.size, domains.dim))
@@ -698,6 +711,17 @@ class Observer:
             for own in self.comm.allgather(_compat.own_dofs(bc, V) + start):
                 fixed.ravel()[own] = True
         return fixed
+
+    def _check_floor(self, found):
+        """Look that what began the step off its background was held by the boundary."""
+        for i, (domains, background) in enumerate(zip(self.domains, self.backgrounds, strict=True)):
+            x = domains.X + self.previous[i]
+            nodes, values, _ = background.at(x)
+            bcs = self.run.bcs[i : i + 1] if self.pair else self.run.bcs
+            fixed = self._fixed(self.run.bodies[i].V, bcs, background.size, domains.dim)
+            loose = ~fixed[nodes] & background.beyond(x)[:, None]
+            if loose[np.abs(values) > 1e-9].any():
+                found.append("a run went on with what has left the background")
 
     def _check_balance(self, found, figures):
         """Sum element forces on the background: zero at all free dofs."""
@@ -757,7 +781,7 @@ class Observer:
                 largest = float(np.ptp(x[domains.nodes], axis=1).max(initial=0.0))
                 reach = 2.0 * self.comm.allreduce(largest, MPI.MAX)
                 close = cKDTree(points).query(x)[0] < reach
-                nodes, values, _ = domains.rows(background, self.previous[i])
+                nodes, values = domains.rows(background, self.previous[i])
                 np.add.at(near, nodes, np.abs(values) * close[domains.nodes][:, :, None])
             near = self.comm.allreduce(near) > 0.0
             residual = internal - outer
