@@ -184,8 +184,9 @@ class Passes:
             self.evaluate()
         found_by = [each.evaluation for each in self.every if each.evaluation is not None]
         groups = self._matrices.groups([evaluation.met() for evaluation in found_by])
-        for each, (group, positions) in zip(self.every, groups, strict=True):
-            each.add_tangents(factor, secants, group, positions, self._matrices.values)
+        with agree(self._comm):  # of the slopes of a user's shape
+            for each, (group, positions) in zip(self.every, groups, strict=True):
+                each.add_tangents(factor, secants, group, positions, self._matrices.values)
         found = {place: [K] for place, K in self._matrices.assembled().items()}
         for own, (each, evaluation) in enumerate(zip(self.every, found_by, strict=True)):
             if each.stress is not None:

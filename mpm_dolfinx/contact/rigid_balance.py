@@ -232,7 +232,8 @@ class RigidBalance:
             norm = float(np.linalg.norm(now.left))
             if norm <= UNBALANCED * now.size or (now.touches and not self._creeps):
                 break
-            parts = [contact.of_own(motion.centres, motion.theta) for contact in self._contacts]
+            with agree(self._comm):  # of the slopes of a user's shape
+                parts = [contact.of_own(motion.centres, motion.theta) for contact in self._contacts]
             K, largest = self._whole(np.sum(parts, axis=0))
             if not now.touches or np.linalg.norm(K, 2) <= LOOSE * largest:
                 step = self._fallen(step, now)
