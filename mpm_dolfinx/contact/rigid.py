@@ -60,7 +60,6 @@ class Rigid(Contact):
             not all of its boundary may.
         modulus: Modulus of the body; that of the material by default.
         penalty: Stiffness in the normal direction, without unit.
-        tangential_penalty: Stiffness of points that stick, without unit.
         axisymmetric: Whether ``x[0]`` is a radius.
         law: ``"penalty"``, or ``"nitsche"``: the pressure is that of the stress behind the facet,
             and the penalty holds the gap at zero. It takes the body's material, and a solver for

@@ -76,7 +76,7 @@ class RigidBody(Driven):
         velocity: Of its centre at the beginning, shape ``(gdim,)``.
         spin: Its rate of rotation at the beginning: a number, in space a vector ``(3,)``.
         fixed: What follows :meth:`move`: names among ``"x"``, ``"y"``, ``"z"`` and ``"rotation"``.
-        **options: Those of :class:`Rigid` for its contacts: ``penalty``, ``facet_tags``, ...
+        **options: Those of :class:`Rigid` for its contacts: ``penalty``, ``facets``, ...
 
     Attributes:
         contacts: The contact with each body, which tells pressures, gaps, and where points stick.
