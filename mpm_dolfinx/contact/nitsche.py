@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Nitsche's method: the stress of a body's material that presses, as a part of the tangent.
 
-The pressure is that of :func:`.law.nitsche`, by the traction that :mod:`.behind` takes from the
+The pressure is that of :func:`.law.traction`, by the traction that :mod:`.behind` takes from the
 domains behind the facets. As that depends on the displacement of all nodes of a domain, and with
 F-bar on that of a group of domains, so do the forces on both bodies.
 """
