@@ -244,7 +244,7 @@ class Contact(Results):
 
     def known_by(self) -> list[Any]:
         """Return the identity of the contact in a checkpoint, in types that JSON has."""
-        return [type(self).__name__, self._places]
+        return [type(self).__name__, self._places, LAWS[self._nitsche]]
 
     def numbers(self) -> dict[str, Any]:
         """Return the numbers kept besides columns; see :class:`Kept`."""

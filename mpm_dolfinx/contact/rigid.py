@@ -232,7 +232,7 @@ class Rigid(Contact):
         pivot = self.shape.pivot
         depth = float(self.shape.distance(pivot[None])[0][0])
         kind = type(self.shape).__name__.strip("_")
-        return [type(self).__name__, kind, pivot.tolist(), depth, self._places]
+        return [*super().known_by(), kind, pivot.tolist(), depth]
 
     @override
     def take(self, taken: Taken) -> None:
