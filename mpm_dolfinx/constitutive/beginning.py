@@ -17,6 +17,7 @@ __all__ = ["begin_unstrained", "begin_with_stress", "take_over"]
 
 def begin_unstrained(points: MaterialPoints) -> None:
     """Let the points, which have not moved, be as they were made (collective)."""
+    points.begin_at(None)
     points.go_from(points.initial_states())
     if points.averaging is not None:
         points.averaging.uneven[:] = 0.0
@@ -38,6 +39,7 @@ def begin_with_stress(points: MaterialPoints, cauchy_stress: NDArray[np.float64]
         points.mean_stress.begin_with(np.trace(stress, axis1=1, axis2=2) / 3.0)
     if points.averaging is not None:
         points.averaging.begin_with(cauchy_stress)
+    points.begin_at(stress)
     with agree(points.strain.particles.mesh.comm):
         states = [
             p.stressed_state(np.arange(len(p.points)), carried, {}) for p in points.laws.governed
@@ -72,6 +74,7 @@ def take_over(points: MaterialPoints, before: MaterialPoints) -> None:
     gradient = gradient.reshape(-1, points.dim, points.dim)
     stress = before.last.cauchy_stress(gradient).reshape(-1, 3, 3)
     carried = Carried(stress, gradient, gap)
+    points.begin_at(before.last.begun)
     if points.softening is not None and before.last.average is not None:
         points.remember(before.last.average, before.last.growth)
     known = zip(before.laws.given, before.laws.governed, before.last.states, strict=True)

@@ -186,6 +186,7 @@ class Converged(PointState):
         resisted: Energy that F-bar resists, shape ``(n nq,)``; ``None`` without F-bar.
         growth: Change of the average in the last step, by which it is expected to change in the
             next; ``None`` without a length.
+        begun: Cauchy stress that the points began with, ``(n nq, 3, 3)``; ``None``: without one.
     """
 
     stress: Array
@@ -194,6 +195,22 @@ class Converged(PointState):
     recovery: Array | float = 0.0
     resisted: Array | None = None
     growth: Array | None = None
+    begun: Array | None = None
+
+    def gained_stress(self, deformation: Array) -> Array:
+        """Return the Cauchy stress beyond the one that the points began with, ``(n, nq, 3, 3)``.
+
+        Args:
+            deformation: Deformation gradient F, with whose rotation that one turns, ``(n, nq, 3,
+                3)``.
+        """
+        stress = self.cauchy_stress()
+        if self.begun is None:
+            return stress
+        left, _, right = np.linalg.svd(deformation)
+        R = left @ right
+        turned = R @ self.laws.by_domain(self.begun) @ R.swapaxes(-1, -2)
+        return np.asarray(stress - turned / np.linalg.det(deformation)[..., None, None])
 
     def columns(self) -> dict[str, Column]:
         """Return all there is, as a checkpoint keeps it.
@@ -220,6 +237,8 @@ class Converged(PointState):
             whole |= {"average": self.average, "growth": self.growth}
         if self.resisted is not None:
             whole["resisted"] = self.resisted
+        if self.begun is not None:
+            whole["begun"] = self.begun
         columns = {
             name: Column(self.laws.by_domain(values), "points") for name, values in whole.items()
         }
@@ -256,6 +275,7 @@ class Converged(PointState):
             resisted=taken("resisted", self.resisted),
             average=taken("average", self.average),
             growth=taken("growth", self.growth),
+            begun=taken("begun", self.begun),
         )
         for key, values in flat.items():
             name, numbers = key.rsplit("@", 1)

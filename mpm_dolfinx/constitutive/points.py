@@ -141,6 +141,10 @@ class MaterialPoints:
         self.last = replace(self.last, states=states)
         self.trial = self.last
 
+    def begin_at(self, stress: NDArray[np.float64] | None) -> None:
+        """Take a Cauchy stress, ``(n nq, 3, 3)``, or none, for that which points begin with."""
+        self.last = replace(self.last, begun=stress)
+
     def recall(self, memories: list[State]) -> None:
         """Go on from memories of a converged step at the present displacement (collective)."""
         gradient = self.strain.gradient()

@@ -21,6 +21,7 @@ type Array = NDArray[np.float64]
 def stress_errors(particles: Particles, points: MaterialPoints) -> Array:
     """Return the energy by which the stress differs from a continuous one (collective).
 
+    It is the stress beyond the one that the body began with, which is no answer of its elements.
     The continuous stress is linear in the domains' shape functions, with values at nodes that are
     means of the domains around, each continued to its nodes as far as its points tell
     (Zienkiewicz & Zhu 1987). Domains of other laws have means of their own. With a pressure of
@@ -34,7 +35,7 @@ def stress_errors(particles: Particles, points: MaterialPoints) -> Array:
     Returns:
         ``int ds : C^-1 : ds + 2/3 mu g^2 dX`` with the undeformed body's moduli, shape ``(n,)``.
     """
-    stress = points.last.cauchy_stress()
+    stress = points.last.gained_stress(particles.point_deformation_gradient)
     stress = stress + np.broadcast_to(points.last.recovery, (len(stress), 3, 3))[:, None]
     weights = points.weights
     at_nodes = _continued(particles, stress, weights)

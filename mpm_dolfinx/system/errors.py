@@ -93,7 +93,7 @@ def estimated(
             own.append(np.zeros(body.num_local))
         energy += _energy(body, term, force)
     reduced.terms.roll_back()
-    return Errors(nodal, own, bodies[0].mesh.comm.allreduce(energy))
+    return Errors(nodal, own, abs(bodies[0].mesh.comm.allreduce(energy)))
 
 
 def _unprescribed(body: Particles, conditions: Sequence[fem.DirichletBC]) -> NDArray[np.float64]:
@@ -110,17 +110,27 @@ def _unprescribed(body: Particles, conditions: Sequence[fem.DirichletBC]) -> NDA
 def _energy(body: Particles, term: BodyTerm, force: NDArray[np.float64]) -> float:
     """Return this rank's part of the square of a body's energy norm.
 
-    It is the integral of ``tau : ln V``, twice the energy of an elastic body of Hencky's law, or,
-    without a material, the work of the forces that depend on the displacement.
+    With parts of the mean and of the deviator of ``tau``, beyond the stress that the body began
+    with, and of ``ln V`` it is the integral of ``|p v| + |s| |e|``: twice the energy of an
+    isotropic elastic body of Hencky's law; and where plastic flow has left strain, it does not
+    vanish as the body is unloaded. Without a material it is the work of the forces that depend on
+    the displacement.
     """
-    internal = term.forms.internal
-    if not body.has_material or internal is None:
+    points = term.forms.internal
+    if not isinstance(points, MaterialPoints):
         own = len(force)
         inner = force - term.forms.external.array_r
-        return float(abs(inner @ body.converged_displacement[:own]))
+        return float(inner @ body.converged_displacement[:own])
     F = body.point_deformation_gradient
     squares, axes = np.linalg.eigh(F @ F.swapaxes(-1, -2))
     strain = np.einsum("nqik,nqk,nqjk->nqij", axes, 0.5 * np.log(squares), axes)
-    density = np.linalg.det(F) * np.einsum("nqij,nqij->nq", body.point_stress, strain)
-    weights = internal.weights.reshape(density.shape)
-    return float(abs((weights * density)[~body.deleted].sum()))
+    stress = np.linalg.det(F)[..., None, None] * points.last.gained_stress(F)
+    (p, s), (v, e) = (_parts(tensor) for tensor in (stress, strain))
+    density = 3.0 * np.abs(p * v) + s * e
+    return float((points.weights * density)[~body.deleted].sum())
+
+
+def _parts(tensor: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the mean of symmetric tensors ``(..., 3, 3)`` and the size of their deviator."""
+    mean = np.trace(tensor, axis1=-2, axis2=-1) / 3.0
+    return mean, np.linalg.norm(tensor - mean[..., None, None] * np.eye(3), axis=(-2, -1))

@@ -313,6 +313,62 @@ def test_it_is_the_same_turned_and_in_other_units(degree):
     assert cantilever(4, 0.37, degree, unit=1e3).error() == pytest.approx(plain, rel=1e-6)
 
 
+def ground(cells, degree, offset=0.37, free=False, law=None, load=0.01, **stress):
+    """Return ground that a strip loads, not yet solved, and its loads."""
+    V = None if free else around([2, 1], cells, offset, degree)
+    body = mpm.Particles(
+        box([0, 0], [2, 1], [4 * cells, 2 * cells], QUADRILATERAL),
+        V,
+        degree=degree,
+        quadrature_degree=2 * degree,
+    )
+    where = {1: mpm.region(y=0.0), 2: mpm.region(x=(-1.0, 0.5), y=1.0), 3: mpm.region(x=0.0)}
+    tags = mpm.facet_tags(body.mesh, where | {4: mpm.region(x=2.0)})
+    pressure = fem.Constant(body.mesh, (0.0, -load))
+    given = mpm.Body(
+        body,
+        law or materials.LinearElastic(100.0, 0.3),
+        tractions=[(pressure, 2)],
+        facet_tags=tags,
+        f_bar="patch" if law and degree == 1 else "none",
+        **stress,
+    )
+    held = [mpm.boundary.fixed(body, tags, 1)]
+    held += [mpm.boundary.roller(body, tags, tag, (side, 0.0)) for tag, side in ((3, -1), (4, 1))]
+    return mpm.QuasiStaticProblem(given, supports=held), pressure
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_initial_stress_is_no_deformation(degree, mpi_tmp_path):
+    """Ground that carries its weight already errs by as much as weightless one under a load."""
+    plain, _ = ground(4, degree)
+    plain.solve(1)
+    gravity = (0.0, -1.0)
+    weight = {"density": 0.1, "body_force": gravity}  # ten times the load
+    weight["initial_stress"] = mpm.geostatic(1.0, 0.1, 0.5, gravity)
+    heavy, again = (ground(4, degree, **weight)[0] for _ in range(2))
+    heavy.solve(1)
+    assert heavy.error() == pytest.approx(plain.error(), rel=0.01)
+    heavy.save(mpi_tmp_path / "state")
+    again.restore(mpi_tmp_path / "state")
+    assert again.error() == pytest.approx(heavy.error(), rel=1e-9)
+
+
+def test_strain_that_plastic_flow_has_left_is_deformation():
+    """Ground that is unloaded has errors of the size that it had under the load."""
+    law = materials.VonMises(1e3, 0.3, rho_y=np.sqrt(2.0))
+    problem, pressure = ground(4, 1, law=law)
+
+    def load(t):
+        problem.particles.load.value = 1.0
+        pressure.value[1] = -4.2 * min(2.0 * t, 2.0 - 2.0 * t)
+
+    errors = [problem.error() for _ in problem.steps(4, update=load)]
+    assert np.all(problem.particles.plastic_strain < 0.1)
+    assert total(problem.particles, problem.particles.plastic_strain) > 0.1
+    assert 0.7 * errors[1] < errors[3] < 1.5 * errors[1] < 0.3
+
+
 def test_locking_is_seen():
     """Nearly incompressible material: without F-bar the error stays, with patches it is small."""
     law = materials.LinearElastic(2.5, 0.4999)
