@@ -223,7 +223,7 @@ class ShiftedFactor:
         self.iterates = iterates
         ksp, pc = self._ksp, self._ksp.getPC()
         ksp.reset()
-        self._multigrid = self._flexible = self._refining = self.K = None
+        self._multigrid = self._flexible = self._refining = self._shifted = self.K = None
         if iterates:
             plain = self._symmetric and not self._constrained
             ksp.setType("cg" if plain else "fgmres")
@@ -321,7 +321,7 @@ class ShiftedFactor:
             pc.setFromOptions()
 
     def _make_levels(self, K: PETSc.Mat, levels: Levels, damping: float) -> None:
-        """Make the levels of multigrid for K; the shift, which is none of them, matters little."""
+        """Make the levels of multigrid for K, a copy of which is shifted where it must be."""
         known = self.K is K
         damped = damping > self.shift
         with self._statistics.phase("factorise"), self._own_options(), options_refused():
@@ -336,15 +336,22 @@ class ShiftedFactor:
                     self._multigrid = Multigrid(pc, interpolations, symmetric)
                     pc.setFromOptions()
             assert self._multigrid is not None
-            # (sweeps must not divide by what is round-off)
-            relative = damping if damped else HALF_DIGITS
-            matrix = self._shifted_copy(K, relative * levels.diagonal(K))
+            matrix = K if not damped and self._sweepable(K) else None
+            if matrix is None:
+                relative = damping if damped else HALF_DIGITS
+                matrix = self._shifted_copy(K, relative * levels.diagonal(K))
             if self._symmetric:
                 matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
             self._ksp.setOperators(matrix if damped else K, matrix)
             self._multigrid.set(matrix)
             self._ksp.setUp()
         self.K, self.P = K, matrix
+
+    def _sweepable(self, K: PETSc.Mat) -> bool:
+        """Return whether sweeps of multigrid may divide by the diagonal of K (collective)."""
+        diagonal = K.getDiagonal()
+        diagonal.abs()
+        return not self._constrained and bool(diagonal.min()[1] > 0.0)
 
     def _shifted_copy(self, K: PETSc.Mat, diagonal: PETSc.Vec) -> PETSc.Mat:
         """Return K with more on its diagonal, the same object for the same K."""

@@ -155,6 +155,60 @@ def test_a_tangent_without_a_shift_is_damped_in_a_copy():
         np.testing.assert_array_equal(K.getDiagonal().array_r, 2.0)
 
 
+class Chain(Alone):
+    """Unknowns along a line, of which every second one is coarser."""
+
+    def splits(self):
+        return [("displacement", slice(0, 0))]
+
+    def diagonal(self, K):
+        diagonal = super().diagonal(K)
+        diagonal.array_w[diagonal.array_r == 0.0] = diagonal.max()[1]
+        return diagonal
+
+    def interpolations(self, coarsest, values):
+        n = 801
+        weights = np.zeros((n, n // 2 + 1))
+        fine = np.arange(n)
+        for places in (fine // 2, (fine + 1) // 2):
+            weights[fine, places] += 0.5
+        P = PETSc.Mat().createDense(weights.shape, array=weights, comm=MPI.COMM_SELF)
+        return [P.convert("aij")]
+
+
+def test_multigrid_copies_a_tangent_only_to_shift_it():
+    n, own = 801, MPI.COMM_SELF
+    dense = 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    K = PETSc.Mat().createDense((n, n), array=dense, comm=own).convert("aij")
+    snes = PETSc.SNES().create(own)
+    snes.setOptionsPrefix("chain_")
+    given = "chain_", {"ksp_rtol": 1e-12}, True, 1e-13, 2, mpm.Statistics(), "multigrid"
+    factor = linear.ShiftedFactor(snes, *given)
+    factor.begin(n, Chain())
+    b = K.createVecLeft()
+    b.array_w[:] = np.sin(np.arange(n))
+    b.array_w[400] = 0.0
+    x = b.duplicate()
+    for case in ("plain", "nothing holds an unknown", "damped", "plain"):
+        values = dense.copy()
+        if case == "nothing holds an unknown":
+            values[400] = values[:, 400] = 0.0
+        for row in (399, 400, 401):
+            near = [row - 1, row, row + 1]
+            K.setValues([row], near, values[row, near])
+        K.assemble()
+        damping = 0.25 if case == "damped" else 0.0
+        factor.set(K, Chain(), damping)
+        assert (factor.P is K) == (case == "plain")
+        assert factor.step(b, x) is None
+        exact = values + damping * np.diag(np.diag(values))
+        if case == "nothing holds an unknown":
+            exact[400, 400] = 1.0
+        error = np.abs(x.array_r - np.linalg.solve(exact, b.array_r)).max()
+        assert error < 1e-6 * np.abs(x.array_r).max()
+        np.testing.assert_array_equal(K.getDiagonal().array_r, np.diag(values))
+
+
 @pytest.mark.skip_in_parallel
 def test_few_unknowns_are_factorised_by_petsc_with_the_same_result(monkeypatch):
     # Unknowns of the column become more as it spreads over the cells: packages change on the way.
