@@ -388,15 +388,15 @@ class BodyForms:
         return self.K
 
     @cached_property
-    def _elementwise(self) -> tuple[list[fem.Form], PETSc.Vec]:
-        """The residual tested domain by domain: element vectors that are not summed."""
+    def _elementwise(self) -> tuple[list[fem.Form], fem.FunctionSpace]:
+        """The residual tested domain by domain, and the space of functions on single ones."""
         broken = fem.functionspace(
             self._body,
             ("Discontinuous Lagrange", self._element.degree, (self._element.block_size,)),
         )
         swap = {self._test: ufl.TestFunction(broken)}
         forms = self._compile([ufl.replace(part, swap) for part in self._parts])
-        return forms, create_vector(broken)
+        return forms, broken
 
     def absolute_contributions(self, domain_nodes: NDArray[np.int32]) -> PETSc.Vec:
         """Return the sum over domains of the absolute values of what each adds to the residual.
@@ -407,7 +407,8 @@ class BodyForms:
         n, k = domain_nodes.shape
         external: NDArray[np.float64] = np.broadcast_to(0.0, (n, k, gdim))
         if self._parts:
-            forms, vector = self._elementwise
+            forms, broken = self._elementwise
+            vector = create_vector(broken)
             assemble_into(vector, forms)
             external = vector.array_r[: n * k * gdim].reshape(n, k, gdim)
         total = self.r.duplicate()

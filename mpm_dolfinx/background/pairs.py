@@ -34,7 +34,6 @@ class CellPairs:
         mine: Whether a pair belongs to this rank, that of the lower one of its cells' owners.
         num_own: Number of cells that this rank owns.
         nodes: Global nodes of V of each cell, those of other ranks last, shape ``(c, k)``.
-        vertices: Geometry nodes of each cell, shape ``(c, m, gdim)``.
         volumes: Volumes of the cells that this rank owns, areas in the plane.
     """
 
@@ -64,10 +63,24 @@ class CellPairs:
         self._sent: list[NDArray[np.int64]] = self._comm.alltoall(asked)
         dofs = V.dofmap.list[: self.num_own]
         nodes = V.dofmap.index_map.local_to_global(dofs.ravel()).reshape(dofs.shape)
-        geometry = _compat.geometry_dofmap(background)[: self.num_own]
         self.nodes = self.with_others(nodes)
-        self.vertices = self.with_others(background.geometry.x[geometry, : background.geometry.dim])
+        self._background = background
+        own = np.arange(self.num_own if self._comm.size > 1 else 0)
+        self._beyond = self.with_others(self._own_vertices(own))[len(own) :].copy()
         self.volumes = cell_volumes(background)
+
+    def _own_vertices(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+        geometry = self._background.geometry
+        corners = _compat.geometry_dofmap(self._background)[cells]
+        return np.asarray(geometry.x[corners, : geometry.dim])
+
+    def vertices(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the geometry nodes of cells, ``(..., m, gdim)``."""
+        own = cells < self.num_own
+        found = np.empty((*cells.shape, *self._beyond.shape[1:]))
+        found[own] = self._own_vertices(cells[own])
+        found[~own] = self._beyond[cells[~own] - self.num_own]
+        return found
 
     def _across(self, keys: NDArray[np.int64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return pairs with another rank's cell: own cell, that rank, its cell; shape ``(n, 3)``.

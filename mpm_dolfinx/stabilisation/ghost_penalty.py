@@ -117,7 +117,7 @@ class GhostPenalty:
         modulus = PENALTY * np.where(total > 0.0, mean, body.min())
         nodes = self.tied
         if self._unit is None:
-            self._unit = self._penalties(self._cells.vertices[chosen])
+            self._unit = self._penalties(self._cells.vertices(chosen))
         values = modulus[:, None, None] * self._unit
         rows = np.broadcast_to(nodes[:, :, None], values.shape)
         columns = np.broadcast_to(nodes[:, None, :], values.shape)

@@ -17,7 +17,7 @@ def test_fill_is_the_share_of_the_body():
     particles = mpm.Particles(body, scenes.vectors(grid, 2), degree=2)
     cells = CellPairs(particles.V)
     found = CellFill.of([particles], cells)
-    middle = cells.vertices[: cells.num_own].mean(axis=1)
+    middle = cells.vertices(np.arange(cells.num_own)).mean(axis=1)
     exact = np.where(middle[:, 1] < 1.0, np.clip(2.5 - (middle[:, 0] - 0.5), 0.0, 1.0), 0.0)
     assert np.allclose(found.fill[:, 0], exact, atol=1e-12)
     assert np.array_equal(found.active, exact > 0.0)
