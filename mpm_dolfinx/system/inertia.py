@@ -110,23 +110,24 @@ class _Rest:
 class _Reduced(NamedTuple):
     """The mass in all unknowns.
 
+    It is another one where T is: whatever changes the mass, as particles that are gone and meshes,
+    changes T, too.
+
     Attributes:
-        nodal: That of the bodies' nodes.
         transfers: T of each body, by which it is reduced.
         mass: That of bodies whose mass the compiled loops do not have, or ``None``.
         scaled: Room for a multiple of it.
         projection: Solves with the mass of all.
     """
 
-    nodal: NodalMass
     transfers: list[PETSc.Mat]
     mass: PETSc.Mat | None
     scaled: PETSc.Mat | None
     projection: Projection
 
-    def is_of(self, mass: NodalMass, transfers: list[PETSc.Mat]) -> bool:
-        """Return whether it is a mass reduced by some transfers."""
-        return self.nodal is mass and all(map(operator.is_, transfers, self.transfers))
+    def is_by(self, transfers: list[PETSc.Mat]) -> bool:
+        """Return whether it is reduced by some transfers."""
+        return all(map(operator.is_, transfers, self.transfers))
 
 
 class Projected(NamedTuple):
@@ -228,9 +229,9 @@ class Inertia(Term):
 
         What kinetic energy changes by where these are others is lost, or gained.
         """
-        present = deleted(self.bodies)
-        if self._mass is None or present != self._mass.deleted:
-            self._mass = nodal_mass(self.bodies, self._rest.domain_masses(self.state), present)
+        if self._mass is None or not self._mass.is_of_present():
+            domains = self._rest.domain_masses(self.state)
+            self._mass = nodal_mass(self.bodies, domains, deleted(self.bodies))
             owned = [own.sum(axis=(1, 2)) for own in self._mass.domains]
             for term in self._rest.terms:
                 term.weigh([owned[self.state.number(body)] for body in term.bodies])
@@ -369,9 +370,9 @@ class Inertia(Term):
         """Return the mass reduced by T of all bodies, anew where they are others."""
         Ts = [transfer(body) for body in self.bodies]
         known = self._reduced
-        mass = self.step.mass
-        if known is None or not known.is_of(mass, Ts):
-            self._reduced = known = _reduced(mass, Ts, self._rest.reduced.tangent.masses)
+        if known is None or not known.is_by(Ts):
+            masses = self._rest.reduced.tangent.masses
+            self._reduced = known = _reduced(self.step.mass, Ts, masses)
         return known
 
     @override
@@ -412,7 +413,7 @@ class Inertia(Term):
         moved = self._moved()
         kinetic = 0.5 * step.mass.product(moved.after, moved.after)
         works = self._works(moved)
-        if deleted(self.bodies) != step.mass.deleted:
+        if not step.mass.is_of_present():
             # Forces of particles that the step's end has deleted are in its balance, but gone now.
             works["lost"] += account.missing(works, kinetic)
         account.book(works, kinetic, self._rest.problem.stored_and_done()[1])
@@ -482,7 +483,7 @@ def _reduced(mass: NodalMass, transfers: list[PETSc.Mat], by_loops: ReducedMasse
     ]
     left = _sum(others) if others else None
     projection = Projection(_sum([one for one in (known, left) if one is not None]))
-    return _Reduced(mass, transfers, left, None if left is None else left.copy(), projection)
+    return _Reduced(transfers, left, None if left is None else left.copy(), projection)
 
 
 def _sum(parts: Sequence[PETSc.Mat]) -> PETSc.Mat:

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -16,6 +17,7 @@ from dolfinx import fem
 
 from ..assembly.petsc import blocked
 from ..errors import MPMError
+from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
 
 __all__ = ["NodalMass", "deleted", "dot", "nodal_mass"]
@@ -29,13 +31,19 @@ class NodalMass:
         bodies: The bodies.
         domains: Mass of each owned domain, ``(n, k, k)`` for each body; 0 without inertia.
         matrices: The same on W.
-        deleted: Number of deleted particles of each body, with all ranks.
+        deleted: Which of this rank's particles of each body are gone.
     """
 
     bodies: Sequence[Particles]
     domains: Sequence[NDArray[np.float64]]
     matrices: Sequence[PETSc.Mat]
-    deleted: Sequence[int]
+    deleted: Sequence[NDArray[np.bool_]]
+
+    def is_of_present(self) -> bool:
+        """Return whether the same particles are gone now (collective)."""
+        now = deleted(self.bodies)
+        same = all(map(np.array_equal, now, self.deleted))
+        return over_ranks(self.bodies[0].V.mesh.comm, same, MPI.LAND)
 
     def vectors(self, functions: Sequence[fem.Function]) -> list[PETSc.Vec]:
         """Return the values of Functions on W of each body."""
@@ -92,7 +100,7 @@ class NodalMass:
 def nodal_mass(
     bodies: Sequence[Particles],
     domains: Sequence[NDArray[np.float64] | None],
-    present: Sequence[int],
+    present: Sequence[NDArray[np.bool_]],
 ) -> NodalMass:
     """Return the mass of bodies (collective).
 
@@ -115,12 +123,9 @@ def nodal_mass(
     return NodalMass(bodies, masses, matrices, present)
 
 
-def deleted(bodies: Sequence[Particles]) -> list[int]:
-    """Return how many particles of each body are deleted (collective)."""
-    return [
-        0 if body.deletion is None else body.mesh.comm.allreduce(int(body.deletion.mask.sum()))
-        for body in bodies
-    ]
+def deleted(bodies: Sequence[Particles]) -> list[NDArray[np.bool_]]:
+    """Return which of this rank's particles of each body are deleted."""
+    return [body.deleted.copy() for body in bodies]
 
 
 def dot(some: Sequence[PETSc.Vec], others: Sequence[PETSc.Vec]) -> float:

@@ -12,6 +12,7 @@ from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.stabilisation.ghost_penalty import PENALTY, GhostPenalty
+from mpm_dolfinx.transfer.touched import TouchedNodes
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
@@ -106,3 +107,19 @@ def test_a_penalty_beside_forces_that_count_for_the_whole_step_counts_as_often()
     )
     problem.step(0.1)
     assert problem.reduced.unknowns.moduli == pytest.approx([2e3 / 2.6, 1e3 / 2.6])
+
+
+def test_whether_it_acts_is_asked_of_carried_nodes_each_counted_once_on_any_ranks():
+    body, V = scenes.unit(6, TRIANGLE), scenes.vectors(scenes.unit(4, TRIANGLE))
+    particles = mpm.Particles(body, V, free=lambda x: x[0] + x[1] < 0.9)
+    x = np.unique(np.round(scenes.gather(particles.node_positions), 9), axis=0)
+    carried = np.count_nonzero(~(x[:, 0] + x[:, 1] < 0.9))
+    look(loose := GhostPenalty([particles]), particles)
+    owned = particles.W.dofmap.index_map.size_local
+    touched = TouchedNodes(V, [particles.node_basis], [owned])
+    active = WORLD.allreduce(len(touched.active))
+    assert loose.acts and 0 < carried < len(x)
+    for more in (-0.01, 0.01):
+        ghost = GhostPenalty([particles], least=(active + more) / carried)
+        look(ghost, particles)
+        assert ghost.acts == (more < 0.0)

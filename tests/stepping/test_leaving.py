@@ -95,6 +95,47 @@ def test_the_last_particle_is_not_deleted():
     np.testing.assert_allclose(p.centroid[~p.deleted, 1], p.initial_centroid[~p.deleted, 1] - 1.0)
 
 
+def test_a_state_is_that_of_its_own_particles_where_as_many_others_have_left(mpi_tmp_path):
+    # A plate heavier on one side slides off one end of its background; others before off the other.
+    straight, other = plate(), plate()
+    for problem, ways in ((straight, (8.0,)), (other, (8.0, -8.0))):
+        problem.save(mpi_tmp_path / "first")
+        for way in ways:
+            problem.restore(mpi_tmp_path / "first")
+            slide(problem, way, 0.3)
+            if way > 0.0:
+                problem.save(mpi_tmp_path / "then")
+    lost = [scenes.total(p.particles, p.particles.deleted) for p in (straight, other)]
+    assert lost[0] == lost[1] > 0
+    other.restore(mpi_tmp_path / "then")
+    for problem in (straight, other):
+        slide(problem, 0.0, 0.4)
+    one, two = straight, other
+    np.testing.assert_allclose(two.particles.centroid, one.particles.centroid, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(two.momentum, one.momentum, rtol=1e-12, atol=1e-13)
+    energies = [list(vars(p.history.energies[-1]).values()) for p in (one, two)]
+    np.testing.assert_allclose(energies[1], energies[0], rtol=1e-10, atol=1e-12)
+
+
+def plate():
+    """Return a plate that forces may move over both ends of its background."""
+    V = scenes.vectors(scenes.box([-1.0, -0.5], [1.0, 1.0], [8, 6], QUADRILATERAL))
+    body = scenes.box([-0.8, 0.0], [0.8, 0.5], [8, 2], TRIANGLE)
+    particles = mpm.Particles(body, V, outside="delete")
+    density = fem.Function(fem.functionspace(body, ("DG", 0)))
+    density.interpolate(lambda x: 1.0 + 0.5 * x[0])
+    force = fem.Constant(body, np.zeros(2))
+    law = LinearElastic(1e3, 0.3)
+    one = mpm.Body(particles, law, density=density, body_force=force)
+    return mpm.DynamicProblem(one, scheme="euler")
+
+
+def slide(problem, way, time):
+    """Go on under a horizontal force."""
+    problem.body().body_force.value[0] = way
+    problem.solve(time=time, dt=0.05)
+
+
 def test_a_boundary_that_has_been_moved_holds_nothing_beyond_it_at_rest_either():
     V = scenes.vectors(scenes.box([-0.5, -0.5], [1.5, 1.5], [4, 4], QUADRILATERAL))
     bc, u = scenes.everywhere(V)

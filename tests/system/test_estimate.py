@@ -63,6 +63,14 @@ def test_it_is_the_energy_of_what_the_residual_would_do_to_the_node():
         assert found == pytest.approx(R @ np.linalg.solve(2.0 * K, R))
 
 
+def test_a_tangent_that_is_not_symmetric_counts_by_the_energy_that_it_has():
+    body, R = particles(), np.array([1.0, -4.0])
+    for slip in (np.array([[0.0, 0.8], [-0.8, 0.0]]), np.array([[0.0, -0.8], [0.8, 0.0]])):
+        found = alone(body, [Springs([body], K + slip)], R)
+        if found is not None:
+            assert found == pytest.approx(R @ np.linalg.solve(K, R))
+
+
 def test_tangents_of_each_of_several_bodies_are_its_own():
     bodies, R = [particles(), particles((1.0, 1.0))], np.array([1.0, -4.0])
     for number, body in enumerate(bodies):
