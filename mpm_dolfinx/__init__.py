@@ -18,6 +18,7 @@ from .gradients.adjoint import Adjoint  # noqa: E402
 from .gradients.sensitivity import Sensitivity  # noqa: E402
 from .gradients.tape import taped  # noqa: E402
 from .history import Energy, History, Loss, Stage, Statistics, Step  # noqa: E402
+from .io.record import Record  # noqa: E402
 from .meshes.grid import grid, grid_lines  # noqa: E402
 from .meshes.regions import cell_tags, facet_tags, held, region  # noqa: E402
 from .particles.field import ParticleField  # noqa: E402
@@ -73,6 +74,7 @@ __all__ = [
     "Problem",
     "QuasiStaticProblem",
     "Rates",
+    "Record",
     "Scheme",
     "Sensitivity",
     "Solver",

@@ -268,6 +268,7 @@ class History:
         statistics: Counters and seconds per phase.
         energies: Of a :class:`DynamicProblem`, at the beginning and after each step.
         stages: Beginnings of stages that changed the problem.
+        in_time: Whether steps have a duration, as in a motion.
     """
 
     steps: list[Step] = field(default_factory=list)
@@ -279,6 +280,7 @@ class History:
     energies: list[Energy] = field(default_factory=list)
     stages: list[Stage] = field(default_factory=list)
     taken_back: list[Attempt] = field(default_factory=list)
+    in_time: bool = False
 
     def __repr__(self) -> str:
         return f"<History: {self.in_words()}>"
@@ -289,7 +291,7 @@ class History:
             words = "no step yet"
         else:
             steps = f"{len(self.steps)} step{'s' if len(self.steps) > 1 else ''}"
-            end = f"time {self.time:g}" if self.energies else f"load {self.steps[-1].load:g}"
+            end = f"time {self.time:g}" if self.in_time else f"load {self.steps[-1].load:g}"
             words = f"{steps} to {end}, {self.total_iterations} linear solves"
         if self.cutbacks:
             words += f", {self.cutbacks} cutback{'s' if self.cutbacks > 1 else ''}"

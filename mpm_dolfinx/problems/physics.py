@@ -251,4 +251,5 @@ def _in_words(given: Body, setup: Setup) -> str:
     """Return the material of a body and its loads."""
     held = setup.supports_of(given.particles)
     more = [counted(len(held), "support")] if held else []
+    more += [] if setup.mixed is None else [f"mixed with a {setup.mixed}"]
     return "; ".join([given.in_words(), *more, *(["body of revolution"] * setup.axisymmetric)])

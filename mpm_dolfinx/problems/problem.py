@@ -131,7 +131,7 @@ class Problem(Hooked):
         self.bodies = as_bodies(particles)
         self.bcs = as_conditions(bcs, [*spaces_of(self.bodies), *spaces])
         self.terms = as_terms(terms, self.bodies)
-        self.history = History()
+        self.history = History(in_time=not self.at_rest)
         self._comm: MPI.Comm = self.bodies[0].V.mesh.comm
         self._background, self._how = background, solver
         self._output = Output()

@@ -71,7 +71,8 @@ def on_a_screen(
         names = sorted(type(term).__name__ for term in problem.terms)
         held = [counted(len(problem.bcs), "Dirichlet condition")] if problem.bcs else []
         rows.append(("held by", ", ".join([*held, *names])))
-    rows.append(("solver", ", ".join(f"{name} {value}" for name, value in numerics.items())))
+    chosen = _chosen(problem, numerics) if problem.history.steps else numerics
+    rows.append(("solver", ", ".join(f"{name} {value}" for name, value in chosen.items())))
     rows.append(("run", _run(problem.history)))
     if problem.history.steps:
         rows.append(("seconds", _seconds(problem.history, comm)))
@@ -98,6 +99,20 @@ def _state(body: Particles, comm: MPI.Comm) -> str:
 
 def _most(comm: MPI.Comm, values: NDArray[Any]) -> float:
     return float(comm.allreduce(float(np.max(values, initial=0.0)), MPI.MAX))
+
+
+def _chosen(problem: Any, numerics: Mapping[str, str]) -> dict[str, str]:
+    """Return how a problem is solved, with what was chosen for the last step."""
+    words = {"linear": problem.trial.newton.linear_solver, **numerics}
+    if words["stabilisation"] == "auto":
+        counts = problem.history.statistics
+        acts = [
+            counted(int(counts[name]), noun)
+            for name, noun in (("ghost_facets", "ghost facet"), ("joint_nodes", "joint node"))
+            if counts[name]
+        ]
+        words["stabilisation"] += f" ({' and '.join(acts) or 'nothing to hold'})"
+    return words
 
 
 def _space(V: fem.FunctionSpace) -> str:

@@ -36,6 +36,8 @@ ACCURATE, ITERATIONS = 1e-6, 200
 FIRST, ROUGHEST, FINAL = 1e-2, 0.1, 0.2
 #: Tries of a step that end where a tangent is indefinite, before it is solved with all the same.
 PATIENCE = 3
+#: How packages that factorise write themselves.
+NAMES = {"mumps": "MUMPS", "petsc": "PETSc", "superlu_dist": "SuperLU_DIST"}
 #: By which conjugate gradients say that a tangent is not positive definite.
 INDEFINITE = (
     PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT,
@@ -131,6 +133,22 @@ class ShiftedFactor:
         self._direct = ksp.getType(), pc.getType(), pc.getFactorSolverType()
         suits = symmetric and shift > 0.0 and not said and snes.comm.size == 1
         self._few = self._strategy.few if suits else 0
+
+    def in_words(self) -> str:
+        """Return what solves, and why."""
+        if self._own_type:
+            return f"{self._ksp.getType()} with {self._ksp.getPC().getType()} by PETSc's options"
+        if self.iterates:
+            chosen = "chosen for so many unknowns" if self._linear_solver == "auto" else "as asked"
+            return f"multigrid ({chosen})"
+        _, factor, package = self._direct
+        kind, why = ("LDL^T", "symmetric") if factor == "cholesky" else ("LU", "unsymmetric")
+        why += " tangent"
+        if package != (package := self._ksp.getPC().getFactorSolverType()):
+            why += ", few unknowns"
+        elif self._dear:
+            why += ", after multigrid came to nothing"
+        return f"{kind} by {NAMES.get(package, package)} ({why})"
 
     @contextmanager
     def _own_options(self, size: int = 0) -> Iterator[PETSc.Options]:

@@ -114,6 +114,11 @@ class NewtonSolver:
         return self._factor.K
 
     @property
+    def linear_solver(self) -> str:
+        """What solves the linear systems of the last step, and why, in words."""
+        return self._factor.in_words()
+
+    @property
     def iterations(self) -> int:
         """Linear solves of the last attempt."""
         return 0 if self._attempt is None else self._attempt.steps.count

@@ -102,3 +102,55 @@ def test_cutbacks_are_logged(caplog):
 @pytest.mark.parametrize("module", [mpm, mpm.materials, mpm.boundary, mpm.plot])
 def test_dir_lists_the_public_names(module):
     assert dir(module) == sorted(module.__all__)
+
+
+def pressed(law, degree=1, n=3, mixed=None, **options):
+    """Return a square under its weight on a background that its own cells do not fit."""
+    V = vectors(unit(4, QUADRILATERAL), degree)
+    particles = mpm.Particles(unit(n, QUADRILATERAL), V, degree=degree)
+    body = mpm.Body(particles, law, body_force=(0.0, -1.0))
+    bcs, solver = [mpm.held(V, y=0.0)], mpm.Solver(**options)
+    return mpm.QuasiStaticProblem(body, bcs=bcs, mixed=mixed, solver=solver)
+
+
+@pytest.mark.parametrize(
+    "law, options, words",
+    [
+        (mpm.materials.Hencky(1e6, 0.3), {}, "LDL^T by PETSc (symmetric tangent, few unknowns)"),
+        (mpm.materials.Hencky(1e6, 0.3), {"shift": 0.0}, "LDL^T by MUMPS (symmetric tangent)"),
+        (
+            mpm.materials.MohrCoulomb(1e6, 0.3, cohesion=1e6, friction_angle=20.0),
+            {},
+            "LU by MUMPS (unsymmetric tangent)",
+        ),
+        (mpm.materials.Hencky(1e6, 0.3), {"petsc_options": {"pc_type": "svd"}}, "preonly with svd"),
+    ],
+)
+def test_the_summary_says_which_solver_was_chosen(law, options, words):
+    problem = pressed(law, n=8, **options)
+    if problem.particles.mesh.comm.size > 1:
+        words = words.replace("PETSc", "MUMPS").replace(", few unknowns", "")
+        if "svd" in words:
+            return  # PETSc's is for one rank
+    assert "linear" not in problem.summary()
+    problem.solve()
+    text = " ".join(problem.summary().split())
+    assert f"solver linear {words}" in text and "stabilisation auto (nothing to hold)" in text
+
+
+def test_the_summary_counts_what_holds_badly_supported_nodes():
+    problem = pressed(mpm.materials.NeoHooke(1e3, 0.3), degree=2, mixed="pressure")
+    problem.solve()
+    text, counts = " ".join(problem.summary().split()), problem.history.statistics
+    assert f"stabilisation auto ({int(counts['ghost_facets'])} ghost facets)" in text
+    assert "mixed with a pressure" in text
+
+
+def test_water_goes_through_time():
+    V = vectors(unit(2, QUADRILATERAL), 2)
+    particles = mpm.Particles(unit(2, QUADRILATERAL), V, degree=2)
+    water = mpm.PoreFluid(0.1)
+    body = mpm.Body(particles, mpm.materials.Hencky(1e3, 0.3), pore_fluid=water)
+    problem = mpm.PorousProblem(body, bcs=[mpm.held(V, y=0.0)])
+    problem.solve(time=80.0, dt=40.0)
+    assert "2 steps to time 80," in problem.history.in_words()
