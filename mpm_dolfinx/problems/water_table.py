@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,7 @@ from dolfinx import mesh
 
 from ..errors import MPMError
 from ..parallel.given import is_number
-from ..reals import holds_ufl
+from ..reals import as_finite, holds_ufl
 
 __all__ = ["WaterTable"]
 
@@ -32,28 +32,55 @@ class WaterTable:
     on it.
 
     Args:
-        level: Height of the level along the last axis, or a function of coordinates that returns it
-            by arithmetic, which takes UFL and NumPy alike: ``lambda x: 8.0 - 0.2 * x[0]``.
+        level: Height of the level along the last axis; or points ``[(x, height), ...]`` of it in
+            ascending order of ``x[0]``, straight in between and level beyond; or a function of
+            coordinates that returns it by arithmetic, which takes UFL and NumPy alike:
+            ``lambda x: 8.0 - 0.2 * x[0]``.
         weight: Weight of water, force per volume.
 
     Raises:
         MPMError: Numbers that make no sense.
     """
 
-    level: float | Callable[[Any], Any]
+    level: float | Sequence[tuple[float, float]] | Callable[[Any], Any]
     weight: float
 
     def __post_init__(self) -> None:
         """Say so where something makes no sense."""
-        numbers: list[Any] = [self.weight, *([] if self._function else [self.level])]
+        points = isinstance(self.level, list | tuple | np.ndarray)
+        numbers: list[Any] = [self.weight, *([] if points or self._function else [self.level])]
         if not all(is_number(n) and np.isfinite(n) for n in numbers):
-            raise MPMError("WaterTable needs a finite level, or a function of it, and a weight.")
+            raise MPMError(
+                "WaterTable needs a finite level, points (x, height) or a function of it, and a "
+                "weight."
+            )
         if not self.weight > 0.0:
             raise MPMError(f"The weight of water must be positive, not {self.weight:g}.")
+        if points:
+            self._corners()
+
+    def _corners(self) -> Array:
+        """Return the points of the level, shape ``(n, 2)``."""
+        corners = as_finite(self.level, None, 2)
+        if corners is None or (np.diff(corners[:, 0]) <= 0.0).any():
+            raise MPMError(
+                "The points of a WaterTable's level must be pairs (x, height) of finite numbers, "
+                f"each x larger than the one before, not {self.level!r}."
+            )
+        return corners
 
     def level_at(self, x: Any) -> Any:
         """Return the level at coordinates, UFL or arrays."""
-        return self._function(x) if self._function else self.level
+        if self._function is not None:
+            return self._function(x)
+        if is_number(self.level):
+            return self.level
+        # the sum of what the slope changes by at each point takes UFL and arrays alike
+        along, heights = self._corners().T
+        changes = np.diff(np.diff(heights) / np.diff(along), prepend=0.0, append=0.0)
+        beyond = [(x[0] - a + abs(x[0] - a)) / 2 for a in map(float, along)]
+        bends = zip(changes, beyond, strict=True)
+        return sum((float(c) * b for c, b in bends), float(heights[0]))
 
     @property
     def _function(self) -> Callable[[Any], Any] | None:

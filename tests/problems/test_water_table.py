@@ -75,6 +75,25 @@ def test_a_pressure_in_ufl_is_the_same_and_seepage_acts_along_its_slope():
     assert in_order(flow, flow.stress[:, 1, 1]) == pytest.approx(in_order(flow, expected), abs=2e-3)
 
 
+def test_a_level_by_points_is_straight_in_between_and_level_beyond():
+    bends = [(0.5, 3.0), (1.0, 4.0), (1.6, 1.5)]
+    water = mpm.WaterTable(bends, WEIGHT)
+    x = np.zeros((3, 50))
+    x[0] = np.linspace(-1.0, 3.0, 50)
+    known = np.interp(x[0], *np.transpose(bends))
+    assert water.level_at(x) == pytest.approx(known, abs=1e-12)
+    body = box([0, 0], [2, 4], [8, 16], QUADRILATERAL)
+    Q = fem.functionspace(body, ("Lagrange", 1))
+    pressure = fem.Function(Q)
+    pressure.interpolate(fem.Expression(water(body), Q.element.interpolation_points))
+    at_nodes = Q.tabulate_dof_coordinates()
+    below = np.interp(at_nodes[:, 0], *np.transpose(bends)) - at_nodes[:, 1]
+    assert pressure.x.array == pytest.approx(WEIGHT * np.maximum(below, 0.0), abs=1e-12)
+    # a level by points that is level is the level
+    by_points, by_level = (ground(level).bodies[0] for level in ([(0.3, 2.0), (1.1, 2.0)], 2.0))
+    assert largest(np.abs(by_points.stress - by_level.stress)) < 1e-9
+
+
 def test_water_that_sinks_in_a_stage_loads_the_ground():
     problem = ground(4.0)
     problem.stage("sunk", problem.body().replace(pore_pressure=mpm.WaterTable(2.0, WEIGHT)))
@@ -128,7 +147,11 @@ def test_what_makes_no_sense_is_said():
     for build, words in (
         (lambda: mpm.WaterTable("high", 10.0), "level"),
         (lambda: mpm.WaterTable(1.0, -10.0), "positive"),
-        (lambda: mpm.WaterTable(ufl.as_ufl(4.0), 10.0), "finite level, or a function"),
+        (lambda: mpm.WaterTable([(1.0, 2.0), (1.0, 3.0)], 10.0), "each x larger than"),
+        (lambda: mpm.WaterTable([(1.0, 2.0, 3.0)], 10.0), "must be pairs"),
+        (lambda: mpm.WaterTable([(0.0, np.inf), (1.0, 3.0)], 10.0), "finite"),
+        (lambda: mpm.WaterTable([], 10.0), "must be pairs"),
+        (lambda: mpm.WaterTable(ufl.as_ufl(4.0), 10.0), "finite level, points"),
         (lambda: ground(4.0, pore_pressure=mpm.WaterTable(lambda x: np.nan, 10.0)), "The level of"),
         (lambda: ground(4.0, pore_pressure=mpm.WaterTable(lambda x: "high", 10.0)), "The level of"),
         (lambda: mpm.geostatic(4.0, 2.0, 0.5, G, water=3.0), "WaterTable"),
