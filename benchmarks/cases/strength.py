@@ -4,12 +4,14 @@
 
 `factor` is what is found and `exact` what is known: the factor of safety of Griffiths & Lane's
 first slope (1999), dry or, as in their fifth example, under a level of water that was lowered
-slowly; gamma H/c of a vertical cut in undrained soil (bounds 3.775 and 3.786), and at
-most of a slope of 45 degrees on a firm base; of strips N_c and N_q of Prandtl and Reissner, and
-N_gamma of soil with weight and without cohesion (Martin 2005); N_c of a circular footing on clay
-(Cox, Eason & Hopkins 1961, Eason & Shield 1960). `--recommended` is the way to limit loads that
-docs/limit-loads.md describes.
+slowly, and of the dam of their sixth, dry or with a reservoir 17.1 m deep; gamma H/c of a vertical
+cut in undrained soil (bounds 3.775 and 3.786), and at most of a slope of 45 degrees on a firm base;
+of strips N_c and N_q of Prandtl and Reissner, and N_gamma of soil with weight and without cohesion
+(Martin 2005); N_c of a circular footing on clay (Cox, Eason & Hopkins 1961, Eason & Shield 1960).
+`--recommended` is the way to limit loads that docs/limit-loads.md describes.
 """
+
+from itertools import pairwise
 
 from mpi4py import MPI
 
@@ -21,7 +23,7 @@ from dolfinx import fem, mesh
 import mpm_dolfinx as mpm
 
 parser = kit.Parser("Strength of soils: slope, vertical cut, footing.")
-CASES = ("slope", "vertical_cut", "footing", "footing_surcharge", "footing_weight", "circle")
+CASES = ("slope", "dam", "vertical_cut", "footing", "footing_surcharge", "footing_weight", "circle")
 parser.add_argument("--case", choices=CASES, default="slope")
 parser.add_argument("--domain", choices=("quad", "tri"), default="quad", help="particle domains")
 parser.add_argument(
@@ -40,7 +42,7 @@ parser.add_argument(
 parser.add_argument("--run", type=kit.positive, default=2.0, help="of the slope, for a rise of 1")
 parser.add_argument("--friction-angle", type=float, default=20.0, help="of slope and footing")
 parser.add_argument(
-    "--water", type=float, help="level of water below the slope's crest, over its height"
+    "--water", type=float, help="level of water below the crest of slope or dam, over its height"
 )
 parser.add_argument("--tolerance", type=kit.positive, default=0.01, help="of the factor of safety")
 parser.add_argument(
@@ -65,8 +67,10 @@ parser.add_argument(
 parser.add_stabilisation()
 parser.add_argument("--dilation-angle", type=float, help="of the footing's soil, else associated")
 args = parser.parse()
-if args.water is not None and args.case != "slope":
-    parser.error("argument --water: of a slope alone")
+if args.water is not None and args.case not in ("slope", "dam"):
+    parser.error("argument --water: of a slope or a dam alone")
+if args.case == "dam" and args.recommended:
+    parser.error("argument --recommended: not of a dam")
 if not 1.0 <= args.fine <= 5.0:
     parser.error(f"argument --fine: {args.fine:g} is not from 1 to 5")
 
@@ -159,6 +163,39 @@ if args.case == "slope":
     if args.water is not None:
         # The weight of soil is 20 kN/m3, that of water 9.81.
         water = mpm.WaterTable((1.0 - args.water) * height, 9.81 / 20.0 * weight / height)
+elif args.case == "dam":
+    # 21.3 m high, slopes of 18 and 23 degrees, on 7.3 m of the same soil. The widths that are given
+    # do not close by 1.4 m: height, base and crest are kept, and both slopes share the rest.
+    weight = 18.2 * 21.3 / 13.8
+    base, toe, crest, shoulder, end, width = (
+        height / 21.3 * np.array([7.3, 33.5, 99.83, 107.13, 157.9, 191.4])
+    )
+    full = mpm.grid(
+        comm,
+        [
+            np.unique(np.concatenate([mpm.grid_lines(*pair, 0.5 * h) for pair in pairwise(places)]))
+            for places in ((0.0, toe, end, width), (0.0, base, base + height))
+        ],
+        kind,
+    )
+    cells = np.arange(full.topology.index_map(2).size_local, dtype=np.int32)
+    x = mesh.compute_midpoints(full, 2, cells)
+    under = (x[:, 0] > toe) & (x[:, 0] < end)
+    body = mesh.create_submesh(full, 2, cells[under | (x[:, 1] < base)])[0]
+    x = body.geometry.x
+    share = np.clip((x[:, 1] - base) / height, 0.0, 1.0)
+    x[:, 0] += share * (np.interp(x[:, 0], [toe, end], [crest, shoulder]) - x[:, 0])
+    up = h * np.arange(np.ceil((base + height) / h) + 2)
+    grid = mpm.grid(comm, [mpm.grid_lines(0.0, width, h), up])
+    V = fem.functionspace(grid, ("Lagrange", 1, (2,)))
+    law = mpm.materials.MohrCoulomb(young, 0.3, 1.0, 37.0, args.dilation_angle or 0.0)
+    bcs = [held(V, 0, 0.0, width), *floor(V)]
+    exact = {None: 2.4, 0.197: 1.9}.get(args.water, np.nan)
+    if args.water is not None:
+        # It goes from the reservoir to the toe in a straight line.
+        depth = (1.0 - args.water) * height
+        inlet = toe + depth / height * (crest - toe)
+        water = mpm.WaterTable([(inlet, base + depth), (end, base)], 9.81 / 18.2 * weight / height)
 elif args.case == "vertical_cut":
     weight, wide, deep = 3.0, 2.25 * height, 1.375 * height
     wide, deep = h * round(wide / h), h * round(deep / h)

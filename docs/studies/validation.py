@@ -202,6 +202,15 @@ WATER = {
     "Water lowered slowly by 0.7 of its height": Value(
         "factor", "exact", "strength --case slope --water 0.7 --cell 0.1", "--cell 0.05"
     ),
+    "Dam on its foundation, factor of safety (their example 6)": Value(
+        "factor", "exact", "strength --case dam --cell 0.125", "--cell 0.083333"
+    ),
+    "With a reservoir, 0.8 of its height": Value(
+        "factor",
+        "exact",
+        "strength --case dam --water 0.197 --cell 0.125",
+        "--cell 0.083333",
+    ),
     "Column, pressure (Terzaghi 1943)": Error(
         "error", "consolidation --cells 8 --steps 16", "--cells 16 --steps 64"
     ),
