@@ -47,7 +47,8 @@ class SofteningAverage:
         values: That of the present update, at all points, shape ``(n nq,)``.
 
     Raises:
-        MPMError: No law softens, or domains do not share their nodes.
+        MPMError: No law softens, one does as no average can make it, or domains do not share their
+            nodes.
     """
 
     def __init__(self, strain: Strain, laws: Assignment, length: float) -> None:
@@ -61,6 +62,8 @@ class SofteningAverage:
                 "length= is for laws that soften with their plastic strain (with_softening), which "
                 f"{names} does not; omit it, or give the law a residual strength and decay."
             )
+        for law in laws.given:
+            law.softening_by(np.zeros(1))  # which may be refused
         self._over = GradientAverage(strain, length, laws.by_domain(counts).any(axis=1))
         self.values = np.zeros(laws.num_points)
         self._turns = 0

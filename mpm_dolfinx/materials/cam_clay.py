@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import MPMError
 from .base import Field, Parameter, State, checked, exceeds, per_row
 from .compiled import CompiledMaterial
-from .mandel import deviator, norm, trace
+from .mandel import deviator, norm, to_vector, trace
 
 __all__ = ["ModifiedCamClay"]
 
@@ -43,6 +43,9 @@ class ModifiedCamClay(CompiledMaterial):
     method, and where that does not do by bisection: for a given multiplier eps_v is unique,
     between its trial value and that of the critical state, p = p_c/2.
 
+    Ground that was under more is told by its overconsolidation, p_c over that of the ellipse on
+    which its first stress lies, p + q^2/(M^2 p); p_c grows with depth as the stress does.
+
     The state holds p_c as ``"preconsolidation"`` and the accumulated plastic strain, the sum of
     sqrt(2/3) |d eps_p|, as ``"plastic_strain"``, both of shape ``(n,)``.
 
@@ -69,6 +72,7 @@ class ModifiedCamClay(CompiledMaterial):
                 "reference_pressure",
             )
         }
+        | {"overconsolidation": {"least": 1.0}}
     )
     yield_tolerance: ClassVar[float] = 1e-13
     _loop: ClassVar[str] = "cam_clay"
@@ -79,8 +83,9 @@ class ModifiedCamClay(CompiledMaterial):
         swelling: ArrayLike | Field,
         critical_ratio: ArrayLike | Field,
         shear_modulus: ArrayLike | Field,
-        preconsolidation: ArrayLike | Field,
-        reference_pressure: ArrayLike | Field,
+        preconsolidation: ArrayLike | Field | None = None,
+        reference_pressure: ArrayLike | Field | None = None,
+        overconsolidation: ArrayLike | Field | None = None,
     ) -> None:
         """Set the parameters.
 
@@ -91,18 +96,27 @@ class ModifiedCamClay(CompiledMaterial):
             shear_modulus: G, in units of stress.
             preconsolidation: Initial p_c, in units of stress.
             reference_pressure: p_r, the pressure of the body that has not moved, at most p_c.
+            overconsolidation: Instead of ``preconsolidation``, at least 1: initial p_c over that at
+                which the stress would yield that a point begins with, ``initial_stress=`` or p_r.
 
         Raises:
-            MPMError: A value is out of range.
+            MPMError: A value is out of range, or other than one of ``preconsolidation`` and
+                ``overconsolidation`` is given.
         """
+        if reference_pressure is None or (preconsolidation is None) == (overconsolidation is None):
+            raise MPMError(
+                "ModifiedCamClay needs a reference_pressure, and either preconsolidation, the "
+                "initial p_c, or overconsolidation, its ratio to what the first stress asks for."
+            )
         self.parameters = checked(
             self.limits,
             compression=compression,
             swelling=swelling,
             critical_ratio=critical_ratio,
             shear_modulus=shear_modulus,
-            preconsolidation=preconsolidation,
             reference_pressure=reference_pressure,
+            preconsolidation=preconsolidation,
+            overconsolidation=overconsolidation,
         )
         self._require_order()
 
@@ -111,7 +125,9 @@ class ModifiedCamClay(CompiledMaterial):
         own = self.parameters
         if exceeds(own, "swelling", "compression", np.greater_equal):
             raise MPMError("swelling must be less than compression, at each point.")
-        if exceeds(own, "reference_pressure", "preconsolidation"):
+        if {"preconsolidation", "overconsolidation"} <= own.keys():
+            raise MPMError("A ModifiedCamClay has preconsolidation or overconsolidation, not both.")
+        if "preconsolidation" in own and exceeds(own, "reference_pressure", "preconsolidation"):
             raise MPMError("reference_pressure must be at most preconsolidation, at each point.")
 
     @override
@@ -120,10 +136,28 @@ class ModifiedCamClay(CompiledMaterial):
         state = super().initial_state(n, dim)
         self._require_order()
         state["stress"][:, :3] = -per_row(self.parameters["reference_pressure"])
-        state["preconsolidation"] = np.array(
-            np.broadcast_to(self.parameters["preconsolidation"], n), dtype=np.float64
-        )
+        own = self.parameters.get("preconsolidation")
+        if own is None:
+            own = self.parameters["overconsolidation"] * self.parameters["reference_pressure"]
+        state["preconsolidation"] = np.array(np.broadcast_to(own, n), dtype=np.float64)
         return state
+
+    @override
+    def stressed_state(
+        self,
+        cauchy_stress: Array,
+        displacement_gradient: Array,
+        variables: Mapping[str, Array] = MappingProxyType({}),
+    ) -> State:
+        if "overconsolidation" in self.parameters and "preconsolidation" not in variables:
+            ratio = self._kinematics.volume_ratio(displacement_gradient)[:, None, None]
+            stress = to_vector(ratio * cauchy_stress, displacement_gradient.shape[-1])
+            p = -trace(stress) / 3.0
+            q = np.sqrt(1.5) * norm(deviator(stress)) / self.parameters["critical_ratio"]
+            with np.errstate(invalid="ignore", divide="ignore"):
+                p_c = self.parameters["overconsolidation"] * (p + q**2 / p)
+            variables = {**variables, "preconsolidation": np.where(p > 0.0, p_c, 1.0)}
+        return super().stressed_state(cauchy_stress, displacement_gradient, variables)
 
     def elastic_strain(self, stress: Array) -> Array:
         """Return the elastic strain, shape ``(n, m)``, of stresses ``(n, m)``.

@@ -28,8 +28,8 @@ class FrictionalMaterial(SofteningMaterial):
 
     Hencky elasticity at finite strain; the state holds the accumulated plastic strain kappa, the
     sum of sqrt(2/3) |d eps_p|, as ``"plastic_strain"``, shape ``(n,)``. Plasticity is perfect, or
-    softens: cohesion and angle of friction fall as c_r + (c - c_r) exp(-decay kappa). A step has
-    the strength of its beginning, so returns stay closed forms and tangents exact.
+    softens: cohesion and angles fall as c_r + (c - c_r) exp(-decay kappa). A step has the strength
+    of its beginning, so returns stay closed forms and tangents exact.
 
     Attributes:
         volume_correction: Whether volume that opens at the apex closes again before there is
@@ -48,6 +48,7 @@ class FrictionalMaterial(SofteningMaterial):
             "tension_cutoff": {"least": 0.0},
             "cohesion_residual": {"least": 0.0},
             "friction_residual": {"least": 0.0, "below": 90.0},
+            "dilation_residual": {"least": 0.0, "below": 90.0},
             "decay": {"least": 0.0},
         }
     )
@@ -105,8 +106,12 @@ class FrictionalMaterial(SofteningMaterial):
         *,
         cohesion: ArrayLike | Field | None = None,
         friction_angle: ArrayLike | Field | None = None,
+        dilation_angle: ArrayLike | Field | None = None,
     ) -> Self:
-        """Return this law with a strength that falls as plastic strain accumulates.
+        """Return this law with a strength, or a dilation, that falls as plastic strain accumulates.
+
+        Where dilation alone falls, to nothing, soil grows by some sqrt(3) psi/decay of its volume
+        in plane strain, with psi in radians, and then shears at constant volume.
 
         Args:
             decay: How fast: by 1/e in a plastic strain of 1/decay.
@@ -115,11 +120,17 @@ class FrictionalMaterial(SofteningMaterial):
             friction_angle: Angle of friction after much plastic strain, the parameter
                 ``"friction_residual"``; ``None``: as before. The angle of dilation falls with it
                 where it is larger.
+            dilation_angle: Angle of dilation after much plastic strain, ``"dilation_residual"``;
+                ``None``: as before.
 
         Raises:
-            MPMError: A value is out of range, neither strength falls, or one rises.
+            MPMError: A value is out of range, none falls, or one rises.
         """
-        strengths = {"cohesion_residual": cohesion, "friction_residual": friction_angle}
+        strengths = {
+            "cohesion_residual": cohesion,
+            "friction_residual": friction_angle,
+            "dilation_residual": dilation_angle,
+        }
         given: dict[str, Any] = {"decay": decay}
         given |= {name: value for name, value in strengths.items() if value is not None}
         other = self.with_parameters(**given)
@@ -144,6 +155,11 @@ class FrictionalMaterial(SofteningMaterial):
 
     @override
     def softening_by(self, average: Array) -> Self:
+        if "dilation_residual" in self.parameters:
+            raise MPMError(
+                "In a Body with length= the dilation of its law does not fall: leave out length=, "
+                "or the dilation_angle of with_softening()."
+            )
         other = super().softening_by(average)
         if other is not self:
             other.symmetric = False
@@ -158,6 +174,8 @@ class FrictionalMaterial(SofteningMaterial):
             other.symmetric = angles[2] == angles[3]
         elif len(replaced) == 1:
             other.symmetric = False
+        if "dilation_residual" in other.parameters:
+            other.symmetric = False
         return other
 
     @override
@@ -171,9 +189,9 @@ class FrictionalMaterial(SofteningMaterial):
             if name in self.parameters:
                 slope = np.tan(np.radians(self.parameters[name])) / factor
                 values[name] = np.degrees(np.arctan(slope))
-        values["dilation_angle"] = np.minimum(
-            self.parameters["dilation_angle"], values["friction_angle"]
-        )
+        for name in ("dilation_angle", "dilation_residual"):
+            if name in self.parameters:
+                values[name] = np.minimum(self.parameters[name], values["friction_angle"])
         known = {n: v if isinstance(v, np.ndarray) else float(v) for n, v in values.items()}
         return self.with_parameters(**known)
 
@@ -210,7 +228,11 @@ class FrictionalMaterial(SofteningMaterial):
 _ANGLES = ("friction_angle", "dilation_angle")
 #: Angle of friction that a strength which grows goes up to, in degrees.
 STEEPEST = 89.0
-_RESIDUALS = {"cohesion": "cohesion_residual", "friction_angle": "friction_residual"}
+_RESIDUALS = {
+    "cohesion": "cohesion_residual",
+    "friction_angle": "friction_residual",
+    "dilation_angle": "dilation_residual",
+}
 
 
 def _require_softening(parameters: Mapping[str, Parameter]) -> None:

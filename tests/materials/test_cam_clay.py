@@ -30,6 +30,12 @@ def clay(overconsolidation=1.0, **options):
     return ModifiedCamClay(**{**arguments, **options})
 
 
+def overconsolidated(ratio, **options):
+    """Return that clay with a p_c in proportion to its first stress."""
+    numbers = {"reference_pressure": P0, "overconsolidation": ratio} | options
+    return ModifiedCamClay(LAMBDA, KAPPA, M, G, **numbers)
+
+
 def invariants(state):
     """Return p and q of states."""
     stress = state["stress"]
@@ -171,6 +177,49 @@ def test_undrained_strength(overconsolidation):
     assert abs(q[-1] / p[-1] / M - 1.0) < 1e-4
 
 
+@pytest.mark.parametrize("overconsolidation", [1.0, 2.0])
+def test_overconsolidated_ground_has_a_strength_in_proportion_to_its_stress(overconsolidation):
+    """c_u = (M p0/2) (R/2)^Lambda at each pressure, whatever the reference pressure is."""
+    material = overconsolidated(overconsolidation)
+    pressure = np.array([20.0, 100.0, 300.0])
+    first = np.multiply.outer(-pressure, np.eye(3))
+    state = material.stressed_state(first, np.zeros((3, 3, 3)))
+    for eps in np.linspace(0.0, 0.5, 401)[1:]:
+        H = np.diag(np.expm1(eps * np.array([0.5, -1.0, 0.5])))
+        state = material.update(np.broadcast_to(H, (3, 3, 3)), state, tangent=False).state
+    _, q = invariants(state)
+    strength = 0.5 * M * pressure * (0.5 * overconsolidation) ** RATIO
+    np.testing.assert_allclose(0.5 * q, strength, rtol=3e-3)
+
+
+@pytest.mark.parametrize("K0", [0.5, 1.0, 1.4])
+def test_preconsolidation_goes_with_the_stress_of_the_ground(K0):
+    """p_c = R (p + q^2/(M^2 p)) of the stress at rest at each depth, which is in equilibrium."""
+    V = vectors(box([0.0, 0.0], [1.0, 5.0], [2, 10], QUADRILATERAL))
+    body = mpm.Particles(box([0.0, 0.0], [1.0, 4.0], [4, 16], QUADRILATERAL), V)
+    gravity = (0.0, -10.0)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(
+            body,
+            overconsolidated(1.5),
+            density=2.0,
+            body_force=gravity,
+            initial_stress=mpm.geostatic(4.0, 2.0, K0, gravity, surcharge=5.0),
+            tractions=[((0.0, -5.0), 1)],
+            facet_tags=mpm.facet_tags(body.mesh, {1: mpm.region(y=4.0)}),
+        ),
+        bcs=[mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=1.0), mpm.held(V, 1, y=0.0)],
+    )
+    problem.solve()
+    assert np.abs(body.displacement.x.array).max(initial=0.0) < 1e-10
+    down = 5.0 + 20.0 * (4.0 - body.centroid[:, 1])
+    p, q = (1.0 + 2.0 * K0) / 3.0 * down, np.abs(1.0 - K0) * down
+    known = 1.5 * (p + (q / M) ** 2 / p)
+    (points,) = problem.points
+    found = points.last.variable("preconsolidation").reshape(known.shape[0], -1).mean(axis=1)
+    np.testing.assert_allclose(found, known, rtol=1e-9)
+
+
 @pytest.mark.parametrize("overconsolidation", [1.0, 5.0])
 def test_drained_compression_ends_at_the_critical_state(overconsolidation):
     """q = M p with the lateral stress held, at p = 3 p0/(3 - M)."""
@@ -210,6 +259,22 @@ def test_parameters_per_point():
 def test_bad_parameters(arguments, message):
     with pytest.raises(MPMError, match=message):
         clay(**arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"reference_pressure": None}, "needs a reference_pressure, and either"),
+        ({"overconsolidation": None}, "either preconsolidation"),
+        ({"preconsolidation": 2.0 * P0}, "either preconsolidation"),
+        ({"overconsolidation": 0.9}, "overconsolidation is 0.9 but must be finite, at least 1"),
+    ],
+)
+def test_bad_overconsolidation(arguments, message):
+    with pytest.raises(MPMError, match=message):
+        overconsolidated(2.0, **arguments)
+    with pytest.raises(MPMError, match="not both"):
+        clay().with_parameters(overconsolidation=2.0).initial_state(1, 2)
 
 
 def test_confined_layer_between_plates_is_compressed_along_lambda():

@@ -118,6 +118,53 @@ def test_softening_that_makes_no_sense_is_refused(given, words):
         VonMises(1e3, 0.3, yield_stress=1.0).with_softening(**given)
 
 
+def pressure_of_sheared_sand(steps, angle=12.0, decay=15.0):
+    """Return how far the mean pressure of sand has grown, over its bulk modulus, in shear.
+
+    Its volume is held, so that this is the volume by which it has dilated; and what is exact:
+    dv = sqrt(3) sin(psi)/sqrt(1 + sin(psi)^2) dkappa in the plane, up to the last kappa.
+    """
+    sand = MohrCoulomb(1e4, 0.3, 1.0, friction_angle=35.0, dilation_angle=angle)
+    sand = sand.with_softening(decay, dilation_angle=0.0)
+    state = sand.stressed_state(-10.0 * np.eye(3)[None], np.zeros((1, 2, 2)))
+    for shear in np.linspace(0.0, 1.0, steps + 1)[1:]:
+        H = np.array([[[0.0, shear], [0.0, 0.0]]])
+        state = sand.update(H, state, tangent=False).state
+    grown = -state["stress"][0, :3].sum() / 3.0 - 10.0
+    kappa = np.linspace(0.0, state["plastic_strain"][0], 20001)
+    sine = np.sin(np.radians(angle) * np.exp(-decay * kappa))
+    exact = np.trapezoid(np.sqrt(3.0) * sine / np.sqrt(1.0 + sine**2), kappa)
+    return grown / sand.bulk, exact
+
+
+def test_dilation_that_falls_ends_at_a_volume():
+    errors = []
+    for steps in (400, 800, 1600):
+        found, exact = pressure_of_sheared_sand(steps)
+        errors.append(abs(found / exact - 1.0))
+    assert errors[-1] < 3e-3 and np.abs(np.log2(np.divide(errors[:-1], errors[1:])) - 1).max() < 0.1
+    assert exact == pytest.approx(np.sqrt(3.0) * np.radians(12.0) / 15.0, rel=0.02)
+
+
+def test_dilation_falls_for_all_that_asks_for_the_law():
+    sand = MohrCoulomb(1e4, 0.3, 1.0, friction_angle=35.0, dilation_angle=35.0)
+    falls = sand.with_softening(15.0, dilation_angle=5.0)
+    assert sand.symmetric and not falls.symmetric
+    for law in (falls, falls.with_softening(15.0, friction_angle=30.0)):
+        after = law.softened(np.array([0.0, 0.1, 9.0])).parameters["dilation_angle"]
+        np.testing.assert_allclose(after, 5.0 + 30.0 * np.exp([0.0, -1.5, -135.0]))
+    weak, most = falls.weakened(10.0), np.degrees(np.arctan(np.tan(np.radians(35.0)) / 10.0))
+    after = weak.softened(np.ones(1)).parameters["dilation_angle"]
+    np.testing.assert_allclose([weak.parameters["dilation_residual"], after[0]], most)
+    for law, words in (
+        (lambda: falls.softening_by(AVERAGE), "with length= the dilation"),
+        (lambda: sand.with_softening(15.0, dilation_angle=36.0), "dilation_residual is larger"),
+        (lambda: sand.with_softening(15.0), "Softening needs decay and a residual"),
+    ):
+        with pytest.raises(MPMError, match=words):
+            law()
+
+
 def test_laws_that_do_not_soften_stay_as_they_are():
     for law in (Hencky(1e3, 0.3), VonMises(1e3, 0.3, yield_stress=1.0)):
         assert not law.softens
