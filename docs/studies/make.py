@@ -41,7 +41,6 @@ import locking
 import methods
 import soils
 import solver
-import splitting
 import step_size
 import supports
 import validation
@@ -54,7 +53,6 @@ SCRIPTS = (
     step_size,
     load_steps,
     locking,
-    splitting,
     soils,
     methods,
     high_order,

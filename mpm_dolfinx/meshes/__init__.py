@@ -6,8 +6,6 @@ A body mesh is an ordinary DOLFINx mesh whose cells are particle domains. This f
 a mesh needs whatever moves it: quadrature on its cells and gradients at the points
 (:mod:`~mpm_dolfinx.meshes.quadrature`), a bound of the Jacobian that tells which cells fold
 (:mod:`~mpm_dolfinx.meshes.jacobian_bound`), meshes of boxes around points
-(:mod:`~mpm_dolfinx.meshes.boxes`), and meshes made of a mesh: on other ranks
-(:mod:`~mpm_dolfinx.meshes.redistribution`), with cells cut or nodes moved
-(:mod:`~mpm_dolfinx.meshes.remesh`). Each of the latter two can carry tags, nodal values and values
-of cells from the mesh before to the one after.
+(:mod:`~mpm_dolfinx.meshes.boxes`), and meshes on other ranks
+(:mod:`~mpm_dolfinx.meshes.redistribution`), to which tags and values of cells are carried.
 """

@@ -8,7 +8,6 @@ these are other ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from ..boundary.supports import Support
@@ -112,58 +111,19 @@ class Setup:
         """Return the same on the present meshes of the particles (collective)."""
         return replace(self, bodies=tuple(body.carried() for body in self.bodies))
 
-    def require_movable(self, consequence: str = "the particles cannot move") -> None:
-        """Raise an error unless all bodies can be taken to other meshes.
-
-        Args:
-            consequence: What else cannot be.
+    def require_movable(self) -> None:
+        """Raise an error unless all bodies can move to other ranks.
 
         Raises:
             MPMError: Something lives on a present mesh.
         """
         for body in self.bodies:
-            body.require_movable(consequence)
-        self.require_no_supports(consequence)
-        self._require_all(lambda term: term.movable, consequence)
-
-    def require_no_supports(self, consequence: str) -> None:
-        """Raise an error where supports lie on a present mesh; see above."""
+            body.require_movable()
         if self.supports:
-            raise MPMError(f"supports= lie on the present body mesh, so {consequence}.")
-
-    def require_remeshable(self, consequence: str) -> None:
-        """Raise an error unless all terms follow bodies that are split or rebased; see above."""
-        self._require_all(lambda term: term.remeshable, consequence)
-
-    def _require_all(self, follows: Callable[[Term], bool], consequence: str) -> None:
-        """Raise an error unless all terms follow their bodies."""
+            raise MPMError("supports= lie on the present body mesh, so the particles cannot move.")
         for term in self.terms:
-            if not follows(term):
+            if not term.movable:
                 raise MPMError(
-                    f"A {type(term).__name__} lives on the present body mesh, so {consequence}."
+                    f"A {type(term).__name__} lives on the present body mesh, so the particles "
+                    "cannot move."
                 )
-
-    def require_divisible(self) -> None:
-        """Raise an error unless domains may be split.
-
-        Raises:
-            MPMError: They may not.
-        """
-        self.require_movable("domains cannot be split")
-        self.require_remeshable("domains cannot be split")
-        for body in self.bodies:
-            if body.f_bar != "none":
-                raise MPMError(
-                    f"Domains cannot be split with f_bar={body.f_bar!r}, whose averages they would "
-                    "change; it keeps most domains from folding by itself."
-                )
-            if body.length is not None:
-                raise MPMError(
-                    "Domains cannot be split in a body with a length=, which averages over the "
-                    "undeformed body; omit one of them."
-                )
-        if self.axisymmetric:
-            raise MPMError(
-                "Domains of a body of revolution cannot be split, since the halves have other "
-                "radii; use quadrature_degree=2 with f_bar='domain'."
-            )

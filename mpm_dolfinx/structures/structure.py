@@ -413,8 +413,6 @@ def _as_bodies(bodies: Any, what: str) -> list[Particles]:
     for body in every:
         if not isinstance(body, Particles) or not body.shares_nodes:
             raise MPMError(f"A {what} needs bodies of mpm.Particles with method='cpdi2'.")
-        if body.trail.rebases > 0:
-            raise MPMError(f"A {what} cannot be drawn in a body whose mesh was rebased.")
     if not every or len({id(body) for body in every}) < len(every):
         raise MPMError(f"A {what} needs one body or several that differ.")
     return every

@@ -19,7 +19,6 @@ from dolfinx import fem
 from ..assembly.field_forms import FieldForms
 from ..errors import ConvergenceError, MPMError, agree
 from ..io.snapshot import Kept, Taken, fill, of_cells
-from ..meshes.remesh import Column
 from ..parallel.boundary import collective
 from ..parallel.conjugate_gradients import conjugate_gradients
 from ..parallel.given import is_number
@@ -260,11 +259,11 @@ class FieldEquation(Term):
     def kept(self) -> Sequence[Kept]:
         return [_Values(self, self.name or f"equation{self._number}")]
 
-    def columns(self, body: int | None) -> dict[str, Column]:
+    def columns(self, body: int | None) -> dict[str, NDArray[Any]]:
         """Return the arrays that are kept on a body, by its number in the problem."""
         if body != self._body_number:
             return {}
-        return {self.field.name: Column(of_cells(self.field.previous), "nodes")}
+        return {self.field.name: of_cells(self.field.previous)}
 
     def take(self, taken: Taken) -> None:
         """Take what was kept (collective)."""
@@ -284,7 +283,7 @@ class _Values(Kept):
         self._equation, self.key = equation, key
 
     @override
-    def columns(self, body: int | None) -> dict[str, Column]:
+    def columns(self, body: int | None) -> dict[str, NDArray[Any]]:
         return self._equation.columns(body)
 
     @override
