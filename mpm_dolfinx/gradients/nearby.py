@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -17,6 +18,7 @@ from dolfinx import fem
 
 from ..constitutive.numbers import Governing
 from ..materials.base import State
+from ..parallel.totals import over_ranks
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from ..problems.motion import MovingProblem
@@ -85,8 +87,6 @@ class _Here:
         self.seen = [points.last.gradient for points in self.points]
         self.moved: Parameter | None = None
         self.side: tuple[Parameter, float, Rates] | None = None
-        self._own = [points.numbers.present() for points in self.points]
-        self._governing: dict[tuple[int, float], list[Governing]] = {}
 
     def return_to(self) -> None:
         """Come back, but for parameters."""
@@ -96,18 +96,6 @@ class _Here:
             body.placement.displacement[...] = body.carried_by(values)
         for points, states in zip(self.points, self.states, strict=True):
             points.go_from(states)
-
-    def govern(self, parameter: Parameter, amount: float) -> None:
-        """Let materials take over a changed parameter; what they make of it is kept."""
-        key = id(parameter), amount
-        known = self._own if amount == 0.0 else self._governing.get(key)
-        if known is None:
-            for points in self.points:
-                parameter.govern(points, amount)
-            self._governing[key] = [points.numbers.present() for points in self.points]
-        else:
-            for points, governing in zip(self.points, known, strict=True):
-                points.numbers.take(governing)
 
 
 class Nearby:
@@ -124,6 +112,8 @@ class Nearby:
         self._has_past = self._moving is not None or bool(problem.fields)
         self._masses: dict[tuple[int, float], NodalMass] = {}
         self._of_mass: NodalMass | None = None
+        self._governing: dict[tuple[int, float], list[Governing]] = {}
+        self._own: list[Governing] = []
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -132,6 +122,10 @@ class Nearby:
         Displacements and fields come back, and history as it was converged.
         """
         self._here = here = _Here(self._problem)
+        own = [points.numbers.present() for points in here.points]
+        same = _are_same(own, self._own)
+        if not over_ranks(self._problem.bodies[0].mesh.comm, same, MPI.LAND):
+            self._own, self._governing = own, {}
         with ExitStack() as blocks:
             if self._moving is not None:
                 blocks.enter_context(self._moving.inertia.held())
@@ -154,11 +148,23 @@ class Nearby:
         """Change a parameter by an amount; what materials make of that is kept (collective)."""
         parameter.shift(amount)
         if parameter.of_law:
-            self._here.govern(parameter, amount)
+            self._govern(parameter, amount)
         if parameter.outside and self._moving is not None and self._of_mass is not None:
             self._weigh(self._moving, self._of_mass, (id(parameter), amount))
         if parameter.outside and not self._has_past:
             self._problem.renew_external()
+
+    def _govern(self, parameter: Parameter, amount: float) -> None:
+        """Let materials take over a changed parameter; what they make of it is kept."""
+        key, points = (id(parameter), amount), self._here.points
+        known = self._own if amount == 0.0 else self._governing.get(key)
+        if known is None:
+            for own in points:
+                parameter.govern(own, amount)
+            self._governing[key] = [own.numbers.present() for own in points]
+        else:
+            for own, governing in zip(points, known, strict=True):
+                own.numbers.take(governing)
 
     def _weigh(self, problem: MovingProblem, own: NodalMass, key: tuple[int, float]) -> None:
         """Let bodies have the mass that they have with a changed parameter (collective)."""
@@ -242,6 +248,17 @@ def add_product(function: fem.Function, matrix: PETSc.Mat, change: PETSc.Vec) ->
 def varying(state: State) -> State:
     """Return the parts of a state that can vary little by little, in one order."""
     return {name: values for name, values in sorted(state.items()) if values.dtype.kind == "f"}
+
+
+def _are_same(some: Sequence[Governing], others: Sequence[Governing]) -> bool:
+    """Return whether the materials of all bodies are the same objects."""
+    pairs = zip(some, others, strict=False)
+    return len(some) == len(others) and all(
+        len(one.materials) == len(other.materials)
+        and all(a is b for a, b in zip(one.materials, other.materials, strict=True))
+        and one.modulus is other.modulus
+        for one, other in pairs
+    )
 
 
 def _same(side: tuple[Parameter, float, Rates], other: tuple[Parameter, float, Rates]) -> bool:

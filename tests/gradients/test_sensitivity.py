@@ -229,6 +229,29 @@ def test_a_parameter_that_is_zero_has_a_scale():
     assert gap < 1e-6 * size(difference)
 
 
+def test_a_path_changes_another_number_of_the_law():
+    """What laws are made of beside the state is made anew as a path changes them."""
+
+    def ended(young, follows=False):
+        values = VON_MISES | {"young": young}
+        scene = Slump(von_mises, values)
+        strength = scene.named["strength"]
+
+        def path(t):
+            strength.value = (1.0 - 0.3 * t) * values["strength"]
+
+        gradient = mpm.Sensitivity(scene.problem, [scene.named["young"]]) if follows else None
+        scene.problem.solve(4, update=path)
+        return scene.particles.displacement.x.array.copy(), gradient
+
+    young = VON_MISES["young"]
+    _, gradient = ended(young, follows=True)
+    after, before = (ended(young * (1.0 + sign * 1e-6))[0] for sign in (1.0, -1.0))
+    difference = (after - before) / (2e-6 * young)
+    gap = size(gradient.displacement[0].x.array - difference)
+    assert gap < 1e-6 * size(difference)
+
+
 def test_a_run_is_what_it_is_without():
     """Who looks at a run does not change it, not in the last bit."""
     ends = []
