@@ -19,7 +19,7 @@ CASES = Path(__file__).parents[2] / "benchmarks" / "cases"
 #: Programs that ``make test`` runs, and numbers that it leaves to ``make test-all``.
 SHORT = ("compaction", "column_free", "snap_through")
 LONG = {
-    *("sand-damped", "sand-dilates", "notch"),
+    *("sand-damped", "sand-dilates", "notch", "retrogression"),
     *("vortex", "disc", "discs", "discs-contact", "column"),
     "indentation",
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
@@ -330,6 +330,16 @@ RUNS = {
         "--aspect 0.5 --cells 6 --rayleigh 0",
         {"ratio": 1.15, "kinetic_left": 0.05},
     ),
+    "retrogression": (
+        "retrogression",
+        "--cells 5 --crest 8 --length 1 --decay 20 --time 2 --steps 20",
+        {"cutbacks": 2},
+    ),
+    "slope-stands": (  # 45 % stronger than Taylor's chart asks for
+        "retrogression",
+        "--cells 4 --crest 8 --length 1.3 --peak 25 --time 1 --steps 5",
+        {"run_out": 0.02, "retrogression": 0.0},
+    ),
     "sand-damped": (
         "sand_column",
         "--aspect 2 --cells 10 --rayleigh 1.6e-5",
@@ -396,6 +406,7 @@ RUNS = {
 #: Cases that go through time, whose load is that.
 IN_TIME = {
     "sand_column",
+    "retrogression",
     "flying_bar",
     "spinning_block",
     "consolidation",
@@ -434,6 +445,7 @@ KEYS = {
     "column_dynamic": {"toe", "top"},
     "taylor": {"length", "radius", "strain", "lift"},
     "sand_column": {"run_out", "experiment", "ratio", "deposit", "front", "height_at_wall"},
+    "retrogression": {"run_out", "retrogression", "kinetic_left", "alternations"},
     "strength": {"factor", "exact", "ratio", "plateau", "particles"},
     "consolidation": {"error", "degree", "error_degree", "particles"},
     "seepage": {"discharge", "exact", "error"},
@@ -513,6 +525,8 @@ def test_numbers(case, capfd):
         assert abs(numbers["taylor"] - 2.0) < 0.05
     if name == "sand_column":
         assert numbers["ratio"] > 0.85
+    if case == "retrogression":
+        assert numbers["retrogression"] > 1.5 * numbers["run_out"] > 1.5
     if name in ("compaction", "column_roller") and "--elements 8" in arguments:
         each = 2 if "tri" in arguments or "hex" in arguments else 1
         assert numbers["particles"] == 32 * each
@@ -652,6 +666,7 @@ def test_case_is_a_program(name, tmp_path):
         "vortex": "--steps 8",
         "column_dynamic": "--cell 1 --steps 20",
         "sand_column": "--cells 4 --time 0.1 --steps 5",
+        "retrogression": "--cells 4 --crest 5 --length 1.3 --time 0.2 --steps 2",
         "hertz": "--cells 2 --steps 2",
         "penetration": "--cell 0.25 --depth 0.05 --steps 4",
         "incline": "--steps 5",
