@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from mpi4py import MPI
@@ -63,18 +63,27 @@ class FusedTangent:
         self._rows: tuple[Any, Any] = (), ()  # of the matrix, in columns of this rank and in others
         self._room = [no_values, no_values]  # for entries in columns of this rank, and in others
 
-    def restrict(self, fields: Sequence[Restriction], sizes: tuple[int, int]) -> None:
+    def restrict(
+        self,
+        fields: Sequence[Restriction],
+        sizes: tuple[int, int],
+        release: Callable[[], None] | None = None,
+    ) -> None:
         """Take over the present transfer and unknowns (collective).
 
         Args:
             fields: Those of each field.
             sizes: Number of unknowns of this rank and of all ranks.
+            release: Called before the matrix is made anew, so that others let go of the old one.
         """
         same = self._A is not None and self._A.getSizes()[0] == sizes
         pairs = list(zip(self._blocks, fields, strict=True))
         for block, field in sorted(pairs, key=lambda pair: pair[0].is_carried):  # (hosts first)
             same &= block.restrict(field)
         if not over_ranks(self._comm, same, MPI.LAND):
+            self._A, self._rows = None, ((), ())
+            if release is not None:
+                release()
             self._make_matrix(fields, sizes)
             self._statistics.count("patterns")
         for block, field in zip(self._blocks, fields, strict=True):

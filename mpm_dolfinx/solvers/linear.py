@@ -263,6 +263,12 @@ class ShiftedFactor:
         """Take the next tangent for a new one."""
         self.K = None
 
+    def release(self) -> None:
+        """Let go of the last tangent and of the levels below it (collective)."""
+        if self.iterates:
+            self._choose(True)
+            self.P = None
+
     def set(self, K: PETSc.Mat, levels: Levels, damping: float = 0.0) -> None:
         """Factorise K with the step's shift, or with a larger one (collective).
 

@@ -169,6 +169,10 @@ class NewtonSolver:
         if self._attempt is not None:
             self._attempt.yielding.clear()
 
+    def release(self) -> None:
+        """Let go of the last tangent, which is needed no more (collective)."""
+        self._factor.release()
+
     def solve(
         self,
         problem: ReducedProblem,

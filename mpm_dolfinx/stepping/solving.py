@@ -144,7 +144,7 @@ class StepSolver:
         changes = [new - old for new, old in zip(goal.values, before, strict=True)]
         while True:
             newton.forget()
-            reduced.begin(changes, size, before)
+            reduced.begin(changes, size, before, newton.release)
             system: ReducedProblem = reduced
             if control is not None:
                 system = ControlledSystem(reduced, control, goal.parameter, list(bodies))

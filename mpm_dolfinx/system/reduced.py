@@ -98,6 +98,7 @@ class ReducedSystem:
         changes: Sequence[NDArray[np.float64]],
         size: float,
         before: Sequence[NDArray[np.float64] | None] | None = None,
+        release: Callable[[], None] | None = None,
     ) -> None:
         """Prepare a step, or another try of the same.
 
@@ -105,6 +106,7 @@ class ReducedSystem:
             changes: Change of the Dirichlet values, on the local dofs of V, for each field.
             size: Size of the step, in load factor or parameter of the path.
             before: Totals of the Dirichlet values at its beginning, for each field; ``None``: zero.
+            release: Called where the last tangent is needed no more.
 
         Raises:
             ParticleOutsideError: Where the last step left a domain outside the background.
@@ -119,7 +121,7 @@ class ReducedSystem:
         unknowns.follow()
         if unknowns.numbering is None:
             with self._statistics.phase("transfer"):
-                self._find_unknowns()
+                self._find_unknowns(release)
         with self._statistics.phase("assemble"):
             self.balance.begin()
             for field in self.fields:
@@ -149,10 +151,10 @@ class ReducedSystem:
                 field.unit = float(2.0 ** np.round(0.5 * np.log2(whole / size)))
         self._find_unknowns()
 
-    def _find_unknowns(self) -> None:
+    def _find_unknowns(self, release: Callable[[], None] | None = None) -> None:
         unknowns, statistics = self.unknowns, self._statistics
         numbering = unknowns.find()
-        self.tangent.renew(numbering)
+        self.tangent.renew(numbering, release)
         counts: dict[str, int] = {}
         for field in self.fields:
             for name, count in field.counts.items():

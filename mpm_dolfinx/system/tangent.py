@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from petsc4py import PETSc
@@ -105,8 +105,13 @@ class Tangent:
         bodies: list[Particles | CarriedField] = [body for body, _ in self._fused_on(field)]
         return bodies + [body for body in carried if self._unknowns.place(body)[0] is field]
 
-    def renew(self, numbering: Numbering) -> None:
-        """Take over the present unknowns; matrices last as long as these are numbered alike."""
+    def renew(self, numbering: Numbering, release: Callable[[], None] | None = None) -> None:
+        """Take over the present unknowns; matrices last as long as these are numbered alike.
+
+        Args:
+            numbering: The present unknowns.
+            release: As in :meth:`.FusedTangent.restrict`.
+        """
         if self._numbering is numbering:
             return
         self._numbering = numbering
@@ -114,7 +119,8 @@ class Tangent:
         if self.loops is not None:
             subspaces = self._unknowns.subspaces
             reduced = [one.restriction(self._reduced_on(one.host)) for one in subspaces]
-            self.loops.restrict([restriction for restriction, _ in reduced], reduced[0][1])
+            its = [restriction for restriction, _ in reduced]
+            self.loops.restrict(its, reduced[0][1], release)
 
     def masses(self, masses: Masses) -> tuple[PETSc.Mat | None, list[Particles]]:
         """Reduce the mass of bodies by the compiled loops, as far as these know them.

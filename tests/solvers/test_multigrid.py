@@ -12,6 +12,7 @@ from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.assembly.fused import FusedTangent
 from mpm_dolfinx.errors import MPMError
 from mpm_dolfinx.materials import Hencky, LinearElastic, MohrCoulomb, VonMises
 from mpm_dolfinx.solvers import linear, strategies
@@ -206,6 +207,22 @@ def test_iterations_do_not_grow_with_the_number_of_unknowns():
         statistics = run.history.statistics
         counts.append(statistics["krylov_iterations"] / run.history.total_iterations)
     assert counts[2] <= 1.3 * counts[0] + 1.0
+
+
+def test_a_tangent_is_let_go_of_before_the_next_has_room(monkeypatch):
+    run, make, kept = heavy(20, linear_solver="multigrid"), FusedTangent._make_matrix, []
+
+    def make_matrix(self, *given):
+        kept.append(run.A)
+        make(self, *given)
+
+    monkeypatch.setattr(FusedTangent, "_make_matrix", make_matrix)
+    run.solve(steps=3)
+    assert len(kept) > 1 and kept == [None] * len(kept)
+    assert run.A is not None
+    factored = heavy(20, linear_solver="direct")
+    factored.solve(steps=3)
+    assert_same(factored, run)
 
 
 def tied(linear_solver):
