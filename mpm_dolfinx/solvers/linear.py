@@ -22,7 +22,7 @@ from .problem import Levels
 from .refinement import KRYLOV, Refinement
 from .refusals import options_refused, require_factor
 from .saddle import SaddleMultigrid
-from .strategies import STRATEGIES, mumps_options
+from .strategies import STRATEGIES, Coarsening, mumps_options
 from .workspace import FACTORS, give_workspace, lacks_workspace
 
 __all__ = ["ShiftedFactor"]
@@ -223,10 +223,11 @@ class ShiftedFactor:
         if self._linear_solver != "auto":
             return self._linear_solver == "multigrid"
         least = self._strategy.crossover
-        if least is None or not self._symmetric or self._constrained:
+        if least is None or self._constrained or size < min(least.values()):
             return False
         # (how well boxes follow the tangent is asked of many unknowns alone: that takes time)
-        return size >= min(least.values()) and size >= least[levels.coarsening]
+        kind = levels.coarsening
+        return size >= least[kind if self._symmetric else max(kind, Coarsening.FAIR)]
 
     def _bearable(self, size: int) -> float:
         """Return the iterations for a decade of the residual that cost as much as a factor."""

@@ -18,8 +18,8 @@ class Coarsening(IntEnum):
     """How well the boxes of multigrid follow a tangent."""
 
     GOOD = 0  # backgrounds are grids, of degree 1 or of boxes
-    FAIR = 1  # of degree 1 and no grid, or a term couples two backgrounds
-    POOR = 2  # of degree 2, of simplices or no grid, or of a higher one, whose rows are long
+    FAIR = 1  # of degree 1 and no grid; a term couples two backgrounds, or tangents are unsymmetric
+    POOR = 2  # of degree 2, of simplices or no grid; of a higher one, whose rows are long; friction
 
 
 class Strategy(NamedTuple):

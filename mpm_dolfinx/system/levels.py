@@ -69,6 +69,8 @@ class Levels:
         hosts = ({id(unknowns.place(body)[0]) for body in term.bodies} for term in self._terms)
         if joint or any(len(fields) > 1 for fields in hosts):
             found.append(Coarsening.FAIR)  # each field has boxes of its own
+        if any(term.one_sided and not term.symmetric for term in self._terms):
+            found.append(Coarsening.POOR)  # a tangent of friction may be indefinite
         return max(found)
 
     def splits(self) -> Sequence[tuple[str, slice]]:

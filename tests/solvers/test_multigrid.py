@@ -319,6 +319,36 @@ def test_backgrounds_that_a_tie_couples_are_for_multigrid_later(monkeypatch):
     assert run.reduced.levels.coarsening is strategies.Coarsening.FAIR
 
 
+SAND = MohrCoulomb(1e6, 0.3, 2e4, 0.5, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("material", "friction", "least"),
+    [(PLASTIC, None, 700), (SAND, None, 1000), (PLASTIC, 0.0, 700), (PLASTIC, 0.3, 10**6)],
+)
+def test_unsymmetric_tangents_are_for_multigrid_later(monkeypatch, material, friction, least):
+    change(monkeypatch, crossover=from_on(700, 1000, 10**6))
+    for n in (20, 24):
+        run = heavy(n, material=material, weight=4e3, linear_solver="auto")
+        if friction is not None:
+            wall = mpm.contact.plane((6.0, 0.0), (-1.0, 0.0))
+            floor = mpm.contact.Rigid(run.particles, wall, friction)
+            run = posed(
+                mpm.QuasiStaticProblem,
+                run.particles,
+                material,
+                density=1.0,
+                body_force=(0.0, -4e3),
+                bcs=run.bcs,
+                terms=[floor],
+                linear_solver="auto",
+            )
+        run.solve(steps=1)
+        unknowns = run.history.statistics["free_dofs"]
+        assert 700 < unknowns and (unknowns < 1000) == (n == 20)
+        assert (run.history.statistics["krylov_iterations"] > 0) == (unknowns > least)
+
+
 def test_a_factorisation_goes_on_where_multigrid_takes_longer(monkeypatch):
     change(monkeypatch, crossover=from_on(700))
     counts = []
