@@ -37,11 +37,13 @@ PLANES = [(axis, 0.0) for axis in range(3)]
 COMM = MPI.COMM_WORLD
 
 
-def column(n: int, solver: str) -> mpm.QuasiStaticProblem:
-    """Return the column, n background cells wide."""
+def column(n: int, solver: str, spread: bool = False) -> mpm.QuasiStaticProblem:
+    """Return the column, n background cells wide; spread over ranks as its background is."""
     background = box([8.0, 8.0, 4.5], [2 * n, 2 * n, round(4.5 * n / 4)], HEXAHEDRON)
     V = fem.functionspace(background, ("Lagrange", 1, (3,)))
     particles = mpm.Particles(box([4.0] * 3, [2 * n] * 3, HEXAHEDRON), V)
+    if spread:
+        particles.repartition()
     return mpm.QuasiStaticProblem(
         mpm.Body(
             particles,
