@@ -64,12 +64,12 @@ RUNS = (
     "domain_distortion --steps 8",
     "ufl_material --elements 8",
     "ufl_material --elements 8 --domain tri --degree 2 --steps 20",
-    "hertz --cells 2 --steps 2",
-    "hertz --cells 2 --domain tet --steps 2",
-    "hertz --cells 2 --law nitsche --steps 2",
+    "sphere --cells 2 --steps 2",
+    "sphere --cells 2 --domain tet --steps 2",
+    "sphere --cells 2 --law nitsche --steps 2",
     "penetration --cell 0.25 --depth 0.1 --friction 0.3 --steps 8",
     "penetration --cell 0.25 --domain tri --obstacle pile --depth 0.1 --friction 0.5 --steps 8",
-    "colliding_discs --contact --cell 0.2 --dt 0.2 --steps 12 --friction 0.5 --beside 0.08",
+    "colliding_discs --fields two --cell 0.2 --dt 0.2 --steps 12 --friction 0.5 --beside 0.08",
 )
 
 

@@ -19,7 +19,7 @@ parser = kit.Parser("Von Mises block in space, squeezed between two plates.")
 parser.add_argument("--domain", choices=("hex", "tet"), default="hex", help="particle domains")
 parser.add_argument("--plates", choices=("rough", "smooth"), default="rough", help="the plates")
 parser.add_argument("--elements", type=kit.whole, default=4, help="background cells, 1 m")
-parser.add_argument("--steps", type=kit.whole, default=40, help="steps")
+parser.add_steps(40)
 parser.add_order()
 args = parser.parse()
 
@@ -93,7 +93,7 @@ def update(t):
 curve = [(0.0, 0.0)]
 failure = None
 try:
-    for step in kit.progress(problem.steps(args.steps, update=update), args.steps, args):
+    for step in kit.progress(problem.steps(**kit.chosen(args), update=update), args.steps, args):
         curve.append((squeeze * step.load, problem.reaction(plate)[2]))
 except mpm.MPMError as error:
     failure = error

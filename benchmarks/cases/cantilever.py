@@ -21,7 +21,7 @@ parser.add_argument("--domain", choices=("quad", "tri"), default="quad", help="p
 parser.add_argument("--root", choices=("clamped", "pinned"), default="clamped", help="support")
 parser.add_argument("--poisson", type=float, default=0.2, help="Poisson's ratio")
 parser.add_argument("--offset", type=float, default=0.0, help="of the beam, downwards, m")
-parser.add_argument("--steps", type=kit.whole, default=50, help="load steps")
+parser.add_steps(50)
 parser.add_f_bar()
 parser.add_mixed()
 parser.add_order()
@@ -105,7 +105,7 @@ path = [(0.0, 0.0, 0.0)]
 shapes = []
 failure = None
 try:
-    for step in kit.progress(problem.steps(args.steps), args.steps, args):
+    for step in kit.progress(problem.steps(**kit.chosen(args)), args.steps, args):
         path.append((step.load, *tip()))
         if args.plot and step.load >= 0.2 * (len(shapes) + 1) - 1e-9 and step.load < 1.0:
             shapes.append(kit.gathered(kit.nodes(particles)[along_axis]))

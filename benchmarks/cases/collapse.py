@@ -24,7 +24,7 @@ parser.add_argument(
 )
 parser.add_f_bar()
 parser.add_order()
-parser.add_argument("--steps", type=kit.whole, default=40, help="load steps")
+parser.add_steps(40)
 args = parser.parse()
 
 comm = MPI.COMM_WORLD
@@ -75,7 +75,7 @@ def displacement(corner, component: int) -> float:
 path = [(0.0, 0.0, 0.0)]
 failure = None
 try:
-    for step in kit.progress(problem.steps(args.steps), args.steps, args):
+    for step in kit.progress(problem.steps(**kit.chosen(args)), args.steps, args):
         path.append((step.load, displacement((0.0, size), 1), displacement((size, 0.0), 0)))
 except mpm.MPMError as error:
     failure = error

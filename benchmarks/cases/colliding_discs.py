@@ -19,11 +19,12 @@ parser.add_argument("--steps", type=kit.whole, help="time steps; up to 3.5 by dt
 parser.add_argument("--scheme", choices=("midpoint", "conserving", "euler"), default="conserving")
 parser.add_argument("--out-of-range", choices=("project", "reflect"), default="reflect")
 parser.add_argument(
-    "--contact", action="store_true", help="a background for each, and contact of their facets"
+    "--fields", choices=("one", "two"), default="one", help="two: with contact of the facets"
 )
 parser.add_argument("--friction", type=float, default=0.0, help="of the contact")
 parser.add_argument("--beside", type=float, default=0.0, help="how far the paths lie apart")
 args = parser.parse()
+separate = args.fields == "two"
 
 comm = MPI.COMM_WORLD
 h, speed = args.cell, 0.1
@@ -33,7 +34,7 @@ background = mesh.create_rectangle(
     comm, [[-0.2, -0.2], [1.2, 1.2]], [cells, cells], mesh.CellType.quadrilateral
 )
 V = fem.functionspace(background, ("Lagrange", 1, (2,)))
-spaces = [V, fem.functionspace(background, ("Lagrange", 1, (2,))) if args.contact else V]
+spaces = [V, fem.functionspace(background, ("Lagrange", 1, (2,))) if separate else V]
 
 
 def disc(centre, n):
@@ -55,10 +56,10 @@ side = np.sqrt(0.5) * args.beside / 2.0
 centres = (0.2 - side, 0.2 + side), (0.8 + side, 0.8 - side)
 bodies = [
     # (by contact, meshes do not mirror each other)
-    mpm.Particles(disc(c, n + number * args.contact), V, quadrature_degree=3)
+    mpm.Particles(disc(c, n + number * separate), V, quadrature_degree=3)
     for number, (c, V) in enumerate(zip(centres, spaces, strict=True))
 ]
-touch = mpm.contact.Pair(*bodies, friction=args.friction) if args.contact else None
+touch = mpm.contact.Pair(*bodies, friction=args.friction) if separate else None
 problem = mpm.DynamicProblem(
     [
         mpm.Body(body, mpm.materials.Hencky(1000.0, 0.3), density=1000.0, velocity=(way, way))

@@ -33,7 +33,7 @@ parser.add_argument("--cell", type=kit.positive, default=0.5, help="background c
 parser.add_argument(
     "--particles-per-cell", type=kit.whole, default=2, help="quadrilaterals, each way"
 )
-parser.add_argument("--steps", type=kit.whole, default=40, help="load steps")
+parser.add_steps(40)
 parser.add_argument("--width", type=kit.positive, help="of the background, m (ample by default)")
 parser.add_argument(
     "--outside", choices=("error", "stop", "delete"), default="error", help="if particles leave it"
@@ -138,7 +138,7 @@ def collapse(g0: float):
     try:
         if args.resume and comm.bcast(checkpoint.exists()):
             problem.restore(checkpoint, functions=[violation])
-        for _ in kit.progress(problem.steps(args.steps), args.steps, args):
+        for _ in kit.progress(problem.steps(**kit.chosen(args)), args.steps, args):
             most = violation.x.array[: particles.num_local]
             np.maximum(most, problem.yield_function, out=most)
             if checkpoint is not None:

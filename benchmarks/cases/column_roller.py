@@ -20,7 +20,7 @@ parser.add_argument("--domain", choices=tuple(kit.DOMAINS), default="quad", help
 parser.add_argument("--method", choices=kit.METHODS, default="cpdi2", help="rows of T")
 parser.add_argument("--small-strain", action="store_true", help="material of small strain")
 parser.add_argument("--young", type=kit.positive, default=2e5, help="Young's modulus, Pa")
-parser.add_argument("--steps", type=kit.whole, default=40, help="load steps")
+parser.add_steps(40)
 parser.add_argument(
     "--particles-per-cell", type=kit.whole, default=2, help="domains, each way in a cell"
 )
@@ -76,7 +76,7 @@ problem = mpm.QuasiStaticProblem(
 yield_violation = -np.inf
 failure = None
 try:
-    for _ in kit.progress(problem.steps(args.steps), args.steps, args):
+    for _ in kit.progress(problem.steps(**kit.chosen(args)), args.steps, args):
         yield_violation = max(yield_violation, kit.largest(problem.yield_function))
 except mpm.MPMError as error:
     failure = error

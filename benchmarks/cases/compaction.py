@@ -19,7 +19,7 @@ parser.add_argument("--elements", type=kit.whole, default=16, help="background c
 parser.add_argument("--domain", choices=tuple(kit.DOMAINS), default="quad", help="domains")
 parser.add_argument("--method", choices=kit.METHODS, default="cpdi2", help="rows of T")
 parser.add_argument("--young", type=kit.positive, default=1e4, help="Young's modulus")
-parser.add_argument("--steps", type=kit.whole, default=40, help="load steps")
+parser.add_steps(40)
 parser.add_order()
 args = parser.parse()
 
@@ -101,7 +101,7 @@ def errors(particles: mpm.Particles) -> tuple[float, float]:
 particles, problem = column(args.elements)
 failure = None
 try:
-    problem.solve(steps=args.steps, progress=not args.json)
+    problem.solve(**kit.chosen(args), progress=not args.json)
 except mpm.MPMError as error:
     failure = error
 
@@ -148,7 +148,7 @@ if args.plot:
     sizes, found = [8, 16, 32, 64], []
     for elements in sizes:
         other, again = column(elements)
-        again.solve(steps=args.steps)
+        again.solve(**kit.chosen(args))
         found.append(errors(other))
 
     if comm.rank == 0:

@@ -23,7 +23,7 @@ except ImportError:
 
 parser = kit.Parser("Thick tube under inner pressure: axisymmetric, and as a quarter ring.")
 parser.add_argument("--elements", type=kit.whole, default=16, help="cells over the wall")
-parser.add_argument("--steps", type=kit.whole, default=10, help="load steps")
+parser.add_steps(10)
 parser.add_order()
 args = parser.parse()
 if solve_bvp is None:
@@ -149,7 +149,7 @@ def solve(scene, n, axisymmetric):
         axisymmetric=axisymmetric,
         solver=mpm.Solver(petsc_options_prefix="cylinder_", stabilisation=kit.stabilisation(args)),
     )
-    for _ in kit.progress(problem.steps(args.steps), args.steps, args):
+    for _ in kit.progress(problem.steps(**kit.chosen(args)), args.steps, args):
         pass
     return particles, problem.history
 

@@ -35,7 +35,7 @@ parser.add_argument(
     "--finer", type=kit.count, default=0, help="how often cells are halved towards the strip's edge"
 )
 parser.add_argument("--small-strain", action="store_true", help="material of small strain")
-parser.add_argument("--steps", type=kit.whole, default=40, help="steps")
+parser.add_steps(40)
 args = parser.parse()
 
 comm = MPI.COMM_WORLD
@@ -124,7 +124,7 @@ problem = mpm.QuasiStaticProblem(
 path = [(0.0, 0.0)]
 failure = None
 try:
-    for step in kit.progress(problem.steps(args.steps), args.steps, args):
+    for step in kit.progress(problem.steps(**kit.chosen(args)), args.steps, args):
         path.append((step.load, -problem.reaction(footing)[1] / half_width))
 except mpm.MPMError as error:
     failure = error

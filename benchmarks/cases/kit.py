@@ -74,6 +74,11 @@ class Parser(argparse.ArgumentParser):
             )
         self.add_stabilisation()
 
+    def add_steps(self, default: int) -> None:
+        """Add the number of load steps, which an estimate of their error may choose."""
+        self.add_argument("--steps", type=steps, default=default, help="load steps, or auto")
+        self.add_argument("--tolerance", type=positive, default=1e-2, help="with --steps auto")
+
     def add_stabilisation(self) -> None:
         """Add the cures of badly supported dofs."""
         self.add_argument(
@@ -106,6 +111,11 @@ def whole(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a whole number from 1 on")
     return value
+
+
+def steps(text: str) -> int | str:
+    """A number of steps, or the word for steps that are chosen."""
+    return text if text == "auto" else whole(text)
 
 
 def count(text: str) -> int:
@@ -247,14 +257,43 @@ def lambert_w(x: Any) -> np.ndarray:
     return w
 
 
+# Hertz's pressure (1882) between long cylinders, from the middle outwards.
+
+
+def hertz(
+    x: np.ndarray, force: np.ndarray, length: np.ndarray, stiff: float, radius: float
+) -> tuple[float, np.ndarray]:
+    """The half width of contact and the mean pressure over facets of one of its halves.
+
+    `x` has the facets' middles, `force` what they bear, `length` how long they are; `stiff` is the
+    modulus and `radius` the radius of the cylinder that is as curved as both together.
+    """
+    whole = 2.0 * force.sum()
+    half = np.sqrt(4.0 * whole * radius / np.pi / stiff)
+
+    def below(s: np.ndarray) -> np.ndarray:
+        """The integral of the pressure from 0 to s."""
+        s = np.minimum(s / half, 1.0)
+        return whole / np.pi * (s * np.sqrt(1.0 - s**2) + np.arcsin(s))
+
+    return float(half), (below(x + length / 2) - below(x - length / 2)) / length
+
+
 # ## A run and its report
 
 
+def chosen(args: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of `problem.solve` and `problem.steps` for the options of `add_steps`."""
+    automatic = {"tolerance": args.tolerance} if args.steps == "auto" else {}
+    return {"steps": args.steps, **automatic}
+
+
 def progress(
-    steps: Iterable[mpm.Step], number: int, args: argparse.Namespace, done: Any = None
+    steps: Iterable[mpm.Step], number: int | str, args: argparse.Namespace, done: Any = None
 ) -> Iterator:
     """Go through load steps with the bar that `solve(progress=True)` shows."""
-    yield from steps if args.json or comm.rank > 0 else with_bar(steps, number, done)
+    whole = 1 if isinstance(number, str) else number
+    yield from steps if args.json or comm.rank > 0 else with_bar(steps, whole, done)
 
 
 def outcome(history: mpm.History, failure: mpm.MPMError | None) -> dict[str, Any]:

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """A column of dry sand that is let go, beside the run-out of experiments.
 
-demos/demo_sand_column.py is its simplest form. `deposit` is how far the sand has come that is
+demos/demo_sand_column.py is its simplest form. `runout` is how far the sand has come that is
 connected and at least one grain thick, over the column's width, without what was thrown ahead of it
 or is drawn out to a thread there. `experiment` is that of Lube, Huppert, Sparks & Freundt
 (2005) between plane walls: 1.2 a for aspects a = height/width below 1.8, 1.9 a^(2/3) above 2.8
-(straight in between); `ratio` is the one over the other. `run_out` is the same of the outermost
+(straight in between); `ratio` is the one over the other. `outermost` is the same of the outermost
 corner, `front` of the place up to which 99 % of the sand lies.
 
 With `--law mu-i` friction at rest is that of Mohr-Coulomb's sand in plane strain, and rises with
@@ -27,7 +27,7 @@ import mpm_dolfinx as mpm
 
 parser = kit.Parser("A column of dry sand that is let go.")
 parser.add_argument("--aspect", type=kit.positive, default=1.0, help="height over width")
-parser.add_argument("--cells", type=kit.whole, default=8, help="background cells in the width")
+parser.add_argument("--cell", type=kit.positive, default=1 / 8, help="over the width")
 parser.add_argument("--particles-per-cell", type=kit.whole, default=2, help="each way")
 parser.add_argument("--domain", choices=("tri", "quad"), default="tri", help="particle domains")
 parser.add_argument(
@@ -53,7 +53,8 @@ if args.law == "mu-i" and (args.cohesion or args.dilation_angle or args.no_volum
 
 comm = MPI.COMM_WORLD
 width, density, gravity = 1.0, 2000.0, 10.0  # m, kg/m3, m/s2
-a, h = args.aspect, width / args.cells
+n = max(1, round(1.0 / args.cell))
+a, h = args.aspect, width / n
 height = a * width
 
 
@@ -87,7 +88,7 @@ bcs = [
     fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 1, facets), V.sub(i))
     for i, facets in ((0, floor), (1, floor), (0, wall))
 ]
-n = args.particles_per_cell * args.cells
+n *= args.particles_per_cell
 body = kit.box([width, height], [n, max(1, round(n * a))], kit.DOMAINS[args.domain])
 particles = mpm.Particles(body, V, outside=args.outside)
 
@@ -155,17 +156,17 @@ def deposit() -> float:
     return float(places[np.flatnonzero(thickness < args.grain)[0]])
 
 
-history, run_out = problem.history, path[-1][1]
+history, outermost = problem.history, path[-1][1]
 connected = deposit() / width - 1.0
 kinetic = [energy.kinetic for energy in history.energies]
 at_wall = np.isclose(X[:, 0], 0.0)
 top = kit.largest((X[:, 1] + particles.displacement.x.array[1::2])[at_wall])
 numbers = {
     **kit.outcome(history, failure),
-    "run_out": run_out,
+    "outermost": outermost,
     "experiment": known,
     "ratio": connected / known,
-    "deposit": connected,
+    "runout": connected,
     "front": front(0.99) / width - 1.0,
     "height_at_wall": top,
     "kinetic_left": kinetic[-1] / max(kinetic),
@@ -174,11 +175,11 @@ numbers = {
     "lost_particles": history.statistics["lost_particles"],
 }
 rows = [
-    ("column", f"aspect {a:g}, {args.cells} cells wide, {particles.num_global} {args.domain}"),
+    ("column", f"aspect {a:g}, cells of {h:.3g} m, {particles.num_global} {args.domain}"),
     ("steps", f"{len(history.steps)}, {history.cutbacks} cutbacks"),
     ("linear solves in a step", f"{numbers['iterations_per_step']:.1f}"),
     ("run-out over width", f"{connected:.3f}, experiment {known:.3f}"),
-    ("outermost corner, 99 % of all", f"{run_out:.3f}, {numbers['front']:.3f}"),
+    ("outermost corner, 99 % of all", f"{outermost:.3f}, {numbers['front']:.3f}"),
     ("kinetic energy left", f"{numbers['kinetic_left']:.1e} of its largest"),
 ]
 
@@ -192,7 +193,7 @@ if args.plot:
         ax = axes["body"]
         ax.plot([0.0, width, width], [height, height, 0.0], color="0.4", ls="--", lw=1.0)
         ax.plot([width * (1.0 + known)] * 2, [0.0, 0.3 * height], color=kit.COLOURS["blue"])
-        reach = width * (1.3 + max(known, run_out))
+        reach = width * (1.3 + max(known, outermost))
         ax.set(xlim=(0.0, reach), ylim=(-h, 1.05 * height), xlabel="x, m", ylabel="y, m")
         fig.colorbar(colours, ax=ax, label="plastic strain", shrink=0.7)
         ax = axes["path"]

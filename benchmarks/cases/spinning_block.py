@@ -17,7 +17,7 @@ parser = kit.Parser("A free block that spins: angular momentum and energy.")
 parser.add_argument("--angle", type=kit.positive, default=0.04, help="radians in a step")
 parser.add_argument("--turn", type=kit.positive, default=20.0, help="radians in all")
 parser.add_argument("--steps", type=kit.whole, help="time steps; by angle and turn")
-parser.add_argument("--material", choices=("hencky", "von_mises"), default="hencky")
+parser.add_argument("--material", choices=("hencky", "neo_hooke", "von_mises"), default="hencky")
 parser.add_argument("--yield-stress", type=kit.positive, default=0.05, help="Pa, von Mises")
 parser.add_argument("--domain", choices=("quad", "tri", "hex"), default="quad")
 parser.add_argument("--cell", type=kit.positive, default=0.1, help="background cell size, m")
@@ -37,11 +37,12 @@ make = mesh.create_box if dim == 3 else mesh.create_rectangle
 background = make(comm, [[low] * dim, [low + size] * dim], [2 * half] * dim, kind)
 V = fem.functionspace(background, ("Lagrange", 1, (dim,)))
 body = make(comm, [[-0.5] * dim, [0.5] * dim], [n] * dim, kit.DOMAINS[args.domain])
-law = (
-    mpm.materials.Hencky(100.0, 0.3)
-    if args.material == "hencky"
-    else mpm.materials.VonMises(100.0, 0.3, rho_y=args.yield_stress)
-)
+elastic = (100.0, 0.3)
+law = {
+    "hencky": mpm.materials.Hencky(*elastic),
+    "neo_hooke": mpm.materials.NeoHooke(*elastic),
+    "von_mises": mpm.materials.VonMises(*elastic, rho_y=args.yield_stress),
+}[args.material]
 particles = mpm.Particles(body, V)
 problem = mpm.DynamicProblem(
     mpm.Body(

@@ -90,7 +90,7 @@ def percent(share: float) -> str:
 
 
 CLAMPED = "cantilever --degree 2 --cell 0.5", "--cell 0.25"
-HERTZ = "hertz --cells 3", "--cells 6"
+HERTZ = "sphere --cells 3", "--cells 6"
 COLUMN = "column_roller --elements 16", "--elements 64"
 STRIP = "strength --recommended --case"
 WEDGE = "penetration --obstacle wedge --depth 0.5"
@@ -212,10 +212,10 @@ WATER = {
         "--cell 0.083333",
     ),
     "Column, pressure (Terzaghi 1943)": Error(
-        "error", "consolidation --cells 8 --steps 16", "--cells 16 --steps 64"
+        "pressure_error", "consolidation --cell 0.125 --steps 16", "--cell 0.0625 --steps 64"
     ),
     "Its degree of consolidation": Error(
-        "error_degree", "consolidation --cells 8 --steps 16", "--cells 16 --steps 64"
+        "settlement_error", "consolidation --cell 0.125 --steps 16", "--cell 0.0625 --steps 64"
     ),
     "Slab between plates, largest pressure (Mandel 1953)": Value(
         "peak", "exact", "mandel_cryer --case slab --cells 4", "--cells 8 --steps 56", 4

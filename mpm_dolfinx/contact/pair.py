@@ -45,7 +45,9 @@ class Pair(Contact):
     same mesh. Then they feel each other by contact alone, where their facets meet::
 
         touch = mpm.contact.Pair(a, b, friction=0.2)
-        problem = mpm.QuasiStaticProblem([a, b], law, terms=[touch])
+        problem = mpm.QuasiStaticProblem(
+            [mpm.Body(a, law), mpm.Body(b, law)], bcs, terms=[touch]
+        )
 
     Points on the facets of each body meet the facets of the other, with the pressure of
     :class:`Rigid` for the stiffness of both bodies one behind the other.

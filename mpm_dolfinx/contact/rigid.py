@@ -48,7 +48,7 @@ class Rigid(Contact):
 
         shape = mpm.contact.polygon(corners, radius=0.05)
         pile = mpm.contact.Rigid(soil, shape, friction=0.3)
-        problem = mpm.QuasiStaticProblem(soil, law, terms=[pile])
+        problem = mpm.QuasiStaticProblem(mpm.Body(soil, law), bcs, terms=[pile])
         problem.solve(40, update=lambda t: pile.move((0.0, -0.5 * t)))
 
     Args:

@@ -55,7 +55,7 @@ class RigidBody(Driven):
     balance: a footing that a force presses down, and that is free to tilt::
 
         footing = mpm.contact.RigidBody(soil, shape, friction=0.5)
-        problem = mpm.QuasiStaticProblem(soil, law, terms=[footing])
+        problem = mpm.QuasiStaticProblem(mpm.Body(soil, law), bcs, terms=[footing])
         problem.solve(20, update=lambda t: footing.push((0.0, -300.0 * t), -20.0 * t))
 
     It has two or three displacements and one or three rotations; axisymmetric one displacement

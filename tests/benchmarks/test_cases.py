@@ -32,7 +32,7 @@ LONG = {
         "footing-edge",
     ),
     *("finer-footing", "mixed-footing"),
-    *("stiff-footing", "hertz", "hertz-penalty", "hertz-tets", "expansion-whole", "pile-deep"),
+    *("stiff-footing", "sphere", "sphere-penalty", "sphere-tets", "expansion-whole", "pile-deep"),
     *("taylor-whole", "pipe-rough", "wedge-fine", "ironing-stiff"),
     *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
 }
@@ -63,7 +63,7 @@ RUNS = {
     "consolidation": (
         "consolidation",
         "--settlement 0.3",
-        {"error": 7.5e-3, "error_degree": 5e-3, "iterations": 16},
+        {"pressure_error": 7.5e-3, "settlement_error": 5e-3, "iterations": 16},
     ),
     "mandel": (
         "mandel_cryer",
@@ -216,23 +216,29 @@ RUNS = {
         "--obstacle footing --young 5e4 --depth 6e-4 --radius 0.002 --law nitsche",
         {"ratio": 1.03, "cutbacks": 0, "iterations": 260, "penetration": 1e-4},
     ),
-    "hertz": (
+    "hertz": ("hertz", "", {"pressure_error": 0.067, "half_width": 1.035, "iterations": 24}),
+    "hertz-pair": (
         "hertz",
+        "--pair --law nitsche --degree 2 --steps 4",
+        {"pressure_error": 0.014, "half_width": 1.0, "force": 1.0, "iterations": 28},
+    ),
+    "sphere": (
+        "sphere",
         "--law nitsche",
         {"error_force": 0.03, "error_radius": 0.03, "error_pressure": 0.08, "iterations": 20},
     ),
-    "hertz-penalty": (
-        "hertz",
+    "sphere-penalty": (
+        "sphere",
         "",
         {"error_force": 0.03, "error_radius": 0.03, "error_pressure": 0.08, "iterations": 26},
     ),
-    "hertz-tets": (
-        "hertz",
+    "sphere-tets": (
+        "sphere",
         "--domain tet",
         {"error_force": 0.03, "error_radius": 0.03, "error_pressure": 0.08, "iterations": 24},
     ),
-    "hertz-coarse": (
-        "hertz",
+    "sphere-coarse": (
+        "sphere",
         "--cells 3 --law nitsche --penalty 0.5",
         {"error_force": 0.04, "error_radius": 0.01, "error_pressure": 0.08},
     ),
@@ -316,7 +322,7 @@ RUNS = {
     ),
     "discs-contact": (
         "colliding_discs",
-        "--contact --cell 0.1 --dt 0.05",
+        "--fields two --cell 0.1 --dt 0.05",
         {
             "energy_largest": 1e-6,
             "momentum_error": 1e-11,
@@ -327,7 +333,7 @@ RUNS = {
     "vortex": ("vortex", "", {"displacement_error": 4.6e-2, "velocity_error": 1.26e-1}),
     "sand": (
         "sand_column",
-        "--aspect 0.5 --cells 6 --rayleigh 0",
+        "--aspect 0.5 --cell 0.1667 --rayleigh 0",
         {"ratio": 1.15, "kinetic_left": 0.05},
     ),
     "retrogression": (
@@ -342,12 +348,12 @@ RUNS = {
     ),
     "sand-damped": (
         "sand_column",
-        "--aspect 2 --cells 10 --rayleigh 1.6e-5",
+        "--aspect 2 --cell 0.1 --rayleigh 1.6e-5",
         {"ratio": 1.15, "kinetic_left": 1e-4, "cutbacks": 35},
     ),
     "sand-dilates": (
         "sand_column",
-        "--aspect 2 --cells 10 --rayleigh 1e-5 --cohesion 1e3 --dilation-angle 10",
+        "--aspect 2 --cell 0.1 --rayleigh 1e-5 --cohesion 1e3 --dilation-angle 10",
         {"ratio": 1.3, "kinetic_left": 1e-3, "cutbacks": 35},
     ),
     "free-body": (
@@ -444,10 +450,10 @@ KEYS = {
     "vortex": {"displacement_error", "velocity_error"},
     "column_dynamic": {"toe", "top"},
     "taylor": {"length", "radius", "strain", "lift"},
-    "sand_column": {"run_out", "experiment", "ratio", "deposit", "front", "height_at_wall"},
+    "sand_column": {"runout", "experiment", "ratio", "outermost", "front", "height_at_wall"},
     "retrogression": {"run_out", "retrogression", "kinetic_left", "alternations"},
     "strength": {"factor", "exact", "ratio", "plateau", "particles"},
-    "consolidation": {"error", "degree", "error_degree", "particles"},
+    "consolidation": {"pressure_error", "degree", "settlement_error", "particles"},
     "seepage": {"discharge", "exact", "error"},
     "cone": {"factor", "exact", "rise"},
     "pipe": {"factor", "exact", "ratio", "plateau"},
@@ -455,7 +461,10 @@ KEYS = {
     "penetration": {"force", "depth", "ratio", "iterations_per_step", "penetration"},
     "incline": {"stick_angle", "exact", "ratio"},
     "ironing": {"force", "scatter", "ratio"},
-    "hertz": {"force", "error_force", "error_radius", "error_pressure", "error_most"},
+    "hertz": {
+        *("pressure_error", "max_pressure", "half_width", "force", "line_search_halvings"),
+    },
+    "sphere": {"force", "error_force", "error_radius", "error_pressure", "error_most"},
     "free_body": {"difference", "seconds_ratio", "unknowns"},
     "lshape": {"error", "estimate", "unknowns", "error_all_free", "unknowns_carried"},
     "gradient": {"taylor", "difference", "trend", "seconds_ratio"},
@@ -653,7 +662,7 @@ def test_case_is_a_program(name, tmp_path):
         "block3d": "--elements 2 --steps 4",
         "collapse": "--cell 2 --particles-per-cell 1 --f-bar domain --steps 4",
         "footing": "--cell 0.5 --steps 4",
-        "consolidation": "--cells 4 --steps 2",
+        "consolidation": "--cell 0.25 --steps 2",
         "mandel_cryer": "--cells 2",
         "expansion": "--cells 2 --steps 4 --widest 2",
         "strength": "--cell 0.5",
@@ -665,9 +674,10 @@ def test_case_is_a_program(name, tmp_path):
         "colliding_discs": "--steps 4",
         "vortex": "--steps 8",
         "column_dynamic": "--cell 1 --steps 20",
-        "sand_column": "--cells 4 --time 0.1 --steps 5",
+        "sand_column": "--cell 0.25 --time 0.1 --steps 5",
         "retrogression": "--cells 4 --crest 5 --length 1.3 --time 0.2 --steps 2",
         "hertz": "--cells 2 --steps 2",
+        "sphere": "--cells 2 --steps 2",
         "penetration": "--cell 0.25 --depth 0.05 --steps 4",
         "incline": "--steps 5",
         "seepage": "--cell 0.5",
