@@ -5,18 +5,18 @@
 # # A ball rolls down and hits a wall
 #
 # It illustrates how to:
-# - let bodies in space meet: each has a background of its own, and a `Pair` for each two,
-# - keep the books of a motion with impacts and friction: energy, and momentum.
+# - let bodies in 3-D collide: each has a background of its own, and each two a `Pair`,
+# - check the balance of energy and momentum of a motion with impacts and friction.
 #
 # ## Problem
 #
-# A ball of radius $R$ = 0.35 m is let go on an incline of 30° that ends in a plain. There a gate of
-# three blocks stands, two pillars and a lintel that lies on them. All are of soft rubber with
+# A ball of radius $R$ = 0.35 m is released on an incline of 30° that ends in a plain. There a gate
+# of three blocks stands, two pillars and a lintel that lies on them. All are of soft rubber with
 # $E$ = 0.5 MPa, $\nu$ = 0.3 and 1 t/m3, a little damped; friction is $\mu$ = 0.4 everywhere.
 #
-# What is known without solving: kinetic energy, that of strains and contacts, and what friction and
-# damping have taken is the work of weight; momentum along $x$ is the impulse of the ground, which
-# alone pushes from outside; and a ball that rolls has 7/5 of the energy of one that slides.
+# Some things are known without solving: kinetic energy, the energy of strains and contacts, and the
+# losses by friction and damping add up to the work of the weight; momentum along $x$ is the impulse
+# of the ground, the only external force; and rolling takes 7/5 of the energy of sliding.
 #
 # ## Implementation
 

@@ -5,22 +5,22 @@
 # # Stiffness and strength of clay from a loading test
 #
 # It illustrates how to:
-# - differentiate a run, with its plastic history, by numbers of a law,
-# - fit these numbers to a measured curve by the method of Gauss and Newton,
-# - say how sure the fit is.
+# - differentiate a run, with its plastic history, with respect to parameters of a law,
+# - fit these parameters to a measured curve by the Gauss-Newton method,
+# - estimate the uncertainty of the fit.
 #
 # ## Problem
 #
-# A flexible strip of 2 m is loaded on undrained clay; its mean settlement $s_i$ is read at loads
-# $q_i$ up to 100 kPa. At small loads the curve tells the stiffness $E$, at large ones the strength
-# $c$. With what a run with these numbers gives, $s(E, c)$, and $x = (\ln E, \ln c)$ we look for
+# A flexible strip, 2 m wide, is loaded on undrained clay; its mean settlement $s_i$ is read at
+# loads $q_i$ up to 100 kPa. At small loads the curve determines the stiffness $E$, at large ones
+# the strength $c$. With the settlements $s(E, c)$ of a run and $x = (\ln E, \ln c)$ we look for
 #
 # $$
 # \min_x\ \sum_i \left(\ln s_i(x) - \ln \bar s_i\right)^2, \qquad
 # x \leftarrow x - J^+ (\ln s - \ln \bar s), \quad J_{ij} = \partial \ln s_i / \partial x_j. \tag{1}
 # $$
 #
-# The readings here are made up: a run with $E$ = 12 MPa and $c$ = 25 kPa, and errors of 1 %.
+# The readings here are synthetic: a run with $E$ = 12 MPa and $c$ = 25 kPa, and errors of 1 %.
 #
 # ## Implementation
 
@@ -86,8 +86,8 @@ for number in range(1, 6):
 
 # ## Result
 #
-# The errors of readings come through (1) to the parameters: with the standard deviation $\sigma$ of
-# $\ln \bar s$ their covariance is $\sigma^2 (J^T J)^{-1}$.
+# Errors of the readings propagate to the parameters through (1): with the standard deviation
+# $\sigma$ of $\ln \bar s$ their covariance is $\sigma^2 (J^T J)^{-1}$.
 
 deviation = error * np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
 if comm.rank == 0:
@@ -95,7 +95,7 @@ if comm.rank == 0:
         told = f"standard deviation {100 * part:.1f} %; true {right:.4g}"
         print(f"{name} = {value:.4g} Pa, {told}")
 
-# The picture: the readings, the curves of the runs, and what yields at the whole load.
+# The picture: the readings, the curves of the runs, and the yielding clay at full load.
 
 fig, axes = None, dict.fromkeys(("curves", "clay"))
 if comm.rank == 0:
@@ -121,7 +121,7 @@ assert np.abs(change).max() < 1e-3
 
 # ## Exercises
 #
-# 1. Read the settlement at small loads alone, up to 40 kPa. What becomes of $c$ and of $J^T J$?
+# 1. Use only readings at small loads, up to 40 kPa. What becomes of $c$ and of $J^T J$?
 # 2. Take Poisson's ratio as a third parameter. Look at the deviations, and at the eigenvectors of
-#    $J^T J$: which combination does the curve not tell?
+#    $J^T J$: which combination does the curve not determine?
 # 3. Without `stabilisation="ghost"` plot the derivative by $E$ over $E$ within 10 %.

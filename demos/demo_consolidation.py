@@ -10,9 +10,9 @@
 #
 # ## Problem
 #
-# An embankment of half a width of 4 m is raised on 5 m of soft clay in 60 days. Water carries the
-# load at first, and the clay gives way without a change of volume, down under the embankment and up
-# beside it. Over the years the water leaves through the surface, and the clay settles. With the
+# An embankment with a half width of 4 m is raised on 5 m of soft clay in 60 days. The water carries
+# the load at first, and the clay yields at constant volume, down under the embankment and up beside
+# it. Over the years the water drains through the surface, and the clay settles. With the
 # effective first Piola stress $P'$, the pore pressure $p$ and $J = \det F$, on the undeformed clay,
 #
 # $$
@@ -36,8 +36,8 @@ comm, quadrilateral = MPI.COMM_WORLD, mesh.CellType.quadrilateral
 DEPTH, WIDTH, HALF, LOAD, DAYS = 5.0, 20.0, 4.0, 40.0, 60.0  # m, kPa, days
 YOUNG, POISSON, PERMEABILITY = 400.0, 0.3, 9e-6  # kPa, -, m2/(kPa d)
 
-# A row of cells above the ground is room for the heave. Displacements are of degree 2, the pressure
-# of degree 1: in (1) the clay is incompressible at first.
+# A row of cells above the ground leaves room for the heave. Displacements are of degree 2, the
+# pressure of degree 1: in (1) the clay is incompressible at first.
 
 background = mesh.create_rectangle(comm, [[0, 0], [WIDTH, 6]], [20, 6], quadrilateral)
 V = fem.functionspace(background, ("Lagrange", 2, (2,)))
@@ -68,7 +68,7 @@ def largest(values):
     return comm.allreduce(float(values.max(initial=0.0)), MPI.MAX)
 
 
-# Steps are longer and longer. On the way the mean pressure of each domain is drawn.
+# Steps grow longer and longer. On the way the mean pressure of each domain is drawn.
 
 fig, axes = plt.subplots(3, 1, figsize=(7, 8), layout="constrained")
 rows = []
@@ -86,7 +86,7 @@ for end, dt in ((60, 10), (180, 30), (1000, 100), (5000, 500), (30000, 2500)):
             fig.colorbar(drawn, ax=ax, label="excess pressure, kPa")
 time, settled, heaved, most = np.array(rows).T
 
-# Without water the clay settles at once by what it does with it in the end.
+# Without water the clay settles at once by as much as it does with water in the end.
 
 dry, dry_tags = ground()
 loaded = mpm.Body(dry, clay, tractions=[((0.0, -LOAD), 1)], facet_tags=dry_tags)

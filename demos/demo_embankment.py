@@ -5,8 +5,8 @@
 # # An embankment in lifts on soft clay
 #
 # It illustrates how to:
-# - begin with ground at rest (`initial_stress=mpm.geostatic(...)`),
-# - build lift by lift with `problem.add`, each of its own material,
+# - start from ground at rest (`initial_stress=mpm.geostatic(...)`),
+# - build lift by lift with `problem.add`, each with its own material,
 # - read settlement and heave after each stage, and the factor of safety at the end.
 #
 # ## Problem

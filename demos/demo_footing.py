@@ -6,7 +6,7 @@
 #
 # It illustrates how to:
 # - drive a problem by a support on the body's own facets, and read its force,
-# - see volumetric locking in a limit load, and its cure, `f_bar="patch"`,
+# - recognise volumetric locking in a limit load, and cure it by `f_bar="patch"`,
 # - grade the cells of a background and of a body.
 #
 # ## Problem

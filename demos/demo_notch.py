@@ -5,9 +5,9 @@
 # # A rubber sheet with a notch tears
 #
 # It illustrates how to:
-# - let a body crack: a law of fracture instead of an elastic one, and nothing else,
-# - go through the moment in which a load falls to nothing,
-# - compare the energy of a crack with its toughness.
+# - let a body crack, by replacing its elastic law with a law of fracture,
+# - continue through the moment in which the load drops to zero,
+# - compare the energy of a crack with the toughness.
 #
 # ## Problem
 #
@@ -23,8 +23,8 @@
 # 1 in the crack, and never falls. $\psi^+$ is the neo-Hookean energy but for that of a volume that
 # is pressed together. The crack is smeared over $l$.
 #
-# Stretched so far, a mesh would not survive the snap of the two halves; here increments of the
-# displacement are those of a background, and the damage is one of the sheet's own mesh.
+# Stretched so far, a mesh would not survive the snap of the two halves. Here increments of the
+# displacement live on a background, and the damage on the sheet's own mesh.
 
 from mpi4py import MPI
 

@@ -5,8 +5,8 @@
 # # A pile is pressed into clay
 #
 # It illustrates how to:
-# - drive an obstacle in for many of its radii, in a body of revolution,
-# - let clay adhere to a surface, and find where it touches.
+# - drive an obstacle in by many radii, in an axisymmetric problem,
+# - let clay adhere to a surface, and find where it is in contact.
 #
 # ## Problem
 #
@@ -113,10 +113,10 @@ for _ in problem.steps(80, update=lambda t: pile.move((0.0, -way * t))):
 
 # ## Result
 #
-# Above a depth of 1.3 radii clay stands off for good. Below, it comes back to the shaft behind the
-# tip, at first little of it and in the end nearly all. So from $L = 2 R$ on the force grows faster
-# than that of a shaft in touch all along (grey), by 17 %; it is what adheres to the clay that
-# touches. $N$ rises and falls as facet after facet turns round the shoulder.
+# Above a depth of 1.3 radii a gap remains for good. Below, the clay returns to the shaft behind the
+# tip, at first only a little of it and in the end nearly all. So from $L = 2 R$ on the force grows
+# faster than that of a shaft in contact all along (grey), by 17 %; it is the adhesion of the clay
+# in contact. $N$ rises and falls as facet after facet turns round the shoulder.
 
 L, shaft, end, length = np.array(rows).T
 borne, section = 2.0 * np.pi * R * adhesion, np.pi * (R**2 - h**2)

@@ -5,8 +5,8 @@
 # # A pile is pressed into sand
 #
 # It illustrates how to:
-# - widen a hole to four times its radius, beside an exact solution,
-# - drive a pile into sand under pressure, and weigh the whole by what the base bears.
+# - expand a cavity to four times its radius, compared with an exact solution,
+# - drive a pile into sand under pressure, and check the force against the load on the base.
 #
 # ## Problem
 #

@@ -5,15 +5,15 @@
 # # A pipe is pressed into the seabed
 #
 # It illustrates how to:
-# - make a rigid obstacle, and move it along a path,
-# - read the reaction, and what acts at points of contact,
-# - see what friction does to a resistance.
+# - create a rigid obstacle and move it along a path,
+# - read its reaction and the tractions at contact points,
+# - see how friction changes the resistance.
 #
 # ## Problem
 #
 # A rigid pipe of diameter $D$ = 1 m is pressed 0.3 m into clay, of which the right
 # half is 3 m wide and 2 m deep. The clay is undrained and perfectly plastic (von Mises'), with the
-# strength $c$ = 5 kPa, $E = 500\, c$ and $\nu$ = 0.45, at finite strain. Its weight is left out.
+# strength $c$ = 5 kPa, $E = 500\, c$ and $\nu$ = 0.45, at finite strain. Its weight is neglected.
 # Contact begins in one point. The pipe is smooth, or has the friction $\mu$ = 0.3.
 #
 # While the depth $w$ is small, the pipe is much like a strip footing as wide as its chord at the

@@ -5,9 +5,9 @@
 # # A shear band that does not follow the mesh
 #
 # It illustrates how to:
-# - give softening a length, `mpm.Body(..., length=...)`,
-# - turn a background against the body that it carries,
-# - read the width of a band.
+# - give softening an internal length, `mpm.Body(..., length=...)`,
+# - rotate a background relative to the body that it carries,
+# - measure the width of a band.
 #
 # ## Problem
 #
@@ -18,9 +18,9 @@
 # c = \frac{\sigma_y}{\sqrt3} = 0.3 + 0.7\, e^{-15 \kappa}, \tag{1}
 # $$
 #
-# and a place on its left side is weaker by 10 %. Once it yields, all that follows happens in a band
-# at 45 degrees. By (1) alone the band is one domain wide, and there is no answer. With a length
-# $l$ strength follows $2 \bar\kappa - \kappa$, with an average over the body before it moved,
+# and a spot on its left side is weaker by 10 %. Once it yields, all further strain localises in a
+# band at 45 degrees. With (1) alone the band is one domain wide, and results depend on the mesh.
+# With a length $l$ strength follows $2 \bar\kappa - \kappa$, with an average over the reference body,
 #
 # $$
 # \bar\kappa - l^2 \nabla^2 \bar\kappa = \kappa, \qquad

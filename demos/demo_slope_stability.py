@@ -6,7 +6,7 @@
 #
 # It illustrates how to:
 # - give layers of a slope their own cohesion and friction,
-# - find its factor of safety by one call, `mpm.strength_reduction`,
+# - find its factor of safety with one call, `mpm.strength_reduction`,
 # - see where it slides: along a seam of weak clay, not on a circle.
 #
 # ## Problem

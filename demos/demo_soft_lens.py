@@ -5,9 +5,9 @@
 # # A soft lens in the ground, seen from its surface
 #
 # It illustrates how to:
-# - differentiate a misfit by the stiffness in each cell, at the cost of about one run,
-# - let a minimiser find a field of stiffness from displacements of the surface,
-# - see what such measurements tell, and what they do not.
+# - differentiate a misfit with respect to the stiffness in each cell, at the cost of about one run,
+# - let a minimiser find a stiffness field from displacements of the surface,
+# - see what such measurements reveal, and what they do not.
 #
 # ## Problem
 #
@@ -22,8 +22,8 @@
 #   + \frac{\beta}{2} \sum_{k \sim l} (m_k - m_l)^2, \tag{1}
 # $$
 #
-# where neighbours $k \sim l$ are to be alike: what the surface does not tell is to be smooth. The
-# surveys here are made up, by runs with the lens and errors of $\sigma$ = 0.2 mm.
+# where the last term makes neighbours $k \sim l$ similar, wherever the surface reveals nothing. The
+# surveys here are synthetic, from runs with the lens and errors of $\sigma$ = 0.2 mm.
 #
 # ## Implementation
 

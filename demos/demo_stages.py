@@ -5,9 +5,9 @@
 # # A layered slope, loaded in stages
 #
 # It illustrates how to:
-# - give layers of a body their own materials and densities by cell tags,
+# - assign materials and densities to layers by cell tags,
 # - go from stage to stage: weight, a load on the crest, and its removal,
-# - follow a load on a path, `update=`, with the weight staying.
+# - prescribe a load path, `update=`, while the weight stays.
 #
 # ## Problem
 #
@@ -36,7 +36,7 @@ WIDTH, HEIGHT, STRIP = 10.0, 4.0, 2.0  # m
 LOAD, GRAVITY = 100e3, 9.81  # Pa, m/s2
 SOFT, STIFF, CREST = 1, 2, 3
 
-# The body is a rectangle whose right side is leant back: its vertices are moved.
+# The body is a rectangle whose vertices are moved so that its right side becomes the slope.
 
 background = mesh.create_rectangle(comm, [[0, 0], [13, 5]], [52, 20], quadrilateral)
 V = fem.functionspace(background, ("Lagrange", 1, (2,)))
@@ -51,7 +51,7 @@ density.interpolate(lambda x: np.where(x[1] < 1.0, 1700.0, 2000.0))
 side = mpm.held(V, 0, x=0.0)
 base_x, base_y = (mpm.held(V, i, y=0.0) for i in (0, 1))
 
-# The load is a Constant on the body: what it is in (1) at the moment. A path sets it.
+# The load $q$ in (1) is a Constant on the body, which a path sets.
 
 q = fem.Constant(body, (0.0, 0.0))
 particles = mpm.Particles(body, V)
@@ -87,8 +87,8 @@ for name, path in (("weight", None), ("load", load), ("unload", lambda t: load(1
     problem.solve(steps=5, update=path)
     rows.append((name, settlement(), problem.reaction(base_y)[1]))
 
-# After the last stage the base carries what it did after the first; the settlement is larger, as
-# the soft layer has yielded.
+# After the last stage the base carries as much as after the first; the settlement is larger,
+# because the soft layer has yielded.
 
 if comm.rank == 0:
     print("stage    settlement, m    base, kN/m")

@@ -5,9 +5,9 @@
 # # A steel footing pushed deep into clay
 #
 # It illustrates how to:
-# - put a body of finite elements beside particles, in one problem,
-# - let both touch with friction,
-# - ask how large the error is, and where it comes from.
+# - combine a finite element body and particles in one problem,
+# - let them interact by frictional contact,
+# - estimate the error, and see where it comes from.
 #
 # ## Problem
 #
@@ -20,8 +20,8 @@
 # T = \begin{pmatrix} T_\mathrm{clay} & 0 \\ 0 & I \end{pmatrix} .
 # $$
 #
-# At small depths the force on the block is Prandtl's, $(2 + \pi)\, c$ times its width; as it sinks,
-# clay heaves beside it and has to be lifted and sheared too.
+# At small depths the force on the block is Prandtl's, $(2 + \pi)\, c$ times its width; as the block
+# sinks, clay heaves beside it and has to be lifted and sheared too.
 #
 # ## Implementation
 

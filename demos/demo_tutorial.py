@@ -5,12 +5,12 @@
 # # A first run: a block of clay slumps
 #
 # It illustrates how to:
-# - make a background and a body, and hold the background,
-# - give the body a material and its weight, and solve,
+# - create a background and a body, and apply boundary conditions,
+# - assign a material and self-weight, and solve,
 # - look at the result.
 #
-# A block of clay, 4 m wide and 4 m high, is too weak to stand: it flows sideways under its own
-# weight until it is low enough. Half of it is computed; its left side is the plane of symmetry.
+# A block of clay, 4 m wide and 4 m high, is too weak to stand: it spreads under its own weight
+# until it is low enough. Half of it is modelled; its left side is the plane of symmetry.
 
 from mpi4py import MPI
 
