@@ -168,6 +168,45 @@ def test_water_takes_its_share_of_a_load():
     assert "pressure" not in fields and "mean_effective_stress" in fields
 
 
+def test_rapid_drawdown_leaves_the_water_in_the_ground_and_takes_its_load_off():
+    """Total stress falls by the water that went, pore pressure by ``K_w / (K_w + M)`` of that.
+
+    Once it has drained the ground is as if the water had gone slowly. (Of small strains.)
+    """
+    V = vectors(box([0, 0], [1, 1.5], [2, 3], QUADRILATERAL), 1)
+    body = box([0, 0], [1, 1], [4, 4], QUADRILATERAL)
+    tags = mpm.facet_tags(body, {1: mpm.region(y=1.0)})
+    law = LinearElastic(1e4, 0.25)
+    stiff = float(law.bulk + 4.0 / 3.0 * law.shear)
+    soil = mpm.Particles(body, V, quadrature_degree=2)
+    high, low = mpm.WaterTable(3.0, 10.0), mpm.WaterTable([(0.0, 1.8), (1.0, 1.8)], 10.0)
+    gravity = (0.0, -20.0)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(
+            soil,
+            Undrained(law, 4.0 * stiff),
+            density=1.0,
+            body_force=gravity,
+            facet_tags=tags,
+            pore_pressure=high,
+            initial_stress=mpm.geostatic(1.0, 1.0, 0.5, gravity, water=high),
+        ),
+        bcs=[mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=1.0), mpm.held(V, 1, y=0.0)],
+    )
+    problem.solve()
+    assert largest(np.abs(soil.displacement.x.array)) < 1e-12
+    problem.stage("drawn", problem.body().replace(pressures=[(low(body) - high(body), 1)]))
+    problem.solve()
+    fields, depth = soil.fields(), 1.0 - soil.initial_centroid[:, 1]
+    assert fields["excess_pore_pressure"] == pytest.approx(-9.6, rel=1e-6)
+    assert fields["total_stress"][:, 1, 1] == pytest.approx(-8.0 - 20.0 * depth, rel=1e-6)
+    drained = problem.body().replace(material=law, pore_pressure=low, pressures=())
+    problem.stage("drained", drained)
+    problem.solve()
+    assert soil.fields()["stress"][:, 1, 1] == pytest.approx(-10.0 * depth, rel=1e-6)
+    assert largest(np.abs(soil.displacement.x.array)) < 1e-12
+
+
 def test_what_has_drained_is_where_a_drained_body_is():
     law = Hencky(1e3, 0.3)
     problem = block(Undrained(law, WATER))
