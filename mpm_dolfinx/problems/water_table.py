@@ -57,17 +57,13 @@ class WaterTable:
         if not self.weight > 0.0:
             raise MPMError(f"The weight of water must be positive, not {self.weight:g}.")
         if points:
-            self._corners()
-
-    def _corners(self) -> Array:
-        """Return the points of the level, shape ``(n, 2)``."""
-        corners = as_finite(self.level, None, 2)
-        if corners is None or (np.diff(corners[:, 0]) <= 0.0).any():
-            raise MPMError(
-                "The points of a WaterTable's level must be pairs (x, height) of finite numbers, "
-                f"each x larger than the one before, not {self.level!r}."
-            )
-        return corners
+            corners = as_finite(self.level, None, 2)
+            if corners is None or (np.diff(corners[:, 0]) <= 0.0).any():
+                raise MPMError(
+                    "The points of a WaterTable's level must be pairs (x, height) of finite "
+                    f"numbers, each x larger than the one before, not {self.level!r}."
+                )
+            object.__setattr__(self, "level", tuple(map(tuple, corners.tolist())))
 
     def level_at(self, x: Any) -> Any:
         """Return the level at coordinates, UFL or arrays."""
@@ -76,7 +72,8 @@ class WaterTable:
         if is_number(self.level):
             return self.level
         # the sum of what the slope changes by at each point takes UFL and arrays alike
-        along, heights = self._corners().T
+        points: Any = self.level
+        along, heights = np.transpose(points)
         changes = np.diff(np.diff(heights) / np.diff(along), prepend=0.0, append=0.0)
         beyond = [(x[0] - a + abs(x[0] - a)) / 2 for a in map(float, along)]
         bends = zip(changes, beyond, strict=True)

@@ -78,6 +78,7 @@ def test_a_pressure_in_ufl_is_the_same_and_seepage_acts_along_its_slope():
 def test_a_level_by_points_is_straight_in_between_and_level_beyond():
     bends = [(0.5, 3.0), (1.0, 4.0), (1.6, 1.5)]
     water = mpm.WaterTable(bends, WEIGHT)
+    assert water == mpm.WaterTable(np.array(bends), WEIGHT)
     x = np.zeros((3, 50))
     x[0] = np.linspace(-1.0, 3.0, 50)
     known = np.interp(x[0], *np.transpose(bends))
