@@ -63,7 +63,7 @@ from .summary import in_one_line, on_a_screen
 __all__ = ["Law", "Problem"]
 
 #: What goes with automatic steps, and is of no meaning to others.
-AUTOMATIC = {"tolerance": 1e-2, "output_at": (), "length": None}
+AUTOMATIC = {"tolerance": None, "output_at": (), "length": None}
 #: What is there of a problem that is not built.
 NOTHING = Built([], [], [], [], [], set(), {})
 
@@ -311,7 +311,7 @@ class Problem(Hooked):
         progress: bool = False,
         repartition: float | None = None,
         control: DisplacementControl | None = None,
-        tolerance: float = 1e-2,
+        tolerance: float | None = None,
         output_at: Sequence[float] = (),
         length: float | None = None,
         adapt: float | None = None,
@@ -332,7 +332,9 @@ class Problem(Hooked):
             control: A displacement of a body that goes to a value in these steps; the load
                 factor is found for each, which may fall again. Dirichlet values stay.
             tolerance: With ``"auto"``: error of the displacement at the end that is aimed at,
-                relative to the motion of the run, as root mean squares over the nodes.
+                relative to the motion of the run, as root mean squares over the nodes. ``None`` is
+                0.01, or with ``adapt=`` its square: the error in energy is the root of the one in
+                displacements that belongs to it.
             output_at: With ``"auto"``: shares t of the run in (0, 1] at which a step is to end, to
                 the last bit; ``step.output`` says so.
             length: With ``"auto"``: a motion to be expected, by which the error is measured instead
@@ -375,7 +377,7 @@ class Problem(Hooked):
         update: Callable[[float], None] | None = None,
         repartition: float | None = None,
         control: DisplacementControl | None = None,
-        tolerance: float = 1e-2,
+        tolerance: float | None = None,
         output_at: Sequence[float] = (),
         length: float | None = None,
         adapt: float | None = None,
@@ -406,7 +408,10 @@ class Problem(Hooked):
             "output_at": output_at,
             "length": length,
         }
+        adaptivity = None if adapt is None else adaptivity_of(self.trial, self.bcs, adapt)
         if isinstance(steps, str) and steps == "auto":
+            if tolerance is None:
+                tolerance = 1e-2 if adaptivity is None else adaptivity.tolerance**2
             chosen: Any = ErrorControl(tolerance, output_at, length)
         elif automatic != AUTOMATIC:
             raise MPMError(
@@ -414,7 +419,6 @@ class Problem(Hooked):
             )
         else:
             chosen = steps
-        adaptivity = None if adapt is None else adaptivity_of(self.trial, self.bcs, adapt)
         return self._stepper.steps(
             self, chosen, update, repartition, control, adaptivity=adaptivity
         )

@@ -247,6 +247,15 @@ def test_steps_chosen_by_their_error_and_levels():
     assert ends[0] == pytest.approx(ends[1], rel=0.02)
 
 
+def test_one_tolerance_for_nodes_and_steps():
+    runs = []
+    for tolerance in (None, 0.15**2, 1e-2):
+        problem, _ = angle(law=Hencky(1e3, 0.25), load=5.0)
+        problem.solve("auto", tolerance=tolerance, adapt=0.15)
+        runs.append([(step.load, step.freed) for step in problem.history.steps])
+    assert runs[0] == runs[1] != runs[2]
+
+
 def test_a_controlled_displacement():
     """The load is found for the displacement, with nodes freed at the end of the step too."""
     problem, own = angle()
