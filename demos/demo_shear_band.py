@@ -20,7 +20,7 @@
 #
 # and a spot on its left side is weaker by 10 %. Once it yields, all further strain localises in a
 # band at 45 degrees. With (1) alone the band is one domain wide, and results depend on the mesh.
-# With a length $l$ strength follows $2 \bar\kappa - \kappa$, with an average over the reference body,
+# With a length $l$ strength follows $2 \bar\kappa - \kappa$, averaged over the reference body,
 #
 # $$
 # \bar\kappa - l^2 \nabla^2 \bar\kappa = \kappa, \qquad

@@ -20,6 +20,9 @@ namespace
 {
 using namespace core;
 
+// How many derivatives are carried along together.
+constexpr int together = 4;
+
 // Which of so many second derivatives is that by two directions, -1: it is zero. A line or a triangle
 // of degree 1 has none, a quadrilateral the mixed one.
 template <int dim, int bends>
@@ -334,18 +337,17 @@ HOT_PART Traction<T, dim> traction_at(const core::Touching& known, std::size_t p
   return traction_of(known, p, press, gap, n, delta);
 }
 
-// Set what acts at a point by places of its stencil.
+// Set what acts at a point by places of its stencil, with a pressure on top where one acts.
 template <int bends, int dim, typename T>
-void act_at(const core::Meeting& m, std::size_t p, const std::array<T, dim>* x,
-            Acting<T, dim>& found)
+HOT_PART void act_at(const core::Meeting& m, std::size_t p, const std::array<T, dim>* x,
+                     Acting<T, dim>& found, const T* top = nullptr)
 {
   const Shapes<dim> shapes(m.table, p, m.nodes);
   const auto foot = foot_of(ways_of<T, dim, bends>(shapes, x), m.outward[p]);
   const auto delta = delta_of<T, dim>(m, p, x);
   if (!m.start)
   {
-    auto press = pressing(m.known, p, foot.gap, foot.n);
-    put_on_top(press);
+    const auto press = pressing(m.known, p, foot.gap, foot.n, top);
     found.acts = traction_at<T, dim>(m.known, p, press, foot.gap, foot.n, delta);
     found.point(foot, shapes);
     found.rub(foot, shapes);
@@ -400,7 +402,9 @@ HOT_LOOP void act_in(const core::Meeting& m, const core::Met& result)
 template <int dim, int bends>
 HOT_LOOP void differentiate_by_pressure_in(const core::Meeting& m, double* slopes)
 {
-  using T = Dual<1>;
+  using T = Dual<together>;
+  T top;
+  top.by.set(0, 1.0);
   Acting<T, dim> found(m.nodes);
   std::vector<std::array<T, dim>> x(m.count);
   for (std::size_t p = 0; p < m.points; ++p)
@@ -408,7 +412,7 @@ HOT_LOOP void differentiate_by_pressure_in(const core::Meeting& m, double* slope
     const auto* places = places_of<dim>(m.x, p, m.count);
     for (int k = 0; k < m.count; ++k)
       std::copy_n(places[k].begin(), dim, x[k].begin());
-    act_at<bends, dim>(m, p, x.data(), found);
+    act_at<bends, dim>(m, p, x.data(), found, &top);
     for (int k = 0; k <= m.nodes; ++k)
       for (int i = 0; i < dim; ++i)
         *slopes++ = (found.pushes[k][i] + found.rubs[k][i]).by[0];
@@ -438,9 +442,6 @@ void see_in(const core::Meeting& m, double* gap, double* n, double* delta)
     std::copy_n(way.data(), dim, delta + p * dim);
   }
 }
-
-// How many derivatives are carried along together.
-constexpr int together = 4;
 
 // Set the derivative of all forces at a point by the places of its stencil, (1 + nodes, dim, count,
 // dim), by way of that of the vectors that they are made of.

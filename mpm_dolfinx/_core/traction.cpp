@@ -32,7 +32,8 @@ struct Seen
 // Return what acts on a point, and set its traction by pressure.
 template <typename T, int dim>
 Traction<T, dim> acting(const Touching& known, const Separation& all, std::size_t p,
-                        const Seen<T, dim>& seen, std::array<T, dim>& normal)
+                        const Seen<T, dim>& seen, std::array<T, dim>& normal,
+                        const T* top = nullptr)
 {
   normal = seen.n;
   Press<T> press;
@@ -43,10 +44,7 @@ Traction<T, dim> acting(const Touching& known, const Separation& all, std::size_
     correct(&normal, &seen.change, &seen.change, 1, difference, known.still);
   }
   else
-  {
-    press = pressing(known, p, seen.gap, seen.n);
-    put_on_top(press);
-  }
+    press = pressing(known, p, seen.gap, seen.n, top);
   for (T& part : normal)
     part = press.value * part;
   return traction_of(known, p, press, seen.gap, seen.n, seen.delta);
@@ -74,11 +72,13 @@ void act_in(const Touching& known, const Separation& all, double* pressure, doub
 template <int dim>
 void differentiate_by_pressure_in(const Touching& known, const Separation& all, double* slopes)
 {
-  using T = Dual<1>;
+  using T = Dual<dim>;
+  T top;
+  top.by.set(0, 1.0);
   std::array<T, dim> normal;
   for (std::size_t p = 0; p < all.points; ++p)
   {
-    const auto acts = acting<T, dim>(known, all, p, Seen<T, dim>(all, p), normal);
+    const auto acts = acting<T, dim>(known, all, p, Seen<T, dim>(all, p), normal, &top);
     for (int i = 0; i < dim; ++i)
       slopes[p * dim + i] = (normal[i] + acts.shear[i]).by[0];
   }

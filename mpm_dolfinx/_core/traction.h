@@ -45,9 +45,11 @@ struct Traction
   bool inside, slips;
 };
 
-// The pressure of a gap, or of a traction of the body that presses, but for what gap is left.
+// The pressure of a gap, or of a traction of the body that presses, but for what gap is left; and,
+// where it acts, a pressure on top.
 template <typename T, std::size_t dim>
-Press<T> pressing(const Touching& known, std::size_t p, const T& gap, const std::array<T, dim>& n)
+Press<T> pressing(const Touching& known, std::size_t p, const T& gap, const std::array<T, dim>& n,
+                  const T* top = nullptr)
 {
   const double k = known.stiffness[p];
   T pressure = -k * gap;
@@ -58,16 +60,10 @@ Press<T> pressing(const Touching& known, std::size_t p, const T& gap, const std:
       pressure = pressure + known.behind[p * dim + i] * n[i];
     acts = value_of(pressure) >= -k * known.touch;
   }
+  if (top)
+    pressure = pressure + *top;
   return {acts ? pressure : T(0.0), acts};
 }
-
-// Derivatives by one number are by a pressure that comes on top where one acts.
-template <typename T>
-void put_on_top(Press<T>&)
-{
-}
-
-inline void put_on_top(Press<Dual<1>>& press) { press.value.by.set(0, press.acts ? 1.0 : 0.0); }
 
 // The mean pressure of a step between two gaps: the loss of the energy k/2 <-gap>^2 over the change.
 template <typename T>
