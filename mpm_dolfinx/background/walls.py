@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dolfinx import fem, geometry, la, mesh
+from dolfinx import fem, la, mesh
 
 from .. import _compat
+from ..meshes.nearest import FacetTree
 from ..tolerances import ROUND_OFF, SMALL
 from .cells import Cells, CellTable
 from .points import PointBasis
@@ -58,11 +59,14 @@ class Walls:
         domain, dim = V.mesh, V.mesh.topology.dim - 1
         domain.topology.create_connectivity(dim, dim + 1)
         facets = mesh.exterior_facet_indices(domain.topology)
-        self._tree = geometry.bb_tree(domain, dim, entities=facets)
-        self._middles = geometry.create_midpoint_tree(domain, dim, facets)
-        corners = domain.geometry.x[_compat.entity_nodes(domain, dim, facets)]
-        self._corners = dict(zip(facets.tolist(), corners, strict=True))
-        self._to_cell = domain.topology.connectivity(dim, dim + 1)
+        corners = domain.geometry.x[_compat.entity_nodes(domain, dim, facets), : self._gdim]
+        to_cell = domain.topology.connectivity(dim, dim + 1)
+        cells = np.array([to_cell.links(facet)[0] for facet in facets], dtype=np.int64)
+        if corners.shape[1] == 4:  # two triangles of each quadrilateral
+            corners = corners[:, [[0, 1, 2], [1, 3, 2]]].reshape(-1, 3, 3)
+            cells = np.repeat(cells, 2)
+        self._cells = cells
+        self._boundary = FacetTree(corners) if len(cells) else None
 
     def extend(
         self,
@@ -109,20 +113,10 @@ class Walls:
             np.zeros((n, k, self._gdim)),
             np.zeros(n, dtype=np.int64),
         )
-        if n == 0 or not self._corners:
+        if n == 0 or self._boundary is None:
             return found
-        padded = np.zeros((n, 3))
-        padded[:, : self._gdim] = points
-        facets = geometry.compute_closest_entity(
-            self._tree, self._middles, self._V.mesh, padded
-        ).tolist()
-        ways = np.array(
-            [
-                geometry.compute_distance_gjk(self._corners[facet], x[None])
-                for facet, x in zip(facets, padded, strict=True)
-            ]
-        )[:, : self._gdim]
-        cell = np.array([self._to_cell.links(facet)[0] for facet in facets], dtype=np.int64)
+        facets, ways = self._boundary.ways(points)
+        cell = self._cells[facets]
         near = self._own.violation(cell, self._own.pull_back(cell, points)) <= 1.0
         cell, ways = cell[near], ways[near]
         there = self._own.clip(cell, self._own.pull_back(cell, points[near] + ways))

@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError, agree, as_ours
+from ..meshes.nearest import FacetTree
 from ..parallel.given import as_positive
 from ..plot.outlines import surface_algorithm
 from ..reals import as_finite
 from ..tolerances import NEGLIGIBLE, ROUND_OFF
-from .nearest import FacetTree
 from .orientation import edges_of, facet_normals, oriented
 from .shapes import Shape, as_point, as_radius
 

@@ -6,6 +6,7 @@ A body mesh is an ordinary DOLFINx mesh whose cells are particle domains. This f
 a mesh needs whatever moves it: quadrature on its cells and gradients at the points
 (:mod:`~mpm_dolfinx.meshes.quadrature`), a bound of the Jacobian that tells which cells fold
 (:mod:`~mpm_dolfinx.meshes.jacobian_bound`), meshes of boxes around points
-(:mod:`~mpm_dolfinx.meshes.boxes`), and meshes on other ranks
+(:mod:`~mpm_dolfinx.meshes.boxes`), the facets nearest to points
+(:mod:`~mpm_dolfinx.meshes.nearest`), and meshes on other ranks
 (:mod:`~mpm_dolfinx.meshes.redistribution`), to which tags and values of cells are carried.
 """

@@ -298,11 +298,14 @@ def test_a_boundary_that_is_held_goes_on_beyond_it(name):
     assert evaluator.hold(np.zeros_like(at_rest)) and not evaluator.at(below).found.any()
 
 
-def test_a_boundary_holds_what_is_less_than_a_cell_beyond_it():
-    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 1.0], [8, 2], scenes.QUADRILATERAL))
+@pytest.mark.parametrize(("size", "low"), [(1.0, 0.0), (1e-9, 0.0), (1e9, 0.0), (1.0, 5e6)])
+def test_a_boundary_holds_what_is_less_than_a_cell_beyond_it(size, low):
+    lower, upper = size * np.array([[low, low], [low + 2.0, low + 1.0]])
+    V = scenes.vectors(scenes.box(lower, upper, [8, 2], scenes.QUADRILATERAL))
     evaluator = BackgroundBasis(V)
-    x = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local]
-    evaluator.hold(np.column_stack([np.zeros(len(x), dtype=bool), x[:, 1] < 1e-9]))
+    x = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local] / size - low
+    evaluator.hold(np.column_stack([np.zeros(len(x), dtype=bool), x[:, 1] < 1e-3]))
     depths = np.array([0.01, 0.25, 0.49, 0.51, 0.75])
-    found = evaluator.at(np.column_stack([np.full(5, 0.9), -depths])).found
+    points = np.column_stack([np.full(5, low + 0.9), low - depths])
+    found = evaluator.at(size * points).found
     np.testing.assert_array_equal(found, depths < 0.5)

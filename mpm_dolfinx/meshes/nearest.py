@@ -95,6 +95,35 @@ class FacetTree:
         _, corner, edge = self._places(points, facet)
         return Nearest(facet, corner, edge)
 
+    def ways(self, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the nearest facets of points, and the ways to their nearest places.
+
+        A way to the inside of a facet is along its normal to the last place.
+
+        Args:
+            points: Shape ``(n, dim)``.
+
+        Returns:
+            Shapes ``(n,)`` and ``(n, dim)``.
+        """
+        facet, corner, edge = self(points)
+        row, corners = np.arange(len(points)), self._corners[facet]
+        arm = points - corners[row, np.maximum(np.maximum(corner, edge), 0)]
+        if self._dim == 2:
+            inside = corner < 0
+            along = self._edges[facet, 0]
+            normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
+            normal /= np.linalg.norm(normal, axis=1)[:, None]
+        else:
+            inside = (corner < 0) & (edge < 0)
+            normal = self._normal[facet]
+            side = self._edges[facet, np.maximum(edge, 0)]
+            square = self._squares[facet, np.maximum(edge, 0)]
+            share = (arm * side).sum(axis=1) / np.where(square > 0.0, square, np.inf)
+            arm = np.where((edge >= 0)[:, None], arm - share[:, None] * side, arm)
+        flat = (arm * normal).sum(axis=1)[:, None] * normal
+        return facet, -np.where(inside[:, None], flat, arm)
+
     def _find(
         self, points: NDArray[np.float64], hints: NDArray[np.int64] | None
     ) -> NDArray[np.int64]:
