@@ -115,7 +115,7 @@ outline = [(0, tip), (R, shoulder), (R, 20 * R), (-R, 20 * R), (-R, shoulder)]
 bore, surface = mpm.region(x=a0), mpm.region(y=0.0)
 top = mpm.facet_tags(ground.mesh, {1: surface})
 free = mpm.facet_tags(ground.mesh, {1: lambda x: bore(x) | surface(x)})
-look = {"facet_tags": free, "tag": 1, "axisymmetric": True, "modulus": E}
+look = {"facets": (free, 1), "axisymmetric": True, "modulus": E}
 guide = mpm.contact.Rigid(ground, mpm.contact.box((-a0, -40.0), (a0, 40.0)), **look)
 pile = mpm.contact.Rigid(ground, mpm.contact.polygon(outline, radius=0.4 * R), **look)
 problem = mpm.QuasiStaticProblem(

@@ -17,7 +17,7 @@ from ..io.identity import same
 from ..io.snapshot import Kept, Taken
 from ..particles.particles import Particles
 from ..reals import is_one_of
-from ..system.term import PointMaterial, Term
+from ..system.term import Motion, PointMaterial, Term, Transfer
 from .law import Friction
 from .nitsche import require_stress
 from .passes import Kept as KeptOnBody
@@ -136,6 +136,10 @@ class Contact(Results):
         self._passes.settle(self._materials)
         self._passes.begin()
         return ()
+
+    @override
+    def start(self, transfer: Transfer, prescribed: Motion) -> None:
+        self._passes.start()
 
     @override
     def update(self) -> MPMError | None:

@@ -87,7 +87,7 @@ class FacetPass(Pass[State, Meeting]):
         body = target.particles
         facets = len(basix.topology(body.mesh.basix_cell())[target.gdim - 1])
         number = body.global_index[target.layout.cells] * facets + target.layout.facets
-        self._sides = Sides(source, target, number, reach, self._law.by_area)
+        self._sides = Sides(source, target, number, reach)
         self._evaluations = 0
         self._paired: Closest | None = None
         self._around = self._learn(None)
@@ -290,14 +290,14 @@ class FacetPass(Pass[State, Meeting]):
         parts = [x[which][:, None], nodes[facet]]
         if not self._law.smooth:
             parts.append(nodes[anchor])
-        own = around.facets[which // self.source.nq]
+        normal, tangential, stretch = (part[which] for part in self._stiffnesses(around.facets))
         points = Points(
-            self._penalty * self._normal[own],
-            np.where(lost, 0.0, self._law.stiffness * self._stiffness[own]),
+            normal,
+            np.where(lost, 0.0, tangential),
             memory.touched[which] | lost,
             np.zeros((len(which), 0)),
             np.where(lost, 0.0, memory.gap[which]),
-            around.stretch[which],
+            stretch,
             memory.friction[which],
         )
         start = None

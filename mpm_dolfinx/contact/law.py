@@ -9,6 +9,10 @@ and has that size (the return mapping of Wriggers 2006, Computational Contact Me
 5.2.3, with the anchor instead of a traction that would have to be turned and transported). Compiled
 loops do so for the points of obstacles and of pairs alike; a law of a user's own gives the bound.
 
+Tractions are per undeformed area. k and k_t are per area at the last converged step: clay that is
+drawn out over a pile is held off it by the pressure that it bears. In a step of a motion they are
+not, or a facet that is drawn out would gain energy.
+
 In a step of a motion contact neither adds energy nor takes any. A gap g stores the energy
 ``W(g) = k/2 <-g>^2`` per area. Over a step in which positions z go from z_0 to z_1 and the gap from
 g_0 to g_1 there acts
@@ -110,11 +114,6 @@ class Friction:
         return False
 
     @property
-    def by_area(self) -> bool:
-        """Whether a part of it does not grow with the pressure, but with the area."""
-        return True
-
-    @property
     def compiled(self) -> bool:
         """Whether compiled loops know it by heart."""
         return is_as_inherited(self, "_loop")
@@ -181,12 +180,6 @@ class Coulomb(Friction):
         none = self.limit == 0.0 or (self.friction == 0.0 and self.cohesion == 0.0)
         return none and type(self).bound is Coulomb.bound
 
-    @property
-    @override
-    def by_area(self) -> bool:
-        known = type(self).bound is Coulomb.bound
-        return not known or self.cohesion > 0.0 or bool(np.isfinite(self.limit))
-
     @override
     def bound(self, at: Rubbing) -> Array:
         p, stretch = map(np.ascontiguousarray, (at.pressure, at.stretch))
@@ -215,11 +208,6 @@ class _Shared(Friction):
     @override
     def smooth(self) -> bool:
         return self._whole.smooth
-
-    @property
-    @override
-    def by_area(self) -> bool:
-        return self._whole.by_area
 
     @property
     @override

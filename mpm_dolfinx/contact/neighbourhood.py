@@ -26,14 +26,12 @@ class Sides(NamedTuple):
         target: The facets.
         number: A number of each facet that this rank owns, the same on any ranks, shape ``(m,)``.
         reach: How near a facet must be to be met.
-        by_area: Whether a law depends on the present area of points.
     """
 
     source: Surface
     target: Surface
     number: NDArray[np.int64]
     reach: float
-    by_area: bool
 
     @property
     def touch(self) -> float:
@@ -57,7 +55,6 @@ class Neighbourhood:
         facets: Facets of the points' surface that may come near, shape ``(m,)``.
         which: Their points.
         weights: Those of these.
-        stretch: Their areas at the last converged step over the undeformed ones.
     """
 
     def __init__(
@@ -84,7 +81,6 @@ class Neighbourhood:
         self.facets = np.flatnonzero(within)
         self.which = (self.facets[:, None] * source.nq + np.arange(source.nq)).ravel()
         self.weights = source.weights[self.facets].ravel()
-        self.stretch = source.stretch(sides.by_area, self.facets).ravel()
 
     def is_left(self, mine: NDArray[np.float64], nodes: NDArray[np.float64]) -> bool:
         """Return whether bodies have gone far since it was made (collective).

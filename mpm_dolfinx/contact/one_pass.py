@@ -87,6 +87,24 @@ class Pass[State, Found: Evaluation]:
         """
         raise NotImplementedError
 
+    def _stiffnesses(self, facets: NDArray[np.int64] | None) -> tuple[Array, Array, Array]:
+        """Return stiffnesses of points, normal and along the surface, and stretches, ``(n,)``.
+
+        Stiffnesses are per area at the step's beginning. Where a motion keeps the energy of
+        penetration they are per undeformed area, or a facet that is drawn out would gain energy,
+        and by Nitsche's method, where they hold what the stress presses.
+
+        Args:
+            facets: Numbers of the points' facets; ``None``: all.
+        """
+        some = slice(None) if facets is None else facets
+        stretch = self.source.stretch[some]
+        of_area = not self.of_step and self.stress is None
+        area = stretch if of_area else np.ones_like(stretch)
+        normal = self._penalty * self._normal[some, None] * area
+        tangential = self._law.stiffness * self._stiffness[some, None] * area
+        return normal.ravel(), tangential.ravel(), stretch.ravel()
+
     def _behind(self, facets: NDArray[np.int64] | None, touch: float) -> tuple[Array, Array]:
         """Return tractions by the stress behind points, and gaps up to which these may press."""
         assert self.stress is not None
@@ -187,6 +205,7 @@ class Pass[State, Found: Evaluation]:
             "pressure": told.pressure,
             "traction": told.traction,
             "anchor": self.anchors,
+            "stretch": self.source.last_stretch,
         }
         if self._law.memory:
             kept["friction"] = self.rubbed.reshape(*told.gap.shape, len(self._law.memory))

@@ -133,6 +133,11 @@ class Passes:
             each.prepare()
         self._begins = True
 
+    def start(self) -> None:
+        """Note how wide facets are, once in each try of a step."""
+        for surface in self.surfaces:
+            surface.begin_step()
+
     def _look(self) -> None:
         """Learn where points and targets are now."""
         if self._begins:
@@ -220,10 +225,13 @@ class Passes:
         before = [each.state for each in passes]
         for each, state in zip(passes, after, strict=True):
             each.state = state
+        narrow = [surface.end_step() for surface in self.surfaces]
 
         def undo() -> None:
             for each, state in zip(passes, before, strict=True):
                 each.state = state
+            for back in narrow:
+                back()
 
         return undo
 
@@ -231,6 +239,8 @@ class Passes:
         """Return to the last converged step."""
         for each in self.every:
             each.roll_back()
+        for surface in self.surfaces:
+            surface.roll_back()
 
     # -- What is kept ---------------------------------------------------------------------------
 
@@ -253,6 +263,7 @@ class Passes:
         for each, columns in zip(self.every, kept, strict=False):
             known = [name for name in TOUCHING if name in columns]
             each.restore({name: each.source.of_column(columns[name]) for name in known})
+            each.source.take_stretch(each.source.of_column(columns["stretch"]))
 
     def kept(self) -> list[Kept] | None:
         """Return the kept columns of each body; ``None``: the contact belongs to no problem."""

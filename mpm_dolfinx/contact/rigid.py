@@ -41,8 +41,9 @@ class Rigid(Contact):
     domain behind over the facet (and over the square of its degree), so that ``penalty`` is a
     number without unit. It makes the
     body softer by about one layer of domains, and should stay near 1: where facets
-    are chords of a curved surface, a larger one puts all load on their ends. Friction
-    remembers where each point has stuck to the obstacle.
+    are chords of a curved surface, a larger one puts all load on their ends. It acts on the area
+    that facets have at a step's beginning; by Nitsche's method, and in a motion that keeps energy,
+    on the undeformed one. Friction remembers where each point has stuck to the obstacle.
 
     Give it to ``QuasiStaticProblem(..., terms=[contact])``, and move the obstacle along a path::
 

@@ -30,7 +30,7 @@ from ..io.snapshot import Kept
 from ..parallel.boundary import collective
 from ..parallel.given import as_positive, require_same
 from ..particles.particles import Particles
-from ..system.term import PointMaterial, Term
+from ..system.term import Motion, PointMaterial, Term, Transfer
 from .body_contact import BodyContact
 from .contact import KeptContact
 from .driven import Driven, KeptMotion
@@ -210,6 +210,11 @@ class RigidBody(Driven):
             contact.begin()
         self._balance.begin()
         return ()
+
+    @override
+    def start(self, transfer: Transfer, prescribed: Motion) -> None:
+        for contact in self.contacts:
+            contact.start(transfer, prescribed)
 
     @override
     def end_forces(self) -> Sequence[PETSc.Vec]:

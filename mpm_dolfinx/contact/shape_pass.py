@@ -237,7 +237,6 @@ class ShapePass(Pass[ShapeMemory, Touch]):
         self._reach = Reach(source, shape)
         self._slip_changes = SlipChanges()
         self.tangent = np.zeros((0, source.gdim, source.gdim))
-        self._stretch: Array | None = None
         self._require_same_shape()
         self.state = self._anew(pose)
 
@@ -269,7 +268,7 @@ class ShapePass(Pass[ShapeMemory, Touch]):
     @property
     def penalties(self) -> Array:
         """Stiffnesses of all points in the normal direction, shape ``(m, nq)``."""
-        return np.repeat(self._penalty * self._normal[:, None], self.source.nq, axis=1)
+        return self._stiffnesses(None)[0].reshape(self.source.weights.shape)
 
     # -- What it tells ----------------------------------------------------------------------------
 
@@ -315,14 +314,8 @@ class ShapePass(Pass[ShapeMemory, Touch]):
 
     @override
     def prepare(self) -> None:
-        """Note which facets may touch in the step, and the stretch of all.
-
-        The latter once in a step: where one is committed bodies are at its end already, and a
-        motion begins its terms anew.
-        """
+        """Note which facets may touch in the step."""
         self._slip_changes.begin()
-        if self._stretch is None:
-            self._stretch = self.source.stretch(self._law.by_area)
         if self.stress is None:
             self._reach.look(self.state)
         else:  # (the stress presses wherever it does)
@@ -341,10 +334,6 @@ class ShapePass(Pass[ShapeMemory, Touch]):
                     "The obstacle of a Rigid moves through the body in one step; move it in "
                     "smaller ones, by a path (update=)"
                 )
-
-    def _forget_step(self) -> None:
-        self._reach.forget()
-        self._stretch = None
 
     @override
     def evaluate(self) -> None:
@@ -372,19 +361,14 @@ class ShapePass(Pass[ShapeMemory, Touch]):
 
     def _points(self, memory: ShapeMemory) -> Points:
         """Return the points of facets of which something is known."""
-        which, source = memory.facets, self.source
-        some = slice(None) if which is None else which
-        stretch = self._stretch
-        if stretch is None:
-            stretch = source.stretch(self._law.by_area)
-        k = np.repeat(self._normal[some], source.nq), np.repeat(self._stiffness[some], source.nq)
+        normal, tangential, stretch = self._stiffnesses(memory.facets)
         return Points(
-            self._penalty * k[0],
-            self._law.stiffness * k[1],
+            normal,
+            tangential,
             memory.outcome.inside.ravel(),
-            memory.anchor.reshape(-1, source.gdim),
+            memory.anchor.reshape(-1, self.source.gdim),
             memory.gap.ravel(),
-            stretch[some].ravel(),
+            stretch,
             memory.friction.reshape(memory.gap.size, memory.friction.shape[2]),
         )
 
@@ -489,14 +473,14 @@ class ShapePass(Pass[ShapeMemory, Touch]):
                 "quarter of a turn at most; turn it in smaller steps, by a path (update=), and "
                 "count whole turns on"
             )
-        self._forget_step()
+        self._reach.forget()
         return trial
 
     @override
     def roll_back(self) -> None:
         super().roll_back()
         self.pose = self.state.pose
-        self._forget_step()
+        self._reach.forget()
 
     # -- What is kept ---------------------------------------------------------------------------
 

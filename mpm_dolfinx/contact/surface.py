@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -169,6 +169,9 @@ class Surface:
             shape ``(m, nq)``; 0 where deleted.
         thickness: Undeformed height of the domain behind each facet, shape ``(m,)``: volume over
             area, times :attr:`Layout.narrowing`.
+        stretch: Area of each point over the undeformed one at the beginning of the step that is
+            tried, or else of the last one, shape ``(m, nq)``.
+        last_stretch: The same of the last converged step.
     """
 
     def __init__(
@@ -211,6 +214,7 @@ class Surface:
         ]
         self._layout: Layout | None = None
         self._areas = self.weights = np.zeros((0, self.nq))
+        self.stretch = self.last_stretch = self.weights
         self.thickness = np.zeros(0)
 
     @property
@@ -257,6 +261,8 @@ class Surface:
         volume = self.particles.initial_volume[cells]
         self.thickness = layout.narrowing * volume / self._areas.sum(axis=1)
         self.look_at_deleted()
+        self.begin_step()
+        self.end_step()
         return True
 
     def look_at_deleted(self) -> None:
@@ -279,25 +285,35 @@ class Surface:
         """The points on each facet of the reference cell, each of shape ``(nq, tdim)``."""
         return self._places
 
-    def stretch(
-        self, counts: bool = True, which: NDArray[np.int64] | None = None
-    ) -> NDArray[np.float64]:
-        """Return area at the last converged step over undeformed area, shape ``(m, nq)``.
+    # -- How wide facets have become ------------------------------------------------------------
 
-        Args:
-            counts: Whether it counts; otherwise 1 is told.
-            which: Numbers of facets; ``None``: all.
-        """
-        some = slice(None) if which is None else which
-        if not counts:
-            return np.ones_like(self._areas[some])
-        x = self.own_nodes(converged=True)[self.layout.own[some]]
-        now = normals(np.einsum("jqk,mki->mqij", self.slopes, x))
-        mesh_size = np.linalg.norm(normals(self.layout.edges[some]), axis=2)
-        ratio = np.linalg.norm(now, axis=2) / mesh_size
+    def begin_step(self) -> None:
+        """Note the stretch of facets at the last converged step, where a step begins."""
+        x = self.own_nodes(converged=True)[self.layout.own]
+        edges = np.einsum("jqk,mki->mqij", self.slopes, x)
+        self.stretch = np.linalg.norm(normals(edges), axis=2) * self._rule / self._areas
         if self.axisymmetric:
-            ratio = ratio * (2.0 * np.pi) * (self.shapes @ x)[:, :, 0] / self.layout.around[some]
-        return np.asarray(ratio)
+            around, now = self.layout.around, 2.0 * np.pi * np.abs((self.shapes @ x)[:, :, 0])
+            # (a facet along the axis has no area)
+            self.stretch *= np.divide(now, around, out=np.ones_like(now), where=around > 0.0)
+
+    def end_step(self) -> Callable[[], None]:
+        """Keep the stretch by which a step was made; return what takes that back."""
+        before, self.last_stretch = self.last_stretch, self.stretch
+
+        def undo() -> None:
+            self.last_stretch = before
+
+        return undo
+
+    def roll_back(self) -> None:
+        """Return to the stretch by which the last converged step was made."""
+        self.stretch = self.last_stretch
+
+    def take_stretch(self, kept: NDArray[np.float64]) -> None:
+        """Take the stretch by which the last converged step was made, where it is known."""
+        self.stretch = np.where(kept > 0.0, kept, self.stretch)
+        self.end_step()
 
     def mesh_normals(self) -> NDArray[np.float64]:
         """Return outward unit normals in the present mesh, shape ``(m, nq, gdim)``."""

@@ -67,6 +67,34 @@ def test_forces_and_moments_of_friction_balance():
     assert not touch.sticks.all() and touch.touches.any()
 
 
+@pytest.mark.parametrize("passes", [1, 2])
+def test_stiffness_is_per_area_of_facets_that_have_become_wider(passes):
+    wider, deep, n = 0.5, 0.05, 4
+    bodies, values = [], []
+    for low in (1.0, 0.0):
+        V = scenes.vectors(scenes.box([-0.3, -0.3], [2.1, 2.4], [8, 9], QUADRILATERAL))
+        body = scenes.box([0.0, low], [1.0, low + 1.0], [n, n], QUADRILATERAL)
+        bodies.append(mpm.Particles(body, V))
+        values.append(fem.Function(V))
+    everywhere = np.arange(len(values[0].x.array) // 2, dtype=np.int32)
+    touch = contact.Pair(*bodies, passes=passes)
+    problem = mpm.QuasiStaticProblem(
+        [mpm.Body(body, Hencky(YOUNG, POISSON)) for body in bodies],
+        bcs=[fem.dirichletbc(value, everywhere) for value in values],
+        terms=[touch],
+    )
+
+    def path(t):  # wider first, at a distance, then into each other
+        for value, up in zip(values, (0.1 if t < 1.0 else -deep, 0.0), strict=True):
+            value.interpolate(lambda x, up=up: (wider * x[0], 0.0 * x[1] + up))
+
+    problem.solve(2, update=path)  # (values are of places, so each in one step)
+    confined = YOUNG * (1 - POISSON) / (1 + POISSON) / (1 - 2 * POISSON)
+    pressure = deep * confined * n / 2.0  # of both layers one behind the other
+    assert problem.history.cutbacks == 0
+    assert problem.reaction(touch) == pytest.approx([0.0, pressure * (1.0 + wider)], rel=1e-9)
+
+
 def test_cohesion_is_borne_once_by_two_passes():
     dragged = []
     for passes in (1, 2):
