@@ -60,7 +60,7 @@ class FacetPass(Pass[State, Meeting]):
         law: Friction, of both passes.
         penalty: Stiffness in the normal direction, without unit.
         stiffnesses: Of the facets of both, shape ``(m,)`` each.
-        share: Share of what both passes bear.
+        share: Share of the load that it bears.
     """
 
     WITHIN = (
@@ -77,7 +77,8 @@ class FacetPass(Pass[State, Meeting]):
         stiffnesses: tuple[Array, Array],
         share: float,
     ) -> None:
-        super().__init__(source, law.shared(share), penalty, share)  # (pressure by stiffness)
+        super().__init__(source, law, penalty)
+        self.share = share
         self._comm: MPI.Comm = source.particles.mesh.comm
         self._stiffness = self._normal = self._in_series(*stiffnesses)
         reach = REACH * max(
@@ -87,7 +88,7 @@ class FacetPass(Pass[State, Meeting]):
         body = target.particles
         facets = len(basix.topology(body.mesh.basix_cell())[target.gdim - 1])
         number = body.global_index[target.layout.cells] * facets + target.layout.facets
-        self._sides = Sides(source, target, number, reach)
+        self._sides = Sides(source, target, number, reach, share)
         self._evaluations = 0
         self._paired: Closest | None = None
         self._around = self._learn(None)
@@ -98,9 +99,9 @@ class FacetPass(Pass[State, Meeting]):
         self._normal = self._in_series(*stiffnesses)
 
     def _in_series(self, source: Array, target: Array) -> Array:
-        """Return the share of both bodies' stiffnesses one behind the other (collective)."""
+        """Return both bodies' stiffnesses one behind the other (collective)."""
         facing = float(np.median(np.concatenate(self._comm.allgather(target))))
-        return self.share / (1.0 / source + 1.0 / facing) if len(source) else source
+        return 1.0 / (1.0 / source + 1.0 / facing)
 
     # -- What it tells ----------------------------------------------------------------------------
 
@@ -209,65 +210,33 @@ class FacetPass(Pass[State, Meeting]):
 
     @override
     def evaluate(self) -> None:
-        approach, sides, source = self._approach, self._sides, self.source
-        around, x = approach.around, approach.x
+        approach, sides = self._approach, self._sides
+        around = approach.around
         self._evaluations += 1
         frozen = self._evaluations > FREEZE
-        paired = self._paired = approach.met(self._paired, frozen)
+        found = paired = self._paired = approach.met(self._paired, frozen)
         borne = around.weights > 0.0
-        gap = np.where(paired.near, paired.gap, np.inf)
-        within = paired.near & (gap <= sides.touch) & borne
-        behind: NDArray[np.float64] | None = None
-        inside = pressed = within
+        pressed = within = paired.near & (paired.gap <= sides.touch) & borne
+        behind: Array | None = None
         if self.stress is not None:
             behind, reach = self._behind(around.facets, sides.touch)
             pressed = paired.near & (paired.gap <= reach) & borne
         step: OverStep | None = None
         if self.of_step:
             step = approach.over_step(paired, within)
-            inside, pressed = step.inside, step.pressed & borne
-        which = np.flatnonzero(pressed)
-        found = paired if step is None else step.found
-        stencil, anchor = self._stencil(which, found, behind, step)
-        shape = (len(around.facets), source.nq)
-        force = np.zeros_like(x)
-        pressure, slips = np.zeros(len(x)), np.zeros(len(x), dtype=bool)
-        pushes, rubs, acts = acting(self._law, stencil, sides.touch)
-        both = pushes + rubs
-        force[which], pressure[which], slips[which] = both[:, 0], acts.pressure, acts.slips
-        if behind is not None:
-            inside = within.copy()
-            inside[which] = acts.inside
-        works = 0.0, 0.0
-        if stencil.start is not None:
-            change = stencil.x[:, : both.shape[1]] - stencil.start.x
-            w = around.weights[which]
-            done = [-float(w @ (part * change).sum(axis=(1, 2))) for part in (pushes, rubs)]
-            works = done[0], done[1]
-        outcome = Outcome(
-            x.reshape(*shape, x.shape[-1]),
-            gap.reshape(shape),
-            pressure.reshape(shape),
-            force.reshape(*shape, x.shape[-1]),
-            inside.reshape(shape),
-            slips.reshape(shape),
-        )
+            found, pressed = step.found, step.pressed & borne
+        stencil, anchor = self._stencil(np.flatnonzero(pressed), found, behind, step)
         self.evaluation = Meeting(
-            law=self._law,
-            share=self.share,
-            approach=approach,
-            found=paired,
-            within=within,
-            offset=np.zeros(len(x)) if step is None else step.offset,
-            stencil=stencil,
-            facet=found.facet[which],
-            anchor=anchor,
-            outcome=outcome,
-            shear=acts.shear,
-            reaction=both[:, 1:],
-            works=works,
-            of_step=self.of_step,
-            frozen=frozen,
+            self._law,
+            approach,
+            paired,
+            within,
+            step,
+            stencil,
+            found.facet[stencil.which],
+            anchor,
+            acting(self._law, stencil, sides.touch),
+            frozen,
         )
 
     def _stencil(

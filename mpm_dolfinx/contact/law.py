@@ -30,7 +30,7 @@ with its traction at the step's end, within the cone of the step's pressure: it 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, override
 
 import numpy as np
@@ -134,10 +134,6 @@ class Friction:
         """
         return at.memory
 
-    def shared(self, share: float) -> Friction:
-        """Return the friction of points that bear a share of the pressure, and of its bound."""
-        return _Shared(self, share)
-
     @property
     def told(self) -> list[Any]:
         """Values that ranks must agree on: the kind of the law, and its numbers."""
@@ -184,46 +180,6 @@ class Coulomb(Friction):
     def bound(self, at: Rubbing) -> Array:
         p, stretch = map(np.ascontiguousarray, (at.pressure, at.stretch))
         return np.asarray(loops.coulomb(p, stretch, self.friction, self.cohesion, self.limit))
-
-    @override
-    def shared(self, share: float) -> Friction:
-        if self.compiled:
-            return replace(self, cohesion=share * self.cohesion, limit=share * self.limit)
-        return super().shared(share)
-
-
-class _Shared(Friction):
-    """Friction by another law, of points that bear a share of the pressure.
-
-    Args:
-        whole: The law of points that bear all of it.
-        share: The share.
-    """
-
-    def __init__(self, whole: Friction, share: float) -> None:
-        self._whole, self._share = whole, share
-        self.memory, self.stiffness = whole.memory, whole.stiffness
-
-    @property
-    @override
-    def smooth(self) -> bool:
-        return self._whole.smooth
-
-    @property
-    @override
-    def told(self) -> list[Any]:
-        return self._whole.told
-
-    def _wholly(self, at: Rubbing) -> Rubbing:
-        return at._replace(pressure=at.pressure / self._share)
-
-    @override
-    def bound(self, at: Rubbing) -> Array:
-        return self._share * self._whole.bound(self._wholly(at))
-
-    @override
-    def remember(self, at: Rubbing) -> Array:
-        return self._whole.remember(self._wholly(at))
 
 
 def as_friction(value: Any) -> Friction:

@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 from petsc4py import PETSc
 
@@ -12,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assembly.petsc import create_vector
-from .approach import Approach
+from .approach import Approach, OverStep
 from .behind import At
 from .facets import Closest
 from .law import Friction
@@ -20,56 +22,74 @@ from .memory import FacetMemory, no_memory, spread
 from .nitsche import Spread
 from .outcome import Outcome, untouched
 from .pair_matrices import Met
-from .stencil import Stencil, Sums, add_tangents, by_stress, remembered
+from .stencil import Acting, Stencil, Sums, add_tangents, by_stress, remembered
 from .surface import global_nodes
 
 __all__ = ["Meeting"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Meeting:
     """An evaluation of a pass.
 
     Attributes:
         law: Friction.
-        share: Share of the pass of what bears.
         approach: The points and facets.
         found: Which meet which.
         within: Which points are behind their facets.
-        offset: Gap at which they begin to be pressed.
+        step: How they meet in a whole step of a motion; ``None``: forces are of its end.
         stencil: The points where something acts.
         facet: The facets that these meet.
         anchor: Those of their anchors.
-        outcome: What acts on the points.
-        shear: By friction, where something acts, shape ``(n, gdim)``.
-        reaction: What acts on the nodes of facets there, shape ``(n, k, gdim)``.
-        works: Work against pressure and against friction in a step of a motion.
-        of_step: Whether forces are those of a whole step of a motion.
+        acting: What acts there.
         frozen: Whether points have stayed with facets of earlier evaluations.
     """
 
     law: Friction
-    share: float
     approach: Approach
     found: Closest
     within: NDArray[np.bool_]
-    offset: NDArray[np.float64]
+    step: OverStep | None
     stencil: Stencil
     facet: NDArray[np.int64]
     anchor: NDArray[np.int64]
-    outcome: Outcome
-    shear: NDArray[np.float64]
-    reaction: NDArray[np.float64]
-    works: tuple[float, float]
-    of_step: bool
+    acting: Acting
     frozen: bool
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """What acts on all points that were looked at."""
+        x, which, acts = self.approach.x, self.stencil.which, self.acting.acts
+        inside = self.within if self.step is None else self.step.inside
+        if self.stencil.behind is not None:
+            inside = inside.copy()
+            inside[which] = acts.inside
+        force, pressure, slips = np.zeros_like(x), np.zeros(len(x)), np.zeros(len(x), dtype=bool)
+        force[which] = acts.normal + acts.shear
+        pressure[which], slips[which] = acts.pressure, acts.slips
+        gap = np.where(self.found.near, self.found.gap, np.inf)
+        nq = self.approach.around.sides.source.nq
+        parts: list[Any] = [x, gap, pressure, force, inside, slips]
+        return Outcome(*(part.reshape(-1, nq, *part.shape[1:]) for part in parts))
+
+    @property
+    def works(self) -> tuple[float, float]:
+        """Work against pressure and against friction in a step of a motion."""
+        if (start := self.stencil.start) is None:
+            return 0.0, 0.0
+        change = self.stencil.x[:, : start.x.shape[1]] - start.x
+        w = self.approach.around.weights[self.stencil.which]
+        push, rub = ((p * change).sum(axis=(1, 2)) for p in (self.acting.pushes, self.acting.rubs))
+        return -float(w @ push), -float(w @ rub)
 
     def forces(self) -> list[PETSc.Vec]:
         """Return the forces on the nodes of both bodies (collective)."""
         around = self.approach.around
-        first = around.sides.source.force(self.outcome.traction, which=around.facets)
-        second = create_vector(around.sides.target.particles.W)
-        values = around.weights[self.stencil.which][:, None, None] * self.reaction
+        sides = around.sides
+        first = sides.source.force(self.outcome.traction, sides.share, around.facets)
+        second = create_vector(sides.target.particles.W)
+        reaction = (self.acting.pushes + self.acting.rubs)[:, 1:]
+        values = around.weights[self.stencil.which][:, None, None] * reaction
         dofs = around.near.dofs[self.facet].astype(PETSc.IntType)
         second.setValues(dofs.ravel(), values.ravel(), addv=PETSc.InsertMode.ADD_VALUES)
         second.assemble()
@@ -117,8 +137,7 @@ class Meeting:
         around, near = self.approach.around, self.approach.around.near
         source, which = around.sides.source, self.stencil.which
         normals, forces = by_stress(self.law, self.stencil, around.sides.touch)
-        w = factor * self.share * around.weights[which]
-        forces = w[:, None, None] * forces
+        forces = factor * around.weights[which][:, None, None] * forces
         at = At(around.facets[which // source.nq], which % source.nq, normals)
         numbers, dofs = near.number[self.facet], near.dofs[self.facet]
         others = Spread.over_met(at, numbers, dofs, forces[:, 1:], len(source.layout.cells))
@@ -132,9 +151,9 @@ class Meeting:
         """
         approach, around, last = self.approach, self.approach.around, self.approach.last
         near, nodes, sides = around.near, approach.nodes, around.sides
-        trial, found, offset = self.outcome, self.found, self.offset
-        if self.of_step:
-            found, offset = approach.returned(found, self.within, offset, self.frozen)
+        trial, found, offset = self.outcome, self.found, np.zeros(len(approach.x))
+        if self.step is not None:
+            found, offset = approach.returned(found, self.within, self.step.offset, self.frozen)
         inside = trial.inside.ravel()
         place, numbers = found.place.copy(), near.numbers(found.facet)
         which = self.stencil.which
@@ -147,7 +166,7 @@ class Meeting:
             # anchors that moved are beside the foot, and belong to the facet that is there
             X = nodes[self.facet[moves]]
             N, _, _ = near.tabulate(self.stencil.place[moves])
-            lag = self.shear[moves] / np.where(k[moves] > 0.0, k[moves], 1.0)[:, None]
+            lag = self.acting.acts.shear[moves] / np.where(k[moves] > 0.0, k[moves], 1.0)[:, None]
             foot = np.einsum("nk,nki->ni", N, X) + lag
             at, s = approach.located(foot, self.facet[moves])
             numbers[which[stays]] = last.facet[which[stays]]

@@ -26,12 +26,14 @@ class Sides(NamedTuple):
         target: The facets.
         number: A number of each facet that this rank owns, the same on any ranks, shape ``(m,)``.
         reach: How near a facet must be to be met.
+        share: Share of the load that the points bear.
     """
 
     source: Surface
     target: Surface
     number: NDArray[np.int64]
     reach: float
+    share: float
 
     @property
     def touch(self) -> float:
@@ -54,7 +56,7 @@ class Neighbourhood:
         before: Their nodes at the last converged step, shape ``(f, k, gdim)``.
         facets: Facets of the points' surface that may come near, shape ``(m,)``.
         which: Their points.
-        weights: Those of these.
+        weights: Their areas, times the share of the load.
     """
 
     def __init__(
@@ -80,7 +82,7 @@ class Neighbourhood:
             within |= followed.reshape(len(within), source.nq).any(axis=1)
         self.facets = np.flatnonzero(within)
         self.which = (self.facets[:, None] * source.nq + np.arange(source.nq)).ravel()
-        self.weights = source.weights[self.facets].ravel()
+        self.weights = sides.share * source.weights[self.facets].ravel()
 
     def is_left(self, mine: NDArray[np.float64], nodes: NDArray[np.float64]) -> bool:
         """Return whether bodies have gone far since it was made (collective).

@@ -52,11 +52,9 @@ class Pass[State, Found: Evaluation]:
         source: The points.
         law: The law of friction.
         penalty: Stiffness in the normal direction, without unit.
-        share: Share of all that bears.
 
     Attributes:
         source: As given.
-        share: As given.
         of_step: Whether forces are those of whole steps of a motion.
         stress: The stress behind the points, where that presses.
         state: The points at the last converged step.
@@ -71,8 +69,11 @@ class Pass[State, Found: Evaluation]:
     _stiffness: Array
     _normal: Array
 
-    def __init__(self, source: Surface, law: Friction, penalty: float, share: float = 1.0) -> None:
-        self.source, self.share = source, share
+    #: Share of the load that it bears: what acts at its points counts by as much.
+    share = 1.0
+
+    def __init__(self, source: Surface, law: Friction, penalty: float) -> None:
+        self.source = source
         self._law, self._penalty = law, penalty
         self.of_step = False
         self.stress: Nitsche | None = None
@@ -109,7 +110,7 @@ class Pass[State, Found: Evaluation]:
         """Return tractions by the stress behind points, and gaps up to which these may press."""
         assert self.stress is not None
         some = slice(None) if facets is None else facets
-        behind = self.share * self.stress.tractions(facets).reshape(-1, self.source.gdim)
+        behind = self.stress.tractions(facets).reshape(-1, self.source.gdim)
         k = np.repeat(self._penalty * self._normal[some], self.source.nq)
         return behind, touch + np.linalg.norm(behind, axis=1) / k
 

@@ -21,7 +21,7 @@ __all__ = ["Results"]
 class Results(Term):
     """Tractions of a contact at points of its (first) body.
 
-    With two passes points bear a share of the load, and are told what acts where they bear all.
+    With two passes each bears a share of the load; tractions are those of points that bear all.
     """
 
     _passes: Passes
@@ -46,14 +46,13 @@ class Results(Term):
     @property
     def pressure(self) -> NDArray[np.float64]:
         """Pressure per undeformed area at this rank's points, shape ``(n,)``."""
-        first = self._every()[0]
-        return first.told.pressure.ravel() / first.share
+        return self._every()[0].told.pressure.ravel()
 
     @property
     def traction(self) -> NDArray[np.float64]:
         """Traction on the body per undeformed area at this rank's points, shape ``(n, gdim)``."""
         first = self._every()[0]
-        return first.told.traction.reshape(-1, first.source.gdim) / first.share
+        return first.told.traction.reshape(-1, first.source.gdim)
 
     @property
     def area(self) -> NDArray[np.float64]:
@@ -80,8 +79,8 @@ class Results(Term):
         """Return positions of the points of each pass, and forces there on the (first) body."""
         found = []
         for number, each in enumerate(self._every()):
-            sign = 1.0 - 2.0 * number
-            force = sign * each.source.weights[:, :, None] * each.told.traction
+            share = (1.0 - 2.0 * number) * each.share
+            force = share * each.source.weights[:, :, None] * each.told.traction
             gdim = each.source.gdim
             found.append((each.told.positions.reshape(-1, gdim), force.reshape(-1, gdim)))
         return found
