@@ -4,8 +4,7 @@
 
 At the beginning of a step facets within some domains of the obstacle are noted. Others cannot touch
 until points have come nearer by a margin, which is told by the motion of nodes and of the shape
-(distances change no faster than positions do). Where they have, facets are looked for anew, farther
-away, and where all are near there is nothing to be left out.
+(distances change no faster than positions do). Where they have, all facets are looked at.
 """
 
 from __future__ import annotations
@@ -22,8 +21,7 @@ from .surface import Surface
 
 __all__ = ["Reach", "is_near"]
 
-#: Gap, over the thickness of the domain behind, up to which a facet may touch in a step; and how
-#: much farther facets are looked for than they have come nearer, where that was too far.
+#: Gap, over the thickness of the domain behind, up to which a facet may touch in a step.
 NEAR = 2.0
 
 
@@ -54,11 +52,10 @@ class Reach:
     def __init__(self, surface: Surface, shape: Shape) -> None:
         self._surface, self._shape = surface, shape
         self._near: Near | None = None
-        self._wider: Near | None = None
 
     def forget(self) -> None:
         """Take all facets for near, until they are looked for."""
-        self._near = self._wider = None
+        self._near = None
 
     def look(self, memory: ShapeMemory) -> None:
         """Note which facets may touch in a step, and what others may move until they could.
@@ -66,7 +63,7 @@ class Reach:
         Args:
             memory: What is known of the last converged step.
         """
-        self._near, self._wider = self._within(memory, 0.0), None
+        self._near = self._within(memory)
 
     def of(self, memory: ShapeMemory, pose: Pose) -> ShapeMemory | None:
         """Return the memory of facets that may touch at the present positions; ``None``: all.
@@ -76,21 +73,16 @@ class Reach:
             pose: Where the shape is.
         """
         near = self._near
-        if near is None:
+        if near is None or self._approach(near, memory, pose) >= near.margin:
             return None
-        if (moved := self._approach(near, memory, pose)) < near.margin:
-            return near.memory
-        if self._wider is None or moved >= self._wider.margin:
-            self._wider = self._within(memory, NEAR * moved)
-        wider = self._wider
-        return wider.memory if wider is not None and moved < wider.margin else None
+        return near.memory
 
-    def _within(self, memory: ShapeMemory, distance: float) -> Near | None:
-        """Return the facets that are within a distance, or some domains; ``None``: all."""
+    def _within(self, memory: ShapeMemory) -> Near | None:
+        """Return the facets that are within some domains; ``None``: all."""
         surface, shape = self._surface, self._shape
         if not shape.measures or memory.gap.size == 0:
             return None
-        near = is_near(memory, surface, distance)
+        near = is_near(memory, surface)
         if near.all():
             return None
         which = np.flatnonzero(near)
@@ -111,13 +103,11 @@ class Reach:
         return self._surface.spread * (moved + turned) + shifted
 
 
-def is_near(memory: ShapeMemory, surface: Surface, distance: float = 0.0) -> NDArray[np.bool_]:
+def is_near(memory: ShapeMemory, surface: Surface) -> NDArray[np.bool_]:
     """Return which facets of a surface are near to an obstacle, shape ``(m,)``.
 
     Args:
         memory: What is known of them.
         surface: The surface.
-        distance: Up to where they are near, if that is more than some domains.
     """
-    least = memory.gap.min(axis=1, initial=np.inf)
-    return np.asarray(least <= np.maximum(NEAR * surface.thickness, distance))
+    return np.asarray(memory.gap.min(axis=1, initial=np.inf) <= NEAR * surface.thickness)

@@ -23,7 +23,7 @@ from ..system.own import OwnUnknowns
 from ..tolerances import HALF_DIGITS, LAST_PLACES, LOCAL_ITERATIONS
 from .body_contact import BodyContact
 from .rigid_motion import RigidMotion, State
-from .rotation import Pose
+from .rotation import QUARTER, Pose
 
 __all__ = ["RigidBalance"]
 
@@ -35,8 +35,6 @@ UNBALANCED = 0.1
 #: Drag on a body that creeps to its balance, over the largest stiffness, to begin with; by how much
 #: it rises where the residual becomes larger than by a factor.
 DRAG, RISES, GROWS = 0.1, 4.0, 2.0
-#: Most that it turns in a step that is tried: the Cayley vector of a quarter of a turn.
-MOST_TURN = 2.0
 #: What is said where forces and moments on a body at rest are left.
 ADVICE = (
     "{} of the forces on a RigidBody do not balance: where it slides or rolls away, hold more of "
@@ -145,7 +143,8 @@ class RigidBalance:
         """Put the body where a step leads to, on this rank; return why that cannot be."""
         motion = self._motion
         motion.go(step)
-        if not motion.held[-1] and float(np.linalg.norm(motion.theta)) > MOST_TURN:
+        turn = 2.0 * np.arctan(0.5 * float(np.linalg.norm(motion.theta)))
+        if not motion.held[-1] and turn > QUARTER:
             return ConvergenceError("A RigidBody turns too far in one step; take smaller ones")
         try:
             for contact in self._contacts:

@@ -18,7 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Pose", "Turn", "cayley_variation", "crossing", "rotation"]
+__all__ = ["QUARTER", "Pose", "Turn", "cayley_variation", "crossing", "rotation"]
+
+#: Most that a rigid body turns in a step that is tried, and an obstacle in one at whose end points
+#: rub against it: friction is along the chord of their way in its frame.
+QUARTER = 0.5 * np.pi
 
 
 def rotation(angle: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -42,17 +42,13 @@ from .outcome import Outcome, untouched
 from .pair_matrices import Met
 from .placed import distance_within, framed, unframed
 from .reach import Reach, is_near
-from .rotation import Pose
+from .rotation import QUARTER, Pose
 from .shapes import Shape
 from .slip_changes import SlipChanges
 from .surface import Surface, global_nodes
 from .ways import OPPOSITE, passes
 
 __all__ = ["ShapePass", "Touch"]
-
-#: Most that an obstacle turns in a step at whose end points rub against it: friction is along the
-#: chord of their way in its frame.
-MOST_TURN = 0.5 * np.pi
 
 type Array = NDArray[np.float64]
 
@@ -467,7 +463,7 @@ class ShapePass(Pass[ShapeMemory, Touch]):
         last, pose = before.pose, trial.pose
         turn = pose.turn_from(last) if self._whole_turns else pose.least_turn_from(last)
         rubs = not self._law.smooth and bool(trial.outcome.inside.any())
-        if rubs and turn > MOST_TURN * (1.0 + NEGLIGIBLE):
+        if rubs and turn > QUARTER * (1.0 + NEGLIGIBLE):
             raise ConvergenceError(
                 f"An obstacle turns by {turn:.3g} rad in one step, and friction follows a "
                 "quarter of a turn at most; turn it in smaller steps, by a path (update=), and "

@@ -11,7 +11,7 @@ from scenes import HEXAHEDRON, QUADRILATERAL, box
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import contact
-from mpm_dolfinx.contact.rigid_balance import MOST_TURN
+from mpm_dolfinx.contact.rotation import QUARTER
 from mpm_dolfinx.materials import Hencky
 
 TIGHT = {"snes_rtol": 1e-12}
@@ -94,11 +94,11 @@ def test_what_no_force_acts_on_stays_where_it_is():
 def test_no_trial_turns_it_by_more_than_half_a_turn(turn):
     problem, plate = on_block(contact.box((-0.2, 1.0), (1.2, 1.4), 0.05), friction=0.5)
     problem.solve(1, update=lambda t: plate.push((0.0, -5.0 * t)))
-    unknowns = plate.own
-    unknowns.values = np.array([0.0, 0.0, turn * MOST_TURN])  # (times a length, here 1)
+    unknowns, most = plate.own, 2.0 * np.tan(0.5 * QUARTER)  # (its Cayley vector)
+    unknowns.values = np.array([0.0, 0.0, turn * most])  # (times a length, here 1)
     failure = plate.update()
     assert isinstance(failure, mpm.ConvergenceError) and "turns too far" in str(failure)
-    unknowns.values = np.array([0.0, 0.0, 0.9 * MOST_TURN])
+    unknowns.values = np.array([0.0, 0.0, 0.9 * most])
     assert plate.update() is None
 
 
