@@ -222,8 +222,8 @@ class BodyContact(Rigid):
         of_motion, by_motion = self._couplings
         return Coupled(
             K,
-            of_motion.of([Blocks(keys, motions, dofs, of)]),
-            by_motion.of([Blocks(keys, dofs, motions, by)]),
+            of_motion.of(Blocks(keys, motions, dofs, of)),
+            by_motion.of(Blocks(keys, dofs, motions, by)),
             own,
         )
 

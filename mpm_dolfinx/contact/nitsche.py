@@ -112,17 +112,17 @@ class Nitsche:
     Args:
         surface: The facets.
         material: The body's material.
-        spaces: W of the bodies on which forces act; that of the facets alone by default.
+        spaces: W of the bodies on which forces act.
     """
 
     def __init__(
         self,
         surface: Surface,
         material: PointMaterial,
-        spaces: Sequence[fem.FunctionSpace] | None = None,
+        spaces: Sequence[fem.FunctionSpace],
     ) -> None:
         self._surface, self._material = surface, material
-        self._spaces = [surface.particles.W] if spaces is None else list(spaces)
+        self._spaces = list(spaces)
 
     @cached_property
     def _behind(self) -> Behind:
@@ -165,7 +165,7 @@ class Nitsche:
         for matrix, spread in zip(self._matrices, spreads, strict=True):
             columns = global_dofs(self._surface.particles.W, behind.nodes[spread.facets])
             blocks = Blocks(spread.keys, spread.dofs, columns, spread.times(slopes))
-            found.append(matrix.of([blocks]))
+            found.append(matrix.of(blocks))
         return found if self._groups is None else self._groups.added_to(found, at, spreads)
 
 
@@ -209,7 +209,7 @@ class ThroughGroups:
         factors = self._behind.through_groups(self._averaging, at)
         every = np.arange(len(self._dofs))
         rights = [
-            matrix.of([_row_blocks(every, number, self._dofs, self._averaging.nodal(part))])
+            matrix.of(_row_blocks(every, number, self._dofs, self._averaging.nodal(part)))
             for matrix, part in zip(self._right, (gamma, right), strict=True)
         ]
         cells, found = self._behind.surface.layout.cells, []
@@ -220,7 +220,7 @@ class ThroughGroups:
             ):
                 values = spread.times(factor[:, None])
                 rows = number[cells[spread.facets]]
-                L = left.of([_row_blocks(spread.keys, rows, spread.dofs, values)])
+                L = left.of(_row_blocks(spread.keys, rows, spread.dofs, values))
                 if K is not None and L is not None:
                     parts.append(self._product((i, j), L, other))
             found.append(None if K is None else self._sums[i].of([K, *parts]))

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -455,49 +455,35 @@ class PointMatrix:
         self._comm: MPI.Comm = spaces[0].mesh.comm
         self._sizes = tuple(s if isinstance(s, tuple) else sizes_of(s) for s in (rows, columns))
         self._matrix: PETSc.Mat | None = None
-        self._places: dict[int, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
-        self._size = 0
+        self._keys = np.zeros(0, dtype=np.int64)
         self._i: list[NDArray[np.int64]] = []
         self._j: list[NDArray[np.int64]] = []
 
-    def of(self, parts: Sequence[Blocks]) -> PETSc.Mat | None:
+    def of(self, part: Blocks) -> PETSc.Mat | None:
         """Return the matrix of some blocks, the same object where no new ones come (collective).
 
         Args:
-            parts: Blocks of some sizes, each list of them with keys of its own.
+            part: The blocks, all of one size.
 
         Returns:
             ``None`` where no rank has had any.
         """
-        before = self._size
-        begins = [self._begin(number, part) for number, part in enumerate(parts)]
-        if self._comm.allreduce(self._size > before, MPI.LOR):
+        new = np.flatnonzero(~np.isin(part.keys, self._keys))
+        if self._comm.allreduce(len(new) > 0, MPI.LOR):
+            rows, columns = part.rows[new], part.columns[new]
+            self._i.append(np.repeat(rows, columns.shape[1], axis=1).ravel())
+            self._j.append(np.tile(columns, (1, rows.shape[1])).ravel())
+            self._keys = np.concatenate([self._keys, part.keys[new]])
             self._matrix = self._make()
         if self._matrix is None:
             return None
-        values = np.zeros(self._size)
-        for part, begin in zip(parts, begins, strict=True):
-            flat = part.values.reshape(len(begin), part.rows.shape[1] * part.columns.shape[1])
-            values[begin[:, None] + np.arange(flat.shape[1])] = flat
-        _compat.set_entries(self._matrix, values)
+        order = np.argsort(self._keys)
+        places = order[np.searchsorted(self._keys, part.keys, sorter=order)]
+        size = part.rows.shape[1] * part.columns.shape[1]
+        values = np.zeros((len(self._keys), size))
+        values[places] = part.values.reshape(len(places), size)
+        _compat.set_entries(self._matrix, values.ravel())
         return self._matrix
-
-    def _begin(self, number: int, part: Blocks) -> NDArray[np.int64]:
-        """Return where the entries of each block begin, at the end those of new ones."""
-        none = np.zeros(0, dtype=np.int64)
-        keys, begins = self._places.get(number, (none, none))
-        new = np.flatnonzero(~np.isin(part.keys, keys))
-        if len(new):
-            rows, columns = part.rows[new], part.columns[new]
-            size = rows.shape[1] * columns.shape[1]
-            self._i.append(np.repeat(rows, columns.shape[1], axis=1).ravel())
-            self._j.append(np.tile(columns, (1, rows.shape[1])).ravel())
-            keys = np.concatenate([keys, part.keys[new]])
-            begins = np.concatenate([begins, self._size + size * np.arange(len(new))])
-            self._size += size * len(new)
-            order = np.argsort(keys)
-            keys, begins = self._places[number] = keys[order], begins[order]
-        return begins[np.searchsorted(keys, part.keys)]
 
     def _make(self) -> PETSc.Mat:
         matrix = PETSc.Mat().create(self._comm)
