@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +46,7 @@ class Scene:
         if self.run is not None:
             self.run()
         else:
-            self.problem.solve(steps=self.steps)
+            solve(self.problem, self.steps)
 
     def account(self) -> dict[str, Any]:
         """Return how large it is, how far it came, and the linear solves of all attempts."""
@@ -56,6 +57,18 @@ class Scene:
             "iterations": history.total_iterations,
             "cutbacks": history.cutbacks,
         }
+
+
+def solve(problem: mpm.Problem, steps: int, **given: Any) -> None:
+    """Make load steps; with nodes of bodies that are made for it freed where the background errs.
+
+    As many are freed as are worth it, whatever the body's own elements err by.
+    """
+    if any(body.free_nodes is not None for body in problem.bodies):
+        given["adapt"] = 1e-6
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "adapt=", UserWarning)
+        problem.solve(steps, **given)
 
 
 def rollers(V: fem.FunctionSpace, *planes: tuple[int, float]) -> list[fem.DirichletBC]:
@@ -74,10 +87,12 @@ def rollers(V: fem.FunctionSpace, *planes: tuple[int, float]) -> list[fem.Dirich
 def particles_of(
     body: mesh.Mesh, V: fem.FunctionSpace, method: str, degree: int, rule: int | None = None
 ) -> mpm.Particles:
-    """Return particles of a method; for ``"fem"`` finite elements."""
+    """Return particles of a method; ``"fem"`` finite elements, ``"adapted"`` with nodes to free."""
     options: dict[str, Any] = {"degree": degree, "quadrature_degree": rule}
     if method == "fem":
         return mpm.Particles(body, **options)
+    if method == "adapted":
+        return mpm.Particles(body, V, free=[], **options)
     return mpm.Particles(body, V, method=method, **options)
 
 
@@ -376,7 +391,7 @@ def block(
         force = float(problem.reaction(plate[2])[2])
         return {"force": force, "error": abs(force / BLOCK_FORCE - 1.0)}
 
-    return Scene(problem, steps, measure, lambda: problem.solve(steps, update=update))
+    return Scene(problem, steps, measure, lambda: solve(problem, steps, update=update))
 
 
 # -- A rigid disc on an elastic block -------------------------------------------------------
@@ -466,7 +481,7 @@ def hertz(
         return hertz_error((ends[1:] + ends[:-1]) / 2, force, area)
 
     def run() -> None:
-        problem.solve(steps, update=lambda t: die.move((0.0, -depth * t)))
+        solve(problem, steps, update=lambda t: die.move((0.0, -depth * t)))
 
     return Scene(problem, steps, measure, run)
 

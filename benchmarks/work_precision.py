@@ -59,6 +59,8 @@ KINDS = {
     "auto-tri": Kind("tri", "cpdi2", 1, "automatic steps, triangles", "#E69F00", ">"),
     "free1": Kind("body", "fem", 1, "finite element body, degree 1", "#117733", "o"),
     "free2": Kind("body", "fem", 2, "finite element body, degree 2", "#117733", "s"),
+    "adapt1": Kind("body", "adapted", 1, "nodes freed, degree 1", "#AA4499", "D"),
+    "adapt2": Kind("body", "adapted", 2, "nodes freed, degree 2", "#AA4499", "P"),
     "fem1": Kind("", "stock", 1, "stock DOLFINx, degree 1", "0.0", "o"),
     "fem2": Kind("", "stock", 2, "stock DOLFINx, degree 2", "0.0", "s"),
 }
@@ -196,22 +198,9 @@ def point(case: str, kind: str, size: float, steps: int | None) -> None:
     """Run a scene in this process and print what it took and what came out."""
     from mpi4py import MPI  # noqa: F401
 
-    import finite_elements
-    import scenes
-
     import mpm_dolfinx as mpm
 
-    domain, method, degree = KINDS[kind][:3]
-    options: dict[str, Any] = {} if steps is None else {"steps": steps}
-    if KINDS[kind].f_bar != "none":
-        options["f_bar"] = KINDS[kind].f_bar
-    scene: Any
-    if method == "stock":
-        scene = finite_elements.CASES[case](size, degree, **options)
-    else:
-        if domain == "body":
-            domain = "hex" if case in ("D", "P") else "quad"
-        scene = scenes.CASES[case](size, domain, method, degree, **options)
+    scene = made(case, kind, size, steps)
     start = time.process_time()
     failure = None
     try:
@@ -232,6 +221,22 @@ def point(case: str, kind: str, size: float, steps: int | None) -> None:
             }
         )
     )
+
+
+def made(case: str, kind: str, size: float, steps: int | None = None) -> Any:
+    """Return a scene, before its first step."""
+    import finite_elements
+    import scenes
+
+    domain, method, degree = KINDS[kind][:3]
+    options: dict[str, Any] = {} if steps is None else {"steps": steps}
+    if KINDS[kind].f_bar != "none":
+        options["f_bar"] = KINDS[kind].f_bar
+    if method == "stock":
+        return finite_elements.CASES[case](size, degree, **options)
+    if domain == "body":
+        domain = "hex" if case in ("D", "P") else "quad"
+    return scenes.CASES[case](size, domain, method, degree, **options)
 
 
 def process(arguments: dict[str, Any]) -> dict[str, Any]:

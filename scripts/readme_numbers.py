@@ -1,6 +1,6 @@
 # Copyright (C) 2026 the mpm-dolfinx authors
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Write tables of README.md and docs/performance.md from benchmarks/results/work_precision.json.
+"""Write tables of README.md and docs/performance.md from benchmarks/results.
 
 usage: readme_numbers.py [--check]    (--check: change nothing, fail where a table is another)
 """
@@ -16,6 +16,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "work_precision.json"
+BESIDE = RESULTS.with_name("side_by_side.json")
 SIZES = (16, 64, 256)
 KINDS = {
     "quad1": "**CPDI2, quadrilaterals**",
@@ -146,6 +147,30 @@ def is_of(point: dict[str, Any], kind: str) -> bool:
     return point["case"] == "A" and point["kind"] == kind and point["size"] in SIZES
 
 
+def side_by_side(_: dict[str, Any]) -> str:
+    """Return a table: errors and seconds of bodies that are carried, wholly or in part, or not."""
+    points = json.loads(BESIDE.read_text("utf-8"))["points"]
+    lines = [
+        "| | error: carried | freed | elements | CPU s: carried | freed | elements | stock |",
+        "| --- |" + " ---: |" * 7,
+    ]
+    runs = dict.fromkeys((p["case"], p["kind"][-1], p["size"]) for p in points)
+    for case, degree, size in runs:
+        kinds = ("hex" if case in ("D", "P") else "quad", "adapt", "free", "fem")
+        some = [
+            next(
+                (p for p in points if p["case"] == case and p["size"] == size and p["kind"] == k),
+                {},
+            )
+            for k in (kind + degree for kind in kinds)
+        ]
+        told = [f"{p['error']:.2g}" if "error" in p and not p["failure"] else "" for p in some[:3]]
+        told += [f"{p['run']:.2g}" if p else "" for p in some]
+        name = f"{NAMES[case]}, degree {degree}, {some[0]['particles']} domains"
+        lines.append(f"| {name} | {' | '.join(told)} |")
+    return "\n".join(lines) + "\n"
+
+
 #: What stands between the marks of a name in a file.
 PARTS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "README.md": {"numbers": columns},
@@ -153,6 +178,7 @@ PARTS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
         "machine": machine,
         "seconds": partial(seconds, which="plane"),
         "more seconds": partial(seconds, which="more"),
+        "side by side": side_by_side,
         "load steps": load_steps,
     },
 }
